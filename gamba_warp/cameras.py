@@ -1,0 +1,156 @@
+"""Cameras and their conventions, stated once.
+
+``viewmats [.., V, 4, 4]`` map world to camera in the OpenCV frame (x right, y down, z forward).
+``Ks [.., V, 3, 3]`` are in pixels, with pixel centres at +0.5. Dataset files hold camera-to-world
+matrices in the OpenGL/Blender frame (x right, y up, z backward); ``from_opengl`` is the only bridge.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+DEFAULT_FOV = 49.1  # degrees, vertical; the released data's camera
+DEFAULT_DISTANCE = 1.5  # of the reference camera from the object's centre, object units
+
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+@dataclass
+class Cameras:
+    """V pinhole cameras with one picture size.
+
+    Attributes:
+        viewmats: ``[.., V, 4, 4]`` world to camera, OpenCV frame.
+        Ks: ``[.., V, 3, 3]`` intrinsics in pixels.
+        width: pixels.
+        height: pixels.
+    """
+
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+    def __getitem__(self, index) -> Cameras:
+        """Indexes the leading dimensions of both tensors."""
+        return replace(self, viewmats=self.viewmats[index], Ks=self.Ks[index])
+
+    def to(self, *args, **kwargs) -> Cameras:
+        """As ``torch.Tensor.to``."""
+        return replace(
+            self, viewmats=self.viewmats.to(*args, **kwargs), Ks=self.Ks.to(*args, **kwargs)
+        )
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """The same cameras for another picture size (the field of view stays)."""
+        factor = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
+        return Cameras(self.viewmats, self.Ks * factor[:, None], width, height)
+
+
+def intrinsics(width: int, height: int, fov: float = DEFAULT_FOV) -> Tensor:
+    """``[3, 3]`` float32 for square pixels, a centred axis and a vertical field of view in degrees."""
+    focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+    return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+
+
+def from_opengl(camera_to_world: Tensor) -> Tensor:
+    """World-to-camera OpenCV matrices from camera-to-world OpenGL ones, both ``[.., 4, 4]``."""
+    inverse = torch.linalg.inv(camera_to_world.double())
+    return (_FLIP @ inverse).to(camera_to_world.dtype)
+
+
+def to_opengl(viewmats: Tensor) -> Tensor:
+    """Camera-to-world OpenGL matrices from world-to-camera OpenCV ones, both ``[.., 4, 4]``."""
+    return torch.linalg.inv(_FLIP @ viewmats.double()).to(viewmats.dtype)
+
+
+def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
+    """``[4, 4]`` float32: the reference camera in its own frame, looking at the origin along +z."""
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = distance
+    return viewmat
+
+
+def orbit(
+    azimuths: Tensor, elevation: float | Tensor = 0.0, distance: float | Tensor = DEFAULT_DISTANCE
+) -> Tensor:
+    """World-to-camera matrices ``[V, 4, 4]`` on an orbit about the origin, in the reference frame.
+
+    Azimuth and elevation 0 is the reference camera itself. The world is the reference camera's
+    frame, so "up" is -y; a positive elevation looks down from above.
+
+    Args:
+        azimuths: ``[V]``, degrees.
+        elevation: degrees, one or ``[V]``.
+        distance: object units, one or ``[V]``.
+    """
+    a = torch.deg2rad(torch.as_tensor(azimuths, dtype=torch.float64))
+    e = torch.deg2rad(torch.as_tensor(elevation, dtype=torch.float64)).expand_as(a)
+    d = torch.as_tensor(distance, dtype=torch.float64).expand_as(a)
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+    # z forward points from the camera to the origin; x right stays horizontal; y down = z × x.
+    forward = torch.stack([-a.sin() * e.cos(), e.sin(), a.cos() * e.cos()], -1)
+    right = torch.stack([a.cos(), zero, a.sin()], -1)
+    down = torch.linalg.cross(forward, right)
+    viewmats = torch.zeros(len(a), 4, 4, dtype=torch.float64)
+    viewmats[:, :3, :3] = torch.stack([right, down, forward], 1)
+    viewmats[:, 2, 3] = d
+    viewmats[:, 3, 3] = one
+    return viewmats.float()
+
+
+def relative_to_reference(
+    viewmats: Tensor, reference: Tensor, distance: float = DEFAULT_DISTANCE
+) -> tuple[Tensor, Tensor]:
+    """Expresses poses in the reference camera's frame, at a normalised distance.
+
+    The new world has its origin where the object's is, its axes along the reference camera's, and
+    its unit such that the reference camera, if it looks at the origin, becomes ``reference_viewmat``.
+    If it looks past the origin the pose keeps the remaining offset.
+
+    Args:
+        viewmats: ``[.., V, 4, 4]`` world to camera.
+        reference: ``[.., 4, 4]`` world to camera, the reference view.
+        distance: the reference camera's distance from the origin in the new world.
+
+    Returns:
+        New ``viewmats [.., V, 4, 4]`` and ``scale [..]``: new length = scale · old length. A point
+        moves by ``x_new = scale · R_reference · x_old``.
+    """
+    rotation = reference[..., :3, :3]
+    scale = distance / reference[..., :3, 3].norm(dim=-1)
+    out = viewmats.clone()
+    out[..., :3, :3] = viewmats[..., :3, :3] @ rotation[..., None, :, :].mT
+    out[..., :3, 3] = viewmats[..., :3, 3] * scale[..., None, None]
+    return out, scale
+
+
+def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
+    """Plücker coordinates (o × d, d) of the ray through every pixel centre, world frame.
+
+    Args:
+        viewmats: ``[.., 4, 4]``.
+        Ks: ``[.., 3, 3]``.
+        width: pixels.
+        height: pixels.
+
+    Returns:
+        ``[.., height, width, 6]``: moment, then unit direction (paper §3.2; DMV3D).
+    """
+    rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    x = torch.arange(width, device=Ks.device, dtype=Ks.dtype) + 0.5
+    y = torch.arange(height, device=Ks.device, dtype=Ks.dtype) + 0.5
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    pixels = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], -1)
+    # d_world = Rᵀ K⁻¹ p, row vectors
+    to_world = torch.linalg.inv(Ks).mT @ rotation
+    directions = pixels.reshape(-1, 3) @ to_world
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    origin = -(rotation.mT @ translation[..., None])[..., 0]
+    moments = torch.linalg.cross(origin[..., None, :].expand_as(directions), directions)
+    rays = torch.cat([moments, directions], -1)
+    return rays.reshape(*viewmats.shape[:-2], height, width, 6)

@@ -1,0 +1,116 @@
+"""The container that every part passes on: activated Gaussian parameters, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+
+@dataclass
+class Gaussians:
+    """3D Gaussians with activated values; any number of leading batch dimensions ``..``.
+
+    Attributes:
+        means: ``[.., N, 3]``, object units (the bounding cube of an object has side 1).
+        quats: ``[.., N, 4]`` wxyz, any length > 0, or None for no rotation (cheaper).
+        scales: ``[.., N, 3]`` standard deviations, > 0, object units.
+        opacities: ``[.., N]`` in (0, 1).
+        colors: ``[.., N, 3]`` RGB in [0, 1].
+    """
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+    def __post_init__(self) -> None:
+        lead = tuple(self.opacities.shape)
+        want = {"means": 3, "quats": 4, "scales": 3, "colors": 3}
+        for name, size in want.items():
+            value = getattr(self, name)
+            if value is not None and tuple(value.shape) != (*lead, size):
+                raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {(*lead, size)}")
+
+    @property
+    def num(self) -> int:
+        """N, the number of Gaussians of one object."""
+        return self.opacities.shape[-1]
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """The same container with ``function`` applied to every tensor that is there."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Gaussians(**{k: None if v is None else function(v) for k, v in values.items()})
+
+    def __getitem__(self, index) -> Gaussians:
+        """Indexes the leading batch dimensions, the same way in every tensor."""
+        return self.map(lambda value: value[index])
+
+    def select(self, keep: Tensor) -> Gaussians:
+        """The Gaussians of one object (no batch dimension) where ``keep [N]`` says so."""
+        return self.map(lambda value: value[keep])
+
+    def to(self, *args, **kwargs) -> Gaussians:
+        """As ``torch.Tensor.to``."""
+        return self.map(lambda value: value.to(*args, **kwargs))
+
+    def detach(self) -> Gaussians:
+        """The same values, cut from the graph."""
+        return self.map(torch.Tensor.detach)
+
+    def transformed(self, rotation: Tensor, translation: Tensor, scale: float = 1.0) -> Gaussians:
+        """Moved by ``x -> scale · rotation · x + translation`` (one rigid motion for all).
+
+        Args:
+            rotation: ``[3, 3]``, a proper rotation.
+            translation: ``[3]``.
+            scale: > 0.
+        """
+        turn = matrix_to_quat(rotation)
+        quats = self.quats
+        if quats is None:
+            quats = torch.zeros_like(self.means[..., :1]).expand(*self.means.shape[:-1], 4).clone()
+            quats[..., 0] = 1.0
+        return Gaussians(
+            means=scale * self.means @ rotation.mT + translation,
+            quats=quat_multiply(turn.to(quats), quats),
+            scales=scale * self.scales,
+            opacities=self.opacities,
+            colors=self.colors,
+        )
+
+
+def quat_multiply(p: Tensor, q: Tensor) -> Tensor:
+    """Hamilton product of wxyz quaternions ``[.., 4]``: the rotation q, then p."""
+    pw, px, py, pz = p.unbind(-1)
+    qw, qx, qy, qz = q.unbind(-1)
+    return torch.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        dim=-1,
+    )
+
+
+def matrix_to_quat(rotation: Tensor) -> Tensor:
+    """The wxyz quaternion ``[4]``, w >= 0, of a rotation matrix ``[3, 3]``.
+
+    The eigenvector of Bar-Itzhack's symmetric matrix: exact near every angle, 180° included.
+    """
+    m = rotation.double()
+    k = torch.stack(
+        [
+            torch.stack([m.trace(), m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
+            torch.stack([m[2, 1] - m[1, 2], 2 * m[0, 0] - m.trace(), m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]),
+            torch.stack([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 2 * m[1, 1] - m.trace(), m[1, 2] + m[2, 1]]),
+            torch.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 2 * m[2, 2] - m.trace()]),
+        ]
+    )
+    quat = torch.linalg.eigh(k).eigenvectors[:, -1]
+    return (quat if quat[0] >= 0 else -quat).to(rotation.dtype)

@@ -1,0 +1,70 @@
+"""Reading and writing pictures: any common file to float RGBA, with errors that name the file."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from .errors import UserError
+from .files import atomic_path
+
+MAX_PIXELS = 64 * 1024 * 1024
+
+
+def load_rgba(path: str | Path) -> np.ndarray:
+    """Reads one still picture.
+
+    8-bit and 16-bit, grey, palette, RGB and RGBA files are converted; EXIF rotation is applied.
+
+    Returns:
+        ``[H, W, 4]`` float32 in [0, 1], colour not premultiplied; alpha 1 where the file has none.
+
+    Raises:
+        UserError: missing, empty, not a picture, truncated, animated or over 64 megapixels.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder, not a picture")
+    if not path.exists():
+        raise UserError(f"{path}: no such file")
+    try:
+        if path.stat().st_size == 0:
+            raise UserError(f"{path}: the file is empty")
+        with Image.open(path) as image:
+            if getattr(image, "n_frames", 1) > 1:
+                raise UserError(f"{path}: animated picture ({image.n_frames} frames); give one frame")
+            if image.width * image.height > MAX_PIXELS:
+                raise UserError(f"{path}: {image.width}x{image.height} is over 64 megapixels")
+            return _to_rgba(image)
+    except UserError:
+        raise
+    except UnidentifiedImageError as error:
+        raise UserError(f"{path}: not a picture that can be read") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise UserError(f"{path}: cannot be decoded ({str(error).splitlines()[0]})") from error
+
+
+def _to_rgba(image: Image.Image) -> np.ndarray:
+    from PIL import ImageOps
+
+    image = ImageOps.exif_transpose(image)
+    if image.mode.startswith(("I", "F")):  # 16-bit grey (PIL reads 16-bit colour as 8-bit)
+        grey = np.asarray(image, dtype=np.float32)
+        top = 65535.0 if image.mode != "F" else max(1.0, float(np.nanmax(grey)))
+        grey = np.clip(np.nan_to_num(grey) / top, 0.0, 1.0)
+        return np.dstack([grey, grey, grey, np.ones_like(grey)])
+    return np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+
+
+def to_uint8(picture: np.ndarray) -> np.ndarray:
+    """Rounds ``[.., C]`` float values in [0, 1] to 8 bits; NaN becomes 0."""
+    return (np.clip(np.nan_to_num(picture), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
+    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], atomically, in the suffix's format."""
+    pixels = to_uint8(np.asarray(picture))
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[..., 0]
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels).save(temporary, **options)

@@ -1,0 +1,64 @@
+"""Gaussians and cameras to pictures, by the rasterizer kernels."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from .cameras import Cameras
+from .gaussians import Gaussians
+from .kernels.rasterize import rasterization
+
+
+@dataclass
+class Rendering:
+    """What ``render`` returns.
+
+    Attributes:
+        rgb: ``[.., V, H, W, 3]``, composited on the background.
+        alpha: ``[.., V, H, W, 1]`` in [0, 1].
+        depth: ``[.., V, H, W, 1]`` expected depth in object units, or None.
+        meta: work counts of the rasterizer.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    meta: dict
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Tensor | None = None,
+    depth: bool = False,
+    **options,
+) -> Rendering:
+    """Renders every object in each of its views, all in one launch.
+
+    Args:
+        gaussians: leading dimensions ``..``.
+        cameras: the same leading dimensions, then V.
+        background: RGB in [0, 1], ``[3]`` or ``[.., V, 3]``; None means black.
+        depth: also return the expected depth.
+        options: passed on to ``rasterization``.
+
+    Returns:
+        A ``Rendering``.
+    """
+    if background is not None:
+        background = background.expand(*cameras.viewmats.shape[:-2], 3)
+    pictures, alpha, meta = rasterization(
+        means=gaussians.means,
+        quats=gaussians.quats,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        colors=gaussians.colors,
+        viewmats=cameras.viewmats,
+        Ks=cameras.Ks,
+        width=cameras.width,
+        height=cameras.height,
+        backgrounds=background,
+        render_mode="RGB+ED" if depth else "RGB",
+        **options,
+    )
+    return Rendering(pictures[..., :3], alpha, pictures[..., 3:] if depth else None, meta)
