@@ -2,7 +2,7 @@
 
 ``viewmats [.., V, 4, 4]`` map world to camera in the OpenCV frame (x right, y down, z forward).
 ``Ks [.., V, 3, 3]`` are in pixels, with pixel centres at +0.5. Dataset files hold camera-to-world
-matrices in the OpenGL/Blender frame (x right, y up, z backward); ``from_opengl`` is the only bridge.
+matrices in the OpenGL/Blender frame (x right, y up, z backward); ``from_opengl`` is the bridge.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Cameras:
 
 
 def intrinsics(width: int, height: int, fov: float = DEFAULT_FOV) -> Tensor:
-    """``[3, 3]`` float32 for square pixels, a centred axis and a vertical field of view in degrees."""
+    """``[3, 3]`` float32 for square pixels, a centred axis, a vertical field of view in degrees."""
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
@@ -109,8 +109,8 @@ def relative_to_reference(
     """Expresses poses in the reference camera's frame, at a normalised distance.
 
     The new world has its origin where the object's is, its axes along the reference camera's, and
-    its unit such that the reference camera, if it looks at the origin, becomes ``reference_viewmat``.
-    If it looks past the origin the pose keeps the remaining offset.
+    its unit such that the reference camera is at ``distance``: ``reference_viewmat`` if it looks at
+    the origin, else that with the remaining offset.
 
     Args:
         viewmats: ``[.., V, 4, 4]`` world to camera.

@@ -12,7 +12,7 @@ from .errors import UserError
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path in the same folder; on success it replaces ``path``, else it is removed.
+    """Yields a temporary path in the same folder; on success it replaces ``path``, else it goes.
 
     The temporary name keeps the suffix of ``path``, since many writers go by it.
 
@@ -21,7 +21,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent
+        )
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
     os.close(handle)

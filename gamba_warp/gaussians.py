@@ -107,9 +107,15 @@ def matrix_to_quat(rotation: Tensor) -> Tensor:
     k = torch.stack(
         [
             torch.stack([m.trace(), m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
-            torch.stack([m[2, 1] - m[1, 2], 2 * m[0, 0] - m.trace(), m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]),
-            torch.stack([m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 2 * m[1, 1] - m.trace(), m[1, 2] + m[2, 1]]),
-            torch.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 2 * m[2, 2] - m.trace()]),
+            torch.stack(
+                [m[2, 1] - m[1, 2], 2 * m[0, 0] - m.trace(), m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]
+            ),
+            torch.stack(
+                [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 2 * m[1, 1] - m.trace(), m[1, 2] + m[2, 1]]
+            ),
+            torch.stack(
+                [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 2 * m[2, 2] - m.trace()]
+            ),
         ]
     )
     quat = torch.linalg.eigh(k).eigenvectors[:, -1]

@@ -32,7 +32,9 @@ def load_rgba(path: str | Path) -> np.ndarray:
             raise UserError(f"{path}: the file is empty")
         with Image.open(path) as image:
             if getattr(image, "n_frames", 1) > 1:
-                raise UserError(f"{path}: animated picture ({image.n_frames} frames); give one frame")
+                raise UserError(
+                    f"{path}: animated picture ({image.n_frames} frames); give one frame"
+                )
             if image.width * image.height > MAX_PIXELS:
                 raise UserError(f"{path}: {image.width}x{image.height} is over 64 megapixels")
             return _to_rgba(image)
@@ -62,7 +64,7 @@ def to_uint8(picture: np.ndarray) -> np.ndarray:
 
 
 def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
-    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], atomically, in the suffix's format."""
+    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1] in the suffix's format, atomically."""
     pixels = to_uint8(np.asarray(picture))
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]

@@ -50,9 +50,9 @@ def test_imports(path):
     for name, top in _imports(path):
         root = name.split(".")[0]
         assert root not in ("kernels", "train", "eval"), f"import gamba_warp.{name} instead"
-        assert not any(
-            name == bad or name.startswith(bad + ".") for bad in FORBIDDEN[folder]
-        ), f"{folder} must not import {name}"
+        assert not any(name == bad or name.startswith(bad + ".") for bad in FORBIDDEN[folder]), (
+            f"{folder} must not import {name}"
+        )
         if folder == "kernels" and root not in KERNELS_MAY:
             assert root in __import__("sys").stdlib_module_names, f"kernels must not import {name}"
         if root in ("open3d", "pymeshlab"):
