@@ -64,7 +64,7 @@ def to_uint8(picture: np.ndarray) -> np.ndarray:
 
 
 def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
-    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1] in the suffix's format, atomically."""
+    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], in the suffix's format."""
     pixels = to_uint8(np.asarray(picture))
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
