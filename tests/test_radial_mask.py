@@ -1,0 +1,154 @@
+"""The radial mask constraint: known answers in units of half the image's height, and gradients."""
+
+import math
+
+import pytest
+import torch
+
+from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
+from gamba_warp.train.radial_mask import contour_distances, project_means, radial_mask_loss
+
+SIZE = 96
+CONTOUR = 0.5 / (SIZE / 2)  # half a pixel: how well a 0/1 pixel mask states a curve
+
+
+def disc(radius: float, width=SIZE, height=SIZE, centre=(0.0, 0.0)) -> torch.Tensor:
+    """A disc of ``radius`` half heights about ``centre`` (from the image centre, same unit)."""
+    x = (torch.arange(width) + 0.5 - width / 2) / (height / 2) - centre[0]
+    y = (torch.arange(height) + 0.5 - height / 2) / (height / 2) - centre[1]
+    return (x * x + (y * y)[:, None] < radius * radius).float()
+
+
+def camera(width=SIZE, height=SIZE, views=1) -> Cameras:
+    viewmats = reference_viewmat(1.5).expand(views, 4, 4).clone()
+    return Cameras(viewmats, intrinsics(width, height).expand(views, 3, 3), width, height)
+
+
+def mean_at(distance: float, angle: float, depth: float = 1.5) -> torch.Tensor:
+    """A centre that projects to ``distance`` half heights from the image centre."""
+    reach = distance * math.tan(math.radians(49.1 / 2)) * depth
+    return torch.tensor([[reach * math.cos(angle), reach * math.sin(angle), depth - 1.5]])
+
+
+@pytest.mark.parametrize("width", [96, 131])
+def test_disc_contour(width):
+    contours = contour_distances(disc(0.6, width)[None])
+    assert contours.shape == (1, 256)
+    assert (contours - 0.6).abs().max() < CONTOUR
+
+
+def test_square_contour():
+    mask = torch.zeros(SIZE, SIZE)
+    mask[24:72, 24:72] = 1  # half a picture wide: sides at 0.5
+    got = contour_distances(mask, rays=64)
+    angles = torch.arange(64) * (2 * math.pi / 64)
+    want = 0.5 / torch.maximum(angles.cos().abs(), angles.sin().abs())
+    assert (got - want).abs().max() < CONTOUR
+
+
+def test_full_picture_ends_at_its_border():
+    got = contour_distances(torch.ones(32, 48), rays=4)
+    torch.testing.assert_close(got, torch.tensor([1.5, 1.0, 1.5, 1.0]), atol=1e-5, rtol=0)
+
+
+def test_outermost_contour_counts():
+    ring = disc(0.8) - disc(0.4)
+    assert (contour_distances(ring) - 0.8).abs().max() < CONTOUR
+
+
+def test_rays_that_meet_nothing_are_zero():
+    contours = contour_distances(disc(0.2, centre=(0.6, 0.0)))
+    assert abs(contours[0].item() - 0.8) < CONTOUR
+    assert contours[128] == 0 and contours[64] == 0
+    assert (contour_distances(torch.zeros(3, 8, 8)) == 0).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, 2.5, -1.9, math.pi])
+def test_loss_outside_a_disc(angle):
+    """A Gaussian at distance d outside a disc of radius r costs (d - r)²."""
+    contours = contour_distances(disc(0.5)[None])
+    loss = radial_mask_loss(mean_at(0.9, angle), camera(), contours)
+    assert loss.shape == (1,)
+    assert abs(loss.item() ** 0.5 - 0.4) < CONTOUR
+
+
+def test_loss_does_not_depend_on_the_picture_size():
+    losses = []
+    for size in (64, 256):
+        contours = contour_distances(disc(0.5, size, size)[None])
+        losses.append(radial_mask_loss(mean_at(0.9, 0.3), camera(size, size), contours).item())
+    assert losses[0] == pytest.approx(losses[1], rel=2 * CONTOUR / 0.4)
+
+
+def test_no_loss_inside_and_mean_over_all():
+    contours = contour_distances(disc(0.5)[None])
+    inside = torch.cat([mean_at(0.45, 1.0), torch.zeros(1, 3)])
+    assert radial_mask_loss(inside, camera(), contours).item() == 0
+    both = torch.cat([inside, mean_at(0.9, 1.0)])
+    alone = radial_mask_loss(both[2:], camera(), contours)
+    torch.testing.assert_close(radial_mask_loss(both, camera(), contours), alone / 3)
+
+
+def test_interpolates_between_rays():
+    """Half-way between a ray at 0.2 and one at 0.6 the contour is 0.4."""
+    contours = torch.full((1, 8), 0.2)
+    contours[0, 1] = 0.6
+    loss = radial_mask_loss(mean_at(0.9, math.pi / 8), camera(), contours)
+    assert loss.item() == pytest.approx(0.25, rel=1e-4)  # float32 projection
+    last = torch.full((1, 8), 0.2)
+    last[0, 7] = 0.6  # the last ray and the first are neighbours too
+    loss = radial_mask_loss(mean_at(0.9, -math.pi / 8), camera(), last)
+    assert loss.item() == pytest.approx(0.25, rel=1e-4)
+
+
+def test_off_centre_object():
+    contours = contour_distances(disc(0.2, centre=(0.6, 0.0))[None])
+    assert radial_mask_loss(mean_at(0.7, 0.0), camera(), contours).item() == 0
+    loss = radial_mask_loss(mean_at(0.5, math.pi), camera(), contours)
+    assert loss.item() == pytest.approx(0.25, rel=1e-4)
+
+
+def test_empty_mask_and_behind_the_camera_cost_nothing():
+    means = torch.cat(
+        [mean_at(0.9, 1.0), mean_at(0.9, 1.0, depth=-0.5), mean_at(0.9, 1.0, depth=0)]
+    )
+    means.requires_grad_()
+    empty = radial_mask_loss(means, camera(), torch.zeros(1, 256))
+    assert empty.item() == 0
+    contours = contour_distances(disc(0.3)[None])
+    loss = radial_mask_loss(means, camera(), contours).sum()
+    gradient = torch.autograd.grad(loss, means)[0]
+    assert torch.isfinite(gradient).all()
+    assert (gradient[1:] == 0).all() and (gradient[0] != 0).any()
+
+
+def test_gradient_at_the_image_centre_is_finite():
+    means = torch.zeros(2, 3, requires_grad=True)
+    contours = torch.cat([torch.zeros(255), torch.ones(1)])[None]
+    radial_mask_loss(means, camera(), contours).sum().backward()
+    assert (means.grad == 0).all()
+
+
+def test_gradient_by_finite_differences():
+    generator = torch.Generator().manual_seed(1)
+    means = torch.rand(2, 7, 3, dtype=torch.float64, generator=generator) - 0.5
+    cameras = camera(views=3).to(torch.float64)
+    turn = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], dtype=torch.float64)
+    cameras.viewmats[1, :3, :3] = turn
+    cameras = Cameras(
+        cameras.viewmats.expand(2, 3, 4, 4), cameras.Ks.expand(2, 3, 3, 3), SIZE, SIZE
+    )
+    contours = 0.1 + 0.2 * torch.rand(2, 3, 16, dtype=torch.float64, generator=generator)
+    cotangent = torch.randn(2, 3, dtype=torch.float64, generator=generator)
+
+    def weighed(x):
+        return (radial_mask_loss(x, cameras, contours) * cotangent).sum()
+
+    assert weighed(means) != 0
+    assert torch.autograd.gradcheck(weighed, (means.requires_grad_(),), eps=1e-6, atol=1e-7)
+
+
+def test_projection_known_answer():
+    positions, depths = project_means(torch.tensor([[0.0, 0.0, 0.25]]), camera())
+    torch.testing.assert_close(positions[0, 0], torch.tensor([SIZE / 2, SIZE / 2]))
+    assert depths[0, 0] == 1.75
