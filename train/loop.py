@@ -1,0 +1,357 @@
+"""The training loop: ``Trainer.run`` is the loop, ``Trainer.train_step`` one optimizer step."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+from tqdm import tqdm
+
+from gamba_warp.errors import UserError
+from gamba_warp.model import Gamba, save_model
+
+from .batches import BatchSource, Prefetcher, fixed_batches
+from .checkpoint import load_weights, read_state, save_checkpoint
+from .config import TrainConfig, config_differences
+from .ddp import World
+from .log import RunLog, save_strip
+from .optim import Ema, build_optimizer
+from .prepare import TrainingData
+from .schedule import learning_rate, novel_views, radial_weight
+from .step import collapse_reason, forward, health
+from .validate import validate
+
+STATE_VERSION = 1
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Collects SIGTERM and SIGINT in the yielded list; a second SIGINT interrupts at once."""
+    received: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        if received and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        received.append(number)
+
+    old = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield received
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+class Trainer:
+    """A model, its optimizer and their state, trained on one dataset."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        model: Gamba,
+        data: TrainingData,
+        world: World,
+        log: RunLog | None,
+        lpips: Callable[[Tensor, Tensor], Tensor] | None,
+    ) -> None:
+        """``log`` is there on the main process alone; ``model`` is on the world's device."""
+        self.config, self.data, self.world, self.log, self.lpips = config, data, world, log, lpips
+        self.model = model
+        self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
+        self.ema = Ema(model, config.optim.ema) if config.optim.ema else None
+        self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        self.wrapped = DistributedDataParallel(model) if world.size > 1 else model
+        self.precision = getattr(torch, config.optim.precision)
+        self.accumulate = config.views.accumulate
+        self.step = self.skipped = self.skipped_in_row = 0
+        self.elapsed = 0.0  # seconds of training, resumed parts included
+        self._collapsed = False
+        self._saved = self._validated = -1  # the steps at which each was last done
+        self._source = BatchSource(
+            data.train,
+            model.config,
+            objects=data.objects,
+            batch_size=data.batch_size * world.size,
+            size=config.views.size,
+            reference=data.reference,
+            background=config.views.background,
+            seed=config.run.seed,
+        )
+        length = config.length
+        self.steps_per_epoch = len(data.objects) / (self._source.batch_size * self.accumulate)
+        self.total = length.steps
+        if self.total is None and (length.epochs or not length.minutes):
+            self.total = math.ceil((length.epochs or 400) * self.steps_per_epoch)
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Uid -> reason, of the objects that could not be read so far."""
+        return self._source.failures
+
+    # ---- schedules
+
+    def progress(self, step: int) -> float:
+        """0 to 1 at a step: its share of all, or the clock's where only minutes are limited."""
+        if self.total is not None:
+            return min(1.0, step / self.total)
+        return min(1.0, self.elapsed / (60 * self.config.length.minutes))
+
+    def learning_rate(self) -> float:
+        """Of the next step."""
+        warmup = self.config.optim.warmup_steps
+        if self.total is not None:
+            warmup = min(warmup, 0.1 * self.total)
+            return learning_rate(self.step, self.total, self.config.optim.lr, warmup)
+        # By the clock: as many steps are to come as the speed so far promises.
+        total = self.step / max(self.progress(self.step), 1e-6)
+        return learning_rate(self.step, max(total, warmup + 1), self.config.optim.lr, warmup)
+
+    def novel_views(self, step: int) -> int:
+        """V of a step."""
+        views = self.config.views
+        if views.views_per_object is not None:
+            return views.views_per_object
+        return novel_views(self.progress(step), views.views_first, views.views_last)
+
+    def weights(self) -> dict[str, float]:
+        """Of the loss terms at the next step."""
+        loss = self.config.loss
+        span = loss.rdist_steps
+        span = loss.rdist_epochs * self.steps_per_epoch if span is None else span
+        use_lpips = self.lpips is not None and self.step >= loss.lpips_after
+        return {
+            "rgb": 1.0,
+            "mask": loss.mask_weight,
+            "lpips": loss.lpips_weight if use_lpips else 0.0,
+            "rdist": radial_weight(self.step, loss.rdist_weight, span) if loss.radial_mask else 0.0,
+        }
+
+    # ---- one step
+
+    def train_step(self, batches: Prefetcher) -> dict[str, float]:
+        """One optimizer step; returns the figures of its last batch.
+
+        A step whose loss or gradient is not finite leaves the weights alone and is counted.
+
+        Raises:
+            UserError: too many such steps in a row, or data that cannot be read.
+        """
+        started = time.perf_counter()
+        rate, weights = self.learning_rate(), self.weights()
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.zero_grad(set_to_none=True)
+        losses, waited, views = [], 0.0, 0
+        for micro in range(self.accumulate):
+            self._submit(batches, self.step, micro)
+            before = time.perf_counter()
+            batch = batches.take((self.step, micro)).to(self.world.device)
+            waited += time.perf_counter() - before
+            following = divmod(self.step * self.accumulate + micro + 1, self.accumulate)
+            self._submit(batches, *following)
+            last = micro == self.accumulate - 1
+            hold = contextlib.nullcontext() if last else self._no_sync()
+            with hold:
+                result = forward(self.wrapped, batch, weights, self.lpips, self.precision)
+                (result.loss / self.accumulate).backward()
+            losses.append(result.loss.detach())
+            views += batch.cameras.viewmats[..., 0, 0].numel()
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.config.optim.clip)
+        loss, norm = torch.stack([torch.stack(losses).mean(), norm]).tolist()
+        self._apply(loss, norm)
+        seconds = time.perf_counter() - started
+        figures = {"loss": loss, "grad_norm": norm, "lr": rate}
+        figures |= {"seconds": seconds, "wait_share": waited / seconds}
+        figures["views_per_second"] = views * self.world.size / seconds
+        if self.log is not None and self.step % self.config.run.log_every == 0:
+            figures |= {f"loss_{name}": term.mean().item() for name, term in result.terms.items()}
+            figures |= {name: value.item() for name, value in health(result, batch).items()}
+        return figures
+
+    def _no_sync(self):
+        return self.wrapped.no_sync() if self.world.size > 1 else contextlib.nullcontext()
+
+    def _submit(self, batches: Prefetcher, step: int, micro: int) -> None:
+        if self.total is not None and step >= self.total:
+            return
+        number = step * self.accumulate + micro
+        key, place = (step, micro), (self.world.rank, self.world.size)
+        batches.submit(key, self._source.batch, number, self.novel_views(step), *place)
+
+    def _apply(self, loss: float, norm: float) -> None:
+        """Updates the weights, or skips, on all processes alike; counts the step."""
+        bad = not (math.isfinite(loss) and math.isfinite(norm))
+        bad = self.world.total(bad)[0] > 0
+        self.step += 1
+        if not bad:
+            self.skipped_in_row = 0
+            self.optimizer.step()
+            if self.ema is not None:
+                self.ema.update()
+            return
+        self.skipped += 1
+        self.skipped_in_row += 1
+        if self.log is not None:
+            what = "loss" if not math.isfinite(loss) else "gradient"
+            self.log.warn(self.step, f"step {self.step} skipped: its {what} is not finite")
+        if self.skipped_in_row >= self.config.optim.max_skipped:
+            raise UserError(
+                f"{self.skipped_in_row} steps in a row were not finite (step {self.step}); "
+                "lower --lr, or resume from an older checkpoint"
+            )
+
+    # ---- the loop
+
+    def run(self) -> int:
+        """Trains to the end, to the limit of time or to a signal; always leaves a checkpoint.
+
+        Returns:
+            0; or 128 + the number of the signal that stopped it.
+
+        Raises:
+            UserError: as ``train_step``, or the run folder cannot be written.
+        """
+        batches = Prefetcher(self.config.views.workers)
+        bar = tqdm(total=self.total, initial=self.step, unit="step", disable=not self.world.main)
+        began, before = time.monotonic(), self.elapsed
+        stop = 0.0
+        self.model.train()
+        try:
+            with stop_signals() as received:
+                while True:
+                    clock = before + time.monotonic() - began
+                    self.elapsed, stop = self._agree(clock, received)
+                    if stop or self._finished():
+                        break
+                    figures = self.train_step(batches)
+                    self._after_step(figures, bar)
+                if not stop:
+                    self._validate(bar)
+                self.save()
+        finally:
+            batches.close()
+            bar.close()
+        if stop:
+            return 128 + int(stop)
+        if self.world.main:
+            best = self.ema.model if self.ema else self.model
+            save_model(self.config.run.out / "model.safetensors", best)
+        return 0
+
+    def _agree(self, clock: float, received: list[int]) -> tuple[float, float]:
+        """Elapsed seconds and stop signal (0: none), the same on all processes."""
+        signals = [float(received[0] if received else 0)]
+        clock, total, senders = self.world.total(
+            clock / self.world.size, *signals, float(bool(received))
+        )
+        return clock, total / senders if senders else 0.0
+
+    def _finished(self) -> bool:
+        minutes = self.config.length.minutes
+        if minutes is not None and self.elapsed >= 60 * minutes:
+            return True
+        return self.total is not None and self.step >= self.total
+
+    def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
+        run = self.config.run
+        bar.update()
+        if self.log is not None and self.step % run.log_every == 0:
+            bar.set_postfix(loss=f"{figures['loss']:.4f}", psnr=f"{figures['psnr']:.1f}")
+            epoch = self.step / self.steps_per_epoch
+            self.log.write("train", self.step, epoch=epoch, skipped=self.skipped, **figures)
+            reason = collapse_reason(figures)
+            if reason and not self._collapsed:
+                self.log.warn(self.step, f"possible collapse at step {self.step}: {reason}")
+            self._collapsed = reason is not None
+        if run.val_every and self.step % run.val_every == 0:
+            self._validate(bar)
+        if self.step % run.save_every == 0:
+            self.save()
+
+    def _validate(self, bar: tqdm) -> None:
+        """Validates the averaged weights on the main process; the others wait."""
+        if self._validated == self.step or not self.config.run.val_every:
+            return
+        self._validated = self.step
+        if self.log is not None and self.data.held_out:
+            model = self.ema.model if self.ema else self.model
+            held_out = fixed_batches(
+                self.data.validation,
+                self.model.config,
+                self.data.held_out,
+                self.data.val_views,
+                self.config.views.size,
+            )
+            weights = self.weights() | {"rdist": 0.0}
+            figures, rows = validate(model, held_out, weights, self.lpips, self.world.device)
+            self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
+            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+            bar.write(f"step {self.step}: validation {text}")
+            save_strip(self.config.run.out / "samples" / f"step_{self.step:06d}.png", rows)
+        self.world.barrier()
+
+    # ---- state
+
+    def save(self) -> None:
+        """Writes a checkpoint on the main process, once per step; the others wait."""
+        if self.world.main and self._saved != self.step:
+            models = {"model": self.model} | ({"ema": self.ema.model} if self.ema else {})
+            run = self.config.run
+            save_checkpoint(run.out, self.step, models, self.state(), run.keep)
+            self._saved = self.step
+        self.world.barrier()
+
+    def state(self) -> dict:
+        """All that continues the run beside the weights; tensors and plain values."""
+        return {
+            "version": STATE_VERSION,
+            "config": self.config.to_dict(),
+            "objects": self.data.fingerprint,
+            "step": self.step,
+            "skipped": self.skipped,
+            "skipped_in_row": self.skipped_in_row,
+            "elapsed": self.elapsed,
+            "world_size": self.world.size,
+            "ema_updates": self.ema.updates if self.ema else 0,
+            "optimizer": self.optimizer.state_dict(),
+            "rng": torch.get_rng_state(),
+            "rng_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        }
+
+    def restore(self, checkpoint: Path) -> None:
+        """Continues from a checkpoint: bit-identically on one device.
+
+        Raises:
+            UserError: damaged, or of a run with another configuration, data or world size; names
+                the differing fields.
+        """
+        state = read_state(checkpoint)
+        if state.get("version") != STATE_VERSION:
+            raise UserError(f"{checkpoint}: state of version {state.get('version')!r}")
+        differing = config_differences(state["config"], self.config.to_dict())
+        for name, value in (
+            ("objects", self.data.fingerprint),
+            ("world_size", self.world.size),
+        ):
+            if state[name] != value:
+                differing.append(f"{name} ({state[name]} there, {value} here)")
+        if differing:
+            raise UserError(f"{checkpoint}: is of another run: {', '.join(differing)}")
+        load_weights(checkpoint / "model.safetensors", self.model)
+        if self.ema is not None:
+            load_weights(checkpoint / "ema.safetensors", self.ema.model)
+            self.ema.updates = state["ema_updates"]
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.step, self.skipped = state["step"], state["skipped"]
+        self.skipped_in_row, self.elapsed = state["skipped_in_row"], state["elapsed"]
+        self._saved = self.step if checkpoint.parent.parent == self.config.run.out else -1
+        torch.set_rng_state(state["rng"])
+        if len(state["rng_cuda"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["rng_cuda"])

@@ -1,0 +1,52 @@
+"""AdamW's parameter groups and the running average of the weights."""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+
+from gamba_warp.model import Gamba
+
+from .schedule import ema_decay
+
+
+def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.optim.AdamW:
+    """AdamW with decay on matrices alone, not on those flagged ``_no_weight_decay``.
+
+    The learning rate is set before each step by the loop.
+    """
+    trained = [p for p in model.parameters() if p.requires_grad]
+    decayed = [p for p in trained if p.ndim >= 2 and not getattr(p, "_no_weight_decay", False)]
+    chosen = {id(p) for p in decayed}
+    groups = [
+        {"params": decayed, "weight_decay": weight_decay},
+        {"params": [p for p in trained if id(p) not in chosen], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, lr=0.0, betas=(0.9, beta2), fused=True)
+
+
+class Ema:
+    """A copy of the model whose trained weights follow by exponential averaging.
+
+    Attributes:
+        model: the copy, in eval mode; a frozen encoder is shared, not copied.
+        updates: number of updates so far; the decay is short at first (``ema_decay``).
+    """
+
+    def __init__(self, model: Gamba, decay: float) -> None:
+        encoder = model.encoder
+        shared = {id(encoder): encoder} if encoder is not None and encoder.frozen else {}
+        self.model = copy.deepcopy(model, shared).eval()
+        self.decay, self.updates = decay, 0
+        pairs = [(a, b) for a, b in zip(self.model.parameters(), model.parameters())]
+        self._pairs = [(a, b) for a, b in pairs if b.requires_grad]
+        for average, _ in self._pairs:
+            average.requires_grad_(False)
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Moves the average towards the model's weights."""
+        averages, weights = zip(*self._pairs)
+        torch._foreach_lerp_(averages, weights, 1 - ema_decay(self.updates, self.decay))
+        self.updates += 1
