@@ -1,0 +1,87 @@
+"""The selective scan, the convolution and their states as plain torch loops, for belief.
+
+They run in the dtype they are given (float64 for an oracle), are differentiable by autograd, and
+share nothing with the kernels.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def discretize(x: Tensor, discretization: str) -> tuple[Tensor, Tensor]:
+    """f and g of x = δA: the step is h ← f·h + g·δ·B·u (README, equations 2 to 4)."""
+    if discretization == "mamba":
+        return torch.exp(x), torch.ones_like(x)
+    if discretization == "bilinear":
+        return (1 + x / 2) / (1 - x / 2), 1 / (1 - x / 2)
+    if discretization == "zoh":
+        small = x.abs() < 1e-5
+        safe = torch.where(small, torch.ones_like(x), x)
+        series = 1 + x / 2 + x * x / 6 + x * x * x / 24
+        return torch.exp(x), torch.where(small, series, torch.expm1(safe) / safe)
+    raise ValueError(f"discretization is {discretization!r}")
+
+
+def selective_scan_reference(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None = None,
+    z: Tensor | None = None,
+    delta_bias: Tensor | None = None,
+    delta_softplus: bool = False,
+    *,
+    initial_state: Tensor | None = None,
+    discretization: str = "mamba",
+) -> tuple[Tensor, Tensor]:
+    """One token after the other; arguments as ``selective_scan``. Returns (out, last state)."""
+    batch, length, channels = u.shape
+    if B.dim() == 3:
+        B = B[:, :, None]
+    if C.dim() == 3:
+        C = C[:, :, None]
+    B = B.repeat_interleave(channels // B.shape[2], dim=2)
+    C = C.repeat_interleave(channels // C.shape[2], dim=2)
+    if delta_bias is not None:
+        delta = delta + delta_bias
+    if delta_softplus:
+        delta = F.softplus(delta)
+    h = u.new_zeros(batch, channels, A.shape[1]) if initial_state is None else initial_state
+    rows = []
+    for t in range(length):
+        step = delta[:, t, :, None]
+        f, g = discretize(step * A, discretization)
+        h = f * h + g * step * B[:, t] * u[:, t, :, None]
+        rows.append((h * C[:, t]).sum(-1))
+    y = torch.stack(rows, 1) if rows else torch.zeros_like(u)
+    if D is not None:
+        y = y + D * u
+    if z is not None:
+        y = y * F.silu(z)
+    return y, h
+
+
+def causal_conv1d_reference(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    initial_state: Tensor | None = None,
+    activation: str | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Depthwise causal convolution, channels last. Returns (out, final state [B, W-1, D])."""
+    width = weight.shape[1]
+    if initial_state is None:
+        initial_state = x.new_zeros(x.shape[0], width - 1, x.shape[2])
+    padded = torch.cat([initial_state, x], 1)
+    length = x.shape[1]
+    out = sum(weight[:, k] * padded[:, k : k + length] for k in range(width))
+    if bias is not None:
+        out = out + bias
+    if activation is not None:
+        out = F.silu(out)
+    return out, padded[:, padded.shape[1] - (width - 1) :]
