@@ -31,10 +31,10 @@ def load_rgba(path: str | Path) -> np.ndarray:
         if path.stat().st_size == 0:
             raise UserError(f"{path}: the file is empty")
         with Image.open(path) as image:
-            if getattr(image, "n_frames", 1) > 1:
-                raise UserError(
-                    f"{path}: animated picture ({image.n_frames} frames); give one frame"
-                )
+            # An MPO is a phone's JPEG with a preview or a depth map behind it.
+            frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
+            if frames > 1:
+                raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
             if image.width * image.height > MAX_PIXELS:
                 raise UserError(f"{path}: {image.width}x{image.height} is over 64 megapixels")
             return _to_rgba(image)
@@ -42,8 +42,9 @@ def load_rgba(path: str | Path) -> np.ndarray:
         raise
     except UnidentifiedImageError as error:
         raise UserError(f"{path}: not a picture that can be read") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise UserError(f"{path}: cannot be decoded ({str(error).splitlines()[0]})") from error
+    except Exception as error:  # on damaged files decoders raise nearly any type
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise UserError(f"{path}: cannot be decoded ({reason})") from error
 
 
 def _to_rgba(image: Image.Image) -> np.ndarray:
@@ -52,7 +53,9 @@ def _to_rgba(image: Image.Image) -> np.ndarray:
     image = ImageOps.exif_transpose(image)
     if image.mode.startswith(("I", "F")):  # 16-bit grey (PIL reads 16-bit colour as 8-bit)
         grey = np.asarray(image, dtype=np.float32)
-        top = 65535.0 if image.mode != "F" else max(1.0, float(np.nanmax(grey)))
+        top = 65535.0
+        if image.mode == "F":
+            top = max(1.0, float(grey.max(where=np.isfinite(grey), initial=0.0)))
         grey = np.clip(np.nan_to_num(grey) / top, 0.0, 1.0)
         return np.dstack([grey, grey, grey, np.ones_like(grey)])
     return np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
