@@ -1,0 +1,78 @@
+"""Where the cameras of one object stand: around it, all of it in the picture, z up."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+MARGIN = 0.96  # of the picture's half size that the object may reach
+NEAREST = 3.0  # times the object's half size along the camera's axes; see sample_poses
+SPREAD = 0.2  # distances are up to so much farther than the nearest
+
+
+def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndarray:
+    """``[4, 4]`` camera-to-world, OpenGL frame, of a camera that looks at the origin, z up.
+
+    Azimuth 0 stands at -y (the front, as in Blender) and grows towards +x.
+
+    Args:
+        azimuth: degrees.
+        elevation: degrees, below 90 either way.
+        distance: object units.
+    """
+    a, e = math.radians(azimuth), math.radians(elevation)
+    back = np.array([math.sin(a) * math.cos(e), -math.cos(a) * math.cos(e), math.sin(e)])
+    right = np.array([math.cos(a), math.sin(a), 0.0])
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(back, right), back
+    pose[:3, 3] = distance * back
+    return pose
+
+
+def nearest_distance(points: np.ndarray, pose: np.ndarray, fov: float) -> float:
+    """The least distance along the pose's axis at which this camera may stand.
+
+    All points are then in a square picture, with a margin; and if this view becomes the reference,
+    which puts its camera at distance 1.5, the object lies within [-0.5, 0.5] on each camera axis,
+    where the model can place Gaussians.
+
+    Args:
+        points: ``[P, 3]`` in the object's frame.
+        pose: ``[4, 4]`` camera to world; only its rotation counts.
+        fov: degrees, of the picture's side.
+    """
+    local = points @ pose[:3, :3]
+    slope = MARGIN * math.tan(math.radians(fov) / 2)
+    in_picture = (np.abs(local[:, :2]).max(1) / slope + local[:, 2]).max()
+    return float(max(in_picture, NEAREST * np.abs(local).max()))
+
+
+def sample_poses(
+    points: np.ndarray, views: int, fov: float, rng: np.random.Generator
+) -> np.ndarray:
+    """``[views, 4, 4]`` camera-to-world matrices, OpenGL frame.
+
+    View 0 is front-ish: azimuth within 35°, elevation 0 to 20°. The others are spread in azimuth by
+    the golden ratio with a random start; nine in ten have an elevation of -10 to 50°, the rest of
+    -30 to 75°.
+
+    Args:
+        points: ``[P, 3]`` vertices of the object, which is centred at the origin.
+        views: how many.
+        fov: degrees, of the picture's side.
+        rng: everything random comes from it.
+    """
+    golden = (math.sqrt(5) - 1) / 2
+    start = rng.uniform()
+    poses = []
+    for view in range(views):
+        if view == 0:
+            azimuth, elevation = rng.uniform(-35, 35), rng.uniform(0, 20)
+        else:
+            azimuth = 360 * ((start + view * golden) % 1.0)
+            elevation = rng.uniform(-30, 75) if rng.uniform() < 0.1 else rng.uniform(-10, 50)
+        pose = look_at_origin(azimuth, elevation, 1.0)
+        distance = nearest_distance(points, pose, fov) * rng.uniform(1.0, 1.0 + SPREAD)
+        poses.append(look_at_origin(azimuth, elevation, distance))
+    return np.stack(poses)
