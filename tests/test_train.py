@@ -63,7 +63,9 @@ def stop_after(monkeypatch, count):
 
 @pytest.mark.parametrize("accumulate", [1, 2])
 def test_resume_is_bit_identical(data, tmp_path, monkeypatch, accumulate):
-    views = {"views": {"accumulate": accumulate, "background": "random"}}
+    # Another number of views at almost every step, so that one prepared too early would show.
+    views = {"accumulate": accumulate, "background": "random", "views_last": 5}
+    views = {"views": views}
     assert run(data, tmp_path / "whole", **views) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3 * accumulate)
