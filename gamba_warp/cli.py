@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 from ._version import __version__
@@ -53,23 +54,30 @@ def run(name: str, arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print("gamba: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 141
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the console script."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = _main(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader left, as `head` does; Python would complain at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 141
+    sys.exit(code)
+
+
+def _main(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage())
-        sys.exit(0)
+        return 0
     if arguments[0] in ("-V", "--version"):
         print(__version__)
-        sys.exit(0)
+        return 0
     try:
         name, rest = _find(arguments)
     except UserError as error:
         print(f"gamba: {error}", file=sys.stderr)
-        sys.exit(2)
-    sys.exit(run(name, rest))
+        return 2
+    return run(name, rest)
