@@ -1,8 +1,8 @@
-"""The scan on a CPU: lanes are adjacent channels, tokens run in chunks, states one after the other.
+"""The scan on a CPU: lanes are adjacent channels, tokens run in chunks, states one by one.
 
-A task is one batch element and up to ``BLOCKS`` lane groups. In a chunk of ``CHUNK`` tokens it keeps
-what does not depend on the state n (step, input, output) in a local array and walks the tokens once
-per n, so a state lives in registers and N is free. Equations are those of README.md.
+A task is one batch element and up to ``BLOCKS`` lane groups. In a chunk of ``CHUNK`` tokens it
+keeps what does not depend on the state n (step, input, output) in local arrays and walks the tokens
+once per n, so that h_n lives in registers and N is free. Equations are those of README.md.
 """
 
 import functools
@@ -13,8 +13,20 @@ import warp as wp
 from torch import Tensor
 
 from ..interop import lane_contiguous, parallel_launch, view
-from .lanes import ACCESSORS, LANES, PRELUDE, WARP_DTYPES, W, flush_denormals, fma, lanes, mul
-from .lanes import restore_denormals, sigmoid, softplus
+from .lanes import (
+    ACCESSORS,
+    LANES,
+    PRELUDE,
+    WARP_DTYPES,
+    W,
+    flush_denormals,
+    fma,
+    lanes,
+    mul,
+    restore_denormals,
+    sigmoid,
+    softplus,
+)
 
 CHUNK = 64  # tokens; a state is saved at the start of each chunk
 BLOCKS = 4  # lane groups of a task; fixed, so that sums do not depend on the number of threads
@@ -27,8 +39,8 @@ _W = wp.constant(W)
 _LOG2E = wp.constant(1.4426950408889634)
 _DZ, _DC, _DB, _DH = (wp.constant(v) for v in (NEED_DZ, NEED_DC, NEED_DB, NEED_DH))
 
-# Equations 2 to 4 by mode: f and g of x = δA and their slopes. ``rate`` is δ, times log2(e) where an
-# exponential is wanted. ``mode`` is a constant of the kernel, so that one branch remains.
+# Equations 2 to 4 by mode: f and g of x = δA and their slopes. ``rate`` is δ, times log2(e) where
+# an exponential is wanted. ``mode`` is a constant of the kernel, so that one branch remains.
 MODES = {"mamba": 0, "bilinear": 1, "zoh": 2}
 _PHI = """
     F x = rate[t] * a * 0.6931471805599453f;
@@ -47,7 +59,7 @@ _STEP = (
     F f, g = F{} + 1.0f;
     if (mode == 1) {
         g = 1.0f / (1.0f - 0.5f * (rate[t] * a));
-        f = g * (1.0f + 0.5f * (rate[t] * a));
+        f = fma_(rate[t] * a, g, F{} + 1.0f);
     } else f = exp2_(rate[t] * a);
     if (mode == 2) {"""
     + _PHI
@@ -384,13 +396,13 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
                     a = a_in[k, n]
                     first = n * _K
                     recompute(
-                        wp.static(mode), starts_in[b, chunk, k, n], a, rate, du, b_in[row], c_in[row], t0, count,
-                        dy, needs, first, y, f, h, dc_sums[task],
+                        wp.static(mode), starts_in[b, chunk, k, n], a, rate, du,
+                        b_in[row], c_in[row], t0, count, dy, needs, first, y, f, h, dc_sums[task],
                     )  # fmt: skip
                     if (needs & _DH) != 0:
                         dh_out[b, k, n] = retreat(
-                            wp.static(mode), dh_out[b, k, n], a, rate, du, b_in[row], c_in[row], t0, count,
-                            step, dy, f, h, needs, first, s, p, db_sums[task], da,
+                            wp.static(mode), dh_out[b, k, n], a, rate, du,
+                            b_in[row], c_in[row], t0, count, step, dy, f, h, needs, first, s, p, db_sums[task], da,
                         )  # fmt: skip
                         da_out[b, k, n] = da_out[b, k, n] + da[0]
                 dskip = lanes()

@@ -9,6 +9,7 @@ import warp as wp
 
 W = 16  # channels of a lane group: one cache line of float32
 lanes = wp.types.vector(W, wp.float32)
+VALUE, WIDTH = lanes, W  # the names that scalars.py shares
 LANES = "wp::vec_t<16, float>"
 
 VECTORS = """
@@ -16,9 +17,9 @@ typedef float F __attribute__((vector_size(64), aligned(4)));
 typedef int I __attribute__((vector_size(64), aligned(4)));
 """
 
-# exp2: round to an integer by adding 1.5 * 2^23 (+127, the exponent bias), then a minimax polynomial
-# of the rest with the constant term held at 1, so that exp2(x) - 1 keeps its relative accuracy for
-# small x: the errors of slow decays add up over thousands of steps. NaN stays NaN.
+# exp2: round to an integer by adding 1.5 * 2^23 (+127, the exponent bias), then a minimax
+# polynomial of the rest with the constant term held at 1, so that exp2(x) - 1 keeps its relative
+# accuracy for small x: the errors of slow decays add up over thousands of steps. NaN stays NaN.
 PRELUDE = (
     VECTORS
     + """
@@ -79,9 +80,7 @@ def mul(a: lanes, b: lanes) -> lanes: ...
 
 
 @wp.func_native(
-    VECTORS
-    + f"{LANES} r; *(F*)&r = __builtin_elementwise_fma(*(const F*)&a, *(const F*)&b, *(const F*)&c);"
-    "return r;"
+    PRELUDE + f"{LANES} r; *(F*)&r = fma_(*(const F*)&a, *(const F*)&b, *(const F*)&c); return r;"
 )
 def fma(a: lanes, b: lanes, c: lanes) -> lanes: ...
 
@@ -173,6 +172,6 @@ def _accessors(dtype: torch.dtype):
     return load, store
 
 
-# By element type, ``(load, store)``: both address row [b, t] of a [B, L, D] array from channel d on,
-# whose last dimension is dense. Lanes from ``count`` on are read as 0 and not written.
+# By element type, ``(load, store)``: both address row [b, t] of a [B, L, D] array, dense in D, from
+# channel d on. Lanes from ``count`` on are read as 0 and not written.
 ACCESSORS = {dtype: _accessors(dtype) for dtype in WARP_DTYPES}

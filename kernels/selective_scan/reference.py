@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def discretize(x: Tensor, discretization: str) -> tuple[Tensor, Tensor]:
-    """f and g of x = δA: the step is h ← f·h + g·δ·B·u (README, equations 2 to 4)."""
+    """Factors f and g of x = δA: the step is h ← f·h + g·δ·B·u (README, equations 2 to 4)."""
     if discretization == "mamba":
         return torch.exp(x), torch.ones_like(x)
     if discretization == "bilinear":

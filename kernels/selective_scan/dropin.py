@@ -1,0 +1,138 @@
+"""mamba-ssm's and causal-conv1d's own signatures and ``[B, D, L]`` layout over our operators."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .conv import causal_conv1d
+from .function import selective_scan
+
+
+def _tokens(x: Tensor | None, name: str) -> Tensor | None:
+    if isinstance(x, Tensor) and x.dim() != 3:
+        raise ValueError(f"{name} has shape {tuple(x.shape)}, must be [B, D, L]")
+    return x.transpose(1, 2) if isinstance(x, Tensor) else x
+
+
+def _input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
+    """(D, N), (B, N, L) or (B, G, N, L) to ``[B, L, G, N]``."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
+    if x.is_complex():
+        raise TypeError(f"{name} has dtype {x.dtype}; complex states are not supported")
+    if x.dim() == 2:
+        return x.expand(u.shape[0], u.shape[2], *x.shape)
+    if x.dim() == 3:
+        return x.transpose(1, 2)[:, :, None]
+    if x.dim() == 4:
+        return x.permute(0, 3, 1, 2)
+    raise ValueError(f"{name} has shape {tuple(x.shape)}; must be (D, N), (B, N, L), (B, G, N, L)")
+
+
+def selective_scan_fn(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None = None,
+    z: Tensor | None = None,
+    delta_bias: Tensor | None = None,
+    delta_softplus: bool = False,
+    return_last_state: bool = False,
+) -> Tensor | tuple[Tensor, Tensor]:
+    """``mamba_ssm.ops.selective_scan_interface.selective_scan_fn``, same arguments and layout.
+
+    Args:
+        u: ``[B, D, L]`` float32, bfloat16 or float16; likewise delta and z.
+        delta: as u.
+        A: ``[D, N]`` float32.
+        B: (D, N) constant, (B, N, L), or (B, G, N, L).
+        C: as B, on its own.
+        D: ``[D]``, or None.
+        z: as u, or None.
+        delta_bias: ``[D]``, or None.
+        delta_softplus: whether softplus is applied to delta.
+        return_last_state: also return ``[B, D, N]`` float32 (its gradient flows here).
+
+    Returns:
+        ``[B, D, L]`` in u's dtype, with channels adjacent in memory.
+
+    Raises:
+        TypeError: as ``selective_scan``; also for complex A, B or C.
+        ValueError: as ``selective_scan``.
+    """
+    if isinstance(A, Tensor) and A.is_complex():
+        raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
+    u = _tokens(u, "u")
+    if not isinstance(u, Tensor):
+        raise TypeError(f"u is {type(u).__name__}, must be a tensor")
+    tokens = u.transpose(1, 2)
+    B, C = _input_matrix(B, tokens, "B"), _input_matrix(C, tokens, "C")
+    groups = max(B.shape[2], C.shape[2])
+    if B.shape[2] != groups and groups % B.shape[2] == 0:
+        B = B.repeat_interleave(groups // B.shape[2], dim=2)
+    if C.shape[2] != groups and groups % C.shape[2] == 0:
+        C = C.repeat_interleave(groups // C.shape[2], dim=2)
+    result = selective_scan(
+        u,
+        _tokens(delta, "delta"),
+        A,
+        B,
+        C,
+        D,
+        _tokens(z, "z"),
+        delta_bias,
+        delta_softplus,
+        return_last_state=return_last_state,
+    )
+    if return_last_state:
+        return result[0].transpose(1, 2), result[1]
+    return result.transpose(1, 2)
+
+
+def causal_conv1d_fn(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    seq_idx: None = None,
+    initial_states: Tensor | None = None,
+    return_final_states: bool = False,
+    final_states_out: Tensor | None = None,
+    activation: str | None = None,
+) -> Tensor | tuple[Tensor, Tensor]:
+    """``causal_conv1d.causal_conv1d_fn``, same arguments and layout.
+
+    Args:
+        x: ``[B, D, L]`` float32, bfloat16 or float16.
+        weight: ``[D, W]``, W from 2 to 4.
+        bias: ``[D]``, or None.
+        seq_idx: must be None.
+        initial_states: ``[B, D, W-1]``, or None.
+        return_final_states: also return ``[B, D, W-1]``.
+        final_states_out: where to write the final states, or None.
+        activation: None, "silu" or "swish".
+
+    Returns:
+        ``[B, D, L]`` in x's dtype, and the final states if asked for.
+
+    Raises:
+        TypeError: as ``causal_conv1d``.
+        ValueError: as ``causal_conv1d``; also for a ``seq_idx``.
+    """
+    if seq_idx is not None:
+        raise ValueError("seq_idx is given; packed sequences are not supported")
+    out, final = causal_conv1d(
+        _tokens(x, "x"),
+        weight,
+        bias,
+        activation=activation,
+        initial_state=_tokens(initial_states, "initial_states"),
+        return_final_state=True,
+    )
+    out, final = out.transpose(1, 2), final.transpose(1, 2)
+    if final_states_out is not None:
+        with torch.no_grad():
+            final_states_out.copy_(final)
+    return (out, final) if return_final_states else out
