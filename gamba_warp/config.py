@@ -26,12 +26,13 @@ class GambaConfig:
         width: channels D of a token.
         depth: number of Gamba blocks.
         state_size: SSM states per channel, 1 to 256.
-        conv_size: taps of the causal convolution, 1 to 4.
+        conv_size: taps of the causal convolution, 2 to 4.
         expand: inner channels of a block per channel of a token.
         dt_rank: rank of the step size's projection; 0 means ceil(width / 16), as in mamba-ssm.
         norm: normalisation before every block and before the decoder.
         discretization: of the selective scan; "mamba" is what mamba-ssm runs, "zoh" and "bilinear"
             are the exact zero-order hold and the paper's appendix.
+        embedding_init: standard deviation of the learned embedding E at the start.
         additive_image_tokens: False leaves G = E (paper Table 2, "w/o additive 3DGS tokens").
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
         camera_token: whether the camera is prepended; the image tokens may be prepended alone.
@@ -62,6 +63,7 @@ class GambaConfig:
     dt_rank: int = 0
     norm: Norm = "layer"
     discretization: Discretization = "mamba"
+    embedding_init: float = 0.5
     additive_image_tokens: bool = True
     prepend: bool = True
     camera_token: bool = True
@@ -97,7 +99,7 @@ class GambaConfig:
                 f"config: image_size {self.image_size} is not a multiple of "
                 f"patch_size {self.patch_size}"
             )
-        limits = {"state_size": (1, 256), "conv_size": (1, 4), "position_bins": (2, 4096)}
+        limits = {"state_size": (1, 256), "conv_size": (2, 4), "position_bins": (2, 4096)}
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise UserError(f"config: {name} is {getattr(self, name)}, not in {low}..{high}")

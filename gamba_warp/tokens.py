@@ -66,9 +66,9 @@ class SplatTokens(nn.Module):
             patch = config.patch_size
             self.patchify = nn.Conv2d(9, config.width, kernel_size=patch, stride=patch)
         self.embedding = nn.Parameter(torch.empty(config.num_gaussians, config.width))
-        # As large as a normalised image token: where the picture is plain background, E alone
+        # Nearly as large as an image token: where the picture is plain background, E alone
         # tells the tokens apart, and positions start spread only if the tokens differ.
-        nn.init.normal_(self.embedding, std=0.5)
+        nn.init.normal_(self.embedding, std=config.embedding_init)
         self.embedding._no_weight_decay = True
         self.register_buffer("orders", scan_orders(grid, grid).flatten(), persistent=False)
 

@@ -1,0 +1,192 @@
+"""The Gamba network, and its checkpoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from .block import GambaBlock, make_norm
+from .cameras import Cameras
+from .config import GambaConfig
+from .decoder import GaussianDecoder
+from .encoders import build_encoder
+from .errors import UserError
+from .files import atomic_path
+from .gaussians import Gaussians
+from .tokens import CameraToken, SplatTokens
+
+FORMAT = "gamba_warp.model.1"
+FILE_NAME = "model.safetensors"
+# Of checkpoint metadata; extra_metadata may use any other key.
+_OWN_KEYS = ("format", "config", "encoder_sha256")
+
+
+class Gamba(nn.Module):
+    """One posed picture to Gaussians, in one pass (paper §3.2, GambaFormer and decoder)."""
+
+    def __init__(self, config: GambaConfig, encoder_weights: str | Path | None = None) -> None:
+        """Builds the network with fresh weights, the encoder's excepted.
+
+        Args:
+            config: what to build.
+            encoder_weights: see ``build_encoder``; not used where there is nothing to encode for.
+
+        Raises:
+            UserError: the encoder cannot be built or its weights are not there.
+        """
+        super().__init__()
+        self.config = config
+        self.encoder = build_encoder(config, encoder_weights) if config.prepend else None
+        image_channels = self.encoder.channels if self.encoder else 0
+        camera_channels = 0
+        if config.prepend and config.camera_token:
+            camera_channels = image_channels or config.width
+        self.camera_token = CameraToken(camera_channels) if camera_channels else None
+        self.tokens = SplatTokens(config)
+        self.blocks = nn.ModuleList(
+            GambaBlock(config, camera_channels, image_channels) for _ in range(config.depth)
+        )
+        self.norm = make_norm(config)
+        self.decoder = GaussianDecoder(config)
+        for parameter in self.parameters():
+            if parameter.ndim == 1:
+                parameter._no_weight_decay = True
+
+    def forward(self, images: Tensor, cameras: Cameras) -> Gaussians:
+        """Predicts the Gaussians of each picture's object.
+
+        Args:
+            images: ``[B, H, W, 3]`` RGB in [0, 1] on ``config.background``, H = W =
+                ``config.image_size``.
+            cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same picture size.
+
+        Returns:
+            ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N = ``num_gaussians``.
+
+        Raises:
+            ValueError: a shape that does not fit.
+        """
+        self._check(images, cameras)
+        camera = self.camera_token(cameras) if self.camera_token else None
+        image = self.encoder(images) if self.encoder else None
+        tokens = self.tokens(images, cameras)
+        for block in self.blocks:
+            tokens = block(tokens, camera, image)
+        return self.decoder(self.norm(tokens))
+
+    def _check(self, images: Tensor, cameras: Cameras) -> None:
+        size = self.config.image_size
+        batch = len(images) if images.ndim else 0
+        wanted = {
+            "images": (images.shape, (batch, size, size, 3)),
+            "cameras.viewmats": (cameras.viewmats.shape, (batch, 4, 4)),
+            "cameras.Ks": (cameras.Ks.shape, (batch, 3, 3)),
+            "cameras (height, width)": ((cameras.height, cameras.width), (size, size)),
+        }
+        for name, (got, want) in wanted.items():
+            if tuple(got) != want:
+                raise ValueError(f"{name} is {tuple(got)}, expected {want}")
+
+    def stored_state(self) -> dict[str, Tensor]:
+        """What a checkpoint holds: the state dict without a frozen encoder."""
+        state = self.state_dict()
+        if self.encoder and self.encoder.frozen:
+            return {name: v for name, v in state.items() if not name.startswith("encoder.")}
+        return state
+
+    def load_stored_state(self, state: dict[str, Tensor]) -> None:
+        """Loads ``stored_state``'s form.
+
+        Raises:
+            ValueError: missing or unknown tensors, or other shapes.
+        """
+        own = self.stored_state()
+        missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
+        if missing or unknown:
+            kind, names = ("no", missing) if missing else ("an unknown", unknown)
+            raise ValueError(f"{kind} tensor '{names[0]}' ({len(names)} such)")
+        for name, value in own.items():
+            if state[name].shape != value.shape:
+                got, want = tuple(state[name].shape), tuple(value.shape)
+                raise ValueError(f"tensor '{name}' is {got}, expected {want}")
+        self.load_state_dict(state, strict=False)
+
+
+def save_model(
+    path: str | Path, model: Gamba, extra_metadata: dict[str, str] | None = None
+) -> None:
+    """Writes weights and configuration to one safetensors file, atomically.
+
+    Args:
+        path: the file; ``load_model`` reads a folder's ``model.safetensors``.
+        model: a frozen encoder's weights are left out, their SHA-256 is kept.
+        extra_metadata: kept beside ours in the file's header; not "format", "config" or
+            "encoder_sha256".
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    metadata = dict(extra_metadata or {})
+    taken = [key for key in _OWN_KEYS if key in metadata]
+    if taken:
+        raise ValueError(f"extra_metadata has {', '.join(taken)}, which save_model writes itself")
+    metadata |= {"format": FORMAT, "config": model.config.to_json()}
+    if model.encoder and model.encoder.frozen:
+        metadata["encoder_sha256"] = model.encoder.fingerprint
+    state = {name: value.contiguous() for name, value in model.stored_state().items()}
+    with atomic_path(path) as temporary:
+        save_file(state, temporary, metadata=metadata)
+
+
+def load_model(
+    path: str | Path,
+    device: str | torch.device = "cpu",
+    encoder_weights: str | Path | None = None,
+) -> Gamba:
+    """Reads ``save_model``'s file; the model comes in eval mode.
+
+    Args:
+        path: the file, or a folder with a ``model.safetensors``.
+        device: where the model goes.
+        encoder_weights: as ``build_encoder``; needed for a frozen timm encoder.
+
+    Raises:
+        UserError: no such file, not our format, damaged, or an encoder that is not the one the
+            model was trained with.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / FILE_NAME
+    metadata, state = _read(path)
+    config = GambaConfig.from_json(metadata["config"], source=str(path))
+    if not config.encoder_frozen and config.encoder != "none":
+        encoder_weights = "random"  # the file holds the trained ones
+    model = Gamba(config, encoder_weights)
+    try:
+        model.load_stored_state(state)
+    except ValueError as error:
+        raise UserError(f"{path}: does not fit its own configuration: {error}") from error
+    if model.encoder and model.encoder.frozen:
+        if model.encoder.fingerprint != metadata.get("encoder_sha256"):
+            raise UserError(
+                f"{path}: was trained with other weights of {config.encoder} than those given"
+            )
+    return model.to(device).eval()
+
+
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    if not path.is_file():
+        raise UserError(f"{path}: no such checkpoint")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT or "config" not in metadata:
+                found = metadata.get("format", "none")
+                raise UserError(f"{path}: not a Gamba checkpoint (format {found}, not {FORMAT})")
+            return metadata, {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{path}: not a whole safetensors file ({error})") from error
