@@ -102,18 +102,24 @@ class LPIPS(nn.Module):
             raise ValueError(
                 f"a is {tuple(a.shape)} and b {tuple(b.shape)}; both must be [.., H, W, 3]"
             )
-        total = 0.0
-        features = zip(self._features(a), self._features(b), strict=True)
-        for k, (x, y) in enumerate(features):
-            difference = (_unit(x) - _unit(y)).square()
-            total = total + torch.einsum("bchw,c->bhw", difference, getattr(self, f"lin{k}")).mean(
-                (1, 2)
-            )
-        return total.reshape(a.shape[:-3])
+        return self.distance(self.features(a), self.features(b)).reshape(a.shape[:-3])
 
-    def _features(self, pictures: Tensor) -> list[Tensor]:
+    def features(self, pictures: Tensor) -> list[Tensor]:
+        """What ``distance`` compares: five maps ``[B, C, h, w]``, each pixel of unit length.
+
+        Args:
+            pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
+        """
         x = pictures.reshape(-1, *pictures.shape[-3:]).permute(0, 3, 1, 2)
-        return self.trunk((2 * x - 1 - self.shift) / self.scale)
+        return [_unit(y) for y in self.trunk((2 * x - 1 - self.shift) / self.scale)]
+
+    def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
+        """``[B]`` from two pictures' ``features``, for those who compare one picture with many."""
+        total = 0.0
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            weighted = torch.einsum("bchw,c->bhw", (x - y).square(), getattr(self, f"lin{k}"))
+            total = total + weighted.mean((1, 2))
+        return total
 
 
 def _unit(x: Tensor) -> Tensor:

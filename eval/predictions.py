@@ -1,0 +1,96 @@
+"""Where the Gaussians under test come from: a checkpoint, or a folder of ``.ply`` files."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import torch
+
+from gamba_warp.cameras import Cameras, relative_to_reference
+from gamba_warp.dataset import ViewDataset
+from gamba_warp.errors import UserError
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.ply import load_ply
+
+
+class Predictions(ABC):
+    """Gaussians by object, in the world of the reference camera.
+
+    Attributes:
+        distance: of the reference camera from the origin of that world, object units.
+        source: what is under test, for the report.
+    """
+
+    distance: float
+    source: dict[str, str]
+
+    @abstractmethod
+    def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
+        """One object's Gaussians (no batch dimension). Raises UserError where there are none."""
+
+
+class PlyPredictions(Predictions):
+    """``<folder>/<uid>.ply``, 3DGS layout, in the reference camera's world."""
+
+    def __init__(self, folder: Path, distance: float, device: str) -> None:
+        self.folder, self.distance, self.device = folder, distance, device
+        self.source = {"kind": "ply", "path": folder.name}
+
+    def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
+        """Reads the file."""
+        return load_ply(self.folder / f"{uid}.ply").to(self.device)
+
+
+class ModelPredictions(Predictions):
+    """A checkpoint, shown the reference view alone."""
+
+    def __init__(self, path: Path, device: str, encoder_weights: Path | None) -> None:
+        from gamba_warp.model import load_model
+
+        self.model, self.device = load_model(path, device, encoder_weights), device
+        self.distance = self.model.config.distance
+        self.source = {"kind": "checkpoint", "path": path.name}
+
+    @torch.no_grad()
+    def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
+        """Runs the model on the reference view, on the model's own background."""
+        config = self.model.config
+        views = dataset.load(uid, views=[reference], size=config.image_size)
+        images = on_background(views.images, config.background_color)
+        viewmats, _ = relative_to_reference(
+            views.cameras.viewmats, views.cameras.viewmats[0], self.distance
+        )
+        cameras = Cameras(viewmats, views.cameras.Ks, views.cameras.width, views.cameras.height).to(
+            self.device
+        )
+        return self.model(images.to(self.device), cameras)[0]
+
+
+def on_background(images: torch.Tensor, background: float) -> torch.Tensor:
+    """Straight-alpha RGBA ``[.., 4]`` over a background, to RGB ``[.., 3]``."""
+    alpha = images[..., 3:]
+    return images[..., :3] * alpha + background * (1 - alpha)
+
+
+def open_predictions(
+    path: Path, distance: float, device: str, encoder_weights: Path | None = None
+) -> Predictions:
+    """A folder with ``.ply`` files, else a checkpoint.
+
+    Args:
+        path: what the user gave.
+        distance: of the reference camera, for ``.ply`` files; a checkpoint states its own.
+        device: torch device.
+        encoder_weights: see ``load_model``.
+
+    Raises:
+        UserError: there is nothing, or the checkpoint cannot be read.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: no such checkpoint or folder of .ply files")
+    if path.is_dir() and next(path.rglob("*.ply"), None) is not None:
+        return PlyPredictions(path, distance, device)
+    if path.is_dir() and next(path.glob("*.safetensors"), None) is None:
+        raise UserError(f"{path}: holds neither .ply files nor a checkpoint")
+    return ModelPredictions(path, device, encoder_weights)
