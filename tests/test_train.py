@@ -17,12 +17,15 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+from gamba_warp import cli
 from gamba_warp.errors import UserError
-from gamba_warp.train import loop, step
+from gamba_warp.model import Gamba
+from gamba_warp.train import loop, prepare, step
 from gamba_warp.train.__main__ import train
 from gamba_warp.train.batches import choose_views
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.ddp import World
+from gamba_warp.train.optim import build_optimizer
 
 ALONE = World(0, 1, torch.device("cpu"))
 
@@ -293,6 +296,62 @@ def test_input_view_is_the_model_s_reference(data):
     torch.testing.assert_close(batch.cameras.viewmats[0, 0], want, atol=1e-5, rtol=0)
     assert batch.targets.shape == (1, 2, 8, 8, 4) and batch.inputs.shape == (1, 16, 16, 3)
     assert batch.inputs[0, 0, 0].min() > 0.99, "the input lies on white"
+
+
+def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(prepare, "lpips_available", lambda: False)
+    short = {"length": {"steps": 3}}
+    assert run(data, tmp_path / "auto", loss={"lpips": "auto"}, **short) == 0
+    warnings = [record["message"] for record in lines(tmp_path / "auto", "warning")]
+    assert len(warnings) == 1 and "no LPIPS weights" in warnings[0]
+    assert "loss_lpips" not in lines(tmp_path / "auto", "train")[0]
+
+    class Half(torch.nn.Module):
+        def forward(self, got, want):
+            return (got - want).abs().mean((-3, -2, -1)) * 0 + 0.5
+
+    monkeypatch.setattr(prepare, "load_lpips", Half)
+    loss = {"lpips": "on", "lpips_weight": 3.0, "lpips_after": 2, "radial_mask": False}
+    assert run(data, tmp_path / "on", loss=loss, **short) == 0
+    records = lines(tmp_path / "on", "train")
+    assert ["loss_lpips" in record for record in records] == [False, False, True]
+    third = records[2]
+    assert third["loss"] == pytest.approx(third["loss_rgb"] + third["loss_mask"] + 1.5, abs=1e-4)
+
+
+def test_bfloat16_keeps_float32_weights(data, tmp_path):
+    assert run(data, tmp_path, optim={"precision": "bfloat16"}, length={"steps": 3}) == 0
+    weights = load_file(tmp_path / "model.safetensors")
+    assert all(value.dtype == torch.float32 for value in weights.values())
+    assert all(record["loss"] is not None for record in lines(tmp_path, "train"))
+
+
+def test_decay_is_on_matrices_that_are_not_flagged(data):
+    model = Gamba(micro.options(data, data).model_config())
+    decayed, plain = build_optimizer(model, 0.05, 0.95).param_groups
+    assert decayed["weight_decay"] == 0.05 and plain["weight_decay"] == 0
+    names = {id(p): name for name, p in model.named_parameters()}
+    without = {names[id(p)] for p in plain["params"]}
+    assert "blocks.0.mamba.in_proj.weight" not in without
+    for name in ("A_log", "D", "in_proj.bias", "conv_bias", "norm.weight", "tokens.embedding"):
+        matching = [full for full in names.values() if full.endswith(name)]
+        assert set(matching) <= without, name
+    assert len(decayed["params"]) + len(plain["params"]) == len(names)
+
+
+def test_command_line(data, tmp_path, capsys):
+    model = ["--preset", "tiny", "--set", *micro.MODEL]
+    quick = ["--steps", "2", "--size", "16", "--lpips", "off", "--no-tensorboard"]
+    views = ["--batch-size", "1", "--views-per-object", "1", "--no-radial-mask", "--device", "cpu"]
+    arguments = [str(data), *model, *quick, *views, "--out", str(tmp_path / "run")]
+    assert cli.run("train", arguments) == 0
+    assert "loss_rdist" not in (tmp_path / "run" / "log.jsonl").read_text()
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["views"]["views_per_object"] == 1 and config["model"]["depth"] == 1
+    capsys.readouterr()
+    assert cli.run("train", [str(tmp_path / "missing")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "missing: no such folder" in error
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ class TrainConfig:
 
     data: tyro.conf.Positional[Path]
     """Dataset folder."""
-    preset: Literal["tiny", "small", "paper"] = "small"
+    preset: Literal[tuple(PRESETS)] = "small"
     """Size of the model."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")] = ()
     """Changes to the preset, e.g. prepend=false depth=4; the fields are GambaConfig's."""
