@@ -23,6 +23,7 @@ GREY = 0.6  # display value of a surface whose colour is not known
 MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
 CREASE = np.cos(np.radians(40))  # a vertex normal farther than this from its face's is not used
 
+_TEXTURED = b"gamba_textured"  # key of a note in a material that names a texture
 _Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
@@ -200,7 +201,10 @@ def _resolver(path: Path, warnings: list[str]):
             if file is None:
                 warnings.append(f"{name}: not found")
                 raise OSError(f"{name}: not found")
-            return file.read_bytes()
+            data = file.read_bytes()
+            if file.suffix.lower() == ".mtl":  # trimesh forgets the textures it could not open
+                data = re.sub(rb"(?im)^\s*map_kd\s.*$", rb"\g<0>\n" + _TEXTURED + b" 1", data)
+            return data
 
     return Resolver(str(path))
 
@@ -304,9 +308,12 @@ def _material(source, path: Path, warnings: list[str]) -> tuple[Material, bool]:
             cut = 0.5 if source.alphaCutoff is None else source.alphaCutoff
             texture[..., 3] = np.where(texture[..., 3] >= 255 * cut, 255, 0)
         return Material(color.astype(np.float32), texture), texture is not None
-    if not isinstance(source, SimpleMaterial):
-        warnings.append(f"material of kind {type(source).__name__}: grey")
-        return Material(np.array([*[to_linear(GREY)] * 3, 1], np.float32)), False
+    grey = Material(np.array([*[to_linear(GREY)] * 3, 1], np.float32))
+    # trimesh makes up an empty material; one from an MTL file has the file's lines in kwargs
+    made_up = path.suffix.lower() == ".obj" and not source.kwargs
+    if not isinstance(source, SimpleMaterial) or made_up:
+        warnings.append("a part has no material: grey")
+        return grey, False
     texture = _texture(source.image, warnings)
     mask = source.kwargs.get("map_d")
     if texture is not None and mask:
@@ -314,8 +321,8 @@ def _material(source, path: Path, warnings: list[str]) -> tuple[Material, bool]:
     color = np.ones(4, np.float32)
     if texture is None:
         color[:3] = to_linear(np.asarray(source.diffuse[:3], np.float32) / 255)
-        if source.kwargs.get("map_kd"):
-            color[:3] = to_linear(GREY)
+        if _TEXTURED.decode() in source.kwargs:
+            color[:3] = grey.color[:3]
     color[3] = _opacity(source.kwargs)
     return Material(color, texture), texture is not None
 
