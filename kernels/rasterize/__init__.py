@@ -1,0 +1,5 @@
+"""The differentiable Gaussian rasterizer."""
+
+from .function import rasterization
+
+__all__ = ["rasterization"]

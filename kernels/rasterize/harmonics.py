@@ -1,0 +1,55 @@
+"""Real spherical harmonics up to degree 3, in torch (autograd gives the gradients)."""
+
+import torch
+from torch import Tensor
+
+
+def _basis(degree: int, directions: Tensor) -> Tensor:
+    """``[.., (degree + 1)²]`` of unit ``directions [.., 3]``, in the order and signs of 3DGS."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 0:
+        c = 0.4886025119029199
+        basis += [-c * y, c * z, -c * x]
+    if degree > 1:
+        c = 1.0925484305920792
+        basis += [
+            c * x * y,
+            -c * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -c * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if degree > 2:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, -1)
+
+
+def colors_from_harmonics(
+    degree: int, coefficients: Tensor, means: Tensor, viewmats: Tensor
+) -> Tensor:
+    """Colours seen from each camera, ``max(0, ½ + Σ_k Y_k(direction) coefficient_k)``.
+
+    Args:
+        degree: 0 to 3; coefficients beyond it are not used.
+        coefficients: ``[B, N, K, 3]``.
+        means: ``[B, N, 3]``.
+        viewmats: ``[B, V, 4, 4]``.
+
+    Returns:
+        ``[B, V, N, 3]``.
+    """
+    rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    centers = -(rotation.mT @ translation[..., None])[..., 0]
+    directions = torch.nn.functional.normalize(means[:, None] - centers[:, :, None], dim=-1)
+    used = coefficients[:, :, : (degree + 1) ** 2]
+    return (torch.einsum("bvnk,bnkc->bvnc", _basis(degree, directions), used) + 0.5).clamp_min(0)

@@ -1,0 +1,45 @@
+"""Counts of the work that a call did, computed only when somebody looks."""
+
+import torch
+from torch import Tensor
+
+from .bin import Bins
+from .composite_cpu import Walk
+from .project import STATUS_NAMES
+
+
+class Meta(dict):
+    """A dict; these keys are computed at the first look, as ints (which synchronises on CUDA).
+
+    ``culled``: dict of counts of (view, Gaussian) by reason; ``pairs_box`` and ``pairs``: (tile,
+    Gaussian) pairs without and with the exact test; ``pairs_walked``: until every pixel of the tile
+    had stopped; ``blocks_used``: 4 x 4 blocks of pixels to which a pair contributed;
+    ``tiles`` and ``tiles_empty``.
+    """
+
+    def __init__(self, bins: Bins, walk: Walk, status: Tensor):
+        super().__init__()
+        self._bins, self._walk, self._status = bins, walk, status
+
+    def __missing__(self, key: str):
+        counts = {
+            "culled": self._culled,
+            "pairs_box": lambda: int(self._bins.box_pairs),
+            "pairs": lambda: self._bins.pairs.numel(),
+            "pairs_walked": lambda: int(self._walk.walked.sum(dtype=torch.int64)),
+            "blocks_used": self._blocks_used,
+            "tiles": lambda: self._bins.starts.numel() - 1,
+            "tiles_empty": lambda: int((self._bins.starts.diff() == 0).sum()),
+        }
+        if key not in counts:
+            raise KeyError(key)
+        self[key] = counts[key]()
+        return self[key]
+
+    def _culled(self) -> dict[str, int]:
+        counts = torch.bincount(self._status.view(-1), minlength=len(STATUS_NAMES)).tolist()
+        return dict(zip(STATUS_NAMES[1:], counts[1:]))
+
+    def _blocks_used(self) -> int:
+        blocks = self._walk.blocks
+        return sum(int((blocks >> b & 1).sum()) for b in range(16))

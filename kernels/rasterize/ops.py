@@ -1,0 +1,238 @@
+"""The three registered operators and their gradients: project, bin, composite.
+
+They hold no arithmetic: each calls the launchers of its file. ``function.py`` joins them.
+"""
+
+import torch
+from torch import Tensor
+
+from . import composite_cpu
+from .bin import Bins, bin_gaussians, tile_grid
+from .composite_cpu import Walk, make_frame
+from .project import make_lens, project_backward, project_forward
+from .reduce import reduce_pairs
+
+_OP = "gamba_warp::rasterize_"
+
+
+@torch.library.custom_op(_OP + "project", mutates_args=())
+def project(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    lens: list[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """``project_forward`` as an operator; ``lens`` holds ``make_lens``'s arguments."""
+    return project_forward(means, quats, scales, opacities, colors, viewmats, Ks, make_lens(*lens))
+
+
+@project.register_fake
+def _(means, quats, scales, opacities, colors, viewmats, Ks, lens):
+    shape = (*viewmats.shape[:2], means.shape[1])
+    sizes = ((2,), (3,), (), (), (2,))
+    floats = tuple(means.new_empty(*shape, *size) for size in sizes)
+    return *floats, means.new_empty(shape, dtype=torch.int32)
+
+
+@torch.library.custom_op(_OP + "project_vjp", mutates_args=())
+def _project_vjp(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    lens: list[float],
+    conics: Tensor,
+    status: Tensor,
+    cotangents: list[Tensor],
+    needs: list[bool],
+) -> list[Tensor]:
+    inputs = (means, quats, scales, opacities, viewmats, Ks)
+    grads = project_backward(inputs, make_lens(*lens), conics, status, cotangents, needs)
+    return [g for g in grads if g is not None]
+
+
+@_project_vjp.register_fake
+def _(means, quats, scales, opacities, viewmats, Ks, lens, conics, status, cotangents, needs):
+    inputs = (means, quats, scales, opacities, viewmats)
+    return [torch.empty_like(x) for x, need in zip(inputs, needs) if need]
+
+
+def _project_setup(ctx, inputs, output):
+    means, quats, scales, opacities, _, viewmats, Ks, ctx.lens = inputs
+    _, conics, _, _, extents, status = output
+    ctx.mark_non_differentiable(extents, status)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks, conics, status)
+
+
+def _project_backward(ctx, v_means2d, v_conics, v_depths, v_view_opacities, _extents, _status):
+    *inputs, conics, status = ctx.saved_tensors
+    needs = [ctx.needs_input_grad[i] for i in (0, 1, 2, 3, 5)]
+    shape = status.shape
+    cotangents = [
+        conics.new_zeros(*shape, *size) if v is None else v.contiguous()
+        for v, size in zip((v_means2d, v_conics, v_depths, v_view_opacities), ((2,), (3,), (), ()))
+    ]
+    grads = iter(_project_vjp(*inputs, ctx.lens, conics, status, cotangents, needs))
+    v = [next(grads) if need else None for need in needs]
+    return v[0], v[1], v[2], v[3], None, v[4], None, None
+
+
+project.register_autograd(_project_backward, setup_context=_project_setup)
+
+
+@torch.library.custom_op(_OP + "bin", mutates_args=())
+def bin_op(
+    means2d: Tensor,
+    conics: Tensor,
+    depths: Tensor,
+    view_opacities: Tensor,
+    extents: Tensor,
+    width: int,
+    height: int,
+    alpha_min: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """``bin_gaussians`` as an operator; the number of pairs is known only at run time."""
+    return tuple(
+        bin_gaussians(means2d, conics, depths, view_opacities, extents, width, height, alpha_min)
+    )
+
+
+@bin_op.register_fake
+def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min):
+    def ints(*shape):
+        return depths.new_empty(shape, dtype=torch.int32)
+
+    tiles_x, tiles_y = tile_grid(width, height)
+    count = depths.numel()
+    pairs = torch.library.get_ctx().new_dynamic_size()
+    starts = ints(depths.shape[0] * tiles_x * tiles_y + 1)
+    box_pairs = depths.new_empty((), dtype=torch.int64)
+    return ints(count), ints(count + 1), ints(pairs), ints(pairs), starts, box_pairs
+
+
+@torch.library.custom_op(_OP + "composite", mutates_args=())
+def composite(
+    means2d: Tensor,
+    conics: Tensor,
+    view_opacities: Tensor,
+    colors: Tensor,
+    bins: list[Tensor],
+    size: list[int],
+    alpha_range: list[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Blends the pairs; ``size`` is width, height, V, and whether colours are per view.
+
+    ``colors`` is ``[I * N, C]`` or, shared by the views, ``[B * N, C]``; ``bins`` is a ``Bins``.
+    """
+    renders, alphas, walk = composite_cpu.composite_forward(
+        means2d, conics, view_opacities, colors, Bins(*bins), _frame(means2d, size, alpha_range)
+    )
+    return renders, alphas, *walk
+
+
+def _frame(means2d: Tensor, size: list[int], alpha_range: list[float]):
+    width, height, views, per_view = size
+    return make_frame(width, height, views, means2d.shape[1], bool(per_view), *alpha_range)
+
+
+@composite.register_fake
+def _(means2d, conics, view_opacities, colors, bins, size, alpha_range):
+    width, height = size[:2]
+    tiles_x, tiles_y = tile_grid(width, height)
+    images, pairs = means2d.shape[0], Bins(*bins).pairs
+    blocks = images * tiles_x * tiles_y * 16
+    return (
+        colors.new_empty(images, height, width, colors.shape[1]),
+        colors.new_empty(images, height, width),
+        colors.new_empty(blocks, 16),
+        pairs.new_empty(blocks, 16),
+        torch.empty_like(pairs),
+        pairs.new_empty(blocks // 16),
+    )
+
+
+@torch.library.custom_op(_OP + "composite_vjp", mutates_args=())
+def _composite_vjp(
+    means2d: Tensor,
+    conics: Tensor,
+    view_opacities: Tensor,
+    colors: Tensor,
+    bins: list[Tensor],
+    size: list[int],
+    alpha_range: list[float],
+    walk: list[Tensor],
+    v_renders: Tensor,
+    v_alphas: Tensor,
+    geometry: bool,
+) -> list[Tensor]:
+    every = Bins(*bins)
+    v_pairs, _ = composite_cpu.composite_backward(
+        means2d,
+        conics,
+        view_opacities,
+        colors,
+        every,
+        _frame(means2d, size, alpha_range),
+        Walk(*walk),
+        v_renders,
+        v_alphas,
+        geometry,
+    )
+    grads = reduce_pairs(v_pairs, every, conics, view_opacities, geometry)
+    return [g for g in grads if g is not None]
+
+
+@_composite_vjp.register_fake
+def _(means2d, conics, view_opacities, colors, bins, size, alpha_range, walk, *rest):
+    v_colors = colors.new_empty(*view_opacities.shape, colors.shape[1])
+    if not rest[-1]:
+        return [v_colors]
+    return [*map(torch.empty_like, (means2d, conics, view_opacities)), v_colors]
+
+
+def _composite_setup(ctx, inputs, output):
+    means2d, conics, view_opacities, colors, bins, ctx.size, ctx.alpha_range = inputs
+    renders, alphas, *walk = output
+    ctx.mark_non_differentiable(*walk)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(means2d, conics, view_opacities, colors, *bins, *walk)
+    ctx.shapes = renders.shape, alphas.shape
+
+
+def _composite_backward(ctx, v_renders, v_alphas, *_):
+    means2d, conics, view_opacities, colors, *rest = ctx.saved_tensors
+    bins, walk = rest[: len(Bins._fields)], rest[len(Bins._fields) :]
+    v_renders = colors.new_zeros(ctx.shapes[0]) if v_renders is None else v_renders
+    v_alphas = colors.new_zeros(ctx.shapes[1]) if v_alphas is None else v_alphas
+    needs = ctx.needs_input_grad
+    geometry = any(needs[:3])
+    *v_geometry, v_colors = _composite_vjp(
+        means2d,
+        conics,
+        view_opacities,
+        colors,
+        bins,
+        ctx.size,
+        ctx.alpha_range,
+        walk,
+        v_renders.contiguous(),
+        v_alphas.contiguous(),
+        geometry,
+    )
+    v_means2d, v_conics, v_view_opacities = v_geometry if geometry else (None, None, None)
+    views, per_view = ctx.size[2:]
+    if not per_view:
+        num, channels = v_colors.shape[1:]
+        v_colors = v_colors.view(-1, views, num, channels).sum(1)
+    v_colors = v_colors.reshape(colors.shape) if needs[3] else None
+    return v_means2d, v_conics, v_view_opacities, v_colors, [None] * len(bins), None, None
+
+
+composite.register_autograd(_composite_backward, setup_context=_composite_setup)

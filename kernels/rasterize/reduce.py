@@ -1,0 +1,99 @@
+"""Sums of pair gradients by Gaussian, in emission order: bitwise repeatable, no atomics."""
+
+import warp as wp
+from torch import Tensor
+
+from .bin import Bins
+from .launch import launch, vectors
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _reduce(
+    offset: wp.int32,
+    order_in: wp.array[wp.int32],
+    offsets_in: wp.array[wp.int32],
+    v_pairs_in: wp.array2d[wp.float32],
+    conics_in: wp.array[wp.vec3],
+    view_opacities_in: wp.array[wp.float32],
+    v_means2d_out: wp.array[wp.vec2],
+    v_conics_out: wp.array[wp.vec3],
+    v_view_opacities_out: wp.array[wp.float32],
+    v_colors_out: wp.array2d[wp.float32],
+):
+    j = offset + wp.tid()
+    i = order_in[j]
+    begin = offsets_in[j]
+    end = offsets_in[j + 1]
+    for c in range(v_colors_out.shape[1]):
+        total = wp.float32(0.0)
+        for p in range(begin, end):
+            total += v_pairs_in[p, 6 + c]
+        v_colors_out[i, c] = total
+    if v_means2d_out:
+        h = wp.float32(0.0)
+        hu = wp.float32(0.0)
+        hy = wp.float32(0.0)
+        huu = wp.float32(0.0)
+        huy = wp.float32(0.0)
+        hyy = wp.float32(0.0)
+        for p in range(begin, end):
+            h += v_pairs_in[p, 0]
+            hu += v_pairs_in[p, 1]
+            hy += v_pairs_in[p, 2]
+            huu += v_pairs_in[p, 3]
+            huy += v_pairs_in[p, 4]
+            hyy += v_pairs_in[p, 5]
+        # README eq. 11: moments of h to the gradients
+        conic = conics_in[i]
+        a, k, e = conic[0], conic[1], conic[2]
+        v_means2d_out[i] = wp.vec2(a * hu, a * k * hu + e * hy)
+        v_conics_out[i] = wp.vec3(-0.5 * huu, -a * huy, -0.5 * hyy)
+        v_opacity = wp.float32(0.0)
+        if end > begin:
+            v_opacity = h / view_opacities_in[i]
+        v_view_opacities_out[i] = v_opacity
+
+
+def reduce_pairs(
+    v_pairs: Tensor, bins: Bins, conics: Tensor, view_opacities: Tensor, geometry: bool
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor]:
+    """Sums the rows of ``composite_backward`` by (view, Gaussian).
+
+    Args:
+        v_pairs: ``[P, 6 + C]``.
+        bins: as forward.
+        conics: ``[I, N, 3]``.
+        view_opacities: ``[I, N]``.
+        geometry: whether anything but colours is asked for.
+
+    Returns:
+        Gradients of means2d, conics, view_opacities (None without ``geometry``), and of the colours
+        ``[I, N, C]``.
+    """
+    v_means2d = v_conics = v_opacities = None
+    if geometry:
+        v_means2d = conics.new_empty(*conics.shape[:-1], 2)
+        v_conics = conics.new_empty(conics.shape)
+        v_opacities = conics.new_empty(conics.shape[:-1])
+    v_colors = conics.new_empty(*conics.shape[:-1], v_pairs.shape[1] - 6)
+    launch(
+        _reduce,
+        bins.order.numel(),
+        [
+            bins.order,
+            bins.offsets,
+            v_pairs,
+            vectors(conics, wp.vec3),
+            view_opacities.view(-1),
+        ],
+        [
+            vectors(v_means2d, wp.vec2),
+            vectors(v_conics, wp.vec3),
+            None if v_opacities is None else v_opacities.view(-1),
+            v_colors.view(-1, v_colors.shape[-1]),
+        ],
+        conics.device,
+    )
+    return v_means2d, v_conics, v_opacities, v_colors
