@@ -27,12 +27,12 @@ def _values(device_type: str, io: torch.dtype):
     """Value type, its channels, load, store and the arithmetic of one device."""
     m = cpu_values if device_type == "cpu" else cuda_values
     load, store = m.ACCESSORS[io]
-    return m.VALUE, m.WIDTH, load, store, m.mul, m.fma, m.sigmoid
+    return m.VALUE, m.WIDTH, load, store, m.times, m.fma, m.sigmoid
 
 
 @functools.cache
 def _forward_kernel(device_type: str, io: torch.dtype):
-    value, channels_of_value, load, store, mul, fma, sigmoid = _values(device_type, io)
+    value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
     scalar = cpu_values.WARP_DTYPES[io]
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -68,7 +68,7 @@ def _forward_kernel(device_type: str, io: torch.dtype):
             x3 = load(x_in, b, t, d, width)
             y = fma(w0, x0, fma(w1, x1, fma(w2, x2, fma(w3, x3, bias_in[k]))))
             if use_silu != 0:
-                y = mul(y, sigmoid(y))
+                y = times(y, sigmoid(y))
             store(y_out, b, t, d, width, y)
             x0 = x1
             x1 = x2
@@ -79,7 +79,7 @@ def _forward_kernel(device_type: str, io: torch.dtype):
 
 @functools.cache
 def _backward_kernel(device_type: str, io: torch.dtype):
-    value, channels_of_value, load, store, mul, fma, sigmoid = _values(device_type, io)
+    value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
     scalar = cpu_values.WARP_DTYPES[io]
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -127,14 +127,14 @@ def _backward_kernel(device_type: str, io: torch.dtype):
                 if use_silu != 0:
                     y = fma(w0, x0, fma(w1, x1, fma(w2, x2, fma(w3, x3, bias_in[k]))))
                     s = sigmoid(y)
-                    g3 = mul(g3, fma(mul(y, s), value(1.0) - s, s))
+                    g3 = times(g3, fma(times(y, s), value(1.0) - s, s))
                 if t < end:
                     v0 = fma(g3, x0, v0)
                     v1 = fma(g3, x1, v1)
                     v2 = fma(g3, x2, v2)
                     v3 = fma(g3, x3, v3)
                     vb = vb + g3
-            dx = fma(w3, g0, fma(w2, g1, fma(w1, g2, mul(w0, g3))))
+            dx = fma(w3, g0, fma(w2, g1, fma(w1, g2, times(w0, g3))))
             at = t - _HISTORY
             if at >= t0:
                 if dx_out.shape[1] > 0:

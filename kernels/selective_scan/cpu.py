@@ -15,214 +15,36 @@ from torch import Tensor
 from ..interop import lane_contiguous, parallel_launch, view
 from .lanes import (
     ACCESSORS,
-    LANES,
-    PRELUDE,
     WARP_DTYPES,
     W,
     flush_denormals,
     fma,
     lanes,
-    mul,
     restore_denormals,
     sigmoid,
     softplus,
+    times,
+)
+from .recurrence import (
+    MODES,
+    NEED_DB,
+    NEED_DC,
+    NEED_DH,
+    NEED_DZ,
+    advance,
+    recompute,
+    retreat,
+    sum_lanes,
 )
 
 CHUNK = 64  # tokens; a state is saved at the start of each chunk
 BLOCKS = 4  # lane groups of a task; fixed, so that sums do not depend on the number of threads
-NEED_DZ, NEED_DC, NEED_DB, NEED_DH = 1, 2, 4, 8
 
 _K = wp.constant(CHUNK)
 _K1 = wp.constant(CHUNK + 1)
 _P = wp.constant(BLOCKS)
 _W = wp.constant(W)
-_LOG2E = wp.constant(1.4426950408889634)
 _DZ, _DC, _DB, _DH = (wp.constant(v) for v in (NEED_DZ, NEED_DC, NEED_DB, NEED_DH))
-
-# Equations 2 to 4 by mode: f and g of x = δA and their slopes. ``rate`` is δ, times log2(e) where
-# an exponential is wanted. ``mode`` is a constant of the kernel, so that one branch remains.
-MODES = {"mamba": 0, "bilinear": 1, "zoh": 2}
-_PHI = """
-    F x = rate[t] * a * 0.6931471805599453f;
-    F series = F{} + 2.505210838544172e-8f, slope = F{} + 2.505210838544172e-7f;
-    const float k[10] = {2.755731922398589e-7f, 2.755731922398589e-6f, 2.48015873015873e-5f,
-        1.984126984126984e-4f, 1.388888888888889e-3f, 8.333333333333333e-3f,
-        4.1666666666666664e-2f, 0.16666666666666666f, 0.5f, 1.0f};
-    for (int i = 0; i < 10; ++i) series = fma_(series, x, F{} + k[i]);
-    for (int i = 0; i < 9; ++i) slope = fma_(slope, x, F{} + k[i] * (float)(9 - i));
-    I small = (x < 1.0f) & (x > -1.0f);
-    F safe = small ? F{} + 1.0f : x;
-    g = small ? series : (f - 1.0f) / safe;
-"""
-_STEP = (
-    """
-    F f, g = F{} + 1.0f;
-    if (mode == 1) {
-        g = 1.0f / (1.0f - 0.5f * (rate[t] * a));
-        f = fma_(rate[t] * a, g, F{} + 1.0f);
-    } else f = exp2_(rate[t] * a);
-    if (mode == 2) {"""
-    + _PHI
-    + "}"
-)
-_SLOPE = (
-    """
-    F f = fs[t], g = F{} + 1.0f, df = f, dg = F{};
-    if (mode == 1) {
-        g = 1.0f / (1.0f - 0.5f * (rate[t] * a));
-        df = g * g;
-        dg = 0.5f * df;
-    }
-    if (mode == 2) {"""
-    + _PHI
-    + "dg = small ? slope : (f - g) / safe;}"
-)
-_OPERANDS = """
-F h = *(const F*)&h_in;
-const F a = *(const F*)&a_in;
-const F* rate = (const F*)rate_in.data;
-const F* du = (const F*)du_in.data;
-const float* b = &b_in.data[t0];
-const float* c = &c_in.data[t0];
-"""
-
-
-# Equations 1 and 5 for one state over a chunk.
-@wp.func_native(
-    PRELUDE
-    + _OPERANDS
-    + f"""
-F* y = (F*)y_out.data;
-for (int t = 0; t < count; ++t) {{
-    {_STEP}
-    h = fma_(f, h, g * (du[t] * b[t]));
-    y[t] = fma_(h, F{{}} + c[t], y[t]);
-}}
-{LANES} r; *(F*)&r = h; return r;
-"""
-)
-def advance(
-    mode: int,
-    h_in: lanes,
-    a_in: lanes,
-    rate_in: wp.array(dtype=lanes),
-    du_in: wp.array(dtype=lanes),
-    b_in: wp.array(dtype=wp.float32),
-    c_in: wp.array(dtype=wp.float32),
-    t0: int,
-    count: int,
-    y_out: wp.array(dtype=lanes),
-) -> lanes: ...
-
-
-# As ``advance``, keeping f and h of every token, and adding dy·h to the sums of dC (equation 8).
-@wp.func_native(
-    PRELUDE
-    + _OPERANDS
-    + f"""
-const F* dy = (const F*)dy_in.data;
-F* y = (F*)y_out.data;
-F* fs = (F*)f_out.data;
-F* hs = (F*)h_out.data;
-F* dc = (F*)dc_out.data + first;
-hs[0] = h;
-for (int t = 0; t < count; ++t) {{
-    {_STEP}
-    h = fma_(f, h, g * (du[t] * b[t]));
-    fs[t] = f;
-    hs[t + 1] = h;
-    if (needs & {NEED_DZ}) y[t] = fma_(h, F{{}} + c[t], y[t]);
-    if (needs & {NEED_DC}) dc[t] = fma_(dy[t], h, dc[t]);
-}}
-"""
-)
-def recompute(
-    mode: int,
-    h_in: lanes,
-    a_in: lanes,
-    rate_in: wp.array(dtype=lanes),
-    du_in: wp.array(dtype=lanes),
-    b_in: wp.array(dtype=wp.float32),
-    c_in: wp.array(dtype=wp.float32),
-    t0: int,
-    count: int,
-    dy_in: wp.array(dtype=lanes),
-    needs: int,
-    first: int,
-    y_out: wp.array(dtype=lanes),
-    f_out: wp.array(dtype=lanes),
-    h_out: wp.array(dtype=lanes),
-    dc_out: wp.array(dtype=lanes),
-): ...
-
-
-# Equations 6, 7 and 9 to 12 for one state, backwards over a chunk; h is the gradient of h_t.
-@wp.func_native(
-    PRELUDE
-    + _OPERANDS
-    + f"""
-const F* step = (const F*)step_in.data;
-const F* dy = (const F*)dy_in.data;
-const F* fs = (const F*)f_in.data;
-const F* hs = (const F*)hs_in.data;
-F* s = (F*)s_out.data;
-F* p = (F*)p_out.data;
-F* db = (F*)db_out.data + first;
-F da = F{{}};
-for (int t = count - 1; t >= 0; --t) {{
-    {_SLOPE}
-    h = fma_(dy[t], F{{}} + c[t], h);
-    if (needs & {NEED_DB}) db[t] = fma_(g * h, du[t], db[t]);
-    s[t] = fma_(g * h, F{{}} + b[t], s[t]);
-    F q;
-    if (mode == 0) q = (f * h) * hs[t];
-    else q = h * (hs[t] * df + du[t] * b[t] * dg);
-    h = f * h;
-    p[t] = fma_(q, a, p[t]);
-    da = fma_(q, step[t], da);
-}}
-*(F*)da_out.data = da;
-{LANES} r; *(F*)&r = h; return r;
-"""
-)
-def retreat(
-    mode: int,
-    h_in: lanes,
-    a_in: lanes,
-    rate_in: wp.array(dtype=lanes),
-    du_in: wp.array(dtype=lanes),
-    b_in: wp.array(dtype=wp.float32),
-    c_in: wp.array(dtype=wp.float32),
-    t0: int,
-    count: int,
-    step_in: wp.array(dtype=lanes),
-    dy_in: wp.array(dtype=lanes),
-    f_in: wp.array(dtype=lanes),
-    hs_in: wp.array(dtype=lanes),
-    needs: int,
-    first: int,
-    s_out: wp.array(dtype=lanes),
-    p_out: wp.array(dtype=lanes),
-    db_out: wp.array(dtype=lanes),
-    da_out: wp.array(dtype=lanes),
-) -> lanes: ...
-
-
-@wp.func_native(
-    PRELUDE
-    + """
-const F* p = (const F*)sums.data + first;
-for (int t = 0; t < count; ++t) {
-    F v = p[t];
-    v += __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7);
-    v += __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3, 8, 9, 10, 11, 12, 13, 14, 15);
-    out.data[t0 + t] = (v[0] + v[1]) + (v[2] + v[3]);
-}
-"""
-)
-def sum_lanes(
-    sums: wp.array(dtype=lanes), first: int, count: int, t0: int, out: wp.array(dtype=wp.float32)
-): ...
 
 
 @functools.cache
@@ -279,8 +101,8 @@ def _forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
                         step = softplus(step)
                     ut = load(u_in, b, t0 + t, d, width)
                     rate[t] = step * wp.static(scale)
-                    du[t] = mul(step, ut)
-                    y[t] = mul(skip_in[k], ut)
+                    du[t] = times(step, ut)
+                    y[t] = times(skip_in[k], ut)
                 for n in range(states):
                     row = group_row * states + n
                     h = h_out[b, k, n]
@@ -293,7 +115,7 @@ def _forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
                     out = y[t]
                     if use_z != 0:
                         zt = load(z_in, b, t0 + t, d, width)
-                        out = mul(out, mul(zt, sigmoid(zt)))
+                        out = times(out, times(zt, sigmoid(zt)))
                     store(y_out, b, t0 + t, d, width, out)
         restore_denormals(before)
 
@@ -383,12 +205,12 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
                     grad = load(dout_in, b, t0 + t, d, width)
                     if use_z != 0:
                         zt = load(z_in, b, t0 + t, d, width)
-                        grad = mul(grad, mul(zt, sigmoid(zt)))
+                        grad = times(grad, times(zt, sigmoid(zt)))
                     step[t] = x
                     rate[t] = x * wp.static(scale)
-                    du[t] = mul(x, ut)
+                    du[t] = times(x, ut)
                     dy[t] = grad
-                    y[t] = mul(skip_in[k], ut)
+                    y[t] = times(skip_in[k], ut)
                     s[t] = lanes()
                     p[t] = lanes()
                 for n in range(states):
@@ -402,7 +224,8 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
                     if (needs & _DH) != 0:
                         dh_out[b, k, n] = retreat(
                             wp.static(mode), dh_out[b, k, n], a, rate, du,
-                            b_in[row], c_in[row], t0, count, step, dy, f, h, needs, first, s, p, db_sums[task], da,
+                            b_in[row], c_in[row], t0, count, step, dy, f, h, needs, first, s, p,
+                            db_sums[task], da,
                         )  # fmt: skip
                         da_out[b, k, n] = da_out[b, k, n] + da[0]
                 dskip = lanes()
@@ -413,15 +236,15 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
                     if (needs & _DZ) != 0:
                         zt = load(z_in, b, t0 + t, d, width)
                         sig = sigmoid(zt)
-                        slope = fma(mul(zt, sig), lanes(1.0) - sig, sig)
+                        slope = fma(times(zt, sig), lanes(1.0) - sig, sig)
                         grad = load(dout_in, b, t0 + t, d, width)
-                        store(dz_out, b, t0 + t, d, width, mul(mul(grad, y[t]), slope))
+                        store(dz_out, b, t0 + t, d, width, times(times(grad, y[t]), slope))
                     ddelta = fma(ut, s[t], p[t])
                     if use_softplus != 0:
-                        ddelta = mul(ddelta, sigmoid(raw[t]))
+                        ddelta = times(ddelta, sigmoid(raw[t]))
                     dbias = dbias + ddelta
                     if du_out.shape[1] > 0:
-                        v = fma(step[t], s[t], mul(skip_in[k], dy[t]))
+                        v = fma(step[t], s[t], times(skip_in[k], dy[t]))
                         store(du_out, b, t0 + t, d, width, v)
                     if ddelta_out.shape[1] > 0:
                         store_delta(ddelta_out, b, t0 + t, d, width, ddelta)

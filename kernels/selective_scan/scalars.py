@@ -26,7 +26,7 @@ def softplus(x: float) -> float:
 
 
 @wp.func
-def mul(a: float, b: float) -> float:
+def times(a: float, b: float) -> float:
     return a * b
 
 
