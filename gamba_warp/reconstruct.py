@@ -87,7 +87,7 @@ class Outputs:
 
 
 def reconstruct_command(
-    images: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    images: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")],
     /,
     checkpoint: Path | None = None,
     encoder_weights: Path | None = None,
@@ -116,14 +116,15 @@ def reconstruct_command(
         frames: Number of views in the turntable.
         page: Write an HTML page with the input, the turntable and a 3D viewer.
         mask: Picture that is white where the object is (for a single image).
-        sam: Segment Anything checkpoint, for pictures whose background is neither transparent nor
-            plain.
+        sam: Segment Anything checkpoint, for pictures with a busy background.
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Where to compute.
     """
     if size < 16 or frames < 2:
         raise UserError("--size must be at least 16 and --frames at least 2")
+    if not images:
+        raise UserError("give at least one picture or folder")
     pictures, failures = find_pictures(images)
     if mask is not None and len(pictures) != 1:
         raise UserError(f"--mask goes with one picture, {len(pictures)} are given")

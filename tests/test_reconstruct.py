@@ -238,6 +238,7 @@ def test_what_cannot_start_is_refused(tmp_path, picture, checkpoint, capsys):
         refused([picture, *quick(file, tmp_path / "out")], file, "safetensors"),
         refused([picture, *quick(checkpoint, file)], "cannot write into", file),
         refused([picture, *quick(checkpoint, "/dev/null/x")], "cannot write into /dev/null/x"),
+        refused(ready, "give at least one picture or folder"),
         refused([tmp_path / "empty", *ready], "empty: the folder holds no pictures"),
         refused([picture, other, *ready, "--mask", picture], "--mask goes with one picture"),
         refused([picture, *ready, "--size", 8], "--size"),
