@@ -75,10 +75,7 @@ def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECOND
 
 
 def _write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
-    # One palette for all frames, from a few of them side by side: colours do not flicker.
-    sample = frames[:: max(1, len(frames) // 8)]
-    montage = Image.fromarray(np.concatenate(list(sample), axis=1))
-    palette = montage.quantize(255, method=Image.Quantize.MEDIANCUT, kmeans=1)
+    palette = _palette(frames[:: max(1, len(frames) // 8)])
     pictures = [
         Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
         for frame in frames
@@ -88,6 +85,18 @@ def _write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, optimize=True
     )
+
+
+def _palette(frames: np.ndarray) -> Image.Image:
+    """One palette for all frames, so that colours do not flicker: white and 255 others."""
+    pixels = frames.reshape(-1, 3)
+    pixels = pixels[(pixels < 255).any(1)]
+    if len(pixels) == 0:
+        pixels = frames.reshape(-1, 3)[:1]
+    colours = Image.fromarray(pixels[None]).quantize(255, kmeans=1).getpalette()
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([255, 255, 255, *colours[: 3 * 255]])
+    return palette
 
 
 def _write_mp4(path: Path, frames: np.ndarray, seconds: float) -> None:

@@ -124,6 +124,19 @@ def test_gif(tmp_path):
             assert np.abs(got - want).mean() < 12
 
 
+@pytest.mark.parametrize("object_there", [True, False])
+def test_gif_keeps_its_background_white(tmp_path, object_there):
+    frames = np.full((3, 30, 30, 3), 255, np.uint8)
+    if object_there:
+        frames[:, 10:20, 10:20] = np.random.default_rng(0).integers(0, 256, (3, 10, 10, 3))
+    save_turntable(tmp_path / "a.gif", frames)
+    with Image.open(tmp_path / "a.gif") as image:
+        for index in range(image.n_frames):
+            image.seek(index)
+            got = np.asarray(image.convert("RGB"))
+            assert (got[:9] == 255).all() and (got[10:20, 10:20] == 255).all() != object_there
+
+
 def test_mp4_of_odd_size(tmp_path):
     frames = moving(size=(35, 45), count=12)
     save_turntable(tmp_path / "a.mp4", frames, seconds=1)
