@@ -51,95 +51,145 @@ def tile_grid(width: int, height: int) -> tuple[int, int]:
     return -(-width // TILE), -(-height // TILE)
 
 
+@wp.struct
+class Grid:
+    """Per launch: the picture and its tiles."""
+
+    num: wp.int32
+    width: wp.int32
+    height: wp.int32
+    tiles_x: wp.int32
+    tiles_y: wp.int32
+    alpha_min: wp.float32
+
+
 @wp.func
-def _touches(
-    conic: wp.vec3,
-    limit: wp.float32,
-    x0: wp.float32,
-    x1: wp.float32,
-    y0: wp.float32,
-    y1: wp.float32,
-) -> bool:
-    # README eq. 6: the least q = a (x + k y)² + e y² on a rectangle, on its two nearest edges
+def _to_tile(x: wp.float32, size: wp.int32) -> wp.int32:
+    # clamped before the cast: a footprint may be larger than an int32
+    return wp.int32(wp.clamp(x, 0.0, float(size - 1))) // _TILE
+
+
+@wp.func
+def _tile_rows(grid: Grid, y: wp.float32, extent: wp.float32) -> wp.vec2i:
+    # first and last row with a pixel centre (at +0.5) in reach, with a pixel to spare
+    return wp.vec2i(
+        _to_tile(y - extent - 1.0, grid.height), _to_tile(y + extent + 1.0, grid.height)
+    )
+
+
+@wp.func
+def _tile_columns(
+    grid: Grid, mean: wp.vec2, conic: wp.vec3, limit: wp.float32, ty: wp.int32
+) -> wp.vec2i:
+    # README eq. 6: columns of row ty that the ellipse q <= limit touches; first > last: none
     a, k, e = conic[0], conic[1], conic[2]
-    ny = wp.clamp(0.0, y0, y1)
-    u = wp.clamp(-k * ny, x0, x1) + k * ny
-    best = a * u * u + e * ny * ny
-    nx = wp.clamp(0.0, x0, x1)
-    y = wp.clamp(-nx * a * k / (a * k * k + e), y0, y1)
-    u = nx + k * y
-    best = wp.min(best, a * u * u + e * y * y)
-    return best <= limit
+    reach = wp.sqrt(limit / e)
+    y0 = wp.max(float(ty * _TILE) + 0.5 - mean[1], -reach)
+    y1 = wp.min(float(wp.min(ty * _TILE + _TILE, grid.height)) - 0.5 - mean[1], reach)
+    if y0 > y1:
+        return wp.vec2i(0, -1)
+    # the ellipse is rightmost at y = top, leftmost at -top; convex, so clamping finds the extremes
+    top = -k * a * wp.sqrt(limit / (a * (a * k * k + e) * e))
+    right = wp.clamp(top, y0, y1)
+    left = wp.clamp(-top, y0, y1)
+    x1 = mean[0] - k * right + wp.sqrt(wp.max(limit - e * right * right, 0.0) / a)
+    x0 = mean[0] - k * left - wp.sqrt(wp.max(limit - e * left * left, 0.0) / a)
+    if x1 < 0.5 or x0 > float(grid.width) - 0.5:
+        return wp.vec2i(0, -1)
+    # a tile spans pixel centres 0.5 to 15.5; a gap between two tiles belongs to neither
+    first = _to_tile(x0 + 0.5, grid.width)
+    last = _to_tile(x1 - 0.5, grid.width)
+    return wp.vec2i(first, last)
 
 
 @wp.func
-def _tile_range(center: wp.float32, extent: wp.float32, size: wp.int32) -> wp.vec2i:
-    # the tiles whose pixel centres (at +0.5) the interval can reach; clamped before the cast
-    last = float(size - 1)
-    first = wp.int32(wp.clamp(center - extent - 0.5, 0.0, last)) // _TILE
-    return wp.vec2i(first, wp.int32(wp.clamp(center + extent + 0.5, 0.0, last)) // _TILE + 1)
+def _limit(opacity: wp.float32, alpha_min: wp.float32) -> wp.float32:
+    return 2.0 * wp.log(opacity / alpha_min) * _SLACK + _SLACK_ABS
 
 
 @wp.kernel
-def _emit(
+def _count(
     offset: wp.int32,
-    num: wp.int32,
-    width: wp.int32,
-    height: wp.int32,
-    tiles_x: wp.int32,
-    tiles_y: wp.int32,
-    alpha_min: wp.float32,
-    count_only: wp.int32,
+    grid: Grid,
     order_in: wp.array[wp.int32],
     means2d_in: wp.array[wp.vec2],
     conics_in: wp.array[wp.vec3],
     view_opacities_in: wp.array[wp.float32],
     extents_in: wp.array[wp.vec2],
-    offsets_in: wp.array[wp.int32],
     counts_out: wp.array[wp.int32],
     box_counts_out: wp.array[wp.int32],
-    tiles_out: wp.array[wp.int32],
 ):
-    """Counts the pairs of a Gaussian, or writes them: one code, so that the two agree."""
     j = offset + wp.tid()
     i = order_in[j]
     extent = extents_in[i]
     count = wp.int32(0)
     box_count = wp.int32(0)
     if extent[0] > 0.0:
-        center = means2d_in[i]
-        conic = conics_in[i]
-        limit = 2.0 * wp.log(view_opacities_in[i] / alpha_min) * _SLACK + _SLACK_ABS
-        xs = _tile_range(center[0], extent[0], width)
-        ys = _tile_range(center[1], extent[1], height)
-        box_count = (xs[1] - xs[0]) * (ys[1] - ys[0])
-        first_tile = (i // num) * tiles_x * tiles_y
-        for ty in range(ys[0], ys[1]):
-            y0 = float(ty * _TILE) + 0.5 - center[1]
-            y1 = float(wp.min(ty * _TILE + _TILE, height)) - 0.5 - center[1]
-            for tx in range(xs[0], xs[1]):
-                x0 = float(tx * _TILE) + 0.5 - center[0]
-                x1 = float(wp.min(tx * _TILE + _TILE, width)) - 0.5 - center[0]
-                if _touches(conic, limit, x0, x1, y0, y1):
-                    if count_only == 0:
-                        tiles_out[offsets_in[j] + count] = first_tile + ty * tiles_x + tx
-                    count += 1
-    if count_only != 0:
-        counts_out[j] = count
-        box_counts_out[j] = box_count
+        mean = means2d_in[i]
+        limit = _limit(view_opacities_in[i], grid.alpha_min)
+        rows = _tile_rows(grid, mean[1], extent[1])
+        first = _to_tile(mean[0] - extent[0], grid.width)
+        last = _to_tile(mean[0] + extent[0], grid.width)
+        box_count = (rows[1] - rows[0] + 1) * (last - first + 1)
+        for ty in range(rows[0], rows[1] + 1):
+            columns = _tile_columns(grid, mean, conics_in[i], limit, ty)
+            count += wp.max(columns[1] - columns[0] + 1, 0)
+    counts_out[j] = count
+    box_counts_out[j] = box_count
 
 
 @wp.kernel
-def _place(
+def _emit(
     offset: wp.int32,
+    grid: Grid,
     order_in: wp.array[wp.int32],
+    means2d_in: wp.array[wp.vec2],
+    conics_in: wp.array[wp.vec3],
+    view_opacities_in: wp.array[wp.float32],
+    extents_in: wp.array[wp.vec2],
     offsets_in: wp.array[wp.int32],
+    tiles_out: wp.array[wp.int32],
     gaussians_out: wp.array[wp.int32],
 ):
-    """Writes each Gaussian's index at its pairs."""
     j = offset + wp.tid()
-    for p in range(offsets_in[j], offsets_in[j + 1]):
-        gaussians_out[p] = order_in[j]
+    i = order_in[j]
+    p = offsets_in[j]
+    extent = extents_in[i]
+    if extent[0] > 0.0:
+        mean = means2d_in[i]
+        limit = _limit(view_opacities_in[i], grid.alpha_min)
+        rows = _tile_rows(grid, mean[1], extent[1])
+        for ty in range(rows[0], rows[1] + 1):
+            columns = _tile_columns(grid, mean, conics_in[i], limit, ty)
+            row = ((i // grid.num) * grid.tiles_y + ty) * grid.tiles_x
+            for tx in range(columns[0], columns[1] + 1):
+                tiles_out[p] = row + tx
+                gaussians_out[p] = i
+                p += 1
+
+
+@wp.kernel
+def _sort_view(
+    offset: wp.int32,
+    grid: Grid,
+    offsets_in: wp.array[wp.int32],
+    tiles_in: wp.array[wp.int32],
+    gaussians_in: wp.array[wp.int32],
+    starts_in: wp.array[wp.int32],
+    cursors_out: wp.array[wp.int32],
+    pairs_out: wp.array[wp.int32],
+    rows_out: wp.array[wp.int32],
+):
+    """Counting sort of one view's pairs by tile: stable, for the CPU."""
+    image = offset + wp.tid()
+    tiles = grid.tiles_x * grid.tiles_y
+    for tile in range(image * tiles, (image + 1) * tiles):
+        cursors_out[tile] = starts_in[tile]
+    for p in range(offsets_in[image * grid.num], offsets_in[(image + 1) * grid.num]):
+        place = cursors_out[tiles_in[p]]
+        cursors_out[tiles_in[p]] = place + 1
+        pairs_out[place] = gaussians_in[p]
+        rows_out[place] = p
 
 
 def bin_gaussians(
@@ -176,33 +226,38 @@ def bin_gaussians(
     order = torch.argsort(depths, dim=1, stable=True)
     order += torch.arange(images, device=device)[:, None] * num
     order = order.view(-1).int()
-    counts, box_counts = order.new_zeros(2, order.numel())
-    inputs = [num, width, height, tiles_x, tiles_y, alpha_min]
-    arrays = [
+    grid = Grid()
+    grid.num, grid.width, grid.height = num, width, height
+    grid.tiles_x, grid.tiles_y, grid.alpha_min = tiles_x, tiles_y, alpha_min
+    inputs = [
+        grid,
         order,
         vectors(means2d, wp.vec2),
         vectors(conics, wp.vec3),
         view_opacities.view(-1),
         vectors(extents, wp.vec2),
     ]
-    dim = order.numel()
-    launch(_emit, dim, [*inputs, 1, *arrays, None], [counts, box_counts, None], device)
-    ends = counts.cumsum(0, dtype=torch.int64)
-    total = int(ends[-1]) if dim else 0
+    counts, box_counts = order.new_empty(2, order.numel())
+    launch(_count, order.numel(), inputs, [counts, box_counts], device)
+    offsets = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0))
+    total = int(offsets[-1])
     if total > MAX_PAIRS:
         raise ValueError(
             f"{total} pairs of tiles and Gaussians; at most 2^31 - 1 fit: fewer views, a smaller "
             "picture or smaller scales are needed"
         )
-    offsets = torch.cat([ends.new_zeros(1), ends]).int()
-    tile_of = order.new_empty(total)
-    gaussians = order.new_empty(total)
+    offsets = offsets.int()
+    tile_of, gaussians = order.new_empty(2, total)
     if total:
-        launch(_emit, dim, [*inputs, 0, *arrays, offsets], [None, None, tile_of], device)
-        launch(_place, dim, [order, offsets], [gaussians], device)
-    tile_of, rows = torch.sort(tile_of, stable=True)
-    starts = torch.searchsorted(
-        tile_of, torch.arange(tiles + 1, dtype=torch.int32, device=device), out_int32=True
-    )
-    box_pairs = box_counts.sum(dtype=torch.int64)
-    return Bins(order, offsets, gaussians[rows], rows.int(), starts, box_pairs)
+        launch(_emit, order.numel(), [*inputs, offsets], [tile_of, gaussians], device)
+    per_tile = torch.bincount(tile_of, minlength=tiles)
+    starts = torch.nn.functional.pad(per_tile.cumsum(0), (1, 0)).int()
+    if device.type == "cpu":
+        pairs, rows = torch.empty_like(gaussians), torch.empty_like(gaussians)
+        sort_inputs = [grid, offsets, tile_of, gaussians, starts]
+        outputs = [order.new_empty(tiles), pairs, rows]
+        launch(_sort_view, images if total else 0, sort_inputs, outputs, device)
+    else:
+        rows = torch.argsort(tile_of, stable=True)
+        pairs, rows = gaussians[rows], rows.int()
+    return Bins(order, offsets, pairs, rows, starts, box_counts.sum(dtype=torch.int64))

@@ -6,8 +6,6 @@ Backward walks back to front and writes one gradient row per (tile, Gaussian) pa
 by Gaussian afterwards: no atomics. README.md §3 and §5 hold the maths.
 """
 
-from typing import NamedTuple
-
 import torch
 import warp as wp
 from torch import Tensor
@@ -15,7 +13,8 @@ from torch import Tensor
 from ..constants import T_MIN, TILE
 from ..interop import parallel_launch, view
 from . import lanes as L
-from .bin import SLACK, SLACK_ABS, Bins, tile_grid
+from .bin import SLACK, SLACK_ABS, Bins
+from .frame import Frame, Walk, color_row
 from .launch import vectors
 
 # Unrolled, the loops over blocks and pixels would take the compiler long for no gain.
@@ -29,30 +28,6 @@ _SLACK = wp.constant(SLACK)
 _SLACK_ABS = wp.constant(SLACK_ABS)
 _NEVER = wp.constant(2**31 - 1)
 _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
-
-
-@wp.struct
-class Frame:
-    """Per launch: picture and list sizes."""
-
-    width: wp.int32
-    height: wp.int32
-    tiles_x: wp.int32
-    tiles_y: wp.int32
-    views: wp.int32
-    num: wp.int32
-    colors_per_view: wp.int32
-    alpha_min: wp.float32
-    alpha_max: wp.float32
-
-
-@wp.func
-def _color_row(frame: Frame, g: int) -> int:
-    # of view-major Gaussian g; shared colours have one row per object
-    row = g
-    if frame.colors_per_view == 0:
-        row = g // (frame.views * frame.num) * frame.num + g % frame.num
-    return row
 
 
 @wp.func
@@ -81,7 +56,7 @@ def _composite(
     blocks_out: wp.array[wp.int32],
     walked_out: wp.array[wp.int32],
     renders_out: wp.array4d[wp.float32],
-    alphas_out: wp.array3d[wp.float32],
+    alphas_out: wp.array4d[wp.float32],
 ):
     tile = offset + wp.tid()
     image = tile // (frame.tiles_x * frame.tiles_y)
@@ -91,6 +66,9 @@ def _composite(
     ys = L.block_y(float(y) + 0.5)
     channels = colors_in.shape[1]
     first = tile * 16
+    walked_out[tile] = 0
+    if starts_in[tile] == starts_in[tile + 1]:
+        return
     for b in range(16):
         transmittances_out[first + b] = L.lanes(1.0)
         stops_out[first + b] = L.lanes_int(_NEVER)
@@ -101,7 +79,7 @@ def _composite(
     k = starts_in[tile]
     while k < starts_in[tile + 1] and alive != 0:
         g = pairs_in[k]
-        row = _color_row(frame, g)
+        row = color_row(frame, g)
         mean = means2d_in[g]
         conic = conics_in[g]
         shear = conic[1]
@@ -144,16 +122,16 @@ def _composite(
         k += 1
     walked_out[tile] = k - starts_in[tile]
 
-    for b in range(16):
-        t = transmittances_out[first + b]
-        for l in range(16):
-            px = x + (b % 4) * 4 + l % 4
-            py = y + (b // 4) * 4 + l // 4
-            if px < frame.width and py < frame.height:
-                alphas_out[image, py, px] = 1.0 - wp.abs(t[l])
-                for c in range(channels):
-                    s = sums_out[first + b, c]
-                    renders_out[image, py, px, c] = s[l]
+    inside = _blocks_inside(frame, x, y)
+    while inside != 0:
+        b = L.lowest_bit(inside)
+        inside = inside & (inside - 1)
+        px = x + (b % 4) * 4
+        py = y + (b // 4) * 4
+        covered = L.coverage(transmittances_out[first + b])
+        L.store_block(alphas_out, image, py, px, 0, covered)
+        for c in range(channels):
+            L.store_block(renders_out, image, py, px, c, sums_out[first + b, c])
 
 
 @wp.kernel
@@ -173,7 +151,7 @@ def _composite_vjp(
     blocks_in: wp.array[wp.int32],
     walked_in: wp.array[wp.int32],
     v_renders_in: wp.array4d[wp.float32],
-    v_alphas_in: wp.array3d[wp.float32],
+    v_alphas_in: wp.array4d[wp.float32],
     v_sums_out: wp.array2d[L.lanes],
     v_colors_out: wp.array2d[L.lanes],
     v_pairs_out: wp.array2d[wp.float32],
@@ -192,19 +170,19 @@ def _composite_vjp(
         return
 
     any_v = wp.int32(0)
-    for b in range(16):
-        for c in range(channels + 1):
-            v = L.lanes(0.0)
-            for l in range(16):
-                px = x + (b % 4) * 4 + l % 4
-                py = y + (b // 4) * 4 + l // 4
-                if px < frame.width and py < frame.height:
-                    if c < channels:
-                        v[l] = v_renders_in[image, py, px, c]
-                    else:
-                        v[l] = v_alphas_in[image, py, px]
-            any_v = any_v | L.any_nonzero(v)
-            v_sums_out[first + b, c] = v
+    inside = _blocks_inside(frame, x, y)
+    while inside != 0:
+        b = L.lowest_bit(inside)
+        inside = inside & (inside - 1)
+        px = x + (b % 4) * 4
+        py = y + (b // 4) * 4
+        v_alpha = L.load_block(v_alphas_in, image, py, px, 0)
+        v_sums_out[first + b, channels] = v_alpha
+        any_v = any_v | L.any_nonzero(v_alpha)
+        for c in range(channels):
+            v_c = L.load_block(v_renders_in, image, py, px, c)
+            v_sums_out[first + b, c] = v_c
+            any_v = any_v | L.any_nonzero(v_c)
     if any_v == 0:
         return
     skipped_out[tile] = 0
@@ -218,7 +196,7 @@ def _composite_vjp(
         bits = blocks_in[k]
         if bits != 0:
             g = pairs_in[k]
-            row = _color_row(frame, g)
+            row = color_row(frame, g)
             mean = means2d_in[g]
             conic = conics_in[g]
             shear = conic[1]
@@ -279,40 +257,6 @@ def _composite_vjp(
         k -= 1
 
 
-class Walk(NamedTuple):
-    """What forward leaves for backward, by tiles and blocks.
-
-    Attributes:
-        transmittances: ``[tiles * 16, 16]`` final T; negative where the pixel stopped early.
-        stops: ``[tiles * 16, 16]`` int32, the pair at which the pixel stopped.
-        blocks: ``[P]`` int32, one bit per 4 x 4 block to which the pair contributed.
-        walked: ``[tiles]`` int32, pairs walked until every pixel had stopped.
-    """
-
-    transmittances: Tensor
-    stops: Tensor
-    blocks: Tensor
-    walked: Tensor
-
-
-def make_frame(
-    width: int,
-    height: int,
-    views: int,
-    num: int,
-    colors_per_view: bool,
-    alpha_min: float,
-    alpha_max: float,
-) -> Frame:
-    """The scalars of a composite launch as one kernel argument."""
-    frame = Frame()
-    frame.width, frame.height = width, height
-    frame.tiles_x, frame.tiles_y = tile_grid(width, height)
-    frame.views, frame.num, frame.colors_per_view = views, num, int(colors_per_view)
-    frame.alpha_min, frame.alpha_max = alpha_min, alpha_max
-    return frame
-
-
 def composite_forward(
     means2d: Tensor,
     conics: Tensor,
@@ -332,12 +276,12 @@ def composite_forward(
         frame: from ``make_frame``.
 
     Returns:
-        ``renders [I, H, W, C]``, ``alphas [I, H, W]`` and a ``Walk``.
+        ``renders [I, H, W, C]``, ``alphas [I, H, W, 1]`` and a ``Walk``.
     """
     images, channels = means2d.shape[0], colors.shape[1]
     tiles = images * frame.tiles_x * frame.tiles_y
-    renders = colors.new_empty(images, frame.height, frame.width, channels)
-    alphas = colors.new_empty(images, frame.height, frame.width)
+    renders = colors.new_zeros(images, frame.height, frame.width, channels)
+    alphas = colors.new_zeros(images, frame.height, frame.width, 1)
     sums = colors.new_empty(tiles * 16, channels, 16)
     walk = Walk(
         colors.new_empty(tiles * 16, 16),
@@ -394,7 +338,7 @@ def composite_backward(
         frame: as forward.
         walk: as returned forward.
         v_renders: ``[I, H, W, C]``.
-        v_alphas: ``[I, H, W]``.
+        v_alphas: ``[I, H, W, 1]``.
         geometry: whether anything but colours is asked for.
 
     Returns:

@@ -8,7 +8,7 @@ from torch import Tensor
 from ..constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TILE
 from .bin import Bins
 from .checks import check_inputs
-from .composite_cpu import Walk
+from .frame import Walk
 from .harmonics import colors_from_harmonics
 from .meta import Meta
 from .ops import bin_op, composite, project
@@ -114,7 +114,6 @@ def rasterization(
         [width, height, views, int(channels.dim() == 4)],
         [alpha_min, alpha_max],
     )
-    alphas = alphas[..., None]
     renders = _finish(render_mode, renders, alphas, backgrounds)
     meta = Meta(Bins(*bins), Walk(*walk), status)
     meta.update(

@@ -245,3 +245,55 @@ def axpy(a: lanes, s: wp.float32, c: lanes) -> lanes:
 def total(x: lanes) -> wp.float32:
     """Sum of the lanes."""
     ...
+
+
+# The block's pixels that lie in the picture, one channel; strides in bytes.
+_PIXELS = """
+    const int height = {image}.shape[1], width = {image}.shape[2];
+    const int ny = height - y < 4 ? height - y : 4, nx = width - x < 4 ? width - x : 4;
+    char* begin = (char*){image}.data + (size_t)view * {image}.strides[0]
+        + (size_t)y * {image}.strides[1] + (size_t)x * {image}.strides[2]
+        + (size_t)channel * {image}.strides[3];
+    for (int j = 0; j < ny; ++j)
+        for (int i = 0; i < nx; ++i) {{
+            float* pixel = (float*)(begin + j * {image}.strides[1] + i * {image}.strides[2]);
+            {body}
+        }}
+"""
+
+
+@wp.func_native(_PIXELS.format(image="image", body="*pixel = value.c[4 * j + i];"))
+def store_block(
+    image: wp.array4d[wp.float32],
+    view: wp.int32,
+    y: wp.int32,
+    x: wp.int32,
+    channel: wp.int32,
+    value: lanes,
+):
+    """Writes the lanes to image [view, y:y+4, x:x+4, channel]."""
+    ...
+
+
+@wp.func_native(
+    _leaf(
+        "float value[16] = {};"
+        + _PIXELS.format(image="image", body="value[4 * j + i] = *pixel;")
+        + "out = *(const F*)value;"
+    )
+)
+def load_block(
+    image: wp.array4d[wp.float32],
+    view: wp.int32,
+    y: wp.int32,
+    x: wp.int32,
+    channel: wp.int32,
+) -> lanes:
+    """Lanes from image [view, y:y+4, x:x+4, channel], 0 outside the picture."""
+    ...
+
+
+@wp.func_native(_leaf("F T = *(const F*)&t; out = 1.0f - (T < 0.0f ? -T : T);"))
+def coverage(t: lanes) -> lanes:
+    """Returns 1 - |T|."""
+    ...

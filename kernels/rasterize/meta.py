@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from .bin import Bins
-from .composite_cpu import Walk
+from .frame import Walk
 from .project import STATUS_NAMES
 
 

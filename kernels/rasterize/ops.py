@@ -8,8 +8,9 @@ from torch import Tensor
 
 from . import composite_cpu
 from .bin import Bins, bin_gaussians, tile_grid
-from .composite_cpu import Walk, make_frame
-from .project import make_lens, project_backward, project_forward
+from .frame import Walk, make_frame
+from .project import make_lens, project_forward
+from .project_vjp import project_backward
 from .reduce import reduce_pairs
 
 _OP = "gamba_warp::rasterize_"
@@ -150,7 +151,7 @@ def _(means2d, conics, view_opacities, colors, bins, size, alpha_range):
     blocks = images * tiles_x * tiles_y * 16
     return (
         colors.new_empty(images, height, width, colors.shape[1]),
-        colors.new_empty(images, height, width),
+        colors.new_empty(images, height, width, 1),
         colors.new_empty(blocks, 16),
         pairs.new_empty(blocks, 16),
         torch.empty_like(pairs),
