@@ -76,10 +76,12 @@ def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECOND
 
 def _write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
     palette = _palette(frames[:: max(1, len(frames) // 8)])
-    pictures = [
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-        for frame in frames
-    ]
+    pictures = []
+    for frame in frames:
+        picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
+        # Pillow looks colours up coarsely: white may become a neighbour of white.
+        picture.paste(0, mask=Image.fromarray((frame == 255).all(-1)))
+        pictures.append(picture)
     # GIF counts time in units of 10 ms, and viewers slow down anything under 20 ms.
     duration = max(20, round(seconds * 100 / len(frames)) * 10)
     pictures[0].save(

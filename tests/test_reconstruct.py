@@ -128,6 +128,7 @@ def test_gif(tmp_path):
 def test_gif_keeps_its_background_white(tmp_path, object_there):
     frames = np.full((3, 30, 30, 3), 255, np.uint8)
     if object_there:
+        frames[:, 9:21, 9:21] = np.linspace(245, 254, 12 * 12 * 3).reshape(12, 12, 3)  # a soft edge
         frames[:, 10:20, 10:20] = np.random.default_rng(0).integers(0, 256, (3, 10, 10, 3))
     save_turntable(tmp_path / "a.gif", frames)
     with Image.open(tmp_path / "a.gif") as image:
