@@ -1,0 +1,132 @@
+"""Makes the starter set in ``starter/``: forty of the furniture models, small enough to ship.
+
+``gamba data furniture --out FURNITURE``, then
+``python -m gamba_warp.train.data.starter FURNITURE --out starter``. The same call makes the same
+files again. The split is that of the whole furniture set (by group, see ``gamba_warp.dataset``), so
+nothing that is held out here is trained on there.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import tyro
+from tqdm import tqdm
+
+from gamba_warp.cameras import DEFAULT_FOV
+from gamba_warp.dataset import split_of, write_split
+from gamba_warp.errors import UserError
+from gamba_warp.files import atomic_path, output_folder
+from gamba_warp.images import load_rgba
+from gamba_warp.meshes import default_up, load_mesh
+
+from .render import Mesh, Settings, find_meshes, render_object
+
+SETTINGS = Settings(
+    views=24, size=128, fov=DEFAULT_FOV, seed=0, depth=False, format="webp-lossless", up="auto"
+)
+
+OBJECTS = """
+blendswap-cc-0-barrel blendswap-cc-0-basketball blendswap-cc-0-chairwithcushion
+blendswap-cc-0-crate blendswap-cc-0-littleplant blendswap-cc-0-oaktable blendswap-cc-0-rock1
+blendswap-cc-0-stonelantern blendswap-cc-0-tablewithtablecloth blendswap-cc-0-umbrella
+blendswap-cc-by-bulldog blendswap-cc-by-chest blendswap-cc-by-hamburger blendswap-cc-by-lamp
+blendswap-cc-by-plaidchair blendswap-cc-by-siamesecat blendswap-cc-by-toytrain
+blendswap-cc-by-tulip reallusion-sitmale03 scopia-birthday_cake scopia-bowlwithfruits
+scopia-citybus scopia-dog scopia-fireplace1 scopia-living_lamp scopia-maceta
+scopia-rattanarmchair scopia-renault-scenic scopia-shopping-basket scopia-small-oven
+scopia-sneakers scopia-table3
+blendswap-cc-0-desklamp scopia-bed1 scopia-cat scopia-truck
+blendswap-cc-0-teddybear scopia-chair3 scopia-dog-house scopia-toaster
+""".split()
+
+# single pictures by somebody else's renderer, of objects that no training split holds
+ICONS = """
+blendswap-cc-0-antiquechair blendswap-cc-0-armchair2 blendswap-cc-0-kitchenaid
+blendswap-cc-0-teddybear blendswap-cc-by-decorativeplant blendswap-cc-by-fordfocus
+katorlegaz-scooter scopia-bonsai-tree scopia-cardboard-box scopia-chair3 scopia-dog-house
+scopia-toaster
+""".split()
+
+INTRO = """# Where the starter set comes from
+
+Everything here is made from models of Sweet Home 3D's furniture libraries. `data/` holds new
+renderings. `meshes/` holds the models' triangles without materials, moved to a common frame:
+longest side 1, centred, z up. `icons/` holds the libraries' own pictures, unchanged. Thanks to
+everybody named below.
+
+Licences: [CC BY 3.0](https://creativecommons.org/licenses/by/3.0/),
+[CC BY 3.0 US](https://creativecommons.org/licenses/by/3.0/us/),
+[CC0 1.0](https://creativecommons.org/publicdomain/zero/1.0/).
+
+| object | name | in | creator | licence | source |
+| --- | --- | --- | --- | --- | --- |
+"""
+
+
+def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
+    """Makes the starter set from the furniture models.
+
+    Args:
+        furniture: what `gamba data furniture` made.
+        out: the folder to make, afresh.
+    """
+    meshes = {mesh.uid: mesh for mesh in find_meshes(furniture)}
+    missing = [uid for uid in (*OBJECTS, *ICONS) if uid not in meshes]
+    if missing:
+        raise UserError(f"{furniture}: has no {missing[0]}")
+    groups = {uid: meshes[uid].group for uid in OBJECTS}
+    held_out = [uid for uid in OBJECTS if split_of(groups[uid]) != "train"]
+    leaked = [uid for uid in ICONS if split_of(meshes[uid].group) == "train"]
+    if leaked:
+        raise UserError(f"the icon of {leaked[0]} is of a training object")
+    for name in ("data", "meshes", "icons"):
+        shutil.rmtree(out / name, ignore_errors=True)
+        output_folder(out / name)
+    for uid in tqdm(OBJECTS, unit="object"):
+        render_object(meshes[uid], out / "data", SETTINGS)
+    write_split(out / "data", groups)
+    for uid in held_out:
+        _write_geometry(meshes[uid], out / "meshes" / f"{uid}.ply")
+    for uid in ICONS:
+        _copy_icon(furniture / "icons" / f"{uid}.png", out / "icons" / f"{uid}.png")
+    rows = [_row(meshes[uid]) for uid in sorted({*OBJECTS, *ICONS})]
+    with atomic_path(out / "ATTRIBUTION.md") as temporary:
+        temporary.write_text(INTRO + "\n".join(rows) + "\n", encoding="utf-8")
+
+
+def _write_geometry(mesh: Mesh, path: Path) -> None:
+    """The model's triangles in the frame of its views."""
+    import trimesh
+
+    model, _, _ = load_mesh(mesh.path).normalized(default_up(mesh.path), mesh.rotation)
+    bare = trimesh.Trimesh(model.vertices, model.faces, process=True)  # merges equal vertices
+    with atomic_path(path) as temporary:
+        bare.export(temporary, vertex_normal=False)
+
+
+def _copy_icon(source: Path, path: Path) -> None:
+    if load_rgba(source)[..., 3].min() > 0:
+        raise UserError(f"{source}: has no transparent background")
+    shutil.copyfile(source, path)
+
+
+def _row(mesh: Mesh) -> str:
+    known = mesh.attribution
+    folders = []
+    if mesh.uid in OBJECTS:
+        part = split_of(mesh.group)
+        folders += [f"data ({part})"] + (["meshes"] if part != "train" else [])
+    folders += ["icons"] if mesh.uid in ICONS else []
+    cells = [f"`{mesh.uid}`", mesh.name, ", ".join(folders)]
+    cells += [known["creator"], known["licence"], known["source"]]
+    return "| " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(starter)
+    except UserError as error:
+        sys.exit(f"gamba: {error}")
