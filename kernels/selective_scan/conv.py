@@ -55,7 +55,7 @@ def _forward_kernel(device_type: str, io: torch.dtype):
         d = k * wp.static(channels_of_value)
         width = wp.min(wp.static(channels_of_value), x_in.shape[2] - d)
         w0, w1, w2, w3 = weight_in[0, k], weight_in[1, k], weight_in[2, k], weight_in[3, k]
-        x0, x1, x2 = value(), value(), value()
+        x0, x1, x2 = value(0.0), value(0.0), value(0.0)
         for i in range(_HISTORY):
             x0 = x1
             x1 = x2
@@ -107,7 +107,7 @@ def _backward_kernel(device_type: str, io: torch.dtype):
         d = k * wp.static(channels_of_value)
         width = wp.min(wp.static(channels_of_value), x_in.shape[2] - d)
         w0, w1, w2, w3 = weight_in[0, k], weight_in[1, k], weight_in[2, k], weight_in[3, k]
-        x0, x1, x2, x3 = value(), value(), value(), value()
+        x0, x1, x2, x3 = value(0.0), value(0.0), value(0.0), value(0.0)
         for i in range(_HISTORY):
             x0 = x1
             x1 = x2
@@ -116,11 +116,11 @@ def _backward_kernel(device_type: str, io: torch.dtype):
                 x2 = load(x_in, b, t, d, width)
             elif state_in.shape[1] > 0:
                 x2 = load(state_in, b, t + _HISTORY, d, width)
-        g0, g1, g2, g3 = value(), value(), value(), value()
-        v0, v1, v2, v3, vb = value(), value(), value(), value(), value()
+        g0, g1, g2, g3 = value(0.0), value(0.0), value(0.0), value(0.0)
+        v0, v1, v2, v3, vb = value(0.0), value(0.0), value(0.0), value(0.0), value(0.0)
         # dx of token t needs the gradients g of t to t + 3: the loop runs three tokens behind
         for t in range(t0, end + _HISTORY):
-            g3 = value()
+            g3 = value(0.0)
             if t < length:
                 x3 = load(x_in, b, t, d, width)
                 g3 = load(dout_in, b, t, d, width)
@@ -310,8 +310,9 @@ def causal_conv1d(
 
 
 def _check(x, weight, bias, activation, initial_state) -> None:
-    for name, value in (("x", x), ("weight", weight), ("bias", bias), ("state", initial_state)):
-        if value is None and name in ("bias", "state"):
+    tensors = {"x": x, "weight": weight, "bias": bias, "initial_state": initial_state}
+    for name, value in tensors.items():
+        if value is None and name in ("bias", "initial_state"):
             continue
         if not isinstance(value, Tensor):
             raise TypeError(f"{name} is {type(value).__name__}, must be a tensor")
@@ -328,8 +329,8 @@ def _check(x, weight, bias, activation, initial_state) -> None:
         raise ValueError(f"bias has shape {tuple(bias.shape)}, must be ({channels},)")
     want = (batch, weight.shape[1] - 1, channels)
     if initial_state is not None and tuple(initial_state.shape) != want:
-        raise ValueError(f"initial state has shape {tuple(initial_state.shape)}, must be {want}")
+        raise ValueError(f"initial_state has shape {tuple(initial_state.shape)}, must be {want}")
     if initial_state is not None and initial_state.dtype != x.dtype:
-        raise TypeError(f"initial state has dtype {initial_state.dtype}, x has {x.dtype}")
+        raise TypeError(f"initial_state has dtype {initial_state.dtype}, x has {x.dtype}")
     if activation not in ACTIVATIONS:
         raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")
