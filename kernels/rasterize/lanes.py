@@ -141,13 +141,14 @@ def any_positive(x: lanes) -> wp.int32:
     ...
 
 
-# A pixel that has stopped keeps its transmittance with a minus sign.
+# A pixel that has stopped keeps its transmittance, above t_min, with a minus sign. Written without
+# a choice of T itself: that would become a masked store, from which the next load cannot forward.
 @wp.func_native(
     _leaf(
         """
     F T = *(const F*)&t;
-    F next = T - T * *(const F*)&alpha;
-    out = T > 0.0f ? (next > t_min ? next : -T) : T;
+    F next = T - T * (T > 0.0f ? *(const F*)&alpha : F{});
+    out = max_(next, -next) > t_min ? next : -T;
     """
     )
 )
