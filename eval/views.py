@@ -21,6 +21,7 @@ from gamba_warp.files import output_folder
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
 from gamba_warp.lpips import LPIPS, load_lpips, lpips_available
+from gamba_warp.ply import save_ply
 
 from .metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
 from .predictions import Predictions, on_background, open_predictions
@@ -187,6 +188,7 @@ def evaluate_object(
     device: str,
     baselines: bool,
     strips: Path | None,
+    save: Path | None = None,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """One object's record, and its baselines' records by name. Raises UserError, ValueError."""
     truth = load_truth(dataset, uid, protocol, device)
@@ -199,6 +201,10 @@ def evaluate_object(
     by_view = compare(candidates, truth, lpips)
     if strips is not None:
         save_strips(strips / f"{uid}.png", rgb, truth)
+    if save is not None:
+        path = save / f"{uid}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_ply(path, gaussians)
     record = {
         "name": uid,
         "status": OK,
@@ -227,6 +233,7 @@ def eval_views_command(
     strips: int = 8,
     baselines: bool = True,
     lpips: bool = True,
+    save_gaussians: bool = False,
     distance: float = DEFAULT_DISTANCE,
     encoder_weights: Path | None = None,
     device: Annotated[str, tyro.conf.arg(metavar="auto|cpu|cuda")] = "auto",
@@ -245,6 +252,8 @@ def eval_views_command(
         strips: comparison pictures for the first so many objects.
         baselines: also score an empty picture and a copy of the input.
         lpips: LPIPS where its weights are there (gamba weights lpips).
+        save_gaussians: also write OUT/gaussians/NAME.ply, in the input camera's world
+            (eval-geometry --frame reference reads them).
         distance: of the input camera, for .ply files; a checkpoint states its own.
         encoder_weights: the image encoder's file, for a checkpoint that does not hold it.
         device: where to run.
@@ -259,6 +268,7 @@ def eval_views_command(
     dataset = open_dataset(data, split)
     predictions = open_predictions(checkpoint, distance, device, encoder_weights)
     folder = output_folder(out)
+    save = output_folder(folder / "gaussians") if save_gaussians else None
     network, reason = None, None if lpips else "not asked for"
     if lpips and lpips_available():
         network = load_lpips().to(device)
@@ -279,7 +289,7 @@ def eval_views_command(
         where = folder / "strips" if number < strips else None
         try:
             record, others = evaluate_object(
-                predictions, dataset, uid, protocol, network, device, baselines, where
+                predictions, dataset, uid, protocol, network, device, baselines, where, save
             )
         except (UserError, ValueError, RuntimeError) as error:
             objects.append(failure(uid, error))
