@@ -140,7 +140,7 @@ def test_code_in_a_state_file_is_not_run(tmp_path):
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "owned"),)
 
-    (tmp_path / "state.pt").write_bytes(pickle.dumps(Evil()))
+    (tmp_path / "state.pt").write_bytes(pickle.dumps(Evil(), protocol=2))
     with pytest.raises(UserError, match="damaged"):
         read_state(tmp_path)
     torch.save(Evil(), tmp_path / "state.pt")

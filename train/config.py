@@ -41,7 +41,7 @@ class DataConfig:
     views_last: int = 6
     """Novel views per object at the end; the number grows in equal shares of the run."""
     views_per_object: int | None = None
-    """A fixed number of novel views, in place of the growing one."""
+    """A fixed number of novel views, in place of the growing one; 9 with --overfit."""
     background: Literal["white", "black", "random"] = "white"
     """Colour behind the rendered and the true pictures. "random" draws one for each object and
     step. The input picture always lies on the model's own background."""

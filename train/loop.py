@@ -67,7 +67,9 @@ class Trainer:
         self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
         self.ema = Ema(model, config.optim.ema) if config.optim.ema else None
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        self.wrapped = DistributedDataParallel(model) if world.size > 1 else model
+        self.wrapped = model
+        if world.size > 1:
+            self.wrapped = DistributedDataParallel(model, broadcast_buffers=False)
         self.precision = getattr(torch, config.optim.precision)
         self.accumulate = config.views.accumulate
         self.step = self.skipped = self.skipped_in_row = 0
@@ -95,8 +97,6 @@ class Trainer:
         """Uid -> reason, of the objects that could not be read so far."""
         return self._source.failures
 
-    # ---- schedules
-
     def progress(self, step: int) -> float:
         """0 to 1 at a step: its share of all, or the clock's where only minutes are limited."""
         if self.total is not None:
@@ -116,8 +116,8 @@ class Trainer:
     def novel_views(self, step: int) -> int:
         """V of a step."""
         views = self.config.views
-        if views.views_per_object is not None:
-            return views.views_per_object
+        if self.data.novel is not None:
+            return self.data.novel
         return novel_views(self.progress(step), views.views_first, views.views_last)
 
     def weights(self) -> dict[str, float]:
@@ -132,8 +132,6 @@ class Trainer:
             "lpips": loss.lpips_weight if use_lpips else 0.0,
             "rdist": radial_weight(self.step, loss.rdist_weight, span) if loss.radial_mask else 0.0,
         }
-
-    # ---- one step
 
     def train_step(self, batches: Prefetcher) -> dict[str, float]:
         """One optimizer step; returns the figures of its last batch.
@@ -206,8 +204,6 @@ class Trainer:
                 f"{self.skipped_in_row} steps in a row were not finite (step {self.step}); "
                 "lower --lr, or resume from an older checkpoint"
             )
-
-    # ---- the loop
 
     def run(self) -> int:
         """Trains to the end, to the limit of time or to a signal; always leaves a checkpoint.
@@ -296,8 +292,6 @@ class Trainer:
             bar.write(f"step {self.step}: validation {text}")
             save_strip(self.config.run.out / "samples" / f"step_{self.step:06d}.png", rows)
         self.world.barrier()
-
-    # ---- state
 
     def save(self) -> None:
         """Writes a checkpoint on the main process, once per step; the others wait."""

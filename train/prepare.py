@@ -11,6 +11,9 @@ from gamba_warp.lpips import LPIPS, load_lpips, lpips_available
 
 from .config import TrainConfig
 
+# For one object the network's pass is shared by all views, and drawing them is cheap beside it.
+_OVERFIT_VIEWS = 9
+
 
 @dataclass(frozen=True)
 class TrainingData:
@@ -21,6 +24,7 @@ class TrainingData:
         objects: indices into ``train``; one pass over the list is an epoch.
         reference: the input view, or None for any.
         batch_size: objects per batch and process.
+        novel: novel views of each at every step; None means as many as the schedule says.
         validation: objects to validate on.
         held_out: indices into ``validation``; may be empty.
         val_views: novel views of each; None means all.
@@ -31,6 +35,7 @@ class TrainingData:
     objects: list[int]
     reference: int | None
     batch_size: int
+    novel: int | None
     validation: ViewDataset
     held_out: list[int]
     val_views: int | None
@@ -72,6 +77,7 @@ def open_data(config: TrainConfig) -> TrainingData:
         objects=objects,
         reference=0 if views.reference == "first" else None,
         batch_size=views.batch_size or 8,
+        novel=views.views_per_object,
         validation=validation,
         held_out=held_out,
         val_views=run.val_views,
@@ -94,6 +100,7 @@ def _open_one(config: TrainConfig) -> TrainingData:
         objects=[index] * dataset.num_views(index),
         reference=None if views.reference == "random" else 0,
         batch_size=views.batch_size or 1,
+        novel=_OVERFIT_VIEWS if views.views_per_object is None else views.views_per_object,
         validation=dataset,
         held_out=[index],
         val_views=None,
