@@ -151,6 +151,7 @@ def test_charts_place_their_points():
     first, second = points(svg)
     left, middle, right = first
     assert left[0] < middle[0] < right[0] and left[1] > middle[1] > right[1]  # y grows downwards
+    assert left[0] > 0 and right[0] < 640 and left[1] < 240 and right[1] > 16  # inside the viewBox
     assert middle == pytest.approx(((left[0] + right[0]) / 2, (left[1] + right[1]) / 2), abs=0.1)
     assert second == [pytest.approx((right[0], left[1]), abs=0.1)]
     for tick in (">0<", ">100<", ">10<", ">y<"):
