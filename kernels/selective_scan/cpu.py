@@ -8,7 +8,6 @@ once per n, so that h_n lives in registers and N is free. Equations are those of
 import functools
 
 import torch
-import torch.nn.functional as F
 import warp as wp
 from torch import Tensor
 
@@ -25,6 +24,7 @@ from .lanes import (
     softplus,
     times,
 )
+from .layout import BLOCKS, CHUNK, Layout
 from .recurrence import (
     MODES,
     NEED_DB,
@@ -37,14 +37,34 @@ from .recurrence import (
     sum_lanes,
 )
 
-CHUNK = 64  # tokens; a state is saved at the start of each chunk
-BLOCKS = 4  # lane groups of a task; fixed, so that sums do not depend on the number of threads
-
 _K = wp.constant(CHUNK)
 _K1 = wp.constant(CHUNK + 1)
 _P = wp.constant(BLOCKS)
 _W = wp.constant(W)
 _DZ, _DC, _DB, _DH = (wp.constant(v) for v in (NEED_DZ, NEED_DC, NEED_DB, NEED_DH))
+
+
+@wp.struct
+class Sizes:
+    """What both kernels know: shapes, options, and which gradients are wanted."""
+
+    length: int
+    states: int
+    groups: int
+    group_width: int
+    group_blocks: int
+    parts: int
+    use_softplus: int
+    use_z: int
+    needs: int
+
+
+def _sizes(layout: Layout, softplus: bool, z: Tensor | None, needs: int = 0) -> Sizes:
+    sizes = Sizes()
+    for name in ("length", "states", "groups", "group_width", "group_blocks", "parts"):
+        setattr(sizes, name, getattr(layout, name))
+    sizes.use_softplus, sizes.use_z, sizes.needs = int(softplus), int(z is not None), needs
+    return sizes
 
 
 @functools.cache
@@ -58,13 +78,7 @@ def _forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
     def scan_forward(
         offset: int,
         # in
-        length: int,
-        states: int,
-        group_width: int,
-        group_blocks: int,
-        parts: int,
-        use_softplus: int,
-        use_z: int,
+        sizes: Sizes,
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
         z_in: wp.array3d(dtype=scalar),
@@ -79,32 +93,31 @@ def _forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
         y_out: wp.array3d(dtype=scalar),
     ):
         task = offset + wp.tid()
-        part = task % parts
-        group_row = task / parts
-        groups = h_out.shape[1] / group_blocks
-        b = group_row / groups
-        group = group_row % groups
+        part = task % sizes.parts
+        row0 = task / sizes.parts * sizes.states
+        b = task / (sizes.parts * sizes.groups)
+        group = task / sizes.parts % sizes.groups
         rate = wp.zeros(shape=(_K,), dtype=lanes)
         du = wp.zeros(shape=(_K,), dtype=lanes)
         y = wp.zeros(shape=(_K,), dtype=lanes)
         before = flush_denormals()
-        for chunk in range((length + _K - 1) / _K):
+        for chunk in range((sizes.length + _K - 1) / _K):
             t0 = chunk * _K
-            count = wp.min(_K, length - t0)
-            for block in range(part * _P, wp.min((part + 1) * _P, group_blocks)):
-                k = group * group_blocks + block
-                d = group * group_width + block * _W
-                width = wp.min(_W, group_width - block * _W)
+            count = wp.min(_K, sizes.length - t0)
+            for block in range(part * _P, wp.min((part + 1) * _P, sizes.group_blocks)):
+                k = group * sizes.group_blocks + block
+                d = group * sizes.group_width + block * _W
+                width = wp.min(_W, sizes.group_width - block * _W)
                 for t in range(count):
                     step = load_delta(delta_in, b, t0 + t, d, width) + bias_in[k]
-                    if use_softplus != 0:
+                    if sizes.use_softplus != 0:
                         step = softplus(step)
                     ut = load(u_in, b, t0 + t, d, width)
                     rate[t] = step * wp.static(scale)
                     du[t] = times(step, ut)
                     y[t] = times(skip_in[k], ut)
-                for n in range(states):
-                    row = group_row * states + n
+                for n in range(sizes.states):
+                    row = row0 + n
                     h = h_out[b, k, n]
                     if starts_out.shape[1] > 0:
                         starts_out[b, chunk, k, n] = h
@@ -113,7 +126,7 @@ def _forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
                     )
                 for t in range(count):
                     out = y[t]
-                    if use_z != 0:
+                    if sizes.use_z != 0:
                         zt = load(z_in, b, t0 + t, d, width)
                         out = times(out, times(zt, sigmoid(zt)))
                     store(y_out, b, t0 + t, d, width, out)
@@ -133,14 +146,7 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
     def scan_backward(
         offset: int,
         # in
-        length: int,
-        states: int,
-        group_width: int,
-        group_blocks: int,
-        parts: int,
-        use_softplus: int,
-        use_z: int,
-        needs: int,
+        sizes: Sizes,
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
         z_in: wp.array3d(dtype=scalar),
@@ -152,8 +158,8 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
         starts_in: wp.array4d(dtype=lanes),
         dout_in: wp.array3d(dtype=scalar),
         # scratch
-        db_sums: wp.array2d(dtype=lanes),
-        dc_sums: wp.array2d(dtype=lanes),
+        db_sums_out: wp.array2d(dtype=lanes),
+        dc_sums_out: wp.array2d(dtype=lanes),
         # out
         dh_out: wp.array3d(dtype=lanes),
         du_out: wp.array3d(dtype=scalar),
@@ -166,12 +172,10 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
         dbias_out: wp.array2d(dtype=lanes),
     ):
         task = offset + wp.tid()
-        part = task % parts
-        group_row = task / parts
-        groups = dh_out.shape[1] / group_blocks
-        b = group_row / groups
-        group = group_row % groups
-        raw = wp.zeros(shape=(_K,), dtype=lanes)
+        part = task % sizes.parts
+        row0 = task / sizes.parts * sizes.states
+        b = task / (sizes.parts * sizes.groups)
+        group = task / sizes.parts % sizes.groups
         step = wp.zeros(shape=(_K,), dtype=lanes)
         rate = wp.zeros(shape=(_K,), dtype=lanes)
         du = wp.zeros(shape=(_K,), dtype=lanes)
@@ -183,27 +187,26 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
         h = wp.zeros(shape=(_K1,), dtype=lanes)
         da = wp.zeros(shape=(1,), dtype=lanes)
         before = flush_denormals()
-        chunks = (length + _K - 1) / _K
+        chunks = (sizes.length + _K - 1) / _K
         for reverse in range(chunks):
             chunk = chunks - 1 - reverse
             t0 = chunk * _K
-            count = wp.min(_K, length - t0)
-            for i in range(db_sums.shape[1]):
-                db_sums[task, i] = lanes()
-            for i in range(dc_sums.shape[1]):
-                dc_sums[task, i] = lanes()
-            for block in range(part * _P, wp.min((part + 1) * _P, group_blocks)):
-                k = group * group_blocks + block
-                d = group * group_width + block * _W
-                width = wp.min(_W, group_width - block * _W)
+            count = wp.min(_K, sizes.length - t0)
+            for i in range(db_sums_out.shape[1]):
+                db_sums_out[task, i] = lanes()
+            for i in range(dc_sums_out.shape[1]):
+                dc_sums_out[task, i] = lanes()
+            for block in range(part * _P, wp.min((part + 1) * _P, sizes.group_blocks)):
+                k = group * sizes.group_blocks + block
+                d = group * sizes.group_width + block * _W
+                width = wp.min(_W, sizes.group_width - block * _W)
                 for t in range(count):
                     x = load_delta(delta_in, b, t0 + t, d, width) + bias_in[k]
-                    raw[t] = x
-                    if use_softplus != 0:
+                    if sizes.use_softplus != 0:
                         x = softplus(x)
                     ut = load(u_in, b, t0 + t, d, width)
                     grad = load(dout_in, b, t0 + t, d, width)
-                    if use_z != 0:
+                    if sizes.use_z != 0:
                         zt = load(z_in, b, t0 + t, d, width)
                         grad = times(grad, times(zt, sigmoid(zt)))
                     step[t] = x
@@ -213,19 +216,20 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
                     y[t] = times(skip_in[k], ut)
                     s[t] = lanes()
                     p[t] = lanes()
-                for n in range(states):
-                    row = group_row * states + n
+                for n in range(sizes.states):
+                    row = row0 + n
                     a = a_in[k, n]
                     first = n * _K
                     recompute(
                         wp.static(mode), starts_in[b, chunk, k, n], a, rate, du,
-                        b_in[row], c_in[row], t0, count, dy, needs, first, y, f, h, dc_sums[task],
+                        b_in[row], c_in[row], t0, count, dy, sizes.needs, first, y, f, h,
+                        dc_sums_out[task],
                     )  # fmt: skip
-                    if (needs & _DH) != 0:
+                    if (sizes.needs & _DH) != 0:
                         dh_out[b, k, n] = retreat(
                             wp.static(mode), dh_out[b, k, n], a, rate, du,
-                            b_in[row], c_in[row], t0, count, step, dy, f, h, needs, first, s, p,
-                            db_sums[task], da,
+                            b_in[row], c_in[row], t0, count, step, dy, f, h, sizes.needs, first,
+                            s, p, db_sums_out[task], da,
                         )  # fmt: skip
                         da_out[b, k, n] = da_out[b, k, n] + da[0]
                 dskip = lanes()
@@ -233,15 +237,16 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
                 for t in range(count):
                     ut = load(u_in, b, t0 + t, d, width)
                     dskip = fma(dy[t], ut, dskip)
-                    if (needs & _DZ) != 0:
+                    if (sizes.needs & _DZ) != 0:
                         zt = load(z_in, b, t0 + t, d, width)
                         sig = sigmoid(zt)
                         slope = fma(times(zt, sig), lanes(1.0) - sig, sig)
                         grad = load(dout_in, b, t0 + t, d, width)
                         store(dz_out, b, t0 + t, d, width, times(times(grad, y[t]), slope))
                     ddelta = fma(ut, s[t], p[t])
-                    if use_softplus != 0:
-                        ddelta = times(ddelta, sigmoid(raw[t]))
+                    if sizes.use_softplus != 0:
+                        x = load_delta(delta_in, b, t0 + t, d, width) + bias_in[k]
+                        ddelta = times(ddelta, sigmoid(x))
                     dbias = dbias + ddelta
                     if du_out.shape[1] > 0:
                         v = fma(step[t], s[t], times(skip_in[k], dy[t]))
@@ -250,63 +255,15 @@ def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str
                         store_delta(ddelta_out, b, t0 + t, d, width, ddelta)
                 dskip_out[b, k] = dskip_out[b, k] + dskip
                 dbias_out[b, k] = dbias_out[b, k] + dbias
-            if (needs & _DB) != 0:
-                for n in range(states):
-                    sum_lanes(db_sums[task], n * _K, count, t0, db_out[task, n])
-            if (needs & _DC) != 0:
-                for n in range(states):
-                    sum_lanes(dc_sums[task], n * _K, count, t0, dc_out[task, n])
+            if (sizes.needs & _DB) != 0:
+                for n in range(sizes.states):
+                    sum_lanes(db_sums_out[task], n * _K, count, t0, db_out[task, n])
+            if (sizes.needs & _DC) != 0:
+                for n in range(sizes.states):
+                    sum_lanes(dc_sums_out[task], n * _K, count, t0, dc_out[task, n])
         restore_denormals(before)
 
     return scan_backward
-
-
-class _Layout:
-    """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded."""
-
-    def __init__(self, u: Tensor, A: Tensor, B: Tensor):
-        self.batch, self.length, self.channels = u.shape
-        self.states, self.groups = A.shape[1], B.shape[2]
-        self.group_width = self.channels // self.groups
-        self.group_blocks = -(-self.group_width // W)
-        self.parts = -(-self.group_blocks // BLOCKS)
-        self.blocks = self.groups * self.group_blocks
-        self.tasks = self.batch * self.groups * self.parts
-        self.chunks = -(-self.length // CHUNK)
-
-    def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
-        """``[.., D, *]`` to float32 ``[.., blocks, *, W]``, a copy; None becomes zeros."""
-        if x is None:
-            return torch.zeros(*lead, self.blocks, W)
-        n = len(lead)
-        tail = tuple(x.shape[n + 1 :])
-        x = x.float().reshape(*lead, self.groups, self.group_width, *tail)
-        x = x.movedim(n + 1, -1)
-        x = F.pad(x, (0, self.group_blocks * W - self.group_width))
-        x = x.reshape(*lead, self.groups, *tail, self.group_blocks, W).movedim(-2, n + 1)
-        return x.reshape(*lead, self.blocks, *tail, W).contiguous().clone()
-
-    def unpack(self, x: Tensor, lead: tuple[int, ...] = ()) -> Tensor:
-        """The inverse of ``pack``, dense."""
-        n = len(lead)
-        tail = tuple(x.shape[n + 1 : -1])
-        x = x.reshape(*lead, self.groups, self.group_blocks, *tail, W).movedim(n + 1, -2)
-        x = x.reshape(*lead, self.groups, *tail, self.group_blocks * W)
-        x = x[..., : self.group_width].movedim(-1, n + 1)
-        return x.reshape(*lead, self.channels, *tail).contiguous()
-
-    def rows(self, x: Tensor) -> Tensor:
-        """``[B, L, G, N]`` to float32 ``[B·G·N, L]``: the tokens of one state are adjacent."""
-        rows = self.batch * self.groups * self.states
-        return x.permute(0, 2, 3, 1).float().reshape(rows, self.length).contiguous()
-
-    def sizes(self) -> list[int]:
-        return [self.length, self.states, self.group_width, self.group_blocks, self.parts]
-
-    def total(self, parts: Tensor, dtype: torch.dtype) -> Tensor:
-        """Sums ``[tasks, N, L]`` over the parts of a group: ``[B, L, G, N]``."""
-        x = parts.view(self.batch, self.groups, self.parts, self.states, self.length).sum(2)
-        return x.permute(0, 3, 1, 2).to(dtype, memory_format=torch.contiguous_format)
 
 
 def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save):
@@ -318,7 +275,7 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
     Returns:
         ``out [B, L, D]``, the last state ``[B, D, N]`` and the saved states (a private layout).
     """
-    layout = _Layout(u, A, B)
+    layout = Layout(u, A, B)
     lead = (layout.batch,)
     if initial_state is None:
         h = torch.zeros(layout.batch, layout.blocks, layout.states, W)
@@ -331,7 +288,7 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
         _forward_kernel(u.dtype, delta.dtype, discretization),
         layout.tasks,
         [
-            *layout.sizes(), int(softplus), int(z is not None),
+            _sizes(layout, softplus, z),
             lane_contiguous(u), lane_contiguous(delta), lane_contiguous(u if z is None else z),
             view(layout.pack(A), lanes), layout.rows(B), layout.rows(C),
             view(layout.pack(D), lanes), view(layout.pack(delta_bias), lanes),
@@ -352,7 +309,7 @@ def backward(
     Returns:
         Nine tensors, None where not needed.
     """
-    layout = _Layout(u, A, B)
+    layout = Layout(u, A, B)
     lead = (layout.batch,)
     need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
     through = need_u or need_delta or need_A or need_B or need_bias or need_h
@@ -378,7 +335,7 @@ def backward(
         _backward_kernel(u.dtype, delta.dtype, discretization),
         layout.tasks,
         [
-            *layout.sizes(), int(softplus), int(z is not None), flags,
+            _sizes(layout, softplus, z, flags),
             lane_contiguous(u), lane_contiguous(delta), lane_contiguous(u if z is None else z),
             view(layout.pack(A), lanes), layout.rows(B), layout.rows(C),
             view(layout.pack(D), lanes), view(layout.pack(delta_bias), lanes),
@@ -405,5 +362,5 @@ def backward(
 
 def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    layout = _Layout(u, A, B)
+    layout = Layout(u, A, B)
     return (layout.batch, layout.chunks if save else 0, layout.blocks, layout.states, W)

@@ -40,7 +40,7 @@ def selective_scan_reference(
     discretization: str = "mamba",
 ) -> tuple[Tensor, Tensor]:
     """One token after the other; arguments as ``selective_scan``. Returns (out, last state)."""
-    batch, length, channels = u.shape
+    batch, _, channels = u.shape
     if B.dim() == 3:
         B = B[:, :, None]
     if C.dim() == 3:
@@ -53,11 +53,11 @@ def selective_scan_reference(
         delta = F.softplus(delta)
     h = u.new_zeros(batch, channels, A.shape[1]) if initial_state is None else initial_state
     rows = []
-    for t in range(length):
-        step = delta[:, t, :, None]
-        f, g = discretize(step * A, discretization)
-        h = f * h + g * step * B[:, t] * u[:, t, :, None]
-        rows.append((h * C[:, t]).sum(-1))
+    tokens = (u.unbind(1), delta.unbind(1), B.unbind(1), C.unbind(1))  # indexing costs a fill each
+    for u_t, delta_t, B_t, C_t in zip(*tokens):
+        f, g = discretize(delta_t[..., None] * A, discretization)
+        h = f * h + g * delta_t[..., None] * B_t * u_t[..., None]
+        rows.append((h * C_t).sum(-1))
     y = torch.stack(rows, 1) if rows else torch.zeros_like(u)
     if D is not None:
         y = y + D * u
