@@ -152,6 +152,7 @@ def test_huge_pictures_are_refused_before_they_are_decoded(tmp_path, monkeypatch
         load_rgba(tmp_path / "a.png")
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of the TIFF decoder
 @pytest.mark.parametrize("form", ["PNG", "JPEG", "GIF", "TIFF", "WEBP", "BMP"])
 def test_damaged_files_give_a_picture_or_a_user_error(tmp_path, form):
     rng, whole = random.Random(form), encoded(form)
