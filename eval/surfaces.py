@@ -34,6 +34,7 @@ class SurfaceOptions:
         pixels: side of a TSDF depth map.
         truncation: of the TSDF, in voxels.
         min_alpha: pixels with less have no depth.
+        min_support: fused voxels that a smaller share of the views support are dropped.
         level: of the density.
         min_component: smaller parts are removed, as a share of all faces.
     """
@@ -44,6 +45,7 @@ class SurfaceOptions:
     pixels: int = 256
     truncation: float = 5.0
     min_alpha: float = 0.5
+    min_support: float = 0.1
     level: float = 0.5
     min_component: float = 0.01
 
@@ -125,10 +127,11 @@ def tsdf(gaussians: Gaussians, options: SurfaceOptions) -> Mesh:
             continue
         image = o3d.t.geometry.Image(o3d.core.Tensor(depth.numpy()[..., None]))
         pose = o3d.core.Tensor(viewmat.double().numpy())
-        reach = {"trunc_voxel_multiplier": options.truncation}
+        reach = {"trunc_voxel_multiplier": float(options.truncation)}
         blocks = grid.compute_unique_block_coordinates(image, K, pose, **scales, **reach)
         grid.integrate(blocks, image, K, pose, **scales, **reach)
-    mesh = grid.extract_triangle_mesh(weight_threshold=1.0)
+    support = max(1.0, options.min_support * options.views)
+    mesh = grid.extract_triangle_mesh(weight_threshold=support)
     if "indices" not in mesh.triangle or len(mesh.triangle["indices"]) == 0:
         raise UserError("the fused depth has no surface")
     return Mesh(

@@ -20,7 +20,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
-from gamba_warp.lpips import LPIPS, load_lpips, lpips_available
+from gamba_warp.lpips import FETCH, LPIPS, load_lpips, lpips_available
 from gamba_warp.ply import save_ply
 
 from .metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
@@ -221,6 +221,14 @@ def evaluate_object(
     return record, {name: summary(views) for name, views in by_view.items()}
 
 
+def _lpips_or_reason(device: str) -> tuple[LPIPS | None, str | None]:
+    if lpips_available():
+        return load_lpips().to(device), None
+    reason = f"no weights; fetch them with: {FETCH}"
+    print(f"LPIPS left out: {reason}")
+    return None, reason
+
+
 def eval_views_command(
     checkpoint: tyro.conf.Positional[Path],
     data: tyro.conf.Positional[Path],
@@ -269,12 +277,7 @@ def eval_views_command(
     predictions = open_predictions(checkpoint, distance, device, encoder_weights)
     folder = output_folder(out)
     save = output_folder(folder / "gaussians") if save_gaussians else None
-    network, reason = None, None if lpips else "not asked for"
-    if lpips and lpips_available():
-        network = load_lpips().to(device)
-    elif lpips:
-        reason = "no weights; fetch them with: gamba weights lpips"
-        print(f"LPIPS left out: {reason}")
+    network, reason = _lpips_or_reason(device) if lpips else (None, "not asked for")
     protocol = ViewsProtocol(
         split=split,
         reference=reference,

@@ -9,8 +9,21 @@ import trimesh
 from gamba_warp.cli import run
 from gamba_warp.errors import UserError
 from gamba_warp.eval.alignment import icp, match_moments
-from gamba_warp.eval.geometry import PRESETS, GeometryProtocol, compare, load_truth
-from gamba_warp.eval.occupancy import grid_around, parity, solid, syncdreamer_grid
+from gamba_warp.eval.geometry import (
+    PRESETS,
+    GeometryProtocol,
+    compare,
+    load_truth,
+    syncdreamer_points,
+)
+from gamba_warp.eval.occupancy import (
+    VOTERS,
+    fibonacci_sphere,
+    grid_around,
+    parity,
+    solid,
+    syncdreamer_grid,
+)
 from gamba_warp.eval.shapes import Mesh, Similarity, load_shape, sample
 from gamba_warp.eval.surfaces import SurfaceOptions, cleaned, opacity_volume, to_surface
 from gamba_warp.gaussians import Gaussians
@@ -41,8 +54,6 @@ def protocol(**options):
 
 
 def shell(radius, count=4000, sigma=0.012):
-    from gamba_warp.eval.occupancy import fibonacci_sphere
-
     means = radius * torch.from_numpy(fibonacci_sphere(count)).float()
     return Gaussians(
         means=means,
@@ -101,10 +112,25 @@ def test_solid_of_open_meshes():
         assert least < share <= 1  # only the mouth is lost
 
 
-def test_solid_of_a_sheet():
-    corners = np.array([[-0.5, -0.5, 0.01], [0.5, -0.5, 0.01], [0.5, 0.5, 0.2], [-0.5, 0.5, 0.2]])
-    sheet = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+@pytest.mark.parametrize("tilt", [0.0, 0.3, 0.9, 1.57])
+def test_solid_of_a_sheet(tilt):
+    side, rise = math.cos(tilt), math.sin(tilt)
+    corners = [[-0.4, 0, 0], [0.4, 0, 0], [0.4, side, rise], [-0.4, side, rise]]
+    sheet = Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
     assert not solid(sheet, grid_around(sheet, resolution=32)).any()
+    half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
+    assert (half[:, 2] > 0).all()  # so no direction is also among the opposites
+
+
+def test_syncdreamer_sees_from_above():
+    points = syncdreamer_points(cube()).positions
+    low, high = points.min(0), points.max(0)
+    assert np.allclose(high, 0.5, atol=1e-3) and low[0] < -0.499 and low[1] < -0.499
+    assert np.mean(points[:, 2] > 0.499) > 0.15  # the top, one of five sides seen
+    inside = np.abs(points[:, :2]).max(1) < 0.49
+    assert points[inside, 2].min() > 0.49  # the bottom is not seen
+    spacing = len(points) / 5
+    assert 0.8e4 < spacing < 2.5e4  # a mean point a voxel of 0.01: about 1e4 a side
 
 
 def test_unmerged_corners_are_still_closed():
