@@ -11,7 +11,7 @@ from .errors import UserError
 
 # command (one or two words) -> ("module:function", one line of help). Modules load when called.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("gamba_warp.demo:demo", "Train, reconstruct and evaluate on the starter set."),
+    "demo": ("gamba_warp.demo:demo_command", "Train, reconstruct and evaluate on the starter set."),
     "reconstruct": ("gamba_warp.reconstruct:reconstruct_command", "Pictures to 3D Gaussians."),
     "train": ("gamba_warp.train.__main__:train_command", "Train a model on posed views."),
     "data furniture": ("gamba_warp.train.data.furniture:furniture_command", "Get 820 models."),
