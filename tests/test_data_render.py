@@ -12,7 +12,7 @@ from gamba_warp.cameras import from_opengl, intrinsics
 from gamba_warp.cli import run
 from gamba_warp.dataset import open_dataset
 from gamba_warp.errors import UserError
-from gamba_warp.meshes import load_mesh
+from gamba_warp.meshes import load_mesh, to_linear
 from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses
 from gamba_warp.train.data.raycast import Lights, RayCaster
 from gamba_warp.train.data.render import find_meshes, render_command
@@ -145,6 +145,14 @@ def test_cut_out_and_glass_let_rays_pass(tmp_path):
     write_quad(tmp_path, mtl="newmtl paint\nKd 1 1 1\nd 0.25\n")
     picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
     assert picture[16, 16, 3] == pytest.approx(0.25, abs=1e-6) and depth[16, 16] == 0
+    glass = "newmtl paint\nKd 1 1 1\nd 0.25\nnewmtl red\nKd 1 0 0\nd 0.5\n"
+    write_quad(tmp_path, obj=QUAD + back, mtl=glass)
+    picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
+    assert picture[16, 16, 3] == pytest.approx(1 - 0.75 * 0.5, abs=1e-6)
+    # red gets 1/4 of white and 3/8 of red, green only the white; mixed in linear light
+    mixed = to_linear(picture[16, 16, :2])
+    assert mixed[1] / mixed[0] == pytest.approx(0.25 / (0.25 + 0.375), abs=0.02)
+    assert depth[16, 16] == pytest.approx(2.25)  # where half the light is blocked
 
 
 def test_edges_are_smooth_and_keep_their_colour(tmp_path):
