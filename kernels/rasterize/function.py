@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -89,14 +91,14 @@ def rasterization(
         alpha_max=alpha_max,
     )  # fmt: skip
     lead = check_inputs(tensors, options)
-    views = viewmats.shape[-3]
+    views, size = viewmats.shape[-3], math.prod(lead)
     flat = {
-        name: None if x is None else x.reshape(-1, *x.shape[len(lead) :]).float().contiguous()
+        name: None if x is None else x.reshape(size, *x.shape[len(lead) :]).float().contiguous()
         for name, x in tensors.items()
     }
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat.values()
     if sh_degree is not None:
-        colors = colors_from_harmonics(sh_degree, colors, means, viewmats)
+        colors = colors_from_harmonics(sh_degree, colors, means, viewmats).contiguous()
     antialiased = rasterize_mode == "antialiased"
     lens = [width, height, near_plane, far_plane, radius_clip, eps2d, alpha_min, antialiased]
     means2d, conics, depths, view_opacities, extents, status = project(
@@ -105,6 +107,7 @@ def rasterization(
     per_view = [x.flatten(0, 1) for x in (means2d, conics, depths, view_opacities, extents)]
     bins = bin_op(*(x.detach() for x in per_view), width, height, alpha_min)
     channels = _channels(render_mode, colors, depths)
+    skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
     renders, alphas, *walk = composite(
         per_view[0],
         per_view[1],
@@ -113,9 +116,10 @@ def rasterization(
         list(bins),
         [width, height, views, int(channels.dim() == 4)],
         [alpha_min, alpha_max],
+        skipped,
     )
     renders = _finish(render_mode, renders, alphas, backgrounds)
-    meta = Meta(Bins(*bins), Walk(*walk), status)
+    meta = Meta(Bins(*bins), Walk(*walk), status, skipped)
     meta.update(
         means2d=means2d, conics=conics, depths=depths, opacities=view_opacities,
         radii=extents.ceil().int(),

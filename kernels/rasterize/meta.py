@@ -14,14 +14,17 @@ class Meta(dict):
     ``culled``: dict of counts of (view, Gaussian) by reason; ``pairs_box`` and ``pairs``: (tile,
     Gaussian) pairs without and with the exact test; ``pairs_walked``: until every pixel of the tile
     had stopped; ``blocks_used``: 4 x 4 blocks of pixels to which a pair contributed;
-    ``tiles`` and ``tiles_empty``.
+    ``tiles`` and ``tiles_empty``; ``tiles_skipped``: not walked by the latest backward, being empty
+    or without upstream gradient. The last one is None before a backward and under torch.compile.
     """
 
-    def __init__(self, bins: Bins, walk: Walk, status: Tensor):
+    def __init__(self, bins: Bins, walk: Walk, status: Tensor, skipped: Tensor | None):
         super().__init__()
-        self._bins, self._walk, self._status = bins, walk, status
+        self._bins, self._walk, self._status, self._skipped = bins, walk, status, skipped
 
     def __missing__(self, key: str):
+        if key == "tiles_skipped":
+            return None if self._skipped is None or self._skipped < 0 else int(self._skipped)
         counts = {
             "culled": self._culled,
             "pairs_box": lambda: int(self._bins.box_pairs),

@@ -6,7 +6,7 @@ They hold no arithmetic: each calls the launchers of its file. ``function.py`` j
 import torch
 from torch import Tensor
 
-from . import composite_cpu
+from . import composite_cpu, composite_cuda
 from .bin import Bins, bin_gaussians, tile_grid
 from .frame import Walk, make_frame
 from .project import make_lens, project_forward
@@ -14,6 +14,10 @@ from .project_vjp import project_backward
 from .reduce import reduce_pairs
 
 _OP = "gamba_warp::rasterize_"
+
+
+def _compositor(device: torch.device):
+    return composite_cpu if device.type == "cpu" else composite_cuda
 
 
 @torch.library.custom_op(_OP + "project", mutates_args=())
@@ -127,12 +131,14 @@ def composite(
     bins: list[Tensor],
     size: list[int],
     alpha_range: list[float],
+    skipped: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Blends the pairs; ``size`` is width, height, V, and whether colours are per view.
 
     ``colors`` is ``[I * N, C]`` or, shared by the views, ``[B * N, C]``; ``bins`` is a ``Bins``.
+    Backward counts the tiles that it skips into ``skipped``, int64 without dimensions.
     """
-    renders, alphas, walk = composite_cpu.composite_forward(
+    renders, alphas, walk = _compositor(means2d.device).composite_forward(
         means2d, conics, view_opacities, colors, Bins(*bins), _frame(means2d, size, alpha_range)
     )
     return renders, alphas, *walk
@@ -144,7 +150,7 @@ def _frame(means2d: Tensor, size: list[int], alpha_range: list[float]):
 
 
 @composite.register_fake
-def _(means2d, conics, view_opacities, colors, bins, size, alpha_range):
+def _(means2d, conics, view_opacities, colors, bins, size, alpha_range, skipped):
     width, height = size[:2]
     tiles_x, tiles_y = tile_grid(width, height)
     images, pairs = means2d.shape[0], Bins(*bins).pairs
@@ -174,7 +180,7 @@ def _composite_vjp(
     geometry: bool,
 ) -> list[Tensor]:
     every = Bins(*bins)
-    v_pairs, _ = composite_cpu.composite_backward(
+    v_pairs, skipped = _compositor(means2d.device).composite_backward(
         means2d,
         conics,
         view_opacities,
@@ -187,24 +193,30 @@ def _composite_vjp(
         geometry,
     )
     grads = reduce_pairs(v_pairs, every, conics, view_opacities, geometry)
-    return [g for g in grads if g is not None]
+    return [skipped, *(g for g in grads if g is not None)]
 
 
 @_composite_vjp.register_fake
 def _(means2d, conics, view_opacities, colors, bins, size, alpha_range, walk, *rest):
     v_colors = colors.new_empty(*view_opacities.shape, colors.shape[1])
+    skipped = torch.empty_like(Walk(*walk).walked)
     if not rest[-1]:
-        return [v_colors]
-    return [*map(torch.empty_like, (means2d, conics, view_opacities)), v_colors]
+        return [skipped, v_colors]
+    return [skipped, *map(torch.empty_like, (means2d, conics, view_opacities)), v_colors]
 
 
 def _composite_setup(ctx, inputs, output):
-    means2d, conics, view_opacities, colors, bins, ctx.size, ctx.alpha_range = inputs
+    means2d, conics, view_opacities, colors, bins, ctx.size, ctx.alpha_range, ctx.skipped = inputs
     renders, alphas, *walk = output
     ctx.mark_non_differentiable(*walk)
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(means2d, conics, view_opacities, colors, *bins, *walk)
     ctx.shapes = renders.shape, alphas.shape
+
+
+def _shaped(gradient: Tensor, value: Tensor) -> Tensor:
+    # without a view there is nothing to sum
+    return gradient.reshape(value.shape) if gradient.numel() else torch.zeros_like(value)
 
 
 def _composite_backward(ctx, v_renders, v_alphas, *_):
@@ -214,7 +226,7 @@ def _composite_backward(ctx, v_renders, v_alphas, *_):
     v_alphas = colors.new_zeros(ctx.shapes[1]) if v_alphas is None else v_alphas
     needs = ctx.needs_input_grad
     geometry = any(needs[:3])
-    *v_geometry, v_colors = _composite_vjp(
+    skipped, *v_geometry, v_colors = _composite_vjp(
         means2d,
         conics,
         view_opacities,
@@ -228,12 +240,14 @@ def _composite_backward(ctx, v_renders, v_alphas, *_):
         geometry,
     )
     v_means2d, v_conics, v_view_opacities = v_geometry if geometry else (None, None, None)
+    if ctx.skipped is not None:
+        ctx.skipped.copy_(skipped.sum())
     views, per_view = ctx.size[2:]
-    if not per_view:
-        num, channels = v_colors.shape[1:]
-        v_colors = v_colors.view(-1, views, num, channels).sum(1)
-    v_colors = v_colors.reshape(colors.shape) if needs[3] else None
-    return v_means2d, v_conics, v_view_opacities, v_colors, [None] * len(bins), None, None
+    if not per_view and views:
+        images, num, channels = v_colors.shape
+        v_colors = v_colors.view(images // views, views, num, channels).sum(1)
+    v_colors = _shaped(v_colors, colors) if needs[3] else None
+    return v_means2d, v_conics, v_view_opacities, v_colors, [None] * len(bins), None, None, None
 
 
 composite.register_autograd(_composite_backward, setup_context=_composite_setup)

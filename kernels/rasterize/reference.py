@@ -51,8 +51,8 @@ def _jacobian(points: Tensor, K: Tensor, width: int, height: int) -> Tensor:
 
 
 def _blend(mean2d, conic, opacity, channels, pixels, alpha_min, alpha_max):
-    d = pixels[:, None] - mean2d[None]
-    q = (d[..., None, :] @ conic @ d[..., None])[..., 0, 0]
+    dx, dy = (pixels[:, None] - mean2d[None]).unbind(-1)
+    q = conic[:, 0, 0] * dx * dx + 2 * conic[:, 0, 1] * dx * dy + conic[:, 1, 1] * dy * dy
     alpha = (opacity * torch.exp(-0.5 * q)).clamp_max(alpha_max)
     alpha = torch.where(alpha >= alpha_min, alpha, 0.0)
     after = torch.cumprod(1 - alpha, 1)
