@@ -23,7 +23,6 @@ GREY = 0.6  # display value of a surface whose colour is not known
 MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
 CREASE = np.cos(np.radians(40))  # a vertex normal farther than this from its face's is not used
 
-_TEXTURED = b"gamba_textured"  # key of a note in a material that names a texture
 _Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
@@ -111,7 +110,8 @@ def default_up(path: str | Path) -> str:
 def load_mesh(path: str | Path) -> TexturedMesh:
     """Reads a mesh file: .obj (with .mtl), .glb, .gltf, .ply, .stl or .off.
 
-    A missing material or texture is replaced by grey and named in ``warnings``.
+    A missing texture is replaced by its material's plain colour, a missing material by grey, a
+    texture without UV coordinates by its mean colour; ``warnings`` names each.
 
     Raises:
         UserError: missing, unreadable, no faces, vertices not finite, or no extent.
@@ -201,10 +201,12 @@ def _resolver(path: Path, warnings: list[str]):
             if file is None:
                 warnings.append(f"{name}: not found")
                 raise OSError(f"{name}: not found")
-            data = file.read_bytes()
-            if file.suffix.lower() == ".mtl":  # trimesh forgets the textures it could not open
-                data = re.sub(rb"(?im)^\s*map_kd\s.*$", rb"\g<0>\n" + _TEXTURED + b" 1", data)
-            return data
+            if file.suffix.lower() in Image.registered_extensions():
+                try:
+                    Image.open(file).close()
+                except OSError:  # trimesh would go on without a word
+                    warnings.append(f"{name}: not a picture")
+            return file.read_bytes()
 
     return Resolver(str(path))
 
@@ -241,11 +243,12 @@ def _flatten(mesh, matrix: np.ndarray, warnings: list[str], path: Path) -> tuple
     colors = np.full((count, 3, 4), 255, np.uint8)
     visual = mesh.visual
     if visual.kind == "texture":
-        material, textured = _material(visual.material, path, warnings)
+        material = _material(visual.material, path, warnings)
         if visual.uv is not None and len(visual.uv) == len(vertices):
             uvs = np.nan_to_num(np.asarray(visual.uv, np.float32)[faces])
-        elif textured:
+        elif material.texture is not None:
             warnings.append("a textured part has no UV coordinates")
+            material.texture = material.texture.mean((0, 1), keepdims=True).astype(np.uint8)
         vertex_colors = visual.vertex_attributes.get("color")
     else:
         material = Material(np.ones(4, np.float32))
@@ -292,8 +295,8 @@ def _corner_normals(
     return np.where(np.abs(agree) > CREASE, smooth, flat).astype(np.float32)
 
 
-def _material(source, path: Path, warnings: list[str]) -> tuple[Material, bool]:
-    """The material of a trimesh one, and whether it has a texture."""
+def _material(source, path: Path, warnings: list[str]) -> Material:
+    """The material of a trimesh one."""
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     if isinstance(source, PBRMaterial):
@@ -307,24 +310,25 @@ def _material(source, path: Path, warnings: list[str]) -> tuple[Material, bool]:
         elif source.alphaMode == "MASK" and texture is not None:
             cut = 0.5 if source.alphaCutoff is None else source.alphaCutoff
             texture[..., 3] = np.where(texture[..., 3] >= 255 * cut, 255, 0)
-        return Material(color.astype(np.float32), texture), texture is not None
+        return Material(color.astype(np.float32), texture)
     grey = Material(np.array([*[to_linear(GREY)] * 3, 1], np.float32))
     # trimesh makes up an empty material; one from an MTL file has the file's lines in kwargs
     made_up = path.suffix.lower() == ".obj" and not source.kwargs
     if not isinstance(source, SimpleMaterial) or made_up:
         warnings.append("a part has no material: grey")
-        return grey, False
+        return grey
     texture = _texture(source.image, warnings)
     mask = source.kwargs.get("map_d")
     if texture is not None and mask:
         texture = _with_mask(texture, path.parent, " ".join(mask), warnings)
     color = np.ones(4, np.float32)
     if texture is None:
-        color[:3] = to_linear(np.asarray(source.diffuse[:3], np.float32) / 255)
-        if _TEXTURED.decode() in source.kwargs:
+        if "kd" in source.kwargs:
+            color[:3] = to_linear(np.asarray(source.diffuse[:3], np.float32) / 255)
+        else:
             color[:3] = grey.color[:3]
     color[3] = _opacity(source.kwargs)
-    return Material(color, texture), texture is not None
+    return Material(color, texture)
 
 
 def _opacity(options: dict) -> float:

@@ -69,7 +69,7 @@ def test_normalized(tmp_path):
     "changes, warning",
     [
         ({"mtl": None}, "quad.mtl: not found"),
-        ({"texture": None}, "paint.png: not found"),
+        ({"texture": None, "mtl": MTL.replace("Kd 0.1 0.1 0.1", "")}, "paint.png: not found"),
         ({"obj": QUAD.replace("usemtl paint", "usemtl other")}, "no material: grey"),
     ],
 )
@@ -81,15 +81,23 @@ def test_missing_parts_are_grey_and_named(tmp_path, changes, warning):
     np.testing.assert_allclose(material.color, [*[to_linear(0.6)] * 3, 1])
 
 
-def test_broken_texture_is_grey_and_named(tmp_path):
+def test_broken_texture_becomes_the_plain_colour(tmp_path):
     path = write_quad(tmp_path)
-    (tmp_path / "paint.png").write_bytes((tmp_path / "paint.png").read_bytes()[:60])
-    mesh = load_mesh(path)
-    assert mesh.materials[0].texture is None
-    assert any("paint.png: cannot be decoded" in line for line in mesh.warnings)
-    (tmp_path / "paint.png").write_bytes(b"no picture")
-    mesh = load_mesh(path)
-    np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear(0.6))
+    for content in ((tmp_path / "paint.png").read_bytes()[:60], b"no picture", None):
+        (tmp_path / "paint.png").unlink()
+        if content is not None:
+            (tmp_path / "paint.png").write_bytes(content)
+        mesh = load_mesh(path)
+        assert mesh.materials[0].texture is None
+        assert any("paint.png" in line for line in mesh.warnings), content
+        # 0.1 is rounded to 8 bits on the way
+        np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear(0.1), atol=1e-3)
+
+
+def test_texture_without_uvs_becomes_its_mean(tmp_path):
+    mesh = load_mesh(write_quad(tmp_path, obj=QUAD.replace("1/1 2/2 3/3 4/4", "1 2 3 4")))
+    assert mesh.warnings == ["a textured part has no UV coordinates"]
+    np.testing.assert_array_equal(mesh.materials[0].texture, [[[127, 127, 63, 255]]])
 
 
 @pytest.mark.parametrize(
