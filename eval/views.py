@@ -28,6 +28,7 @@ from .predictions import Predictions, on_background, open_predictions
 from .report import OK, check_finite, failure, mean_of, print_summary, versions, write_report
 
 WHITE = 1.0
+BATCH = 4  # views compared at once: bounds the memory of LPIPS features
 METRICS = ("psnr", "ssim", "lpips", "mask_iou")
 
 
@@ -136,21 +137,30 @@ def compare(
 ) -> dict[str, list[dict[str, float | None]]]:
     """Metrics of each view for each candidate ``(rgb, mask)``, as ``Truth`` holds them.
 
-    The truth's LPIPS features are computed once for all candidates.
+    LPIPS features, which take nearly all the time, are computed once for the truth, and once for a
+    candidate that shows every view the same picture (an expanded tensor).
     """
+    fixed = {
+        name: lpips.features(rgb[0])
+        for name, (rgb, _) in candidates.items()
+        if lpips and rgb.stride(0) == 0
+    }
     result: dict[str, list[dict[str, float | None]]] = {name: [] for name in candidates}
-    for view in range(len(truth.rgb)):
-        features = lpips.features(truth.rgb[view]) if lpips else None
+    for start in range(0, len(truth.rgb), BATCH):
+        part = slice(start, start + BATCH)
+        true_rgb, true_mask = truth.rgb[part], truth.mask[part]
+        features = lpips.features(true_rgb) if lpips else None
         for name, (rgb, mask) in candidates.items():
-            values: dict[str, float | None] = {
-                "psnr": float(psnr(rgb[view], truth.rgb[view])),
-                "ssim": float(ssim(rgb[view], truth.rgb[view])),
-                "lpips": None,
-                "mask_iou": float(mask_iou(mask[view], truth.mask[view])),
+            values = {
+                "psnr": psnr(rgb[part], true_rgb).tolist(),
+                "ssim": ssim(rgb[part], true_rgb).tolist(),
+                "lpips": [None] * len(true_rgb),
+                "mask_iou": mask_iou(mask[part], true_mask).tolist(),
             }
             if lpips:
-                values["lpips"] = float(lpips.distance(lpips.features(rgb[view]), features))
-            result[name].append(values)
+                shown = fixed[name] if name in fixed else lpips.features(rgb[part])
+                values["lpips"] = lpips.distance(shown, features).tolist()
+            result[name] += [dict(zip(values, row)) for row in zip(*values.values())]
     return result
 
 
@@ -163,7 +173,10 @@ def summary(views: list[dict[str, float | None]]) -> dict[str, Any]:
 def baselines_of(truth: Truth) -> dict[str, tuple[Tensor, Tensor]]:
     """Predictions that need no model: an empty picture, and the input shown for every view."""
     return {
-        "white": (torch.full_like(truth.rgb, WHITE), torch.zeros_like(truth.mask)),
+        "white": (
+            torch.full_like(truth.rgb[:1], WHITE).expand_as(truth.rgb),
+            torch.zeros_like(truth.mask),
+        ),
         "input_copy": (
             truth.rgb[:1].expand_as(truth.rgb),
             truth.mask[:1].expand_as(truth.mask),
