@@ -7,6 +7,8 @@ CPU launch releases the GIL). On CUDA it goes to torch's current stream. Nothing
 from __future__ import annotations
 
 import os
+import sys
+import tempfile
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +19,28 @@ from torch import Tensor
 
 if wp.config.log_level == wp.LOG_INFO:  # the default; a level that somebody chose stays
     wp.config.log_level = wp.LOG_WARNING
+
+
+def _start_without_gpu() -> None:
+    """Starts Warp, holding back its native note on a missing CUDA driver: a CPU is no fault."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # stderr is closed: nobody to spare
+        return wp.init()
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+        held.seek(0)
+        lines = held.read().decode(errors="replace").splitlines(keepends=True)
+    sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
+
+
+if not torch.cuda.is_available():
+    _start_without_gpu()
 
 _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
 
