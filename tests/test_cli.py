@@ -135,3 +135,11 @@ def test_a_closed_pipe_is_no_traceback():
     result = run("--help", stdout=writer)
     os.close(writer)
     assert result.returncode == 141 and result.stderr == ""
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.run(name, ["--help"])
+    assert stop.value.code == 0
+    assert f"gamba {name}" in capsys.readouterr().out
