@@ -172,6 +172,17 @@ def test_leading_dimensions(lead):
     assert meta["radii"].shape == (*lead, 3, 60, 2)
 
 
+@pytest.mark.parametrize("lead", [(2,), (), (1, 2)])
+def test_gradients_of_projected_means(lead):
+    """Densification reads them from meta, as with gsplat."""
+    scene = mapped(make(batch=max(1, math.prod(lead))), lambda v: v.view(*lead, *v.shape[1:]))
+    scene["means"].requires_grad_()
+    renders, _, meta = rasterization(**scene)
+    meta["means2d"].retain_grad()
+    renders.square().sum().backward()
+    assert meta["means2d"].grad.abs().max() > 0
+
+
 def test_permutation_changes_nothing():
     scene = make()
     order = torch.randperm(60)

@@ -86,49 +86,41 @@ def rasterization(
         viewmats=viewmats, Ks=Ks, backgrounds=backgrounds,
     )  # fmt: skip
     options = dict(
-        width=width, height=height, near_plane=near_plane, eps2d=eps2d, sh_degree=sh_degree,
-        render_mode=render_mode, rasterize_mode=rasterize_mode, alpha_min=alpha_min,
-        alpha_max=alpha_max,
+        width=width, height=height, near_plane=near_plane, eps2d=eps2d, alpha_min=alpha_min,
+        alpha_max=alpha_max, sh_degree=sh_degree, render_mode=render_mode,
+        rasterize_mode=rasterize_mode,
     )  # fmt: skip
     lead = check_inputs(tensors, options)
     views, size = viewmats.shape[-3], math.prod(lead)
-    flat = {
-        name: None if x is None else x.reshape(size, *x.shape[len(lead) :]).float().contiguous()
-        for name, x in tensors.items()
-    }
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat.values()
+    flat = [_flat(x, size, len(lead)) for x in tensors.values()]
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat
     if sh_degree is not None:
         colors = colors_from_harmonics(sh_degree, colors, means, viewmats).contiguous()
-    antialiased = rasterize_mode == "antialiased"
-    lens = [width, height, near_plane, far_plane, radius_clip, eps2d, alpha_min, antialiased]
-    means2d, conics, depths, view_opacities, extents, status = project(
-        means, quats, scales, opacities, colors, viewmats, Ks, [float(x) for x in lens]
-    )
-    per_view = [x.flatten(0, 1) for x in (means2d, conics, depths, view_opacities, extents)]
+    lens = [width, height, near_plane, far_plane, radius_clip, eps2d, alpha_min]
+    lens = [float(x) for x in (*lens, rasterize_mode == "antialiased")]
+    *projected, status = project(means, quats, scales, opacities, colors, viewmats, Ks, lens)
+    # with the caller's dimensions first: a gradient retained on meta's tensors must be on the way
+    projected = [x.view(*lead, *x.shape[1:]) for x in projected]
+    per_view = [x.reshape(size * views, *x.shape[len(lead) + 1 :]) for x in projected]
+    means2d, conics, depths, view_opacities, _ = per_view
     bins = bin_op(*(x.detach() for x in per_view), width, height, alpha_min)
-    channels = _channels(render_mode, colors, depths)
+    channels = _channels(render_mode, colors, depths.view(size, views, means.shape[1]))
     skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
     renders, alphas, *walk = composite(
-        per_view[0],
-        per_view[1],
-        per_view[3],
-        channels.reshape(-1, channels.shape[-1]),
-        list(bins),
-        [width, height, views, int(channels.dim() == 4)],
-        [alpha_min, alpha_max],
-        skipped,
-    )
+        means2d, conics, view_opacities, channels.reshape(-1, channels.shape[-1]), list(bins),
+        [width, height, views, int(channels.dim() == 4)], [alpha_min, alpha_max], skipped,
+    )  # fmt: skip
     renders = _finish(render_mode, renders, alphas, backgrounds)
     meta = Meta(Bins(*bins), Walk(*walk), status, skipped)
-    meta.update(
-        means2d=means2d, conics=conics, depths=depths, opacities=view_opacities,
-        radii=extents.ceil().int(),
-    )  # fmt: skip
-    for name, value in meta.items():
-        meta[name] = value.view(*lead, *value.shape[1:])
-    meta.update(width=width, height=height, tile_size=TILE)
-    shape = (*lead, views, height, width)
-    return renders.view(*shape, renders.shape[-1]), alphas.view(*shape, 1), meta
+    meta.update(zip(("means2d", "conics", "depths", "opacities"), projected))
+    meta.update(radii=projected[4].ceil().int(), width=width, height=height, tile_size=TILE)
+    renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
+    return renders, alphas, meta
+
+
+def _flat(x: Tensor | None, size: int, lead: int) -> Tensor | None:
+    """One batch dimension of the given size for the leading ones; contiguous float32."""
+    return None if x is None else x.reshape(size, *x.shape[lead:]).float().contiguous()
 
 
 def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
