@@ -44,8 +44,9 @@ def demo_command(
     # LPIPS in the loss would take most of a short CPU run; the evaluation has it.
     _gamba(
         *("train", data, "--preset", "tiny", "--minutes", minutes, "--out", run),
-        *("--resume", "never", "--lpips", "off", "--rdist-steps", "200", "--cache"),
-        *("--batch-size", "2", "--val-every", "200", "--val-objects", "4"),
+        *("--resume", "never", "--lpips", "off", "--cache", "--batch-size", "2"),
+        *("--lr", "2e-3", "--warmup-steps", "30", "--rdist-steps", "100"),
+        *("--val-every", "50", "--val-objects", "4", "--no-tensorboard"),
     )
     model = run / "model.safetensors"
     _gamba("reconstruct", starter / "icons", "--checkpoint", model, "--out", out / "icons")
