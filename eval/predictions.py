@@ -11,6 +11,7 @@ from gamba_warp.cameras import Cameras, relative_to_reference
 from gamba_warp.dataset import ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import over_background
 from gamba_warp.ply import load_ply
 
 
@@ -57,7 +58,7 @@ class ModelPredictions(Predictions):
         """Runs the model on the reference view, on the model's own background."""
         config = self.model.config
         views = dataset.load(uid, views=[reference], size=config.image_size)
-        images = on_background(views.images, config.background_color)
+        images = over_background(views.images, config.background_color)
         viewmats, _ = relative_to_reference(
             views.cameras.viewmats, views.cameras.viewmats[0], self.distance
         )
@@ -65,12 +66,6 @@ class ModelPredictions(Predictions):
             self.device
         )
         return self.model(images.to(self.device), cameras)[0]
-
-
-def on_background(images: torch.Tensor, background: float) -> torch.Tensor:
-    """Straight-alpha RGBA ``[.., 4]`` over a background, to RGB ``[.., 3]``."""
-    alpha = images[..., 3:]
-    return images[..., :3] * alpha + background * (1 - alpha)
 
 
 def open_predictions(

@@ -19,12 +19,12 @@ from gamba_warp.dataset import ViewDataset, open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.images import save_image
+from gamba_warp.images import over_background, save_image
 from gamba_warp.lpips import FETCH, LPIPS, load_lpips, lpips_available
 from gamba_warp.ply import save_ply
 
 from .metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
-from .predictions import Predictions, on_background, open_predictions
+from .predictions import Predictions, open_predictions
 from .report import OK, check_finite, failure, mean_of, print_summary, versions, write_report
 
 WHITE = 1.0
@@ -114,7 +114,7 @@ def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: 
     )
     cameras = Cameras(viewmats, loaded.cameras.Ks, loaded.cameras.width, loaded.cameras.height)
     return Truth(
-        rgb=on_background(loaded.images, WHITE).to(device),
+        rgb=over_background(loaded.images, WHITE).to(device),
         mask=(loaded.images[..., 3] > 0.5).to(device),
         cameras=cameras.to(device),
         views=views,

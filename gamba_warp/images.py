@@ -61,6 +61,20 @@ def _to_rgba(image: Image.Image) -> np.ndarray:
     return np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
 
 
+def over_background(rgba, background):
+    """Straight-alpha RGBA over a colour; for arrays and tensors alike.
+
+    Args:
+        rgba: ``[.., H, W, 4]`` in [0, 1], colour not premultiplied.
+        background: a grey value, or RGB that broadcasts with ``[.., H, W, 3]``, in [0, 1].
+
+    Returns:
+        ``[.., H, W, 3]``.
+    """
+    alpha = rgba[..., 3:]
+    return rgba[..., :3] * alpha + background * (1 - alpha)
+
+
 def to_uint8(picture: np.ndarray) -> np.ndarray:
     """Rounds ``[.., C]`` float values in [0, 1] to 8 bits; NaN becomes 0."""
     return (np.clip(np.nan_to_num(picture), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

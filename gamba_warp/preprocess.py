@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from .errors import UserError
-from .images import load_rgba
+from .images import load_rgba, over_background
 
 BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
 WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, no model sees more
@@ -170,8 +170,7 @@ def composite(rgba: np.ndarray, size: int, background: float = 1.0) -> Tensor:
     Returns:
         ``[size, size, 3]`` float32 in [0, 1].
     """
-    alpha = rgba[..., 3:]
-    flat = rgba[..., :3] * alpha + background * (1 - alpha)
+    flat = over_background(rgba, background)
     return torch.from_numpy(_resize(flat, size, size)).clamp(0, 1)
 
 

@@ -5,13 +5,14 @@ import math
 import pytest
 import torch
 
-from gamba_warp.train.losses import composite, mse, psnr, total_loss, view_losses
+from gamba_warp.images import over_background
+from gamba_warp.train.losses import mse, psnr, total_loss, view_losses
 
 
 def test_composite_is_straight_alpha():
     pictures = torch.tensor([0.5, 1.0, 0.0, 0.25]).expand(2, 1, 3, 5, 4)
     background = torch.tensor([[[1.0, 0.0, 1.0]], [[0.0, 0.0, 0.0]]])  # [2, 1, 3]
-    got = composite(pictures, background)
+    got = over_background(pictures, background[..., None, None, :])
     assert got.shape == (2, 1, 3, 5, 3)
     torch.testing.assert_close(got[0, 0, 1, 2], torch.tensor([0.875, 0.25, 0.75]))
     torch.testing.assert_close(got[1, 0, 1, 2], torch.tensor([0.125, 0.25, 0.0]))

@@ -17,6 +17,7 @@ from gamba_warp.cameras import Cameras, relative_to_reference
 from gamba_warp.config import GambaConfig
 from gamba_warp.dataset import ViewDataset
 from gamba_warp.errors import UserError
+from gamba_warp.images import over_background
 
 _TRIES = 8  # objects tried in place of one that cannot be read
 
@@ -94,11 +95,9 @@ def load_sample(
     viewmats, _ = relative_to_reference(
         target.cameras.viewmats, target.cameras.viewmats[0], config.distance
     )
-    rgba = source.images[:1]
-    alpha = rgba[..., 3:]
     return Batch(
         uids=[target.uid],
-        inputs=rgba[..., :3] * alpha + config.background_color * (1 - alpha),
+        inputs=over_background(source.images[:1], config.background_color),
         input_cameras=Cameras(
             viewmats[:1], source.cameras.Ks[:1], source.cameras.width, source.cameras.height
         ),

@@ -11,20 +11,6 @@ import torch
 from torch import Tensor
 
 
-def composite(pictures: Tensor, background: Tensor) -> Tensor:
-    """Straight-alpha RGBA over a colour.
-
-    Args:
-        pictures: ``[.., H, W, 4]`` in [0, 1].
-        background: RGB ``[3]`` or ``[.., 3]`` in [0, 1].
-
-    Returns:
-        ``[.., H, W, 3]``.
-    """
-    rgb, alpha = pictures[..., :3], pictures[..., 3:]
-    return rgb * alpha + background[..., None, None, :] * (1 - alpha)
-
-
 def mse(got: Tensor, want: Tensor) -> Tensor:
     """Mean squared error over height, width and channels: ``[.., H, W, C]`` to ``[..]``."""
     return (got - want).square().mean((-3, -2, -1))

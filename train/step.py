@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import over_background
 from gamba_warp.render import Rendering, render
 
 from .batches import Batch
-from .losses import composite, psnr, total_loss, view_losses
+from .losses import psnr, total_loss, view_losses
 from .radial_mask import NEAR, contour_distances, project_means, radial_mask_loss
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
@@ -58,7 +59,7 @@ def forward(
     with torch.autocast(kind, precision, enabled=precision != torch.float32):
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
-    target = composite(batch.targets, batch.background)
+    target = over_background(batch.targets, batch.background[..., None, None, :])
     target_alpha = batch.targets[..., 3:]
     terms = view_losses(
         rendering.rgb,

@@ -105,11 +105,13 @@ def rasterization(
     means2d, conics, depths, view_opacities, _ = per_view
     bins = bin_op(*(x.detach() for x in per_view), width, height, alpha_min)
     channels = _channels(render_mode, colors, depths.view(size, views, means.shape[1]))
+    size2d = [width, height, views, int(channels.dim() == 4)]
+    channels = channels.reshape(-1, channels.shape[-1])
     skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
+    limits = [alpha_min, alpha_max]
     renders, alphas, *walk = composite(
-        means2d, conics, view_opacities, channels.reshape(-1, channels.shape[-1]), list(bins),
-        [width, height, views, int(channels.dim() == 4)], [alpha_min, alpha_max], skipped,
-    )  # fmt: skip
+        means2d, conics, view_opacities, channels, list(bins), size2d, limits, skipped
+    )
     renders = _finish(render_mode, renders, alphas, backgrounds)
     meta = Meta(Bins(*bins), Walk(*walk), status, skipped)
     meta.update(zip(("means2d", "conics", "depths", "opacities"), projected))
