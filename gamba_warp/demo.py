@@ -13,9 +13,11 @@ import numpy as np
 
 from .errors import UserError
 from .files import output_folder
+from .gaussians import Gaussians
 from .images import load_rgba
 from .page import Section, demo_page
 from .ply import load_ply
+from .turntable import turntable_frames
 
 STARTER = Path(__file__).resolve().parent.parent / "starter"
 METRICS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "Mask IoU"}
@@ -130,12 +132,14 @@ def _held_out(strip: Path, views: Path) -> Section:
     rgb = load_rgba(strip)[..., :3]
     side = rgb.shape[1] // 3
     tiles = rgb.reshape(-1, side, 3, side, 3).transpose(2, 0, 1, 3, 4)
+    gaussians = load_ply(views / "gaussians" / f"{strip.stem}.ply")
     record = next(o for o in _report(views)["objects"] if o["name"] == strip.stem)
     return Section(
         strip.stem,
         f"Novel views: {record['psnr']:.1f} dB; input view: {record['input']['psnr']:.1f} dB.",
         picture=tiles[0][0],
-        gaussians=load_ply(views / "gaussians" / f"{strip.stem}.ply"),
+        gaussians=gaussians,
+        turntable=_turntable(gaussians),
         views={"Predicted": tiles[1], "Truth": tiles[2]},
     )
 
@@ -145,20 +149,17 @@ def _icons(icons: Path, results: Path) -> list[Section]:
     for icon in sorted(icons.glob("*.png")):
         ply = results / f"{icon.stem}.ply"
         if ply.exists():
-            turntable = results / f"{icon.stem}.gif"
+            gaussians = load_ply(ply)
             sections.append(
                 Section(
                     f"Icon: {icon.stem}",
                     picture=load_rgba(icon),
-                    turntable=_frames(turntable) if turntable.exists() else None,
-                    gaussians=load_ply(ply),
+                    turntable=_turntable(gaussians),
+                    gaussians=gaussians,
                 )
             )
     return sections
 
 
-def _frames(path: Path) -> np.ndarray:
-    from PIL import Image, ImageSequence
-
-    with Image.open(path) as image:
-        return np.stack([np.asarray(f.convert("RGB")) for f in ImageSequence.Iterator(image)])
+def _turntable(gaussians: Gaussians) -> np.ndarray:
+    return turntable_frames(gaussians, size=192, frames=24)

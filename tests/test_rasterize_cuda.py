@@ -3,9 +3,8 @@
 import pytest
 import torch
 import warp as wp
-from helpers import assert_rel_rms
+from helpers import assert_rel_rms, resources
 from test_rasterize import leaves, make
-from test_selective_scan_cuda import resources
 
 from gamba_warp.kernels.rasterize import composite_cpu, composite_cuda, ops, rasterization
 

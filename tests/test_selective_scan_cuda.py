@@ -1,11 +1,9 @@
 """The CUDA kernels without a GPU: small shapes on CPU blocks, and compiled ahead of time."""
 
-import struct
-
 import pytest
 import torch
 import warp as wp
-from helpers import assert_rel_rms
+from helpers import assert_rel_rms, resources
 from test_causal_conv1d import make as make_conv
 from test_selective_scan import leaves, make
 
@@ -105,31 +103,6 @@ def test_convolution_kernels(monkeypatch, use_silu):
     assert_rel_rms(got, out, 2e-7, "out")
     for name, grad, want in zip(mine, grads, wants):
         assert_rel_rms(grad, want, 2e-6, f"gradient of {name}")
-
-
-def resources(cubin: bytes) -> tuple[int, int]:
-    """Registers and bytes of stack per thread: the largest in the ``.nv.info`` attributes."""
-    offset, size, count = (
-        *struct.unpack_from("<Q", cubin, 40),
-        *struct.unpack_from("<HH", cubin, 58),
-    )
-    registers = stack = 0
-    for i in range(count):
-        kind, start, length = (
-            struct.unpack_from("<I", cubin, offset + i * size + 4)[0],
-            *struct.unpack_from("<QQ", cubin, offset + i * size + 24),
-        )
-        if kind != 0x70000000:  # SHT_CUDA_INFO
-            continue
-        at = start
-        while at < start + length:
-            form, attribute, payload = struct.unpack_from("<BBH", cubin, at)
-            if form == 4 and attribute == 0x2F:  # EIATTR_REGCOUNT: symbol, registers
-                registers = max(registers, struct.unpack_from("<II", cubin, at + 4)[1])
-            if form == 4 and attribute == 0x11:  # EIATTR_FRAME_SIZE: symbol, bytes
-                stack = max(stack, struct.unpack_from("<II", cubin, at + 4)[1])
-            at += 4 + (payload if form == 4 else 0)
-    return registers, stack
 
 
 # registers and stack bytes, about a tenth above what the compiler used when this was written
