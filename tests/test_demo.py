@@ -1,4 +1,4 @@
-"""The demo on three objects and a few seconds of training: every command runs, the page is whole."""
+"""The demo on three objects and a few seconds of training: all commands run, the page is whole."""
 
 import json
 import shutil
