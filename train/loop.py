@@ -259,7 +259,10 @@ class Trainer:
         run = self.config.run
         bar.update()
         if self.log is not None and self.step % run.log_every == 0:
-            bar.set_postfix(loss=f"{figures['loss']:.4f}", psnr=f"{figures['psnr']:.1f}")
+            shown = {"loss": f"{figures['loss']:.4f}", "psnr": f"{figures['psnr']:.1f}"}
+            if self.total is None:  # by the clock, the bar has no end
+                shown["minutes"] = f"{self.elapsed / 60:.1f} of {self.config.length.minutes:g}"
+            bar.set_postfix(shown)
             epoch = self.step / self.steps_per_epoch
             self.log.write("train", self.step, epoch=epoch, skipped=self.skipped, **figures)
             reason = collapse_reason(figures)
