@@ -200,7 +200,11 @@ class SamSegmenter:
 
     def __init__(self, checkpoint: str | Path, device: str | torch.device = "cpu") -> None:
         from kornia.contrib.visual_prompter import VisualPrompter
-        from kornia.models.sam import SamConfig
+
+        try:
+            from kornia.models.sam import SamConfig
+        except ImportError:  # kornia 0.8, the last for Python 3.10
+            from kornia.contrib.models.sam import SamConfig
 
         path = Path(checkpoint)
         if not path.is_file():
