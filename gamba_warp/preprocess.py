@@ -212,6 +212,7 @@ class SamSegmenter:
         try:
             config = SamConfig(model_type=self._model_type(path), checkpoint=str(path))
             self._prompter = VisualPrompter(config, device=torch.device(device))
+            self._prompter.model.eval()  # kornia 0.8 leaves it in training
         except Exception as error:  # torch.load raises many types on files that are not checkpoints
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UserError(
