@@ -193,26 +193,23 @@ class SamSegmenter:
         device: where it runs.
 
     Raises:
-        UserError: the file is missing or is none of these.
+        UserError: the file is missing or is none of these, or kornia is older than 0.9.
     """
 
     _WIDTHS = {768: "vit_b", 1024: "vit_l", 1280: "vit_h"}
 
     def __init__(self, checkpoint: str | Path, device: str | torch.device = "cpu") -> None:
-        from kornia.contrib.visual_prompter import VisualPrompter
-
-        try:
-            from kornia.models.sam import SamConfig
-        except ImportError:  # kornia 0.8, the last for Python 3.10
-            from kornia.contrib.models.sam import SamConfig
-
         path = Path(checkpoint)
         if not path.is_file():
             raise UserError(f"--sam {path}: no such file")
         try:
+            from kornia.contrib.visual_prompter import VisualPrompter
+            from kornia.models.sam import SamConfig
+        except ImportError as error:
+            raise UserError("--sam needs kornia 0.9, and so Python 3.11 or newer") from error
+        try:
             config = SamConfig(model_type=self._model_type(path), checkpoint=str(path))
             self._prompter = VisualPrompter(config, device=torch.device(device))
-            self._prompter.model.eval()  # kornia 0.8 leaves it in training
         except Exception as error:  # torch.load raises many types on files that are not checkpoints
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UserError(

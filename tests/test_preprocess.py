@@ -1,3 +1,5 @@
+import importlib.util
+
 import numpy as np
 import pytest
 import torch
@@ -203,6 +205,12 @@ def test_compositing():
     assert composite(rgba, 33).shape == (33, 33, 3)
 
 
+needs_sam = pytest.mark.skipif(
+    importlib.util.find_spec("kornia.models.sam") is None, reason="needs kornia 0.9"
+)
+
+
+@needs_sam
 def test_files_that_are_not_sam_checkpoints(tmp_path):
     (tmp_path / "text.pth").write_text("hello")
     torch.save({"image_encoder.pos_embed": torch.zeros(1, 64, 64, 7)}, tmp_path / "odd.pth")
@@ -215,12 +223,10 @@ def test_files_that_are_not_sam_checkpoints(tmp_path):
         assert "\n" not in str(caught.value)
 
 
+@needs_sam
 def test_sam_runs_the_weights_of_the_file(tmp_path):
     """A MobileSAM is recognised, its weights are the file's, and it is not left in training."""
-    try:
-        from kornia.models.sam import Sam, SamConfig
-    except ImportError:  # kornia 0.8, with Python 3.10
-        from kornia.contrib.models.sam import Sam, SamConfig
+    from kornia.models.sam import Sam, SamConfig
 
     model = Sam.from_config(SamConfig("mobile_sam")).eval()
     torch.save(model.state_dict(), tmp_path / "mobile.pt")
