@@ -7,7 +7,7 @@ import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -22,6 +22,7 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import over_background, save_image
 from gamba_warp.lpips import FETCH, LPIPS, load_lpips, lpips_available
 from gamba_warp.ply import save_ply
+from gamba_warp.reconstruct import pick_device
 
 from .metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
 from .predictions import Predictions, open_predictions
@@ -257,7 +258,7 @@ def eval_views_command(
     save_gaussians: bool = False,
     distance: float = DEFAULT_DISTANCE,
     encoder_weights: Path | None = None,
-    device: Annotated[str, tyro.conf.arg(metavar="auto|cpu|cuda")] = "auto",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> int:
     """PSNR, SSIM, LPIPS and mask IoU of predicted views; the input view and novel views apart.
 
@@ -284,13 +285,12 @@ def eval_views_command(
             raise UserError(f"--{name} {value}: must be at least {least}")
     if not (math.isfinite(distance) and distance > 0):
         raise UserError(f"--distance {distance}: must be above 0")
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    place = str(pick_device(device))
     dataset = open_dataset(data, split)
-    predictions = open_predictions(checkpoint, distance, device, encoder_weights)
+    predictions = open_predictions(checkpoint, distance, place, encoder_weights)
     folder = output_folder(out)
     save = output_folder(folder / "gaussians") if save_gaussians else None
-    network, reason = _lpips_or_reason(device) if lpips else (None, "not asked for")
+    network, reason = _lpips_or_reason(place) if lpips else (None, "not asked for")
     protocol = ViewsProtocol(
         split=split,
         reference=reference,
@@ -305,7 +305,7 @@ def eval_views_command(
         where = folder / "strips" if number < strips else None
         try:
             record, others = evaluate_object(
-                predictions, dataset, uid, protocol, network, device, baselines, where, save
+                predictions, dataset, uid, protocol, network, place, baselines, where, save
             )
         except (UserError, ValueError, RuntimeError) as error:
             objects.append(failure(uid, error))

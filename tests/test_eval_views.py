@@ -288,3 +288,10 @@ def test_saved_gaussians_evaluate_to_the_same(data, painted):
     code, again = evaluate(data, "--no-lpips", pred="out/gaussians")
     assert code == 0 and len(list((data / "out" / "gaussians").rglob("*.ply"))) == len(POINTS)
     assert again["mean"]["psnr"] == report["mean"]["psnr"] > 30
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_cuda_without_a_device_is_refused(data, capsys):
+    options = [str(data / "pred"), str(data / "data"), "--out", str(data / "out")]
+    assert run("eval-views", [*options, "--device", "cuda"]) == 2
+    assert "no CUDA device" in capsys.readouterr().err and not (data / "out").exists()
