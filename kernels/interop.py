@@ -6,6 +6,7 @@ CPU launch releases the GIL). On CUDA it goes to torch's current stream. Nothing
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import tempfile
@@ -109,6 +110,26 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
 def lane_contiguous(tensor: Tensor) -> Tensor:
     """The tensor itself if its last dimension is dense (rows may be strided), else a dense copy."""
     return tensor if tensor.stride(-1) == 1 or tensor.shape[-1] == 1 else tensor.contiguous()
+
+
+_HUGE = 4 << 20  # bytes from which huge pages pay
+_libc = ctypes.CDLL(None) if sys.platform == "linux" else None
+
+
+def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """As ``torch.empty`` on the CPU; a large tensor asks for huge pages.
+
+    The first touch of a page costs more than filling it, and with rows of 4 KiB each row would be a
+    page of its own.
+    """
+    tensor = torch.empty(*shape, dtype=dtype)
+    size = tensor.numel() * tensor.element_size()
+    if _libc is not None and size >= _HUGE:
+        begin = -(-tensor.data_ptr() // 4096) * 4096
+        end = (tensor.data_ptr() + size) // 4096 * 4096
+        # 14 is MADV_HUGEPAGE; a kernel without huge pages refuses, which does no harm
+        _libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), 14)
+    return tensor
 
 
 def parallel_launch(

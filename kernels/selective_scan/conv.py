@@ -11,8 +11,9 @@ import warp as wp
 from torch import Tensor
 
 from ..interop import cuda_launch, lane_contiguous, parallel_launch, view
-from . import lanes as cpu_values
+from . import rows as cpu_values
 from . import scalars as cuda_values
+from .lanes import WARP_DTYPES
 
 TAPS = 4
 CHUNK = 256  # tokens of a task; the gradient of the weight is summed in these, then over them
@@ -33,7 +34,7 @@ def _values(device_type: str, io: torch.dtype):
 @functools.cache
 def _forward_kernel(device_type: str, io: torch.dtype):
     value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
-    scalar = cpu_values.WARP_DTYPES[io]
+    scalar = WARP_DTYPES[io]
 
     @wp.kernel(enable_backward=False, module="unique")
     def conv_forward(
@@ -80,7 +81,7 @@ def _forward_kernel(device_type: str, io: torch.dtype):
 @functools.cache
 def _backward_kernel(device_type: str, io: torch.dtype):
     value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
-    scalar = cpu_values.WARP_DTYPES[io]
+    scalar = WARP_DTYPES[io]
 
     @wp.kernel(enable_backward=False, module="unique")
     def conv_backward(

@@ -1,269 +1,74 @@
-"""The scan on a CPU: lanes are adjacent channels, tokens run in chunks, states one by one.
+"""The scan on a CPU: operands, launches and sums around the kernels of ``cpu_kernels.py``."""
 
-A task is one batch element and up to ``BLOCKS`` lane groups. In a chunk of ``CHUNK`` tokens it
-keeps what does not depend on the state n (step, input, output) in local arrays and walks the tokens
-once per n, so that h_n lives in registers and N is free. Equations are those of README.md.
-"""
-
-import functools
+from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from ..interop import lane_contiguous, parallel_launch, view
-from .lanes import (
-    ACCESSORS,
-    WARP_DTYPES,
-    W,
-    flush_denormals,
-    fma,
-    lanes,
-    restore_denormals,
-    sigmoid,
-    softplus,
-    times,
-)
+from ..interop import empty, lane_contiguous, parallel_launch, view
+from . import cpu_kernels
+from .cpu_kernels import SPAN, Sizes
+from .lanes import W, lanes
 from .layout import BLOCKS, CHUNK, Layout
-from .recurrence import (
-    MODES,
-    NEED_DB,
-    NEED_DC,
-    NEED_DH,
-    NEED_DZ,
-    advance,
-    recompute,
-    retreat,
-    sum_lanes,
-)
-
-_K = wp.constant(CHUNK)
-_K1 = wp.constant(CHUNK + 1)
-_P = wp.constant(BLOCKS)
-_W = wp.constant(W)
-_DZ, _DC, _DB, _DH = (wp.constant(v) for v in (NEED_DZ, NEED_DC, NEED_DB, NEED_DH))
+from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ, SCALES
 
 
-@wp.struct
-class Sizes:
-    """What both kernels know: shapes, options, and which gradients are wanted."""
-
-    length: int
-    states: int
-    groups: int
-    group_width: int
-    group_blocks: int
-    parts: int
-    use_softplus: int
-    use_z: int
-    needs: int
-
-
-def _sizes(layout: Layout, softplus: bool, z: Tensor | None, needs: int = 0) -> Sizes:
+def _sizes(layout: Layout, softplus: bool, use_z: bool, needs: int = 0) -> Sizes:
     sizes = Sizes()
-    for name in ("length", "states", "groups", "group_width", "group_blocks", "parts"):
+    names = "length segment segments batch states groups group_width group_blocks span"
+    for name in names.split():
         setattr(sizes, name, getattr(layout, name))
-    sizes.use_softplus, sizes.use_z, sizes.needs = int(softplus), int(z is not None), needs
+    sizes.use_softplus, sizes.use_z, sizes.needs = int(softplus), int(use_z), needs
     return sizes
 
 
-@functools.cache
-def _forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
-    scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
-    (load, store), (load_delta, _) = ACCESSORS[io], ACCESSORS[delta_io]
-    mode = MODES[discretization]
-    scale = 1.0 if discretization == "bilinear" else 1.4426950408889634
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def scan_forward(
-        offset: int,
-        # in
-        sizes: Sizes,
-        u_in: wp.array3d(dtype=scalar),
-        delta_in: wp.array3d(dtype=delta_scalar),
-        z_in: wp.array3d(dtype=scalar),
-        a_in: wp.array2d(dtype=lanes),
-        b_in: wp.array2d(dtype=wp.float32),
-        c_in: wp.array2d(dtype=wp.float32),
-        skip_in: wp.array(dtype=lanes),
-        bias_in: wp.array(dtype=lanes),
-        # out
-        h_out: wp.array3d(dtype=lanes),
-        starts_out: wp.array4d(dtype=lanes),
-        y_out: wp.array3d(dtype=scalar),
-    ):
-        task = offset + wp.tid()
-        part = task % sizes.parts
-        row0 = task / sizes.parts * sizes.states
-        b = task / (sizes.parts * sizes.groups)
-        group = task / sizes.parts % sizes.groups
-        rate = wp.zeros(shape=(_K,), dtype=lanes)
-        du = wp.zeros(shape=(_K,), dtype=lanes)
-        y = wp.zeros(shape=(_K,), dtype=lanes)
-        before = flush_denormals()
-        for chunk in range((sizes.length + _K - 1) / _K):
-            t0 = chunk * _K
-            count = wp.min(_K, sizes.length - t0)
-            for block in range(part * _P, wp.min((part + 1) * _P, sizes.group_blocks)):
-                k = group * sizes.group_blocks + block
-                d = group * sizes.group_width + block * _W
-                width = wp.min(_W, sizes.group_width - block * _W)
-                for t in range(count):
-                    step = load_delta(delta_in, b, t0 + t, d, width) + bias_in[k]
-                    if sizes.use_softplus != 0:
-                        step = softplus(step)
-                    ut = load(u_in, b, t0 + t, d, width)
-                    rate[t] = step * wp.static(scale)
-                    du[t] = times(step, ut)
-                    y[t] = times(skip_in[k], ut)
-                for n in range(sizes.states):
-                    row = row0 + n
-                    h = h_out[b, k, n]
-                    if starts_out.shape[1] > 0:
-                        starts_out[b, chunk, k, n] = h
-                    h_out[b, k, n] = advance(
-                        wp.static(mode), h, a_in[k, n], rate, du, b_in[row], c_in[row], t0, count, y
-                    )
-                for t in range(count):
-                    out = y[t]
-                    if sizes.use_z != 0:
-                        zt = load(z_in, b, t0 + t, d, width)
-                        out = times(out, times(zt, sigmoid(zt)))
-                    store(y_out, b, t0 + t, d, width, out)
-        restore_denormals(before)
-
-    return scan_forward
+def _carry(first: Tensor, local: Tensor, product: Tensor) -> Tensor:
+    """States before each segment (dimension 0): a segment turns h to local + product · h."""
+    states = torch.empty_like(local)
+    for s in range(len(local)):
+        states[s] = first
+        first = torch.addcmul(local[s], product[s], first)
+    return states
 
 
-@functools.cache
-def _backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
-    scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
-    (load, store), (load_delta, store_delta) = ACCESSORS[io], ACCESSORS[delta_io]
-    mode = MODES[discretization]
-    scale = 1.0 if discretization == "bilinear" else 1.4426950408889634
+class _Operands:
+    """What the launches of one call share, by name."""
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def scan_backward(
-        offset: int,
-        # in
-        sizes: Sizes,
-        u_in: wp.array3d(dtype=scalar),
-        delta_in: wp.array3d(dtype=delta_scalar),
-        z_in: wp.array3d(dtype=scalar),
-        a_in: wp.array2d(dtype=lanes),
-        b_in: wp.array2d(dtype=wp.float32),
-        c_in: wp.array2d(dtype=wp.float32),
-        skip_in: wp.array(dtype=lanes),
-        bias_in: wp.array(dtype=lanes),
-        starts_in: wp.array4d(dtype=lanes),
-        dout_in: wp.array3d(dtype=scalar),
-        # scratch
-        db_sums_out: wp.array2d(dtype=lanes),
-        dc_sums_out: wp.array2d(dtype=lanes),
-        # out
-        dh_out: wp.array3d(dtype=lanes),
-        du_out: wp.array3d(dtype=scalar),
-        ddelta_out: wp.array3d(dtype=delta_scalar),
-        dz_out: wp.array3d(dtype=scalar),
-        da_out: wp.array3d(dtype=lanes),
-        db_out: wp.array3d(dtype=wp.float32),
-        dc_out: wp.array3d(dtype=wp.float32),
-        dskip_out: wp.array2d(dtype=lanes),
-        dbias_out: wp.array2d(dtype=lanes),
-    ):
-        task = offset + wp.tid()
-        part = task % sizes.parts
-        row0 = task / sizes.parts * sizes.states
-        b = task / (sizes.parts * sizes.groups)
-        group = task / sizes.parts % sizes.groups
-        step = wp.zeros(shape=(_K,), dtype=lanes)
-        rate = wp.zeros(shape=(_K,), dtype=lanes)
-        du = wp.zeros(shape=(_K,), dtype=lanes)
-        dy = wp.zeros(shape=(_K,), dtype=lanes)
-        y = wp.zeros(shape=(_K,), dtype=lanes)
-        s = wp.zeros(shape=(_K,), dtype=lanes)
-        p = wp.zeros(shape=(_K,), dtype=lanes)
-        f = wp.zeros(shape=(_K,), dtype=lanes)
-        h = wp.zeros(shape=(_K1,), dtype=lanes)
-        da = wp.zeros(shape=(1,), dtype=lanes)
-        before = flush_denormals()
-        chunks = (sizes.length + _K - 1) / _K
-        for reverse in range(chunks):
-            chunk = chunks - 1 - reverse
-            t0 = chunk * _K
-            count = wp.min(_K, sizes.length - t0)
-            for i in range(db_sums_out.shape[1]):
-                db_sums_out[task, i] = lanes()
-            for i in range(dc_sums_out.shape[1]):
-                dc_sums_out[task, i] = lanes()
-            for block in range(part * _P, wp.min((part + 1) * _P, sizes.group_blocks)):
-                k = group * sizes.group_blocks + block
-                d = group * sizes.group_width + block * _W
-                width = wp.min(_W, sizes.group_width - block * _W)
-                for t in range(count):
-                    x = load_delta(delta_in, b, t0 + t, d, width) + bias_in[k]
-                    if sizes.use_softplus != 0:
-                        x = softplus(x)
-                    ut = load(u_in, b, t0 + t, d, width)
-                    grad = load(dout_in, b, t0 + t, d, width)
-                    if sizes.use_z != 0:
-                        zt = load(z_in, b, t0 + t, d, width)
-                        grad = times(grad, times(zt, sigmoid(zt)))
-                    step[t] = x
-                    rate[t] = x * wp.static(scale)
-                    du[t] = times(x, ut)
-                    dy[t] = grad
-                    y[t] = times(skip_in[k], ut)
-                    s[t] = lanes()
-                    p[t] = lanes()
-                for n in range(sizes.states):
-                    row = row0 + n
-                    a = a_in[k, n]
-                    first = n * _K
-                    recompute(
-                        wp.static(mode), starts_in[b, chunk, k, n], a, rate, du,
-                        b_in[row], c_in[row], t0, count, dy, sizes.needs, first, y, f, h,
-                        dc_sums_out[task],
-                    )  # fmt: skip
-                    if (sizes.needs & _DH) != 0:
-                        dh_out[b, k, n] = retreat(
-                            wp.static(mode), dh_out[b, k, n], a, rate, du,
-                            b_in[row], c_in[row], t0, count, step, dy, f, h, sizes.needs, first,
-                            s, p, db_sums_out[task], da,
-                        )  # fmt: skip
-                        da_out[b, k, n] = da_out[b, k, n] + da[0]
-                dskip = lanes()
-                dbias = lanes()
-                for t in range(count):
-                    ut = load(u_in, b, t0 + t, d, width)
-                    dskip = fma(dy[t], ut, dskip)
-                    if (sizes.needs & _DZ) != 0:
-                        zt = load(z_in, b, t0 + t, d, width)
-                        sig = sigmoid(zt)
-                        slope = fma(times(zt, sig), lanes(1.0) - sig, sig)
-                        grad = load(dout_in, b, t0 + t, d, width)
-                        store(dz_out, b, t0 + t, d, width, times(times(grad, y[t]), slope))
-                    ddelta = fma(ut, s[t], p[t])
-                    if sizes.use_softplus != 0:
-                        x = load_delta(delta_in, b, t0 + t, d, width) + bias_in[k]
-                        ddelta = times(ddelta, sigmoid(x))
-                    dbias = dbias + ddelta
-                    if du_out.shape[1] > 0:
-                        v = fma(step[t], s[t], times(skip_in[k], dy[t]))
-                        store(du_out, b, t0 + t, d, width, v)
-                    if ddelta_out.shape[1] > 0:
-                        store_delta(ddelta_out, b, t0 + t, d, width, ddelta)
-                dskip_out[b, k] = dskip_out[b, k] + dskip
-                dbias_out[b, k] = dbias_out[b, k] + dbias
-            if (sizes.needs & _DB) != 0:
-                for n in range(sizes.states):
-                    sum_lanes(db_sums_out[task], n * _K, count, t0, db_out[task, n])
-            if (sizes.needs & _DC) != 0:
-                for n in range(sizes.states):
-                    sum_lanes(dc_sums_out[task], n * _K, count, t0, dc_out[task, n])
-        restore_denormals(before)
+    def __init__(self, layout, u, delta, A, z, delta_bias, discretization):
+        self.layout = layout
+        self.kinds = (u.dtype, delta.dtype, discretization)
+        self.u, self.delta = lane_contiguous(u), lane_contiguous(delta)
+        self.z = self.u if z is None else lane_contiguous(z)
+        self.a, self.widest = view(layout.pack(A), lanes), view(layout.pack(A.abs().amax(1)), lanes)
+        self.bias = view(layout.pack(delta_bias), lanes)
 
-    return scan_backward
+    def run(self, kernel, inputs: list, outputs: list) -> None:
+        """Launches a kernel of ``cpu_kernels``; names are looked up here, states are viewed."""
+        inputs = [getattr(self, x) if isinstance(x, str) else x for x in inputs]
+        parallel_launch(kernel(*self.kinds), self.layout.tasks, inputs, outputs)
+
+    def states(self, fill: float = 0.0) -> Tensor:
+        y = self.layout
+        return torch.full((y.segments, y.batch, y.blocks, y.states, W), fill)
+
+    def starts(self, save: bool) -> Tensor:
+        y = self.layout
+        return torch.empty(y.batch, y.chunks if save else 0, y.blocks, y.states, W)
+
+
+def _flat(states: Tensor):
+    return view(states.flatten(0, 1), lanes)
+
+
+def _accumulate(s: _Operands, sizes: Sizes, b: Tensor, h: Tensor, starts: Tensor) -> Tensor:
+    """Brings ``h`` from before each segment to after it; returns the products of the decays."""
+    product = s.states(1.0)
+    s.run(
+        cpu_kernels.states_kernel,
+        [sizes, "u", "delta", "a", "widest", b, "bias"],
+        [_flat(h), _flat(product), view(starts, lanes)],
+    )
+    return product
 
 
 def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save):
@@ -275,33 +80,45 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
     Returns:
         ``out [B, L, D]``, the last state ``[B, D, N]`` and the saved states (a private layout).
     """
-    layout = Layout(u, A, B)
-    lead = (layout.batch,)
-    if initial_state is None:
-        h = torch.zeros(layout.batch, layout.blocks, layout.states, W)
-    else:
-        h = layout.pack(initial_state, lead)
-    saved = layout.chunks if save else 0
-    starts = torch.empty(layout.batch, saved, layout.blocks, layout.states, W)
-    out = torch.empty(u.shape, dtype=u.dtype)
-    parallel_launch(
-        _forward_kernel(u.dtype, delta.dtype, discretization),
-        layout.tasks,
+    layout = Layout(u, A, B, SPAN)
+    s = _Operands(layout, u, delta, A, z, delta_bias, discretization)
+    sizes = _sizes(layout, softplus, z is not None)
+    b = layout.rows(B)
+    h = layout.states_of(initial_state)[None]
+    if layout.segments > 1:
+        local = s.states()
+        product = _accumulate(s, sizes, b, local, s.starts(False))
+        h = _carry(h[0], local, product)
+    starts = s.starts(save)
+    out = empty(u.shape, u.dtype)
+    s.run(
+        cpu_kernels.forward_kernel,
         [
-            _sizes(layout, softplus, z),
-            lane_contiguous(u), lane_contiguous(delta), lane_contiguous(u if z is None else z),
-            view(layout.pack(A), lanes), layout.rows(B), layout.rows(C),
-            view(layout.pack(D), lanes), view(layout.pack(delta_bias), lanes),
+            sizes, "u", "delta", "z", "a", "widest", b, layout.rows(C),
+            view(layout.pack(D), lanes), "bias",
         ],
-        [view(h, lanes), view(starts, lanes), out],
+        [_flat(h), view(starts, lanes), out],
     )  # fmt: skip
-    return out, layout.unpack(h, lead), starts
+    return out, layout.unpack(h[-1], (layout.batch,)), starts
+
+
+def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save):
+    """The last state alone, ``[B, D, N]``, and the saved states; arguments as ``forward``."""
+    layout = Layout(u, A, B, SPAN, split=not save)
+    s = _Operands(layout, u, delta, A, None, delta_bias, discretization)
+    h, starts = layout.states_of(initial_state)[None], s.starts(save)
+    if layout.segments > 1:
+        first, h = h[0], s.states()
+    product = _accumulate(s, _sizes(layout, softplus, False), layout.rows(B), h, starts)
+    if layout.segments > 1:
+        h = torch.addcmul(h[-1:], product[-1:], _carry(first, h, product)[-1:])
+    return layout.unpack(h[-1], (layout.batch,)), starts
 
 
 def backward(
     dout, dlast, u, delta, A, B, C, D, z, delta_bias, starts, softplus, discretization, needs
 ):
-    """Gradients of ``forward`` from those of its output (dense) and last state.
+    """Gradients of ``forward`` from those of its output and last state.
 
     Args:
         needs: nine booleans for u, delta, A, B, C, D, z, delta_bias, initial_state.
@@ -309,58 +126,79 @@ def backward(
     Returns:
         Nine tensors, None where not needed.
     """
-    layout = Layout(u, A, B)
-    lead = (layout.batch,)
+    layout = Layout(u, A, B, BLOCKS)
+    s = _Operands(layout, u, delta, A, z, delta_bias, discretization)
     need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
     through = need_u or need_delta or need_A or need_B or need_bias or need_h
     flags = NEED_DZ * need_z + NEED_DC * need_C + NEED_DB * need_B + NEED_DH * through
+    sizes = _sizes(layout, softplus, z is not None, flags)
+    dout = lane_contiguous(dout)
+    b, c = layout.rows(B), layout.rows(C)
 
     def like(x: Tensor, needed: bool) -> Tensor:
-        return torch.empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), dtype=x.dtype)
+        return empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), x.dtype)
 
     def partial(needed: bool) -> tuple[Tensor, Tensor]:
         rows = layout.states if needed else 0
         sums = torch.empty(layout.tasks, rows * CHUNK, W)
-        return sums, torch.empty(layout.tasks, rows, layout.length)
+        return sums, empty((layout.tasks // layout.segments, rows, layout.length), torch.float32)
 
-    dh = torch.zeros(layout.batch, layout.blocks, layout.states, W)
-    if dlast is not None:
-        dh = layout.pack(dlast, lead)
-    da = torch.zeros_like(dh)
-    dskip, dbias = torch.zeros(2, layout.batch, layout.blocks, W)
+    dh = layout.states_of(dlast)[None]
+    if layout.segments > 1 and through:
+        local, product = s.states(), s.states(1.0)
+        s.run(
+            cpu_kernels.gradient_states_kernel,
+            [sizes, "u", "delta", "z", "a", "widest", c, "bias", dout],
+            [_flat(local), _flat(product)],
+        )
+        dh = _carry(dh[0], local.flip(0), product.flip(0)).flip(0).contiguous()
+    elif layout.segments > 1:
+        dh = s.states()
+    da = s.states()
+    dskip, dbias = torch.zeros(2, layout.segments * layout.batch, layout.blocks, W)
     du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
-    db_sums, db = partial(need_B)
-    dc_sums, dc = partial(need_C)
-    parallel_launch(
-        _backward_kernel(u.dtype, delta.dtype, discretization),
-        layout.tasks,
+    db_lanes, db = partial(need_B)
+    dc_lanes, dc = partial(need_C)
+    s.run(
+        cpu_kernels.backward_kernel,
         [
-            _sizes(layout, softplus, z, flags),
-            lane_contiguous(u), lane_contiguous(delta), lane_contiguous(u if z is None else z),
-            view(layout.pack(A), lanes), layout.rows(B), layout.rows(C),
-            view(layout.pack(D), lanes), view(layout.pack(delta_bias), lanes),
-            view(starts, lanes), lane_contiguous(dout),
+            sizes, "u", "delta", "z", "a", "widest", b, c, view(layout.pack(D), lanes), "bias",
+            view(starts, lanes), dout,
         ],
         [
-            view(db_sums, lanes), view(dc_sums, lanes), view(dh, lanes), du, ddelta, dz,
-            view(da, lanes), db, dc, view(dskip, lanes), view(dbias, lanes),
+            view(db_lanes, lanes), view(dc_lanes, lanes), _flat(dh), du, ddelta, dz,
+            _flat(da), db, dc, view(dskip, lanes), view(dbias, lanes),
         ],
     )  # fmt: skip
     values = (
         lambda: du,
         lambda: ddelta,
-        lambda: layout.unpack(da.sum(0)),
+        lambda: layout.unpack(da.sum((0, 1))) / SCALES[discretization],
         lambda: layout.total(db, B.dtype),
         lambda: layout.total(dc, C.dtype),
         lambda: layout.unpack(dskip.sum(0)).to(D.dtype),
         lambda: dz,
         lambda: layout.unpack(dbias.sum(0)).to(delta_bias.dtype),
-        lambda: layout.unpack(dh, lead),
+        lambda: layout.unpack(dh[0], (layout.batch,)),
     )
     return [value() if needed else None for value, needed in zip(values, needs)]
 
 
+def final_state_backward(
+    dlast, u, delta, A, B, delta_bias, starts, softplus, discretization, needs
+):
+    """Gradients of ``final_state``; ``needs`` for u, delta, A, B, delta_bias, initial_state."""
+    dout = u.new_zeros(1, 1, u.shape[2]).expand_as(u)
+    need_u, need_delta, need_A, need_B, need_bias, need_h = needs
+    grads = backward(
+        dout, dlast, u, delta, A, B, torch.zeros_like(B), None, None, delta_bias, starts,
+        softplus, discretization,
+        (need_u, need_delta, need_A, need_B, False, False, False, need_bias, need_h),
+    )  # fmt: skip
+    return [grads[i] for i in (0, 1, 2, 3, 7, 8)]
+
+
 def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    layout = Layout(u, A, B)
+    layout = Layout(u, A, B, SPAN)
     return (layout.batch, layout.chunks if save else 0, layout.blocks, layout.states, W)

@@ -1,117 +1,15 @@
-"""The public scan: checks at the door, one torch operator with its gradient, a kernel by device."""
+"""The public scan: checks at the door, then the operators of ``ops.py``."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from . import cpu
+from . import ops
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 DISCRETIZATIONS = ("mamba", "bilinear", "zoh")
 MAX_STATES = 256
-
-
-def _implementation(tensor: Tensor):
-    if tensor.device.type == "cpu":
-        return cpu
-    from . import cuda
-
-    return cuda
-
-
-@torch.library.custom_op("gamba_warp::selective_scan", mutates_args=())
-def _scan(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None,
-    z: Tensor | None,
-    delta_bias: Tensor | None,
-    initial_state: Tensor | None,
-    softplus: bool,
-    discretization: str,
-    save: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    run = _implementation(u).forward
-    return run(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save)
-
-
-@_scan.register_fake
-def _(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save):
-    out = torch.empty_like(u, memory_format=torch.contiguous_format)
-    last = A.new_empty(u.shape[0], *A.shape)
-    return out, last, A.new_empty(_implementation(u).saved_shape(u, A, B, save))
-
-
-@torch.library.custom_op("gamba_warp::selective_scan_backward", mutates_args=())
-def _scan_backward(
-    dout: Tensor,
-    dlast: Tensor | None,
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None,
-    z: Tensor | None,
-    delta_bias: Tensor | None,
-    saved: Tensor,
-    softplus: bool,
-    discretization: str,
-    needs: list[bool],
-) -> list[Tensor]:
-    run = _implementation(u).backward
-    grads = run(
-        dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs
-    )
-    return [grad for grad in grads if grad is not None]
-
-
-@_scan_backward.register_fake
-def _(dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs):
-    state = A.new_empty(u.shape[0], *A.shape)
-    inputs = (u, delta, A, B, C, D, z, delta_bias, state)
-    return [
-        torch.empty_like(x, memory_format=torch.contiguous_format)
-        for x, needed in zip(inputs, needs)
-        if needed
-    ]
-
-
-def _setup_context(ctx, inputs, output):
-    u, delta, A, B, C, D, z, delta_bias, _, softplus, discretization, save = inputs
-    _, _, saved = output
-    ctx.mark_non_differentiable(saved)
-    ctx.set_materialize_grads(False)
-    ctx.save_for_backward(u, delta, A, B, C, D, z, delta_bias, saved)
-    ctx.softplus, ctx.discretization, ctx.saved = softplus, discretization, save
-
-
-def _gradient(ctx, dout, dlast, _):
-    if not ctx.saved:
-        raise RuntimeError("selective_scan: this call kept nothing for a gradient")
-    u, delta, A, B, C, D, z, delta_bias, saved = ctx.saved_tensors
-    needs = list(ctx.needs_input_grad[:9])
-    if dout is None:
-        dout = torch.zeros_like(u)
-    grads = iter(
-        _scan_backward(
-            dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved,
-            ctx.softplus, ctx.discretization, needs,
-        )
-    )  # fmt: skip
-    return (*(next(grads) if needed else None for needed in needs), None, None, None)
-
-
-def _no_second_gradient(ctx, *grads):
-    raise RuntimeError("selective_scan: second derivatives are not supported")
-
-
-_scan.register_autograd(_gradient, setup_context=_setup_context)
-_scan_backward.register_autograd(_no_second_gradient)
 
 
 def _check(name: str, x: Tensor, shape: tuple[int, ...], dtypes: tuple, device) -> None:
@@ -141,6 +39,35 @@ def _check_groups(name: str, x: Tensor, u: Tensor, states: int) -> Tensor:
         )
     _check(name, x, (batch, length, groups, states), DTYPES, u.device)
     return x
+
+
+def _check_common(u, delta, A, delta_bias, initial_state, discretization) -> int:
+    """What both functions take but B and C; returns N."""
+    if not isinstance(u, Tensor):
+        raise TypeError(f"u is {type(u).__name__}, must be a tensor")
+    if u.dim() != 3 or u.shape[2] == 0:
+        raise ValueError(f"u has shape {tuple(u.shape)}, must be [B, L, D] with D >= 1")
+    _check("u", u, tuple(u.shape), DTYPES, u.device)
+    if u.device.type not in ("cpu", "cuda"):
+        raise ValueError(f"u is on {u.device}, allowed are cpu and cuda")
+    if discretization not in DISCRETIZATIONS:
+        raise ValueError(f"discretization is {discretization!r}, allowed: {DISCRETIZATIONS}")
+    batch, _, channels = u.shape
+    states = A.shape[1] if isinstance(A, Tensor) and A.dim() == 2 else 0
+    _check("A", A, (channels, states), (torch.float32,), u.device)
+    if not 1 <= states <= MAX_STATES:
+        raise ValueError(f"A has shape {tuple(A.shape)}, must be [D, N] with N from 1 to 256")
+    _check("delta", delta, tuple(u.shape), DTYPES, u.device)
+    if delta_bias is not None:
+        _check("delta_bias", delta_bias, (channels,), DTYPES, u.device)
+    if initial_state is not None:
+        shape = (batch, channels, states)
+        _check("initial_state", initial_state, shape, (torch.float32,), u.device)
+    return states
+
+
+def _saves(tensors: tuple[Tensor | None, ...]) -> bool:
+    return torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
 
 
 def selective_scan(
@@ -186,33 +113,50 @@ def selective_scan(
         TypeError: an argument is not a tensor or has another dtype.
         ValueError: a shape, a device or ``discretization`` is not one of the above.
     """
-    if not isinstance(u, Tensor):
-        raise TypeError(f"u is {type(u).__name__}, must be a tensor")
-    if u.dim() != 3 or u.shape[2] == 0:
-        raise ValueError(f"u has shape {tuple(u.shape)}, must be [B, L, D] with D >= 1")
-    _check("u", u, tuple(u.shape), DTYPES, u.device)
-    if u.device.type not in ("cpu", "cuda"):
-        raise ValueError(f"u is on {u.device}, allowed are cpu and cuda")
-    if discretization not in DISCRETIZATIONS:
-        raise ValueError(f"discretization is {discretization!r}, allowed: {DISCRETIZATIONS}")
-    batch, _, channels = u.shape
-    states = A.shape[1] if isinstance(A, Tensor) and A.dim() == 2 else 0
-    _check("A", A, (channels, states), (torch.float32,), u.device)
-    if not 1 <= states <= MAX_STATES:
-        raise ValueError(f"A has shape {tuple(A.shape)}, must be [D, N] with N from 1 to 256")
-    _check("delta", delta, tuple(u.shape), DTYPES, u.device)
+    states = _check_common(u, delta, A, delta_bias, initial_state, discretization)
     B, C = _check_groups("B", B, u, states), _check_groups("C", C, u, states)
     if B.shape != C.shape:
         raise ValueError(f"C has {C.shape[2]} groups, B has {B.shape[2]}; they must be equal")
-    for name, x, shape, dtypes in (
-        ("D", D, (channels,), DTYPES),
-        ("z", z, tuple(u.shape), (u.dtype,)),
-        ("delta_bias", delta_bias, (channels,), DTYPES),
-        ("initial_state", initial_state, (batch, channels, states), (torch.float32,)),
-    ):
-        if x is not None:
-            _check(name, x, shape, dtypes, u.device)
+    if D is not None:
+        _check("D", D, (u.shape[2],), DTYPES, u.device)
+    if z is not None:
+        _check("z", z, tuple(u.shape), (u.dtype,), u.device)
     tensors = (u, delta, A, B, C, D, z, delta_bias, initial_state)
-    save = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
-    out, last, _ = _scan(*tensors, delta_softplus, discretization, save)
+    out, last, _ = ops.scan(*tensors, delta_softplus, discretization, _saves(tensors))
     return (out, last) if return_last_state else out
+
+
+def selective_scan_state(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    delta_bias: Tensor | None = None,
+    delta_softplus: bool = False,
+    *,
+    initial_state: Tensor | None = None,
+    discretization: str = "mamba",
+) -> Tensor:
+    """The state after the last token, for those who need no output: no C, D or gate is computed.
+
+    Args:
+        u: as ``selective_scan``; likewise the others.
+        delta: one step per token and channel.
+        A: rates of decay.
+        B: input matrix.
+        delta_bias: added to delta.
+        delta_softplus: whether δ is a softplus.
+        initial_state: h before the first token.
+        discretization: as ``selective_scan``.
+
+    Returns:
+        ``[B, D, N]`` float32, with gradients to every tensor.
+
+    Raises:
+        TypeError: as ``selective_scan``.
+        ValueError: as ``selective_scan``.
+    """
+    states = _check_common(u, delta, A, delta_bias, initial_state, discretization)
+    tensors = (u, delta, A, _check_groups("B", B, u, states), delta_bias, initial_state)
+    last, _ = ops.state(*tensors, delta_softplus, discretization, _saves(tensors))
+    return last

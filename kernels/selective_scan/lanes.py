@@ -9,12 +9,17 @@ import warp as wp
 
 W = 16  # channels of a lane group: one cache line of float32
 lanes = wp.types.vector(W, wp.float32)
-VALUE, WIDTH = lanes, W  # the names that scalars.py shares
 LANES = "wp::vec_t<16, float>"
+WARP_DTYPES = {
+    torch.float32: wp.float32,
+    torch.float16: wp.float16,
+    torch.bfloat16: wp.bfloat16,
+}
 
 VECTORS = """
 typedef float F __attribute__((vector_size(64), aligned(4)));
 typedef int I __attribute__((vector_size(64), aligned(4)));
+auto splat = [](float x) -> F { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; };
 """
 
 # exp2: round to an integer by adding 1.5 * 2^23 (+127, the exponent bias), then a minimax
@@ -24,54 +29,78 @@ PRELUDE = (
     VECTORS
     + """
 auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
-auto exp2_ = [&](F x) -> F {
-    const F low = F{} - 126.0f, high = F{} + 128.0f, shifter = F{} + 12583039.0f;
-    x = x < low ? low : x;
-    x = x > high ? high : x;
+// max(top, |x|) by their bits, so that NaN is the greatest
+auto wider_ = [](F top, F x) -> F {
+    I i = (I)x & 0x7fffffff;
+    return (F)(i > (I)top ? i : (I)top);
+};
+// whether |x| <= 125 in all lanes
+auto tame_ = [](F x) -> bool { return !__builtin_reduce_or(~((x <= 125.0f) & (x >= -125.0f))); };
+const float LOG2E = 1.44269504088896341f;
+const F shifter = splat(12583039.0f);
+auto exp2_clamped_ = [&](F x) -> F {
     F r = x + shifter;
     F f = x - (r - shifter);
-    F p = F{} + 1.5353360628288064e-4f;
-    p = fma_(p, f, F{} + 1.3398874866584892e-3f);
-    p = fma_(p, f, F{} + 9.618437366421834e-3f);
-    p = fma_(p, f, F{} + 5.5503324696939e-2f);
-    p = fma_(p, f, F{} + 0.24022647913498998f);
-    p = fma_(p, f, F{} + 0.6931472028559706f);
-    p = fma_(p, f, F{} + 1.0f);
+    F p = splat(1.546973508084193e-4f);
+    p = fma_(p, f, splat(1.3390866806730628e-3f));
+    p = fma_(p, f, splat(9.618030861020088e-3f));
+    p = fma_(p, f, splat(5.5503569543361664e-2f));
+    p = fma_(p, f, splat(0.24022650718688965f));
+    p = fma_(p, f, splat(0.6931471824645996f));
+    p = fma_(p, f, splat(1.0f));
     return p * (F)((I)r << 23);
 };
-const float LOG2E = 1.44269504088896341f;
+auto exp2_ = [&](F x) -> F {
+    x = x < -126.0f ? splat(-126.0f) : x;
+    return exp2_clamped_(x > 128.0f ? splat(128.0f) : x);
+};
+// e^-|x|; for NaN it is 2^-126
+auto decay_ = [&](F x) -> F {
+    x = (F)((I)x | (int)0x80000000) * LOG2E;
+    return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
+};
+// the same of degree 5 for |x| <= 125, NaN excluded: the exponent is added as an integer
+auto exp2_tame_ = [&](F x) -> F {
+    const F plain = splat(12582912.0f);
+    F r = x + plain;
+    F f = x - (r - plain);
+    F p = splat(1.3400436146184802e-3f);
+    p = fma_(p, f, splat(9.666373021900654e-3f));
+    p = fma_(p, f, splat(5.550333112478256e-2f));
+    p = fma_(p, f, splat(0.2402234822511673f));
+    p = fma_(p, f, splat(0.6931471824645996f));
+    p = fma_(p, f, splat(1.0f));
+    return (F)((I)p + ((I)r << 23));
+};
 """
 )
 
-
-def _unary(body: str) -> str:
-    return PRELUDE + f"F v = *(const F*)&x; {LANES} result; {body} return result;"
-
-
 # softplus(x) = max(x, 0) + log1p(e), e = exp(-|x|), log1p(e) = 2 atanh(e / (2 + e)): no branch,
-# relatively accurate for x << 0, and x itself in float32 well before 20.
-@wp.func_native(
-    _unary("""
-F e = exp2_((v < 0.0f ? v : -v) * LOG2E);
-F s = e / (e + 2.0f);
-F w = s * s;
-F p = F{} + 0.1401223282424694f;
-p = fma_(p, w, F{} + 0.13999569703388653f);
-p = fma_(p, w, F{} + 0.20010849594358543f);
-p = fma_(p, w, F{} + 0.33333206564805135f);
-p = fma_(p, w, F{} + 1.0f);
-*(F*)&result = (v < 0.0f ? F{} : v) + 2.0f * s * p;
-""")
-)
+# relatively accurate for x << 0, and x itself in float32 well before 20. NaN stays NaN.
+ACTIVATIONS = """
+auto softplus_ = [&](F v) -> F {
+    F e = decay_(v);
+    F s = e / (e + 2.0f);
+    F w = s * s;
+    F p = splat(0.1401223282424694f);
+    p = fma_(p, w, splat(0.13999569703388653f));
+    p = fma_(p, w, splat(0.20010849594358543f));
+    p = fma_(p, w, splat(0.33333206564805135f));
+    p = fma_(p, w, splat(1.0f));
+    return fma_(s + s, p, F{} > v ? F{} : v);
+};
+auto sigmoid_ = [&](F v) -> F {
+    F e = decay_(v);
+    return (v < 0.0f ? e : splat(1.0f)) / (e + 1.0f);
+};
+"""
+
+
+@wp.func_native(PRELUDE + ACTIVATIONS + f"{LANES} r; *(F*)&r = softplus_(*(const F*)&x); return r;")
 def softplus(x: lanes) -> lanes: ...
 
 
-@wp.func_native(
-    _unary("""
-F e = exp2_((v < 0.0f ? v : -v) * LOG2E);
-*(F*)&result = (v < 0.0f ? e : F{} + 1.0f) / (e + 1.0f);
-""")
-)
+@wp.func_native(PRELUDE + ACTIVATIONS + f"{LANES} r; *(F*)&r = sigmoid_(*(const F*)&x); return r;")
 def sigmoid(x: lanes) -> lanes: ...
 
 
@@ -104,74 +133,3 @@ __builtin_ia32_ldmxcsr(before);
 #endif
 """)
 def restore_denormals(before: int): ...
-
-
-_ADDRESS = (
-    "{T}* p = ({T}*)((char*)x.data + (size_t)b * x.strides[0] + (size_t)t * x.strides[1]) + d;"
-)
-# element type, lanes from *p, one lane from p[i], *p from lanes v, p[i] from v.c[i]
-_CODE = {
-    torch.float32: ("float", "*(const F*)p", "p[i]", "*(F*)p = *(const F*)&v", "p[i] = v.c[i]"),
-    torch.float16: (
-        "_Float16",
-        "__builtin_convertvector(*(const H*)p, F)",
-        "(float)p[i]",
-        "*(H*)p = __builtin_convertvector(*(const F*)&v, H)",
-        "p[i] = (_Float16)v.c[i]",
-    ),
-    torch.bfloat16: (
-        "unsigned short",
-        "(F)(__builtin_convertvector(*(const S*)p, I) << 16)",
-        "widen(p[i])",
-        "*(S*)p = __builtin_convertvector(narrow((I)*(const F*)&v), S)",
-        "p[i] = (unsigned short)narrow(I{} + bits(v.c[i]))[0]",
-    ),
-}
-_HALF = """
-typedef _Float16 H __attribute__((vector_size(32), aligned(2)));
-"""
-_BFLOAT = """
-typedef unsigned short S __attribute__((vector_size(32), aligned(2)));
-auto widen = [](unsigned short s) -> float {
-    int i = (int)s << 16;
-    float f;
-    __builtin_memcpy(&f, &i, 4);
-    return f;
-};
-auto bits = [](float f) -> int { int i; __builtin_memcpy(&i, &f, 4); return i; };
-auto narrow = [](I i) -> I {  // to nearest, ties to even; NaN stays a NaN
-    I is_nan = (i & 0x7fffffff) > 0x7f800000;
-    I rounded = (i + 0x7fff + ((i >> 16) & 1)) >> 16;
-    return (is_nan ? (i >> 16) | 0x40 : rounded) & 0xffff;
-};
-"""
-WARP_DTYPES = {
-    torch.float32: wp.float32,
-    torch.float16: wp.float16,
-    torch.bfloat16: wp.bfloat16,
-}
-
-
-def _accessors(dtype: torch.dtype):
-    element, read, read_one, write, write_one = _CODE[dtype]
-    scalar = WARP_DTYPES[dtype]
-    address = VECTORS + {torch.float16: _HALF, torch.bfloat16: _BFLOAT}.get(dtype, "")
-    address += _ADDRESS.format(T=element)
-    read_body = (
-        f"{LANES} r; if (count == 16) *(F*)&r = {read};"
-        f"else for (int i = 0; i < count; ++i) r.c[i] = {read_one}; return r;"
-    )
-    write_body = f"if (count == 16) {write}; else for (int i = 0; i < count; ++i) {write_one};"
-
-    @wp.func_native(address + read_body)
-    def load(x: wp.array3d(dtype=scalar), b: int, t: int, d: int, count: int) -> lanes: ...
-
-    @wp.func_native(address + write_body)
-    def store(x: wp.array3d(dtype=scalar), b: int, t: int, d: int, count: int, v: lanes): ...
-
-    return load, store
-
-
-# By element type, ``(load, store)``: both address row [b, t] of a [B, L, D] array, dense in D, from
-# channel d on. Lanes from ``count`` on are read as 0 and not written.
-ACCESSORS = {dtype: _accessors(dtype) for dtype in WARP_DTYPES}

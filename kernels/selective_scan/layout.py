@@ -1,4 +1,4 @@
-"""How the CPU kernels see their tensors: channels in lanes, tokens in chunks."""
+"""How the CPU kernels see their tensors: channels in lanes, tokens in chunks, work in tasks."""
 
 from __future__ import annotations
 
@@ -9,21 +9,43 @@ from torch import Tensor
 from .lanes import W
 
 CHUNK = 64  # tokens; a state is saved at the start of each chunk
-BLOCKS = 4  # lane groups of a task; fixed, so that sums do not depend on the number of threads
+BLOCKS = 4  # lane groups whose dB and dC are one partial sum, whatever the number of threads
+_SEGMENT = 4 * CHUNK  # tokens of a segment at least
 
 
 class Layout:
-    """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded."""
+    """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded.
 
-    def __init__(self, u: Tensor, A: Tensor, B: Tensor):
+    A task is a segment of one batch element's tokens and a span of blocks of one group. The blocks
+    of a span are walked side by side, so that long pieces of rows are read. Segments are for inputs
+    with fewer channels than feed torch's threads; finding their first states costs a second walk.
+    """
+
+    def __init__(self, u: Tensor, A: Tensor, B: Tensor, most: int, split: bool = True):
+        """
+        Args:
+            u: ``[B, L, D]``.
+            A: ``[D, N]``.
+            B: ``[B, L, G, N]``.
+            most: blocks of a span at most, a multiple of BLOCKS.
+            split: whether there may be several segments.
+        """
         self.batch, self.length, self.channels = u.shape
         self.states, self.groups = A.shape[1], B.shape[2]
         self.group_width = self.channels // self.groups
         self.group_blocks = -(-self.group_width // W)
-        self.parts = -(-self.group_blocks // BLOCKS)
         self.blocks = self.groups * self.group_blocks
-        self.tasks = self.batch * self.groups * self.parts
         self.chunks = -(-self.length // CHUNK)
+        threads = torch.get_num_threads()
+        per_thread = max(1, min(self.group_blocks, -(-self.batch * self.blocks // threads)))
+        self.span = min(most, -(-per_thread // BLOCKS) * BLOCKS)
+        spans = self.batch * self.groups * -(-self.group_blocks // self.span)
+        self.segments = 1
+        if split and 0 < spans < threads:
+            self.segments = max(1, min(-(-threads // spans), self.length // _SEGMENT))
+        self.segment = max(1, -(-self.chunks // self.segments)) * CHUNK
+        self.segments = max(1, -(-self.length // self.segment))
+        self.tasks = self.segments * spans
 
     def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
         """``[.., D, *]`` to float32 ``[.., blocks, *, W]``, a copy; None becomes zeros."""
@@ -46,12 +68,19 @@ class Layout:
         x = x[..., : self.group_width].movedim(-1, n + 1)
         return x.reshape(*lead, self.channels, *tail).contiguous()
 
+    def states_of(self, x: Tensor | None) -> Tensor:
+        """States ``[B, D, N]`` or None for 0 to packed ones, ``[B, blocks, N, W]``."""
+        if x is None:
+            return torch.zeros(self.batch, self.blocks, self.states, W)
+        return self.pack(x, (self.batch,))
+
     def rows(self, x: Tensor) -> Tensor:
         """``[B, L, G, N]`` to float32 ``[B·G·N, L]``: the tokens of one state are adjacent."""
         rows = self.batch * self.groups * self.states
         return x.permute(0, 2, 3, 1).float().reshape(rows, self.length).contiguous()
 
     def total(self, parts: Tensor, dtype: torch.dtype) -> Tensor:
-        """Sums ``[tasks, N, L]`` over the parts of a group: ``[B, L, G, N]``."""
-        x = parts.view(self.batch, self.groups, self.parts, self.states, self.length).sum(2)
+        """Sums ``[B·G·parts, N, L]`` over the parts of a group: ``[B, L, G, N]``."""
+        spans = -(-self.group_blocks // self.span)
+        x = parts.view(self.batch, self.groups, spans, self.states, self.length).sum(2)
         return x.permute(0, 3, 1, 2).to(dtype, memory_format=torch.contiguous_format)

@@ -1,182 +1,259 @@
-"""Native inner loops of the CPU scan: one state n, a chunk of tokens, sixteen channels.
+"""Native inner loops of the CPU scan: one state n, a strip of tokens, sixteen channels.
 
-Equations are those of README.md. Rows of B and C are passed from the chunk's first token ``t0`` on.
+Equations are those of README.md. Values per token come from ``tokens.py``; rows of B and C are
+passed whole, the strip's first token is ``t0``.
 """
+
+import functools
+from types import SimpleNamespace
 
 import warp as wp
 
 from .lanes import LANES, PRELUDE, lanes
+from .tokens import TOKENS
 
 # gradients that cost work inside the loops, as bits of ``needs``
 NEED_DZ, NEED_DC, NEED_DB, NEED_DH = 1, 2, 4, 8
 
-# Equations 2 to 4 by mode: f and g of x = δA and their slopes. ``rate`` is δ, times log2(e) where
-# an exponential is wanted. ``mode`` is a constant of the kernel, so that one branch remains.
-MODES = {"mamba": 0, "bilinear": 1, "zoh": 2}
+LOG2E = 1.4426950408889634
+# what δ is multiplied by to give ``rate``: exponentials are powers of two
+SCALES = {"mamba": LOG2E, "bilinear": 1.0, "zoh": LOG2E}
+
 _PHI = """
-    F x = rate[t] * a * 0.6931471805599453f;
-    F series = F{} + 2.505210838544172e-8f, slope = F{} + 2.505210838544172e-7f;
-    const float k[10] = {2.755731922398589e-7f, 2.755731922398589e-6f, 2.48015873015873e-5f,
+    const F xe = x * 0.6931471805599453f;
+    F series = splat(2.505210838544172e-8f), slope = splat(2.505210838544172e-7f);
+    const float series_of[10] = {2.755731922398589e-7f, 2.755731922398589e-6f, 2.48015873015873e-5f,
         1.984126984126984e-4f, 1.388888888888889e-3f, 8.333333333333333e-3f,
         4.1666666666666664e-2f, 0.16666666666666666f, 0.5f, 1.0f};
-    for (int i = 0; i < 10; ++i) series = fma_(series, x, F{} + k[i]);
-    for (int i = 0; i < 9; ++i) slope = fma_(slope, x, F{} + k[i] * (float)(9 - i));
-    I small = (x < 1.0f) & (x > -1.0f);
-    F safe = small ? F{} + 1.0f : x;
-    g = small ? series : (f - 1.0f) / safe;
+    for (int i = 0; i < 10; ++i) series = fma_(series, xe, splat(series_of[i]));
+    for (int i = 0; i < 9; ++i) slope = fma_(slope, xe, splat(series_of[i] * (float)(9 - i)));
+    const I small = (xe < 1.0f) & (xe > -1.0f);
+    const F safe = small ? splat(1.0f) : xe;
+    const F g = small ? series : (f - 1.0f) / safe;
 """
-_STEP = (
-    """
-    F f, g = F{} + 1.0f;
-    if (mode == 1) {
-        g = 1.0f / (1.0f - 0.5f * (rate[t] * a));
-        f = fma_(rate[t] * a, g, F{} + 1.0f);
-    } else f = exp2_(rate[t] * a);
-    if (mode == 2) {"""
-    + _PHI
-    + "}"
-)
-_SLOPE = (
-    """
-    F f = fs[t], g = F{} + 1.0f, df = f, dg = F{};
-    if (mode == 1) {
-        g = 1.0f / (1.0f - 0.5f * (rate[t] * a));
-        df = g * g;
-        dg = 0.5f * df;
-    }
-    if (mode == 2) {"""
-    + _PHI
-    + "dg = small ? slope : (f - g) / safe;}"
-)
-_OPERANDS = """
+# Equations 2 to 4: f and g of x = rate A.
+_FACTORS = {
+    "mamba": "const F f = exp2(x); const F g = splat(1.0f);",
+    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x); const F f = fma_(x, g, splat(1.0f));",
+    "zoh": "const F f = exp2(x);" + _PHI,
+}
+# And their slopes, f given.
+_SLOPES = {
+    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x); const F df = g * g, dg = 0.5f * df;",
+    "zoh": _PHI + "const F df = f, dg = small ? slope : (f - g) / safe;",
+}
+_OPERANDS = (
+    PRELUDE
+    + TOKENS
+    + """
 F h = *(const F*)&h_in;
 const F a = *(const F*)&a_in;
-const F* rate = (const F*)rate_in.data;
-const F* du = (const F*)du_in.data;
 const float* b = &b_in.data[t0];
+"""
+)
+_RETURN = f"{LANES} r; *(F*)&r = h; return r;"
+
+# Equations 1 and 5.
+_ADVANCE = """
 const float* c = &c_in.data[t0];
+Token* const token = aligned_((Token*)scratch.data) + first;
+auto walk = [&](auto exp2) {
+    for (int t = 0; t < count; ++t) {
+        const F x = token[t].rate * a;
+        FACTORS
+        h = fma_(f, h, g * (token[t].du * b[t]));
+        token[t].y = fma_(h, splat(c[t]), token[t].y);
+    }
+};
+if (tame) walk(exp2_tame_);
+else walk(exp2_);
 """
 
-
-# Equations 1 and 5 for one state over a chunk.
-@wp.func_native(
-    PRELUDE
-    + _OPERANDS
-    + f"""
-F* y = (F*)y_out.data;
-for (int t = 0; t < count; ++t) {{
-    {_STEP}
-    h = fma_(f, h, g * (du[t] * b[t]));
-    y[t] = fma_(h, F{{}} + c[t], y[t]);
-}}
-{LANES} r; *(F*)&r = h; return r;
+# Equation 1 alone, and the product of the decays.
+_ACCUMULATE = """
+F& product = *(F*)product_out.data;
+const Token* const token = aligned_((const Token*)scratch.data) + first;
+auto walk = [&](auto exp2) {
+    F decay = product;
+    for (int t = 0; t < count; ++t) {
+        const F x = token[t].rate * a;
+        FACTORS
+        h = fma_(f, h, g * (token[t].du * b[t]));
+        decay *= f;
+    }
+    product = decay;
+};
+if (tame) walk(exp2_tame_);
+else walk(exp2_);
 """
-)
-def advance(
-    mode: int,
-    h_in: lanes,
-    a_in: lanes,
-    rate_in: wp.array(dtype=lanes),
-    du_in: wp.array(dtype=lanes),
-    b_in: wp.array(dtype=wp.float32),
-    c_in: wp.array(dtype=wp.float32),
-    t0: int,
-    count: int,
-    y_out: wp.array(dtype=lanes),
-) -> lanes: ...
 
-
-# As ``advance``, keeping f and h of every token, and adding dy·h to the sums of dC (equation 8).
-@wp.func_native(
-    PRELUDE
-    + _OPERANDS
-    + f"""
-const F* dy = (const F*)dy_in.data;
-F* y = (F*)y_out.data;
-F* fs = (F*)f_out.data;
-F* hs = (F*)h_out.data;
-F* dc = (F*)dc_out.data + first;
-hs[0] = h;
-for (int t = 0; t < count; ++t) {{
-    {_STEP}
-    h = fma_(f, h, g * (du[t] * b[t]));
-    fs[t] = f;
-    hs[t + 1] = h;
-    if (needs & {NEED_DZ}) y[t] = fma_(h, F{{}} + c[t], y[t]);
-    if (needs & {NEED_DC}) dc[t] = fma_(dy[t], h, dc[t]);
-}}
+# What the outputs send back to the state before the first token, and the product of the decays.
+_GATHER = """
+F& product = *(F*)product_out.data;
+const float* c = &b_in.data[t0];
+const GradToken* const token = aligned_((const GradToken*)scratch.data) + first;
+auto walk = [&](auto exp2) {
+    F decay = product;
+    for (int t = 0; t < count; ++t) {
+        const F x = token[t].rate * a;
+        FACTORS
+        decay *= f;
+        h = fma_(decay, token[t].dy * c[t], h);
+    }
+    product = decay;
+};
+if (tame) walk(exp2_tame_);
+else walk(exp2_);
 """
-)
-def recompute(
-    mode: int,
-    h_in: lanes,
-    a_in: lanes,
-    rate_in: wp.array(dtype=lanes),
-    du_in: wp.array(dtype=lanes),
-    b_in: wp.array(dtype=wp.float32),
-    c_in: wp.array(dtype=wp.float32),
-    t0: int,
-    count: int,
-    dy_in: wp.array(dtype=lanes),
-    needs: int,
-    first: int,
-    y_out: wp.array(dtype=lanes),
-    f_out: wp.array(dtype=lanes),
-    h_out: wp.array(dtype=lanes),
-    dc_out: wp.array(dtype=lanes),
-): ...
 
+# As _ADVANCE, keeping f and h of every token, and adding dy·h to the sums of dC (equation 8).
+_RECOMPUTE = f"""
+const float* c = &c_in.data[t0];
+GradToken* const token = aligned_((GradToken*)scratch.data) + first;
+Kept* const kept = aligned_((Kept*)kept_out.data);
+F* const dc = (F*)dc_out.data + row;
+auto walk = [&](auto exp2) {{
+    for (int t = 0; t < count; ++t) {{
+        const F x = token[t].rate * a;
+        FACTORS
+        kept[t].f = f;
+        kept[t].h = h;
+        h = fma_(f, h, g * (token[t].du * b[t]));
+        if (needs & {NEED_DZ}) token[t].y = fma_(h, splat(c[t]), token[t].y);
+        if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h, dc[t]);
+    }}
+}};
+if (tame) walk(exp2_tame_);
+else walk(exp2_);
+"""
 
-# Equations 6, 7 and 9 to 12 for one state, backwards over a chunk; h is the gradient of h_t.
-@wp.func_native(
-    PRELUDE
-    + _OPERANDS
-    + f"""
-const F* step = (const F*)step_in.data;
-const F* dy = (const F*)dy_in.data;
-const F* fs = (const F*)f_in.data;
-const F* hs = (const F*)hs_in.data;
-F* s = (F*)s_out.data;
-F* p = (F*)p_out.data;
-F* db = (F*)db_out.data + first;
-F da = F{{}};
-for (int t = count - 1; t >= 0; --t) {{
-    {_SLOPE}
-    h = fma_(dy[t], F{{}} + c[t], h);
-    if (needs & {NEED_DB}) db[t] = fma_(g * h, du[t], db[t]);
-    s[t] = fma_(g * h, F{{}} + b[t], s[t]);
-    F q;
-    if (mode == 0) q = (f * h) * hs[t];
-    else q = h * (hs[t] * df + du[t] * b[t] * dg);
-    h = f * h;
-    p[t] = fma_(q, a, p[t]);
-    da = fma_(q, step[t], da);
-}}
+# Equations 6, 7 and 9 to 12, backwards; h is the gradient of h_t, da is Σ rate q.
+_RETREAT = """
+const float* c = &c_in.data[t0];
+GradToken* const token = aligned_((GradToken*)scratch.data) + first;
+const Kept* const kept = aligned_((const Kept*)kept_in.data);
+F* const db = (F*)db_out.data + row;
+F da = F{};
+for (int t = count - 1; t >= 0; --t) {
+    GradToken& k = token[t];
+    h = fma_(k.dy, splat(c[t]), h);
+    const F f = kept[t].f;
+    GRADIENT
+    k.p = fma_(q, a, k.p);
+    da = fma_(q, k.rate, da);
+}
 *(F*)da_out.data = da;
-{LANES} r; *(F*)&r = h; return r;
 """
-)
-def retreat(
-    mode: int,
-    h_in: lanes,
-    a_in: lanes,
-    rate_in: wp.array(dtype=lanes),
-    du_in: wp.array(dtype=lanes),
-    b_in: wp.array(dtype=wp.float32),
-    c_in: wp.array(dtype=wp.float32),
-    t0: int,
-    count: int,
-    step_in: wp.array(dtype=lanes),
-    dy_in: wp.array(dtype=lanes),
-    f_in: wp.array(dtype=lanes),
-    hs_in: wp.array(dtype=lanes),
-    needs: int,
-    first: int,
-    s_out: wp.array(dtype=lanes),
-    p_out: wp.array(dtype=lanes),
-    db_out: wp.array(dtype=lanes),
-    da_out: wp.array(dtype=lanes),
-) -> lanes: ...
+_OWN = f"""
+    if (needs & {NEED_DB}) db[t] = fma_(h, k.du, db[t]);
+    k.s = fma_(h, splat(b[t]), k.s);
+    h = f * h;
+    const F q = h * kept[t].h;
+"""
+_GENERAL = f"""
+    const F x = k.rate * a;
+    SLOPES
+    const F gh = g * h;
+    if (needs & {NEED_DB}) db[t] = fma_(gh, k.du, db[t]);
+    k.s = fma_(gh, splat(b[t]), k.s);
+    const F q = h * (kept[t].h * df + k.du * b[t] * dg);
+    h = f * h;
+"""
+_GRADIENTS = {
+    "mamba": _OWN,
+    "bilinear": _GENERAL.replace("SLOPES", _SLOPES["bilinear"]),
+    "zoh": _GENERAL.replace("SLOPES", _SLOPES["zoh"]),
+}
+
+
+@functools.cache
+def forward_leaves(discretization: str) -> SimpleNamespace:
+    """``advance`` and ``accumulate``; both return the state after the strip."""
+    factors = _FACTORS[discretization]
+
+    @wp.func_native(_OPERANDS + _ADVANCE.replace("FACTORS", factors) + _RETURN)
+    def advance(
+        h_in: lanes,
+        a_in: lanes,
+        tame: int,
+        b_in: wp.array(dtype=wp.float32),
+        c_in: wp.array(dtype=wp.float32),
+        t0: int,
+        count: int,
+        first: int,
+        scratch: wp.array(dtype=lanes),
+    ) -> lanes: ...
+
+    @wp.func_native(_OPERANDS + _ACCUMULATE.replace("FACTORS", factors) + _RETURN)
+    def accumulate(
+        h_in: lanes,
+        a_in: lanes,
+        tame: int,
+        b_in: wp.array(dtype=wp.float32),
+        t0: int,
+        count: int,
+        first: int,
+        scratch: wp.array(dtype=lanes),
+        product_out: wp.array(dtype=lanes),
+    ) -> lanes: ...
+
+    return SimpleNamespace(advance=advance, accumulate=accumulate)
+
+
+@functools.cache
+def backward_leaves(discretization: str) -> SimpleNamespace:
+    """``recompute``, ``retreat`` and ``gather``; two return the gradient of the first state."""
+    factors = _FACTORS[discretization]
+    gradient = _GRADIENTS[discretization]
+
+    @wp.func_native(_OPERANDS + _RECOMPUTE.replace("FACTORS", factors))
+    def recompute(
+        h_in: lanes,
+        a_in: lanes,
+        tame: int,
+        b_in: wp.array(dtype=wp.float32),
+        c_in: wp.array(dtype=wp.float32),
+        t0: int,
+        count: int,
+        first: int,
+        scratch: wp.array(dtype=lanes),
+        needs: int,
+        row: int,
+        kept_out: wp.array(dtype=lanes),
+        dc_out: wp.array(dtype=lanes),
+    ): ...
+
+    @wp.func_native(_OPERANDS + _RETREAT.replace("GRADIENT", gradient) + _RETURN)
+    def retreat(
+        h_in: lanes,
+        a_in: lanes,
+        b_in: wp.array(dtype=wp.float32),
+        c_in: wp.array(dtype=wp.float32),
+        t0: int,
+        count: int,
+        first: int,
+        scratch: wp.array(dtype=lanes),
+        needs: int,
+        row: int,
+        kept_in: wp.array(dtype=lanes),
+        db_out: wp.array(dtype=lanes),
+        da_out: wp.array(dtype=lanes),
+    ) -> lanes: ...
+
+    @wp.func_native(_OPERANDS + _GATHER.replace("FACTORS", factors) + _RETURN)
+    def gather(
+        h_in: lanes,
+        a_in: lanes,
+        tame: int,
+        b_in: wp.array(dtype=wp.float32),
+        t0: int,
+        count: int,
+        first: int,
+        scratch: wp.array(dtype=lanes),
+        product_out: wp.array(dtype=lanes),
+    ) -> lanes: ...
+
+    return SimpleNamespace(recompute=recompute, retreat=retreat, gather=gather)
 
 
 @wp.func_native(

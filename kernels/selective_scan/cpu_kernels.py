@@ -1,0 +1,333 @@
+"""The CPU kernels: lanes are adjacent channels, tokens run in strips, states one by one.
+
+A task is one batch element, a segment of its tokens, and lane groups of one channel group. In a
+strip it holds what does not depend on the state n, and walks the tokens once per n and lane group:
+h_n lives in registers and N is free. Equations are those of README.md.
+"""
+
+import functools
+
+import torch
+import warp as wp
+
+from . import recurrence, tokens
+from .lanes import WARP_DTYPES, W, flush_denormals, lanes, restore_denormals
+from .layout import BLOCKS, CHUNK
+from .recurrence import NEED_DB, NEED_DC, NEED_DH, SCALES, sum_lanes
+from .tokens import GRAD_TOKEN, KEPT, STRIP, TOKEN
+
+SPAN = 32  # lane groups of a forward task at most: with STRIP, what a core's own cache holds
+
+_K = wp.constant(CHUNK)
+_S = wp.constant(STRIP)
+_P = wp.constant(BLOCKS)
+_W = wp.constant(W)
+_DC, _DB, _DH = (wp.constant(v) for v in (NEED_DC, NEED_DB, NEED_DH))
+# room for alignment to cache lines: one more
+_SPAN = wp.constant(SPAN)
+_TOKENS = wp.constant(TOKEN * STRIP * SPAN + 1)
+_GRAD_TOKENS = wp.constant(GRAD_TOKEN * CHUNK * BLOCKS + 1)
+_KEPT = wp.constant(KEPT * CHUNK + 1)
+
+
+@wp.struct
+class Sizes:
+    """What the kernels know: shapes, options, and which gradients are wanted."""
+
+    length: int
+    segment: int  # tokens of a segment, whole chunks
+    segments: int
+    batch: int
+    states: int
+    groups: int
+    group_width: int
+    group_blocks: int
+    span: int
+    use_softplus: int
+    use_z: int
+    needs: int
+
+
+@wp.struct
+class Place:
+    """Where a task works."""
+
+    b: int
+    state: int  # row of the state arrays: segments, then batch elements
+    row: int  # of B and C
+    begin: int  # tokens
+    end: int
+    k: int  # lane groups
+    blocks: int
+    d: int  # channels
+    width: int
+
+
+@wp.func
+def _place(sizes: Sizes, task: int) -> Place:
+    spans = (sizes.group_blocks + sizes.span - 1) / sizes.span
+    first = task % spans * sizes.span
+    rest = task / spans
+    group = rest % sizes.groups
+    rest = rest / sizes.groups
+    p = Place()
+    p.b = rest % sizes.batch
+    p.state = rest
+    p.row = (p.b * sizes.groups + group) * sizes.states
+    p.begin = rest / sizes.batch * sizes.segment
+    p.end = wp.min(p.begin + sizes.segment, sizes.length)
+    p.blocks = wp.min(sizes.span, sizes.group_blocks - first)
+    p.k = group * sizes.group_blocks + first
+    p.d = group * sizes.group_width + first * _W
+    p.width = wp.min(p.blocks * _W, sizes.group_width - first * _W)
+    return p
+
+
+@functools.cache
+def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
+    """From the states before each segment, in ``h_out``, to those after it, and the output."""
+    scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
+    token, state = tokens.forward_leaves(io, delta_io), recurrence.forward_leaves(discretization)
+    prepare, finish, advance = token.prepare, token.finish, state.advance
+    scale = SCALES[discretization]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def scan_forward(
+        offset: int,
+        # in
+        sizes: Sizes,
+        u_in: wp.array3d(dtype=scalar),
+        delta_in: wp.array3d(dtype=delta_scalar),
+        z_in: wp.array3d(dtype=scalar),
+        a_in: wp.array2d(dtype=lanes),
+        widest_in: wp.array(dtype=lanes),
+        b_in: wp.array2d(dtype=wp.float32),
+        c_in: wp.array2d(dtype=wp.float32),
+        skip_in: wp.array(dtype=lanes),
+        bias_in: wp.array(dtype=lanes),
+        # out
+        h_out: wp.array3d(dtype=lanes),
+        starts_out: wp.array4d(dtype=lanes),
+        y_out: wp.array3d(dtype=scalar),
+    ):
+        p = _place(sizes, offset + wp.tid())
+        scratch = wp.zeros(shape=(_TOKENS,), dtype=lanes)
+        tame = wp.zeros(shape=(_SPAN,), dtype=int)
+        before = flush_denormals()
+        for strip in range((p.end - p.begin + _S - 1) / _S):
+            t0 = p.begin + strip * _S
+            count = wp.min(_S, p.end - t0)
+            save = starts_out.shape[1] > 0 and t0 % _K == 0
+            prepare(
+                u_in, delta_in, p.b, t0, count, p.d, p.width, p.k, p.blocks, widest_in, bias_in,
+                skip_in, sizes.use_softplus, wp.static(scale), scratch, tame,
+            )  # fmt: skip
+            for j in range(p.blocks):
+                k = p.k + j
+                for n in range(sizes.states):
+                    h = h_out[p.state, k, n]
+                    if save:
+                        starts_out[p.b, t0 / _K, k, n] = h
+                    h_out[p.state, k, n] = advance(
+                        h, a_in[k, n], tame[j], b_in[p.row + n], c_in[p.row + n],
+                        t0, count, j * _S, scratch,
+                    )  # fmt: skip
+            finish(z_in, p.b, t0, count, p.d, p.width, p.blocks, sizes.use_z, scratch, y_out)
+        restore_denormals(before)
+
+    return scan_forward
+
+
+@functools.cache
+def states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
+    """As ``forward_kernel`` without output, and the products of the decays."""
+    scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
+    prepare = tokens.forward_leaves(io, delta_io).prepare
+    accumulate = recurrence.forward_leaves(discretization).accumulate
+    scale = SCALES[discretization]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def scan_states(
+        offset: int,
+        # in
+        sizes: Sizes,
+        u_in: wp.array3d(dtype=scalar),
+        delta_in: wp.array3d(dtype=delta_scalar),
+        a_in: wp.array2d(dtype=lanes),
+        widest_in: wp.array(dtype=lanes),
+        b_in: wp.array2d(dtype=wp.float32),
+        bias_in: wp.array(dtype=lanes),
+        # out
+        h_out: wp.array3d(dtype=lanes),
+        product_out: wp.array3d(dtype=lanes),
+        starts_out: wp.array4d(dtype=lanes),
+    ):
+        p = _place(sizes, offset + wp.tid())
+        scratch = wp.zeros(shape=(_TOKENS,), dtype=lanes)
+        tame = wp.zeros(shape=(_SPAN,), dtype=int)
+        product = wp.zeros(shape=(1,), dtype=lanes)
+        before = flush_denormals()
+        for strip in range((p.end - p.begin + _S - 1) / _S):
+            t0 = p.begin + strip * _S
+            count = wp.min(_S, p.end - t0)
+            save = starts_out.shape[1] > 0 and t0 % _K == 0
+            prepare(
+                u_in, delta_in, p.b, t0, count, p.d, p.width, p.k, p.blocks, widest_in, bias_in,
+                bias_in, sizes.use_softplus, wp.static(scale), scratch, tame,
+            )  # fmt: skip
+            for j in range(p.blocks):
+                k = p.k + j
+                for n in range(sizes.states):
+                    h = h_out[p.state, k, n]
+                    if save:
+                        starts_out[p.b, t0 / _K, k, n] = h
+                    product[0] = product_out[p.state, k, n]
+                    h_out[p.state, k, n] = accumulate(
+                        h, a_in[k, n], tame[j], b_in[p.row + n], t0, count, j * _S, scratch, product
+                    )
+                    product_out[p.state, k, n] = product[0]
+        restore_denormals(before)
+
+    return scan_states
+
+
+@functools.cache
+def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
+    """What a segment's outputs send back to the state before it, and the products of the decays."""
+    scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
+    prepare = tokens.backward_leaves(io, delta_io).prepare
+    gather = recurrence.backward_leaves(discretization).gather
+    scale = SCALES[discretization]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def scan_gradient_states(
+        offset: int,
+        # in
+        sizes: Sizes,
+        u_in: wp.array3d(dtype=scalar),
+        delta_in: wp.array3d(dtype=delta_scalar),
+        z_in: wp.array3d(dtype=scalar),
+        a_in: wp.array2d(dtype=lanes),
+        widest_in: wp.array(dtype=lanes),
+        c_in: wp.array2d(dtype=wp.float32),
+        bias_in: wp.array(dtype=lanes),
+        dout_in: wp.array3d(dtype=scalar),
+        # out
+        dh_out: wp.array3d(dtype=lanes),
+        product_out: wp.array3d(dtype=lanes),
+    ):
+        p = _place(sizes, offset + wp.tid())
+        scratch = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
+        tame = wp.zeros(shape=(_P,), dtype=int)
+        product = wp.zeros(shape=(1,), dtype=lanes)
+        before = flush_denormals()
+        for chunk in range((p.end - p.begin + _K - 1) / _K):
+            t0 = p.begin + chunk * _K
+            count = wp.min(_K, p.end - t0)
+            prepare(
+                u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d, p.width, p.k, p.blocks,
+                widest_in, bias_in, bias_in, sizes.use_softplus, sizes.use_z, wp.static(scale),
+                scratch, tame,
+            )  # fmt: skip
+            for j in range(p.blocks):
+                k = p.k + j
+                for n in range(sizes.states):
+                    product[0] = product_out[p.state, k, n]
+                    dh_out[p.state, k, n] = gather(
+                        dh_out[p.state, k, n], a_in[k, n], tame[j], c_in[p.row + n], t0, count,
+                        j * _K, scratch, product,
+                    )  # fmt: skip
+                    product_out[p.state, k, n] = product[0]
+        restore_denormals(before)
+
+    return scan_gradient_states
+
+
+@functools.cache
+def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
+    """From the gradients of the states after each segment, in ``dh_out``, to all others."""
+    scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
+    token, state = tokens.backward_leaves(io, delta_io), recurrence.backward_leaves(discretization)
+    prepare, finish = token.prepare, token.finish
+    recompute, retreat = state.recompute, state.retreat
+    scale = SCALES[discretization]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def scan_backward(
+        offset: int,
+        # in
+        sizes: Sizes,
+        u_in: wp.array3d(dtype=scalar),
+        delta_in: wp.array3d(dtype=delta_scalar),
+        z_in: wp.array3d(dtype=scalar),
+        a_in: wp.array2d(dtype=lanes),
+        widest_in: wp.array(dtype=lanes),
+        b_in: wp.array2d(dtype=wp.float32),
+        c_in: wp.array2d(dtype=wp.float32),
+        skip_in: wp.array(dtype=lanes),
+        bias_in: wp.array(dtype=lanes),
+        starts_in: wp.array4d(dtype=lanes),
+        dout_in: wp.array3d(dtype=scalar),
+        # scratch
+        db_lanes_out: wp.array2d(dtype=lanes),
+        dc_lanes_out: wp.array2d(dtype=lanes),
+        # out
+        dh_out: wp.array3d(dtype=lanes),
+        du_out: wp.array3d(dtype=scalar),
+        ddelta_out: wp.array3d(dtype=delta_scalar),
+        dz_out: wp.array3d(dtype=scalar),
+        da_out: wp.array3d(dtype=lanes),
+        db_out: wp.array3d(dtype=wp.float32),
+        dc_out: wp.array3d(dtype=wp.float32),
+        dskip_out: wp.array2d(dtype=lanes),
+        dbias_out: wp.array2d(dtype=lanes),
+    ):
+        task = offset + wp.tid()
+        p = _place(sizes, task)
+        part = task % db_out.shape[0]
+        scratch = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
+        kept = wp.zeros(shape=(_KEPT,), dtype=lanes)
+        tame = wp.zeros(shape=(_P,), dtype=int)
+        da = wp.zeros(shape=(1,), dtype=lanes)
+        before = flush_denormals()
+        chunks = (p.end - p.begin + _K - 1) / _K
+        for reverse in range(chunks):
+            t0 = p.begin + (chunks - 1 - reverse) * _K
+            count = wp.min(_K, p.end - t0)
+            for i in range(db_lanes_out.shape[1]):
+                db_lanes_out[task, i] = lanes()
+            for i in range(dc_lanes_out.shape[1]):
+                dc_lanes_out[task, i] = lanes()
+            prepare(
+                u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d, p.width, p.k, p.blocks,
+                widest_in, bias_in, skip_in, sizes.use_softplus, sizes.use_z, wp.static(scale),
+                scratch, tame,
+            )  # fmt: skip
+            for j in range(p.blocks):
+                k = p.k + j
+                for n in range(sizes.states):
+                    recompute(
+                        starts_in[p.b, t0 / _K, k, n], a_in[k, n], tame[j], b_in[p.row + n],
+                        c_in[p.row + n], t0, count, j * _K, scratch, sizes.needs, n * _K, kept,
+                        dc_lanes_out[task],
+                    )  # fmt: skip
+                    if (sizes.needs & _DH) != 0:
+                        dh_out[p.state, k, n] = retreat(
+                            dh_out[p.state, k, n], a_in[k, n], b_in[p.row + n], c_in[p.row + n],
+                            t0, count, j * _K, scratch, sizes.needs, n * _K, kept,
+                            db_lanes_out[task], da,
+                        )  # fmt: skip
+                        da_out[p.state, k, n] = da_out[p.state, k, n] + da[0]
+            finish(
+                u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d, p.width, p.k, p.blocks,
+                bias_in, skip_in, sizes.use_softplus, wp.static(scale), scratch,
+                du_out, ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
+            )  # fmt: skip
+            for n in range(sizes.states):
+                if (sizes.needs & _DB) != 0:
+                    sum_lanes(db_lanes_out[task], n * _K, count, t0, db_out[part, n])
+                if (sizes.needs & _DC) != 0:
+                    sum_lanes(dc_lanes_out[task], n * _K, count, t0, dc_out[part, n])
+        restore_denormals(before)
+
+    return scan_backward

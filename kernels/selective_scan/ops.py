@@ -1,0 +1,186 @@
+"""The scan as torch operators: fake results, gradients, and a kernel by device."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from . import cpu
+
+
+def _implementation(tensor: Tensor):
+    if tensor.device.type == "cpu":
+        return cpu
+    from . import cuda
+
+    return cuda
+
+
+def _wanted(like: tuple, needs: list[bool]) -> list[Tensor]:
+    return [
+        torch.empty_like(x, memory_format=torch.contiguous_format)
+        for x, needed in zip(like, needs)
+        if needed
+    ]
+
+
+def _placed(grads: list[Tensor], needs: list[bool]) -> tuple[Tensor | None, ...]:
+    grads = iter(grads)
+    return tuple(next(grads) if needed else None for needed in needs)
+
+
+def _need_saved(ctx) -> None:
+    if not ctx.saved:
+        raise RuntimeError("selective_scan: this call kept nothing for a gradient")
+
+
+@torch.library.custom_op("gamba_warp::selective_scan", mutates_args=())
+def scan(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None,
+    z: Tensor | None,
+    delta_bias: Tensor | None,
+    initial_state: Tensor | None,
+    softplus: bool,
+    discretization: str,
+    save: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``(out, last state, saved states)`` of checked tensors; B and C are ``[B, L, G, N]``."""
+    run = _implementation(u).forward
+    return run(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save)
+
+
+@scan.register_fake
+def _(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save):
+    out = torch.empty_like(u, memory_format=torch.contiguous_format)
+    last = A.new_empty(u.shape[0], *A.shape)
+    return out, last, A.new_empty(_implementation(u).saved_shape(u, A, B, save))
+
+
+@torch.library.custom_op("gamba_warp::selective_scan_backward", mutates_args=())
+def _scan_backward(
+    dout: Tensor,
+    dlast: Tensor | None,
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None,
+    z: Tensor | None,
+    delta_bias: Tensor | None,
+    saved: Tensor,
+    softplus: bool,
+    discretization: str,
+    needs: list[bool],
+) -> list[Tensor]:
+    run = _implementation(u).backward
+    grads = run(
+        dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs
+    )
+    return [grad for grad in grads if grad is not None]
+
+
+@_scan_backward.register_fake
+def _(dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs):
+    state = A.new_empty(u.shape[0], *A.shape)
+    return _wanted((u, delta, A, B, C, D, z, delta_bias, state), needs)
+
+
+def _setup_context(ctx, inputs, output):
+    u, delta, A, B, C, D, z, delta_bias, _, softplus, discretization, save = inputs
+    _, _, saved = output
+    ctx.mark_non_differentiable(saved)
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(u, delta, A, B, C, D, z, delta_bias, saved)
+    ctx.softplus, ctx.discretization, ctx.saved = softplus, discretization, save
+
+
+def _gradient(ctx, dout, dlast, _):
+    _need_saved(ctx)
+    u, delta, A, B, C, D, z, delta_bias, saved = ctx.saved_tensors
+    needs = list(ctx.needs_input_grad[:9])
+    if dout is None:
+        dout = u.new_zeros(1, 1, u.shape[2]).expand_as(u)
+    grads = _scan_backward(
+        dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved,
+        ctx.softplus, ctx.discretization, needs,
+    )  # fmt: skip
+    return (*_placed(grads, needs), None, None, None)
+
+
+def _no_second_gradient(ctx, *grads):
+    raise RuntimeError("selective_scan: second derivatives are not supported")
+
+
+scan.register_autograd(_gradient, setup_context=_setup_context)
+_scan_backward.register_autograd(_no_second_gradient)
+
+
+@torch.library.custom_op("gamba_warp::selective_scan_state", mutates_args=())
+def state(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    delta_bias: Tensor | None,
+    initial_state: Tensor | None,
+    softplus: bool,
+    discretization: str,
+    save: bool,
+) -> tuple[Tensor, Tensor]:
+    """``(last state, saved states)`` of checked tensors; B is ``[B, L, G, N]``."""
+    run = _implementation(u).final_state
+    return run(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save)
+
+
+@state.register_fake
+def _(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save):
+    saved = _implementation(u).saved_shape(u, A, B, save)
+    return A.new_empty(u.shape[0], *A.shape), A.new_empty(saved)
+
+
+@torch.library.custom_op("gamba_warp::selective_scan_state_backward", mutates_args=())
+def _state_backward(
+    dlast: Tensor,
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    delta_bias: Tensor | None,
+    saved: Tensor,
+    softplus: bool,
+    discretization: str,
+    needs: list[bool],
+) -> list[Tensor]:
+    run = _implementation(u).final_state_backward
+    grads = run(dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs)
+    return [grad for grad in grads if grad is not None]
+
+
+@_state_backward.register_fake
+def _(dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs):
+    return _wanted((u, delta, A, B, delta_bias, dlast), needs)
+
+
+def _state_setup_context(ctx, inputs, output):
+    u, delta, A, B, delta_bias, _, softplus, discretization, save = inputs
+    _, saved = output
+    ctx.mark_non_differentiable(saved)
+    ctx.save_for_backward(u, delta, A, B, delta_bias, saved)
+    ctx.softplus, ctx.discretization, ctx.saved = softplus, discretization, save
+
+
+def _state_gradient(ctx, dlast, _):
+    _need_saved(ctx)
+    needs = list(ctx.needs_input_grad[:6])
+    grads = _state_backward(dlast, *ctx.saved_tensors, ctx.softplus, ctx.discretization, needs)
+    return (*_placed(grads, needs), None, None, None)
+
+
+state.register_autograd(_state_gradient, setup_context=_state_setup_context)
+_state_backward.register_autograd(_no_second_gradient)
