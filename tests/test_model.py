@@ -113,6 +113,9 @@ def test_condition_can_be_kept(changes):
         for _ in range(2):  # a use changes nothing
             assert torch.equal(model(images, cameras, condition).means, want.means)
         if not changes:
+            with torch.autocast("cpu", torch.bfloat16):  # the condition is float32
+                rounded = model(images, cameras, condition).means
+            assert_rel_rms(rounded, want.means, 0.1, "bfloat16")  # 8 bits, through two blocks
             other = model.condition(1 - images, cameras)
             assert not torch.equal(model(images, cameras, other).means, want.means)
 
