@@ -7,7 +7,9 @@ import warp as wp
 from torch import Tensor
 
 from ..interop import cuda_launch, lane_contiguous, view
+from .cuda_forward import forward_kernel
 from .cuda_kernels import BLOCK, CHUNK, Sizes, carry, kernels
+from .cuda_operands import Operands
 
 
 class _Plan:
@@ -71,24 +73,36 @@ def _state(plan: _Plan, x: Tensor | None) -> Tensor:
 
 def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save):
     """Runs the scan on CUDA; arguments and results as ``cpu.forward``."""
-    plan = _Plan(u, delta, A, B, C, D, z, delta_bias, softplus, discretization)
-    state = _state(plan, initial_state)
-    out = torch.empty(u.shape, dtype=u.dtype, device=u.device)
-    decay, starts = plan.per_chunk(), plan.per_chunk()
-    s, vec = plan, plan.vec
-    if out.numel():
-        plan.launch(
-            "summarise_forward",
-            [s.u, s.delta, s.a, s.b, s.bias],
-            [view(decay, vec), view(starts, vec)],
-        )
-        plan.carry(False, decay, starts, state)
-        plan.launch(
-            "scan_forward",
-            [s.u, s.delta, s.z, s.a, s.b, s.c, s.skip, s.bias, view(starts, vec)],
-            [out],
-        )
-    return out, state, starts if save else starts.new_empty(saved_shape(u, A, B, save))
+    o = Operands(u, delta, A, B, C, D, z, delta_bias, initial_state, back=False)
+    return _forward(o, softplus, discretization, save, True)
+
+
+def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save):
+    """The last state ``[B, D, N]`` of ``forward`` alone, and the saved states."""
+    o = Operands(u, delta, A, B, B, None, None, delta_bias, initial_state, back=False)
+    _, last, saved = _forward(o, softplus, discretization, save, False)
+    return last, saved
+
+
+def _forward(o: Operands, softplus: bool, mode: str, save: bool, read: bool):
+    out = torch.empty(
+        (o.batch, o.length if read else 0, o.channels), dtype=o.u.dtype, device=o.device
+    )
+    saved = o.empty(o.batch, o.marks if save else 0, o.channels, o.states)
+    if not o.u.numel():
+        return out, o.state, saved
+    inputs = [o.u, o.delta, o.z, o.A[None], o.B, o.C, o.skip, o.bias]
+    flat = saved.view(-1, o.channels, o.states)
+    first, decay = o.state, o.empty(0, 0, 0)
+    if o.pieces > 1:
+        first, decay = o.summary(mode)
+        kernel = forward_kernel(o.dtypes, mode, o.frame, False, True, softplus, False)
+        o.launch(kernel, [o.sizes(), *inputs, o.state], [first, decay, flat, out])
+        o.carry(mode, False, first, decay)
+    last = torch.empty_like(o.state)
+    kernel = forward_kernel(o.dtypes, mode, o.frame, read, False, softplus, o.use_z and read)
+    o.launch(kernel, [o.sizes(save), *inputs, first], [last, decay, flat, out])
+    return out, last, saved
 
 
 def backward(
