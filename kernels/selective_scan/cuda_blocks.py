@@ -118,6 +118,15 @@ class Place:
 
 # Shared memory is one tile of floats, addressed by plain offsets: assigning to elements of a tile
 # has a barrier each.
+def offsets(parts: dict) -> tuple[dict, int]:
+    """Where parts of so many floats begin in shared memory, and their sum."""
+    at, size = {}, 0
+    for name, count in parts.items():
+        at[name] = size
+        size += -(-count // 4) * 4
+    return at, size
+
+
 @functools.cache
 def arena_io(size: int):
     """The type of a block's shared memory of ``size`` floats, and access to it."""
@@ -217,6 +226,29 @@ for (int k = 0; k < {f.walks * f.held}; ++k) {{
         store(x, i, p.d0, p.count, p.states, p.slot, p.q, h)
 
     return vec, read, write
+
+
+@functools.cache
+def halves(f: Frame):
+    """Two vectors of a thread's states as one, for a native function to return."""
+    n = f.walks * f.held
+    vec = wp.types.vector(n, wp.float32)
+    pair = wp.types.vector(2 * n, wp.float32)
+    loop = f"WP_PRAGMA_UNROLL for (int k = 0; k < {n}; ++k) "
+    one = f"wp::vec_t<{n}, float> r; {loop}"
+
+    @wp.func_native(
+        f"wp::vec_t<{2 * n}, float> r; {loop} r.c[k] = x.c[k], r.c[{n} + k] = y.c[k]; return r;"
+    )
+    def join(x: vec, y: vec) -> pair: ...
+
+    @wp.func_native(f"{one} r.c[k] = v.c[k]; return r;")
+    def first(v: pair) -> vec: ...
+
+    @wp.func_native(f"{one} r.c[k] = v.c[{n} + k]; return r;")
+    def second(v: pair) -> vec: ...
+
+    return pair, join, first, second
 
 
 @functools.cache

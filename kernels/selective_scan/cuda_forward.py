@@ -18,6 +18,7 @@ from .cuda_blocks import (
     arena_io,
     channel_io,
     matrix_io,
+    offsets,
     placing,
     states_io,
     sync,
@@ -30,15 +31,10 @@ TILE = 16  # tokens
 
 
 def _layout(f: Frame, read: bool) -> tuple[dict, int]:
-    """Offsets of a buffer's parts, in floats, and its size."""
-    sizes = {"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded}
+    parts = {"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded}
     if read:
-        sizes |= {"C": TILE * f.padded, "Y": f.lanes * (TILE * f.span + f.pad)}
-    at, size = {}, 0
-    for name, count in sizes.items():
-        at[name] = size
-        size += -(-count // 4) * 4
-    return at, size
+        parts |= {"C": TILE * f.padded, "Y": f.lanes * (TILE * f.span + f.pad)}
+    return offsets(parts)
 
 
 @functools.cache
@@ -62,9 +58,8 @@ def forward_kernel(
     at, size = _layout(f, read)
     arena_type, put, get = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
-    offsets = tuple(at.items())
-    advance = advancing(f, mode, TILE, offsets, 2 * size, read, False)
-    decay = decaying(f, mode, TILE, offsets, 2 * size)
+    advance = advancing(f, mode, TILE, tuple(at.items()), 2 * size, read, False)
+    decay = decaying(f, mode, TILE, tuple(at.items()), 2 * size)
     multiply = summary and mode == "bilinear"
     scale = 1.0 if mode == "bilinear" else LOG2E
 

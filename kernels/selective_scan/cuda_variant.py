@@ -17,6 +17,8 @@ import torch
 from .cuda_blocks import MARK, frame
 
 MOST_PIECES = 256  # the carry between them is serial
+RESIDENT = (3, 2)  # blocks of a multiprocessor, by their registers: forward, gradient
+OVERHEAD = 16  # tokens
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,36 +66,38 @@ def _multiprocessors(index: int) -> int:
     return torch.cuda.get_device_properties(index).multi_processor_count
 
 
+@functools.cache
 def choose(
     batch: int, length: int, channels: int, states: int, groups: int, multiprocessors: int
 ) -> Variant:
     """The variant for a shape on a device of so many multiprocessors.
 
-    The model: a multiprocessor issues from four schedulers; one warp keeps a scheduler busy for 2/3
-    of the time, w warps for w / (w + 1/2). P pieces walk 2 - 1/P times as many tokens in the
-    forward. The gradient's two walks and its sums make that (3 + 1 - 1/P) / 3. No GPU has timed it.
+    The model: a multiprocessor holds ``RESIDENT`` blocks at a time, and k blocks at once take k + 1/2
+    times as long as one would take at its full rate. P pieces are walked (2 - 1/P) times in the
+    forward; the gradient's walks are longer, so that they cost (4 - 1/P) / 3. Beginning and
+    ending a piece costs as much as ``OVERHEAD`` tokens. No GPU has timed it.
     """
     variant = Variant()
+    if not batch or not length:
+        return variant
     units = -(-length // MARK)
 
-    def pieces(per_thread: tuple[int, int], passes: float) -> int:
+    def pieces(per_thread: tuple[int, int], resident: int, walks: float) -> int:
         f = frame(variant.block, *per_thread, states)
         blocks = batch * groups * -(-(channels // groups) // f.span)
-        warps = blocks * variant.block / 32 / (4 * multiprocessors)
 
         def cost(count: int) -> float:
-            busy = warps * count
-            return (passes + 1 - 1 / count) / passes * (busy + 0.5) / busy
+            load = -(-blocks * count // multiprocessors)
+            rounds = -(-load // resident)
+            work = (walks + 1 - 1 / count) / walks / count
+            return work * (load + 0.5 * rounds) * (1 + OVERHEAD * count / length)
 
-        counts = [1 << i for i in range(9) if 1 << i <= min(max(units, 1), MOST_PIECES)]
-        return min(counts, key=lambda count: (round(cost(count), 6), count))
+        return min(range(1, min(units, MOST_PIECES) + 1), key=cost)
 
-    if not batch or not channels:
-        return variant
     return dataclasses.replace(
         variant,
-        pieces=pieces((variant.channels, variant.states), 1.0),
-        back_pieces=pieces((variant.back_channels, variant.back_states), 3.0),
+        pieces=pieces((variant.channels, variant.states), RESIDENT[0], 1.0),
+        back_pieces=pieces((variant.back_channels, variant.back_states), RESIDENT[1], 3.0),
     )
 
 
