@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
-from .block import GambaBlock, make_norm
+from .block import GambaBlock, State, make_norm, prefix_states
 from .cameras import Cameras
 from .config import GambaConfig
 from .decoder import GaussianDecoder
@@ -21,12 +23,20 @@ from .tokens import CameraToken, SplatTokens
 
 FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
+# Tokens that run through the blocks together where a CPU keeps nothing for a gradient: temporaries
+# are small enough to be used again at once, not got anew from the system page by page.
+SEGMENT = 4096
 # Of checkpoint metadata; extra_metadata may use any other key.
 _OWN_KEYS = ("format", "config", "encoder_sha256")
 
 
 class Gamba(nn.Module):
-    """One posed picture to Gaussians, in one pass (paper §3.2, GambaFormer and decoder)."""
+    """One posed picture to Gaussians, in one pass (paper §3.2, GambaFormer and decoder).
+
+    Attributes:
+        recompute: keep only each block's input for the gradient and run the block again there;
+            less memory, a third more time.
+    """
 
     def __init__(self, config: GambaConfig, encoder_weights: str | Path | None = None) -> None:
         """Builds the network with fresh weights, the encoder's excepted.
@@ -40,6 +50,7 @@ class Gamba(nn.Module):
         """
         super().__init__()
         self.config = config
+        self.recompute = False
         self.encoder = build_encoder(config, encoder_weights) if config.prepend else None
         image_channels = self.encoder.channels if self.encoder else 0
         camera_channels = 0
@@ -56,13 +67,26 @@ class Gamba(nn.Module):
             if parameter.ndim == 1:
                 parameter._no_weight_decay = True
 
-    def forward(self, images: Tensor, cameras: Cameras) -> Gaussians:
+    def condition(self, images: Tensor, cameras: Cameras) -> list[State | None]:
+        """What picture and camera leave in each block's states; all that the prefix does.
+
+        Arguments and errors are those of ``forward``.
+        """
+        self._check(images, cameras)
+        camera = self.camera_token(cameras) if self.camera_token else None
+        image = self.encoder(images) if self.encoder else None
+        return prefix_states(self.blocks, camera, image)
+
+    def forward(
+        self, images: Tensor, cameras: Cameras, condition: list[State | None] | None = None
+    ) -> Gaussians:
         """Predicts the Gaussians of each picture's object.
 
         Args:
             images: ``[B, H, W, 3]`` RGB in [0, 1] on ``config.background``, H = W =
                 ``config.image_size``.
             cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same picture size.
+            condition: of ``condition`` for the same pictures and cameras, if it is there already.
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N = ``num_gaussians``.
@@ -71,12 +95,25 @@ class Gamba(nn.Module):
             ValueError: a shape that does not fit.
         """
         self._check(images, cameras)
-        camera = self.camera_token(cameras) if self.camera_token else None
-        image = self.encoder(images) if self.encoder else None
-        tokens = self.tokens(images, cameras)
-        for block in self.blocks:
-            tokens = block(tokens, camera, image)
+        if condition is None:
+            condition = self.condition(images, cameras)
+        tokens = self._refine(self.tokens(images, cameras), condition)
         return self.decoder(self.norm(tokens))
+
+    def _refine(self, tokens: Tensor, states: list[State | None]) -> Tensor:
+        """Runs the blocks; on a CPU without gradient one segment of tokens after the other."""
+        states = list(states)
+        segments = [tokens]
+        if tokens.device.type == "cpu" and not torch.is_grad_enabled():
+            segments = list(tokens.split(SEGMENT, dim=1))
+        for s, segment in enumerate(segments):
+            for i, block in enumerate(self.blocks):
+                run = block
+                if self.recompute and torch.is_grad_enabled():
+                    run = partial(checkpoint, block, use_reentrant=False)
+                segment, states[i] = run(segment, states[i])
+            segments[s] = segment
+        return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size

@@ -43,3 +43,18 @@ def resources(cubin: bytes) -> tuple[int, int]:
                 stack = max(stack, struct.unpack_from("<II", cubin, at + 4)[1])
             at += 4 + (payload if form == 4 else 0)
     return registers, stack
+
+
+def shared_bytes(cubin: bytes) -> int:
+    """Static shared memory of a kernel, in bytes: the largest ``.nv.shared`` section."""
+    offset, size, count, names = (
+        *struct.unpack_from("<Q", cubin, 40),
+        *struct.unpack_from("<HHH", cubin, 58),
+    )
+    strings = struct.unpack_from("<Q", cubin, offset + names * size + 24)[0]
+    most = 0
+    for i in range(count):
+        name = strings + struct.unpack_from("<I", cubin, offset + i * size)[0]
+        if cubin.startswith(b".nv.shared.", name):
+            most = max(most, struct.unpack_from("<Q", cubin, offset + i * size + 32)[0])
+    return most

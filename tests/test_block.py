@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 
-from gamba_warp.block import GambaBlock, Mamba
+from gamba_warp.block import GambaBlock, Mamba, prefix_states
 from gamba_warp.config import GambaConfig
 
 
@@ -64,6 +64,11 @@ def _block_reference(block: GambaBlock, tokens, camera, image) -> torch.Tensor:
     return torch.stack(outputs)
 
 
+def _run(block: GambaBlock, tokens, camera, image) -> torch.Tensor:
+    """The block behind its own prefix."""
+    return block(tokens, *prefix_states([block], camera, image))[0]
+
+
 def _perturbed(block: GambaBlock) -> GambaBlock:
     """Every parameter away from its starting value, so that none is 0 or 1 by chance."""
     with torch.no_grad():
@@ -79,7 +84,7 @@ def test_block_equals_reference(norm, discretization):
     tokens, camera, image = torch.randn(3, 9, 24), torch.randn(3, 1, 7), torch.randn(3, 4, 11)
     want = _block_reference(block, tokens, camera, image)
     # Float32 against float64.
-    assert_rel_rms(block(tokens, camera, image), want, 2e-6, "block")
+    assert_rel_rms(_run(block, tokens, camera, image), want, 2e-6, "block")
 
 
 @pytest.mark.parametrize("camera_channels, image_channels", [(7, 0), (0, 11), (0, 0)])
@@ -90,7 +95,7 @@ def test_block_with_parts_of_the_condition(camera_channels, image_channels):
     image = torch.randn(1, 4, 11) if image_channels else None
     want = _block_reference(block, tokens, camera, image)
     # Float32 against float64.
-    assert_rel_rms(block(tokens, camera, image), want, 2e-6, "block")
+    assert_rel_rms(_run(block, tokens, camera, image), want, 2e-6, "block")
 
 
 def test_gradients_equal_those_of_the_reference_by_differences():
@@ -101,7 +106,7 @@ def test_gradients_equal_those_of_the_reference_by_differences():
         "image": torch.randn(2, 3, 11, requires_grad=True),
     }
     cotangent = torch.randn(2, 5, 24)
-    (block(**inputs) * cotangent).sum().backward()
+    (_run(block, **inputs) * cotangent).sum().backward()
     leaves = inputs | dict(block.named_parameters())
     for name, leaf in leaves.items():
         direction = torch.randn_like(leaf)
@@ -124,12 +129,12 @@ def test_gradients_equal_those_of_the_reference_by_differences():
 def test_prefix_reaches_the_first_token_and_nothing_flows_back():
     block = _perturbed(GambaBlock(_config(), 7, 11))
     tokens, camera, image = torch.randn(1, 8, 24), torch.randn(1, 1, 7), torch.randn(1, 4, 11)
-    base = block(tokens, camera, image)
-    assert not torch.allclose(base[:, 0], block(tokens, camera + 1, image)[:, 0])
-    assert not torch.allclose(base[:, 0], block(tokens, camera, image + 1)[:, 0])
+    base = _run(block, tokens, camera, image)
+    assert not torch.allclose(base[:, 0], _run(block, tokens, camera + 1, image)[:, 0])
+    assert not torch.allclose(base[:, 0], _run(block, tokens, camera, image + 1)[:, 0])
     later = tokens.clone()
     later[:, 5] += 1
-    changed = block(later, camera, image)
+    changed = _run(block, later, camera, image)
     assert torch.equal(base[:, :5], changed[:, :5])
     assert not torch.allclose(base[:, 5:], changed[:, 5:])
 
@@ -152,9 +157,9 @@ def test_start_values_are_those_of_mamba():
 def test_bfloat16_autocast_stays_near_float32():
     block = _perturbed(GambaBlock(_config(), 7, 11))
     tokens, camera, image = torch.randn(2, 19, 24), torch.randn(2, 1, 7), torch.randn(2, 4, 11)
-    want = block(tokens, camera, image)
+    want = _run(block, tokens, camera, image)
     with torch.autocast("cpu", torch.bfloat16):
-        got = block(tokens, camera, image)
+        got = _run(block, tokens, camera, image)
     assert got.dtype == torch.float32  # the residual stream is not rounded
     # bfloat16 keeps 8 bits; the branch passes through six roundings of 0.2 to 0.4 %.
     assert_rel_rms(got - tokens, want - tokens, 2e-2, "branch")

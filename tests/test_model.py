@@ -3,6 +3,7 @@
 import pytest
 import timm
 import torch
+from helpers import assert_rel_rms
 from timm.models.vision_transformer import _create_vision_transformer
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
@@ -99,6 +100,68 @@ def test_without_prefix_and_image_tokens_the_picture_is_ignored():
     model = Gamba(micro(additive_image_tokens=False, prepend=False))
     images, cameras = inputs(1)
     assert torch.equal(model(images, cameras).means, model(1 - images, cameras).means)
+
+
+@pytest.mark.parametrize("changes", [{}, {"prepend": False}], ids=str)
+def test_condition_can_be_kept(changes):
+    model = Gamba(micro(**changes), None if changes else "random").eval()
+    images, cameras = inputs(2)
+    with torch.no_grad():
+        condition = model.condition(images, cameras)
+        assert len(condition) == 2 and (condition[0] is None) == bool(changes)
+        want = model(images, cameras)
+        for _ in range(2):  # a use changes nothing
+            assert torch.equal(model(images, cameras, condition).means, want.means)
+        if not changes:
+            with torch.autocast("cpu", torch.bfloat16):  # the condition is float32
+                rounded = model(images, cameras, condition).means
+            assert_rel_rms(rounded, want.means, 0.1, "bfloat16")  # 8 bits, through two blocks
+            other = model.condition(1 - images, cameras)
+            assert not torch.equal(model(images, cameras, other).means, want.means)
+
+
+def test_segments_change_nothing(monkeypatch):
+    model = Gamba(micro(encoder="none"))
+    images, cameras = inputs(2)
+    want = model(images, cameras)  # with a gradient: in one piece
+    calls = []
+    hook = model.blocks[0].register_forward_hook(
+        lambda _, args, out: calls.append(args[0].shape[1])
+    )
+    monkeypatch.setattr("gamba_warp.model.SEGMENT", 16)
+    with torch.no_grad():
+        got = model(images, cameras)
+    hook.remove()
+    assert calls == [16, 16, 4]
+    # Matrix products of another size sum in another order.
+    assert_rel_rms(got.means, want.means, 1e-6, "means")
+
+
+def test_recomputation_changes_memory_alone():
+    model = Gamba(micro(image_size=32, width=32, depth=6), "random")
+    images, cameras = inputs(2, 32)
+    cotangent = torch.randn(2, 256, 3)
+
+    def step(recompute: bool) -> tuple[int, dict[str, torch.Tensor]]:
+        model.recompute, kept = recompute, {}
+
+        def pack(tensor):
+            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        model.zero_grad()
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            loss = (model(images, cameras).means * cotangent).sum()
+        saved = sum(kept.values())
+        loss.backward()
+        return saved, {n: p.grad for n, p in model.named_parameters() if p.grad is not None}
+
+    plain, want = step(False)
+    lean, got = step(True)
+    assert lean < 0.35 * plain, (lean, plain)
+    assert got.keys() == want.keys()
+    for name, grad in want.items():
+        assert torch.equal(got[name], grad), name
 
 
 def test_flags_against_weight_decay():

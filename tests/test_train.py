@@ -16,6 +16,7 @@ import pytest
 import torch
 from PIL import Image
 from safetensors.torch import load_file
+from torch.utils.checkpoint import checkpoint
 
 from gamba_warp import cli
 from gamba_warp.errors import UserError
@@ -62,6 +63,20 @@ def stop_after(monkeypatch, count):
         return real(*arguments, **options)
 
     monkeypatch.setattr(loop, "forward", counting)
+
+
+def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
+    assert run(data, tmp_path / "plain") == 0
+    calls = []
+
+    def counting(*arguments, **options):
+        calls.append(1)
+        return checkpoint(*arguments, **options)
+
+    monkeypatch.setattr("gamba_warp.model.checkpoint", counting)
+    assert run(data, tmp_path / "lean", run={"recompute": True}) == 0
+    assert len(calls) == 6  # one block, six steps; none in validation
+    assert_same_files(tmp_path / "plain/model.safetensors", tmp_path / "lean/model.safetensors")
 
 
 @pytest.mark.parametrize("accumulate", [1, 2])

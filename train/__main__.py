@@ -35,6 +35,7 @@ def train(config: TrainConfig, place: World) -> int:
     torch.manual_seed(run.seed)
     torch.set_float32_matmul_precision("high")  # TF32 where there is a GPU; no effect on a CPU
     model = Gamba(config.model_config(), run.encoder_weights)
+    model.recompute = run.recompute
     if run.init is not None and checkpoint is None:
         load_weights(run.init, model)
     model.to(place.device)

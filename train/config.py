@@ -129,6 +129,9 @@ class RunConfig:
     """"auto": the GPU if there is one."""
     threads: int | None = None
     """CPU threads; default: all cores."""
+    recompute: bool = False
+    """Keep only the blocks' inputs for the gradient and run each block again there: the same
+    result in less memory and more time."""
     seed: int = 0
     """Of the initial weights and of the order of the data."""
 

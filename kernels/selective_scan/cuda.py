@@ -1,147 +1,156 @@
-"""The scan on CUDA: operands, launches and sums around the kernels of ``cuda_kernels.py``."""
+"""The scan on CUDA: launches and sums around the kernels of ``cuda_forward.py`` and
+``cuda_backward.py``. Which of them, ``cuda_variant.py`` says.
+
+All runs on torch's current stream, without synchronisation, in memory from torch's allocator.
+"""
 
 from __future__ import annotations
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from ..interop import cuda_launch, lane_contiguous, view
-from .cuda_kernels import BLOCK, CHUNK, Sizes, carry, kernels
-
-
-class _Plan:
-    """Shapes, launches and operands that forward and backward share."""
-
-    def __init__(self, u, delta, A, B, C, D, z, delta_bias, softplus, discretization):
-        self.batch, self.length, self.channels = u.shape
-        self.states, self.groups, self.device = A.shape[1], B.shape[2], u.device
-        sizes = Sizes()
-        sizes.length, sizes.groups = self.length, self.groups
-        sizes.group_width = self.channels // self.groups
-        sizes.parts = self.parts = -(-sizes.group_width // BLOCK)
-        sizes.chunks = self.chunks = -(-self.length // CHUNK)
-        sizes.use_softplus, sizes.use_z = int(softplus), int(z is not None)
-        self.sizes = sizes
-        self.kernels = kernels(u.dtype, delta.dtype, discretization, self.states)
-        self.vec = wp.types.vector(self.states, wp.float32)
-        self.u, self.delta = lane_contiguous(u), lane_contiguous(delta)
-        self.z = self.u if z is None else lane_contiguous(z)
-        self.a = self.vectors(A)
-        self.b, self.c = self.vectors(B), self.vectors(C)
-        self.skip, self.bias = self.vector(D), self.vector(delta_bias)
-
-    def vectors(self, x: Tensor):
-        return view(x.float().contiguous(), self.vec)
-
-    def vector(self, x: Tensor | None) -> Tensor:
-        if x is None:
-            return torch.zeros(self.channels, device=self.device)
-        return x.float().contiguous()
-
-    def per_chunk(self) -> Tensor:
-        shape = (self.batch, self.chunks, self.channels, self.states)
-        return torch.empty(shape, device=self.device)
-
-    def launch(self, name: str, inputs: list, outputs: list) -> None:
-        blocks = self.batch * self.chunks * self.groups * self.parts
-        dim = (blocks, BLOCK)
-        inputs = [self.sizes, *inputs]
-        cuda_launch(self.kernels[name], dim, inputs, outputs, device=self.device, block_dim=BLOCK)
-
-    def carry(self, reverse: bool, decay: Tensor, local: Tensor, state: Tensor) -> None:
-        width = self.channels * self.states
-        shape = (self.batch, self.chunks, width)
-        arguments = [int(reverse), decay.view(shape), local.view(shape)]
-        dim = (self.batch, width)
-        outputs = [state.view(dim)]
-        cuda_launch(carry, dim, arguments, outputs, device=self.device, block_dim=128)
-
-    def total(self, parts: Tensor, dtype: torch.dtype) -> Tensor:
-        """Sums ``[B·G·parts, L, N]`` over the parts of a group: ``[B, L, G, N]``."""
-        shape = (self.batch, self.groups, self.parts, self.length, self.states)
-        return parts.view(shape).sum(2).transpose(1, 2).to(dtype).contiguous()
-
-
-def _state(plan: _Plan, x: Tensor | None) -> Tensor:
-    if x is None:
-        return torch.zeros(plan.batch, plan.channels, plan.states, device=plan.device)
-    return x.float().contiguous().clone()
+from ..interop import lane_contiguous
+from .cuda_backward import backward_kernel, summary_kernel
+from .cuda_blocks import MARK
+from .cuda_forward import forward_kernel
+from .cuda_operands import Operands
 
 
 def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save):
     """Runs the scan on CUDA; arguments and results as ``cpu.forward``."""
-    plan = _Plan(u, delta, A, B, C, D, z, delta_bias, softplus, discretization)
-    state = _state(plan, initial_state)
-    out = torch.empty(u.shape, dtype=u.dtype, device=u.device)
-    decay, starts = plan.per_chunk(), plan.per_chunk()
-    s, vec = plan, plan.vec
-    if out.numel():
-        plan.launch(
-            "summarise_forward",
-            [s.u, s.delta, s.a, s.b, s.bias],
-            [view(decay, vec), view(starts, vec)],
-        )
-        plan.carry(False, decay, starts, state)
-        plan.launch(
-            "scan_forward",
-            [s.u, s.delta, s.z, s.a, s.b, s.c, s.skip, s.bias, view(starts, vec)],
-            [out],
-        )
-    return out, state, starts if save else starts.new_empty(saved_shape(u, A, B, save))
+    o = Operands(u, delta, A, B, C, D, z, delta_bias, initial_state, back=False)
+    return _forward(o, softplus, discretization, save, True)
+
+
+def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save):
+    """The last state ``[B, D, N]`` of ``forward`` alone, and the saved states."""
+    o = Operands(u, delta, A, B, B, None, None, delta_bias, initial_state, back=False)
+    _, last, saved = _forward(o, softplus, discretization, save, False)
+    return last, saved
+
+
+def _forward(o: Operands, softplus: bool, mode: str, save: bool, read: bool):
+    shape = (o.batch, o.length if read else 0, o.channels)
+    out = torch.empty(shape, dtype=o.u.dtype, device=o.device)
+    saved = o.empty(o.batch, o.marks if save else 0, o.channels, o.states)
+    if not o.u.numel():
+        return out, o.state, saved
+    inputs = [o.u, o.delta, o.z, o.A[None], o.B, o.C, o.skip, o.bias]
+    flat = saved.view(-1, o.channels, o.states)
+    first, decay = o.state, o.empty(0, 0, 0)
+    if o.pieces > 1:
+        first, decay = o.summary(mode)
+        kernel = forward_kernel(o.dtypes, mode, o.frame, False, True, softplus, False)
+        o.launch(kernel, [o.sizes(), *inputs, o.state], [first, decay, flat, out])
+        o.carry(mode, False, first, decay)
+    last = torch.empty_like(o.state)
+    kernel = forward_kernel(o.dtypes, mode, o.frame, read, False, softplus, o.use_z and read)
+    o.launch(kernel, [o.sizes(save), *inputs, first], [last, decay, flat, out])
+    return out, last, saved
 
 
 def backward(
-    dout, dlast, u, delta, A, B, C, D, z, delta_bias, starts, softplus, discretization, needs
+    dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs
 ):
     """Gradients of ``forward``; arguments and results as ``cpu.backward``."""
-    plan = _Plan(u, delta, A, B, C, D, z, delta_bias, softplus, discretization)
-    need_u, need_delta, _, need_B, need_C, _, need_z, _, _ = needs
-    plan.sizes.need_db, plan.sizes.need_dc = int(need_B), int(need_C)
-    dstate = _state(plan, dlast)
-    rows = plan.batch * plan.groups * plan.parts
+    o = Operands(u, delta, A, B, C, D, z, delta_bias, dlast, back=True)
+    grads = _backward(o, dout, saved, softplus, discretization, needs)
+    dtypes = [None if x is None else x.dtype for x in (u, delta, A, B, C, D, z, delta_bias, A)]
+    return _wanted(grads, needs, dtypes)
 
-    def like(x: Tensor, needed: bool) -> Tensor:
-        return x.new_empty(x.shape if needed else (x.shape[0], 0, x.shape[2]))
 
-    def sums(needed: bool) -> Tensor:
-        return A.new_empty(rows if needed else 0, plan.length, plan.states)
+def final_state_backward(dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs):
+    """Gradients of ``final_state``: six, for u, delta, A, B, delta_bias and the initial state."""
+    o = Operands(u, delta, A, B, B, None, None, delta_bias, dlast, back=True)
+    u_, delta_, A_, B_, bias_, state_ = needs
+    needs = (u_, delta_, A_, B_, False, False, False, bias_, state_)
+    grads = _backward(o, None, saved, softplus, discretization, needs)
+    dtypes = [None if x is None else x.dtype for x in (u, delta, A, B, B, u, u, delta_bias, A)]
+    grads = _wanted(grads, needs, dtypes)
+    return [grads[i] for i in (0, 1, 2, 3, 7, 8)]
 
-    du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
-    db, dc = sums(need_B), sums(need_C)
-    decay, ends, da = plan.per_chunk(), plan.per_chunk(), plan.per_chunk()
-    dskip, dbias = torch.empty(2, *da.shape[:3], device=u.device)
-    s, vec = plan, plan.vec
-    if dout.numel():
-        dout = lane_contiguous(dout)
-        plan.launch(
-            "summarise_backward",
-            [s.delta, s.z, s.a, s.c, s.bias, dout],
-            [view(decay, vec), view(ends, vec)],
-        )
-        plan.carry(True, decay, ends, dstate)
-        plan.launch(
-            "scan_backward",
+
+def _wanted(grads: list, needs, dtypes: list) -> list:
+    """Nine gradients in the types of their tensors, None where not needed."""
+    return [
+        grad().to(dtype) if needed else None for grad, needed, dtype in zip(grads, needs, dtypes)
+    ]
+
+
+def _flags(needs, read: bool, use_z: bool) -> frozenset:
+    """What the kernel computes; see ``backward_kernel``."""
+    u, delta, A, B, C, _, z, bias, state = needs
+    flags = {
+        "read": read,
+        "du": u,
+        "ddelta": delta,
+        "dz": z,
+        "y": z and use_z and read,
+        "dB": B,
+        "dC": C and read,
+        "through": u or delta or A or B or bias or state,
+    }
+    return frozenset(name for name, on in flags.items() if on)
+
+
+def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str, needs) -> list:
+    """Nine functions that give the gradients."""
+    flags = _flags(needs, dout is not None, o.use_z)
+
+    def like(x: Tensor, flag: str) -> Tensor:
+        return torch.empty(x.shape if flag in flags else (0, 0, 0), dtype=x.dtype, device=o.device)
+
+    def sums(flag: str) -> Tensor:
+        rows = o.batch * o.groups * o.parts if flag in flags else 0
+        return o.empty(rows, o.length, o.states)
+
+    def total(parts: Tensor) -> Tensor:
+        shape = (o.batch, o.groups, o.parts, o.length, o.states)
+        return parts.view(shape).sum(2).transpose(1, 2).contiguous()
+
+    du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
+    db, dc = sums("dB"), sums("dC")
+    rows = o.batch * o.pieces
+    dfirst, da = torch.empty_like(o.state), o.empty(rows, o.channels, o.states)
+    dskip, dbias = o.empty(2, rows, o.frame.rows, o.channels)
+    if o.u.numel():
+        dout = o.u if dout is None else lane_contiguous(dout)
+        last = o.state
+        if o.pieces > 1:
+            last = _carry_back(o, dout, softplus, mode, "read" in flags)
+        kernel = backward_kernel(o.dtypes, mode, o.frame, softplus, o.use_z, flags)
+        o.launch(
+            kernel,
             [
-                s.u, s.delta, s.z, s.a, s.b, s.c, s.skip, s.bias,
-                view(starts, vec), view(ends, vec), dout,
+                o.sizes(), o.u, o.delta, o.z, o.A[None], o.B, o.C, o.skip, o.bias, dout,
+                saved.view(-1, o.channels, o.states), last,
             ],
-            [du, ddelta, dz, view(da, vec), view(db, vec), view(dc, vec), dskip, dbias],
+            [dfirst, du, ddelta, dz, da, db, dc, dskip, dbias],
         )  # fmt: skip
-    values = (
+    else:
+        dfirst = o.state
+    return [
         lambda: du,
         lambda: ddelta,
-        lambda: da.sum((0, 1)),
-        lambda: plan.total(db, B.dtype),
-        lambda: plan.total(dc, C.dtype),
-        lambda: dskip.sum((0, 1)).to(D.dtype),
+        lambda: da.sum(0),
+        lambda: total(db),
+        lambda: total(dc),
+        lambda: dskip.sum((0, 1)),
         lambda: dz,
-        lambda: dbias.sum((0, 1)).to(delta_bias.dtype),
-        lambda: dstate,
-    )
-    return [value() if needed else None for value, needed in zip(values, needs)]
+        lambda: dbias.sum((0, 1)),
+        lambda: dfirst,
+    ]
+
+
+def _carry_back(o: Operands, dout: Tensor, softplus: bool, mode: str, read: bool) -> Tensor:
+    """The gradient of the state after each piece."""
+    last, decay = o.summary(mode)
+    kernel = summary_kernel(o.dtypes, mode, o.frame, softplus, o.use_z, read)
+    o.launch(kernel, [o.sizes(), o.delta, o.z, o.A[None], o.C, o.bias, dout], [last, decay])
+    o.carry(mode, True, last, decay)
+    return last
 
 
 def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    return (u.shape[0], -(-u.shape[1] // CHUNK) if save else 0, *A.shape)
+    return (u.shape[0], -(-u.shape[1] // MARK) if save else 0, *A.shape)

@@ -1,0 +1,178 @@
+"""``gamba bench``: run time against error, measured here; JSON, tables and a page with charts."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from tqdm import tqdm
+
+from .errors import UserError
+from .files import atomic_path, output_folder, write_json
+from .kernels.bench import FORMAT, Case, Settings, Target, measure
+from .kernels.bench.page import page
+from .kernels.bench.peers import versions
+from .kernels.bench.report import judge, markdown, ratio_table
+from .reconstruct import pick_device
+
+# what is measured -> the module with ``cases(settings)`` and ``targets(settings)``, loaded if asked
+SUITES = {
+    "scan": "gamba_warp.kernels.bench.scan",
+    "conv": "gamba_warp.kernels.bench.conv",
+    "raster": "gamba_warp.kernels.bench.raster",
+    "block": "gamba_warp.bench_model",
+    "model": "gamba_warp.bench_model",
+    "train-step": "gamba_warp.train.bench",
+}
+_NEEDED = ("op", "case", "variant", "direction", "dtype", "device", "ms_p50", "status", "work")
+
+
+def bench_command(
+    what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (
+        "all",
+    ),
+    *,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    quick: bool = False,
+    full: bool = False,
+    peers: bool = False,
+    out: Path = Path("out/bench"),
+    threads: int | None = None,
+    compare: Path | None = None,
+    render: tuple[Path, ...] = (),
+) -> int:
+    """Measures run time against error, with what is installed beside us.
+
+    Every variant is compared with float64 before it is timed; what fails gets no time. Writes
+    bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
+
+    Args:
+        what: scan, conv, raster, block, model, train-step, or all.
+        device: Where; auto is the GPU if there is one.
+        quick: Small sizes, a few rounds: seconds.
+        full: All sizes, many rounds, the torch loop at full length.
+        peers: Also measure mambapy, mamba-ssm, causal-conv1d and gsplat, where installed.
+        out: Folder for the results. With --render it may be a .md or .html file.
+        threads: CPU threads; default: torch's.
+        compare: An older bench.json; prints the ratios of the times.
+        render: Measure nothing; make the tables and the page of these JSON files.
+    """
+    if render:
+        return _render(render, out)
+    settings, modules = _settings(what, device, quick, full, peers, threads)
+    old = read_document(compare) if compare is not None else None
+    folder = output_folder(out)
+    cases: list[Case] = []
+    targets: list[Target] = []
+    for op, module in modules.items():
+        cases += [case for case in module.cases(settings) if case.op == op]
+        targets += [t for t in module.targets(settings) if t.times[0].op == op]
+    with tqdm(total=len(cases), unit="case", desc="bench") as bar:
+        document = measure(cases, settings, _progress(bar))
+    document["machine"]["peers"] = versions() if peers else {}
+    document["targets"] = judge(targets, document["records"])
+    write_json(folder / "bench.json", document)
+    _write(folder / "bench.md", markdown([document]))
+    _write(folder / "bench.html", page([document]))
+    return _report(document, old, folder)
+
+
+def _settings(what, device, quick, full, peers, threads) -> tuple[Settings, dict]:
+    unknown = [name for name in what if name not in (*SUITES, "all")]
+    if unknown:
+        raise UserError(f"unknown case '{unknown[0]}'; there are {', '.join(SUITES)} and all")
+    if quick and full:
+        raise UserError("--quick and --full: choose one")
+    if threads is not None and threads < 1:
+        raise UserError(f"--threads is {threads}, it must be positive")
+    settings = Settings(
+        device=pick_device(device),
+        level="quick" if quick else "full" if full else "normal",
+        peers=peers,
+        threads=threads or torch.get_num_threads(),
+    )
+    ops = [name for name in SUITES if name in what or "all" in what]
+    return settings, {op: load_suite(op) for op in ops}
+
+
+def load_suite(op: str) -> ModuleType:
+    """The module with the cases and targets of one of ``SUITES``."""
+    return importlib.import_module(SUITES[op])
+
+
+def _progress(bar: tqdm):
+    """Shows what is under way; the bar moves on when the case changes."""
+    current = [None]
+
+    def say(case: str, variant: str) -> None:
+        if current[0] not in (None, case):
+            bar.update()
+        current[0] = case
+        bar.set_postfix_str(f"{case}, {variant}")
+
+    return say
+
+
+def read_document(path: Path) -> dict:
+    """Reads a bench.json.
+
+    Raises:
+        UserError: no such file, not JSON, or not of this format.
+    """
+    try:
+        document = json.loads(path.read_text())
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror or 'cannot be read'}") from error
+    except ValueError as error:
+        raise UserError(f"{path}: not JSON ({error})") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise UserError(f"{path}: not a result of 'gamba bench' (format is not {FORMAT})")
+    records = document.get("records")
+    whole = isinstance(records, list) and all(
+        isinstance(r, dict) and all(name in r for name in _NEEDED) for r in records
+    )
+    if not whole or not isinstance(document.get("machine"), dict):
+        raise UserError(f"{path}: damaged: records or machine are missing or incomplete")
+    return document
+
+
+def _render(paths: tuple[Path, ...], out: Path) -> int:
+    documents = [read_document(path) for path in paths]
+    if out.suffix in (".md", ".html"):
+        _write(out, markdown(documents) if out.suffix == ".md" else page(documents))
+        print(f"wrote {out}")
+        return 0
+    folder = output_folder(out)
+    _write(folder / "bench.md", markdown(documents))
+    _write(folder / "bench.html", page(documents))
+    print(f"wrote {folder / 'bench.md'} and bench.html")
+    return 0
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _report(document: dict, old: dict | None, folder: Path) -> int:
+    """Prints targets, failures and ratios; returns the exit code."""
+    for t in document["targets"]:
+        word = {True: "reached", False: "missed", None: "not measured"}[t["reached"]]
+        value = "" if t["value"] is None else f"{t['value']:.3g}"
+        print(f"{word:<12} {value:>8}  ({t['wanted']})  {t['op']}: {t['text']}")
+    if old is not None:
+        print(ratio_table(old, document))
+    faults = [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
+    for r in faults:
+        print(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
+    measured = sum(r["status"] == "ok" for r in document["records"])
+    print(f"{measured} measured; wrote {folder / 'bench.json'}, bench.md and bench.html")
+    if document["interrupted"]:
+        print("interrupted; what was measured is kept")
+        return 130
+    return 1 if faults else 0

@@ -1,0 +1,18 @@
+"""Run time against error: what is measured, and how. ``gamba bench`` runs it."""
+
+from .case import LEVELS, Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
+from .measure import FORMAT, measure
+
+__all__ = [
+    "FORMAT",
+    "LEVELS",
+    "Case",
+    "Error",
+    "Key",
+    "NotInstalled",
+    "Settings",
+    "Target",
+    "Variant",
+    "compare",
+    "measure",
+]

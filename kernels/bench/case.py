@@ -1,0 +1,170 @@
+"""What is measured: cases, each a few variants timed in turn, and the targets set on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+
+class NotInstalled(Exception):
+    """A peer that is not there; ``str(error)`` names its package."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """How long to measure.
+
+    Attributes:
+        seconds: spent on a variant, once it has its fewest rounds.
+        fewest: rounds at least.
+        most: rounds at most.
+    """
+
+    seconds: float
+    fewest: int
+    most: int
+
+
+LEVELS = {"quick": Level(0.1, 3, 20), "normal": Level(1.0, 5, 50), "full": Level(3.0, 9, 100)}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run was asked for.
+
+    Attributes:
+        device: where everything runs.
+        level: key of ``LEVELS``; cases also choose their sizes by it.
+        peers: whether other people's packages are measured too, where they are installed.
+        threads: of torch on the CPU; a variant may ask for another number.
+    """
+
+    device: torch.device
+    level: str = "normal"
+    peers: bool = False
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Error:
+    """How far a result is from the oracle.
+
+    Attributes:
+        rel_rms: rms of the difference over rms of the truth; of the worst tensor.
+        maximum: largest difference over the largest value of the truth; of the worst tensor.
+        worst: name of the tensor with that ``rel_rms``.
+    """
+
+    rel_rms: float
+    maximum: float
+    worst: str
+
+
+def compare(got: Mapping[str, Tensor], want: Mapping[str, Tensor]) -> Error:
+    """Error of named results, in float64 on the CPU; NaN or a wrong shape makes it infinite."""
+    rel_rms, maximum, worst = 0.0, 0.0, ""
+    for name, truth in want.items():
+        value, truth = got[name].detach().double().cpu(), truth.detach().double().cpu()
+        if value.shape != truth.shape or not value.isfinite().all():
+            return Error(math.inf, math.inf, name)
+        if not truth.numel():
+            continue
+        difference = value - truth
+        # a truth of zeros: the difference itself, as if it were to be 1
+        rms = truth.square().mean().sqrt().item() or 1.0
+        relative = difference.square().mean().sqrt().item() / rms
+        if relative >= rel_rms:
+            rel_rms, worst = relative, name
+        maximum = max(maximum, (difference.abs().max() / (truth.abs().max() or 1.0)).item())
+    return Error(rel_rms, maximum, worst)
+
+
+@dataclass
+class Variant:
+    """One thing that is timed.
+
+    Attributes:
+        name: within its case, unique for a direction.
+        run: what is timed; its first call is timed apart.
+        check: computes the error, before the clock, or raises; without an oracle None, or a check
+            that returns None.
+        limit: of the check's ``rel_rms``; above it no time is printed.
+        oracle: against what, and on which part of the input, in words.
+        direction: "forward" or "forward+backward".
+        dtype: of the inputs and outputs.
+        peer: not ours; ours are compared with the fastest of these.
+        default: what a caller gets who asks for nothing.
+        threads: of torch on the CPU in this variant, or None for the run's.
+        rounds: at most so many, for what is slow.
+        parameters: sizes, for the tables and charts.
+        work: counts, taken after the clock has stopped.
+    """
+
+    name: str
+    run: Callable[[], object]
+    check: Callable[[], Error | None] | None
+    limit: float = 1e-5
+    oracle: str = ""
+    direction: str = "forward"
+    dtype: str = "float32"
+    peer: bool = False
+    default: bool = False
+    threads: int | None = None
+    rounds: int | None = None
+    parameters: dict[str, int | float | str] = field(default_factory=dict)
+    work: Callable[[], dict[str, int | float]] | None = None
+
+
+@dataclass
+class Case:
+    """Variants that are timed in turn, so that their ratios come from one run.
+
+    Attributes:
+        op: scan, conv, raster, block, model or train-step.
+        name: unique within the op.
+        text: one sentence on what is compared.
+        build: makes the inputs and the variants; what they hold is freed after the case.
+        axis: parameter along which cost is drawn; "error" draws time against error; None: no chart.
+    """
+
+    op: str
+    name: str
+    text: str
+    build: Callable[[], list[Variant]]
+    axis: str | None = None
+
+
+@dataclass(frozen=True)
+class Key:
+    """Finds a figure: op, case, variant, direction and field (``ms_p50`` or a key of ``work``)."""
+
+    op: str
+    case: str
+    variant: str
+    direction: str = "forward"
+    field: str = "ms_p50"
+
+
+@dataclass(frozen=True)
+class Target:
+    """A figure, or a quotient of figures, that should be reached.
+
+    Attributes:
+        text: what it is.
+        times: figures to multiply.
+        over: figures to divide by.
+        scale: multiplies the quotient.
+        at_least: the bound, if it is a lower one.
+        at_most: the bound, if it is an upper one.
+    """
+
+    text: str
+    times: tuple[Key, ...]
+    over: tuple[Key, ...] = ()
+    scale: float = 1.0
+    at_least: float | None = None
+    at_most: float | None = None

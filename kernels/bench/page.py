@@ -1,0 +1,160 @@
+"""The page with charts: one HTML file, nothing loaded."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Sequence
+
+from .charts import Axis, Point, Series, chart, pareto
+from .report import (
+    EXPLANATION,
+    TARGET_HEADER,
+    groups,
+    machine_line,
+    oracles,
+    table,
+    target_rows,
+)
+
+_NUMBER = re.compile(r"[0-9.,e-]+( to [0-9.,e-]+)?")
+_AXES = {
+    "L": "tokens L",
+    "B": "sequences B",
+    "N": "N",
+    "D": "channels D",
+    "threads": "threads",
+    "side": "side of the picture, pixels",
+    "views": "views",
+}
+
+
+def charts_of(case: str, records: Sequence[dict]) -> list[str]:
+    """The case's charts, by its axis; none where there is none or nothing was measured."""
+    axis = records[0]["axis"]
+    done = [r for r in records if r["status"] == "ok"]
+    if axis is None or not done:
+        return []
+    if axis == "error":
+        directions = dict.fromkeys(r["direction"] for r in done)
+        return [_error_chart([r for r in done if r["direction"] == d], d) for d in directions]
+    if axis == "skipped":
+        return [_skip_chart(done)]
+    series = []
+    for direction in dict.fromkeys(r["direction"] for r in done):
+        found = [r for r in done if r["direction"] == direction]
+        points = [Point(r["parameters"][axis], r["ms_p50"]) for r in found]
+        series.append(Series(direction, sorted(points, key=lambda p: p.x), "straight"))
+    ticks = sorted({r["parameters"][axis] for r in done})
+    label = case if axis == "N" else _AXES.get(axis, axis)
+    return [chart(series, Axis(label, values=ticks), Axis("milliseconds"))]
+
+
+def _error_chart(records: Sequence[dict], direction: str) -> str:
+    """Time against error: less is better in both; the front is what no other variant beats."""
+    points = [
+        Point(
+            r["ms_p50"],
+            r["rel_rms_error"] or 0.0,
+            r["variant"],
+            "peer" if r["is_peer"] else "default" if r["is_default"] else "",
+        )
+        for r in records
+    ]
+    front = pareto([p for p in points if p.y > 0])
+    series = [Series(direction, points), Series("Pareto front", front, "steps")]
+    return chart(series, Axis("milliseconds"), Axis("relative rms error to float64"))
+
+
+def _skip_chart(records: Sequence[dict]) -> str:
+    """Work skipped against time saved, both as shares of the default's."""
+    base = next((r["ms_p50"] for r in records if r["is_default"]), None)
+    if base is None:
+        return ""
+    points = [
+        Point(100 * r["work"]["skipped"], 100 * (1 - r["ms_p50"] / base), r["variant"])
+        for r in records
+        if "skipped" in r["work"]
+    ]
+    return chart([Series("", points)], Axis("work skipped, %", False), Axis("time saved, %", False))
+
+
+_STYLE = """
+:root {
+  color-scheme: light dark;
+  --back: #f5f5f2; --card: #ffffff; --text: #22252a; --soft: #686d76; --line: #dfe0dc;
+  --s0: #1f6feb; --s1: #d1582b; --s2: #2c8a57; --s3: #8250c4; --good: #2c8a57; --bad: #c03a2b;
+}
+@media (prefers-color-scheme: dark) {
+  :root {
+    --back: #16181c; --card: #202329; --text: #e8e8e6; --soft: #9aa0aa; --line: #343840;
+    --s0: #6ea8ff; --s1: #f08a5d; --s2: #5cc48d; --s3: #b896f0; --good: #5cc48d; --bad: #ff7b6b;
+  }
+}
+* { box-sizing: border-box; }
+body {
+  margin: 0 auto; padding: 2rem 1.25rem 3rem; max-width: 76rem;
+  background: var(--back); color: var(--text); font: 15px/1.5 system-ui, sans-serif;
+}
+h1 { margin: 0; font-size: 1.6rem; font-weight: 650; }
+h2 { margin: 0 0 .5rem; font-size: 1.15rem; font-weight: 600; }
+p { margin: .35rem 0 0; max-width: 52rem; color: var(--soft); }
+section {
+  margin-top: 1.5rem; padding: 1.25rem; background: var(--card);
+  border: 1px solid var(--line); border-radius: 12px;
+}
+.charts { display: grid; gap: 1rem; margin-top: 1rem;
+  grid-template-columns: repeat(auto-fill, minmax(min(100%, 33rem), 1fr)); }
+svg { display: block; width: 100%; max-width: 45rem; height: auto; }
+svg text { fill: var(--text); font: 12px system-ui, sans-serif; }
+svg .axis { fill: var(--soft); font-weight: 600; }
+svg .grid { stroke: var(--line); }
+svg .line { fill: none; stroke-width: 2; stroke-linejoin: round; }
+svg .steps { stroke-dasharray: 5 4; }
+svg .ring { fill: none !important; stroke-width: 2; }
+.scroll { overflow-x: auto; margin-top: 1rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
+th, td { padding: .25rem 1.2rem .25rem 0; text-align: left; border-bottom: 1px solid var(--line); }
+th { font-weight: 500; color: var(--soft); }
+td.number { text-align: right; }
+.reached { color: var(--good); } .missed { color: var(--bad); }
+"""
+
+
+def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
+    """A self-contained HTML page: the tables and the charts."""
+    body = [f"<header><h1>{title}</h1><p>{EXPLANATION}</p>"]
+    body.append("<p>Circle: ours; ring: the default; square: a peer.</p></header>")
+    for document in documents:
+        head = f"<h2>{html.escape(machine_line(document))}</h2>"
+        if document["interrupted"]:
+            head += "<p>The run was interrupted; what was measured is here.</p>"
+        if targets := target_rows(document):
+            head += _html_table(TARGET_HEADER, targets)
+        body.append(f"<section>{head}</section>")
+        for op, cases in groups(document).items():
+            for case, records in cases.items():
+                text = html.escape(f"{records[0]['text']} {oracles(records)}")
+                figures = "".join(charts_of(case, records))
+                figures = f'<div class="charts">{figures}</div>' if figures else ""
+                rows = _html_table(*table(records))
+                name = html.escape(f"{op}: {case}")
+                body.append(f"<section><h2>{name}</h2><p>{text}</p>{figures}{rows}</section>")
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{_STYLE}</style></head>\n<body>{''.join(body)}</body></html>\n"
+    )
+
+
+def _html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    def cell(text: str) -> str:
+        kind = text if text in ("reached", "missed") else ""
+        if _NUMBER.fullmatch(text):
+            kind = "number"
+        return f'<td class="{kind}">{html.escape(text)}</td>'
+
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
+    lines = [f"<tr>{head}</tr>"]
+    lines += [f"<tr>{''.join(cell(c) for c in row)}</tr>" for row in rows]
+    return f'<div class="scroll"><table>{"".join(lines)}</table></div>'

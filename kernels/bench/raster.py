@@ -1,0 +1,305 @@
+"""Cases of the rasterizer, and the targets on them."""
+
+from __future__ import annotations
+
+import math
+import os
+from functools import partial
+
+import torch
+
+from . import peers
+from .case import Case, Error, Key, Settings, Target, Variant, compare
+from .raster_scene import LEAVES, Scene, orbit_cameras, shell
+
+# Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
+FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 1.0
+BOTH = "forward+backward"
+_COUNT = 16384
+_SIZE = 512
+
+
+def cases(settings: Settings) -> list[Case]:
+    """All cases of the rasterizer at the level's sizes."""
+    builders = [
+        ("scene", _scenes, None),
+        ("knobs", _knobs, "error"),
+        ("skipping", _skipping, "skipped"),
+        ("one call", _one_call, None),
+        ("Gaussians", _counts, "N"),
+        ("pixels", _pixels, "side"),
+        ("views", _views, "views"),
+    ]
+    if settings.device.type == "cpu":
+        builders.append(("threads", _threads, "threads"))
+    else:
+        builders.append(("32 views", _many_views, None))
+    return [
+        Case("raster", name, " ".join(build.__doc__.split()), partial(build, settings), axis)
+        for name, build, axis in builders
+    ]
+
+
+def _scene(
+    settings: Settings,
+    scale: float = 1.0,
+    count: int | None = None,
+    size: int | None = None,
+    views: int = 1,
+) -> Scene:
+    """The shell; a quick run has an eighth of the Gaussians and a quarter of the pixels."""
+    quick = settings.level == "quick"
+    count = count or (_COUNT // 8 if quick else _COUNT)
+    size = size or (_SIZE // 2 if quick else _SIZE)
+    return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
+
+
+def _variant(
+    scene: Scene, name: str, direction: str = "forward", limit: float | None = None, **changes
+) -> Variant:
+    backward = direction == BOTH
+    parameters = {
+        "N": scene.gaussians["opacities"].shape[-1],
+        "side": scene.size,
+        "views": scene.viewmats.shape[:-2].numel(),
+    }
+    return Variant(
+        name,
+        scene.backward if backward else scene.forward,
+        partial(scene.check, backward),
+        limit or (BACKWARD_LIMIT if backward else FORWARD_LIMIT),
+        scene.oracle(backward),
+        direction,
+        parameters=parameters,
+        work=partial(scene.work, backward),
+        **changes,
+    )
+
+
+def _pair(scene: Scene, name: str, **changes) -> list[Variant]:
+    return [_variant(scene, name, direction, **changes) for direction in ("forward", BOTH)]
+
+
+def _scenes(settings: Settings) -> list[Variant]:
+    """The probe scene: 16,384 Gaussians on a shell, one view of 512², whole operator (project,
+    sort, bin, blend), with standard deviations of 0.01, 0.02 and 0.04 of the object's size.
+    """
+    made = []
+    for scale in (1, 2, 4):
+        scene = _scene(settings, scale)
+        made += _pair(scene, f"scale {scale}", default=True)
+        if settings.peers:
+            made += _peers(scene, f"scale {scale}")
+    return made
+
+
+def _peers(scene: Scene, name: str) -> list[Variant]:
+    """On CUDA gsplat; on a CPU the projection of its torch code, all that runs there."""
+    parameters = {"N": scene.gaussians["opacities"].shape[-1], "side": scene.size}
+    if scene.device.type == "cuda":
+        runs = {"forward": scene.forward, BOTH: scene.backward}
+
+        def error() -> Error:
+            got, want = (scene.forward(f)[0] for f in (peers.gsplat_rasterization, *_own()))
+            return compare({"picture": got}, {"picture": want})
+
+        return [
+            Variant(
+                f"gsplat, {name}",
+                partial(run, peers.gsplat_rasterization),
+                error,
+                1e-2,
+                "our float32 picture",
+                direction,
+                peer=True,
+                parameters=parameters,
+            )
+            for direction, run in runs.items()
+        ]
+    x = scene.gaussians
+    arguments = (x["means"], x["quats"], x["scales"], scene.viewmats, scene.Ks, scene.size)
+    run = partial(peers.gsplat_projection, *arguments)
+
+    def check() -> Error:
+        return compare({"means2d": run()}, {"means2d": scene.forward()[2]["means2d"]})
+
+    name = f"gsplat's torch projection alone, {name}"
+    return [
+        Variant(name, run, check, 1e-4, "our float32 centres", peer=True, parameters=parameters)
+    ]
+
+
+def _own() -> tuple:
+    from ..rasterize import rasterization
+
+    return (rasterization,)
+
+
+def _knobs(settings: Settings) -> list[Variant]:
+    """What a caller may trade for time, at scale 2; the truth has no alpha threshold, no radius
+    clip and all Gaussians.
+    """
+    scene = _scene(settings, 2).changed(exact={"alpha_min": 1e-9})
+    made = _pair(scene, "alpha_min 1/255", limit=TRADE_LIMIT, default=True)
+    for denominator in (4096, 1024, 64, 32, 16):
+        options = {"alpha_min": 1 / denominator}
+        name = f"alpha_min 1/{denominator}"
+        made += _pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
+    for radius in (4.0, 8.0):
+        name = f"radius_clip {radius:g}"
+        made += _pair(scene.changed(options={"radius_clip": radius}), name, limit=TRADE_LIMIT)
+    return made
+
+
+def _skipping(settings: Settings) -> list[Variant]:
+    """What is not computed because nobody needs it, at scale 2, against the same call that needs
+    all. Skipped: share of the pairs of Gaussians and tiles, or of the gradients.
+    """
+    scene = _scene(settings, 2)
+    made = [_variant(scene, "all gradients, whole picture", BOTH, default=True)]
+    for name in ("colors", "means"):
+        made.append(_variant(scene.changed(wanted=(name,)), f"gradient of {name} alone", BOTH))
+        made[-1].work = partial(_gradients_skipped, scene, 1 - 1 / len(LEAVES))
+    half = scene.size // 2
+    for name, rows in (("half", scene.size), ("a quarter", half)):
+        part = torch.zeros_like(scene.cotangent)
+        part[:, :rows, :half] = scene.cotangent[:, :rows, :half]
+        part = scene.changed(cotangent=part)
+        made.append(_variant(part, f"upstream gradient on {name} of the picture", BOTH))
+        made[-1].work = partial(_tiles_skipped, part)
+    return made
+
+
+def _gradients_skipped(scene: Scene, share: float) -> dict[str, float]:
+    return scene.work(True) | {"skipped": share}
+
+
+def _tiles_skipped(scene: Scene) -> dict[str, float]:
+    counts = scene.work(True)
+    occupied = counts["tiles"] - counts["tiles_empty"]
+    skipped = counts["tiles_skipped"] - counts["tiles_empty"]
+    return counts | {"skipped": skipped / max(occupied, 1)}
+
+
+def _one_call(settings: Settings) -> list[Variant]:
+    """8 objects of 4,096 Gaussians in 4 views of 128² each: in one call, and in 32."""
+    objects, views, size = (2, 2, 64) if settings.level == "quick" else (8, 4, 128)
+    shells = [shell(4096, 2, seed) for seed in range(objects)]
+    gaussians = {k: torch.stack([x[k] for x in shells]) for k in shells[0]}
+    viewmats, Ks = (x.expand(objects, *x.shape) for x in orbit_cameras(views, size))
+    together = Scene(gaussians, viewmats, Ks, size, settings.device)
+    single = [
+        Scene(shells[b], viewmats[b, v : v + 1], Ks[b, v : v + 1], size, settings.device)
+        for b in range(objects)
+        for v in range(views)
+    ]
+    made = _pair(together, "one call", default=True)
+    for direction in ("forward", BOTH):
+        variant = _variant(single[0], f"{len(single)} calls", direction)
+        runs = [s.forward if direction == "forward" else s.backward for s in single]
+        variant.run = partial(_call_all, runs)
+        variant.work = None
+        variant.parameters["views"] = len(single)
+        made.append(variant)
+    return made
+
+
+def _call_all(runs: list) -> None:
+    for run in runs:
+        run()
+
+
+def _counts(settings: Settings) -> list[Variant]:
+    """Cost against the number of Gaussians, which get smaller so that they cover the same area."""
+    counts = {
+        "quick": (1024, 4096),
+        "normal": (16384, 65536),
+        "full": (16384, 65536, 262144),
+    }[settings.level]
+    made = []
+    for count in counts:
+        scene = _scene(settings, math.sqrt(counts[0] / count), count)
+        made += _pair(scene, f"{count} Gaussians")
+    return made
+
+
+def _pixels(settings: Settings) -> list[Variant]:
+    """Cost against the side of the picture, at scale 2."""
+    sides = (64, 128) if settings.level == "quick" else (128, 256, 512, 1024)
+    made = []
+    for side in sides:
+        made += _pair(_scene(settings, 2, size=side), f"{side} x {side}")
+    return made
+
+
+def _views(settings: Settings) -> list[Variant]:
+    """Cost against the number of views of 256² in one call."""
+    numbers, size = ((1, 2), 64) if settings.level == "quick" else ((1, 2, 4, 8, 16), 256)
+    made = []
+    for views in numbers:
+        made += _pair(_scene(settings, size=size, views=views), f"{views} view{'s' * (views > 1)}")
+    return made
+
+
+def _threads(settings: Settings) -> list[Variant]:
+    """Cost against torch's number of threads, at scale 2."""
+    cores = os.cpu_count() or 1
+    scene = _scene(settings, 2)
+    made = []
+    for threads in sorted({1, cores, *(2**i for i in range(1, 10) if 2**i < cores)}):
+        for variant in _pair(scene, f"{threads} thread{'s' * (threads > 1)}", threads=threads):
+            variant.parameters["threads"] = threads
+            made.append(variant)
+    return made
+
+
+def _many_views(settings: Settings) -> list[Variant]:
+    """32 views of 512² in one launch, beside gsplat."""
+    scene = _scene(settings, views=32)
+    return _pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
+
+
+def _raster(case: str, variant: str, direction: str = "forward", field: str = "ms_p50") -> Key:
+    return Key("raster", case, variant, direction, field)
+
+
+def targets(settings: Settings) -> list[Target]:
+    """What should be reached; nothing at a quick run's sizes."""
+    if settings.level == "quick":
+        return []
+    made = []
+    for scale, bound in ((1, 12), (2, 25), (4, 55)):
+        forward, both = (_raster("scene", f"scale {scale}", d) for d in ("forward", BOTH))
+        if settings.device.type == "cpu":
+            made.append(Target(f"forward, scale {scale}, ms", (forward,), at_most=bound))
+        text = f"forward + backward over forward, scale {scale}"
+        made.append(Target(text, (both,), (forward,), at_most=3.5))
+    for direction in ("forward", BOTH):
+        many, one = (_raster("one call", name, direction) for name in ("32 calls", "one call"))
+        text = f"8 objects x 4 views, {direction}, 32 calls over one"
+        made.append(Target(text, (many,), (one,), at_least=1.3))
+    return made + _growth(settings) + (_cuda_targets() if settings.device.type == "cuda" else [])
+
+
+def _growth(settings: Settings) -> list[Target]:
+    """Time grows no faster than the pairs of Gaussians and tiles."""
+    made = []
+    for count in (65536, 262144) if settings.level == "full" else (65536,):
+        for direction in ("forward", BOTH):
+            few, many = (
+                partial(_raster, "Gaussians", f"{n} Gaussians", direction) for n in (16384, count)
+            )
+            text = f"{direction}, growth of time over growth of pairs, 16384 to {count} Gaussians"
+            times, over = (many(), few("pairs")), (few(), many("pairs"))
+            made.append(Target(text, times, over, at_most=1.0))
+    return made
+
+
+def _cuda_targets() -> list[Target]:
+    ours, both = (_raster("32 views", "ours", d) for d in ("forward", BOTH))
+    peer = _raster("32 views", "gsplat, 32 views")
+    return [
+        Target("forward, µs a view of 512²", (ours,), scale=1e3 / 32, at_most=60),
+        Target("forward + backward, µs a view of 512²", (both,), scale=1e3 / 32, at_most=210),
+        Target("forward, gsplat's time over ours", (peer,), (ours,), at_least=1.5),
+    ]

@@ -1,0 +1,192 @@
+"""What was measured, for people: targets, ratios and Markdown tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from .case import Key, Target
+
+_HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
+
+
+def judge(targets: Iterable[Target], records: Sequence[dict]) -> list[dict]:
+    """Holds records against targets.
+
+    Returns:
+        ``{op, text, wanted, value, reached}`` for each target whose cases were measured; ``value``
+        and ``reached`` are None where a figure is not there.
+    """
+    cases = {(r["op"], r["case"]) for r in records}
+    rows = []
+    for target in targets:
+        keys = (*target.times, *target.over)
+        if not all((k.op, k.case) in cases for k in keys):
+            continue
+        value, reached = _value(target, records), None
+        if value is not None:
+            low = target.at_least is None or value >= target.at_least
+            reached = low and (target.at_most is None or value <= target.at_most)
+        wanted = f"≥ {target.at_least:.3g}" if target.at_least else f"≤ {target.at_most:.3g}"
+        rows.append(
+            dict(op=keys[0].op, text=target.text, wanted=wanted, value=value, reached=reached)
+        )
+    return rows
+
+
+def _value(target: Target, records: Sequence[dict]) -> float | None:
+    value = target.scale
+    for key in target.times:
+        value *= _figure(key, records) or 0.0
+    for key in target.over:
+        figure = _figure(key, records)
+        value = value / figure if figure else 0.0
+    return value or None
+
+
+def _figure(key: Key, records: Sequence[dict]) -> float | None:
+    for r in records:
+        if (r["op"], r["case"], r["variant"], r["direction"]) == (
+            key.op,
+            key.case,
+            key.variant,
+            key.direction,
+        ):
+            return r[key.field] if key.field in r else r["work"].get(key.field)
+    return None
+
+
+def identity(record: dict) -> tuple[str, ...]:
+    """What tells records of one document apart."""
+    names = ("op", "case", "variant", "direction", "dtype", "device")
+    return tuple(str(record[name]) for name in names)
+
+
+def ratios(old: dict, new: dict) -> list[tuple[dict, float, float]]:
+    """Records of the new document that the old one has too, with both median times in ms."""
+    before = {identity(r): r["ms_p50"] for r in old["records"]}
+    pairs = [(r, before.get(identity(r)), r["ms_p50"]) for r in new["records"]]
+    return [(r, a, b) for r, a, b in pairs if a and b]
+
+
+def ratio_table(old: dict, new: dict) -> str:
+    """``ratios`` as text; over 1 is slower than before."""
+    rows = [
+        f"{b / a:8.2f} x  {a:10.4g} -> {b:10.4g} ms  "
+        f"{r['op']} · {r['case']} · {r['variant']} · {r['direction']} · {r['dtype']}"
+        for r, a, b in sorted(ratios(old, new), key=lambda row: -row[2] / row[1])
+    ]
+    notes = [
+        f"note: {name} was {old['machine'].get(name)}, is {value}"
+        for name, value in new["machine"].items()
+        if name not in ("date",) and old["machine"].get(name) != value
+    ]
+    return "\n".join([*notes, *rows]) or "nothing in common"
+
+
+def machine_line(document: dict) -> str:
+    """The machine and the versions in one line."""
+    m = document["machine"]
+    parts = [m["gpu"], f"CUDA {m['cuda']}"] if m["gpu"] else []
+    parts += [f"{m['cpu']} ({m['simd']}, {m['cores']} cores)", f"{m['threads']} threads"]
+    parts += [f"torch {m['torch']}, warp {m['warp']}, gamba_warp {m['gamba_warp']}"]
+    parts += [f"{name} {version}" for name, version in m.get("peers", {}).items()]
+    return " · ".join([*parts, f"Python {m['python']}", m["system"], m["date"]])
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
+
+
+def _row(r: dict) -> list[str]:
+    """Cells under ``_HEADER``, then the peer and the work."""
+    name = r["variant"] + (" (default)" if r["is_default"] and r["variant"] != "default" else "")
+    if r["status"] != "ok":
+        return [name, r["direction"], r["dtype"], r["status"], "", "", _number(r["rel_rms_error"])]
+    spread = f"{_number(r['ms_p20'])} to {_number(r['ms_p80'])}"
+    error = _number(r["rel_rms_error"]) or "none"
+    return [
+        *(name, r["direction"], r["dtype"], _number(r["ms_p50"]), spread),
+        *(_number(r["jit_ms"]), error),
+    ]
+
+
+def _peer(r: dict) -> str:
+    if not r["peer_ms"] or not r["ms_p50"]:
+        return ""
+    return f"{_number(r['peer_ms'] / r['ms_p50'])} ({r['peer']})"
+
+
+def _work(r: dict) -> str:
+    parts = []
+    for name, value in r["work"].items():
+        text = f"{value:.0%}" if name == "skipped" else f"{value:,}"
+        if name.endswith("_bytes"):
+            name, text = name.removesuffix("_bytes"), f"{value / 2**20:,.1f} MiB"
+        parts.append(f"{name.replace('_', ' ')} {text}")
+    return ", ".join(parts)
+
+
+def table(records: Sequence[dict]) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of one case; columns that would be empty are left out."""
+    peers, work = [_peer(r) for r in records], [_work(r) for r in records]
+    header, rows = list(_HEADER), [_row(r) for r in records]
+    for name, cells in (("peer's time / ours", peers), ("work", work)):
+        if any(cells):
+            header.append(name)
+            for row, cell in zip(rows, cells):
+                row.append(cell)
+    return header, rows
+
+
+def groups(document: dict) -> dict[str, dict[str, list[dict]]]:
+    """Records by op, then case, in the order measured."""
+    found: dict[str, dict[str, list[dict]]] = {}
+    for r in document["records"]:
+        found.setdefault(r["op"], {}).setdefault(r["case"], []).append(r)
+    return found
+
+
+def oracles(records: Sequence[dict]) -> str:
+    """What the errors of a case are against, a sentence."""
+    names = list(dict.fromkeys(r["oracle"] for r in records if r["oracle"] and not r["is_peer"]))
+    return f"Error: relative rms to {' / '.join(names)}." if names else ""
+
+
+def target_rows(document: dict) -> list[list[str]]:
+    """Cells under ``TARGET_HEADER``."""
+    words = {True: "reached", False: "missed", None: "not measured"}
+    return [
+        [t["op"], t["text"], t["wanted"], _number(t["value"]), words[t["reached"]]]
+        for t in document.get("targets", [])
+    ]
+
+
+TARGET_HEADER = ("", "target", "wanted", "measured", "")
+EXPLANATION = (
+    "Times are medians in milliseconds, with the 20 % and 80 % quantiles; variants of one table "
+    "were timed in turn, so their ratios come from one run. The first call includes compilation or "
+    "its cache. Before the clock starts every variant is compared with a float64 oracle; what "
+    "fails gets no time."
+)
+
+
+def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
+    """All tables; one document is one machine."""
+    lines = [f"# {title}", "", EXPLANATION, ""]
+    for document in documents:
+        lines += [f"## {machine_line(document)}", ""]
+        if document["interrupted"]:
+            lines += ["The run was interrupted; what was measured is here.", ""]
+        if targets := target_rows(document):
+            lines += [*_markdown_table(TARGET_HEADER, targets), ""]
+        for op, cases in groups(document).items():
+            for case, records in cases.items():
+                lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
+                lines += [*_markdown_table(*table(records)), ""]
+    return "\n".join(lines)
+
+
+def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    cells = [[cell.replace("|", "\\|") for cell in row] for row in (header, *rows)]
+    lines = [f"| {' | '.join(row)} |" for row in cells]
+    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]

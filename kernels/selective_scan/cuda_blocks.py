@@ -1,0 +1,318 @@
+"""How a block of threads maps to channels, states and tokens, and its shared memory.
+
+A block holds adjacent channels of one group. For the recurrence a thread owns ``channels`` times
+``states`` of them (an outer product, so that what it reads from shared memory is used more than
+once), and ``lanes`` threads share a channel; for loads, stores and what depends on a channel alone,
+a thread owns one channel and every ``rows``-th token, so that a warp touches adjacent addresses.
+"""
+
+import dataclasses
+import functools
+
+import torch
+import warp as wp
+
+from .lanes import WARP_DTYPES
+
+STATES = 16  # of a state block, the most that a channel holds in registers
+MARK = 64  # tokens between the states that the forward saves for the gradient
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """The static shape of a block."""
+
+    block: int  # threads
+    channels: int  # of a thread
+    states: int  # of a thread, in one state block
+    lanes: int  # threads that share a channel
+    walks: int  # state blocks, walked one after the other; 1 up to 16 states
+
+    @property
+    def width(self) -> int:
+        """States of a state block, padded."""
+        return self.lanes * self.states
+
+    @property
+    def padded(self) -> int:
+        """All states, padded."""
+        return self.width * self.walks
+
+    @property
+    def slots(self) -> int:
+        """Groups of ``lanes`` threads."""
+        return self.block // self.lanes
+
+    @property
+    def span(self) -> int:
+        """Channels of a block."""
+        return self.slots * self.channels
+
+    @property
+    def rows(self) -> int:
+        """Threads that load one channel, each other tokens of it."""
+        return self.block // self.span
+
+    @property
+    def held(self) -> int:
+        """Elements (channel, state) of a thread."""
+        return self.channels * self.states
+
+    @property
+    def pad(self) -> int:
+        """Floats between the lanes' partial sums, against bank conflicts."""
+        return 32 // self.lanes if self.lanes > 1 else 0
+
+
+def frame(block: int, channels: int, states: int, total: int) -> Frame:
+    """The frame of ``total`` states for a variant's block, channels and states of a thread."""
+    width = min(STATES, 1 << (total - 1).bit_length())
+    states = min(states, width)
+    lanes = width // states
+    return Frame(block, min(channels, lanes), states, lanes, -(-total // width))
+
+
+_SCALARS = {
+    torch.float32: "wp::float32",
+    torch.float16: "wp::float16",
+    torch.bfloat16: "wp::bfloat16",
+}
+
+
+@wp.struct
+class Sizes:
+    """What all kernels know: the shapes, and how block indices map to them."""
+
+    length: int
+    states: int
+    group_width: int
+    groups: int
+    parts: int  # blocks of channels in a group
+    pieces: int  # of the sequence, each a block's own
+    piece: int  # tokens of one, a multiple of MARK
+    save: int
+
+
+@wp.struct
+class Place:
+    """Where a thread works."""
+
+    b: int
+    group: int
+    part: int
+    piece: int
+    at: int  # row of arrays [B * pieces, ...]
+    begin: int  # tokens
+    end: int
+    lane: int  # of the block
+    d0: int  # the block's first channel
+    count: int  # its channels inside the group
+    d: int  # the thread's own channel; threads past the last share that one and are not active
+    c: int  # the same, within the block
+    active: int
+    row: int  # the thread's first token of a tile
+    slot: int  # the recurrence: which channels
+    q: int  # and which states
+    states: int  # of all
+
+
+# Shared memory is one tile of floats, addressed by plain offsets: assigning to elements of a tile
+# has a barrier each.
+def offsets(parts: dict) -> tuple[dict, int]:
+    """Where parts of so many floats begin in shared memory, and their sum."""
+    at, size = {}, 0
+    for name, count in parts.items():
+        at[name] = size
+        size += -(-count // 4) * 4
+    return at, size
+
+
+@functools.cache
+def arena_io(size: int):
+    """The type of a block's shared memory of ``size`` floats, and access to it."""
+    arena_type = wp.tile[float, size]
+
+    @wp.func_native("arena.data.ptr[i] = v;")
+    def put(arena: arena_type, i: int, v: float): ...
+
+    @wp.func_native("return arena.data.ptr[i];")
+    def get(arena: arena_type, i: int) -> float: ...
+
+    return arena_type, put, get
+
+
+@wp.func_native("WP_TILE_SYNC();")
+def sync(): ...
+
+
+@functools.cache
+def placing(f: Frame):
+    """The function that finds a thread's place."""
+
+    @wp.func
+    def place(sizes: Sizes, index: int, lane: int) -> Place:
+        p = Place()
+        p.part = index % sizes.parts
+        rest = index / sizes.parts
+        p.group = rest % sizes.groups
+        rest = rest / sizes.groups
+        p.piece = rest % sizes.pieces
+        p.b = rest / sizes.pieces
+        p.at = rest
+        p.begin = p.piece * sizes.piece
+        p.end = wp.min(p.begin + sizes.piece, sizes.length)
+        p.lane = lane
+        p.d0 = p.group * sizes.group_width + p.part * wp.static(f.span)
+        p.count = wp.min(wp.static(f.span), sizes.group_width - p.part * wp.static(f.span))
+        p.c = lane % wp.static(f.span)
+        p.row = lane / wp.static(f.span)
+        p.active = int(p.c < p.count)
+        p.d = p.d0 + wp.min(p.c, p.count - 1)
+        p.slot = lane / wp.static(f.lanes)
+        p.q = lane % wp.static(f.lanes)
+        p.states = sizes.states
+        return p
+
+    return place
+
+
+@functools.cache
+def states_io(f: Frame):
+    """The vector of a thread's states, walk by walk, and its load from and store to ``[*, D, N]``.
+
+    States past the last are 0.
+    """
+    vec = wp.types.vector(f.walks * f.held, wp.float32)
+
+    def loop(body: str) -> str:
+        return f"""
+float* row = x.data + (size_t)i * (x.strides[0] / 4);
+WP_PRAGMA_UNROLL
+for (int k = 0; k < {f.walks * f.held}; ++k) {{
+    const int c = slot * {f.channels} + k % {f.held} / {f.states};
+    const int n = k / {f.held} * {f.width} + q * {f.states} + k % {f.states};
+    float* at = row + (size_t)(d0 + c) * states + n;
+    {body}
+}}
+"""
+
+    @wp.func_native(
+        f"wp::vec_t<{f.walks * f.held}, float> h;"
+        + loop("h.c[k] = c < count && n < states ? *at : 0.0f;")
+        + "return h;"
+    )
+    def load(
+        x: wp.array3d(dtype=float), i: int, d0: int, count: int, states: int, slot: int, q: int
+    ) -> vec: ...
+
+    @wp.func_native(loop("if (c < count && n < states) *at = h.c[k];"))
+    def store(
+        x: wp.array3d(dtype=float),
+        i: int,
+        d0: int,
+        count: int,
+        states: int,
+        slot: int,
+        q: int,
+        h: vec,
+    ): ...
+
+    @wp.func
+    def read(x: wp.array3d(dtype=float), i: int, p: Place) -> vec:
+        return load(x, i, p.d0, p.count, p.states, p.slot, p.q)
+
+    @wp.func
+    def write(x: wp.array3d(dtype=float), i: int, p: Place, h: vec):
+        store(x, i, p.d0, p.count, p.states, p.slot, p.q, h)
+
+    return vec, read, write
+
+
+@functools.cache
+def halves(f: Frame):
+    """Two vectors of a thread's states as one, for a native function to return."""
+    n = f.walks * f.held
+    vec = wp.types.vector(n, wp.float32)
+    pair = wp.types.vector(2 * n, wp.float32)
+    loop = f"WP_PRAGMA_UNROLL for (int k = 0; k < {n}; ++k) "
+    one = f"wp::vec_t<{n}, float> r; {loop}"
+
+    @wp.func_native(
+        f"wp::vec_t<{2 * n}, float> r; {loop} r.c[k] = x.c[k], r.c[{n} + k] = y.c[k]; return r;"
+    )
+    def join(x: vec, y: vec) -> pair: ...
+
+    @wp.func_native(f"{one} r.c[k] = v.c[k]; return r;")
+    def first(v: pair) -> vec: ...
+
+    @wp.func_native(f"{one} r.c[k] = v.c[{n} + k]; return r;")
+    def second(v: pair) -> vec: ...
+
+    return pair, join, first, second
+
+
+@functools.cache
+def channel_io(f: Frame, io: torch.dtype, tokens: int):
+    """Fetches a thread's own elements of a tile of ``[B, L, D]`` in their own type, as a vector.
+
+    The loads are on their way while the tile before is worked on; converting would wait for them.
+    """
+    scalar = WARP_DTYPES[io]
+    count = tokens // f.rows
+    raw = wp.types.vector(count, scalar)
+
+    snippet = f"""
+wp::vec_t<{count}, {_SCALARS[io]}> r;
+const char* from = (const char*)x.data + (size_t)b * x.strides[0] + (size_t)t * x.strides[1];
+from += (size_t)d * sizeof({_SCALARS[io]});
+const size_t step = (size_t){f.rows} * x.strides[1];
+WP_PRAGMA_UNROLL
+for (int i = 0; i < {count}; ++i, from += step) {{
+    r.c[i] = {_SCALARS[io]}(0.0f);
+    if (t + {f.rows} * i < end) r.c[i] = *(const {_SCALARS[io]}*)from;
+}}
+return r;
+"""
+
+    @wp.func_native(snippet)
+    def fetch(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, end: int) -> raw: ...
+
+    return count, raw, fetch
+
+
+@functools.cache
+def matrix_io(f: Frame, io: torch.dtype, tokens: int, arena_size: int):
+    """As ``channel_io`` for B and C: fetches rows of ``[B, L, G, N]``, and puts them as floats."""
+    scalar = WARP_DTYPES[io]
+    size = tokens * f.padded
+    count = -(-size // f.block)
+    raw = wp.types.vector(count, scalar)
+    arena_type, put, _ = arena_io(arena_size)
+
+    snippet = f"""
+wp::vec_t<{count}, {_SCALARS[io]}> r;
+const char* from = (const char*)x.data + (size_t)b * x.strides[0] + (size_t)group * x.strides[2];
+WP_PRAGMA_UNROLL
+for (int i = 0; i < {count}; ++i) {{
+    const int e = {f.block} * i + lane, t = t0 + e / {f.padded}, n = e % {f.padded};
+    r.c[i] = {_SCALARS[io]}(0.0f);
+    if (t < end && n < states && e < {size})
+        r.c[i] = *(const {_SCALARS[io]}*)(
+            from + (size_t)t * x.strides[1] + (size_t)n * x.strides[3]);
+}}
+return r;
+"""
+
+    @wp.func_native(snippet)
+    def fetch(
+        x: wp.array4d(dtype=scalar), b: int, group: int, lane: int, states: int, t0: int, end: int
+    ) -> raw: ...
+
+    @wp.func
+    def place_rows(arena: arena_type, base: int, p: Place, r: raw):
+        for i in range(wp.static(count)):
+            e = wp.static(i * f.block) + p.lane
+            if e < wp.static(size):
+                put(arena, base + e, float(r[i]))
+
+    return raw, fetch, place_rows
