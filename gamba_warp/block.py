@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from .config import GambaConfig
-from .kernels.selective_scan import causal_conv1d, selective_scan
+from .kernels.selective_scan import causal_conv1d, selective_scan, selective_scan_state
 
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
 
@@ -31,10 +31,6 @@ def make_norm(config: GambaConfig) -> nn.Module:
     for parameter in norm.parameters():
         parameter._no_weight_decay = True
     return norm
-
-
-def _selective_scan_state(u, delta, A, B, **options):
-    return selective_scan(u, delta, A, B, B, return_last_state=True, **options)[1]
 
 
 class State(NamedTuple):
@@ -194,7 +190,7 @@ def prefix_states(
     rows = _stacked(blocks, "mamba.x_proj.weight", rank + states)
     low_rank, B = _product(x.unflatten(2, (-1, inner)), rows).split([rank, states], dim=-1)
     delta = _product(low_rank, _stacked(blocks, "mamba.dt_proj.weight")).flatten(2)
-    scan_state = _selective_scan_state(
+    scan_state = selective_scan_state(
         x,
         delta,
         -torch.exp(_joined(blocks, "mamba.A_log").float()),
