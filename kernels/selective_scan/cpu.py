@@ -9,7 +9,7 @@ from ..interop import empty, lane_contiguous, parallel_launch, view
 from . import cpu_kernels
 from .cpu_kernels import SPAN, Sizes
 from .lanes import W, lanes
-from .layout import BLOCKS, CHUNK, Layout
+from .layout import CHUNK, Layout
 from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ, SCALES
 
 
@@ -126,7 +126,7 @@ def backward(
     Returns:
         Nine tensors, None where not needed.
     """
-    layout = Layout(u, A, B, BLOCKS)
+    layout = Layout(u, A, B, SPAN)
     s = _Operands(layout, u, delta, A, z, delta_bias, discretization)
     need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
     through = need_u or need_delta or need_A or need_B or need_bias or need_h
@@ -141,7 +141,7 @@ def backward(
     def partial(needed: bool) -> tuple[Tensor, Tensor]:
         rows = layout.states if needed else 0
         sums = torch.empty(layout.tasks, rows * CHUNK, W)
-        return sums, empty((layout.tasks // layout.segments, rows, layout.length), torch.float32)
+        return sums, empty((layout.parts, rows * layout.length), torch.float32)
 
     dh = layout.states_of(dlast)[None]
     if layout.segments > 1 and through:

@@ -13,20 +13,20 @@ import warp as wp
 from . import recurrence, tokens
 from .lanes import WARP_DTYPES, W, flush_denormals, lanes, restore_denormals
 from .layout import BLOCKS, CHUNK
-from .recurrence import NEED_DB, NEED_DC, NEED_DH, SCALES, sum_lanes
-from .tokens import GRAD_TOKEN, KEPT, STRIP, TOKEN
+from .recurrence import NEED_DB, NEED_DC, SCALES, sum_lanes
+from .tokens import GRAD_TOKEN, KEPT, TOKEN
 
-SPAN = 32  # lane groups of a forward task at most: with STRIP, what a core's own cache holds
+SPAN = 32  # lane groups of a task at most: long pieces of rows, and what a core's own cache holds
+STRIP = 64  # tokens that the forward pass takes at once; the backward pass takes a chunk
 
 _K = wp.constant(CHUNK)
 _S = wp.constant(STRIP)
 _P = wp.constant(BLOCKS)
 _W = wp.constant(W)
-_DC, _DB, _DH = (wp.constant(v) for v in (NEED_DC, NEED_DB, NEED_DH))
+_DC, _DB = wp.constant(NEED_DC), wp.constant(NEED_DB)
 # room for alignment to cache lines: one more
-_SPAN = wp.constant(SPAN)
-_TOKENS = wp.constant(TOKEN * STRIP * SPAN + 1)
-_GRAD_TOKENS = wp.constant(GRAD_TOKEN * CHUNK * BLOCKS + 1)
+_TOKENS = wp.constant(TOKEN * STRIP + 1)
+_GRAD_TOKENS = wp.constant(GRAD_TOKEN * CHUNK + 1)
 _KEPT = wp.constant(KEPT * CHUNK + 1)
 
 
@@ -61,6 +61,7 @@ class Place:
     blocks: int
     d: int  # channels
     width: int
+    part: int  # row of the partial sums of dB and dC
 
 
 @wp.func
@@ -74,6 +75,8 @@ def _place(sizes: Sizes, task: int) -> Place:
     p.b = rest % sizes.batch
     p.state = rest
     p.row = (p.b * sizes.groups + group) * sizes.states
+    parts = (sizes.group_blocks + _P - 1) / _P
+    p.part = (p.b * sizes.groups + group) * parts + first / _P
     p.begin = rest / sizes.batch * sizes.segment
     p.end = wp.min(p.begin + sizes.segment, sizes.length)
     p.blocks = wp.min(sizes.span, sizes.group_blocks - first)
@@ -101,8 +104,8 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
         z_in: wp.array3d(dtype=scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        b_in: wp.array2d(dtype=wp.float32),
-        c_in: wp.array2d(dtype=wp.float32),
+        b_in: wp.array(dtype=wp.float32),
+        c_in: wp.array(dtype=wp.float32),
         skip_in: wp.array(dtype=lanes),
         bias_in: wp.array(dtype=lanes),
         # out
@@ -111,28 +114,29 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
         y_out: wp.array3d(dtype=scalar),
     ):
         p = _place(sizes, offset + wp.tid())
-        scratch = wp.zeros(shape=(_TOKENS,), dtype=lanes)
-        tame = wp.zeros(shape=(_SPAN,), dtype=int)
+        token = wp.zeros(shape=(_TOKENS,), dtype=lanes)
         before = flush_denormals()
         for strip in range((p.end - p.begin + _S - 1) / _S):
             t0 = p.begin + strip * _S
             count = wp.min(_S, p.end - t0)
-            save = starts_out.shape[1] > 0 and t0 % _K == 0
-            prepare(
-                u_in, delta_in, p.b, t0, count, p.d, p.width, p.k, p.blocks, widest_in, bias_in,
-                skip_in, sizes.use_softplus, wp.static(scale), scratch, tame,
-            )  # fmt: skip
             for j in range(p.blocks):
                 k = p.k + j
-                for n in range(sizes.states):
-                    h = h_out[p.state, k, n]
-                    if save:
-                        starts_out[p.b, t0 / _K, k, n] = h
-                    h_out[p.state, k, n] = advance(
-                        h, a_in[k, n], tame[j], b_in[p.row + n], c_in[p.row + n],
-                        t0, count, j * _S, scratch,
-                    )  # fmt: skip
-            finish(z_in, p.b, t0, count, p.d, p.width, p.blocks, sizes.use_z, scratch, y_out)
+                d = p.d + j * _W
+                width = p.width - j * _W
+                h = h_out[p.state, k]
+                if starts_out.shape[1] > 0 and t0 % _K == 0:
+                    for n in range(sizes.states):
+                        starts_out[p.b, t0 / _K, k, n] = h[n]
+                tame = prepare(
+                    u_in, delta_in, z_in, p.b, t0, count, d, width, j, p.blocks, _S, p.end,
+                    widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus, sizes.use_z,
+                    wp.static(scale), token,
+                )  # fmt: skip
+                advance(
+                    sizes.states, tame, p.row, sizes.length, t0, count, a_in[k], b_in, c_in,
+                    token, h,
+                )  # fmt: skip
+                finish(z_in, p.b, t0, count, d, width, sizes.use_z, token, y_out)
         restore_denormals(before)
 
     return scan_forward
@@ -155,7 +159,7 @@ def states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
         delta_in: wp.array3d(dtype=delta_scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        b_in: wp.array2d(dtype=wp.float32),
+        b_in: wp.array(dtype=wp.float32),
         bias_in: wp.array(dtype=lanes),
         # out
         h_out: wp.array3d(dtype=lanes),
@@ -163,29 +167,26 @@ def states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
         starts_out: wp.array4d(dtype=lanes),
     ):
         p = _place(sizes, offset + wp.tid())
-        scratch = wp.zeros(shape=(_TOKENS,), dtype=lanes)
-        tame = wp.zeros(shape=(_SPAN,), dtype=int)
-        product = wp.zeros(shape=(1,), dtype=lanes)
+        token = wp.zeros(shape=(_TOKENS,), dtype=lanes)
         before = flush_denormals()
         for strip in range((p.end - p.begin + _S - 1) / _S):
             t0 = p.begin + strip * _S
             count = wp.min(_S, p.end - t0)
-            save = starts_out.shape[1] > 0 and t0 % _K == 0
-            prepare(
-                u_in, delta_in, p.b, t0, count, p.d, p.width, p.k, p.blocks, widest_in, bias_in,
-                bias_in, sizes.use_softplus, wp.static(scale), scratch, tame,
-            )  # fmt: skip
             for j in range(p.blocks):
                 k = p.k + j
-                for n in range(sizes.states):
-                    h = h_out[p.state, k, n]
-                    if save:
-                        starts_out[p.b, t0 / _K, k, n] = h
-                    product[0] = product_out[p.state, k, n]
-                    h_out[p.state, k, n] = accumulate(
-                        h, a_in[k, n], tame[j], b_in[p.row + n], t0, count, j * _S, scratch, product
-                    )
-                    product_out[p.state, k, n] = product[0]
+                h = h_out[p.state, k]
+                if starts_out.shape[1] > 0 and t0 % _K == 0:
+                    for n in range(sizes.states):
+                        starts_out[p.b, t0 / _K, k, n] = h[n]
+                tame = prepare(
+                    u_in, delta_in, u_in, p.b, t0, count, p.d + j * _W, p.width - j * _W, j,
+                    p.blocks, _S, p.end, widest_in[k], bias_in[k], bias_in[k],
+                    sizes.use_softplus, 0, wp.static(scale), token,
+                )  # fmt: skip
+                accumulate(
+                    sizes.states, tame, p.row, sizes.length, t0, count, a_in[k], b_in, token,
+                    h, product_out[p.state, k],
+                )  # fmt: skip
         restore_denormals(before)
 
     return scan_states
@@ -209,7 +210,7 @@ def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretizatio
         z_in: wp.array3d(dtype=scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        c_in: wp.array2d(dtype=wp.float32),
+        c_in: wp.array(dtype=wp.float32),
         bias_in: wp.array(dtype=lanes),
         dout_in: wp.array3d(dtype=scalar),
         # out
@@ -217,27 +218,22 @@ def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretizatio
         product_out: wp.array3d(dtype=lanes),
     ):
         p = _place(sizes, offset + wp.tid())
-        scratch = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
-        tame = wp.zeros(shape=(_P,), dtype=int)
-        product = wp.zeros(shape=(1,), dtype=lanes)
+        token = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
         before = flush_denormals()
         for chunk in range((p.end - p.begin + _K - 1) / _K):
             t0 = p.begin + chunk * _K
             count = wp.min(_K, p.end - t0)
-            prepare(
-                u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d, p.width, p.k, p.blocks,
-                widest_in, bias_in, bias_in, sizes.use_softplus, sizes.use_z, wp.static(scale),
-                scratch, tame,
-            )  # fmt: skip
             for j in range(p.blocks):
                 k = p.k + j
-                for n in range(sizes.states):
-                    product[0] = product_out[p.state, k, n]
-                    dh_out[p.state, k, n] = gather(
-                        dh_out[p.state, k, n], a_in[k, n], tame[j], c_in[p.row + n], t0, count,
-                        j * _K, scratch, product,
-                    )  # fmt: skip
-                    product_out[p.state, k, n] = product[0]
+                tame = prepare(
+                    u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d + j * _W,
+                    p.width - j * _W, j, p.blocks, _K, p.end, widest_in[k], bias_in[k],
+                    bias_in[k], sizes.use_softplus, sizes.use_z, wp.static(scale), token,
+                )  # fmt: skip
+                gather(
+                    sizes.states, tame, p.row, sizes.length, t0, count, a_in[k], c_in, token,
+                    dh_out[p.state, k], product_out[p.state, k],
+                )  # fmt: skip
         restore_denormals(before)
 
     return scan_gradient_states
@@ -249,8 +245,7 @@ def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
     token, state = tokens.backward_leaves(io, delta_io), recurrence.backward_leaves(discretization)
     prepare, finish = token.prepare, token.finish
-    recompute, retreat = state.recompute, state.retreat
-    scale = SCALES[discretization]
+    retreat, scale = state.retreat, SCALES[discretization]
 
     @wp.kernel(enable_backward=False, module="unique")
     def scan_backward(
@@ -262,8 +257,8 @@ def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
         z_in: wp.array3d(dtype=scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        b_in: wp.array2d(dtype=wp.float32),
-        c_in: wp.array2d(dtype=wp.float32),
+        b_in: wp.array(dtype=wp.float32),
+        c_in: wp.array(dtype=wp.float32),
         skip_in: wp.array(dtype=lanes),
         bias_in: wp.array(dtype=lanes),
         starts_in: wp.array4d(dtype=lanes),
@@ -277,57 +272,52 @@ def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
         ddelta_out: wp.array3d(dtype=delta_scalar),
         dz_out: wp.array3d(dtype=scalar),
         da_out: wp.array3d(dtype=lanes),
-        db_out: wp.array3d(dtype=wp.float32),
-        dc_out: wp.array3d(dtype=wp.float32),
+        db_out: wp.array2d(dtype=wp.float32),
+        dc_out: wp.array2d(dtype=wp.float32),
         dskip_out: wp.array2d(dtype=lanes),
         dbias_out: wp.array2d(dtype=lanes),
     ):
         task = offset + wp.tid()
         p = _place(sizes, task)
-        part = task % db_out.shape[0]
-        scratch = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
+        token = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
         kept = wp.zeros(shape=(_KEPT,), dtype=lanes)
-        tame = wp.zeros(shape=(_P,), dtype=int)
-        da = wp.zeros(shape=(1,), dtype=lanes)
         before = flush_denormals()
         chunks = (p.end - p.begin + _K - 1) / _K
         for reverse in range(chunks):
             t0 = p.begin + (chunks - 1 - reverse) * _K
             count = wp.min(_K, p.end - t0)
-            for i in range(db_lanes_out.shape[1]):
-                db_lanes_out[task, i] = lanes()
-            for i in range(dc_lanes_out.shape[1]):
-                dc_lanes_out[task, i] = lanes()
-            prepare(
-                u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d, p.width, p.k, p.blocks,
-                widest_in, bias_in, skip_in, sizes.use_softplus, sizes.use_z, wp.static(scale),
-                scratch, tame,
-            )  # fmt: skip
             for j in range(p.blocks):
                 k = p.k + j
-                for n in range(sizes.states):
-                    recompute(
-                        starts_in[p.b, t0 / _K, k, n], a_in[k, n], tame[j], b_in[p.row + n],
-                        c_in[p.row + n], t0, count, j * _K, scratch, sizes.needs, n * _K, kept,
-                        dc_lanes_out[task],
-                    )  # fmt: skip
-                    if (sizes.needs & _DH) != 0:
-                        dh_out[p.state, k, n] = retreat(
-                            dh_out[p.state, k, n], a_in[k, n], b_in[p.row + n], c_in[p.row + n],
-                            t0, count, j * _K, scratch, sizes.needs, n * _K, kept,
-                            db_lanes_out[task], da,
+                d = p.d + j * _W
+                width = p.width - j * _W
+                tame = prepare(
+                    u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, j, p.blocks, -_K,
+                    p.end, widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus,
+                    sizes.use_z, wp.static(scale), token,
+                )  # fmt: skip
+                retreat(
+                    sizes.states, tame, p.row, sizes.length, t0, count, int(j % _P == 0),
+                    sizes.needs, a_in[k], b_in, c_in, starts_in[p.b, t0 / _K, k], token, kept,
+                    db_lanes_out[task], dc_lanes_out[task], dh_out[p.state, k],
+                    da_out[p.state, k],
+                )  # fmt: skip
+                finish(
+                    u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, k, bias_in[k],
+                    skip_in[k], sizes.use_softplus, wp.static(scale), token, du_out,
+                    ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
+                )  # fmt: skip
+                if j % _P == _P - 1 or j == p.blocks - 1:
+                    part = p.part + j / _P
+                    if (sizes.needs & _DB) != 0:
+                        sum_lanes(
+                            sizes.states, sizes.length, t0, count, db_lanes_out[task],
+                            db_out[part],
                         )  # fmt: skip
-                        da_out[p.state, k, n] = da_out[p.state, k, n] + da[0]
-            finish(
-                u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d, p.width, p.k, p.blocks,
-                bias_in, skip_in, sizes.use_softplus, wp.static(scale), scratch,
-                du_out, ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
-            )  # fmt: skip
-            for n in range(sizes.states):
-                if (sizes.needs & _DB) != 0:
-                    sum_lanes(db_lanes_out[task], n * _K, count, t0, db_out[part, n])
-                if (sizes.needs & _DC) != 0:
-                    sum_lanes(dc_lanes_out[task], n * _K, count, t0, dc_out[part, n])
+                    if (sizes.needs & _DC) != 0:
+                        sum_lanes(
+                            sizes.states, sizes.length, t0, count, dc_lanes_out[task],
+                            dc_out[part],
+                        )  # fmt: skip
         restore_denormals(before)
 
     return scan_backward

@@ -46,6 +46,7 @@ class Layout:
         self.segment = max(1, -(-self.chunks // self.segments)) * CHUNK
         self.segments = max(1, -(-self.length // self.segment))
         self.tasks = self.segments * spans
+        self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
 
     def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
         """``[.., D, *]`` to float32 ``[.., blocks, *, W]``, a copy; None becomes zeros."""
@@ -75,12 +76,11 @@ class Layout:
         return self.pack(x, (self.batch,))
 
     def rows(self, x: Tensor) -> Tensor:
-        """``[B, L, G, N]`` to float32 ``[B·G·N, L]``: the tokens of one state are adjacent."""
-        rows = self.batch * self.groups * self.states
-        return x.permute(0, 2, 3, 1).float().reshape(rows, self.length).contiguous()
+        """``[B, L, G, N]`` to float32 ``[B·G·N·L]``: the tokens of one state are adjacent."""
+        return x.permute(0, 2, 3, 1).float().reshape(-1).contiguous()
 
     def total(self, parts: Tensor, dtype: torch.dtype) -> Tensor:
-        """Sums ``[B·G·parts, N, L]`` over the parts of a group: ``[B, L, G, N]``."""
-        spans = -(-self.group_blocks // self.span)
-        x = parts.view(self.batch, self.groups, spans, self.states, self.length).sum(2)
+        """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
+        of_group = -(-self.group_blocks // BLOCKS)
+        x = parts.view(self.batch, self.groups, of_group, self.states, self.length).sum(2)
         return x.permute(0, 3, 1, 2).to(dtype, memory_format=torch.contiguous_format)

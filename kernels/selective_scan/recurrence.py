@@ -1,7 +1,7 @@
-"""Native inner loops of the CPU scan: one state n, a strip of tokens, sixteen channels.
+"""Native inner loops of the CPU scan: state after state, a strip of tokens, sixteen channels.
 
-Equations are those of README.md. Values per token come from ``tokens.py``; rows of B and C are
-passed whole, the strip's first token is ``t0``.
+Equations are those of README.md. Values per token come from ``tokens.py``. B and C are
+``[rows, length]``: state n is row ``row + n``, the strip begins at token ``t0``.
 """
 
 import functools
@@ -9,7 +9,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .lanes import LANES, PRELUDE, lanes
+from .lanes import PRELUDE, lanes
+from .layout import CHUNK
 from .tokens import TOKENS
 
 # gradients that cost work inside the loops, as bits of ``needs``
@@ -42,122 +43,139 @@ _SLOPES = {
     "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x); const F df = g * g, dg = 0.5f * df;",
     "zoh": _PHI + "const F df = f, dg = small ? slope : (f - g) / safe;",
 }
-_OPERANDS = (
+_OPEN = (
     PRELUDE
     + TOKENS
     + """
-F h = *(const F*)&h_in;
-const F a = *(const F*)&a_in;
-const float* b = &b_in.data[t0];
+const F* const rates = (const F*)a_in.data;
+auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
+auto from_ = [&](auto& array, int n) { return array.data + (row + n) * (size_t)length + t0; };
+for (int n = 0; n < states; ++n) {
+    const F a = rates[n];
 """
 )
-_RETURN = f"{LANES} r; *(F*)&r = h; return r;"
+_WALK = """
+    if (tame) walk(exp2_tame_);
+    else walk(exp2_);
+}
+"""
 
 # Equations 1 and 5.
-_ADVANCE = """
-const float* c = &c_in.data[t0];
-Token* const token = aligned_((Token*)scratch.data) + first;
-auto walk = [&](auto exp2) {
-    for (int t = 0; t < count; ++t) {
-        const F x = token[t].rate * a;
-        FACTORS
-        h = fma_(f, h, g * (token[t].du * b[t]));
-        token[t].y = fma_(h, splat(c[t]), token[t].y);
-    }
-};
-if (tame) walk(exp2_tame_);
-else walk(exp2_);
+_ADVANCE = (
+    _OPEN
+    + """
+    Token* const token = aligned_((Token*)scratch.data);
+    const float *const b = from_(b_in, n), *const c = from_(c_in, n);
+    auto walk = [&](auto exp2) {
+        F h = state_(h_out, n);
+        for (int t = 0; t < count; ++t) {
+            const F x = token[t].rate * a;
+            FACTORS
+            h = fma_(f, h, g * (token[t].du * b[t]));
+            token[t].y = fma_(h, splat(c[t]), token[t].y);
+        }
+        state_(h_out, n) = h;
+    };
 """
+    + _WALK
+)
 
 # Equation 1 alone, and the product of the decays.
-_ACCUMULATE = """
-F& product = *(F*)product_out.data;
-const Token* const token = aligned_((const Token*)scratch.data) + first;
-auto walk = [&](auto exp2) {
-    F decay = product;
-    for (int t = 0; t < count; ++t) {
-        const F x = token[t].rate * a;
-        FACTORS
-        h = fma_(f, h, g * (token[t].du * b[t]));
-        decay *= f;
-    }
-    product = decay;
-};
-if (tame) walk(exp2_tame_);
-else walk(exp2_);
+_ACCUMULATE = (
+    _OPEN
+    + """
+    const Token* const token = aligned_((const Token*)scratch.data);
+    const float* const b = from_(b_in, n);
+    auto walk = [&](auto exp2) {
+        F h = state_(h_out, n), product = state_(product_out, n);
+        for (int t = 0; t < count; ++t) {
+            const F x = token[t].rate * a;
+            FACTORS
+            h = fma_(f, h, g * (token[t].du * b[t]));
+            product *= f;
+        }
+        state_(h_out, n) = h;
+        state_(product_out, n) = product;
+    };
 """
+    + _WALK
+)
 
 # What the outputs send back to the state before the first token, and the product of the decays.
-_GATHER = """
-F& product = *(F*)product_out.data;
-const float* c = &b_in.data[t0];
-const GradToken* const token = aligned_((const GradToken*)scratch.data) + first;
-auto walk = [&](auto exp2) {
-    F decay = product;
-    for (int t = 0; t < count; ++t) {
-        const F x = token[t].rate * a;
-        FACTORS
-        decay *= f;
-        h = fma_(decay, token[t].dy * c[t], h);
-    }
-    product = decay;
-};
-if (tame) walk(exp2_tame_);
-else walk(exp2_);
+_GATHER = (
+    _OPEN
+    + """
+    const GradToken* const token = aligned_((const GradToken*)scratch.data);
+    const float* const c = from_(c_in, n);
+    auto walk = [&](auto exp2) {
+        F dh = state_(dh_out, n), product = state_(product_out, n);
+        for (int t = 0; t < count; ++t) {
+            const F x = token[t].rate * a;
+            FACTORS
+            product *= f;
+            dh = fma_(product, token[t].dy * c[t], dh);
+        }
+        state_(dh_out, n) = dh;
+        state_(product_out, n) = product;
+    };
 """
+    + _WALK
+)
 
-# As _ADVANCE, keeping f and h of every token, and adding dy·h to the sums of dC (equation 8).
-_RECOMPUTE = f"""
-const float* c = &c_in.data[t0];
-GradToken* const token = aligned_((GradToken*)scratch.data) + first;
-Kept* const kept = aligned_((Kept*)kept_out.data);
-F* const dc = (F*)dc_out.data + row;
-auto walk = [&](auto exp2) {{
-    for (int t = 0; t < count; ++t) {{
-        const F x = token[t].rate * a;
-        FACTORS
-        kept[t].f = f;
-        kept[t].h = h;
-        h = fma_(f, h, g * (token[t].du * b[t]));
-        if (needs & {NEED_DZ}) token[t].y = fma_(h, splat(c[t]), token[t].y);
-        if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h, dc[t]);
+# As _ADVANCE, keeping f and h of every token, and adding dy·h to the sums of dC (equation 8); then
+# backwards, equations 6, 7 and 9 to 12. Σ rate q is left in da.
+_RETREAT = f"""
+    GradToken* const token = aligned_((GradToken*)scratch.data);
+    Kept* const kept = aligned_((Kept*)kept_out.data);
+    const float *const b = from_(b_in, n), *const c = from_(c_in, n);
+    F* const db = (F*)db_out.data + n * CHUNK;
+    F* const dc = (F*)dc_out.data + n * CHUNK;
+    if (first) for (int t = 0; t < count; ++t) {{
+        if (needs & {NEED_DB}) db[t] = F{{}};
+        if (needs & {NEED_DC}) dc[t] = F{{}};
     }}
-}};
-if (tame) walk(exp2_tame_);
-else walk(exp2_);
-"""
-
-# Equations 6, 7 and 9 to 12, backwards; h is the gradient of h_t, da is Σ rate q.
-_RETREAT = """
-const float* c = &c_in.data[t0];
-GradToken* const token = aligned_((GradToken*)scratch.data) + first;
-const Kept* const kept = aligned_((const Kept*)kept_in.data);
-F* const db = (F*)db_out.data + row;
-F da = F{};
-for (int t = count - 1; t >= 0; --t) {
-    GradToken& k = token[t];
-    h = fma_(k.dy, splat(c[t]), h);
-    const F f = kept[t].f;
-    GRADIENT
-    k.p = fma_(q, a, k.p);
-    da = fma_(q, k.rate, da);
-}
-*(F*)da_out.data = da;
+    auto walk = [&](auto exp2) {{
+        F h = state_(starts_in, n);
+        for (int t = 0; t < count; ++t) {{
+            const F x = token[t].rate * a;
+            FACTORS
+            kept[t].f = f;
+            kept[t].h = h;
+            h = fma_(f, h, g * (token[t].du * b[t]));
+            if (needs & {NEED_DZ}) token[t].y = fma_(h, splat(c[t]), token[t].y);
+            if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h, dc[t]);
+        }}
+    }};
+    if (tame) walk(exp2_tame_);
+    else walk(exp2_);
+    if (!(needs & {NEED_DH})) continue;
+    F dh = state_(dh_out, n), da = F{{}};
+    for (int t = count - 1; t >= 0; --t) {{
+        GradToken& own = token[t];
+        const F f = kept[t].f;
+        dh = fma_(own.dy, splat(c[t]), dh);
+        GRADIENT
+        own.p = fma_(q, a, own.p);
+        da = fma_(q, own.rate, da);
+    }}
+    state_(dh_out, n) = dh;
+    state_(da_out, n) += da;
+}}
 """
 _OWN = f"""
-    if (needs & {NEED_DB}) db[t] = fma_(h, k.du, db[t]);
-    k.s = fma_(h, splat(b[t]), k.s);
-    h = f * h;
-    const F q = h * kept[t].h;
+        if (needs & {NEED_DB}) db[t] = fma_(dh, own.du, db[t]);
+        own.s = fma_(dh, splat(b[t]), own.s);
+        dh = f * dh;
+        const F q = dh * kept[t].h;
 """
 _GENERAL = f"""
-    const F x = k.rate * a;
-    SLOPES
-    const F gh = g * h;
-    if (needs & {NEED_DB}) db[t] = fma_(gh, k.du, db[t]);
-    k.s = fma_(gh, splat(b[t]), k.s);
-    const F q = h * (kept[t].h * df + k.du * b[t] * dg);
-    h = f * h;
+        const F x = own.rate * a;
+        SLOPES
+        const F gh = g * dh;
+        if (needs & {NEED_DB}) db[t] = fma_(gh, own.du, db[t]);
+        own.s = fma_(gh, splat(b[t]), own.s);
+        const F q = dh * (kept[t].h * df + own.du * b[t] * dg);
+        dh = f * dh;
 """
 _GRADIENTS = {
     "mamba": _OWN,
@@ -168,106 +186,124 @@ _GRADIENTS = {
 
 @functools.cache
 def forward_leaves(discretization: str) -> SimpleNamespace:
-    """``advance`` and ``accumulate``; both return the state after the strip."""
+    """``advance`` and ``accumulate``: the states of a lane group from before the strip to after."""
     factors = _FACTORS[discretization]
 
-    @wp.func_native(_OPERANDS + _ADVANCE.replace("FACTORS", factors) + _RETURN)
+    @wp.func_native(_ADVANCE.replace("FACTORS", factors))
     def advance(
-        h_in: lanes,
-        a_in: lanes,
+        states: int,
         tame: int,
+        row: int,
+        length: int,
+        t0: int,
+        count: int,
+        a_in: wp.array(dtype=lanes),
         b_in: wp.array(dtype=wp.float32),
         c_in: wp.array(dtype=wp.float32),
-        t0: int,
-        count: int,
-        first: int,
         scratch: wp.array(dtype=lanes),
-    ) -> lanes: ...
+        h_out: wp.array(dtype=lanes),
+    ): ...
 
-    @wp.func_native(_OPERANDS + _ACCUMULATE.replace("FACTORS", factors) + _RETURN)
+    @wp.func_native(_ACCUMULATE.replace("FACTORS", factors))
     def accumulate(
-        h_in: lanes,
-        a_in: lanes,
+        states: int,
         tame: int,
-        b_in: wp.array(dtype=wp.float32),
+        row: int,
+        length: int,
         t0: int,
         count: int,
-        first: int,
+        a_in: wp.array(dtype=lanes),
+        b_in: wp.array(dtype=wp.float32),
         scratch: wp.array(dtype=lanes),
+        h_out: wp.array(dtype=lanes),
         product_out: wp.array(dtype=lanes),
-    ) -> lanes: ...
+    ): ...
 
     return SimpleNamespace(advance=advance, accumulate=accumulate)
 
 
 @functools.cache
 def backward_leaves(discretization: str) -> SimpleNamespace:
-    """``recompute``, ``retreat`` and ``gather``; two return the gradient of the first state."""
-    factors = _FACTORS[discretization]
-    gradient = _GRADIENTS[discretization]
+    """``retreat`` and ``gather``: gradients of states from after the strip to before.
 
-    @wp.func_native(_OPERANDS + _RECOMPUTE.replace("FACTORS", factors))
-    def recompute(
-        h_in: lanes,
-        a_in: lanes,
+    ``first`` says that the sums of dB and dC are empty yet.
+    """
+    factors = _FACTORS[discretization]
+    retreat_text = _RETREAT.replace("GRADIENT", _GRADIENTS[discretization])
+
+    @wp.func_native(_OPEN + retreat_text.replace("FACTORS", factors).replace("CHUNK", str(CHUNK)))
+    def retreat(
+        states: int,
         tame: int,
-        b_in: wp.array(dtype=wp.float32),
-        c_in: wp.array(dtype=wp.float32),
+        row: int,
+        length: int,
         t0: int,
         count: int,
         first: int,
-        scratch: wp.array(dtype=lanes),
         needs: int,
-        row: int,
+        a_in: wp.array(dtype=lanes),
+        b_in: wp.array(dtype=wp.float32),
+        c_in: wp.array(dtype=wp.float32),
+        starts_in: wp.array(dtype=lanes),
+        scratch: wp.array(dtype=lanes),
         kept_out: wp.array(dtype=lanes),
+        db_out: wp.array(dtype=lanes),
         dc_out: wp.array(dtype=lanes),
+        dh_out: wp.array(dtype=lanes),
+        da_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_OPERANDS + _RETREAT.replace("GRADIENT", gradient) + _RETURN)
-    def retreat(
-        h_in: lanes,
-        a_in: lanes,
-        b_in: wp.array(dtype=wp.float32),
-        c_in: wp.array(dtype=wp.float32),
-        t0: int,
-        count: int,
-        first: int,
-        scratch: wp.array(dtype=lanes),
-        needs: int,
-        row: int,
-        kept_in: wp.array(dtype=lanes),
-        db_out: wp.array(dtype=lanes),
-        da_out: wp.array(dtype=lanes),
-    ) -> lanes: ...
-
-    @wp.func_native(_OPERANDS + _GATHER.replace("FACTORS", factors) + _RETURN)
+    @wp.func_native(_GATHER.replace("FACTORS", factors))
     def gather(
-        h_in: lanes,
-        a_in: lanes,
+        states: int,
         tame: int,
-        b_in: wp.array(dtype=wp.float32),
+        row: int,
+        length: int,
         t0: int,
         count: int,
-        first: int,
+        a_in: wp.array(dtype=lanes),
+        c_in: wp.array(dtype=wp.float32),
         scratch: wp.array(dtype=lanes),
+        dh_out: wp.array(dtype=lanes),
         product_out: wp.array(dtype=lanes),
-    ) -> lanes: ...
+    ): ...
 
-    return SimpleNamespace(recompute=recompute, retreat=retreat, gather=gather)
+    return SimpleNamespace(retreat=retreat, gather=gather)
 
 
+# Rows of ``sums`` [states, CHUNK] to their sums over lanes, eight rows at a time.
 @wp.func_native(
-    PRELUDE
-    + """
-const F* p = (const F*)sums.data + first;
-for (int t = 0; t < count; ++t) {
-    F v = p[t];
-    v += __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7);
-    v += __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3, 8, 9, 10, 11, 12, 13, 14, 15);
-    out.data[t0 + t] = (v[0] + v[1]) + (v[2] + v[3]);
-}
-"""
+    """
+typedef float E __attribute__((vector_size(32), aligned(4)));
+const E* const rows = (const E*)sums.data;
+auto pair = [](E a, E b) -> E {
+    return __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13)
+        + __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
+};
+auto quad = [](E a, E b) -> E {
+    return __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13)
+        + __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
+};
+for (int n = 0; n < states; ++n)
+    for (int t = 0; t < count; t += 8) {
+        const E* const r = rows + 2 * (n * CHUNK + t);
+        E v[8];
+        for (int i = 0; i < 8; ++i) v[i] = r[2 * i] + r[2 * i + 1];
+        const E low = quad(pair(v[0], v[1]), pair(v[2], v[3]));
+        const E high = quad(pair(v[4], v[5]), pair(v[6], v[7]));
+        const E all = __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11)
+            + __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15);
+        float* const out = total.data + n * (size_t)length + t0 + t;
+        if (t + 8 <= count) *(E*)out = all;
+        else for (int i = 0; i < count - t; ++i) out[i] = all[i];
+    }
+""".replace("CHUNK", str(CHUNK))
 )
 def sum_lanes(
-    sums: wp.array(dtype=lanes), first: int, count: int, t0: int, out: wp.array(dtype=wp.float32)
+    states: int,
+    length: int,
+    t0: int,
+    count: int,
+    sums: wp.array(dtype=lanes),
+    total: wp.array(dtype=wp.float32),
 ): ...

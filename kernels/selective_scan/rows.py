@@ -49,29 +49,29 @@ _CODE = {
 }
 _ROWS = """
 TYPE* const NAME_rows = (TYPE*)((char*)NAME_in.data + (size_t)b * NAME_in.strides[0]
-    + (size_t)t0 * NAME_in.strides[1]) + d0;
+    + (size_t)t0 * NAME_in.strides[1]) + d;
 const size_t NAME_step = NAME_in.strides[1] / sizeof(TYPE);
-auto read_NAME = [&](int t, int d, int width) -> F {
-    const TYPE* p = NAME_rows + t * NAME_step + d;
+auto read_NAME = [&](int t) -> F {
+    const TYPE* p = NAME_rows + t * NAME_step;
     if (width >= 16) return READ;
     F v = F{};
     for (int i = 0; i < width; ++i) v[i] = READ_ONE;
     return v;
 };
-auto write_NAME = [&](int t, int d, int width, F v) {
-    TYPE* p = NAME_rows + t * NAME_step + d;
+auto write_NAME = [&](int t, F v) {
+    TYPE* p = NAME_rows + t * NAME_step;
     if (width >= 16) WRITE;
     else for (int i = 0; i < width; ++i) WRITE_ONE;
 };
-auto fetch_NAME = [&](int t, int d) { __builtin_prefetch(NAME_rows + t * NAME_step + d); };
+auto fetch_NAME = [&](int t, int at) { __builtin_prefetch(NAME_rows + t * NAME_step + at); };
 """
 
 
 def rows(name: str, dtype: torch.dtype) -> str:
-    """C++ text: ``read_NAME(t, d, width)``, ``write_NAME(t, d, width, v)``, ``fetch_NAME(t, d)``.
+    """C++ text: ``read_NAME(t)``, ``write_NAME(t, v)`` and ``fetch_NAME(t, at)``.
 
     They address the array NAME_in [B, L, D] from batch element ``b``, token ``t0`` and channel
-    ``d0`` on, which must be in scope.
+    ``d`` on, ``width`` channels; all four must be in scope.
     """
     parts = zip(("TYPE", "READ_ONE", "READ", "WRITE_ONE", "WRITE"), _ordered(dtype))
     text = _ROWS.replace("NAME", name)
@@ -87,12 +87,12 @@ def _ordered(dtype: torch.dtype) -> tuple[str, ...]:
 
 def _accessors(dtype: torch.dtype):
     scalar = WARP_DTYPES[dtype]
-    prelude = PRELUDE + ELEMENTS + "const int t0 = t, d0 = d;" + rows("x", dtype)
+    prelude = PRELUDE + ELEMENTS + "const int t0 = t;" + rows("x", dtype)
 
-    @wp.func_native(prelude + f"{LANES} r; *(F*)&r = read_x(0, 0, width); return r;")
+    @wp.func_native(prelude + f"{LANES} r; *(F*)&r = read_x(0); return r;")
     def load(x_in: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int) -> lanes: ...
 
-    @wp.func_native(prelude + "write_x(0, 0, width, *(const F*)&v);")
+    @wp.func_native(prelude + "write_x(0, *(const F*)&v);")
     def store(x_in: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int, v: lanes): ...
 
     return load, store

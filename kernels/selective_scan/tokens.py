@@ -1,7 +1,6 @@
 """Native leaves of the CPU scan for what does not depend on the state n: step, input, gate.
 
-A call does a strip of tokens of adjacent lane groups, a row at a time, as the cache lines of a row
-lie together. Equations are those of README.md.
+A call does a strip of tokens of sixteen channels. Equations are those of README.md.
 """
 
 import functools
@@ -11,14 +10,10 @@ import torch
 import warp as wp
 
 from .lanes import ACTIVATIONS, PRELUDE, WARP_DTYPES, lanes
-from .layout import CHUNK
 from .rows import ELEMENTS, rows
 
-STRIP = 32  # tokens whose values the forward pass holds at once; the backward pass holds a chunk
-_AHEAD = 4  # tokens between the fetch of a row and its use
-
-# What is held of a token, for one lane group: rate is δ times a scale. The scratch array of a task
-# has a token's values together, and lane groups one after the other.
+# What is held of a token; rate is δ times a scale. The values of a token lie together: arrays of
+# 4 KiB would fall on one another in the cache.
 TOKENS = """
 struct Token { F rate, du, y; };
 struct GradToken { F rate, du, dy, y, s, p; };
@@ -29,133 +24,122 @@ TOKEN, GRAD_TOKEN, KEPT = 3, 6, 2  # lanes of each
 
 _PRELUDE = PRELUDE + ACTIVATIONS + ELEMENTS + TOKENS
 
-_STEP = """
-        const int d = 16 * j;
-        fetch_delta(t + AHEAD, d);
-        fetch_u(t + AHEAD, d);
-        F step = read_delta(t, d, width - d) + bias[j];
-        if (use_softplus) step = softplus_(step);
-        const F u = read_u(t, d, width - d);
-        const F rate = step * scale;
-        top[j] = wider_(top[j], rate);
-"""
+# A row's lines lie together, but a lane group wants one line of each row. So the rows of the next
+# strip are fetched in their order, each lane group doing its share.
 _OPEN = """
-F top[MOST];
-const F* const bias = (const F*)bias_in.data + k0;
-const F* const skip = (const F*)skip_in.data + k0;
-const F* const widest = (const F*)widest_in.data + k0;
-for (int j = 0; j < blocks; ++j) top[j] = F{};
-for (int t = 0; t < count; ++t)
-    for (int j = 0; j < blocks; ++j) {
+F top = F{};
+const F bias = *(const F*)&bias_in, skip = *(const F*)&skip_in;
+int row = share * count / lines, line = share * count % lines;
+for (int t = 0; t < count; ++t) {
+    const int ahead = t0 + next + row < limit ? next + row : 0, at = 16 * (line - share);
+    fetch_u(ahead, at);
+    fetch_delta(ahead, at);
+    if (use_z) fetch_z(ahead, at);
+    FETCH
+    if (++line == lines) line = 0, ++row;
+    F step = read_delta(t) + bias;
+    if (use_softplus) step = softplus_(step);
+    const F u = read_u(t);
+    const F rate = step * scale;
+    top = wider_(top, rate);
 """
-_CLOSE = """
-    }
-for (int j = 0; j < blocks; ++j) tame_out.data[j] = tame_(top[j] * widest[j]);
-"""
+_CLOSE = "} return tame_(top * *(const F*)&widest_in);"
 _PREPARE = (
-    "Token* const tokens = aligned_((Token*)scratch.data);"
-    + _OPEN.replace("MOST", "32")
-    + _STEP
-    + "tokens[j * STRIP + t] = {rate, step * u, skip[j] * u};"
+    "Token* const token = aligned_((Token*)scratch.data);"
+    + _OPEN.replace("FETCH", "")
+    + "token[t] = {rate, step * u, skip * u};"
     + _CLOSE
 )
 
 # out = y silu(z), or y
 _FINISH = """
-const Token* const tokens = aligned_((const Token*)scratch.data);
-for (int t = 0; t < count; ++t)
-    for (int j = 0; j < blocks; ++j) {
-        const int d = 16 * j;
-        F y = tokens[j * STRIP + t].y;
-        if (use_z) {
-            fetch_z(t + AHEAD, d);
-            const F z = read_z(t, d, width - d);
-            y *= z * sigmoid_(z);
-        }
-        write_out(t, d, width - d, y);
+const Token* const token = aligned_((const Token*)scratch.data);
+if (use_z)
+    for (int t = 0; t < count; ++t) {
+        const F z = read_z(t);
+        write_out(t, token[t].y * (z * sigmoid_(z)));
     }
+else
+    for (int t = 0; t < count; ++t) write_out(t, token[t].y);
 """
 
 # As _PREPARE, and dy = dout silu(z).
 _PREPARE_GRAD = (
-    "GradToken* const tokens = aligned_((GradToken*)scratch.data);"
-    + _OPEN.replace("MOST", "4")
-    + _STEP
+    "GradToken* const token = aligned_((GradToken*)scratch.data);"
+    + _OPEN.replace("FETCH", "fetch_dout(ahead, at);")
     + """
-        fetch_dout(t + AHEAD, d);
-        F dy = read_dout(t, d, width - d);
-        if (use_z) {
-            fetch_z(t + AHEAD, d);
-            const F z = read_z(t, d, width - d);
-            dy *= z * sigmoid_(z);
-        }
-        tokens[j * CHUNK + t] = {rate, step * u, dy, skip[j] * u, F{}, F{}};
+    F dy = read_dout(t);
+    if (use_z) {
+        const F z = read_z(t);
+        dy *= z * sigmoid_(z);
+    }
+    token[t] = {rate, step * u, dy, skip * u, F{}, F{}};
     """
     + _CLOSE
 )
 
 # Equations 9 and 11, dz, and the sums for dD and ddelta_bias.
 _FINISH_GRAD = """
-const GradToken* const tokens = aligned_((const GradToken*)scratch.data);
-const F* const bias = (const F*)bias_in.data + k0;
-const F* const skip = (const F*)skip_in.data + k0;
-F* const dskip = (F*)dskip_out.data + k0;
-F* const dbias = (F*)dbias_out.data + k0;
+const GradToken* const token = aligned_((const GradToken*)scratch.data);
+const F bias = *(const F*)&bias_in, skip = *(const F*)&skip_in;
+F dskip = F{}, dbias = F{};
 const bool need_u = du_in.shape[1] > 0, need_delta = ddelta_in.shape[1] > 0;
 const bool need_z = dz_in.shape[1] > 0;
-for (int t = 0; t < count; ++t)
-    for (int j = 0; j < blocks; ++j) {
-        const int d = 16 * j;
-        const GradToken& k = tokens[j * CHUNK + t];
-        const F u = read_u(t, d, width - d);
-        dskip[j] = fma_(k.dy, u, dskip[j]);
-        F ddelta = fma_(u, k.s, k.p);
-        if (use_softplus) ddelta *= sigmoid_(read_delta(t, d, width - d) + bias[j]);
-        dbias[j] += ddelta;
-        if (need_u) write_du(t, d, width - d, fma_(k.rate * (1.0f / scale), k.s, skip[j] * k.dy));
-        if (need_delta) write_ddelta(t, d, width - d, ddelta);
-        if (need_z) {
-            const F z = read_z(t, d, width - d), sig = sigmoid_(z);
-            const F slope = fma_(z * sig, 1.0f - sig, sig);
-            write_dz(t, d, width - d, read_dout(t, d, width - d) * k.y * slope);
-        }
+for (int t = 0; t < count; ++t) {
+    const GradToken& own = token[t];
+    const F u = read_u(t);
+    dskip = fma_(own.dy, u, dskip);
+    F ddelta = fma_(u, own.s, own.p);
+    if (use_softplus) ddelta *= sigmoid_(read_delta(t) + bias);
+    dbias += ddelta;
+    if (need_u) write_du(t, fma_(own.rate * (1.0f / scale), own.s, skip * own.dy));
+    if (need_delta) write_ddelta(t, ddelta);
+    if (need_z) {
+        const F z = read_z(t), sig = sigmoid_(z);
+        const F slope = fma_(z * sig, 1.0f - sig, sig);
+        write_dz(t, read_dout(t) * own.y * slope);
     }
+}
+*(F*)&dskip_out.data[k] += dskip;
+*(F*)&dbias_out.data[k] += dbias;
 """
 
 
 def _leaf(text: str, **arrays: torch.dtype) -> str:
-    text = text.replace("CHUNK", str(CHUNK)).replace("STRIP", str(STRIP))
-    text = "".join(rows(name, dtype) for name, dtype in arrays.items()) + text
-    return _PRELUDE + text.replace("AHEAD", str(_AHEAD))
+    return _PRELUDE + "".join(rows(name, dtype) for name, dtype in arrays.items()) + text
 
 
 @functools.cache
 def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
     """``prepare`` and ``finish`` for u, z, out and delta of these dtypes.
 
-    ``prepare`` fills rate, δu and D u, and says for each lane group whether all |rate A| are tame.
+    ``prepare`` fills rate, δu and D u, returns whether all |rate A| are tame, and fetches this lane
+    group's ``share`` of the ``lines`` of the rows that begin ``next`` tokens on.
     """
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
 
-    @wp.func_native(_leaf(_PREPARE, u=io, delta=delta_io))
+    @wp.func_native(_leaf(_PREPARE, u=io, delta=delta_io, z=io))
     def prepare(
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
+        z_in: wp.array3d(dtype=scalar),
         b: int,
         t0: int,
         count: int,
-        d0: int,
+        d: int,
         width: int,
-        k0: int,
-        blocks: int,
-        widest_in: wp.array(dtype=lanes),
-        bias_in: wp.array(dtype=lanes),
-        skip_in: wp.array(dtype=lanes),
+        share: int,
+        lines: int,
+        next: int,
+        limit: int,
+        widest_in: lanes,
+        bias_in: lanes,
+        skip_in: lanes,
         use_softplus: int,
+        use_z: int,
         scale: float,
         scratch: wp.array(dtype=lanes),
-        tame_out: wp.array(dtype=int),
-    ): ...
+    ) -> int: ...
 
     @wp.func_native(_leaf(_FINISH, z=io, out=io))
     def finish(
@@ -163,9 +147,8 @@ def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         b: int,
         t0: int,
         count: int,
-        d0: int,
+        d: int,
         width: int,
-        blocks: int,
         use_z: int,
         scratch: wp.array(dtype=lanes),
         out_in: wp.array3d(dtype=scalar),
@@ -188,31 +171,23 @@ def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         b: int,
         t0: int,
         count: int,
-        d0: int,
+        d: int,
         width: int,
-        k0: int,
-        blocks: int,
-        widest_in: wp.array(dtype=lanes),
-        bias_in: wp.array(dtype=lanes),
-        skip_in: wp.array(dtype=lanes),
+        share: int,
+        lines: int,
+        next: int,
+        limit: int,
+        widest_in: lanes,
+        bias_in: lanes,
+        skip_in: lanes,
         use_softplus: int,
         use_z: int,
         scale: float,
         scratch: wp.array(dtype=lanes),
-        tame_out: wp.array(dtype=int),
-    ): ...
+    ) -> int: ...
 
     @wp.func_native(
-        _leaf(
-            _FINISH_GRAD,
-            u=io,
-            delta=delta_io,
-            z=io,
-            dout=io,
-            du=io,
-            ddelta=delta_io,
-            dz=io,
-        )
+        _leaf(_FINISH_GRAD, u=io, delta=delta_io, z=io, dout=io, du=io, ddelta=delta_io, dz=io)
     )
     def finish(
         u_in: wp.array3d(dtype=scalar),
@@ -222,12 +197,11 @@ def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         b: int,
         t0: int,
         count: int,
-        d0: int,
+        d: int,
         width: int,
-        k0: int,
-        blocks: int,
-        bias_in: wp.array(dtype=lanes),
-        skip_in: wp.array(dtype=lanes),
+        k: int,
+        bias_in: lanes,
+        skip_in: lanes,
         use_softplus: int,
         scale: float,
         scratch: wp.array(dtype=lanes),
