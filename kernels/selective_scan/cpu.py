@@ -83,7 +83,7 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
     layout = Layout(u, A, B, SPAN)
     s = _Operands(layout, u, delta, A, z, delta_bias, discretization)
     sizes = _sizes(layout, softplus, z is not None)
-    b = layout.rows(B)
+    b = B.float()
     h = layout.states_of(initial_state)[None]
     if layout.segments > 1:
         local = s.states()
@@ -94,7 +94,7 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
     s.run(
         cpu_kernels.forward_kernel,
         [
-            sizes, "u", "delta", "z", "a", "widest", b, layout.rows(C),
+            sizes, "u", "delta", "z", "a", "widest", b, C.float(),
             view(layout.pack(D), lanes), "bias",
         ],
         [_flat(h), view(starts, lanes), out],
@@ -109,7 +109,7 @@ def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretizat
     h, starts = layout.states_of(initial_state)[None], s.starts(save)
     if layout.segments > 1:
         first, h = h[0], s.states()
-    product = _accumulate(s, _sizes(layout, softplus, False), layout.rows(B), h, starts)
+    product = _accumulate(s, _sizes(layout, softplus, False), B.float(), h, starts)
     if layout.segments > 1:
         h = torch.addcmul(h[-1:], product[-1:], _carry(first, h, product)[-1:])
     return layout.unpack(h[-1], (layout.batch,)), starts
@@ -133,7 +133,7 @@ def backward(
     flags = NEED_DZ * need_z + NEED_DC * need_C + NEED_DB * need_B + NEED_DH * through
     sizes = _sizes(layout, softplus, z is not None, flags)
     dout = lane_contiguous(dout)
-    b, c = layout.rows(B), layout.rows(C)
+    b, c = B.float(), C.float()
 
     def like(x: Tensor, needed: bool) -> Tensor:
         return empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), x.dtype)

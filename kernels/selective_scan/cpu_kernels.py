@@ -17,7 +17,7 @@ from .recurrence import NEED_DB, NEED_DC, SCALES, sum_lanes
 from .tokens import GRAD_TOKEN, KEPT, TOKEN
 
 SPAN = 32  # lane groups of a task at most: long pieces of rows, and what a core's own cache holds
-STRIP = 64  # tokens that the forward pass takes at once; the backward pass takes a chunk
+STRIP = 64
 
 _K = wp.constant(CHUNK)
 _S = wp.constant(STRIP)
@@ -54,7 +54,7 @@ class Place:
 
     b: int
     state: int  # row of the state arrays: segments, then batch elements
-    row: int  # of B and C
+    group: int
     begin: int  # tokens
     end: int
     k: int  # lane groups
@@ -74,7 +74,7 @@ def _place(sizes: Sizes, task: int) -> Place:
     p = Place()
     p.b = rest % sizes.batch
     p.state = rest
-    p.row = (p.b * sizes.groups + group) * sizes.states
+    p.group = group
     parts = (sizes.group_blocks + _P - 1) / _P
     p.part = (p.b * sizes.groups + group) * parts + first / _P
     p.begin = rest / sizes.batch * sizes.segment
@@ -104,8 +104,8 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
         z_in: wp.array3d(dtype=scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        b_in: wp.array(dtype=wp.float32),
-        c_in: wp.array(dtype=wp.float32),
+        b_in: wp.array4d(dtype=wp.float32),
+        c_in: wp.array4d(dtype=wp.float32),
         skip_in: wp.array(dtype=lanes),
         bias_in: wp.array(dtype=lanes),
         # out
@@ -133,7 +133,7 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
                     wp.static(scale), token,
                 )  # fmt: skip
                 advance(
-                    sizes.states, tame, p.row, sizes.length, t0, count, a_in[k], b_in, c_in,
+                    sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, c_in,
                     token, h,
                 )  # fmt: skip
                 finish(z_in, p.b, t0, count, d, width, sizes.use_z, token, y_out)
@@ -159,7 +159,7 @@ def states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
         delta_in: wp.array3d(dtype=delta_scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        b_in: wp.array(dtype=wp.float32),
+        b_in: wp.array4d(dtype=wp.float32),
         bias_in: wp.array(dtype=lanes),
         # out
         h_out: wp.array3d(dtype=lanes),
@@ -184,7 +184,7 @@ def states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
                     sizes.use_softplus, 0, wp.static(scale), token,
                 )  # fmt: skip
                 accumulate(
-                    sizes.states, tame, p.row, sizes.length, t0, count, a_in[k], b_in, token,
+                    sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, token,
                     h, product_out[p.state, k],
                 )  # fmt: skip
         restore_denormals(before)
@@ -210,7 +210,7 @@ def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretizatio
         z_in: wp.array3d(dtype=scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        c_in: wp.array(dtype=wp.float32),
+        c_in: wp.array4d(dtype=wp.float32),
         bias_in: wp.array(dtype=lanes),
         dout_in: wp.array3d(dtype=scalar),
         # out
@@ -231,7 +231,7 @@ def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretizatio
                     bias_in[k], sizes.use_softplus, sizes.use_z, wp.static(scale), token,
                 )  # fmt: skip
                 gather(
-                    sizes.states, tame, p.row, sizes.length, t0, count, a_in[k], c_in, token,
+                    sizes.states, tame, p.b, p.group, t0, count, a_in[k], c_in, token,
                     dh_out[p.state, k], product_out[p.state, k],
                 )  # fmt: skip
         restore_denormals(before)
@@ -257,8 +257,8 @@ def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
         z_in: wp.array3d(dtype=scalar),
         a_in: wp.array2d(dtype=lanes),
         widest_in: wp.array(dtype=lanes),
-        b_in: wp.array(dtype=wp.float32),
-        c_in: wp.array(dtype=wp.float32),
+        b_in: wp.array4d(dtype=wp.float32),
+        c_in: wp.array4d(dtype=wp.float32),
         skip_in: wp.array(dtype=lanes),
         bias_in: wp.array(dtype=lanes),
         starts_in: wp.array4d(dtype=lanes),
@@ -296,7 +296,7 @@ def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
                     sizes.use_z, wp.static(scale), token,
                 )  # fmt: skip
                 retreat(
-                    sizes.states, tame, p.row, sizes.length, t0, count, int(j % _P == 0),
+                    sizes.states, tame, p.b, p.group, t0, count, int(j % _P == 0),
                     sizes.needs, a_in[k], b_in, c_in, starts_in[p.b, t0 / _K, k], token, kept,
                     db_lanes_out[task], dc_lanes_out[task], dh_out[p.state, k],
                     da_out[p.state, k],

@@ -75,10 +75,6 @@ class Layout:
             return torch.zeros(self.batch, self.blocks, self.states, W)
         return self.pack(x, (self.batch,))
 
-    def rows(self, x: Tensor) -> Tensor:
-        """``[B, L, G, N]`` to float32 ``[B·G·N·L]``: the tokens of one state are adjacent."""
-        return x.permute(0, 2, 3, 1).float().reshape(-1).contiguous()
-
     def total(self, parts: Tensor, dtype: torch.dtype) -> Tensor:
         """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
         of_group = -(-self.group_blocks // BLOCKS)

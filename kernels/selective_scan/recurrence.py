@@ -1,7 +1,7 @@
 """Native inner loops of the CPU scan: state after state, a strip of tokens, sixteen channels.
 
-Equations are those of README.md. Values per token come from ``tokens.py``. B and C are
-``[rows, length]``: state n is row ``row + n``, the strip begins at token ``t0``.
+Equations are those of README.md. Values per token come from ``tokens.py``; B and C
+are read where they are, from token ``t0`` on.
 """
 
 import functools
@@ -49,7 +49,17 @@ _OPEN = (
     + """
 const F* const rates = (const F*)a_in.data;
 auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
-auto from_ = [&](auto& array, int n) { return array.data + (row + n) * (size_t)length + t0; };
+// entry n of B or C, token by token
+struct Column {
+    const char* at;
+    const size_t step;
+    float operator[](int t) const { return *(const float*)(at + t * step); }
+};
+auto column_ = [&](auto& array, int n) -> Column {
+    const auto* s = array.strides;
+    return {(const char*)array.data + (size_t)batch * s[0] + (size_t)t0 * s[1]
+        + (size_t)group * s[2] + (size_t)n * s[3], (size_t)s[1]};
+};
 for (int n = 0; n < states; ++n) {
     const F a = rates[n];
 """
@@ -65,7 +75,7 @@ _ADVANCE = (
     _OPEN
     + """
     Token* const token = aligned_((Token*)scratch.data);
-    const float *const b = from_(b_in, n), *const c = from_(c_in, n);
+    const Column b = column_(b_in, n), c = column_(c_in, n);
     auto walk = [&](auto exp2) {
         F h = state_(h_out, n);
         for (int t = 0; t < count; ++t) {
@@ -85,7 +95,7 @@ _ACCUMULATE = (
     _OPEN
     + """
     const Token* const token = aligned_((const Token*)scratch.data);
-    const float* const b = from_(b_in, n);
+    const Column b = column_(b_in, n);
     auto walk = [&](auto exp2) {
         F h = state_(h_out, n), product = state_(product_out, n);
         for (int t = 0; t < count; ++t) {
@@ -106,7 +116,7 @@ _GATHER = (
     _OPEN
     + """
     const GradToken* const token = aligned_((const GradToken*)scratch.data);
-    const float* const c = from_(c_in, n);
+    const Column c = column_(c_in, n);
     auto walk = [&](auto exp2) {
         F dh = state_(dh_out, n), product = state_(product_out, n);
         for (int t = 0; t < count; ++t) {
@@ -127,7 +137,7 @@ _GATHER = (
 _RETREAT = f"""
     GradToken* const token = aligned_((GradToken*)scratch.data);
     Kept* const kept = aligned_((Kept*)kept_out.data);
-    const float *const b = from_(b_in, n), *const c = from_(c_in, n);
+    const Column b = column_(b_in, n), c = column_(c_in, n);
     F* const db = (F*)db_out.data + n * CHUNK;
     F* const dc = (F*)dc_out.data + n * CHUNK;
     if (first) for (int t = 0; t < count; ++t) {{
@@ -193,13 +203,13 @@ def forward_leaves(discretization: str) -> SimpleNamespace:
     def advance(
         states: int,
         tame: int,
-        row: int,
-        length: int,
+        batch: int,
+        group: int,
         t0: int,
         count: int,
         a_in: wp.array(dtype=lanes),
-        b_in: wp.array(dtype=wp.float32),
-        c_in: wp.array(dtype=wp.float32),
+        b_in: wp.array4d(dtype=wp.float32),
+        c_in: wp.array4d(dtype=wp.float32),
         scratch: wp.array(dtype=lanes),
         h_out: wp.array(dtype=lanes),
     ): ...
@@ -208,12 +218,12 @@ def forward_leaves(discretization: str) -> SimpleNamespace:
     def accumulate(
         states: int,
         tame: int,
-        row: int,
-        length: int,
+        batch: int,
+        group: int,
         t0: int,
         count: int,
         a_in: wp.array(dtype=lanes),
-        b_in: wp.array(dtype=wp.float32),
+        b_in: wp.array4d(dtype=wp.float32),
         scratch: wp.array(dtype=lanes),
         h_out: wp.array(dtype=lanes),
         product_out: wp.array(dtype=lanes),
@@ -235,15 +245,15 @@ def backward_leaves(discretization: str) -> SimpleNamespace:
     def retreat(
         states: int,
         tame: int,
-        row: int,
-        length: int,
+        batch: int,
+        group: int,
         t0: int,
         count: int,
         first: int,
         needs: int,
         a_in: wp.array(dtype=lanes),
-        b_in: wp.array(dtype=wp.float32),
-        c_in: wp.array(dtype=wp.float32),
+        b_in: wp.array4d(dtype=wp.float32),
+        c_in: wp.array4d(dtype=wp.float32),
         starts_in: wp.array(dtype=lanes),
         scratch: wp.array(dtype=lanes),
         kept_out: wp.array(dtype=lanes),
@@ -257,12 +267,12 @@ def backward_leaves(discretization: str) -> SimpleNamespace:
     def gather(
         states: int,
         tame: int,
-        row: int,
-        length: int,
+        batch: int,
+        group: int,
         t0: int,
         count: int,
         a_in: wp.array(dtype=lanes),
-        c_in: wp.array(dtype=wp.float32),
+        c_in: wp.array4d(dtype=wp.float32),
         scratch: wp.array(dtype=lanes),
         dh_out: wp.array(dtype=lanes),
         product_out: wp.array(dtype=lanes),
