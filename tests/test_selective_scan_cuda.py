@@ -256,16 +256,20 @@ def test_convolution_kernels(monkeypatch, use_silu):
 
 
 # Registers, stack and shared bytes of a block, about a tenth above what the compiler used when this
-# was written. The forward's stack is empty, so nothing spills; the gradient's holds its marks.
-_TYPES = (torch.bfloat16,) * 3
+# was written. Only the gradient has a stack, for its marks: 16 x 8 floats, twice, so none of them
+# spills; three blocks of the forward and two of the gradient fit the registers.
+_HALF, _SINGLE = (torch.bfloat16,) * 3, (torch.float32,) * 3
 _ALL = frozenset(("read", "y", "du", "ddelta", "dz", "dB", "dC", "through"))
 _F = frame(Variant().block, Variant().channels, Variant().states, 16)
 KERNELS = {
-    "forward": (forward_kernel, (_TYPES, "mamba", _F, True, False, True, True), (176, 0, 56000)),
-    "summary": (forward_kernel, (_TYPES, "mamba", _F, False, True, True, False), (152, 0, 21000)),
-    "gradient": (backward_kernel, (_TYPES, "mamba", _F, True, True, _ALL), (240, 1200, 36000)),
+    "forward": (forward_kernel, (_HALF, "mamba", _F, True, False, True, True), (168, 0, 56000)),
+    "forward, float32": (
+        forward_kernel, (_SINGLE, "mamba", _F, True, False, True, True), (168, 0, 56000)
+    ),
+    "summary": (forward_kernel, (_HALF, "mamba", _F, False, True, True, False), (112, 0, 21000)),
+    "gradient": (backward_kernel, (_HALF, "mamba", _F, True, True, _ALL), (255, 1200, 36000)),
     "gradient's summary": (
-        summary_kernel, (_TYPES, "mamba", _F, True, True, True), (152, 0, 21000)
+        summary_kernel, (_HALF, "mamba", _F, True, True, True), (140, 0, 21000)
     ),
 }  # fmt: skip
 
@@ -288,7 +292,7 @@ def test_compiles_ahead_of_time(tmp_path, name):
         shared = shared_bytes(path.read_bytes()) + sum(dynamic.values())
         assert 16 <= registers <= most_registers, (path.name, registers)
         assert stack <= most_stack, (path.name, stack)
-        assert 0 < shared <= most_shared, (path.name, shared)
+        assert most_shared / 2 <= shared <= most_shared, (path.name, shared)
 
 
 @pytest.mark.gpu
