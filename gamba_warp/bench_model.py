@@ -218,7 +218,8 @@ def _blocks(settings: Settings, depth: int) -> list[Variant]:
     backbone = _Backbone(settings, depth)
     products = Products(backbone.forward, settings.device)
     oracle = f"float64 with the condition prepended, first {_TOKENS} of {backbone.length} tokens"
-    common = dict(oracle=oracle, parameters=backbone.parameters)
+    rounds = 3 if depth > 1 and settings.level == "normal" else None  # seconds each
+    common = dict(oracle=oracle, parameters=backbone.parameters, rounds=rounds)
     made = [
         Variant(
             "default",
@@ -241,6 +242,7 @@ def _blocks(settings: Settings, depth: int) -> list[Variant]:
             None,
             work=lambda: {"products": products.count, "flops": products.flops},
             parameters=backbone.parameters,
+            rounds=rounds,
         ),
     ]
     if depth == 1:

@@ -1,5 +1,6 @@
 """The CUDA kernels without a GPU: small shapes on CPU blocks, and compiled ahead of time."""
 
+import contextlib
 import json
 
 import pytest
@@ -27,8 +28,16 @@ LIMIT = 2e-6  # float32 sums of a few hundred terms; measured below 6e-7
 
 @pytest.fixture
 def cpu_blocks(monkeypatch):
-    """CPU launches with real blocks; without it each thread is a block of its own."""
+    """CPU launches with real blocks, into memory full of NaN: what is not written shows."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    for name in ("empty", "empty_like"):
+        make_empty = getattr(torch, name)
+
+        def poisoned(*args, _make_empty=make_empty, **kwargs):
+            x = _make_empty(*args, **kwargs)
+            return x.fill_(torch.nan) if x.is_floating_point() else x
+
+        monkeypatch.setattr(torch, name, poisoned)
 
 
 def run(module, inputs, discretization, v_out, v_last, softplus=True, needs=None):
@@ -256,16 +265,20 @@ def test_convolution_kernels(monkeypatch, use_silu):
 
 
 # Registers, stack and shared bytes of a block, about a tenth above what the compiler used when this
-# was written. The forward's stack is empty, so nothing spills; the gradient's holds its marks.
-_TYPES = (torch.bfloat16,) * 3
+# was written. Only the gradient has a stack, for its marks: 16 x 8 floats, twice, so none of them
+# spills; three blocks of the forward and two of the gradient fit the registers.
+_HALF, _SINGLE = (torch.bfloat16,) * 3, (torch.float32,) * 3
 _ALL = frozenset(("read", "y", "du", "ddelta", "dz", "dB", "dC", "through"))
 _F = frame(Variant().block, Variant().channels, Variant().states, 16)
 KERNELS = {
-    "forward": (forward_kernel, (_TYPES, "mamba", _F, True, False, True, True), (176, 0, 56000)),
-    "summary": (forward_kernel, (_TYPES, "mamba", _F, False, True, True, False), (152, 0, 21000)),
-    "gradient": (backward_kernel, (_TYPES, "mamba", _F, True, True, _ALL), (240, 1200, 36000)),
+    "forward": (forward_kernel, (_HALF, "mamba", _F, True, False, True, True), (168, 0, 56000)),
+    "forward, float32": (
+        forward_kernel, (_SINGLE, "mamba", _F, True, False, True, True), (168, 0, 56000)
+    ),
+    "summary": (forward_kernel, (_HALF, "mamba", _F, False, True, True, False), (112, 0, 21000)),
+    "gradient": (backward_kernel, (_HALF, "mamba", _F, True, True, _ALL), (255, 1200, 36000)),
     "gradient's summary": (
-        summary_kernel, (_TYPES, "mamba", _F, True, True, True), (152, 0, 21000)
+        summary_kernel, (_HALF, "mamba", _F, True, True, True), (140, 0, 21000)
     ),
 }  # fmt: skip
 
@@ -288,28 +301,41 @@ def test_compiles_ahead_of_time(tmp_path, name):
         shared = shared_bytes(path.read_bytes()) + sum(dynamic.values())
         assert 16 <= registers <= most_registers, (path.name, registers)
         assert stack <= most_stack, (path.name, stack)
-        assert 0 < shared <= most_shared, (path.name, shared)
+        assert most_shared / 2 <= shared <= most_shared, (path.name, shared)
+
+
+def gpu_gradients(inputs, v_out, v_last):
+    mine = {k: v.cuda().requires_grad_() for k, v in inputs.items()}
+    out, last = selective_scan(**mine, delta_softplus=True, return_last_state=True)
+    total = (out * v_out.cuda()).sum() + (last * v_last.cuda()).sum()
+    grads = torch.autograd.grad(total, [*mine.values()])
+    return {"out": out.cpu(), "last": last.cpu()} | {k: g.cpu() for k, g in zip(mine, grads)}
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("dtype, limit", [(torch.float32, 5e-6), (torch.bfloat16, 4e-3)])
-@pytest.mark.parametrize("shape", [(2, 577, 70, 16, 1), (1, 65, 40, 3, 2)])
-def test_on_a_gpu(shape, dtype, limit):
+@pytest.mark.parametrize("dtype, limit", [(torch.float32, 1e-5), (torch.bfloat16, 4e-3)])
+@pytest.mark.parametrize("variant", [None, *VARIANTS])
+@pytest.mark.parametrize("shape", [(2, 577, 70, 16, 1), (1, 65, 40, 3, 2), (1, 100, 20, 40, 1)])
+def test_on_a_gpu(shape, variant, dtype, limit):
     inputs = make(*shape, dtype=dtype)
-    exact = leaves(inputs, torch.float64)
-    mine = {k: v.cuda().requires_grad_() for k, v in inputs.items()}
-    out, last = selective_scan(**mine, delta_softplus=True, return_last_state=True)
-    want, want_last = selective_scan_reference(**exact, delta_softplus=True)
-    v_out, v_last = torch.randn_like(want), torch.randn_like(want_last)
-    v_out = v_out.to(dtype).double()
-    grads = torch.autograd.grad(
-        (out * v_out.cuda().to(dtype)).sum() + (last * v_last.cuda().float()).sum(),
-        [*mine.values()],
-    )
-    wants = torch.autograd.grad(
-        (want * v_out).sum() + (want_last * v_last).sum(), [*exact.values()]
-    )
-    assert_rel_rms(out.cpu(), want, limit, "out")
-    assert_rel_rms(last.cpu(), want_last, 5e-6, "last state")
-    for name, grad, expected in zip(mine, grads, wants):
-        assert_rel_rms(grad.cpu(), expected, limit, f"gradient of {name}")
+    v_out, v_last = cotangents(inputs)
+    want = exact(inputs, "mamba", v_out, v_last)
+    with use_variant(variant) if variant else contextlib.nullcontext():
+        first, second = (gpu_gradients(inputs, v_out, v_last) for _ in range(2))
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+        # the exponential of the GPU errs by up to 2^-22 a step
+        assert_rel_rms(value, want[name], 1e-5 if value.dtype == torch.float32 else limit, name)
+
+
+@pytest.mark.gpu
+def test_in_a_cuda_graph():
+    inputs = {k: v.cuda() for k, v in make(1, 577, 70, 16).items()}
+    want = selective_scan(**inputs, delta_softplus=True)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        out = selective_scan(**inputs, delta_softplus=True)
+    out.fill_(torch.nan)
+    graph.replay()
+    assert torch.equal(out, want)

@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-_WIDTH, _HEIGHT = 720, 400
-_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 700, 40, 352
+_WIDTH, _HEIGHT = 600, 380
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 584, 36, 334
 _CHARACTER, _LINE = 6.4, 13.0  # size of a label's character, pixels
 
 
@@ -159,14 +159,14 @@ def _mark(at: tuple[float, float], point: Point, colour: int) -> str:
 
 
 def _labels(named: list[tuple[tuple[float, float], str]]) -> list[str]:
-    """Texts beside their points, each at the first of six places where it hides nothing."""
-    taken = [(x - 7, y - 7, x + 7, y + 7) for (x, y), _ in named]
+    """Texts beside their points, each at the first place near it where it hides nothing."""
+    taken = [(x - 9, y - 9, x + 9, y + 9) for (x, y), _ in named]
     parts = []
     for (x, y), text in named:
         width = _CHARACTER * len(text)
         places = [
-            (left, y + 4 + shift)
-            for shift in (0, -_LINE, _LINE, -2 * _LINE, 2 * _LINE)
+            (left, y + 4 + lines * _LINE)
+            for lines in (0, -1, 1, -2, 2, -3, 3, -4, 4)
             for left in (x + 12, x - 12 - width)
         ]
         left, base = next(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import datetime
 import gc
 import math
@@ -64,7 +65,7 @@ def measure(
         case, variant, device, dtype, direction, ms_p20, ms_p50, ms_p80`` (milliseconds, quantiles
         of ``rounds`` runs), ``jit_ms`` (the first call, compilation or its cache included),
         ``rel_rms_error, max_error`` (see ``Error``), ``peer, peer_ms`` (the fastest peer of the
-        same case and direction), ``work`` (counts); and ``status`` ("ok" or what is wrong),
+        same case, direction and sizes), ``work`` (counts); and ``status`` ("ok" or what is wrong),
         ``is_peer, is_default, oracle, limit, parameters, threads, rounds, axis``. Times are None
         unless the status is "ok".
     """
@@ -206,12 +207,14 @@ def _summarize(t: _Timed) -> None:
 
 
 def _set_peers(records: list[dict]) -> None:
+    """The fastest peer of the same direction and sizes."""
     for record in records:
-        peers = [
+        same = [
             r
             for r in records
-            if r["is_peer"] and r["ms_p50"] and r["direction"] == record["direction"]
+            if all(r[k] == record[k] for k in ("direction", "parameters")) and r["ms_p50"]
         ]
+        peers = [r for r in same if r["is_peer"]]
         if peers and not record["is_peer"]:
             fastest = min(peers, key=lambda r: r["ms_p50"])
             record.update(peer=fastest["variant"], peer_ms=fastest["ms_p50"])
@@ -269,11 +272,12 @@ def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
         del result
         return torch.cuda.max_memory_allocated(device) - before
     try:
+        ctypes.CDLL(None).malloc_trim(0)  # else memory that is free, but kept, serves unseen
         Path("/proc/self/clear_refs").write_text("5")
         before = _resident("VmRSS")
         result = run()
         after = _resident("VmHWM")
-    except (OSError, StopIteration):
+    except (OSError, AttributeError, StopIteration):
         return None
     del result
     return after - before

@@ -106,7 +106,8 @@ section {
 .charts { display: grid; gap: 1rem; margin-top: 1rem;
   grid-template-columns: repeat(auto-fill, minmax(min(100%, 33rem), 1fr)); }
 svg { display: block; width: 100%; max-width: 45rem; height: auto; }
-svg text { fill: var(--text); font: 12px system-ui, sans-serif; }
+svg text { fill: var(--text); font: 12px system-ui, sans-serif;
+  paint-order: stroke; stroke: var(--card); stroke-width: 3px; stroke-linejoin: round; }
 svg .axis { fill: var(--soft); font-weight: 600; }
 svg .grid { stroke: var(--line); }
 svg .line { fill: none; stroke-width: 2; stroke-linejoin: round; }
@@ -116,7 +117,7 @@ svg .ring { fill: none !important; stroke-width: 2; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
 th, td { padding: .25rem 1.2rem .25rem 0; text-align: left; border-bottom: 1px solid var(--line); }
 th { font-weight: 500; color: var(--soft); }
-td.number { text-align: right; }
+td.number { text-align: right; white-space: nowrap; }
 .reached { color: var(--good); } .missed { color: var(--bad); }
 """
 

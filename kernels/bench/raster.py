@@ -54,15 +54,15 @@ def _scene(
     return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
 
 
+def _parameters(scene: Scene) -> dict[str, int]:
+    count, views = scene.gaussians["opacities"].shape[-1], scene.viewmats.shape[:-2].numel()
+    return {"N": count, "side": scene.size, "views": views}
+
+
 def _variant(
     scene: Scene, name: str, direction: str = "forward", limit: float | None = None, **changes
 ) -> Variant:
     backward = direction == BOTH
-    parameters = {
-        "N": scene.gaussians["opacities"].shape[-1],
-        "side": scene.size,
-        "views": scene.viewmats.shape[:-2].numel(),
-    }
     return Variant(
         name,
         scene.backward if backward else scene.forward,
@@ -70,7 +70,7 @@ def _variant(
         limit or (BACKWARD_LIMIT if backward else FORWARD_LIMIT),
         scene.oracle(backward),
         direction,
-        parameters=parameters,
+        parameters=_parameters(scene),
         work=partial(scene.work, backward),
         **changes,
     )
@@ -87,15 +87,18 @@ def _scenes(settings: Settings) -> list[Variant]:
     made = []
     for scale in (1, 2, 4):
         scene = _scene(settings, scale)
-        made += _pair(scene, f"scale {scale}", default=True)
+        variants = _pair(scene, f"scale {scale}", default=True)
         if settings.peers:
-            made += _peers(scene, f"scale {scale}")
+            variants += _peers(scene, f"scale {scale}")
+        for variant in variants:
+            variant.parameters["scale"] = scale
+        made += variants
     return made
 
 
 def _peers(scene: Scene, name: str) -> list[Variant]:
     """On CUDA gsplat; on a CPU the projection of its torch code, all that runs there."""
-    parameters = {"N": scene.gaussians["opacities"].shape[-1], "side": scene.size}
+    parameters = _parameters(scene)
     if scene.device.type == "cuda":
         runs = {"forward": scene.forward, BOTH: scene.backward}
 
@@ -112,7 +115,7 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
                 "our float32 picture",
                 direction,
                 peer=True,
-                parameters=parameters,
+                parameters=dict(parameters),
             )
             for direction, run in runs.items()
         ]
@@ -125,7 +128,11 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
 
     name = f"gsplat's torch projection alone, {name}"
     return [
-        Variant(name, run, check, 1e-4, "our float32 centres", peer=True, parameters=parameters)
+        Variant(
+            *(name, run, check, 1e-4, "our float32 centres", "projection"),
+            peer=True,
+            parameters=parameters,
+        )
     ]
 
 
@@ -145,9 +152,14 @@ def _knobs(settings: Settings) -> list[Variant]:
         options = {"alpha_min": 1 / denominator}
         name = f"alpha_min 1/{denominator}"
         made += _pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
-    for radius in (4.0, 8.0):
+    for radius in (scene.size / 32, scene.size / 16):
         name = f"radius_clip {radius:g}"
         made += _pair(scene.changed(options={"radius_clip": radius}), name, limit=TRADE_LIMIT)
+    for opacity in (0.35, 0.4):
+        kept = scene.gaussians["opacities"] >= opacity
+        pruned = {k: x[kept] for k, x in scene.gaussians.items()}
+        pruned = scene.changed(gaussians=pruned, truth=scene.gaussians)
+        made.append(_variant(pruned, f"without opacities < {opacity}", limit=TRADE_LIMIT))
     return made
 
 

@@ -61,6 +61,7 @@ class Scene:
         options: of ``rasterization``.
         wanted: what gradients are asked for.
         exact: options of the oracle where it shall not have ours, as ``alpha_min``.
+        truth: Gaussians of the oracle, where ours are not all; then there are no gradients.
         cotangent: of the picture, ``[.., V, H, W, 3]``; None: drawn at random, as for the alphas.
     """
 
@@ -72,6 +73,7 @@ class Scene:
     options: dict = field(default_factory=dict)
     wanted: tuple[str, ...] = LEAVES
     exact: dict = field(default_factory=dict)
+    truth: dict[str, Tensor] | None = None
     cotangent: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -149,14 +151,17 @@ class Scene:
         g = torch.Generator().manual_seed(4)
         shape = (1, height, width)
         cotangents = [torch.randn(*shape, c, generator=g) for c in (3, 1)]
-        gaussians = {k: None if x is None else x[first] for k, x in self.gaussians.items()}
+        gaussians, truth = (
+            {k: None if x is None else x[first] for k, x in g.items()}
+            for g in (self.gaussians, self.truth or self.gaussians)
+        )
         rest = dict(viewmats=self.viewmats[first][:1], Ks=Ks, width=width, height=height)
         got = self._run(rasterization, gaussians, rest, self.options, cotangents, backward)
         exact = dict(self.options)
         if exact.pop("rasterize_mode", "classic") == "antialiased":
             exact["antialiased"] = True
         exact.pop("radius_clip", None)
-        truth = {k: None if x is None else x.double().cpu() for k, x in gaussians.items()}
+        truth = {k: None if x is None else x.double().cpu() for k, x in truth.items()}
         rest = {k: x.double().cpu() if isinstance(x, Tensor) else x for k, x in rest.items()}
         want = self._run(
             rasterization_reference, truth, rest, exact | self.exact, cotangents, backward

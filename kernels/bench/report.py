@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Sequence
 
 from .case import Key, Target
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
+
+# counts that the tables show; the JSON has all
+_WORK = {
+    "pairs_box": "pairs of boxes",
+    "pairs": "of ellipses",
+    "pairs_walked": "walked",
+    "skipped": "skipped",
+    "state_history_bytes": "history",
+    "saved_bytes": "saved",
+    "peak_bytes": "peak",
+    "products": "products",
+    "flops": "",
+}
 
 
 def judge(targets: Iterable[Target], records: Sequence[dict]) -> list[dict]:
@@ -101,7 +115,8 @@ def _row(r: dict) -> list[str]:
     """Cells under ``_HEADER``, then the peer and the work."""
     name = r["variant"] + (" (default)" if r["is_default"] and r["variant"] != "default" else "")
     if r["status"] != "ok":
-        return [name, r["direction"], r["dtype"], r["status"], "", "", _number(r["rel_rms_error"])]
+        reason = textwrap.shorten(r["status"], 90, placeholder=" …")
+        return [name, r["direction"], r["dtype"], reason, "", "", _number(r["rel_rms_error"])]
     spread = f"{_number(r['ms_p20'])} to {_number(r['ms_p80'])}"
     error = _number(r["rel_rms_error"]) or "none"
     return [
@@ -118,11 +133,19 @@ def _peer(r: dict) -> str:
 
 def _work(r: dict) -> str:
     parts = []
-    for name, value in r["work"].items():
-        text = f"{value:.0%}" if name == "skipped" else f"{value:,}"
-        if name.endswith("_bytes"):
-            name, text = name.removesuffix("_bytes"), f"{value / 2**20:,.1f} MiB"
-        parts.append(f"{name.replace('_', ' ')} {text}")
+    for name, label in _WORK.items():
+        if name not in r["work"]:
+            continue
+        value = r["work"][name]
+        if name == "skipped":
+            text = f"{value:.0%}"
+        elif name.endswith("_bytes"):
+            text = f"{value / 2**20:,.1f} MiB"
+        elif name == "flops":
+            text = f"{value / 1e9:.3g} GFLOP, {value / r['ms_p50'] / 1e6:.0f} GFLOP/s"
+        else:
+            text = f"{value:,}"
+        parts.append(f"{label} {text}".strip())
     return ", ".join(parts)
 
 
@@ -172,7 +195,7 @@ EXPLANATION = (
 
 def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
     """All tables; one document is one machine."""
-    lines = [f"# {title}", "", EXPLANATION, ""]
+    lines = [f"# {title}", "", "Written by `gamba bench`, not by hand.", "", EXPLANATION, ""]
     for document in documents:
         lines += [f"## {machine_line(document)}", ""]
         if document["interrupted"]:

@@ -174,7 +174,8 @@ def _peer(
 
 def _knobs(settings: Settings) -> list[Variant]:
     """Every choice that a caller has. Half precision is compared with the truth of the float32
-    inputs; each discretisation with its own formula.
+    inputs. The discretisations are different models, each compared with its own formula, so that
+    the one of Mamba's weights is the default at any cost.
     """
     problem = _problem(settings)
     made = _pair(problem, "float32", default=True)

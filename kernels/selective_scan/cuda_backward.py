@@ -24,17 +24,19 @@ from .cuda_blocks import (
     placing,
     states_io,
     sync,
+    widening,
 )
-from .cuda_tokens import SUB, advancing, decaying, marking, retreating
+from .cuda_retreat import lane_stride, retreating, token_stride
+from .cuda_tokens import SUB, advancing, decaying, marking
 from .lanes import WARP_DTYPES
-from .scalars import LOG2E, sigmoid, softplus
+from .scalars import LOG2E, sigmoid, softplus, softplus_slope
 
 TILE = 16  # tokens
 
 
 def _retreat_layout(f: Frame, flags: frozenset) -> tuple[dict, int]:
-    partial = f.lanes * (SUB * f.span + f.pad)
-    products = SUB * (f.slots + 1) * f.width
+    partial = f.lanes * lane_stride(f)
+    products = SUB * token_stride(f)
     parts = {"STEP": SUB * f.span, "DU": SUB * f.span, "B": SUB * f.padded}
     if "read" in flags:
         parts |= {"DY": SUB * f.span, "C": SUB * f.padded}
@@ -64,11 +66,12 @@ def backward_kernel(
     place = placing(f)
     vec, read_states, write_states = states_io(f)
     pair, join, first_half, second_half = halves(f)
-    tile_count, _, fetch_tile = channel_io(f, io, TILE)
-    _, _, fetch_tile_delta = channel_io(f, delta_io, TILE)
-    count, raw, fetch = channel_io(f, io, SUB)
-    _, _, fetch_delta = channel_io(f, delta_io, SUB)
+    tile_count, _, fetch_tile, _ = channel_io(f, io, TILE)
+    _, _, fetch_tile_delta, _ = channel_io(f, delta_io, TILE)
+    count, raw, fetch, store = channel_io(f, io, SUB)
+    _, _, fetch_delta, store_delta = channel_io(f, delta_io, SUB)
     own = wp.types.vector(count, wp.float32)
+    widen, widen_delta = widening(io), widening(delta_io)
     at, size = _retreat_layout(f, flags)
     tile_at, tile_size = offsets({"STEP": TILE * f.span, "DU": TILE * f.span, "B": TILE * f.padded})
     size = max(size, 2 * tile_size)
@@ -79,15 +82,7 @@ def backward_kernel(
     retreat = retreating(f, mode, tuple(at.items()), size, flags)
     scale = 1.0 if mode == "bilinear" else LOG2E
     marks_size = MARK // SUB * f.walks * f.held + 4
-    lane_stride = SUB * f.span + f.pad
-    read, through = "read" in flags, "through" in flags
-
-    @wp.func
-    def step_of(x: float, inside: bool) -> float:
-        step = x
-        if wp.static(use_softplus):
-            step = softplus(x)
-        return wp.where(inside, step, 0.0)
+    read = "read" in flags
 
     @wp.func
     def set_marks(
@@ -98,33 +93,65 @@ def backward_kernel(
         b_in: wp.array4d(dtype=matrix_scalar),
     ):  # fmt: skip
         subs = (end - t0 + wp.static(SUB - 1)) / wp.static(SUB)
-        u = fetch_tile(u_in, p.b, p.d, t0 + p.row, end)
-        delta = fetch_tile_delta(delta_in, p.b, p.d, t0 + p.row, end)
-        b = fetch_tile_matrix(b_in, p.b, p.group, p.lane, p.states, t0, end)
+        u = fetch_tile(u_in, p, t0, end)
+        delta = fetch_tile_delta(delta_in, p, t0, end)
+        b = fetch_tile_matrix(b_in, p, t0, end)
         for tile in range((end - t0 + wp.static(TILE - 1)) / wp.static(TILE)):
             base = (tile % 2) * wp.static(tile_size)
             first = t0 + tile * wp.static(TILE)
             left = wp.where(p.active != 0, end - first - p.row, 0)
             for i in range(wp.static(tile_count)):
-                step = step_of(float(delta[i]) + bias, wp.static(i * f.rows) < left)
+                step = widen_delta(delta[i]) + bias
+                if wp.static(use_softplus):
+                    step = softplus(step)
+                step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
                 e = base + (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
                 put(arena, e + wp.static(tile_at["STEP"]), step)
-                put(arena, e + wp.static(tile_at["DU"]), step * float(u[i]))
+                put(arena, e + wp.static(tile_at["DU"]), step * widen(u[i]))
             put_tile_matrix(arena, base + wp.static(tile_at["B"]), p, b)
             sync()
             first += wp.static(TILE)
-            u = fetch_tile(u_in, p.b, p.d, first + p.row, end)
-            delta = fetch_tile_delta(delta_in, p.b, p.d, first + p.row, end)
-            b = fetch_tile_matrix(b_in, p.b, p.group, p.lane, p.states, first, end)
+            u = fetch_tile(u_in, p, first, end)
+            delta = fetch_tile_delta(delta_in, p, first, end)
+            b = fetch_tile_matrix(b_in, p, first, end)
             h = mark(arena, base, marks, tile, subs, p.slot, p.q, a, h)
         sync()
 
     @wp.func
     def partial(arena: arena_type, p: Place, name: int, t: int) -> float:
-        total = wp.float32(0.0)
-        for q in range(wp.static(f.lanes)):
-            total += get(arena, name + q * wp.static(lane_stride) + t * wp.static(f.span) + p.c)
+        total = get(arena, name + t * wp.static(f.span) + p.c)
+        for q in range(1, wp.static(f.lanes)):
+            total += get(arena, name + q * wp.static(lane_stride(f)) + t * wp.static(f.span) + p.c)
         return total
+
+    @wp.func
+    def finish(
+        p: Place, arena: arena_type, t0: int, left: int, u: own, steps: own, slopes: own,
+        dys: own, gates: own, skip: float,
+        du_out: wp.array3d(dtype=scalar),
+        ddelta_out: wp.array3d(dtype=delta_scalar),
+        dz_out: wp.array3d(dtype=scalar),
+    ) -> wp.vec2:  # fmt: skip
+        # equations 9 and 11; the terms of dD and ddelta_bias
+        dskip = wp.float32(0.0)
+        dbias = wp.float32(0.0)
+        for i in range(wp.static(count)):
+            t = p.row + wp.static(i * f.rows)
+            if wp.static(i * f.rows) < left:
+                dskip += dys[i] * u[i]
+                if wp.static("y" in flags):
+                    y = partial(arena, p, wp.static(at.get("Y", 0)), t) + skip * u[i]
+                    store(dz_out, p.b, p.d, t0 + t, gates[i] * y)
+                if wp.static("through" in flags):
+                    s = partial(arena, p, wp.static(at.get("S", 0)), t)
+                    d = partial(arena, p, wp.static(at.get("P", 0)), t)
+                    d = (d * wp.static(1.0 / scale) + u[i] * s) * slopes[i]
+                    dbias += d
+                    if wp.static("du" in flags):
+                        store(du_out, p.b, p.d, t0 + t, steps[i] * s + skip * dys[i])
+                    if wp.static("ddelta" in flags):
+                        store_delta(ddelta_out, p.b, p.d, t0 + t, d)
+        return wp.vec2(dskip, dbias)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
     def scan_backward(
@@ -160,8 +187,7 @@ def backward_kernel(
         state = join(read_states(last_in, p.at, p), vec())
         bias = bias_in[p.d]
         skip = skip_in[p.d]
-        dskip = wp.float32(0.0)
-        dbias = wp.float32(0.0)
+        sums = wp.vec2()
         row = (p.b * sizes.groups + p.group) * sizes.parts + p.part
         chunks = (p.end - p.begin + wp.static(MARK - 1)) / wp.static(MARK)
         starts = p.b * ((sizes.length + wp.static(MARK - 1)) / wp.static(MARK))
@@ -172,17 +198,17 @@ def backward_kernel(
             set_marks(p, arena, marks, chunk, end, bias, a, h, u_in, delta_in, b_in)
             subs = (end - chunk + wp.static(SUB - 1)) / wp.static(SUB)
             t0 = chunk + (subs - 1) * wp.static(SUB)
-            u_raw = fetch(u_in, p.b, p.d, t0 + p.row, end)
-            delta_raw = fetch_delta(delta_in, p.b, p.d, t0 + p.row, end)
+            u_raw = fetch(u_in, p, t0, end)
+            delta_raw = fetch_delta(delta_in, p, t0, end)
             z_raw = raw()
             dout_raw = raw()
-            b_raw = fetch_matrix(b_in, p.b, p.group, lane, p.states, t0, end)
+            b_raw = fetch_matrix(b_in, p, t0, end)
             c_raw = b_raw
             if wp.static(read):
-                dout_raw = fetch(dout_in, p.b, p.d, t0 + p.row, end)
-                c_raw = fetch_matrix(c_in, p.b, p.group, lane, p.states, t0, end)
+                dout_raw = fetch(dout_in, p, t0, end)
+                c_raw = fetch_matrix(c_in, p, t0, end)
                 if wp.static(use_z):
-                    z_raw = fetch(z_in, p.b, p.d, t0 + p.row, end)
+                    z_raw = fetch(z_in, p, t0, end)
             for again in range(subs):
                 t0 = chunk + (subs - 1 - again) * wp.static(SUB)
                 left = wp.where(p.active != 0, end - t0 - p.row, 0)
@@ -192,20 +218,22 @@ def backward_kernel(
                 dys = own()
                 gates = own()
                 for i in range(wp.static(count)):
-                    x = float(delta_raw[i]) + bias
+                    x = widen_delta(delta_raw[i]) + bias
                     inside = wp.static(i * f.rows) < left
-                    steps[i] = step_of(x, inside)
                     slopes[i] = 1.0
+                    step = x
                     if wp.static(use_softplus):
-                        slopes[i] = sigmoid(x)
-                    u[i] = float(u_raw[i])
+                        step = softplus(x)
+                        slopes[i] = softplus_slope(x)
+                    steps[i] = wp.where(inside, step, 0.0)
+                    u[i] = widen(u_raw[i])
                     e = (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
                     put(arena, e + wp.static(at["STEP"]), steps[i])
                     put(arena, e + wp.static(at["DU"]), steps[i] * u[i])
                     if wp.static(read):
-                        dy = wp.where(inside, float(dout_raw[i]), 0.0)
+                        dy = wp.where(inside, widen(dout_raw[i]), 0.0)
                         if wp.static(use_z):
-                            gate = float(z_raw[i])
+                            gate = widen(z_raw[i])
                             s = sigmoid(gate)
                             gates[i] = dy * s * (1.0 + gate * (1.0 - s))
                             dy = dy * gate * s
@@ -215,43 +243,30 @@ def backward_kernel(
                 if wp.static(read):
                     put_matrix(arena, wp.static(at.get("C", 0)), p, c_raw)
                 sync()
-                if again + 1 < subs:
-                    ahead = t0 - wp.static(SUB)
-                    u_raw = fetch(u_in, p.b, p.d, ahead + p.row, end)
-                    delta_raw = fetch_delta(delta_in, p.b, p.d, ahead + p.row, end)
-                    b_raw = fetch_matrix(b_in, p.b, p.group, lane, p.states, ahead, end)
-                    if wp.static(read):
-                        dout_raw = fetch(dout_in, p.b, p.d, ahead + p.row, end)
-                        c_raw = fetch_matrix(c_in, p.b, p.group, lane, p.states, ahead, end)
-                        if wp.static(use_z):
-                            z_raw = fetch(z_in, p.b, p.d, ahead + p.row, end)
+                ahead = t0 - wp.static(SUB)
+                u_raw = fetch(u_in, p, ahead, end)
+                delta_raw = fetch_delta(delta_in, p, ahead, end)
+                b_raw = fetch_matrix(b_in, p, ahead, end)
+                if wp.static(read):
+                    dout_raw = fetch(dout_in, p, ahead, end)
+                    c_raw = fetch_matrix(c_in, p, ahead, end)
+                    if wp.static(use_z):
+                        z_raw = fetch(z_in, p, ahead, end)
                 state = retreat(
                     arena, 0, marks, subs - 1 - again, p.slot, p.q, lane, p.states,
-                    t0, end - t0, row, a, state, db_out, dc_out,
+                    t0, end - t0, row, sizes.length, a, state, db_out, dc_out,
                 )  # fmt: skip
-                for i in range(wp.static(count)):
-                    t = p.row + wp.static(i * f.rows)
-                    if wp.static(i * f.rows) < left:
-                        if wp.static("y" in flags):
-                            y = partial(arena, p, wp.static(at.get("Y", 0)), t) + skip * u[i]
-                            dz_out[p.b, t0 + t, p.d] = scalar(gates[i] * y)
-                        dskip += dys[i] * u[i]
-                        if wp.static(through):
-                            s = partial(arena, p, wp.static(at.get("S", 0)), t)
-                            if wp.static("du" in flags):
-                                du_out[p.b, t0 + t, p.d] = scalar(steps[i] * s + skip * dys[i])
-                            d = partial(arena, p, wp.static(at.get("P", 0)), t)
-                            d = (d * wp.static(1.0 / scale) + u[i] * s) * slopes[i]
-                            dbias += d
-                            if wp.static("ddelta" in flags):
-                                ddelta_out[p.b, t0 + t, p.d] = delta_scalar(d)
+                sums += finish(
+                    p, arena, t0, left, u, steps, slopes, dys, gates, skip,
+                    du_out, ddelta_out, dz_out,
+                )  # fmt: skip
             sync()
         if p.piece == 0:
             write_states(first_out, p.b, p, first_half(state))
         write_states(da_out, p.at, p, second_half(state))
         if p.active != 0:
-            dskip_out[p.at, p.row, p.d] = dskip
-            dbias_out[p.at, p.row, p.d] = dbias
+            dskip_out[p.at, p.row, p.d] = sums[0]
+            dbias_out[p.at, p.row, p.d] = sums[1]
 
     return scan_backward
 
@@ -266,8 +281,9 @@ def summary_kernel(dtypes: tuple, mode: str, f: Frame, use_softplus: bool, use_z
     scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
     place = placing(f)
     vec, read_states, write_states = states_io(f)
-    count, raw, fetch = channel_io(f, io, TILE)
-    _, _, fetch_delta = channel_io(f, delta_io, TILE)
+    count, raw, fetch, _ = channel_io(f, io, TILE)
+    _, _, fetch_delta, _ = channel_io(f, delta_io, TILE)
+    widen, widen_delta = widening(io), widening(delta_io)
     at, size = offsets({"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded})
     arena_type, put, _ = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
@@ -303,24 +319,24 @@ def summary_kernel(dtypes: tuple, mode: str, f: Frame, use_softplus: bool, use_z
         t0 = p.begin + (tiles - 1) * wp.static(TILE)
         end = wp.where(tiles > 0, p.end, 0)
         z = raw()
-        delta = fetch_delta(delta_in, p.b, p.d, t0 + p.row, end)
-        dout = fetch(dout_in, p.b, p.d, t0 + p.row, end)
-        c = fetch_matrix(c_in, p.b, p.group, lane, p.states, t0, end)
+        delta = fetch_delta(delta_in, p, t0, end)
+        dout = fetch(dout_in, p, t0, end)
+        c = fetch_matrix(c_in, p, t0, end)
         if wp.static(use_z):
-            z = fetch(z_in, p.b, p.d, t0 + p.row, end)
+            z = fetch(z_in, p, t0, end)
         for again in range(tiles):
             base = (again % 2) * wp.static(size)
             left = wp.where(p.active != 0, end - t0 - p.row, 0)
             for i in range(wp.static(count)):
-                step = float(delta[i]) + bias
+                step = widen_delta(delta[i]) + bias
                 if wp.static(use_softplus):
                     step = softplus(step)
                 step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
-                dy = wp.where(wp.static(i * f.rows) < left, float(dout[i]), 0.0)
+                dy = wp.where(wp.static(i * f.rows) < left, widen(dout[i]), 0.0)
                 if wp.static(not read):
                     dy = 0.0
                 if wp.static(use_z):
-                    dy *= float(z[i]) * sigmoid(float(z[i]))
+                    dy *= widen(z[i]) * sigmoid(widen(z[i]))
                 e = base + (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
                 put(arena, e + wp.static(at["STEP"]), step)
                 put(arena, e + wp.static(at["IN"]), dy)
@@ -328,12 +344,11 @@ def summary_kernel(dtypes: tuple, mode: str, f: Frame, use_softplus: bool, use_z
             put_matrix(arena, base + wp.static(at["W"]), p, c)
             sync()
             t0 -= wp.static(TILE)
-            if again + 1 < tiles:
-                delta = fetch_delta(delta_in, p.b, p.d, t0 + p.row, end)
-                dout = fetch(dout_in, p.b, p.d, t0 + p.row, end)
-                c = fetch_matrix(c_in, p.b, p.group, lane, p.states, t0, end)
-                if wp.static(use_z):
-                    z = fetch(z_in, p.b, p.d, t0 + p.row, end)
+            delta = fetch_delta(delta_in, p, t0, end)
+            dout = fetch(dout_in, p, t0, end)
+            c = fetch_matrix(c_in, p, t0, end)
+            if wp.static(use_z):
+                z = fetch(z_in, p, t0, end)
             if wp.static(multiply):
                 product = decay(arena, base, p.slot, p.q, a, product)
             dh = retreat(arena, base, p.slot, p.q, a, dh)

@@ -13,6 +13,7 @@ import torch
 import warp as wp
 
 from .lanes import WARP_DTYPES
+from .scalars import WIDE
 
 STATES = 16  # of a state block, the most that a channel holds in registers
 MARK = 64  # tokens between the states that the forward saves for the gradient
@@ -72,11 +73,30 @@ def frame(block: int, channels: int, states: int, total: int) -> Frame:
     return Frame(block, min(channels, lanes), states, lanes, -(-total // width))
 
 
-_SCALARS = {
-    torch.float32: "wp::float32",
-    torch.float16: "wp::float16",
-    torch.bfloat16: "wp::bfloat16",
+# A type, an integer of its bits, and the float that such an integer means.
+_BITS = {
+    torch.float32: ("float", "unsigned", "float f; memcpy(&f, &bits, 4); return f;"),
+    torch.float16: (
+        "wp::float16",
+        "unsigned short",
+        "wp::half h; h.u = (unsigned short)bits; return wp::half_to_float(h);",
+    ),
+    torch.bfloat16: (
+        "wp::bfloat16",
+        "unsigned short",
+        "unsigned v = bits << 16; float f; memcpy(&f, &v, 4); return f;",
+    ),
 }
+
+
+@functools.cache
+def widening(io: torch.dtype):
+    """The function from the bits of ``io`` to a float."""
+
+    @wp.func_native(_BITS[io][2])
+    def widen(bits: wp.uint32) -> float: ...
+
+    return widen
 
 
 @wp.struct
@@ -253,66 +273,89 @@ def halves(f: Frame):
 
 @functools.cache
 def channel_io(f: Frame, io: torch.dtype, tokens: int):
-    """Fetches a thread's own elements of a tile of ``[B, L, D]`` in their own type, as a vector.
+    """Access to a thread's own elements of a tile of ``[B, L, D]``.
 
-    The loads are on their way while the tile before is worked on; converting would wait for them.
+    ``fetch`` loads their bits: the loads are on their way while the tile before is worked on, and
+    converting would wait for them. Elements from ``end`` on are 0.
     """
     scalar = WARP_DTYPES[io]
+    element, word, _ = _BITS[io]
     count = tokens // f.rows
-    raw = wp.types.vector(count, scalar)
-
+    raw = wp.types.vector(count, wp.uint32)
+    address = (
+        WIDE
+        + f"""
+char* at = (char*)(({element}*)x.data + d) + wide_(b, x.strides[0]);
+at += wide_(t, x.strides[1]);
+"""
+    )
     snippet = f"""
-wp::vec_t<{count}, {_SCALARS[io]}> r;
-const char* from = (const char*)x.data + (size_t)b * x.strides[0] + (size_t)t * x.strides[1];
-from += (size_t)d * sizeof({_SCALARS[io]});
-const size_t step = (size_t){f.rows} * x.strides[1];
+{address}
+wp::vec_t<{count}, unsigned> r;
+const long long step = wide_({f.rows}, x.strides[1]);
 WP_PRAGMA_UNROLL
-for (int i = 0; i < {count}; ++i, from += step) {{
-    r.c[i] = {_SCALARS[io]}(0.0f);
-    if (t + {f.rows} * i < end) r.c[i] = *(const {_SCALARS[io]}*)from;
+for (int i = 0; i < {count}; ++i, at += step) {{
+    r.c[i] = 0;
+    if ({f.rows} * i < left) r.c[i] = *(const {word}*)at;
 }}
 return r;
 """
 
     @wp.func_native(snippet)
-    def fetch(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, end: int) -> raw: ...
+    def fetch_own(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, left: int) -> raw: ...
 
-    return count, raw, fetch
+    @wp.func
+    def fetch(x: wp.array3d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+        left = wp.where(t0 < 0, 0, end - t0 - p.row)  # a tile before the first is not there
+        return fetch_own(x, p.b, p.d, t0 + p.row, left)
+
+    @wp.func_native(f"{address} *({element}*)at = ({element})v;")
+    def store(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, v: float): ...
+
+    return count, raw, fetch, store
 
 
 @functools.cache
 def matrix_io(f: Frame, io: torch.dtype, tokens: int, arena_size: int):
-    """As ``channel_io`` for B and C: fetches rows of ``[B, L, G, N]``, and puts them as floats."""
+    """As ``channel_io`` for a block's tile of B or C, ``[B, L, G, N]``; ``put_rows`` as floats."""
     scalar = WARP_DTYPES[io]
     size = tokens * f.padded
     count = -(-size // f.block)
-    raw = wp.types.vector(count, scalar)
+    raw = wp.types.vector(count, wp.uint32)
     arena_type, put, _ = arena_io(arena_size)
-
+    widen = widening(io)
     snippet = f"""
-wp::vec_t<{count}, {_SCALARS[io]}> r;
-const char* from = (const char*)x.data + (size_t)b * x.strides[0] + (size_t)group * x.strides[2];
+{WIDE}
+const char* from = (const char*)x.data + wide_(b, x.strides[0]) + wide_(group, x.strides[2]);
+wp::vec_t<{count}, unsigned> r;
 WP_PRAGMA_UNROLL
 for (int i = 0; i < {count}; ++i) {{
-    const int e = {f.block} * i + lane, t = t0 + e / {f.padded}, n = e % {f.padded};
-    r.c[i] = {_SCALARS[io]}(0.0f);
-    if (t < end && n < states && e < {size})
-        r.c[i] = *(const {_SCALARS[io]}*)(
-            from + (size_t)t * x.strides[1] + (size_t)n * x.strides[3]);
+    const int e = {f.block} * i + lane, t = e / {f.padded}, n = e % {f.padded};
+    r.c[i] = 0;
+    if (t < left && n < states && e < {size})
+        r.c[i] = *(const {_BITS[io][1]}*)(
+            from + wide_(n, x.strides[3]) + wide_(t0 + t, x.strides[1]));
 }}
 return r;
 """
 
     @wp.func_native(snippet)
-    def fetch(
-        x: wp.array4d(dtype=scalar), b: int, group: int, lane: int, states: int, t0: int, end: int
+    def fetch_all(
+        x: wp.array4d(dtype=scalar), b: int, group: int, lane: int, states: int, t0: int, left: int
     ) -> raw: ...
 
     @wp.func
-    def place_rows(arena: arena_type, base: int, p: Place, r: raw):
+    def fetch(x: wp.array4d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+        left = wp.where(t0 < 0, 0, end - t0)
+        return fetch_all(x, p.b, p.group, p.lane, p.states, t0, left)
+
+    @wp.func
+    def put_rows(arena: arena_type, base: int, p: Place, r: raw):
         for i in range(wp.static(count)):
             e = wp.static(i * f.block) + p.lane
-            if e < wp.static(size):
-                put(arena, base + e, float(r[i]))
+            if wp.static(size % f.block == 0):
+                put(arena, base + e, widen(r[i]))
+            elif e < wp.static(size):
+                put(arena, base + e, widen(r[i]))
 
-    return raw, fetch, place_rows
+    return raw, fetch, put_rows

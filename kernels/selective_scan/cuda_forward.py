@@ -22,18 +22,23 @@ from .cuda_blocks import (
     placing,
     states_io,
     sync,
+    widening,
 )
 from .cuda_tokens import advancing, decaying
 from .lanes import WARP_DTYPES
 from .scalars import LOG2E, sigmoid, softplus
 
-TILE = 16  # tokens
+
+def tile_tokens(f: Frame) -> int:
+    """Tokens of a tile: fewer where B and C of very many states would fill shared memory."""
+    return 16 if f.padded <= 128 else 8
 
 
 def _layout(f: Frame, read: bool) -> tuple[dict, int]:
-    parts = {"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded}
+    tokens = tile_tokens(f)
+    parts = {"STEP": tokens * f.span, "IN": tokens * f.span, "W": tokens * f.padded}
     if read:
-        parts |= {"C": TILE * f.padded, "Y": f.lanes * (TILE * f.span + f.pad)}
+        parts |= {"C": tokens * f.padded, "Y": f.lanes * (tokens * f.span + f.pad)}
     return offsets(parts)
 
 
@@ -51,15 +56,17 @@ def forward_kernel(
     """
     io, delta_io, matrix = dtypes
     scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
+    tokens = tile_tokens(f)
     place = placing(f)
     vec, read_states, write_states = states_io(f)
-    count, raw, fetch = channel_io(f, io, TILE)
-    _, _, fetch_delta = channel_io(f, delta_io, TILE)
+    count, raw, fetch, store = channel_io(f, io, tokens)
+    _, _, fetch_delta, _ = channel_io(f, delta_io, tokens)
+    widen, widen_delta = widening(io), widening(delta_io)
     at, size = _layout(f, read)
     arena_type, put, get = arena_io(2 * size)
-    _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
-    advance = advancing(f, mode, TILE, tuple(at.items()), 2 * size, read, False)
-    decay = decaying(f, mode, TILE, tuple(at.items()), 2 * size)
+    _, fetch_matrix, put_matrix = matrix_io(f, matrix, tokens, 2 * size)
+    advance = advancing(f, mode, tokens, tuple(at.items()), 2 * size, read, False)
+    decay = decaying(f, mode, tokens, tuple(at.items()), 2 * size)
     multiply = summary and mode == "bilinear"
     scale = 1.0 if mode == "bilinear" else LOG2E
 
@@ -73,14 +80,14 @@ def forward_kernel(
         for i in range(wp.static(count)):
             t = p.row + wp.static(i * f.rows)
             if wp.static(i * f.rows) < left:
-                y = skip * float(u[i])
+                y = skip * widen(u[i])
                 for q in range(wp.static(f.lanes)):
-                    part = wp.static(at["Y"]) + q * wp.static(TILE * f.span + f.pad)
+                    part = wp.static(at["Y"]) + q * wp.static(tokens * f.span + f.pad)
                     y += get(arena, base + part + t * wp.static(f.span) + p.c)
                 if wp.static(use_z):
-                    gate = float(z[i])
+                    gate = widen(z[i])
                     y *= gate * sigmoid(gate)
-                y_out[p.b, t0 + t, p.d] = scalar(y)
+                store(y_out, p.b, p.d, t0 + t, y)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
     def scan_forward(
@@ -113,28 +120,28 @@ def forward_kernel(
         skip = skip_in[p.d]
         total = wp.float32(0.0)
         row = p.b * ((sizes.length + MARK - 1) / MARK) + p.begin / MARK
-        u = fetch(u_in, p.b, p.d, p.begin + p.row, p.end)
-        delta = fetch_delta(delta_in, p.b, p.d, p.begin + p.row, p.end)
-        b = fetch_matrix(b_in, p.b, p.group, p.lane, p.states, p.begin, p.end)
-        c = fetch_matrix(c_in, p.b, p.group, p.lane, p.states, p.begin, p.end)
+        u = fetch(u_in, p, p.begin, p.end)
+        delta = fetch_delta(delta_in, p, p.begin, p.end)
+        b = fetch_matrix(b_in, p, p.begin, p.end)
+        c = fetch_matrix(c_in, p, p.begin, p.end)
         u_before = raw()
         z_before = raw()
-        tiles = (p.end - p.begin + wp.static(TILE - 1)) / wp.static(TILE)
+        tiles = (p.end - p.begin + wp.static(tokens - 1)) / wp.static(tokens)
         if wp.static(summary):  # of the last piece nobody asks
             tiles = wp.where(p.piece == sizes.pieces - 1, 0, tiles)
         for tile in range(tiles):
-            t0 = p.begin + tile * wp.static(TILE)
+            t0 = p.begin + tile * wp.static(tokens)
             base = (tile % 2) * wp.static(size)
             left = wp.where(p.active != 0, p.end - t0 - p.row, 0)
             for i in range(wp.static(count)):
                 t = p.row + wp.static(i * f.rows)
-                step = float(delta[i]) + bias
+                step = widen_delta(delta[i]) + bias
                 if wp.static(use_softplus):
                     step = softplus(step)
                 step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
                 e = base + t * wp.static(f.span) + p.c
                 put(arena, e + wp.static(at["STEP"]), step)
-                put(arena, e + wp.static(at["IN"]), step * float(u[i]))
+                put(arena, e + wp.static(at["IN"]), step * widen(u[i]))
                 total += step
             put_matrix(arena, base + wp.static(at["W"]), p, b)
             if wp.static(read):
@@ -142,15 +149,15 @@ def forward_kernel(
             sync()
             if wp.static(read):
                 if tile > 0:
-                    before = wp.static(size) - base
-                    finish(p, arena, before, t0 - wp.static(TILE), u_before, z_before, skip, y_out)
+                    t = t0 - wp.static(tokens)
+                    finish(p, arena, wp.static(size) - base, t, u_before, z_before, skip, y_out)
                 u_before = u
                 if wp.static(use_z):
-                    z_before = fetch(z_in, p.b, p.d, t0 + p.row, p.end)
-                c = fetch_matrix(c_in, p.b, p.group, p.lane, p.states, t0 + wp.static(TILE), p.end)
-            u = fetch(u_in, p.b, p.d, t0 + wp.static(TILE) + p.row, p.end)
-            delta = fetch_delta(delta_in, p.b, p.d, t0 + wp.static(TILE) + p.row, p.end)
-            b = fetch_matrix(b_in, p.b, p.group, p.lane, p.states, t0 + wp.static(TILE), p.end)
+                    z_before = fetch(z_in, p, t0, p.end)
+                c = fetch_matrix(c_in, p, t0 + wp.static(tokens), p.end)
+            u = fetch(u_in, p, t0 + wp.static(tokens), p.end)
+            delta = fetch_delta(delta_in, p, t0 + wp.static(tokens), p.end)
+            b = fetch_matrix(b_in, p, t0 + wp.static(tokens), p.end)
             if wp.static(not summary):
                 if sizes.save != 0 and t0 % MARK == 0:
                     write_states(saved_out, row + (t0 - p.begin) / MARK, p, h)
@@ -159,7 +166,7 @@ def forward_kernel(
             h = advance(arena, base, p.slot, p.q, a, h)
         if wp.static(read):
             sync()
-            t0 = p.begin + (tiles - 1) * wp.static(TILE)
+            t0 = p.begin + (tiles - 1) * wp.static(tokens)
             base = ((tiles - 1) % 2) * wp.static(size)
             finish(p, arena, base, t0, u_before, z_before, skip, y_out)
         if wp.static(summary):

@@ -52,7 +52,7 @@ _ALIGNED = """
 """
 
 # The local array that holds the marks, and a thread's states in it as vectors.
-_MARKS = """
+MARKS = """
 float* marks = (float*)(((size_t)marks_in.data + 15) & ~(size_t)15);
 constexpr int VE = E % 4 == 0 ? 4 : E % 2 == 0 ? 2 : 1;
 struct ALIGNED(4 * VE) PE { float v[VE]; };
@@ -87,7 +87,7 @@ _END_WALK = """
 """
 
 
-def _prelude(f: Frame, mode: str) -> str:
+def prelude(f: Frame, mode: str) -> str:
     """Constants, vector access to shared memory, and the factors of equations 2 to 4."""
 
     def access(name: str, count: int) -> str:
@@ -167,7 +167,7 @@ def advancing(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int, read
     }}
     """
     snippet = f"""
-{_prelude(f, mode)}
+{prelude(f, mode)}
 {_WALK}
 WP_PRAGMA_NO_UNROLL
 for (int t0 = 0; t0 < {tokens}; t0 += {UNROLL}) {{
@@ -210,7 +210,7 @@ def decaying(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int):
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     snippet = f"""
-{_prelude(f, mode)}
+{prelude(f, mode)}
 for (int t = 0; t < {tokens}; ++t)
     WP_PRAGMA_UNROLL
     for (int k = 0; k < {f.walks} * E; ++k) {{
@@ -238,8 +238,8 @@ def marking(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int):
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     snippet = f"""
-{_prelude(f, mode)}
-{_MARKS}
+{prelude(f, mode)}
+{MARKS}
 {_WALK}
 WP_PRAGMA_NO_UNROLL
 for (int t0 = 0; t0 < {tokens}; t0 += {SUB}) {{
@@ -283,159 +283,3 @@ return h;
     ) -> vec: ...
 
     return mark
-
-
-@functools.cache
-def retreating(f: Frame, mode: str, at: tuple, arena_size: int, flags: frozenset):
-    """Equations 6 to 12 over ``SUB`` tokens: from their mark forwards again, then backwards.
-
-    The decays and states of the few tokens stay in registers between the two walks. Sums over
-    states leave as partial sums of the lanes, sums over channels are completed over the block.
-
-    Args:
-        flags: of ``read`` (there is dy), ``y``, ``dB``, ``dC`` (wanted), ``through`` (dh is).
-    """
-    at = {name: 0 for name in ("DY", "C", "Y", "S", "P", "DB", "DC")} | dict(at)
-    vec = wp.types.vector(f.walks * f.held, wp.float32)
-    pair = wp.types.vector(2 * f.walks * f.held, wp.float32)
-    arena_type, _, _ = arena_io(arena_size)
-    row = f.slots * f.width + f.width  # of the products, a token's apart in its banks
-    lane_stride = SUB * f.span + f.pad
-
-    def when(flag: str, code: str) -> str:
-        return code if flag in flags else ""
-
-    def add_to(name: str, values: str) -> str:
-        return f"""{{
-            float* to = s + {at[name]} + q * {lane_stride} + t * SPAN + channel;
-            if (walk > 0) {{
-                float before[CH];
-                load_ch(to, before);
-                WP_PRAGMA_UNROLL
-                for (int i = 0; i < CH; ++i) {values}[i] += before[i];
-            }}
-            store_ch(to, {values});
-        }}"""
-
-    def total(name: str, out: str) -> str:
-        return f"""
-    WP_PRAGMA_UNROLL
-    for (int e = lane; e < {SUB} * WIDTH; e += {f.block}) {{
-        const int t = e / WIDTH, n = e % WIDTH;
-        const float* from = s + {at[name]} + t * {row} + n;
-        float v[4] = {{}};
-        WP_PRAGMA_UNROLL
-        for (int i = 0; i < {f.slots}; ++i) v[i % 4] += from[i * WIDTH];
-        if (t < left && walk * WIDTH + n < states)
-            {out}.data[((size_t)row * {out}.shape[1] + t0 + t) * states + walk * WIDTH + n]
-                = (v[0] + v[1]) + (v[2] + v[3]);
-    }}"""
-
-    load_token = f"""
-        float r[CH], x[CH], b[ST], dy[CH], c[ST];
-        load_ch(s + {at["STEP"]} + t * SPAN + channel, r);
-        load_ch(s + {at["DU"]} + t * SPAN + channel, x);
-        load_st(s + {at["B"]} + t * PADDED + state, b);
-        {when("read", f"load_ch(s + {at['DY']} + t * SPAN + channel, dy);")}
-        {when("read", f"load_st(s + {at['C']} + t * PADDED + state, c);")}
-"""
-    kept = mode == "mamba"
-    slope = """
-                float f = fs[t][k], q_;
-                dh[k] = f * v;
-                q_ = dh[k] * hs[t][k];
-                const float w = v;"""
-    if not kept:
-        slope = """
-                float f, g, df, dg;
-                slopes_(r[i], an[k], f, g, df, dg);
-                dh[k] = f * v;
-                const float q_ = v * (hs[t][k] * df + x[i] * b[j] * dg);
-                const float w = g * v;"""
-    snippet = f"""
-{_prelude(f, mode)}
-{_MARKS}
-WP_PRAGMA_NO_UNROLL
-for (int walk = 0; walk < WALKS; ++walk) {{
-    const int state = walk * WIDTH + q * ST;
-    float hn[E], an[E], dh[E], da[E], hs[{SUB}][E], fs[{SUB}][E];
-    load_e(marks + (walk * {MARK // SUB} + mark) * E, hn, false);
-    WP_PRAGMA_UNROLL
-    for (int k = 0; k < E; ++k) {{
-        an[k] = a.c[walk * E + k];
-        dh[k] = v_in.c[walk * E + k];
-        da[k] = v_in.c[(WALKS + walk) * E + k];
-    }}
-    WP_PRAGMA_UNROLL
-    for (int t = 0; t < {SUB}; ++t) {{
-        {load_token}
-        float y[CH] = {{}}, dc[ST] = {{}};
-        WP_PRAGMA_UNROLL
-        for (int i = 0; i < CH; ++i)
-            WP_PRAGMA_UNROLL
-            for (int j = 0; j < ST; ++j) {{
-                const int k = i * ST + j;
-                float f, g;
-                factors_(r[i], an[k], f, g);
-                fs[t][k] = f;
-                hs[t][k] = hn[k];
-                hn[k] = f * hn[k] + g * (x[i] * b[j]);
-                {when("dC", "dc[j] += dy[i] * hn[k];")}
-                {when("y", "y[i] += c[j] * hn[k];")}
-            }}
-        {when("dC", f"store_st(s + {at['DC']} + t * {row} + slot * WIDTH + q * ST, dc);")}
-        {when("y", add_to("Y", "y"))}
-    }}
-    WP_PRAGMA_UNROLL
-    for (int t = {SUB - 1 if "through" in flags else -1}; t >= 0; --t) {{
-        {load_token}
-        float through[CH] = {{}}, dstep[CH] = {{}}, db[ST] = {{}};
-        WP_PRAGMA_UNROLL
-        for (int i = 0; i < CH; ++i)
-            WP_PRAGMA_UNROLL
-            for (int j = 0; j < ST; ++j) {{
-                const int k = i * ST + j;
-                const float v = {"dh[k] + dy[i] * c[j]" if "read" in flags else "dh[k]"};
-                {slope}
-                {when("dB", "db[j] += w * x[i];")}
-                through[i] += w * b[j];
-                dstep[i] += q_ * an[k];
-                da[k] += q_ * r[i];
-            }}
-        {when("dB", f"store_st(s + {at['DB']} + t * {row} + slot * WIDTH + q * ST, db);")}
-        {add_to("S", "through")}
-        {add_to("P", "dstep")}
-    }}
-    WP_PRAGMA_UNROLL
-    for (int k = 0; k < E; ++k) {{
-        v_in.c[walk * E + k] = dh[k];
-        v_in.c[(WALKS + walk) * E + k] = da[k];
-    }}
-    WP_TILE_SYNC();
-    {when("dB", total("DB", "db_out"))}
-    {when("dC", total("DC", "dc_out"))}
-    if (WALKS > 1) WP_TILE_SYNC();
-}}
-return v_in;
-"""
-
-    @wp.func_native(snippet)
-    def retreat(
-        arena: arena_type,
-        base: int,
-        marks_in: wp.array(dtype=float),
-        mark: int,
-        slot: int,
-        q: int,
-        lane: int,
-        states: int,
-        t0: int,
-        left: int,
-        row: int,
-        a: vec,
-        v_in: pair,
-        db_out: wp.array3d(dtype=float),
-        dc_out: wp.array3d(dtype=float),
-    ) -> pair: ...
-
-    return retreat

@@ -72,10 +72,10 @@ def choose(
 ) -> Variant:
     """The variant for a shape on a device of so many multiprocessors.
 
-    The model: a multiprocessor holds ``RESIDENT`` blocks at a time, and k blocks at once take k + 1/2
-    times as long as one would take at its full rate. P pieces are walked (2 - 1/P) times in the
-    forward; the gradient's walks are longer, so that they cost (4 - 1/P) / 3. Beginning and
-    ending a piece costs as much as ``OVERHEAD`` tokens. No GPU has timed it.
+    The model: a multiprocessor holds ``RESIDENT`` blocks at a time, and k blocks at once take
+    k + 1/2 times as long as one would take at its full rate. P pieces are walked (2 - 1/P) times
+    in the forward; the gradient's walks are longer, so that they cost (4 - 1/P) / 3. Beginning
+    and ending a piece costs as much as ``OVERHEAD`` tokens. No GPU has timed it.
     """
     variant = Variant()
     if not batch or not length:

@@ -37,6 +37,20 @@ auto reciprocal_ = [](float v) -> float {
 """
 
 
+# The product of two int32 in one instruction, for an address.
+WIDE = """
+auto wide_ = [](int a, int b) -> long long {
+#if defined(__CUDA_ARCH__)
+    long long r;
+    asm("mul.wide.s32 %0, %1, %2;" : "=l"(r) : "r"(a), "r"(b));
+    return r;
+#else
+    return (long long)a * b;
+#endif
+};
+"""
+
+
 @wp.func_native(EXP2 + "return exp2_(x);")
 def exp2(x: float) -> float: ...
 
@@ -47,8 +61,7 @@ def reciprocal(x: float) -> float: ...
 
 @wp.func
 def sigmoid(x: float) -> float:
-    e = exp2(-wp.static(LOG2E) * wp.abs(x))
-    return wp.where(x < 0.0, e, 1.0) * reciprocal(1.0 + e)
+    return reciprocal(1.0 + exp2(-wp.static(LOG2E) * x))  # 0 where the power is infinite
 
 
 # As in lanes.py: branch-free, and relatively accurate for x << 0.
@@ -59,6 +72,13 @@ def softplus(x: float) -> float:
     w = s * s
     p = 0.20010849594358543 + w * (0.13999569703388653 + w * 0.1401223282424694)
     return wp.max(x, 0.0) + 2.0 * s * (1.0 + w * (0.33333206564805135 + w * p))
+
+
+# The sigmoid, by the exponential that ``softplus`` takes.
+@wp.func
+def softplus_slope(x: float) -> float:
+    e = exp2(-wp.static(LOG2E) * wp.abs(x))
+    return wp.where(x < 0.0, e, 1.0) * reciprocal(1.0 + e)
 
 
 @wp.func
