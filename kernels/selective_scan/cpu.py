@@ -53,7 +53,7 @@ class _Operands:
 
     def starts(self, save: bool) -> Tensor:
         y = self.layout
-        return torch.empty(y.batch, y.chunks if save else 0, y.blocks, y.states, W)
+        return empty((y.batch, y.chunks if save else 0, y.blocks, y.states, W), torch.float32)
 
 
 def _flat(states: Tensor):
