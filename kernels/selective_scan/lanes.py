@@ -22,13 +22,13 @@ typedef int I __attribute__((vector_size(64), aligned(4)));
 auto splat = [](float x) -> F { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; };
 """
 
-# exp2: an integer, and a minimax polynomial of the rest whose constant term is held at 1, so that
-# exp2(x) - 1 keeps its relative accuracy for small x: errors of slow decays add up over thousands
-# of steps. NaN stays NaN.
+# exp2: round to an integer by adding 1.5 * 2^23 (+127, the exponent bias), then a minimax
+# polynomial of the rest with the constant term held at 1, so that exp2(x) - 1 keeps its relative
+# accuracy for small x: the errors of slow decays add up over thousands of steps. NaN stays NaN.
 PRELUDE = (
     VECTORS
     + """
-auto fma_ = [](auto a, auto b, auto c) { return __builtin_elementwise_fma(a, b, c); };
+auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
 // max(top, |x|) by their bits, so that NaN is the greatest
 auto wider_ = [](F top, F x) -> F {
     I i = (I)x & 0x7fffffff;
@@ -37,46 +37,40 @@ auto wider_ = [](F top, F x) -> F {
 // whether |x| <= 125 in all lanes
 auto tame_ = [](F x) -> bool { return !__builtin_reduce_or(~((x <= 125.0f) & (x >= -125.0f))); };
 const float LOG2E = 1.44269504088896341f;
-// round to an integer by adding 1.5 * 2^23 (+127, the exponent's bias); x in [-126, 128]
-auto exp2_clamped_ = [&](auto x) {
-    using V = decltype(x);
-    using N = decltype(x < x);
-    const V shifter = V{} + 12583039.0f;
-    V r = x + shifter;
-    V f = x - (r - shifter);
-    V p = V{} + 1.546973508084193e-4f;
-    p = fma_(p, f, V{} + 1.3390866806730628e-3f);
-    p = fma_(p, f, V{} + 9.618030861020088e-3f);
-    p = fma_(p, f, V{} + 5.5503569543361664e-2f);
-    p = fma_(p, f, V{} + 0.24022650718688965f);
-    p = fma_(p, f, V{} + 0.6931471824645996f);
-    p = fma_(p, f, V{} + 1.0f);
-    return p * (V)((N)r << 23);
+const F shifter = splat(12583039.0f);
+auto exp2_clamped_ = [&](F x) -> F {
+    F r = x + shifter;
+    F f = x - (r - shifter);
+    F p = splat(1.546973508084193e-4f);
+    p = fma_(p, f, splat(1.3390866806730628e-3f));
+    p = fma_(p, f, splat(9.618030861020088e-3f));
+    p = fma_(p, f, splat(5.5503569543361664e-2f));
+    p = fma_(p, f, splat(0.24022650718688965f));
+    p = fma_(p, f, splat(0.6931471824645996f));
+    p = fma_(p, f, splat(1.0f));
+    return p * (F)((I)r << 23);
 };
-auto exp2_ = [&](auto x) {
-    using V = decltype(x);
-    x = x < -126.0f ? V{} - 126.0f : x;
-    return exp2_clamped_(x > 128.0f ? V{} + 128.0f : x);
-};
-// degree 5, for |x| <= 125, NaN excluded: the exponent is added as an integer
-auto exp2_tame_ = [&](auto x) {
-    using V = decltype(x);
-    using N = decltype(x < x);
-    const V shifter = V{} + 12582912.0f;
-    V r = x + shifter;
-    V f = x - (r - shifter);
-    V p = V{} + 1.3400436146184802e-3f;
-    p = fma_(p, f, V{} + 9.666373021900654e-3f);
-    p = fma_(p, f, V{} + 5.550333112478256e-2f);
-    p = fma_(p, f, V{} + 0.2402234822511673f);
-    p = fma_(p, f, V{} + 0.6931471824645996f);
-    p = fma_(p, f, V{} + 1.0f);
-    return (V)((N)p + ((N)r << 23));
+auto exp2_ = [&](F x) -> F {
+    x = x < -126.0f ? splat(-126.0f) : x;
+    return exp2_clamped_(x > 128.0f ? splat(128.0f) : x);
 };
 // e^-|x|; for NaN it is 2^-126
 auto decay_ = [&](F x) -> F {
     x = (F)((I)x | (int)0x80000000) * LOG2E;
     return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
+};
+// the same of degree 5 for |x| <= 125, NaN excluded: the exponent is added as an integer
+auto exp2_tame_ = [&](F x) -> F {
+    const F plain = splat(12582912.0f);
+    F r = x + plain;
+    F f = x - (r - plain);
+    F p = splat(1.3400436146184802e-3f);
+    p = fma_(p, f, splat(9.666373021900654e-3f));
+    p = fma_(p, f, splat(5.550333112478256e-2f));
+    p = fma_(p, f, splat(0.2402234822511673f));
+    p = fma_(p, f, splat(0.6931471824645996f));
+    p = fma_(p, f, splat(1.0f));
+    return (F)((I)p + ((I)r << 23));
 };
 """
 )

@@ -21,32 +21,33 @@ LOG2E = 1.4426950408889634
 SCALES = {"mamba": LOG2E, "bilinear": 1.0, "zoh": LOG2E}
 
 _PHI = """
-    const V xe = x * 0.6931471805599453f;
-    V series = V{} + 2.505210838544172e-8f, slope = V{} + 2.505210838544172e-7f;
+    const F xe = x * 0.6931471805599453f;
+    F series = splat(2.505210838544172e-8f), slope = splat(2.505210838544172e-7f);
     const float series_of[10] = {2.755731922398589e-7f, 2.755731922398589e-6f, 2.48015873015873e-5f,
         1.984126984126984e-4f, 1.388888888888889e-3f, 8.333333333333333e-3f,
         4.1666666666666664e-2f, 0.16666666666666666f, 0.5f, 1.0f};
-    for (int i = 0; i < 10; ++i) series = fma_(series, xe, V{} + series_of[i]);
-    for (int i = 0; i < 9; ++i) slope = fma_(slope, xe, V{} + series_of[i] * (float)(9 - i));
-    const auto small = (xe < 1.0f) & (xe > -1.0f);
-    const V safe = small ? V{} + 1.0f : xe;
-    const V g = small ? series : (f - 1.0f) / safe;
+    for (int i = 0; i < 10; ++i) series = fma_(series, xe, splat(series_of[i]));
+    for (int i = 0; i < 9; ++i) slope = fma_(slope, xe, splat(series_of[i] * (float)(9 - i)));
+    const I small = (xe < 1.0f) & (xe > -1.0f);
+    const F safe = small ? splat(1.0f) : xe;
+    const F g = small ? series : (f - 1.0f) / safe;
 """
 # Equations 2 to 4: f and g of x = rate A.
 _FACTORS = {
-    "mamba": "const V f = exp2(x); const V g = V{} + 1.0f;",
-    "bilinear": "const V g = 1.0f / (1.0f - 0.5f * x); const V f = fma_(x, g, V{} + 1.0f);",
-    "zoh": "const V f = exp2(x);" + _PHI,
+    "mamba": "const F f = exp2(x); const F g = splat(1.0f);",
+    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x); const F f = fma_(x, g, splat(1.0f));",
+    "zoh": "const F f = exp2(x);" + _PHI,
 }
 # And their slopes, f given.
 _SLOPES = {
-    "bilinear": "const V g = 1.0f / (1.0f - 0.5f * x); const V df = g * g, dg = 0.5f * df;",
-    "zoh": _PHI + "const V df = f, dg = small ? slope : (f - g) / safe;",
+    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x); const F df = g * g, dg = 0.5f * df;",
+    "zoh": _PHI + "const F df = f, dg = small ? slope : (f - g) / safe;",
 }
 _OPEN = (
     PRELUDE
     + TOKENS
     + """
+const F* const rates = (const F*)a_in.data;
 auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
 // entry n of B or C, token by token
 struct Column {
@@ -60,6 +61,7 @@ auto column_ = [&](auto& array, int n) -> Column {
         + (size_t)group * s[2] + (size_t)n * s[3], (size_t)s[1]};
 };
 for (int n = 0; n < states; ++n) {
+    const F a = rates[n];
 """
 )
 _WALK = """
@@ -68,21 +70,10 @@ _WALK = """
 }
 """
 
-# The gradient's loops run over the parts of a lane group, too.
-_PART = """
-for (int part = 0; part < PARTS; ++part) {
-    using V = E;
-    auto part_of_ = [&](auto& array, int n) -> E& { return ((E*)array.data)[n * PARTS + part]; };
-    const E a = part_of_(a_in, n);
-    GradToken* const token = aligned_((GradToken*)scratch.data) + part * CHUNK;
-"""
-
 # Equations 1 and 5.
 _ADVANCE = (
     _OPEN
     + """
-    using V = F;
-    const F a = state_(a_in, n);
     Token* const token = aligned_((Token*)scratch.data);
     const Column b = column_(b_in, n), c = column_(c_in, n);
     auto walk = [&](auto exp2) {
@@ -103,8 +94,6 @@ _ADVANCE = (
 _ACCUMULATE = (
     _OPEN
     + """
-    using V = F;
-    const F a = state_(a_in, n);
     const Token* const token = aligned_((const Token*)scratch.data);
     const Column b = column_(b_in, n);
     auto walk = [&](auto exp2) {
@@ -125,77 +114,77 @@ _ACCUMULATE = (
 # What the outputs send back to the state before the first token, and the product of the decays.
 _GATHER = (
     _OPEN
-    + _PART
     + """
+    const GradToken* const token = aligned_((const GradToken*)scratch.data);
     const Column c = column_(c_in, n);
     auto walk = [&](auto exp2) {
-        E dh = part_of_(dh_out, n), product = part_of_(product_out, n);
+        F dh = state_(dh_out, n), product = state_(product_out, n);
         for (int t = 0; t < count; ++t) {
-            const E x = token[t].rate * a;
+            const F x = token[t].rate * a;
             FACTORS
             product *= f;
             dh = fma_(product, token[t].dy * c[t], dh);
         }
-        part_of_(dh_out, n) = dh;
-        part_of_(product_out, n) = product;
+        state_(dh_out, n) = dh;
+        state_(product_out, n) = product;
     };
 """
     + _WALK
-    + "}"
 )
 
 # As _ADVANCE, keeping f and h of every token, and adding dy·h to the sums of dC (equation 8); then
 # backwards, equations 6, 7 and 9 to 12. Σ rate q is left in da.
 _RETREAT = f"""
+    GradToken* const token = aligned_((GradToken*)scratch.data);
     Kept* const kept = aligned_((Kept*)kept_out.data);
     const Column b = column_(b_in, n), c = column_(c_in, n);
-    E* const db = (E*)db_out.data + n * CHUNK * PARTS + part;
-    E* const dc = (E*)dc_out.data + n * CHUNK * PARTS + part;
+    F* const db = (F*)db_out.data + n * CHUNK;
+    F* const dc = (F*)dc_out.data + n * CHUNK;
     if (first) for (int t = 0; t < count; ++t) {{
-        if (needs & {NEED_DB}) db[PARTS * t] = E{{}};
-        if (needs & {NEED_DC}) dc[PARTS * t] = E{{}};
+        if (needs & {NEED_DB}) db[t] = F{{}};
+        if (needs & {NEED_DC}) dc[t] = F{{}};
     }}
     auto walk = [&](auto exp2) {{
-        E h = part_of_(starts_in, n);
+        F h = state_(starts_in, n);
         for (int t = 0; t < count; ++t) {{
-            const E x = token[t].rate * a;
+            const F x = token[t].rate * a;
             FACTORS
             kept[t].f = f;
             kept[t].h = h;
             h = fma_(f, h, g * (token[t].du * b[t]));
-            if (needs & {NEED_DZ}) token[t].y = fma_(h, full_(c[t]), token[t].y);
-            if (needs & {NEED_DC}) dc[PARTS * t] = fma_(token[t].dy, h, dc[PARTS * t]);
+            if (needs & {NEED_DZ}) token[t].y = fma_(h, splat(c[t]), token[t].y);
+            if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h, dc[t]);
         }}
     }};
     if (tame) walk(exp2_tame_);
     else walk(exp2_);
     if (!(needs & {NEED_DH})) continue;
-    E dh = part_of_(dh_out, n), da = E{{}};
+    F dh = state_(dh_out, n), da = F{{}};
     for (int t = count - 1; t >= 0; --t) {{
         GradToken& own = token[t];
-        const E f = kept[t].f;
-        dh = fma_(own.dy, full_(c[t]), dh);
+        const F f = kept[t].f;
+        dh = fma_(own.dy, splat(c[t]), dh);
         GRADIENT
         own.p = fma_(q, a, own.p);
         da = fma_(q, own.rate, da);
     }}
-    part_of_(dh_out, n) = dh;
-    part_of_(da_out, n) += da;
-}} }}
+    state_(dh_out, n) = dh;
+    state_(da_out, n) += da;
+}}
 """
 _OWN = f"""
-        if (needs & {NEED_DB}) db[PARTS * t] = fma_(dh, own.du, db[PARTS * t]);
-        own.s = fma_(dh, full_(b[t]), own.s);
+        if (needs & {NEED_DB}) db[t] = fma_(dh, own.du, db[t]);
+        own.s = fma_(dh, splat(b[t]), own.s);
         dh = f * dh;
-        const E q = dh * kept[t].h;
+        const F q = dh * kept[t].h;
 """
 _GENERAL = f"""
-        const E x = own.rate * a;
+        const F x = own.rate * a;
         SLOPES
-        const E gh = g * dh;
-        if (needs & {NEED_DB}) db[PARTS * t] = fma_(gh, own.du, db[PARTS * t]);
-        own.s = fma_(gh, full_(b[t]), own.s);
-        const E q = dh * (kept[t].h * df + own.du * b[t] * dg);
+        const F gh = g * dh;
+        if (needs & {NEED_DB}) db[t] = fma_(gh, own.du, db[t]);
+        own.s = fma_(gh, splat(b[t]), own.s);
+        const F q = dh * (kept[t].h * df + own.du * b[t] * dg);
         dh = f * dh;
 """
 _GRADIENTS = {
@@ -250,10 +239,9 @@ def backward_leaves(discretization: str) -> SimpleNamespace:
     ``first`` says that the sums of dB and dC are empty yet.
     """
     factors = _FACTORS[discretization]
-    retreat_text = _OPEN + _PART + _RETREAT.replace("GRADIENT", _GRADIENTS[discretization])
-    retreat_text = retreat_text.replace("CHUNK", str(CHUNK))
+    retreat_text = _RETREAT.replace("GRADIENT", _GRADIENTS[discretization])
 
-    @wp.func_native(retreat_text.replace("FACTORS", factors))
+    @wp.func_native(_OPEN + retreat_text.replace("FACTORS", factors).replace("CHUNK", str(CHUNK)))
     def retreat(
         states: int,
         tame: int,
@@ -275,7 +263,7 @@ def backward_leaves(discretization: str) -> SimpleNamespace:
         da_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_GATHER.replace("FACTORS", factors).replace("CHUNK", str(CHUNK)))
+    @wp.func_native(_GATHER.replace("FACTORS", factors))
     def gather(
         states: int,
         tame: int,

@@ -10,36 +10,14 @@ import torch
 import warp as wp
 
 from .lanes import ACTIVATIONS, PRELUDE, WARP_DTYPES, lanes
-from .layout import CHUNK
 from .rows import ELEMENTS, rows
 
 # What is held of a token; rate is δ times a scale. The values of a token lie together: arrays of
 # 4 KiB would fall on one another in the cache.
 TOKENS = """
 struct Token { F rate, du, y; };
-// The gradient holds three times as much. To stay in the innermost cache it takes the lanes of one
-// register at a time: PARTS of a lane group.
-#if defined(__AVX512F__)
-typedef F E;
-enum { PARTS = 1 };
-auto full_ = splat;
-auto part_ = [](F v, int) { return v; };
-auto whole_ = [](const E* v, size_t) { return *v; };
-#else
-typedef float E __attribute__((vector_size(32), aligned(4)));
-enum { PARTS = 2 };
-auto full_ = [](float x) { return (E){x, x, x, x, x, x, x, x}; };
-auto part_ = [](F v, int part) {
-    return part ? __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15)
-                : __builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7);
-};
-auto whole_ = [](const E* v, size_t step) {
-    return __builtin_shufflevector(
-        v[0], v[step], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-};
-#endif
-struct GradToken { E rate, du, dy, y, s, p; };
-struct Kept { E f, h; };
+struct GradToken { F rate, du, dy, y, s, p; };
+struct Kept { F f, h; };
 auto aligned_ = [](auto* p) { return (decltype(p))(((size_t)p + 63) & ~(size_t)63); };
 """
 TOKEN, GRAD_TOKEN, KEPT = 3, 6, 2  # lanes of each
@@ -95,9 +73,7 @@ _PREPARE_GRAD = (
         const F z = read_z(t);
         dy *= z * sigmoid_(z);
     }
-    const F du = step * u, y = skip * u;
-    for (int i = 0; i < PARTS; ++i)
-        token[i * CHUNK + t] = {part_(rate, i), part_(du, i), part_(dy, i), part_(y, i), E{}, E{}};
+    token[t] = {rate, step * u, dy, skip * u, F{}, F{}};
     """
     + _CLOSE
 )
@@ -107,24 +83,21 @@ _FINISH_GRAD = """
 const GradToken* const token = aligned_((const GradToken*)scratch.data);
 const F bias = *(const F*)&bias_in, skip = *(const F*)&skip_in;
 F dskip = F{}, dbias = F{};
-// a value of token t over all lanes
-auto own_ = [&](const E& first) { return whole_(&first, CHUNK * sizeof(GradToken) / sizeof(E)); };
 const bool need_u = du_in.shape[1] > 0, need_delta = ddelta_in.shape[1] > 0;
 const bool need_z = dz_in.shape[1] > 0;
 for (int t = 0; t < count; ++t) {
     const GradToken& own = token[t];
     const F u = read_u(t);
-    dskip = fma_(own_(own.dy), u, dskip);
-    F ddelta = fma_(u, own_(own.s), own_(own.p));
+    dskip = fma_(own.dy, u, dskip);
+    F ddelta = fma_(u, own.s, own.p);
     if (use_softplus) ddelta *= sigmoid_(read_delta(t) + bias);
     dbias += ddelta;
-    const F step = own_(own.rate) * (1.0f / scale);
-    if (need_u) write_du(t, fma_(step, own_(own.s), skip * own_(own.dy)));
+    if (need_u) write_du(t, fma_(own.rate * (1.0f / scale), own.s, skip * own.dy));
     if (need_delta) write_ddelta(t, ddelta);
     if (need_z) {
         const F z = read_z(t), sig = sigmoid_(z);
         const F slope = fma_(z * sig, 1.0f - sig, sig);
-        write_dz(t, read_dout(t) * own_(own.y) * slope);
+        write_dz(t, read_dout(t) * own.y * slope);
     }
 }
 *(F*)&dskip_out.data[k] += dskip;
@@ -133,8 +106,7 @@ for (int t = 0; t < count; ++t) {
 
 
 def _leaf(text: str, **arrays: torch.dtype) -> str:
-    text = "".join(rows(name, dtype) for name, dtype in arrays.items()) + text
-    return _PRELUDE + text.replace("CHUNK", str(CHUNK))
+    return _PRELUDE + "".join(rows(name, dtype) for name, dtype in arrays.items()) + text
 
 
 @functools.cache
