@@ -42,10 +42,10 @@ class _Operands:
         self.a, self.widest = view(layout.pack(A), lanes), view(layout.pack(A.abs().amax(1)), lanes)
         self.bias = view(layout.pack(delta_bias), lanes)
 
-    def run(self, kernel, inputs: list, outputs: list) -> None:
-        """Launches a kernel of ``cpu_kernels``; names are looked up here, states are viewed."""
+    def run(self, kernel, inputs: list, outputs: list, **options) -> None:
+        """Launches a kernel of ``cpu_kernels``; inputs that are names are looked up here."""
         inputs = [getattr(self, x) if isinstance(x, str) else x for x in inputs]
-        parallel_launch(kernel(*self.kinds), self.layout.tasks, inputs, outputs)
+        parallel_launch(kernel(*self.kinds, **options), self.layout.tasks, inputs, outputs)
 
     def states(self, fill: float = 0.0) -> Tensor:
         y = self.layout
@@ -64,9 +64,10 @@ def _accumulate(s: _Operands, sizes: Sizes, b: Tensor, h: Tensor, starts: Tensor
     """Brings ``h`` from before each segment to after it; returns the products of the decays."""
     product = s.states(1.0)
     s.run(
-        cpu_kernels.states_kernel,
-        [sizes, "u", "delta", "a", "widest", b, "bias"],
-        [_flat(h), _flat(product), view(starts, lanes)],
+        cpu_kernels.forward_kernel,
+        [sizes, "u", "delta", "u", "a", "widest", b, b, "bias", "bias"],
+        [_flat(h), _flat(product), view(starts, lanes), s.u],
+        output=False,
     )
     return product
 
@@ -97,7 +98,8 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
             sizes, "u", "delta", "z", "a", "widest", b, C.float(),
             view(layout.pack(D), lanes), "bias",
         ],
-        [_flat(h), view(starts, lanes), out],
+        [_flat(h), _flat(h), view(starts, lanes), out],
+        output=True,
     )  # fmt: skip
     return out, layout.unpack(h[-1], (layout.batch,)), starts
 

@@ -87,11 +87,16 @@ def _place(sizes: Sizes, task: int) -> Place:
 
 
 @functools.cache
-def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
-    """From the states before each segment, in ``h_out``, to those after it, and the output."""
+def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str, output: bool):
+    """From the states before each segment, in ``h_out``, to those after it.
+
+    With ``output`` it computes y; else it multiplies the decays into ``product_out``, and z, C and
+    skip are not used.
+    """
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
     token, state = tokens.forward_leaves(io, delta_io), recurrence.forward_leaves(discretization)
-    prepare, finish, advance = token.prepare, token.finish, state.advance
+    prepare, finish = token.prepare, token.finish
+    advance, accumulate = state.advance, state.accumulate
     scale = SCALES[discretization]
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -110,6 +115,7 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
         bias_in: wp.array(dtype=lanes),
         # out
         h_out: wp.array3d(dtype=lanes),
+        product_out: wp.array3d(dtype=lanes),
         starts_out: wp.array4d(dtype=lanes),
         y_out: wp.array3d(dtype=scalar),
     ):
@@ -132,64 +138,19 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
                     widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus, sizes.use_z,
                     wp.static(scale), token,
                 )  # fmt: skip
-                advance(
-                    sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, c_in,
-                    token, h,
-                )  # fmt: skip
-                finish(z_in, p.b, t0, count, d, width, sizes.use_z, token, y_out)
+                if wp.static(output):
+                    advance(
+                        sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, c_in, token, h
+                    )
+                    finish(z_in, p.b, t0, count, d, width, sizes.use_z, token, y_out)
+                else:
+                    accumulate(
+                        sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, token, h,
+                        product_out[p.state, k],
+                    )  # fmt: skip
         restore_denormals(before)
 
     return scan_forward
-
-
-@functools.cache
-def states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
-    """As ``forward_kernel`` without output, and the products of the decays."""
-    scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
-    prepare = tokens.forward_leaves(io, delta_io).prepare
-    accumulate = recurrence.forward_leaves(discretization).accumulate
-    scale = SCALES[discretization]
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def scan_states(
-        offset: int,
-        # in
-        sizes: Sizes,
-        u_in: wp.array3d(dtype=scalar),
-        delta_in: wp.array3d(dtype=delta_scalar),
-        a_in: wp.array2d(dtype=lanes),
-        widest_in: wp.array(dtype=lanes),
-        b_in: wp.array4d(dtype=wp.float32),
-        bias_in: wp.array(dtype=lanes),
-        # out
-        h_out: wp.array3d(dtype=lanes),
-        product_out: wp.array3d(dtype=lanes),
-        starts_out: wp.array4d(dtype=lanes),
-    ):
-        p = _place(sizes, offset + wp.tid())
-        token = wp.zeros(shape=(_TOKENS,), dtype=lanes)
-        before = flush_denormals()
-        for strip in range((p.end - p.begin + _S - 1) / _S):
-            t0 = p.begin + strip * _S
-            count = wp.min(_S, p.end - t0)
-            for j in range(p.blocks):
-                k = p.k + j
-                h = h_out[p.state, k]
-                if starts_out.shape[1] > 0 and t0 % _K == 0:
-                    for n in range(sizes.states):
-                        starts_out[p.b, t0 / _K, k, n] = h[n]
-                tame = prepare(
-                    u_in, delta_in, u_in, p.b, t0, count, p.d + j * _W, p.width - j * _W, j,
-                    p.blocks, _S, p.end, widest_in[k], bias_in[k], bias_in[k],
-                    sizes.use_softplus, 0, wp.static(scale), token,
-                )  # fmt: skip
-                accumulate(
-                    sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, token,
-                    h, product_out[p.state, k],
-                )  # fmt: skip
-        restore_denormals(before)
-
-    return scan_states
 
 
 @functools.cache
