@@ -25,7 +25,7 @@ FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
 # Tokens that run through the blocks together where a CPU keeps nothing for a gradient: temporaries
 # are small enough to be used again at once, not got anew from the system page by page.
-SEGMENT = 4096
+SEGMENT = 2048
 # Of checkpoint metadata; extra_metadata may use any other key.
 _OWN_KEYS = ("format", "config", "encoder_sha256")
 

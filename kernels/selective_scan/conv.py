@@ -10,16 +10,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..interop import cuda_launch, lane_contiguous, parallel_launch, view
+from ..interop import cuda_launch, empty, lane_contiguous, parallel_launch, view
 from . import rows as cpu_values
 from . import scalars as cuda_values
 from .lanes import WARP_DTYPES
 
 TAPS = 4
-CHUNK = 256  # tokens of a task; the gradient of the weight is summed in these, then over them
+STRIP = 16  # tokens of a forward task: few rows at once, for each is of another page
+CHUNK = 64  # of a backward one; the gradient of the weight is summed in these, then over them
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 ACTIVATIONS = (None, "silu", "swish")
 
+_S = wp.constant(STRIP)
 _K = wp.constant(CHUNK)
 _HISTORY = wp.constant(TAPS - 1)
 
@@ -40,7 +42,7 @@ def _forward_kernel(device_type: str, io: torch.dtype):
     def conv_forward(
         offset: int,
         # in
-        chunks: int,
+        strips: int,
         use_silu: int,
         x_in: wp.array3d(dtype=scalar),
         weight_in: wp.array2d(dtype=value),
@@ -51,8 +53,8 @@ def _forward_kernel(device_type: str, io: torch.dtype):
     ):
         task, k = wp.tid()
         task = task + offset
-        b = task / chunks
-        t0 = (task % chunks) * _K
+        b = task / strips
+        t0 = (task % strips) * _S
         d = k * wp.static(channels_of_value)
         width = wp.min(wp.static(channels_of_value), x_in.shape[2] - d)
         w0, w1, w2, w3 = weight_in[0, k], weight_in[1, k], weight_in[2, k], weight_in[3, k]
@@ -65,7 +67,7 @@ def _forward_kernel(device_type: str, io: torch.dtype):
                 x2 = load(x_in, b, t, d, width)
             elif state_in.shape[1] > 0:
                 x2 = load(state_in, b, t + _HISTORY, d, width)
-        for t in range(t0, wp.min(t0 + _K, x_in.shape[1])):
+        for t in range(t0, wp.min(t0 + _S, x_in.shape[1])):
             x3 = load(x_in, b, t, d, width)
             y = fma(w0, x0, fma(w1, x1, fma(w2, x2, fma(w3, x3, bias_in[k]))))
             if use_silu != 0:
@@ -158,6 +160,10 @@ def _backward_kernel(device_type: str, io: torch.dtype):
     return conv_backward
 
 
+def _empty(like: Tensor, shape: tuple[int, ...]) -> Tensor:
+    return empty(shape, like.dtype) if like.device.type == "cpu" else like.new_empty(shape)
+
+
 def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
     """``[D, rows]`` to float32 ``[rows, channels]``, zeros in front of too few rows."""
     packed = torch.zeros(rows, channels, device=like.device)
@@ -191,12 +197,12 @@ def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list
 def _conv(
     x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None, silu: bool
 ) -> Tensor:
-    chunks = -(-x.shape[1] // CHUNK)
+    strips = -(-x.shape[1] // STRIP)
     x = lane_contiguous(x)
     blocks, w, v, rows = _operands(x, weight, bias, state)
     out = torch.empty(x.shape, dtype=x.dtype, device=x.device)
     kernel = _forward_kernel(x.device.type, x.dtype)
-    _launch(x, kernel, (x.shape[0] * chunks, blocks), [chunks, int(silu), x, w, v, rows], [out])
+    _launch(x, kernel, (x.shape[0] * strips, blocks), [strips, int(silu), x, w, v, rows], [out])
     return out
 
 
@@ -221,7 +227,7 @@ def _conv_backward(
     x = lane_contiguous(x)
     m = cpu_values if x.device.type == "cpu" else cuda_values
     blocks, w, v, rows = _operands(x, weight, bias, state)
-    dx = x.new_empty(batch, length if need_x else 0, channels)
+    dx = _empty(x, (batch, length if need_x else 0, channels))
     dstate = x.new_zeros(batch, TAPS - 1 if need_state else 0, channels)
     dweight = torch.empty(
         batch * chunks, 5 if need_weight or need_bias else 0, blocks * m.WIDTH, device=x.device
