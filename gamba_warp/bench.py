@@ -72,7 +72,7 @@ def bench_command(
     for op, module in modules.items():
         cases += [case for case in module.cases(settings) if case.op == op]
         targets += [t for t in module.targets(settings) if t.times[0].op == op]
-    with tqdm(total=len(cases), unit="case", desc="bench") as bar:
+    with tqdm(total=len(cases), unit="case", desc="bench", disable=None) as bar:
         document = measure(cases, settings, _progress(bar))
     document["machine"]["peers"] = versions() if peers else {}
     document["targets"] = judge(targets, document["records"])
