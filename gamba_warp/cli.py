@@ -14,6 +14,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("gamba_warp.demo:demo_command", "Train, reconstruct and evaluate on the starter set."),
     "reconstruct": ("gamba_warp.reconstruct:reconstruct_command", "Pictures to 3D Gaussians."),
     "train": ("gamba_warp.train.__main__:train_command", "Train a model on posed views."),
+    "fit": ("gamba_warp.fit_command:fit_command", "Posed views of an object to 3D Gaussians."),
     "data furniture": ("gamba_warp.train.data.furniture:furniture_command", "Get 820 models."),
     "data render": ("gamba_warp.train.data.render:render_command", "Meshes to posed views."),
     "eval-views": ("gamba_warp.eval.views:eval_views_command", "PSNR, SSIM, LPIPS of views."),
