@@ -18,6 +18,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from . import team
+
 if wp.config.log_level == wp.LOG_INFO:  # the default; a level that somebody chose stays
     wp.config.log_level = wp.LOG_WARNING
 
@@ -165,6 +167,9 @@ def parallel_launch(
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
     kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
     cuts = [dim[0] * i // pieces for i in range(pieces + 1)]
+    if threads > 1 and team.has_team():
+        dims = [(end - begin, *dim[1:]) for begin, end in zip(cuts[:-1], cuts[1:])]
+        return team.run(kernel, dims, arguments, threads)
     todo = iter(list(zip(cuts[:-1], cuts[1:])))
 
     def work() -> None:

@@ -14,13 +14,13 @@ from ..constants import T_MIN, TILE
 from ..interop import parallel_launch, view
 from . import lanes as L
 from .bin import SLACK, SLACK_ABS, Bins
+from .blend import blend, unblend
 from .frame import Frame, Walk, color_row
+from .lanes import lanes, lanes_int
 from .launch import vectors
 
 # Unrolled, the loops over blocks and pixels would take the compiler long for no gain.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
-
-PIECES = 16  # of a launch: tiles differ in work
 
 _TILE = wp.constant(TILE)
 _T_MIN = wp.constant(T_MIN)
@@ -40,104 +40,118 @@ def _blocks_inside(frame: Frame, x: int, y: int) -> int:
     return bits
 
 
+@wp.func
+def _limit(frame: Frame, opacity: wp.float32) -> wp.float32:
+    return 2.0 * wp.log(opacity / frame.alpha_min) * _SLACK + _SLACK_ABS
+
+
 @wp.kernel
 def _composite(
     offset: wp.int32,
     frame: Frame,
+    tiles: wp.int32,
     means2d_in: wp.array[wp.vec2],
     conics_in: wp.array[wp.vec3],
     view_opacities_in: wp.array[wp.float32],
     colors_in: wp.array2d[wp.float32],
     pairs_in: wp.array[wp.int32],
     starts_in: wp.array[wp.int32],
-    transmittances_out: wp.array[L.lanes],
-    sums_out: wp.array2d[L.lanes],
-    stops_out: wp.array[L.lanes_int],
+    counter_out: wp.array[wp.int32],
+    room_out: wp.array2d[lanes],
+    transmittances_out: wp.array[lanes],
+    stops_out: wp.array[lanes_int],
     blocks_out: wp.array[wp.int32],
     walked_out: wp.array[wp.int32],
     renders_out: wp.array4d[wp.float32],
     alphas_out: wp.array4d[wp.float32],
 ):
-    tile = offset + wp.tid()
-    image = tile // (frame.tiles_x * frame.tiles_y)
-    x = tile % frame.tiles_x * _TILE
-    y = tile // frame.tiles_x % frame.tiles_y * _TILE
-    xs = L.block_x(float(x) + 0.5)
-    ys = L.block_y(float(y) + 0.5)
+    """Room to work: counter, the next tile to take; room, the colour sums of a worker's tile."""
+    worker = offset + wp.tid()
     channels = colors_in.shape[1]
-    first = tile * 16
-    walked_out[tile] = 0
-    if starts_in[tile] == starts_in[tile + 1]:
-        return
-    for b in range(16):
-        transmittances_out[first + b] = L.lanes(1.0)
-        stops_out[first + b] = L.lanes_int(_NEVER)
-        for c in range(channels):
-            sums_out[first + b, c] = L.lanes(0.0)
+    tile = L.take(counter_out)
+    while tile < tiles:
+        begin = starts_in[tile]
+        end = starts_in[tile + 1]
+        walked_out[tile] = 0
+        if begin < end:
+            image = tile // (frame.tiles_x * frame.tiles_y)
+            x = tile % frame.tiles_x * _TILE
+            y = tile // frame.tiles_x % frame.tiles_y * _TILE
+            xs = L.block_x(float(x) + 0.5)
+            ys = L.block_y(float(y) + 0.5)
+            first = tile * 16
+            for b in range(16):
+                transmittances_out[first + b] = lanes(1.0)
+                stops_out[first + b] = lanes_int(_NEVER)
+            for i in range(16 * channels):
+                room_out[worker, i] = lanes(0.0)
 
-    alive = _blocks_inside(frame, x, y)
-    k = starts_in[tile]
-    while k < starts_in[tile + 1] and alive != 0:
-        g = pairs_in[k]
-        row = color_row(frame, g)
-        mean = means2d_in[g]
-        conic = conics_in[g]
-        shear = conic[1]
-        opacity = view_opacities_in[g]
-        limit = 2.0 * wp.log(opacity / frame.alpha_min) * _SLACK + _SLACK_ABS
-        slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
-        bits = alive & L.blocks_touched(
-            xs, ys, mean[0], mean[1], conic[0], shear, conic[2], slope, limit
-        )
-        used = wp.int32(0)
-        while bits != 0:
-            b = L.lowest_bit(bits)
-            bits = bits & (bits - 1)
-            dx = float(x + (b % 4) * 4) + 0.5 - mean[0]
-            dy = float(y + (b // 4) * 4) + 0.5 - mean[1]
-            alpha = L.alphas(
-                L.sheared(shear, dx + shear * dy),
-                L.rows(dy),
-                _EXP2 * conic[0],
-                _EXP2 * conic[2],
-                opacity,
-                frame.alpha_min,
-                frame.alpha_max,
-            )
-            if L.any_nonzero(alpha) != 0:
-                used = used | (1 << b)
-                before = transmittances_out[first + b]
-                after = L.advance(before, alpha, _T_MIN)
-                weight = L.weights(before, after, alpha)
-                transmittances_out[first + b] = after
-                for c in range(channels):
-                    sums_out[first + b, c] = L.axpy(
-                        weight, colors_in[row, c], sums_out[first + b, c]
+            inside = _blocks_inside(frame, x, y)
+            alive = inside
+            k = begin
+            while k < end and alive != 0:
+                g = pairs_in[k]
+                mean = means2d_in[g]
+                conic = conics_in[g]
+                shear = conic[1]
+                opacity = view_opacities_in[g]
+                slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
+                bits = alive & L.blocks_touched(
+                    xs,
+                    ys,
+                    mean[0],
+                    mean[1],
+                    conic[0],
+                    shear,
+                    conic[2],
+                    slope,
+                    _limit(frame, opacity),
+                )
+                used = wp.int32(0)
+                if bits != 0:
+                    used = blend(
+                        bits,
+                        k,
+                        float(x) + 0.5 - mean[0],
+                        float(y) + 0.5 - mean[1],
+                        shear,
+                        _EXP2 * conic[0],
+                        _EXP2 * conic[2],
+                        opacity,
+                        frame.alpha_min,
+                        frame.alpha_max,
+                        _T_MIN,
+                        colors_in,
+                        color_row(frame, g),
+                        first,
+                        worker,
+                        transmittances_out,
+                        stops_out,
+                        room_out,
                     )
-                if L.any_stopped(before, after) != 0:
-                    stops_out[first + b] = L.record_stops(stops_out[first + b], before, after, k)
-                    if L.any_positive(after) == 0:
-                        alive = alive & ~(1 << b)
-        blocks_out[k] = used
-        k += 1
-    walked_out[tile] = k - starts_in[tile]
+                    alive = alive & ~(used >> 16)
+                blocks_out[k] = used & 0xFFFF
+                k += 1
+            walked_out[tile] = k - begin
 
-    inside = _blocks_inside(frame, x, y)
-    while inside != 0:
-        b = L.lowest_bit(inside)
-        inside = inside & (inside - 1)
-        px = x + (b % 4) * 4
-        py = y + (b // 4) * 4
-        covered = L.coverage(transmittances_out[first + b])
-        L.store_block(alphas_out, image, py, px, 0, covered)
-        for c in range(channels):
-            L.store_block(renders_out, image, py, px, c, sums_out[first + b, c])
+            while inside != 0:
+                b = L.lowest_bit(inside)
+                inside = inside & (inside - 1)
+                px = x + (b % 4) * 4
+                py = y + (b // 4) * 4
+                L.store_block(
+                    alphas_out, image, py, px, 0, L.coverage(transmittances_out[first + b])
+                )
+                for c in range(channels):
+                    L.store_block(renders_out, image, py, px, c, room_out[worker, b * channels + c])
+        tile = L.take(counter_out)
 
 
 @wp.kernel
 def _composite_vjp(
     offset: wp.int32,
     frame: Frame,
+    tiles: wp.int32,
     geometry: wp.int32,
     means2d_in: wp.array[wp.vec2],
     conics_in: wp.array[wp.vec3],
@@ -146,115 +160,79 @@ def _composite_vjp(
     pairs_in: wp.array[wp.int32],
     rows_in: wp.array[wp.int32],
     starts_in: wp.array[wp.int32],
-    transmittances_in: wp.array[L.lanes],
-    stops_in: wp.array[L.lanes_int],
+    transmittances_in: wp.array[lanes],
+    stops_in: wp.array[lanes_int],
     blocks_in: wp.array[wp.int32],
     walked_in: wp.array[wp.int32],
     v_renders_in: wp.array4d[wp.float32],
     v_alphas_in: wp.array4d[wp.float32],
-    v_sums_out: wp.array2d[L.lanes],
-    v_colors_out: wp.array2d[L.lanes],
+    counter_out: wp.array[wp.int32],
+    room_out: wp.array2d[lanes],
     v_pairs_out: wp.array2d[wp.float32],
     skipped_out: wp.array[wp.int32],
 ):
-    """Room to work: v_sums, upstream gradients by lanes; v_colors, those of one pair's colour."""
-    tile = offset + wp.tid()
-    image = tile // (frame.tiles_x * frame.tiles_y)
-    x = tile % frame.tiles_x * _TILE
-    y = tile // frame.tiles_x % frame.tiles_y * _TILE
+    """Room to work: counter, the next tile to take; room as ``unblend`` has it."""
+    worker = offset + wp.tid()
     channels = colors_in.shape[1]
-    first = tile * 16
-    walked = walked_in[tile]
-    skipped_out[tile] = 1
-    if walked == 0:
-        return
-
-    any_v = wp.int32(0)
-    inside = _blocks_inside(frame, x, y)
-    while inside != 0:
-        b = L.lowest_bit(inside)
-        inside = inside & (inside - 1)
-        px = x + (b % 4) * 4
-        py = y + (b // 4) * 4
-        v_alpha = L.load_block(v_alphas_in, image, py, px, 0)
-        v_sums_out[first + b, channels] = v_alpha
-        any_v = any_v | L.any_nonzero(v_alpha)
-        for c in range(channels):
-            v_c = L.load_block(v_renders_in, image, py, px, c)
-            v_sums_out[first + b, c] = v_c
-            any_v = any_v | L.any_nonzero(v_c)
-    if any_v == 0:
-        return
-    skipped_out[tile] = 0
-
-    T = wp.zeros(shape=16, dtype=L.lanes)
-    R = wp.zeros(shape=16, dtype=L.lanes)
-    for b in range(16):
-        T[b] = L.absolute(transmittances_in[first + b])
-    k = starts_in[tile] + walked - 1
-    while k >= starts_in[tile]:
-        bits = blocks_in[k]
-        if bits != 0:
-            g = pairs_in[k]
-            row = color_row(frame, g)
-            mean = means2d_in[g]
-            conic = conics_in[g]
-            shear = conic[1]
-            opacity = view_opacities_in[g]
-            sum_h = L.lanes(0.0)
-            sum_u = L.lanes(0.0)
-            sum_y = L.lanes(0.0)
-            sum_uu = L.lanes(0.0)
-            sum_uy = L.lanes(0.0)
-            sum_yy = L.lanes(0.0)
+    upstream = 32 + channels
+    tile = L.take(counter_out)
+    while tile < tiles:
+        image = tile // (frame.tiles_x * frame.tiles_y)
+        x = tile % frame.tiles_x * _TILE
+        y = tile // frame.tiles_x % frame.tiles_y * _TILE
+        first = tile * 16
+        any_v = wp.int32(0)
+        inside = wp.int32(0)
+        if walked_in[tile] > 0:
+            inside = _blocks_inside(frame, x, y)
+        while inside != 0:
+            b = L.lowest_bit(inside)
+            inside = inside & (inside - 1)
+            px = x + (b % 4) * 4
+            py = y + (b // 4) * 4
+            place = upstream + b * (channels + 1)
+            v_alpha = L.load_block(v_alphas_in, image, py, px, 0)
+            room_out[worker, place + channels] = v_alpha
+            any_v = any_v | L.any_nonzero(v_alpha)
             for c in range(channels):
-                v_colors_out[tile, c] = L.lanes(0.0)
-            while bits != 0:
-                b = L.lowest_bit(bits)
-                bits = bits & (bits - 1)
-                dx = float(x + (b % 4) * 4) + 0.5 - mean[0]
-                dy = float(y + (b // 4) * 4) + 0.5 - mean[1]
-                u = L.sheared(shear, dx + shear * dy)
-                v = L.rows(dy)
-                alpha = L.alphas(
-                    u,
-                    v,
-                    _EXP2 * conic[0],
-                    _EXP2 * conic[2],
-                    opacity,
-                    frame.alpha_min,
-                    frame.alpha_max,
-                )
-                alpha = L.before_stop(alpha, stops_in[first + b], k)
-                T[b] = L.rewind(T[b], alpha)
-                weight = L.mul(T[b], alpha)
-                s = v_sums_out[first + b, channels]
-                for c in range(channels):
-                    v_c = v_sums_out[first + b, c]
-                    s = L.axpy(v_c, colors_in[row, c], s)
-                    v_colors_out[tile, c] = L.fma(weight, v_c, v_colors_out[tile, c])
-                if geometry != 0:
-                    diff = L.sub(s, R[b])
-                    R[b] = L.fma(alpha, diff, R[b])
-                    h = L.alpha_gradients(alpha, weight, diff, frame.alpha_max)
-                    hu = L.mul(h, u)
-                    hy = L.mul(h, v)
-                    sum_h = L.add(sum_h, h)
-                    sum_u = L.add(sum_u, hu)
-                    sum_y = L.add(sum_y, hy)
-                    sum_uu = L.fma(hu, u, sum_uu)
-                    sum_uy = L.fma(hu, v, sum_uy)
-                    sum_yy = L.fma(hy, v, sum_yy)
-            out = rows_in[k]
-            v_pairs_out[out, 0] = L.total(sum_h)
-            v_pairs_out[out, 1] = L.total(sum_u)
-            v_pairs_out[out, 2] = L.total(sum_y)
-            v_pairs_out[out, 3] = L.total(sum_uu)
-            v_pairs_out[out, 4] = L.total(sum_uy)
-            v_pairs_out[out, 5] = L.total(sum_yy)
-            for c in range(channels):
-                v_pairs_out[out, 6 + c] = L.total(v_colors_out[tile, c])
-        k -= 1
+                v_c = L.load_block(v_renders_in, image, py, px, c)
+                room_out[worker, place + c] = v_c
+                any_v = any_v | L.any_nonzero(v_c)
+        skipped_out[tile] = wp.where(any_v == 0, 1, 0)
+        if any_v != 0:
+            for b in range(16):
+                room_out[worker, b] = L.absolute(transmittances_in[first + b])
+                room_out[worker, 16 + b] = lanes(0.0)
+            k = starts_in[tile] + walked_in[tile] - 1
+            while k >= starts_in[tile]:
+                bits = blocks_in[k]
+                if bits != 0:
+                    g = pairs_in[k]
+                    mean = means2d_in[g]
+                    conic = conics_in[g]
+                    unblend(
+                        bits,
+                        k,
+                        geometry,
+                        float(x) + 0.5 - mean[0],
+                        float(y) + 0.5 - mean[1],
+                        conic[1],
+                        _EXP2 * conic[0],
+                        _EXP2 * conic[2],
+                        view_opacities_in[g],
+                        frame.alpha_min,
+                        frame.alpha_max,
+                        colors_in,
+                        color_row(frame, g),
+                        first,
+                        worker,
+                        stops_in,
+                        room_out,
+                        rows_in[k],
+                        v_pairs_out,
+                    )
+                k -= 1
+        tile = L.take(counter_out)
 
 
 def composite_forward(
@@ -282,7 +260,7 @@ def composite_forward(
     tiles = images * frame.tiles_x * frame.tiles_y
     renders = colors.new_zeros(images, frame.height, frame.width, channels)
     alphas = colors.new_zeros(images, frame.height, frame.width, 1)
-    sums = colors.new_empty(tiles * 16, channels, 16)
+    workers = torch.get_num_threads()
     walk = Walk(
         colors.new_empty(tiles * 16, 16),
         bins.pairs.new_empty(tiles * 16, 16),
@@ -291,9 +269,10 @@ def composite_forward(
     )
     parallel_launch(
         _composite,
-        tiles,
+        workers,
         [
             frame,
+            tiles,
             vectors(means2d, wp.vec2),
             vectors(conics, wp.vec3),
             view_opacities.view(-1),
@@ -302,15 +281,15 @@ def composite_forward(
             bins.starts,
         ],
         [
-            view(walk.transmittances, L.lanes),
-            view(sums, L.lanes),
-            view(walk.stops, L.lanes_int),
+            bins.pairs.new_zeros(1),
+            view(colors.new_empty(workers, 16 * channels, 16), lanes),
+            view(walk.transmittances, lanes),
+            view(walk.stops, lanes_int),
             walk.blocks,
             walk.walked,
             renders,
             alphas,
         ],
-        pieces=PIECES,
     )
     return renders, alphas, walk
 
@@ -347,11 +326,13 @@ def composite_backward(
     tiles, channels = walk.walked.numel(), colors.shape[1]
     v_pairs = colors.new_zeros(bins.pairs.numel(), 6 + channels)
     skipped = torch.empty_like(walk.walked)
+    workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)
     parallel_launch(
         _composite_vjp,
-        tiles,
+        workers,
         [
             frame,
+            tiles,
             int(geometry),
             vectors(means2d, wp.vec2),
             vectors(conics, wp.vec3),
@@ -360,19 +341,18 @@ def composite_backward(
             bins.pairs,
             bins.rows,
             bins.starts,
-            view(walk.transmittances, L.lanes),
-            view(walk.stops, L.lanes_int),
+            view(walk.transmittances, lanes),
+            view(walk.stops, lanes_int),
             walk.blocks,
             walk.walked,
             v_renders,
             v_alphas,
         ],
         [
-            view(colors.new_empty(tiles * 16, channels + 1, 16), L.lanes),
-            view(colors.new_empty(tiles, channels, 16), L.lanes),
+            bins.pairs.new_zeros(1),
+            view(colors.new_empty(workers, room, 16), lanes),
             v_pairs,
             skipped,
         ],
-        pieces=PIECES,
     )
     return v_pairs, skipped

@@ -1,0 +1,182 @@
+"""Native inner loops of the CPU compositor: one Gaussian over the 4 x 4 blocks that it touches.
+
+Lanes are the 16 pixels of a block; README.md §3 and §5 hold the maths. Blocks come as a mask, one
+bit each. What a worker needs for its tile (sums, upstream gradients) lies in rows of ``room``.
+"""
+
+import warp as wp
+
+from .lanes import TYPES, lanes, lanes_int
+
+# alpha of a block's pixels. The exponent is rounded to an integer n by adding 1.5 * 2^23 (+127, the
+# bias), 2^rest is a minimax polynomial. ``a`` and ``e`` of the conic come with -log2(e)/2.
+_ALPHA = """
+    const F U0 = X + Y * shear;
+    const F shifter = F{} + 12583039.0f;
+    auto alpha_ = [&](F U, F V) -> F {
+        F x = fma_(U * a, U, V * V * e);
+        x = max_(x, F{} - 126.0f);
+        const F n = x + shifter;
+        const F f = x - (n - shifter);
+        F p = F{} + 1.5353360628288064e-4f;
+        p = fma_(p, f, F{} + 1.3398874866584892e-3f);
+        p = fma_(p, f, F{} + 9.618437366421834e-3f);
+        p = fma_(p, f, F{} + 5.5503324696939e-2f);
+        p = fma_(p, f, F{} + 0.24022647913498998f);
+        p = fma_(p, f, F{} + 0.6931472028559706f);
+        p = fma_(p, f, F{} + 1.0f);
+        return p * (F)((I)n << 23) * opacity;
+    };
+"""
+
+# A pixel that has stopped keeps its transmittance, above t_min, with a minus sign. T itself is not
+# chosen by a mask: that would become a masked store, from which the next load cannot forward.
+_BLEND = (
+    TYPES
+    + _ALPHA
+    + """
+    F* const Ts = (F*)transmittances.data + first;
+    I* const ends = (I*)stops.data + first;
+    F* const sums = (F*)room.data + (size_t)worker * room.shape[1];
+    const int channels = colors.shape[1];
+    const float* const color = colors.data + (size_t)row * channels;
+    unsigned used = 0, dead = 0;
+    while (bits) {
+        const int b = __builtin_ctz(bits);
+        bits &= bits - 1;
+        const float y = dy + (float)(b & 12), x = dx + (float)(4 * (b & 3));
+        const F T = Ts[b];
+        F alpha = alpha_(U0 + (x + shear * y), Y + y);
+        alpha = (alpha >= alpha_min) & (T > 0.0f) ? min_(alpha, F{} + alpha_max) : F{};
+        const F next = T - T * alpha;
+        const I stays = max_(next, -next) > t_min;
+        const F weight = stays ? T * alpha : F{};
+        Ts[b] = stays ? next : -T;
+        if (!any_(weight > 0.0f)) {
+            if (all_(stays)) continue;
+        } else {
+            used |= 1u << b;
+            F* const sum = sums + b * channels;
+            for (int c = 0; c < channels; ++c) sum[c] = fma_(weight, F{} + color[c], sum[c]);
+        }
+        if (!all_(stays)) {
+            ends[b] = stays ? ends[b] : I{} + k;
+            if (!any_(Ts[b] > 0.0f)) dead |= 1u << b;
+        }
+    }
+    return (int)(used | dead << 16);
+"""
+)
+
+
+@wp.func_native(_BLEND)
+def blend(
+    bits: wp.int32,
+    k: wp.int32,
+    dx: wp.float32,
+    dy: wp.float32,
+    shear: wp.float32,
+    a: wp.float32,
+    e: wp.float32,
+    opacity: wp.float32,
+    alpha_min: wp.float32,
+    alpha_max: wp.float32,
+    t_min: wp.float32,
+    colors: wp.array2d[wp.float32],
+    row: wp.int32,
+    first: wp.int32,
+    worker: wp.int32,
+    transmittances: wp.array[lanes],
+    stops: wp.array[lanes_int],
+    room: wp.array2d[lanes],
+) -> wp.int32:
+    """Blends pair k into the blocks of ``bits``; ``dx, dy`` lead from its centre to the tile.
+
+    Transmittances and stops of the tile's blocks begin at ``first``; ``room[worker]`` holds the
+    colour sums. Returns the blocks it contributed to, and in the upper half those it ended.
+    """
+    ...
+
+
+# Accumulators stay in registers over the blocks; the totals go to the pair's row.
+_UNBLEND = (
+    TYPES
+    + _ALPHA
+    + """
+    const I* const ends = (const I*)stops.data + first;
+    const int channels = colors.shape[1];
+    F* const mine = (F*)room.data + (size_t)worker * room.shape[1];
+    F *const Ts = mine, *const Rs = mine + 16, *const v_colors = mine + 32;
+    const F* const v_sums = v_colors + channels;
+    const float* const color = colors.data + (size_t)row * channels;
+    F h0 = {}, hu = {}, hy = {}, huu = {}, huy = {}, hyy = {};
+    for (int c = 0; c < channels; ++c) v_colors[c] = F{};
+    while (bits) {
+        const int b = __builtin_ctz(bits);
+        bits &= bits - 1;
+        const float y = dy + (float)(b & 12), x = dx + (float)(4 * (b & 3));
+        const F U = U0 + (x + shear * y), V = Y + y;
+        F alpha = alpha_(U, V);
+        alpha = (alpha >= alpha_min) & (ends[b] > k) ? min_(alpha, F{} + alpha_max) : F{};
+        const F T = Ts[b] / (1.0f - alpha);
+        Ts[b] = T;
+        const F weight = T * alpha;
+        const F* const v = v_sums + b * (channels + 1);
+        F s = v[channels];
+        for (int c = 0; c < channels; ++c) {
+            s = fma_(v[c], F{} + color[c], s);
+            v_colors[c] = fma_(weight, v[c], v_colors[c]);
+        }
+        if (geometry) {
+            const F diff = s - Rs[b];
+            Rs[b] = fma_(alpha, diff, Rs[b]);
+            const F h = alpha < alpha_max ? weight * diff : F{};
+            const F u = h * U, w = h * V;
+            h0 += h;
+            hu += u;
+            hy += w;
+            huu = fma_(u, U, huu);
+            huy = fma_(u, V, huy);
+            hyy = fma_(w, V, hyy);
+        }
+    }
+    float* const out = v_pairs.data + (size_t)pair * v_pairs.shape[1];
+    out[0] = total_(h0);
+    out[1] = total_(hu);
+    out[2] = total_(hy);
+    out[3] = total_(huu);
+    out[4] = total_(huy);
+    out[5] = total_(hyy);
+    for (int c = 0; c < channels; ++c) out[6 + c] = total_(v_colors[c]);
+"""
+)
+
+
+@wp.func_native(_UNBLEND)
+def unblend(
+    bits: wp.int32,
+    k: wp.int32,
+    geometry: wp.int32,
+    dx: wp.float32,
+    dy: wp.float32,
+    shear: wp.float32,
+    a: wp.float32,
+    e: wp.float32,
+    opacity: wp.float32,
+    alpha_min: wp.float32,
+    alpha_max: wp.float32,
+    colors: wp.array2d[wp.float32],
+    row: wp.int32,
+    first: wp.int32,
+    worker: wp.int32,
+    stops: wp.array[lanes_int],
+    room: wp.array2d[lanes],
+    pair: wp.int32,
+    v_pairs: wp.array2d[wp.float32],
+):
+    """Takes pair k back out of the blocks of ``bits`` and writes its gradient sums to row ``pair``.
+
+    ``room[worker]`` holds 16 transmittances, 16 values R behind, C accumulators, and for each block
+    the C + 1 upstream gradients. Without ``geometry`` the first six sums are 0.
+    """
+    ...
