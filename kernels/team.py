@@ -52,7 +52,7 @@ class _Job(ctypes.Structure):
     """
 )
 def _run_job(parallel: wp.uint64, job: wp.uint64, threads: wp.int32):
-    """Calls OpenMP's ``parallel`` so that each thread of the team takes pieces until none is left."""
+    """Calls OpenMP's ``parallel``: each thread of the team takes pieces until none is left."""
     ...
 
 

@@ -47,7 +47,7 @@ _BLEND = (
         const float y = dy + (float)(b & 12), x = dx + (float)(4 * (b & 3));
         const F T = Ts[b];
         F alpha = alpha_(U0 + (x + shear * y), Y + y);
-        alpha = (alpha >= alpha_min) & (T > 0.0f) ? min_(alpha, F{} + alpha_max) : F{};
+        alpha = ((alpha >= alpha_min) & (T > 0.0f)) ? min_(alpha, F{} + alpha_max) : F{};
         const F next = T - T * alpha;
         const I stays = max_(next, -next) > t_min;
         const F weight = stays ? T * alpha : F{};
@@ -117,7 +117,7 @@ _UNBLEND = (
         const float y = dy + (float)(b & 12), x = dx + (float)(4 * (b & 3));
         const F U = U0 + (x + shear * y), V = Y + y;
         F alpha = alpha_(U, V);
-        alpha = (alpha >= alpha_min) & (ends[b] > k) ? min_(alpha, F{} + alpha_max) : F{};
+        alpha = ((alpha >= alpha_min) & (ends[b] > k)) ? min_(alpha, F{} + alpha_max) : F{};
         const F T = Ts[b] / (1.0f - alpha);
         Ts[b] = T;
         const F weight = T * alpha;

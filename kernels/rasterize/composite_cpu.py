@@ -13,19 +13,18 @@ from torch import Tensor
 from ..constants import T_MIN, TILE
 from ..interop import parallel_launch, view
 from . import lanes as L
-from .bin import SLACK, SLACK_ABS, Bins
+from .bin import Bins
 from .blend import blend, unblend
 from .frame import Frame, Walk, color_row
 from .lanes import lanes, lanes_int
 from .launch import vectors
+from .tiles import q_limit
 
 # Unrolled, the loops over blocks and pixels would take the compiler long for no gain.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _TILE = wp.constant(TILE)
 _T_MIN = wp.constant(T_MIN)
-_SLACK = wp.constant(SLACK)
-_SLACK_ABS = wp.constant(SLACK_ABS)
 _NEVER = wp.constant(2**31 - 1)
 _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
 
@@ -38,11 +37,6 @@ def _blocks_inside(frame: Frame, x: int, y: int) -> int:
         if x + (b % 4) * 4 < frame.width and y + (b // 4) * 4 < frame.height:
             bits = bits | (1 << b)
     return bits
-
-
-@wp.func
-def _limit(frame: Frame, opacity: wp.float32) -> wp.float32:
-    return 2.0 * wp.log(opacity / frame.alpha_min) * _SLACK + _SLACK_ABS
 
 
 @wp.kernel
@@ -105,7 +99,7 @@ def _composite(
                     shear,
                     conic[2],
                     slope,
-                    _limit(frame, opacity),
+                    q_limit(opacity, frame.alpha_min),
                 )
                 used = wp.int32(0)
                 if bits != 0:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import warp as wp
 from torch import Tensor
 
-from .bin import tile_grid
+from .tiles import tile_grid
 
 
 @wp.struct

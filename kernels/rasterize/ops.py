@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from . import composite_cpu, composite_cuda
-from .bin import Bins, bin_gaussians, tile_grid
+from .bin import Bins, bin_gaussians
 from .frame import Walk, make_frame
 from .project import make_lens, project_forward
 from .project_vjp import project_backward
 from .reduce import reduce_pairs
+from .tiles import tile_grid
 
 _OP = "gamba_warp::rasterize_"
 

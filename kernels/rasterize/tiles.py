@@ -1,0 +1,118 @@
+"""Which tiles a Gaussian's ellipse touches: row by row of tiles, by exact intervals of columns.
+
+README.md §2 proves the test. Counting and writing call the same functions.
+"""
+
+import warp as wp
+
+from ..constants import TILE
+
+wp.set_module_options({"enable_backward": False})
+
+_TILE = wp.constant(TILE)
+# Rounding of q, relative and absolute; the test may keep too much, never too little.
+SLACK = 1.0 + 1e-4
+SLACK_ABS = 1e-4
+_SLACK = wp.constant(SLACK)
+_SLACK_ABS = wp.constant(SLACK_ABS)
+
+
+def tile_grid(width: int, height: int) -> tuple[int, int]:
+    """Columns and rows of tiles."""
+    return -(-width // TILE), -(-height // TILE)
+
+
+@wp.struct
+class Grid:
+    """Per launch: the picture and its tiles."""
+
+    num: wp.int32
+    width: wp.int32
+    height: wp.int32
+    tiles_x: wp.int32
+    tiles_y: wp.int32
+    alpha_min: wp.float32
+
+
+def make_grid(num: int, width: int, height: int, alpha_min: float) -> Grid:
+    """The scalars of a binning launch as one kernel argument."""
+    grid = Grid()
+    grid.num, grid.width, grid.height, grid.alpha_min = num, width, height, alpha_min
+    grid.tiles_x, grid.tiles_y = tile_grid(width, height)
+    return grid
+
+
+@wp.struct
+class Ellipse:
+    """q <= limit around a mean, with what the rows of tiles share."""
+
+    mean: wp.vec2
+    k: wp.float32
+    e: wp.float32
+    limit: wp.float32
+    over_a: wp.float32
+    reach: wp.float32
+    top: wp.float32
+
+
+@wp.func
+def to_tile(x: wp.float32, size: wp.int32) -> wp.int32:
+    # clamped before the cast: a footprint may be larger than an int32
+    return wp.int32(wp.clamp(x, 0.0, float(size - 1))) // _TILE
+
+
+@wp.func
+def tile_rows(grid: Grid, y: wp.float32, extent: wp.float32) -> wp.vec2i:
+    # first and last row with a pixel centre (at +0.5) in reach, with a pixel to spare
+    return wp.vec2i(to_tile(y - extent - 1.0, grid.height), to_tile(y + extent + 1.0, grid.height))
+
+
+@wp.func
+def q_limit(opacity: wp.float32, alpha_min: wp.float32) -> wp.float32:
+    return 2.0 * wp.log(opacity / alpha_min) * _SLACK + _SLACK_ABS
+
+
+@wp.func
+def make_ellipse(mean: wp.vec2, conic: wp.vec3, limit: wp.float32) -> Ellipse:
+    a, k, e = conic[0], conic[1], conic[2]
+    ellipse = Ellipse()
+    ellipse.mean = mean
+    ellipse.k = k
+    ellipse.e = e
+    ellipse.limit = limit
+    ellipse.over_a = 1.0 / a
+    ellipse.reach = wp.sqrt(limit / e)
+    # the ellipse is rightmost at y = top, leftmost at -top
+    ellipse.top = -k * a * wp.sqrt(limit / (a * (a * k * k + e) * e))
+    return ellipse
+
+
+@wp.func
+def tile_columns(grid: Grid, ellipse: Ellipse, ty: wp.int32) -> wp.vec2i:
+    # README eq. 6: columns of row ty that the ellipse touches; first > last: none
+    y = float(ty * _TILE) - ellipse.mean[1]
+    y0 = wp.max(y + 0.5, -ellipse.reach)
+    y1 = wp.min(wp.min(y + float(_TILE), float(grid.height) - ellipse.mean[1]) - 0.5, ellipse.reach)
+    if y0 > y1:
+        return wp.vec2i(0, -1)
+    # convex, so clamping finds the extremes
+    right = wp.clamp(ellipse.top, y0, y1)
+    left = wp.clamp(-ellipse.top, y0, y1)
+    e = ellipse.e
+    x1 = wp.sqrt(wp.max(ellipse.limit - e * right * right, 0.0) * ellipse.over_a)
+    x0 = wp.sqrt(wp.max(ellipse.limit - e * left * left, 0.0) * ellipse.over_a)
+    x1 = ellipse.mean[0] - ellipse.k * right + x1
+    x0 = ellipse.mean[0] - ellipse.k * left - x0
+    if x1 < 0.5 or x0 > float(grid.width) - 0.5:
+        return wp.vec2i(0, -1)
+    # a tile spans pixel centres 0.5 to 15.5; a gap between two tiles belongs to neither
+    return wp.vec2i(to_tile(x0 + 0.5, grid.width), to_tile(x1 - 0.5, grid.width))
+
+
+@wp.func
+def box_pairs(grid: Grid, mean: wp.vec2, extent: wp.vec2) -> wp.int64:
+    # pairs of a Gaussian if tiles were tested against its box alone
+    rows = tile_rows(grid, mean[1], extent[1])
+    first = to_tile(mean[0] - extent[0], grid.width)
+    last = to_tile(mean[0] + extent[0], grid.width)
+    return wp.int64(rows[1] - rows[0] + 1) * wp.int64(last - first + 1)
