@@ -80,6 +80,15 @@ def device_of(tensor: Tensor) -> wp.Device:
     return wp.device_from_torch(tensor.device)
 
 
+def _is_small(tensor: Tensor) -> bool:
+    """Whether Warp can hold the tensor's shape and byte strides."""
+    size = tensor.element_size()
+    if tensor.is_contiguous() and 0 < tensor.numel() * size <= _INT32_MAX:
+        return True
+    reach = max((s * size for s in tensor.stride()), default=0)
+    return max(reach, *tensor.shape, 0) <= _INT32_MAX
+
+
 def view(tensor: Tensor, dtype=None, name: str = "tensor"):
     """A Warp array descriptor on the tensor's own memory, strides kept; it keeps the tensor alive.
 
@@ -93,8 +102,7 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
         ValueError: too many dimensions, a broken vector dimension, or over 2^31 bytes per stride.
     """
     tensor = tensor.detach()
-    reach = max((s * tensor.element_size() for s in tensor.stride()), default=0)
-    if max(reach, *tensor.shape, 0) > _INT32_MAX:
+    if not _is_small(tensor):
         raise ValueError(
             f"{name} has shape {tuple(tensor.shape)} and strides {tensor.stride()}; "
             "each length, and each stride in bytes, must be below 2^31"
@@ -165,11 +173,11 @@ def parallel_launch(
     threads = max(1, min(threads or torch.get_num_threads(), dim[0]))
     pieces = max(threads, min(pieces or threads, dim[0]))
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
-    kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
     cuts = [dim[0] * i // pieces for i in range(pieces + 1)]
     if threads > 1 and team.has_team():
         dims = [(end - begin, *dim[1:]) for begin, end in zip(cuts[:-1], cuts[1:])]
         return team.run(kernel, dims, arguments, threads)
+    kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
     todo = iter(list(zip(cuts[:-1], cuts[1:])))
 
     def work() -> None:

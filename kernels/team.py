@@ -87,50 +87,72 @@ def has_team() -> bool:
     return _parallel != 0
 
 
+class _Entry:
+    """A kernel's compiled function and the C structures that it takes.
+
+    Made by a launch that is recorded only, which checks the arguments; later launches have the same
+    kinds of them.
+    """
+
+    def __init__(self, kernel: wp.Kernel, dim: Sequence[int], arguments: list):
+        command = wp.launch(kernel, dim, arguments, device="cpu", record_cmd=True)
+        self.rank = kernel.adj.kernel_dim
+        self.call = command.hooks.forward
+        self.address = ctypes.cast(self.call, ctypes.c_void_p).value
+        self.executable = command.module_exec  # keeps the function loaded
+        self.bounds = type(command.bounds)
+        self.names = [arg.label for arg in kernel.adj.args]
+        fields = [(name, type(x)) for name, x in zip(self.names, command.params[1:])]
+        self.record = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+
+    def pack(self, arguments: list) -> ctypes.Structure:
+        """The arguments as the compiled function takes them; an array that is None is empty."""
+        record = self.record()
+        for name, value in zip(self.names, arguments):
+            if value is not None:
+                setattr(record, name, value.__ctype__() if hasattr(value, "__ctype__") else value)
+        return record
+
+    def extent(self, dim: Sequence[int]) -> ctypes.Structure:
+        """The dimensions as the compiled function takes them."""
+        return self.bounds((*dim, *(1,) * (self.rank - len(dim))))
+
+
+_entries: dict[wp.Kernel, _Entry] = {}
+
+
+def _entry(kernel: wp.Kernel, dim: Sequence[int], arguments: list) -> _Entry:
+    if kernel not in _entries:
+        _entries[kernel] = _Entry(kernel, dim, arguments)
+    return _entries[kernel]
+
+
 def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, threads: int) -> None:
     """Runs one launch per entry of ``dims`` on a team of ``threads``; returns when all are done.
 
     Args:
         kernel: its first parameter is ``offset: wp.int32``, the sum of the first dimension of the
-            launches before; compiled for the CPU.
+            launches before.
         dims: of the launches, which differ in the first dimension.
         arguments: after ``offset``.
         threads: at least 1.
     """
-    command = wp.launch(kernel, dims[0], [0, *arguments], device="cpu", record_cmd=True)
-    bounds_type, values = type(command.bounds), command.params[1:]
-    bounds = (bounds_type * len(dims))()
-    names = [arg.label for arg in kernel.adj.args]
-    record = _record(tuple(type(value) for value in values), tuple(names))
-    records = (record * len(dims))()
-    first = record(*values)
-    offset = 0
+    entry = _entry(kernel, dims[0], [0, *arguments])
+    bounds, records = (entry.bounds * len(dims))(), (entry.record * len(dims))()
+    record, offset = entry.pack([0, *arguments]), 0
     for i, dim in enumerate(dims):
-        padded = (*dim, *(1,) * (kernel.adj.kernel_dim - len(dim)))
-        bounds[i] = bounds_type(padded)
-        setattr(first, names[0], offset)
-        records[i] = first
+        setattr(record, entry.names[0], offset)
+        bounds[i], records[i] = entry.extent(dim), record
         offset += dim[0]
-    entry = ctypes.cast(command.hooks.forward, ctypes.c_void_p)
     job = _Job(
-        entry.value,
+        entry.address,
         ctypes.addressof(bounds),
-        ctypes.sizeof(bounds_type),
+        ctypes.sizeof(entry.bounds),
         ctypes.addressof(records),
-        ctypes.sizeof(record),
+        ctypes.sizeof(entry.record),
         len(dims),
         0,
     )
     inputs = [_parallel, ctypes.addressof(job), threads]
-    wp.launch(_team, 1, inputs, device="cpu", record_tape=False)
-
-
-_records: dict[tuple, type] = {}
-
-
-def _record(types: tuple[type, ...], names: tuple[str, ...]) -> type:
-    """The C structure of a kernel's arguments."""
-    if (types, names) not in _records:
-        fields = {"_fields_": list(zip(names, types))}
-        _records[types, names] = type("Arguments", (ctypes.Structure,), fields)
-    return _records[types, names]
+    team = _entry(_team, (1,), inputs)
+    team.call(ctypes.byref(team.extent((1,))), ctypes.byref(team.pack(inputs)))

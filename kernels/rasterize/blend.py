@@ -18,13 +18,12 @@ _ALPHA = """
         x = max_(x, F{} - 126.0f);
         const F n = x + shifter;
         const F f = x - (n - shifter);
-        F p = F{} + 1.5353360628288064e-4f;
-        p = fma_(p, f, F{} + 1.3398874866584892e-3f);
-        p = fma_(p, f, F{} + 9.618437366421834e-3f);
-        p = fma_(p, f, F{} + 5.5503324696939e-2f);
-        p = fma_(p, f, F{} + 0.24022647913498998f);
-        p = fma_(p, f, F{} + 0.6931472028559706f);
-        p = fma_(p, f, F{} + 1.0f);
+        F p = F{} + 1.32764715e-3f;
+        p = fma_(p, f, F{} + 9.67554133e-3f);
+        p = fma_(p, f, F{} + 5.55071327e-2f);
+        p = fma_(p, f, F{} + 0.240221197f);
+        p = fma_(p, f, F{} + 0.693146967f);
+        p = fma_(p, f, F{} + 1.00000007f);
         return p * (F)((I)n << 23) * opacity;
     };
 """
@@ -52,13 +51,13 @@ _BLEND = (
         const I stays = max_(next, -next) > t_min;
         const F weight = stays ? T * alpha : F{};
         Ts[b] = stays ? next : -T;
-        if (!any_(weight > 0.0f)) {
-            if (all_(stays)) continue;
-        } else {
-            used |= 1u << b;
-            F* const sum = sums + b * channels;
+        // no branch on a weight above 0: it would often be foretold wrongly
+        used |= (unsigned)any_(weight > 0.0f) << b;
+        F* const sum = sums + b * channels;
+        if (channels == 3)
+            for (int c = 0; c < 3; ++c) sum[c] = fma_(weight, F{} + color[c], sum[c]);
+        else
             for (int c = 0; c < channels; ++c) sum[c] = fma_(weight, F{} + color[c], sum[c]);
-        }
         if (!all_(stays)) {
             ends[b] = stays ? ends[b] : I{} + k;
             if (!any_(Ts[b] > 0.0f)) dead |= 1u << b;
