@@ -1,9 +1,11 @@
-"""Compositing on CUDA: launches of one warp per tile of 16 x 16 pixels.
+"""Compositing on CUDA: launches of one warp per tile of 16 x 16 pixels, or per part of one.
 
 Channels go in chunks of at most four: a chunk is a launch, and the geometry's gradients of chunks
 add up. Sums are written per pair and reduced by Gaussian afterwards: no atomics. README.md §3 and
 §5 hold the maths, CUDA.md the design.
 """
+
+import functools
 
 import torch
 import warp as wp
@@ -13,14 +15,38 @@ from ..interop import cuda_launch
 from .bin import Bins
 from .composite_cuda_backward import backward_kernel
 from .composite_cuda_forward import forward_kernel
-from .composite_cuda_warp import CHUNK, WARP
+from .composite_cuda_warp import CHUNK, WARP, Gaussians
 from .frame import Frame, Walk
-from .launch import vectors
 
 
-def _chunks(channels: int) -> list[tuple[int, int]]:
-    """First channel and number of channels of each launch."""
-    return [(first, min(CHUNK, channels - first)) for first in range(0, channels, CHUNK)]
+@functools.cache
+def _multiprocessors(index: int) -> int:
+    return torch.cuda.get_device_properties(index).multi_processor_count
+
+
+def parts_of_tile(tiles: int, device: torch.device) -> int:
+    """Into how many warps' work a tile is cut: 1, or where tiles are few, 2 or 4.
+
+    A multiprocessor holds some 20 warps. As long as there are fewer than that, the tile with the
+    longest list sets the time, and its parts run side by side; with more, parts only repeat the
+    work that a Gaussian costs once per warp. No GPU has timed it.
+    """
+    if device.type != "cuda":
+        return 1
+    places = 20 * _multiprocessors(device.index or 0)
+    return 4 if tiles <= places else 2 if tiles <= 2 * places else 1
+
+
+def _gaussians(
+    means2d: Tensor, conics: Tensor, view_opacities: Tensor, colors: Tensor
+) -> Gaussians:
+    gaussians = Gaussians()
+    gaussians.means2d = wp.from_torch(means2d.detach().view(-1, 2), dtype=wp.vec2)
+    gaussians.conics = wp.from_torch(conics.detach().view(-1, 3), dtype=wp.vec3)
+    gaussians.opacities = wp.from_torch(view_opacities.detach().view(-1))
+    gaussians.colors = wp.from_torch(colors.detach().view(-1))
+    gaussians.channels = colors.shape[1]
+    return gaussians
 
 
 def composite_forward(
@@ -37,32 +63,31 @@ def composite_forward(
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
     """
     images, channels = means2d.shape[0], colors.shape[1]
+    gaussians = _gaussians(means2d, conics, view_opacities, colors)
     tiles = images * frame.tiles_x * frame.tiles_y
     renders = colors.new_empty(images, frame.height, frame.width, channels)
     alphas = colors.new_empty(images, frame.height, frame.width, 1)
+    parts = parts_of_tile(tiles, colors.device)
     walk = Walk(
         colors.new_empty(tiles * 16, 16),
         bins.pairs.new_empty(tiles * 16, 16),
         torch.zeros_like(bins.pairs),
-        bins.pairs.new_empty(tiles),
+        bins.pairs.new_zeros(tiles),
     )
-    for first, count in _chunks(channels) if tiles else ():
+    for first in range(0, channels if tiles else 0, CHUNK):
+        gaussians.first = first
         cuda_launch(
-            forward_kernel(count),
-            (tiles, WARP),
+            forward_kernel(min(CHUNK, channels - first), parts),
+            (tiles * parts, WARP),
             [
                 frame,
-                first,
-                vectors(means2d, wp.vec2),
-                vectors(conics, wp.vec3),
-                view_opacities.view(-1),
-                colors,
+                gaussians,
                 bins.pairs,
                 bins.starts,
             ],
             [
-                walk.transmittances.view(tiles, -1),
-                walk.stops.view(tiles, -1),
+                walk.transmittances.view(-1),
+                walk.stops.view(-1),
                 walk.blocks,
                 walk.walked,
                 renders,
@@ -88,31 +113,30 @@ def composite_backward(
 ) -> tuple[Tensor, Tensor]:
     """As ``composite_cpu.composite_backward``."""
     tiles, channels = walk.walked.numel(), colors.shape[1]
-    v_pairs = colors.new_zeros(bins.pairs.numel(), 6 + channels)
+    gaussians = _gaussians(means2d, conics, view_opacities, colors)
+    parts = parts_of_tile(tiles, colors.device)
+    v_pairs = colors.new_zeros(bins.pairs.numel(), parts, 6 + channels)
     skipped = torch.ones_like(walk.walked)
-    for first, count in _chunks(channels) if tiles else ():
+    for first in range(0, channels if tiles else 0, CHUNK):
+        gaussians.first = first
         cuda_launch(
-            backward_kernel(count, geometry),
-            (tiles, WARP),
+            backward_kernel(min(CHUNK, channels - first), geometry, parts),
+            (tiles * parts, WARP),
             [
                 frame,
-                first,
-                vectors(means2d, wp.vec2),
-                vectors(conics, wp.vec3),
-                view_opacities.view(-1),
-                colors,
+                gaussians,
                 bins.pairs,
                 bins.rows,
                 bins.starts,
-                walk.transmittances.view(tiles, -1),
-                walk.stops.view(tiles, -1),
+                walk.transmittances.view(-1),
+                walk.stops.view(-1),
                 walk.blocks,
                 walk.walked,
                 v_renders,
                 v_alphas,
             ],
-            [v_pairs, skipped],
+            [v_pairs.view(-1), skipped],
             device=colors.device,
             block_dim=WARP,
         )
-    return v_pairs, skipped
+    return v_pairs[:, 0] if parts == 1 else v_pairs.sum(1), skipped

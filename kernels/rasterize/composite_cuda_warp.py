@@ -1,8 +1,8 @@
 """What the CUDA compositor's kernels share: a warp, its pixels, its shared memory, and the test.
 
-A block is one warp and works on one tile of 16 x 16 pixels: eight sub-tiles of 8 x 4, in each of
-which a lane owns one pixel. Leaf functions are C++ with a CPU form, for tests on CPU blocks.
-CUDA.md has the design.
+A tile of 16 x 16 pixels is eight sub-tiles of 8 x 4. A block is one warp and works on a tile, or on
+a half or a quarter of it: on 8, 4 or 2 sub-tiles, in each of which a lane owns one pixel. Leaf
+functions are C++ with a CPU form, for tests on CPU blocks. CUDA.md has the design.
 """
 
 import functools
@@ -16,13 +16,15 @@ from .frame import Frame, color_row
 wp.set_module_options({"enable_backward": False})
 
 WARP = 32
-PIXELS = TILE * TILE // WARP  # of a lane, one in each sub-tile
 WIDTH, HEIGHT = 8, 4  # pixels of a sub-tile; two of them side by side
+SUB_TILES = 8  # of a tile
+STOP = 16  # bit STOP + j of a pair: a pixel of sub-tile j stopped at it; below are 4 x 4 blocks
 RECORD = 12  # floats of a Gaussian in shared memory
 PITCH = WARP + 4  # floats of a row of partial sums: aligned, and without bank conflicts
 CHUNK = 4  # channels of a launch, at most
 
-vec8 = wp.types.vector(PIXELS, wp.float32)
+# An integer that branches change in place; of a plain one Warp keeps a copy for each branch.
+word = wp.types.vector(1, wp.int32)
 
 _TILE = wp.constant(TILE)
 _LOG2_E_HALF = wp.constant(0.72134752044)  # exp(-q/2) = 2^(-this q)
@@ -31,11 +33,6 @@ _LOG2_E_HALF = wp.constant(0.72134752044)  # exp(-q/2) = 2^(-this q)
 _SLACK = wp.constant(1.0 + 1e-4)
 _SLACK_ABS = wp.constant(1e-4)
 _SLACK_PIXELS = wp.constant(0.01)
-
-
-def sub_tile(j: int) -> tuple[int, int]:
-    """Where sub-tile j begins in the tile: x, y in pixels."""
-    return j % 2 * WIDTH, j // 2 * HEIGHT
 
 
 def first_block(j: int) -> int:
@@ -71,10 +68,62 @@ def reciprocal(x: wp.float32) -> wp.float32:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return sqrtf(x);
+#endif
+""")
+def root(x: wp.float32) -> wp.float32:
+    """The square root, to 2 units in the last place."""
+    ...
+
+
+# Arrays are dense. Warp's own indexing multiplies by strides that it reads from the array, which
+# costs instructions and, in loops, registers.
+@wp.func_native("values.data[i] = v;")
+def store(values: wp.array[wp.float32], i: wp.int32, v: wp.float32): ...
+
+
+@wp.func_native("values.data[i] = v;")
+def store_int(values: wp.array[wp.int32], i: wp.int32, v: wp.int32): ...
+
+
+@wp.func_native("return values.data[i];")
+def load(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
+
+
+@wp.func_native("return values.data[i];")
+def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("return values.data[i];")
+def load2(values: wp.array[wp.vec2], i: wp.int32) -> wp.vec2: ...
+
+
+@wp.func_native("return values.data[i];")
+def load3(values: wp.array[wp.vec3], i: wp.int32) -> wp.vec3: ...
+
+
+@wp.func_native("return values.data[(long long)row * width + column];")
+def load_of_row(
+    values: wp.array[wp.float32], row: wp.int32, width: wp.int32, column: wp.int32
+) -> wp.float32: ...
+
+
+@wp.func_native("values.data[(long long)row * width + column] = v;")
+def store_of_row(
+    values: wp.array[wp.float32], row: wp.int32, width: wp.int32, column: wp.int32, v: wp.float32
+): ...
+
+
 # fmaf by name: forward and backward must see the same alpha, so no choice is left to the compiler.
 @wp.func_native("return fmaf(k, dy, dx);")
 def sheared(k: wp.float32, dx: wp.float32, dy: wp.float32) -> wp.float32:
-    """u of README §5."""
+    """The u of README §5."""
     ...
 
 
@@ -199,52 +248,91 @@ def shared_memory(size: int) -> Memory:
 
 @wp.struct
 class Place:
-    """The tile of a warp and the pixel of a lane in its first sub-tile."""
+    """Where a warp and a lane work."""
 
+    tile: wp.int32
+    part: wp.int32  # of the tile
     image: wp.int32
-    px: wp.int32
+    px: wp.int32  # the lane's pixel in the first sub-tile
     py: wp.int32
-    corner: wp.vec2  # the centre of the tile's first pixel
+    pixel: wp.int32  # its number, by tiles and sub-tiles; those of the next ones are WARP apart
+    x: wp.vec2  # centres of the lane's pixels, by columns of sub-tiles
+    y: wp.vec4  # by rows of sub-tiles
+    corner: wp.vec2  # the centre of the part's first pixel
 
 
-@wp.func
-def make_place(frame: Frame, tile: wp.int32, lane: wp.int32) -> Place:
-    p = Place()
-    p.image = tile // (frame.tiles_x * frame.tiles_y)
-    x = tile % frame.tiles_x * _TILE
-    y = tile // frame.tiles_x % frame.tiles_y * _TILE
-    p.px = x + lane % WIDTH
-    p.py = y + lane // WIDTH
-    p.corner = wp.vec2(float(x) + 0.5, float(y) + 0.5)
-    return p
+@functools.cache
+def placing(parts: int):
+    """The function that finds a lane's place, with tiles cut into so many parts."""
+    pixels = SUB_TILES // parts
+
+    @wp.func
+    def place(frame: Frame, index: wp.int32, lane: wp.int32) -> Place:
+        p = Place()
+        p.tile = index // wp.static(parts)
+        p.part = index % wp.static(parts)
+        p.image = p.tile // (frame.tiles_x * frame.tiles_y)
+        x = p.tile % frame.tiles_x * _TILE
+        y = p.tile // frame.tiles_x % frame.tiles_y * _TILE + p.part * wp.static(TILE // parts)
+        p.px = x + lane % WIDTH
+        p.py = y + lane // WIDTH
+        p.pixel = index * wp.static(pixels * WARP) + lane
+        for i in range(2):
+            p.x[i] = float(p.px + i * WIDTH) + 0.5
+        for i in range(wp.static(pixels // 2)):
+            p.y[i] = float(p.py + i * HEIGHT) + 0.5
+        p.corner = wp.vec2(float(x) + 0.5, float(y) + 0.5)
+        return p
+
+    return place
 
 
-@wp.func
-def touched(
-    corner: wp.vec2, mean: wp.vec2, conic: wp.vec3, opacity: wp.float32, alpha_min: wp.float32
-) -> wp.int32:
-    """Bit j: the ellipse alpha >= alpha_min touches sub-tile j. README eq. 6, rows of sub-tiles."""
-    a, k, e = conic[0], conic[1], conic[2]
-    limit = 2.0 * wp.log(opacity / alpha_min) * _SLACK + _SLACK_ABS
-    reach = wp.sqrt(limit / e)
-    over_a = 1.0 / a
-    top = -k * a * wp.sqrt(limit / (a * (a * k * k + e) * e))
-    x = corner[0] - mean[0]
-    y = corner[1] - mean[1]
-    bits = wp.int32(0)
-    for row in range(TILE // HEIGHT):
-        y0 = wp.max(y + float(row * HEIGHT), -reach)
-        y1 = wp.min(y + float(row * HEIGHT + HEIGHT - 1), reach)
-        if y0 <= y1:
-            right = wp.clamp(top, y0, y1)
-            left = wp.clamp(-top, y0, y1)
-            x1 = wp.sqrt(wp.max(limit - e * right * right, 0.0) * over_a) - k * right
-            x0 = -wp.sqrt(wp.max(limit - e * left * left, 0.0) * over_a) - k * left
-            for column in range(TILE // WIDTH):
-                begin = x + float(column * WIDTH)
-                if x1 + _SLACK_PIXELS >= begin and x0 - _SLACK_PIXELS <= begin + float(WIDTH - 1):
-                    bits |= 1 << (row * 2 + column)
-    return bits
+@functools.cache
+def touching(parts: int):
+    """The test of a Gaussian against the sub-tiles of a part of a tile (README eq. 6)."""
+
+    @wp.func
+    def touched(
+        corner: wp.vec2, mean: wp.vec2, conic: wp.vec3, opacity: wp.float32, alpha_min: wp.float32
+    ) -> wp.int32:
+        # bit j: the ellipse alpha >= alpha_min touches sub-tile j
+        a, k, e = conic[0], conic[1], conic[2]
+        limit = 2.0 * wp.log(opacity / alpha_min) * _SLACK + _SLACK_ABS
+        reach = root(limit * reciprocal(e))
+        over_a = reciprocal(a)
+        # top = -k a sqrt(limit / (a e (a k² + e)))
+        top = -k * a * reach * root(over_a * reciprocal(a * k * k + e))
+        x = corner[0] - mean[0]
+        y = corner[1] - mean[1]
+        bits = word()
+        for row in range(wp.static(SUB_TILES // parts // 2)):
+            y0 = wp.max(y + float(row * HEIGHT), -reach)
+            y1 = wp.min(y + float(row * HEIGHT + HEIGHT - 1), reach)
+            if y0 <= y1:
+                right = wp.clamp(top, y0, y1)
+                left = wp.clamp(-top, y0, y1)
+                x1 = root(wp.max(limit - e * right * right, 0.0) * over_a) - k * right
+                x0 = -root(wp.max(limit - e * left * left, 0.0) * over_a) - k * left
+                x1 += _SLACK_PIXELS - x
+                x0 -= _SLACK_PIXELS + x
+                for column in range(2):
+                    if x1 >= float(column * WIDTH) and x0 <= float(column * WIDTH + WIDTH - 1):
+                        bits[0] += wp.static(1) << (row * 2 + column)
+        return bits[0]
+
+    return touched
+
+
+@wp.struct
+class Gaussians:
+    """What is composited; dense arrays over view-major Gaussians."""
+
+    means2d: wp.array[wp.vec2]
+    conics: wp.array[wp.vec3]
+    opacities: wp.array[wp.float32]
+    colors: wp.array[wp.float32]
+    channels: wp.int32  # of ``colors``
+    first: wp.int32  # the first one of this launch
 
 
 @functools.cache
@@ -257,17 +345,25 @@ def staging(channels: int, size: int):
 
     @wp.func
     def stage(
-        arena: arena_type, frame: Frame, at: wp.int32, first: wp.int32, g: wp.int32,
-        mean: wp.vec2, conic: wp.vec3, opacity: wp.float32, colors: wp.array2d[wp.float32],
-        word: wp.int32, row: wp.int32,
-    ):  # fmt: skip
+        arena: arena_type,
+        frame: Frame,
+        gaussians: Gaussians,
+        lane: wp.int32,
+        g: wp.int32,
+        bits: wp.int32,
+        row: wp.int32,
+    ):
+        at = lane * RECORD
+        mean = load2(gaussians.means2d, g)
+        conic = load3(gaussians.conics, g)
         put4(arena, at, wp.vec4(mean[0], mean[1], -_LOG2_E_HALF * conic[0], conic[1]))
         put(arena, at + 4, -_LOG2_E_HALF * conic[2])
-        put(arena, at + 5, wp.log2(opacity))
-        put_int(arena, at + 6, word)
+        put(arena, at + 5, wp.log2(load(gaussians.opacities, g)))
+        put_int(arena, at + 6, bits)
         put_int(arena, at + 7, row)
         source = color_row(frame, g)
         for c in range(wp.static(channels)):
-            put(arena, at + 8 + c, colors[source, first + c])
+            v = load_of_row(gaussians.colors, source, gaussians.channels, gaussians.first + c)
+            put(arena, at + 8 + c, v)
 
     return stage
