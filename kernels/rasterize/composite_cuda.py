@@ -40,6 +40,8 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
 def _gaussians(
     means2d: Tensor, conics: Tensor, view_opacities: Tensor, colors: Tensor
 ) -> Gaussians:
+    if means2d.device.type == "cpu" and not wp.config.enable_cpu_blocks:
+        raise ValueError("device is cpu: these kernels run there with enable_cpu_blocks only")
     gaussians = Gaussians()
     gaussians.means2d = wp.from_torch(means2d.detach().view(-1, 2), dtype=wp.vec2)
     gaussians.conics = wp.from_torch(conics.detach().view(-1, 3), dtype=wp.vec3)

@@ -12,6 +12,7 @@ import warp as wp
 
 from ..constants import TILE
 from .frame import Frame, color_row
+from .tiles import q_limit
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,10 +29,7 @@ word = wp.types.vector(1, wp.int32)
 
 _TILE = wp.constant(TILE)
 _LOG2_E_HALF = wp.constant(0.72134752044)  # exp(-q/2) = 2^(-this q)
-# Rounding of q, relative and absolute, and of a position in pixels: the test of a sub-tile may
-# keep too much, never too little.
-_SLACK = wp.constant(1.0 + 1e-4)
-_SLACK_ABS = wp.constant(1e-4)
+# The rounding of a position: the test of a sub-tile may keep too much, never too little.
 _SLACK_PIXELS = wp.constant(0.01)
 
 
@@ -297,7 +295,7 @@ def touching(parts: int):
     ) -> wp.int32:
         # bit j: the ellipse alpha >= alpha_min touches sub-tile j
         a, k, e = conic[0], conic[1], conic[2]
-        limit = 2.0 * wp.log(opacity / alpha_min) * _SLACK + _SLACK_ABS
+        limit = q_limit(opacity, alpha_min)
         reach = root(limit * reciprocal(e))
         over_a = reciprocal(a)
         # top = -k a sqrt(limit / (a e (a k² + e)))
