@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -26,6 +27,7 @@ from .render import render
 HULL_GRID = 96  # voxels a side of the unit cube
 MAX_PSNR = 100.0  # of equal pictures, whose PSNR has no bound
 _MIN_SCALE, _MAX_SCALE = 1e-3, 0.1  # object units
+RasterizeMode = Literal["classic", "antialiased"]
 _BETAS = (0.9, 0.99)  # a second moment that forgets in 100 steps: there are only hundreds
 
 
@@ -52,6 +54,8 @@ class FitConfig:
         relocate_until: none after this share of the steps.
         min_weight: a Gaussian that has less blending weight than so many pixels in all views
             together is relocated.
+        rasterize_mode: what renders the Gaussians, here and later: files do not hold it, and most
+            viewers are classic; antialiased ones fit small pictures better.
         seed: of everything random.
     """
 
@@ -71,6 +75,7 @@ class FitConfig:
     relocate_share: float = 0.2
     relocate_until: float = 0.7
     min_weight: float = 1.0
+    rasterize_mode: RasterizeMode = "classic"
     seed: int = 0
 
 
@@ -210,7 +215,9 @@ def activate(parameters: dict[str, Tensor]) -> Gaussians:
     )
 
 
-def shares(gaussians: Gaussians, images: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+def shares(
+    gaussians: Gaussians, images: Tensor, cameras: Cameras, mode: RasterizeMode = "classic"
+) -> tuple[Tensor, Tensor]:
     """What each Gaussian has to do with the pictures, from one backward pass.
 
     A rendered channel is linear in the colours, so the gradient of ``Σ_p u_p C_p`` to a colour is
@@ -221,13 +228,14 @@ def shares(gaussians: Gaussians, images: Tensor, cameras: Cameras) -> tuple[Tens
         gaussians: ``[N]``.
         images: ``[V, H, W, 4]``.
         cameras: V cameras.
+        mode: of ``rasterization``.
 
     Returns:
         Weight in pixels, and share in the squared error: two ``[N]``, over all views.
     """
     gaussians = gaussians.detach()
     gaussians.colors.requires_grad_()
-    rgb = render(gaussians, cameras, images.new_ones(3)).rgb
+    rgb = render(gaussians, cameras, images.new_ones(3), rasterize_mode=mode).rgb
     error = (rgb.detach() - over_background(images, 1.0)).square().mean(-1)
     upstream = torch.stack([torch.ones_like(error), error, torch.zeros_like(error)], -1)
     (gradient,) = torch.autograd.grad(rgb, gaussians.colors, upstream)
@@ -335,7 +343,8 @@ def fit(
         step = len(result.losses)
         if config.relocate_every and step % config.relocate_every == 0:
             if done < config.relocate_until:
-                weight, error = shares(activate(parameters), images, cameras)
+                now = activate(parameters)
+                weight, error = shares(now, images, cameras, config.rasterize_mode)
                 moved = relocate(parameters, optimizer, weight, error, config, rng)
                 result.relocated += moved
         done = step / config.steps
@@ -358,7 +367,8 @@ def _step(
     """One step of Adam; returns the loss before it."""
     # a background that changes tells a see-through object from one of the background's colour
     backgrounds = torch.rand(len(images), 3, generator=rng, device=images.device)
-    picture = render(activate(parameters), cameras, backgrounds)
+    mode = config.rasterize_mode
+    picture = render(activate(parameters), cameras, backgrounds, rasterize_mode=mode)
     difference = picture.rgb - over_background(images, backgrounds[:, None, None])
     loss = difference.square().mean() + config.weight_l1 * difference.abs().mean()
     loss = loss + config.weight_alpha * (picture.alpha - images[..., 3:]).square().mean()

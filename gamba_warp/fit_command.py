@@ -19,7 +19,7 @@ from .dataset import ObjectViews, ViewDataset, open_dataset
 from .doctor import versions
 from .errors import UserError
 from .files import atomic_path, output_folder, write_json
-from .fit import FitConfig, fit, psnr
+from .fit import FitConfig, RasterizeMode, fit, psnr
 from .gaussians import Gaussians
 from .images import over_background, save_image
 from .ply import save_ply
@@ -75,6 +75,7 @@ def fit_command(
     minutes: float | None = None,
     gaussians: int = FitConfig.gaussians,
     size: int | None = None,
+    rasterize_mode: RasterizeMode = "classic",
     seed: int = 0,
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> int:
@@ -91,6 +92,8 @@ def fit_command(
         minutes: For each object at most; the learning rates then fall with the time.
         gaussians: In each object.
         size: Height of the pictures; the files' own by default.
+        rasterize_mode: Antialiased fits small pictures better, but files do not hold the mode, and
+            most viewers (and eval-views) are classic.
         seed: Of everything random.
         device: Where to compute.
     """
@@ -99,7 +102,13 @@ def fit_command(
     dataset = open_dataset(folder, split)
     uids = choose_objects(dataset.uids, objects, limit)
     seconds = None if minutes is None else 60 * minutes
-    config = FitConfig(gaussians=gaussians, steps=steps, seconds=seconds, seed=seed)
+    config = FitConfig(
+        gaussians=gaussians,
+        steps=steps,
+        seconds=seconds,
+        rasterize_mode=rasterize_mode,
+        seed=seed,
+    )
     job = FitJob(dataset, output_folder(out), config, held_out, size, where)
     records: list[dict[str, Any]] = []
     failures: list[dict[str, str]] = []
@@ -198,7 +207,9 @@ def fit_object(job: FitJob, uid: str, title: str) -> dict[str, Any]:
         result = fit(images[fitted], cameras[fitted], job.config, show)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     with torch.no_grad():
-        rgb = render(result.gaussians, cameras, images.new_full((3,), WHITE)).rgb.clamp(0, 1)
+        white = images.new_full((3,), WHITE)
+        mode = job.config.rasterize_mode
+        rgb = render(result.gaussians, cameras, white, rasterize_mode=mode).rgb.clamp(0, 1)
     truth = over_background(images, WHITE)
     by_view = psnr(rgb, truth).tolist()
     record = {
@@ -245,7 +256,8 @@ def _write_object(
     reference = cameras.viewmats[0]
     _, scale = relative_to_reference(cameras.viewmats[:1], reference)
     moved = gaussians.transformed(reference[:3, :3], reference.new_zeros(3), scale.item())
-    save_ply(paths["gaussians"], moved, comments=[f"fitted to {record['name']} by gamba fit"])
+    note = f"fitted to {record['name']} by gamba fit, rasterize_mode {job.config.rasterize_mode}"
+    save_ply(paths["gaussians"], moved, comments=[note])
     save_image(paths["strips"], rows[:4].flatten(0, 1).cpu().numpy())
     write_json(paths["objects"], {**_settings(job), **record})
 

@@ -89,6 +89,20 @@ def test_same_seed_same_bits():
         assert not torch.equal(getattr(first.gaussians, name), getattr(other.gaussians, name)), name
 
 
+def test_antialiased_pictures_need_antialiased_fits():
+    """The mode reaches the steps: fitted in one mode, the other renders something else."""
+    cameras = views_around(6)
+    images = photograph(cloud(1), cameras)
+    config = replace(QUICK, steps=40, relocate_every=10, rasterize_mode="antialiased")
+    gaussians = fit(images, cameras, config).gaussians
+    truth = over_background(images, 1.0)
+    quality = {
+        mode: psnr(render(gaussians, cameras, torch.ones(3), rasterize_mode=mode).rgb, truth).mean()
+        for mode in ("antialiased", "classic")
+    }
+    assert quality["antialiased"] > quality["classic"] + 0.5
+
+
 def test_seconds_end_a_fit():
     cameras = views_around(4)
     images = photograph(cloud(1), cameras)
