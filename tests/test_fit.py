@@ -89,18 +89,20 @@ def test_same_seed_same_bits():
         assert not torch.equal(getattr(first.gaussians, name), getattr(other.gaussians, name)), name
 
 
-def test_antialiased_pictures_need_antialiased_fits():
-    """The mode reaches the steps: fitted in one mode, the other renders something else."""
+def test_the_mode_reaches_the_fit():
+    """What is fitted in one mode looks better in it than in the other."""
     cameras = views_around(6)
     images = photograph(cloud(1), cameras)
-    config = replace(QUICK, steps=40, relocate_every=10, rasterize_mode="antialiased")
-    gaussians = fit(images, cameras, config).gaussians
     truth = over_background(images, 1.0)
-    quality = {
-        mode: psnr(render(gaussians, cameras, torch.ones(3), rasterize_mode=mode).rgb, truth).mean()
-        for mode in ("antialiased", "classic")
-    }
-    assert quality["antialiased"] > quality["classic"] + 0.5
+    modes = ("classic", "antialiased")
+    for mode, other in (modes, modes[::-1]):
+        config = replace(QUICK, relocate_every=10, rasterize_mode=mode)
+        gaussians = fit(images, cameras, config).gaussians
+        own, cross = (
+            psnr(render(gaussians, cameras, torch.ones(3), rasterize_mode=m).rgb, truth).mean()
+            for m in (mode, other)
+        )
+        assert own > cross + 0.5, mode
 
 
 def test_seconds_end_a_fit():
@@ -133,8 +135,8 @@ def test_hull_of_a_ball():
     axis = (torch.arange(48) + 0.5) / 48 - 0.5
     radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0)
     assert hull[radius < 0.29].all()
-    # above and below no camera looks: the hull of views at up to 25 degrees has cones there
-    assert (hull & (radius > 0.3)).sum() < 0.25 * hull.sum()
+    # 2 %: small caps above and below, where no camera looks, and a rim of a quarter of alpha
+    assert (hull & (radius > 0.3)).sum() < 0.04 * hull.sum()
 
 
 def test_hull_without_full_agreement():
@@ -149,14 +151,16 @@ def test_hull_without_full_agreement():
 
 def test_points_project_where_the_rasterizer_draws_them():
     cameras = views_around(3, width=40, height=36)
-    scene = cloud(0, num=1)
-    scene.scales = torch.full_like(scene.scales, 0.02)
-    alpha = render(scene, cameras).alpha
-    peak = alpha.flatten(1).amax(1)
-    # bilinear between pixel centres: at most a little under the peak
-    assert (sample_views(alpha, cameras, scene.means)[:, 0, 0] > 0.7 * peak).all()
-    behind = -2 * torch.linalg.inv(cameras.viewmats)[0, :3, 2] + 2 * scene.means
-    assert sample_views(torch.ones_like(alpha), cameras, behind * 10)[0].eq(0).all()
+    scene = cloud(0)
+    means2d = render(scene, cameras).meta["means2d"]
+    # pictures that hold their own pixel coordinates: bilinear sampling is exact on them
+    y, x = torch.meshgrid(torch.arange(36) + 0.5, torch.arange(40) + 0.5, indexing="ij")
+    pixels = torch.stack([x, y], -1).expand(3, 36, 40, 2)
+    torch.testing.assert_close(
+        sample_views(pixels, cameras, scene.means), means2d, rtol=0, atol=1e-3
+    )
+    behind = 20 * (scene.means - torch.linalg.inv(cameras.viewmats)[0, :3, 2])
+    assert sample_views(pixels, cameras, behind)[0].eq(0).all()
 
 
 def test_start_lies_in_the_hull():
