@@ -46,7 +46,7 @@ def _gaussians(
     gaussians.means2d = wp.from_torch(means2d.detach().view(-1, 2), dtype=wp.vec2)
     gaussians.conics = wp.from_torch(conics.detach().view(-1, 3), dtype=wp.vec3)
     gaussians.opacities = wp.from_torch(view_opacities.detach().view(-1))
-    gaussians.colors = wp.from_torch(colors.detach().view(-1))
+    gaussians.colors = wp.from_torch(colors.detach())
     gaussians.channels = colors.shape[1]
     return gaussians
 
@@ -88,12 +88,12 @@ def composite_forward(
                 bins.starts,
             ],
             [
-                walk.transmittances.view(-1),
-                walk.stops.view(-1),
+                walk.transmittances,
+                walk.stops,
                 walk.blocks,
                 walk.walked,
-                renders,
-                alphas,
+                renders.view(-1, channels),
+                alphas.view(-1, 1),
             ],
             device=colors.device,
             block_dim=WARP,
@@ -130,14 +130,14 @@ def composite_backward(
                 bins.pairs,
                 bins.rows,
                 bins.starts,
-                walk.transmittances.view(-1),
-                walk.stops.view(-1),
+                walk.transmittances,
+                walk.stops,
                 walk.blocks,
                 walk.walked,
-                v_renders,
-                v_alphas,
+                v_renders.view(-1, channels),
+                v_alphas.view(-1, 1),
             ],
-            [v_pairs.view(-1), skipped],
+            [v_pairs.view(-1, 6 + channels), skipped],
             device=colors.device,
             block_dim=WARP,
         )

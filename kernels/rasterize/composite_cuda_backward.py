@@ -18,14 +18,14 @@ from .composite_cuda_warp import (
     first_block,
     load,
     load_int,
-    load_of_row,
+    load_stop,
     lowest_bit,
     placing,
     reciprocal,
     shared_memory,
     sheared,
     staging,
-    store_of_row,
+    store,
 )
 from .frame import Frame
 
@@ -60,7 +60,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         gaussians: Gaussians,
         lane: wp.int32,
         count: wp.int32,
-        v_pairs: wp.array[wp.float32],
+        v_pairs: wp.array2d[wp.float32],
     ):
         # each lane adds up one value of one of the waiting pairs, over the 32 lanes
         if lane < count * wp.static(values):
@@ -69,14 +69,14 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
             for i in range(1, wp.static(WARP // 4)):
                 total += get4(arena, at + 4 * i)
             value = (total[0] + total[1]) + (total[2] + total[3])
-            row = get_int(arena, wp.static(rows_at) + lane / wp.static(values))
+            row = wp.int64(get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
+            row *= wp.int64(gaussians.channels + 6)
             column = lane % wp.static(values)
-            width = gaussians.channels + 6
             if column >= wp.static(moments):
                 column += wp.static(6 - moments) + gaussians.first
             elif gaussians.first > 0:
-                value += load_of_row(v_pairs, row, width, column)
-            store_of_row(v_pairs, row, width, column, value)
+                value += load(v_pairs, row, column)
+            store(v_pairs, row, column, value)
 
     @wp.kernel(
         enable_backward=False, module="unique", launch_bounds=(WARP, resident), grid_stride=False
@@ -87,13 +87,13 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         pairs_in: wp.array[wp.int32],
         rows_in: wp.array[wp.int32],
         starts_in: wp.array[wp.int32],
-        transmittances_in: wp.array[wp.float32],
-        stops_in: wp.array[wp.int32],
+        transmittances_in: wp.array2d[wp.float32],
+        stops_in: wp.array2d[wp.int32],
         blocks_in: wp.array[wp.int32],
         walked_in: wp.array[wp.int32],
-        v_renders_in: wp.array4d[wp.float32],
-        v_alphas_in: wp.array4d[wp.float32],
-        v_pairs_out: wp.array[wp.float32],
+        v_renders_in: wp.array2d[wp.float32],
+        v_alphas_in: wp.array2d[wp.float32],
+        v_pairs_out: wp.array2d[wp.float32],
         skipped_out: wp.array[wp.int32],
     ):
         index, lane = wp.tid()
@@ -106,24 +106,26 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
             pixels_type()
         )  # README eq. 10, less the gradient of alpha, which is the same for all pairs
         upstream = upstream_type()
+        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         some = wp.int32(0)
+        walked = walked_in[p.tile]
         for j in range(wp.static(pixels)):
-            T[j] = load(transmittances_in, p.pixel + j * WARP)
+            if walked > 0:
+                T[j] = load(transmittances_in, p.place, j * WARP)
             if T[j] != 0.0:
-                row = p.py + j // 2 * HEIGHT
-                column = p.px + j % 2 * WIDTH
+                step = j // 2 * HEIGHT * frame.width + j % 2 * WIDTH
                 largest = wp.float32(0.0)
-                for c in range(wp.static(channels)):
-                    upstream[j, c] = v_renders_in[p.image, row, column, gaussians.first + c]
-                    largest += wp.abs(upstream[j, c])
                 if gaussians.first == 0:
-                    R[j] = -v_alphas_in[p.image, row, column, 0]
+                    R[j] = -load(v_alphas_in, p.pixel, step)
                     largest += wp.abs(R[j])
+                step *= gaussians.channels
+                for c in range(wp.static(channels)):
+                    upstream[j, c] = load(v_renders_in, first, step + c)
+                    largest += wp.abs(upstream[j, c])
                 # NaN is not taken for zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
         wanted = any_of(arena, lane, some)
-        walked = walked_in[p.tile]
         if wanted == 0:
             walked = 0
         if walked > 0 and lane == 0:
@@ -190,8 +192,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                     at = wp.static(sums_at) + waiting * wp.static(values * PITCH) + lane
                     for v in range(wp.static(values)):
                         put(arena, at + wp.static(v * PITCH), sums[v])
-                    row = get_int(arena, i * RECORD + 7)
-                    put_int(arena, wp.static(rows_at) + waiting, row)
+                    put_int(arena, wp.static(rows_at) + waiting, get_int(arena, i * RECORD + 7))
                     waiting += 1
                     if waiting == wp.static(slots):
                         sync()
@@ -204,7 +205,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if T[j] < 0.0:
-                                if load_int(stops_in, p.pixel + j * WARP) == k:
+                                if load_stop(stops_in, p.place, j * WARP) == k:
                                     T[j] = -T[j]
             sync()
         sync()

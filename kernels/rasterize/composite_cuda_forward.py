@@ -13,10 +13,11 @@ from .composite_cuda_warp import (
     WARP,
     WIDTH,
     Gaussians,
+    anew,
     exp2,
     exponent,
     first_block,
-    load,
+    load1,
     load2,
     load3,
     load_int,
@@ -27,6 +28,7 @@ from .composite_cuda_warp import (
     staging,
     store,
     store_int,
+    store_stop,
     touching,
     word,
 )
@@ -54,12 +56,12 @@ def forward_kernel(channels: int, parts: int):
         gaussians: Gaussians,
         pairs_in: wp.array[wp.int32],
         starts_in: wp.array[wp.int32],
-        transmittances_out: wp.array[wp.float32],
-        stops_out: wp.array[wp.int32],
+        transmittances_out: wp.array2d[wp.float32],
+        stops_out: wp.array2d[wp.int32],
         blocks_out: wp.array[wp.int32],
         walked_out: wp.array[wp.int32],
-        renders_out: wp.array4d[wp.float32],
-        alphas_out: wp.array4d[wp.float32],
+        renders_out: wp.array2d[wp.float32],
+        alphas_out: wp.array2d[wp.float32],
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
@@ -91,7 +93,7 @@ def forward_kernel(channels: int, parts: int):
                     p.corner,
                     load2(gaussians.means2d, g),
                     load3(gaussians.conics, g),
-                    load(gaussians.opacities, g),
+                    load1(gaussians.opacities, g),
                     frame.alpha_min,
                 )
                 stage(arena, frame, gaussians, lane, g, mask, 0)
@@ -130,7 +132,7 @@ def forward_kernel(channels: int, parts: int):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if (stopped[0] & wp.static(1 << (STOP + j))) != 0:
                                 T[j] = -T[j]
-                                store_int(stops_out, p.pixel + j * WARP, k0 + i)
+                                store_stop(stops_out, p.place, j * WARP, k0 + i)
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1
@@ -151,13 +153,15 @@ def forward_kernel(channels: int, parts: int):
 
         if lane == 0:
             wp.atomic_max(walked_out, p.tile, walked)
+        p = place(frame, anew(index), lane)
+        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
-            store(transmittances_out, p.pixel + j * WARP, T[j])
+            store(transmittances_out, p.place, j * WARP, T[j])
             if T[j] != 0.0:
-                row = p.py + j // 2 * HEIGHT
-                column = p.px + j % 2 * WIDTH
-                alphas_out[p.image, row, column, 0] = 1.0 - wp.abs(T[j])
+                step = j // 2 * HEIGHT * frame.width + j % 2 * WIDTH
+                store(alphas_out, p.pixel, step, 1.0 - wp.abs(T[j]))
+                step *= gaussians.channels
                 for c in range(wp.static(channels)):
-                    renders_out[p.image, row, column, gaussians.first + c] = sums[j, c]
+                    store(renders_out, first, step + c, sums[j, c])
 
     return composite

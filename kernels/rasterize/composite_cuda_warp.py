@@ -82,8 +82,8 @@ def root(x: wp.float32) -> wp.float32:
 
 # Arrays are dense. Warp's own indexing multiplies by strides that it reads from the array, which
 # costs instructions and, in loops, registers.
-@wp.func_native("values.data[i] = v;")
-def store(values: wp.array[wp.float32], i: wp.int32, v: wp.float32): ...
+@wp.func_native("return values.data[i];")
+def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
 
 
 @wp.func_native("values.data[i] = v;")
@@ -91,11 +91,7 @@ def store_int(values: wp.array[wp.int32], i: wp.int32, v: wp.int32): ...
 
 
 @wp.func_native("return values.data[i];")
-def load(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
-
-
-@wp.func_native("return values.data[i];")
-def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
+def load1(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
 
 
 @wp.func_native("return values.data[i];")
@@ -106,16 +102,31 @@ def load2(values: wp.array[wp.vec2], i: wp.int32) -> wp.vec2: ...
 def load3(values: wp.array[wp.vec3], i: wp.int32) -> wp.vec3: ...
 
 
-@wp.func_native("return values.data[(long long)row * width + column];")
-def load_of_row(
-    values: wp.array[wp.float32], row: wp.int32, width: wp.int32, column: wp.int32
-) -> wp.float32: ...
+@wp.func_native("return values.data[i + step];")
+def load(values: wp.array2d[wp.float32], i: wp.int64, step: wp.int32) -> wp.float32: ...
 
 
-@wp.func_native("values.data[(long long)row * width + column] = v;")
-def store_of_row(
-    values: wp.array[wp.float32], row: wp.int32, width: wp.int32, column: wp.int32, v: wp.float32
-): ...
+@wp.func_native("values.data[i + step] = v;")
+def store(values: wp.array2d[wp.float32], i: wp.int64, step: wp.int32, v: wp.float32): ...
+
+
+@wp.func_native("return values.data[i + step];")
+def load_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("values.data[i + step] = v;")
+def store_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32, v: wp.int32): ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(x));
+#endif
+    return x;
+""")
+def anew(x: wp.int32) -> wp.int32:
+    """The same; what is computed from it is not kept in registers from before."""
+    ...
 
 
 # fmaf by name: forward and backward must see the same alpha, so no choice is left to the compiler.
@@ -250,10 +261,10 @@ class Place:
 
     tile: wp.int32
     part: wp.int32  # of the tile
-    image: wp.int32
     px: wp.int32  # the lane's pixel in the first sub-tile
     py: wp.int32
-    pixel: wp.int32  # its number, by tiles and sub-tiles; those of the next ones are WARP apart
+    pixel: wp.int64  # its number in all pictures
+    place: wp.int64  # its number by tiles and sub-tiles; those of the next ones are WARP apart
     x: wp.vec2  # centres of the lane's pixels, by columns of sub-tiles
     y: wp.vec4  # by rows of sub-tiles
     corner: wp.vec2  # the centre of the part's first pixel
@@ -269,12 +280,13 @@ def placing(parts: int):
         p = Place()
         p.tile = index // wp.static(parts)
         p.part = index % wp.static(parts)
-        p.image = p.tile // (frame.tiles_x * frame.tiles_y)
+        image = p.tile // (frame.tiles_x * frame.tiles_y)
         x = p.tile % frame.tiles_x * _TILE
         y = p.tile // frame.tiles_x % frame.tiles_y * _TILE + p.part * wp.static(TILE // parts)
         p.px = x + lane % WIDTH
         p.py = y + lane // WIDTH
-        p.pixel = index * wp.static(pixels * WARP) + lane
+        p.pixel = wp.int64(image * frame.height + p.py) * wp.int64(frame.width) + wp.int64(p.px)
+        p.place = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
         for i in range(2):
             p.x[i] = float(p.px + i * WIDTH) + 0.5
         for i in range(wp.static(pixels // 2)):
@@ -328,7 +340,7 @@ class Gaussians:
     means2d: wp.array[wp.vec2]
     conics: wp.array[wp.vec3]
     opacities: wp.array[wp.float32]
-    colors: wp.array[wp.float32]
+    colors: wp.array2d[wp.float32]
     channels: wp.int32  # of ``colors``
     first: wp.int32  # the first one of this launch
 
@@ -356,12 +368,11 @@ def staging(channels: int, size: int):
         conic = load3(gaussians.conics, g)
         put4(arena, at, wp.vec4(mean[0], mean[1], -_LOG2_E_HALF * conic[0], conic[1]))
         put(arena, at + 4, -_LOG2_E_HALF * conic[2])
-        put(arena, at + 5, wp.log2(load(gaussians.opacities, g)))
+        put(arena, at + 5, wp.log2(load1(gaussians.opacities, g)))
         put_int(arena, at + 6, bits)
         put_int(arena, at + 7, row)
-        source = color_row(frame, g)
+        source = wp.int64(color_row(frame, g)) * wp.int64(gaussians.channels)
         for c in range(wp.static(channels)):
-            v = load_of_row(gaussians.colors, source, gaussians.channels, gaussians.first + c)
-            put(arena, at + 8 + c, v)
+            put(arena, at + 8 + c, load(gaussians.colors, source, gaussians.first + c))
 
     return stage
