@@ -26,7 +26,7 @@ def run(scene, v_renders, v_alphas, mode, needs=None, **options):
     renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)
     ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
     grads = {k: v.grad for k, v in tensors.items() if getattr(v, "grad", None) is not None}
-    counts = {k: meta[k] for k in ("pairs_walked", "tiles_skipped")}
+    counts = {k: meta[k] for k in ("pairs_walked", "blocks_used", "tiles_skipped")}
     return {"renders": renders, "alphas": alphas, **grads}, counts
 
 
@@ -111,6 +111,16 @@ def test_a_gradient_of_nan_is_not_zero(on_blocks):
     assert result["colors"][..., 1].isnan().any()
 
 
+@pytest.mark.parametrize("num, views", [(0, 2), (5, 0)])
+def test_empty(on_blocks, num, views):
+    scene = make(1, views, num=num, width=21, height=19)
+    on_blocks(2)
+    v_renders, v_alphas = torch.randn(1, views, 19, 21, 3), torch.randn(1, views, 19, 21, 1)
+    result, _ = run(scene, v_renders, v_alphas, "RGB")
+    assert result["alphas"].shape == v_alphas.shape and not result["alphas"].any()
+    assert result["means"].shape == (1, num, 3) and not result["means"].any()
+
+
 def test_two_runs_and_any_parts(on_blocks):
     """The same bits twice; pictures do not depend on the parts, gradients by rounding only."""
     scene = crowded(3)
@@ -125,6 +135,14 @@ def test_two_runs_and_any_parts(on_blocks):
         assert torch.equal(value, second[name]), name
         assert_rel_rms(cut[name], value, 0 if name in ("renders", "alphas") else 1e-6, name)
     assert any(not torch.equal(first[name], cut[name]) for name in first)
+
+
+def test_many_tiles_are_not_cut(monkeypatch):
+    monkeypatch.setattr(composite_cuda, "_multiprocessors", lambda index: 132)
+    device = torch.device("cuda", 0)
+    views = [1, 2, 3, 32]
+    assert [composite_cuda.parts_of_tile(1024 * n, device) for n in views] == [4, 2, 1, 1]
+    assert composite_cuda.parts_of_tile(4, torch.device("cpu")) == 1
 
 
 _touched = touching(1)

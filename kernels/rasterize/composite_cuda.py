@@ -27,14 +27,14 @@ def _multiprocessors(index: int) -> int:
 def parts_of_tile(tiles: int, device: torch.device) -> int:
     """Into how many warps' work a tile is cut: 1, or where tiles are few, 2 or 4.
 
-    A multiprocessor holds some 20 warps. As long as there are fewer than that, the tile with the
-    longest list sets the time, and its parts run side by side; with more, parts only repeat the
-    work that a Gaussian costs once per warp. No GPU has timed it.
+    A few views do not fill the machine: the tile with the longest list sets the time, and its parts
+    run side by side. With more views parts only repeat the work that a Gaussian costs once per
+    warp. CUDA.md has the estimate behind the limits; no GPU has timed it.
     """
     if device.type != "cuda":
         return 1
-    places = 20 * _multiprocessors(device.index or 0)
-    return 4 if tiles <= places else 2 if tiles <= 2 * places else 1
+    few = 10 * _multiprocessors(device.index or 0)
+    return 4 if tiles <= few else 2 if tiles <= 2 * few else 1
 
 
 def _gaussians(

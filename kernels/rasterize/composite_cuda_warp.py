@@ -174,7 +174,10 @@ _GATHER = """
 #endif
 """
 _ANY_OF = f"""
-#if defined(__CUDA_ARCH__)
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
+    for (int i = 16; i > 0; i /= 2) x |= __shfl_xor_sync(0xffffffffu, x, i);
+    return x;
+#elif defined(__CUDA_ARCH__)
     int r;
     asm volatile("redux.sync.or.b32 %0, %1, 0xffffffff;" : "=r"(r) : "r"(x));
     return r;
