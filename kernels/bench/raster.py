@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import fields, replace
 from functools import partial
 
 import torch
 
+from ..rasterize import Skip
 from . import peers
 from .case import Case, Error, Key, Settings, Target, Variant, compare
 from .raster_scene import LEAVES, Scene, orbit_cameras, shell
@@ -25,6 +27,7 @@ def cases(settings: Settings) -> list[Case]:
         ("scene", _scenes, None),
         ("knobs", _knobs, "error"),
         ("skipping", _skipping, "skipped"),
+        ("switches", _switches, "skipped"),
         ("one call", _one_call, None),
         ("Gaussians", _counts, "N"),
         ("pixels", _pixels, "side"),
@@ -180,6 +183,42 @@ def _skipping(settings: Settings) -> list[Variant]:
         made.append(_variant(part, f"upstream gradient on {name} of the picture", BOTH))
         made[-1].work = partial(_tiles_skipped, part)
     return made
+
+
+def _switches(settings: Settings) -> list[Variant]:
+    """Every exact skip switched off alone, at scale 2, with an upstream gradient on the left half
+    of the picture and for means alone. Same picture and gradients; what the switch is worth is
+    the difference to the default. Skipped: the share of that switch's own count in the default.
+    """
+    scene = _scene(settings, 2)
+    part = torch.zeros_like(scene.cotangent)
+    part[:, :, : scene.size // 2] = scene.cotangent[:, :, : scene.size // 2]
+    scene = scene.changed(cotangent=part, wanted=("means",))
+    made = _pair(scene, "all skips", default=True)
+    for field in fields(Skip):
+        off = scene.changed(options={"skip": replace(Skip(), **{field.name: False})})
+        pair = _pair(off, f"without {field.name}")
+        for variant in pair[field.name in ("zero_upstream", "unused", "unasked") :]:
+            variant.work = partial(_share, field.name, scene)
+            made.append(variant)
+    return made
+
+
+def _share(name: str, scene: Scene) -> dict[str, float]:
+    """What the named switch leaves out of its own count, where all are on."""
+    counts = scene.work(True)
+    blocks = 16 * counts["pairs_walked"]
+    none, half = counts["tiles_empty"], counts["tiles"] - counts["tiles_empty"]
+    share = {
+        "tile_test": 1 - counts["pairs"] / counts["pairs_box"],
+        "block_test": 1 - counts["blocks_walked"] / blocks,
+        "stopped": 1 - counts["pairs_walked"] / counts["pairs"],
+        "empty_tiles": none / counts["tiles"],
+        "zero_upstream": (counts["tiles_skipped"] - none) / half,
+        "unused": 1 - counts["blocks_used"] / blocks,
+        "unasked": 1 - len(scene.wanted) / len(LEAVES),
+    }
+    return counts | {"skipped": share[name]}
 
 
 def _gradients_skipped(scene: Scene, share: float) -> dict[str, float]:

@@ -13,7 +13,15 @@ from ..rasterize.reference import rasterization_reference
 from .case import Error, compare
 
 LEAVES = ("means", "quats", "scales", "opacities", "colors")
-WORK = ("pairs_box", "pairs", "pairs_walked", "blocks_used", "tiles", "tiles_empty")
+WORK = (
+    "pairs_box",
+    "pairs",
+    "pairs_walked",
+    "blocks_walked",
+    "blocks_used",
+    "tiles",
+    "tiles_empty",
+)
 _HALF_FOV = math.radians(49.1) / 2
 _FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # of pictures of 512², width and height
 
@@ -161,6 +169,7 @@ class Scene:
         if exact.pop("rasterize_mode", "classic") == "antialiased":
             exact["antialiased"] = True
         exact.pop("radius_clip", None)
+        exact.pop("skip", None)
         truth = {k: None if x is None else x.double().cpu() for k, x in truth.items()}
         rest = {k: x.double().cpu() if isinstance(x, Tensor) else x for k, x in rest.items()}
         want = self._run(

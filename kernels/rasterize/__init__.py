@@ -1,5 +1,6 @@
 """The differentiable Gaussian rasterizer."""
 
 from .function import rasterization
+from .skip import Skip
 
-__all__ = ["rasterization"]
+__all__ = ["Skip", "rasterization"]

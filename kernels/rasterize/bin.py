@@ -71,7 +71,7 @@ def _count(
         ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
         rows = tile_rows(grid, ellipse.mean[1], extent[1])
         for ty in range(rows[0], rows[1] + 1):
-            columns = tile_columns(grid, ellipse, ty)
+            columns = tile_columns(grid, ellipse, extent, ty)
             count += wp.max(columns[1] - columns[0] + 1, 0)
         box_count = box_pairs(grid, ellipse.mean, extent)
     counts_out[j] = count
@@ -100,7 +100,7 @@ def _emit(
         ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
         rows = tile_rows(grid, ellipse.mean[1], extent[1])
         for ty in range(rows[0], rows[1] + 1):
-            columns = tile_columns(grid, ellipse, ty)
+            columns = tile_columns(grid, ellipse, extent, ty)
             row = ((i // grid.num) * grid.tiles_y + ty) * grid.tiles_x
             for tx in range(columns[0], columns[1] + 1):
                 tiles_out[p] = row + tx
@@ -117,6 +117,7 @@ def bin_gaussians(
     width: int,
     height: int,
     alpha_min: float,
+    skip: int,
 ) -> Bins:
     """Makes the tile lists of all views; reads the number of pairs back (the one synchronisation).
 
@@ -129,6 +130,7 @@ def bin_gaussians(
         width: pixels.
         height: pixels.
         alpha_min: what is fainter than this is not drawn.
+        skip: from ``Skip.bits``.
 
     Raises:
         ValueError: there are more than 2^31 - 1 pairs, or more tiles.
@@ -138,7 +140,7 @@ def bin_gaussians(
     tiles = images * tiles_x * tiles_y
     if max(tiles, depths.numel()) >= MAX_PAIRS:
         raise ValueError(f"{images} views of {tiles_x * tiles_y} tiles, {num} Gaussians: over 2^31")
-    grid = make_grid(num, width, height, alpha_min)
+    grid = make_grid(num, width, height, alpha_min, skip)
     inputs = [
         vectors(means2d, wp.vec2),
         vectors(conics, wp.vec3),

@@ -101,7 +101,7 @@ def _count(
             ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
             rows = tile_rows(grid, ellipse.mean[1], extent[1])
             for ty in range(rows[0], rows[1] + 1):
-                columns = tile_columns(grid, ellipse, ty)
+                columns = tile_columns(grid, ellipse, extent, ty)
                 for tx in range(columns[0], columns[1] + 1):
                     tile = ty * grid.tiles_x + tx
                     in_tiles_out[image, part, tile] = in_tiles_out[image, part, tile] + 1
@@ -142,7 +142,7 @@ def _emit(
             ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
             rows = tile_rows(grid, ellipse.mean[1], extent[1])
             for ty in range(rows[0], rows[1] + 1):
-                columns = tile_columns(grid, ellipse, ty)
+                columns = tile_columns(grid, ellipse, extent, ty)
                 for tx in range(columns[0], columns[1] + 1):
                     tile = ty * grid.tiles_x + tx
                     place = cursors_out[image, part, tile]

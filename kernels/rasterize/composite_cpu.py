@@ -18,6 +18,7 @@ from .blend import blend, unblend
 from .frame import Frame, Walk, color_row
 from .lanes import lanes, lanes_int
 from .launch import vectors
+from .skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
 from .tiles import q_limit
 
 # Unrolled, the loops over blocks and pixels would take the compiler long for no gain.
@@ -25,6 +26,11 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _TILE = wp.constant(TILE)
 _T_MIN = wp.constant(T_MIN)
+_BLOCK_TEST = wp.constant(BLOCK_TEST)
+_STOPPED = wp.constant(STOPPED)
+_EMPTY_TILES = wp.constant(EMPTY_TILES)
+_ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
+_UNUSED = wp.constant(UNUSED)
 _NEVER = wp.constant(2**31 - 1)
 _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
 
@@ -56,6 +62,7 @@ def _composite(
     stops_out: wp.array[lanes_int],
     blocks_out: wp.array[wp.int32],
     walked_out: wp.array[wp.int32],
+    blocks_walked_out: wp.array[wp.int64],
     renders_out: wp.array4d[wp.float32],
     alphas_out: wp.array4d[wp.float32],
 ):
@@ -67,7 +74,8 @@ def _composite(
         begin = starts_in[tile]
         end = starts_in[tile + 1]
         walked_out[tile] = 0
-        if begin < end:
+        blocks_walked_out[tile] = wp.int64(0)
+        if begin < end or (frame.skip & _EMPTY_TILES) == 0:
             image = tile // (frame.tiles_x * frame.tiles_y)
             x = tile % frame.tiles_x * _TILE
             y = tile // frame.tiles_x % frame.tiles_y * _TILE
@@ -82,6 +90,7 @@ def _composite(
 
             inside = _blocks_inside(frame, x, y)
             alive = inside
+            evaluated = wp.int64(0)
             k = begin
             while k < end and alive != 0:
                 g = pairs_in[k]
@@ -89,18 +98,13 @@ def _composite(
                 conic = conics_in[g]
                 shear = conic[1]
                 opacity = view_opacities_in[g]
-                slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
-                bits = alive & L.blocks_touched(
-                    xs,
-                    ys,
-                    mean[0],
-                    mean[1],
-                    conic[0],
-                    shear,
-                    conic[2],
-                    slope,
-                    q_limit(opacity, frame.alpha_min),
-                )
+                bits = alive
+                if (frame.skip & _BLOCK_TEST) != 0:
+                    slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
+                    limit = q_limit(opacity, frame.alpha_min)
+                    bits = alive & L.blocks_touched(
+                        xs, ys, mean[0], mean[1], conic[0], shear, conic[2], slope, limit
+                    )
                 used = wp.int32(0)
                 if bits != 0:
                     used = blend(
@@ -123,10 +127,13 @@ def _composite(
                         stops_out,
                         room_out,
                     )
-                    alive = alive & ~(used >> 16)
+                    evaluated += wp.int64(L.count_bits(bits))
+                    if (frame.skip & _STOPPED) != 0:
+                        alive = alive & ~(used >> 16)
                 blocks_out[k] = used & 0xFFFF
                 k += 1
             walked_out[tile] = k - begin
+            blocks_walked_out[tile] = evaluated
 
             while inside != 0:
                 b = L.lowest_bit(inside)
@@ -163,6 +170,7 @@ def _composite_vjp(
     counter_out: wp.array[wp.int32],
     room_out: wp.array2d[lanes],
     v_pairs_out: wp.array2d[wp.float32],
+    written_out: wp.array[wp.uint8],
     skipped_out: wp.array[wp.int32],
 ):
     """Room to work: counter, the next tile to take; room as ``unblend`` has it."""
@@ -179,6 +187,7 @@ def _composite_vjp(
         inside = wp.int32(0)
         if walked_in[tile] > 0:
             inside = _blocks_inside(frame, x, y)
+        every = inside
         while inside != 0:
             b = L.lowest_bit(inside)
             inside = inside & (inside - 1)
@@ -192,14 +201,17 @@ def _composite_vjp(
                 v_c = L.load_block(v_renders_in, image, py, px, c)
                 room_out[worker, place + c] = v_c
                 any_v = any_v | L.any_nonzero(v_c)
-        skipped_out[tile] = wp.where(any_v == 0, 1, 0)
-        if any_v != 0:
+        wanted = any_v != 0 or ((frame.skip & _ZERO_UPSTREAM) == 0 and every != 0)
+        skipped_out[tile] = wp.where(wanted, 0, 1)
+        if wanted:
             for b in range(16):
                 room_out[worker, b] = L.absolute(transmittances_in[first + b])
                 room_out[worker, 16 + b] = lanes(0.0)
             k = starts_in[tile] + walked_in[tile] - 1
             while k >= starts_in[tile]:
                 bits = blocks_in[k]
+                if (frame.skip & _UNUSED) == 0:
+                    bits = every
                 if bits != 0:
                     g = pairs_in[k]
                     mean = means2d_in[g]
@@ -225,6 +237,7 @@ def _composite_vjp(
                         rows_in[k],
                         v_pairs_out,
                     )
+                    written_out[rows_in[k]] = wp.uint8(1)
                 k -= 1
         tile = L.take(counter_out)
 
@@ -260,6 +273,7 @@ def composite_forward(
         bins.pairs.new_empty(tiles * 16, 16),
         torch.zeros_like(bins.pairs),
         bins.pairs.new_empty(tiles),
+        bins.pairs.new_empty(tiles, dtype=torch.int64),
     )
     parallel_launch(
         _composite,
@@ -281,6 +295,7 @@ def composite_forward(
             view(walk.stops, lanes_int),
             walk.blocks,
             walk.walked,
+            walk.blocks_walked,
             renders,
             alphas,
         ],
@@ -299,7 +314,7 @@ def composite_backward(
     v_renders: Tensor,
     v_alphas: Tensor,
     geometry: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Gradient sums of each pair, in emission order, for ``reduce_pairs``.
 
     Args:
@@ -315,10 +330,12 @@ def composite_backward(
         geometry: whether anything but colours is asked for.
 
     Returns:
-        ``v_pairs [P, 6 + C]`` and ``skipped [tiles]`` int32, 1 where a tile was not walked.
+        ``v_pairs [P, 6 + C]``, ``written [P]`` uint8, 0 where a row was left as it was, and
+        ``skipped [tiles]`` int32, 1 where a tile was not walked.
     """
     tiles, channels = walk.walked.numel(), colors.shape[1]
-    v_pairs = colors.new_zeros(bins.pairs.numel(), 6 + channels)
+    v_pairs = colors.new_empty(bins.pairs.numel(), 6 + channels)
+    written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     skipped = torch.empty_like(walk.walked)
     workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)
     parallel_launch(
@@ -346,7 +363,8 @@ def composite_backward(
             bins.pairs.new_zeros(1),
             view(colors.new_empty(workers, room, 16), lanes),
             v_pairs,
+            written,
             skipped,
         ],
     )
-    return v_pairs, skipped
+    return v_pairs, written, skipped

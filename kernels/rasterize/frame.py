@@ -21,6 +21,7 @@ class Frame:
     colors_per_view: wp.int32
     alpha_min: wp.float32
     alpha_max: wp.float32
+    skip: wp.int32
 
 
 @wp.func
@@ -40,12 +41,14 @@ class Walk(NamedTuple):
         stops: ``[tiles * 16, 16]`` int32, the pair at which the pixel stopped.
         blocks: ``[P]`` int32, one bit per 4 x 4 block to which the pair contributed.
         walked: ``[tiles]`` int32, pairs walked until every pixel had stopped.
+        blocks_walked: ``[tiles]`` int64, blocks evaluated in them.
     """
 
     transmittances: Tensor
     stops: Tensor
     blocks: Tensor
     walked: Tensor
+    blocks_walked: Tensor
 
 
 def make_frame(
@@ -56,11 +59,12 @@ def make_frame(
     colors_per_view: bool,
     alpha_min: float,
     alpha_max: float,
+    skip: int,
 ) -> Frame:
     """The scalars of a composite launch as one kernel argument."""
     frame = Frame()
     frame.width, frame.height = width, height
     frame.tiles_x, frame.tiles_y = tile_grid(width, height)
     frame.views, frame.num, frame.colors_per_view = views, num, int(colors_per_view)
-    frame.alpha_min, frame.alpha_max = alpha_min, alpha_max
+    frame.alpha_min, frame.alpha_max, frame.skip = alpha_min, alpha_max, skip
     return frame

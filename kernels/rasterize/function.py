@@ -14,7 +14,9 @@ from .frame import Walk
 from .harmonics import colors_from_harmonics
 from .meta import Meta
 from .ops import bin_op, composite, project
+from .skip import Skip
 
+EVERYTHING = Skip()
 _DEPTH_EPS = 1e-10  # alpha below this has no expected depth
 
 
@@ -39,6 +41,7 @@ def rasterization(
     rasterize_mode: str = "classic",
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
+    skip: Skip = EVERYTHING,
 ) -> tuple[Tensor, Tensor, Meta]:
     """Renders N Gaussians of each object in each of its V views, all in single launches.
 
@@ -70,6 +73,7 @@ def rasterization(
         rasterize_mode: "classic", or "antialiased": opacity times sqrt(det Σ / det(Σ + eps2d)).
         alpha_min: fainter contributions are skipped; > 0.
         alpha_max: alpha is clamped here, and has zero gradient then; < 1.
+        skip: what work to leave out; changes neither picture nor gradients.
 
     Returns:
         ``renders [.., V, H, W, C]``, ``alphas [.., V, H, W, 1]`` and ``meta``, a dict with
@@ -97,15 +101,15 @@ def rasterization(
     if sh_degree is not None:
         colors = colors_from_harmonics(sh_degree, colors, means, viewmats).contiguous()
     lens = [width, height, near_plane, far_plane, radius_clip, eps2d, alpha_min]
-    lens = [float(x) for x in (*lens, rasterize_mode == "antialiased")]
+    lens = [float(x) for x in (*lens, rasterize_mode == "antialiased", skip.unused)]
     *projected, status = project(means, quats, scales, opacities, colors, viewmats, Ks, lens)
     # with the caller's dimensions first: a gradient retained on meta's tensors must be on the way
     projected = [x.view(*lead, *x.shape[1:]) for x in projected]
     per_view = [x.reshape(size * views, *x.shape[len(lead) + 1 :]) for x in projected]
     means2d, conics, depths, view_opacities, _ = per_view
-    bins = bin_op(*(x.detach() for x in per_view), width, height, alpha_min)
+    bins = bin_op(*(x.detach() for x in per_view), width, height, alpha_min, skip.bits())
     channels = _channels(render_mode, colors, depths.view(size, views, means.shape[1]))
-    size2d = [width, height, views, int(channels.dim() == 4)]
+    size2d = [width, height, views, int(channels.dim() == 4), skip.bits()]
     channels = channels.reshape(-1, channels.shape[-1])
     skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
     limits = [alpha_min, alpha_max]

@@ -97,6 +97,12 @@ def any_nonzero(x: lanes) -> wp.int32:
     ...
 
 
+@wp.func_native("return __builtin_popcount(bits);")
+def count_bits(bits: wp.int32) -> wp.int32:
+    """Number of set bits."""
+    ...
+
+
 @wp.func_native("return __atomic_fetch_add(counter.data, 1, __ATOMIC_RELAXED);")
 def take(counter: wp.array[wp.int32]) -> wp.int32:
     """The next number that no other worker has taken."""

@@ -13,7 +13,8 @@ class Meta(dict):
 
     ``culled``: dict of counts of (view, Gaussian) by reason; ``pairs_box`` and ``pairs``: (tile,
     Gaussian) pairs without and with the exact test; ``pairs_walked``: until every pixel of the tile
-    had stopped; ``blocks_used``: 4 x 4 blocks of pixels to which a pair contributed;
+    had stopped; ``blocks_walked``: 4 x 4 blocks of pixels evaluated for them; ``pairs_used``,
+    ``blocks_used``, ``gaussians_used``: pairs, blocks, (view, Gaussian) that contributed;
     ``tiles`` and ``tiles_empty``; ``tiles_skipped``: not walked by the latest backward, being empty
     or without upstream gradient. The last one is None before a backward and under torch.compile.
     """
@@ -30,7 +31,10 @@ class Meta(dict):
             "pairs_box": lambda: int(self._bins.box_pairs),
             "pairs": lambda: self._bins.pairs.numel(),
             "pairs_walked": lambda: int(self._walk.walked.sum(dtype=torch.int64)),
+            "blocks_walked": lambda: int(self._walk.blocks_walked.sum()),
             "blocks_used": self._blocks_used,
+            "pairs_used": lambda: int((self._walk.blocks != 0).sum()),
+            "gaussians_used": self._gaussians_used,
             "tiles": lambda: self._bins.starts.numel() - 1,
             "tiles_empty": lambda: int((self._bins.starts.diff() == 0).sum()),
         }
@@ -46,3 +50,6 @@ class Meta(dict):
     def _blocks_used(self) -> int:
         blocks = self._walk.blocks
         return sum(int((blocks >> b & 1).sum()) for b in range(16))
+
+    def _gaussians_used(self) -> int:
+        return self._bins.pairs[self._walk.blocks != 0].unique().numel()

@@ -12,6 +12,7 @@ from .frame import Walk, make_frame
 from .project import make_lens, project_forward
 from .project_vjp import project_backward
 from .reduce import reduce_pairs
+from .skip import UNASKED
 from .tiles import tile_grid
 
 _OP = "gamba_warp::rasterize_"
@@ -103,15 +104,15 @@ def bin_op(
     width: int,
     height: int,
     alpha_min: float,
+    skip: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``bin_gaussians`` as an operator; the number of pairs is known only at run time."""
-    return tuple(
-        bin_gaussians(means2d, conics, depths, view_opacities, extents, width, height, alpha_min)
-    )
+    per_view = means2d, conics, depths, view_opacities, extents
+    return tuple(bin_gaussians(*per_view, width, height, alpha_min, skip))
 
 
 @bin_op.register_fake
-def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min):
+def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min, skip):
     def ints(*shape):
         return depths.new_empty(shape, dtype=torch.int32)
 
@@ -133,8 +134,8 @@ def composite(
     size: list[int],
     alpha_range: list[float],
     skipped: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blends the pairs; ``size`` is width, height, V, and whether colours are per view.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Blends the pairs; ``size``: width, height, V, whether colours are per view, ``Skip.bits``.
 
     ``colors`` is ``[I * N, C]`` or, shared by the views, ``[B * N, C]``; ``bins`` is a ``Bins``.
     Backward counts the tiles that it skips into ``skipped``, int64 without dimensions.
@@ -146,8 +147,8 @@ def composite(
 
 
 def _frame(means2d: Tensor, size: list[int], alpha_range: list[float]):
-    width, height, views, per_view = size
-    return make_frame(width, height, views, means2d.shape[1], bool(per_view), *alpha_range)
+    width, height, views, per_view, skip = size
+    return make_frame(width, height, views, means2d.shape[1], bool(per_view), *alpha_range, skip)
 
 
 @composite.register_fake
@@ -163,6 +164,7 @@ def _(means2d, conics, view_opacities, colors, bins, size, alpha_range, skipped)
         pairs.new_empty(blocks, 16),
         torch.empty_like(pairs),
         pairs.new_empty(blocks // 16),
+        pairs.new_empty(blocks // 16, dtype=torch.int64),
     )
 
 
@@ -181,7 +183,7 @@ def _composite_vjp(
     geometry: bool,
 ) -> list[Tensor]:
     every = Bins(*bins)
-    v_pairs, skipped = _compositor(means2d.device).composite_backward(
+    v_pairs, written, skipped = _compositor(means2d.device).composite_backward(
         means2d,
         conics,
         view_opacities,
@@ -193,7 +195,7 @@ def _composite_vjp(
         v_alphas,
         geometry,
     )
-    grads = reduce_pairs(v_pairs, every, conics, view_opacities, geometry)
+    grads = reduce_pairs(v_pairs, written, every, conics, view_opacities, geometry)
     return [skipped, *(g for g in grads if g is not None)]
 
 
@@ -226,7 +228,7 @@ def _composite_backward(ctx, v_renders, v_alphas, *_):
     v_renders = colors.new_zeros(ctx.shapes[0]) if v_renders is None else v_renders
     v_alphas = colors.new_zeros(ctx.shapes[1]) if v_alphas is None else v_alphas
     needs = ctx.needs_input_grad
-    geometry = any(needs[:3])
+    geometry = any(needs[:3]) or not ctx.size[-1] & UNASKED
     skipped, *v_geometry, v_colors = _composite_vjp(
         means2d,
         conics,
@@ -243,12 +245,13 @@ def _composite_backward(ctx, v_renders, v_alphas, *_):
     v_means2d, v_conics, v_view_opacities = v_geometry if geometry else (None, None, None)
     if ctx.skipped is not None:
         ctx.skipped.copy_(skipped.sum())
-    views, per_view = ctx.size[2:]
+    views, per_view = ctx.size[2:4]
     if not per_view and views:
         images, num, channels = v_colors.shape
         v_colors = v_colors.view(images // views, views, num, channels).sum(1)
     v_colors = _shaped(v_colors, colors) if needs[3] else None
-    return v_means2d, v_conics, v_view_opacities, v_colors, [None] * len(bins), None, None, None
+    grads = (x if need else None for x, need in zip((v_means2d, v_conics, v_view_opacities), needs))
+    return *grads, v_colors, [None] * len(bins), None, None, None
 
 
 composite.register_autograd(_composite_backward, setup_context=_composite_setup)

@@ -41,6 +41,7 @@ class Lens:
     eps2d: wp.float32
     alpha_min: wp.float32
     antialiased: wp.int32
+    skip_unused: wp.int32
 
 
 @wp.func
@@ -233,6 +234,7 @@ def make_lens(
     eps2d: float,
     alpha_min: float,
     antialiased: bool,
+    skip_unused: bool,
 ) -> Lens:
     """The scalars of a projection as one kernel argument."""
     lens = Lens()
@@ -240,6 +242,7 @@ def make_lens(
     lens.near_plane, lens.far_plane = near_plane, far_plane
     lens.radius_clip, lens.eps2d = radius_clip, eps2d
     lens.alpha_min, lens.antialiased = alpha_min, int(antialiased)
+    lens.skip_unused = int(skip_unused)
     return lens
 
 

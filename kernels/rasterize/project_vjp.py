@@ -107,7 +107,16 @@ def _project_vjp(
     for view_index in range(views):
         image = b * views + view_index
         i = image * num + g % num
-        if status_in[i] == _VISIBLE:
+        wanted = status_in[i] == _VISIBLE
+        if wanted and lens.skip_unused != 0:
+            # false only for exact zeros: NaN passes on
+            wanted = not (
+                v_means2d_in[i] == wp.vec2(0.0, 0.0)
+                and v_conics_in[i] == wp.vec3(0.0, 0.0, 0.0)
+                and v_depths_in[i] == 0.0
+                and v_view_opacities_in[i] == 0.0
+            )
+        if wanted:
             viewmat = viewmats_in[image]
             W = rotation_of(viewmat)
             t = W * means_in[g] + translation_of(viewmat)

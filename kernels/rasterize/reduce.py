@@ -15,6 +15,7 @@ def _reduce(
     order_in: wp.array[wp.int32],
     offsets_in: wp.array[wp.int32],
     v_pairs_in: wp.array2d[wp.float32],
+    written_in: wp.array[wp.uint8],
     conics_in: wp.array[wp.vec3],
     view_opacities_in: wp.array[wp.float32],
     v_means2d_out: wp.array[wp.vec2],
@@ -26,25 +27,28 @@ def _reduce(
     i = order_in[j]
     begin = offsets_in[j]
     end = offsets_in[j + 1]
+    h = wp.float32(0.0)
+    hu = wp.float32(0.0)
+    hy = wp.float32(0.0)
+    huu = wp.float32(0.0)
+    huy = wp.float32(0.0)
+    hyy = wp.float32(0.0)
     for c in range(v_colors_out.shape[1]):
-        total = wp.float32(0.0)
-        for p in range(begin, end):
-            total += v_pairs_in[p, 6 + c]
-        v_colors_out[i, c] = total
-    if v_means2d_out:
-        h = wp.float32(0.0)
-        hu = wp.float32(0.0)
-        hy = wp.float32(0.0)
-        huu = wp.float32(0.0)
-        huy = wp.float32(0.0)
-        hyy = wp.float32(0.0)
-        for p in range(begin, end):
+        v_colors_out[i, c] = 0.0
+    for p in range(begin, end):
+        used = True
+        if written_in:
+            used = written_in[p] != wp.uint8(0)
+        if used:
+            for c in range(v_colors_out.shape[1]):
+                v_colors_out[i, c] = v_colors_out[i, c] + v_pairs_in[p, 6 + c]
             h += v_pairs_in[p, 0]
             hu += v_pairs_in[p, 1]
             hy += v_pairs_in[p, 2]
             huu += v_pairs_in[p, 3]
             huy += v_pairs_in[p, 4]
             hyy += v_pairs_in[p, 5]
+    if v_means2d_out:
         # README eq. 11: moments of h to the gradients
         conic = conics_in[i]
         a, k, e = conic[0], conic[1], conic[2]
@@ -57,12 +61,18 @@ def _reduce(
 
 
 def reduce_pairs(
-    v_pairs: Tensor, bins: Bins, conics: Tensor, view_opacities: Tensor, geometry: bool
+    v_pairs: Tensor,
+    written: Tensor | None,
+    bins: Bins,
+    conics: Tensor,
+    view_opacities: Tensor,
+    geometry: bool,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor]:
     """Sums the rows of ``composite_backward`` by (view, Gaussian).
 
     Args:
         v_pairs: ``[P, 6 + C]``.
+        written: ``[P]`` uint8, 0 where a row of ``v_pairs`` was not written; None: all were.
         bins: as forward.
         conics: ``[I, N, 3]``.
         view_opacities: ``[I, N]``.
@@ -85,6 +95,7 @@ def reduce_pairs(
             bins.order,
             bins.offsets,
             v_pairs,
+            written,
             vectors(conics, wp.vec3),
             view_opacities.view(-1),
         ],

@@ -6,6 +6,7 @@ README.md §2 proves the test. Counting and writing call the same functions.
 import warp as wp
 
 from ..constants import TILE
+from .skip import TILE_TEST
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,6 +16,7 @@ SLACK = 1.0 + 1e-4
 SLACK_ABS = 1e-4
 _SLACK = wp.constant(SLACK)
 _SLACK_ABS = wp.constant(SLACK_ABS)
+_TILE_TEST = wp.constant(TILE_TEST)
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
@@ -32,12 +34,14 @@ class Grid:
     tiles_x: wp.int32
     tiles_y: wp.int32
     alpha_min: wp.float32
+    skip: wp.int32
 
 
-def make_grid(num: int, width: int, height: int, alpha_min: float) -> Grid:
+def make_grid(num: int, width: int, height: int, alpha_min: float, skip: int) -> Grid:
     """The scalars of a binning launch as one kernel argument."""
     grid = Grid()
-    grid.num, grid.width, grid.height, grid.alpha_min = num, width, height, alpha_min
+    grid.num, grid.width, grid.height = num, width, height
+    grid.alpha_min, grid.skip = alpha_min, skip
     grid.tiles_x, grid.tiles_y = tile_grid(width, height)
     return grid
 
@@ -88,8 +92,15 @@ def make_ellipse(mean: wp.vec2, conic: wp.vec3, limit: wp.float32) -> Ellipse:
 
 
 @wp.func
-def tile_columns(grid: Grid, ellipse: Ellipse, ty: wp.int32) -> wp.vec2i:
+def _box_columns(grid: Grid, x: wp.float32, extent: wp.float32) -> wp.vec2i:
+    return wp.vec2i(to_tile(x - extent, grid.width), to_tile(x + extent, grid.width))
+
+
+@wp.func
+def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) -> wp.vec2i:
     # README eq. 6: columns of row ty that the ellipse touches; first > last: none
+    if (grid.skip & _TILE_TEST) == 0:
+        return _box_columns(grid, ellipse.mean[0], extent[0])
     y = float(ty * _TILE) - ellipse.mean[1]
     y0 = wp.max(y + 0.5, -ellipse.reach)
     y1 = wp.min(wp.min(y + float(_TILE), float(grid.height) - ellipse.mean[1]) - 0.5, ellipse.reach)
@@ -113,6 +124,5 @@ def tile_columns(grid: Grid, ellipse: Ellipse, ty: wp.int32) -> wp.vec2i:
 def box_pairs(grid: Grid, mean: wp.vec2, extent: wp.vec2) -> wp.int64:
     # pairs of a Gaussian if tiles were tested against its box alone
     rows = tile_rows(grid, mean[1], extent[1])
-    first = to_tile(mean[0] - extent[0], grid.width)
-    last = to_tile(mean[0] + extent[0], grid.width)
-    return wp.int64(rows[1] - rows[0] + 1) * wp.int64(last - first + 1)
+    columns = _box_columns(grid, mean[0], extent[0])
+    return wp.int64(rows[1] - rows[0] + 1) * wp.int64(columns[1] - columns[0] + 1)

@@ -1,0 +1,41 @@
+"""What the rasterizer leaves out without changing picture or gradients, each with its switch."""
+
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Work to be left out. Every choice gives the same picture and gradients; all are on.
+
+    README.md, "What is skipped", has the proofs; the counts are keys of ``meta``.
+
+    Attributes:
+        tile_test: tiles that the box of a Gaussian meets and its ellipse does not (``pairs_box``
+            without, ``pairs`` with the test).
+        block_test: of a tile, the parts that the ellipse misses: 4 x 4 pixels on the CPU, 8 x 4 on
+            CUDA (``blocks_walked``; without the test, all of ``pairs_walked``).
+        stopped: what lies behind a tile or part whose pixels have all stopped (``pairs`` without,
+            ``pairs_walked`` with it).
+        empty_tiles: setting up tiles that no Gaussian touches (``tiles_empty``).
+        zero_upstream: in backward, tiles whose upstream gradient is all zero (``tiles_skipped``).
+        unused: in backward, pairs and parts that forward found without effect (``pairs_used``,
+            ``blocks_used``), and Gaussians none of whose pairs had any (``gaussians_used``).
+        unasked: gradients of inputs that do not require one.
+    """
+
+    tile_test: bool = True
+    block_test: bool = True
+    stopped: bool = True
+    empty_tiles: bool = True
+    zero_upstream: bool = True
+    unused: bool = True
+    unasked: bool = True
+
+    def bits(self) -> int:
+        """One bit each, in order: ``TILE_TEST`` and so on below."""
+        return sum(bool(getattr(self, field.name)) << i for i, field in enumerate(fields(self)))
+
+
+TILE_TEST, BLOCK_TEST, STOPPED, EMPTY_TILES, ZERO_UPSTREAM, UNUSED, UNASKED = (
+    1 << i for i in range(len(fields(Skip)))
+)
