@@ -75,6 +75,7 @@ def composite_forward(
         bins.pairs.new_empty(tiles * 16, 16),
         torch.zeros_like(bins.pairs),
         bins.pairs.new_zeros(tiles),
+        bins.pairs.new_zeros(tiles, dtype=torch.int64),
     )
     for first in range(0, channels if tiles else 0, CHUNK):
         gaussians.first = first
@@ -112,8 +113,8 @@ def composite_backward(
     v_renders: Tensor,
     v_alphas: Tensor,
     geometry: bool,
-) -> tuple[Tensor, Tensor]:
-    """As ``composite_cpu.composite_backward``."""
+) -> tuple[Tensor, None, Tensor]:
+    """As ``composite_cpu.composite_backward``; all rows are written."""
     tiles, channels = walk.walked.numel(), colors.shape[1]
     gaussians = _gaussians(means2d, conics, view_opacities, colors)
     parts = parts_of_tile(tiles, colors.device)
@@ -141,4 +142,4 @@ def composite_backward(
             device=colors.device,
             block_dim=WARP,
         )
-    return v_pairs[:, 0] if parts == 1 else v_pairs.sum(1), skipped
+    return v_pairs[:, 0] if parts == 1 else v_pairs.sum(1), None, skipped

@@ -46,10 +46,15 @@ def colors_from_harmonics(
         viewmats: ``[B, V, 4, 4]``.
 
     Returns:
-        ``[B, V, N, 3]``.
+        ``[B, V, N, 3]``; NaN without a gradient where the mean or a used coefficient is not finite.
     """
+    used = coefficients[:, :, : (degree + 1) ** 2]
+    # what is not finite must not meet a zero gradient: 0 * NaN would spread to the whole view
+    finite = means.isfinite().all(-1) & used.isfinite().flatten(2).all(-1)
+    means = torch.where(finite[..., None], means, 0.0)
+    used = torch.where(finite[..., None, None], used, 0.0)
     rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centers = -(rotation.mT @ translation[..., None])[..., 0]
     directions = torch.nn.functional.normalize(means[:, None] - centers[:, :, None], dim=-1)
-    used = coefficients[:, :, : (degree + 1) ** 2]
-    return (torch.einsum("bvnk,bnkc->bvnc", _basis(degree, directions), used) + 0.5).clamp_min(0)
+    colors = torch.einsum("bvnk,bnkc->bvnc", _basis(degree, directions), used) + 0.5
+    return torch.where(finite[:, None, :, None], colors.clamp_min(0), torch.nan)

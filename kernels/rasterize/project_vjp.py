@@ -27,6 +27,7 @@ from .project import (
 wp.set_module_options({"enable_backward": False})
 
 _VISIBLE = wp.constant(VISIBLE)
+_SHORTEST = wp.constant(1e-30)
 
 
 @wp.func
@@ -132,16 +133,15 @@ def _project_vjp(
             conic = conics_in[i]
             a, k, e = conic[0], conic[1], conic[2]
             v = v_conics_in[i]
-            v_sxx = -a * a * v[0]
-            v_sxy = -2.0 * a * a * k * v[0] - e * v[1]
-            v_syy = -a * a * k * k * v[0] - k * e * v[1] - e * e * v[2]
-            v_m0 = 2.0 * v_sxx * m0 + v_sxy * m1
-            v_m1 = v_sxy * m0 + 2.0 * v_syy * m1
+            n = wp.cross(m0, m1)
+            across = e * (lens.eps2d * m0 + wp.cross(m1, n))
+            v_across = -2.0 * a * a * v[0]
+            v_m0 = v_across * across - e * v[1] * m1
+            v_m1 = (v_across * k - e * v[1]) * across - e * (v[1] * k + 2.0 * e * v[2]) * m1
 
             v_o = v_view_opacities_in[i]
             if lens.antialiased != 0:
                 # README eq. 9: the factor sqrt(det0 / det), det0 = |m0 × m1|²
-                n = wp.cross(m0, m1)
                 det0 = wp.dot(n, n)
                 trace = wp.dot(m0, m0) + wp.dot(m1, m1)
                 det = det0 + lens.eps2d * trace + lens.eps2d * lens.eps2d
@@ -191,7 +191,8 @@ def _project_vjp(
     if v_quats_out:
         size = quat_size(quats_in[g])
         v_quats_out[g] = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        if size > 0.0:
+        # of a shorter one the gradient leaves float32's range
+        if size > _SHORTEST:
             v_quats_out[g] = _rotation_vjp(q, v_R) / size
 
 

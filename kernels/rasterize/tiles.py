@@ -101,9 +101,10 @@ def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) ->
     # README eq. 6: columns of row ty that the ellipse touches; first > last: none
     if (grid.skip & _TILE_TEST) == 0:
         return _box_columns(grid, ellipse.mean[0], extent[0])
-    y = float(ty * _TILE) - ellipse.mean[1]
-    y0 = wp.max(y + 0.5, -ellipse.reach)
-    y1 = wp.min(wp.min(y + float(_TILE), float(grid.height) - ellipse.mean[1]) - 0.5, ellipse.reach)
+    # exact numbers first, the mean once: rounding must not turn one row of pixels into none
+    y0 = wp.max(float(ty * _TILE) + 0.5 - ellipse.mean[1], -ellipse.reach)
+    end = float(wp.min(ty * _TILE + _TILE, grid.height)) - 0.5
+    y1 = wp.min(end - ellipse.mean[1], ellipse.reach)
     if y0 > y1:
         return wp.vec2i(0, -1)
     # convex, so clamping finds the extremes
