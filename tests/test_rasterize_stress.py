@@ -99,6 +99,9 @@ def test_scales(scale):
 
 
 SHAPES = {  # scales and the largest opacity, so that neither nothing is left nor all hidden
+    "all sizes": (lambda num: 10 ** (-9 + 12 * torch.rand(1, num, 3)), 0.1),
+    "needles": (lambda num: torch.tensor([1.0, 1e-5, 1e-5]).expand(1, num, 3), 0.2),
+    "long needles": (lambda num: torch.tensor([1e3, 1e-2, 1e-2]).expand(1, num, 3), 0.1),
     "discs": (lambda num: torch.tensor([1.0, 1e-5, 1.0]).expand(1, num, 3), 0.02),
     "points": (lambda num: 1e-9 * torch.exp(torch.randn(1, num, 3)), 1.0),
 }
@@ -240,8 +243,19 @@ def test_background_not_finite():
     assert torch.equal(renders[0, 1, ..., :2], clean[0][0, 1, ..., :2])
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("name", ["means", "colors", "scales"])
+def test_bad_gaussians_with_harmonics(name, value):
+    scene = base()
+    scene["colors"] = 0.4 * torch.randn(1, 60, 16, 3)
+    scene[name][0, ::7] = value
+    _, alphas, grads, meta = survives(scene, sh_degree=3)
+    assert alphas.mean() > 0.1 and meta["culled"]["not_finite"] == 18
+    assert (grads["means"][0, ::7] == 0).all() and (grads["viewmats"] != 0).any()
+
+
 # one pixel beyond a multiple of the tile: the last row or column of tiles is one pixel wide
-SIZES = [(1, 2000), (15, 17), (20, 33), (16, 16), (17, 48), (33, 5)]
+SIZES = [(1, 1), (1, 2000), (2000, 1), (15, 17), (20, 33), (16, 16), (17, 48), (33, 5)]
 
 
 @pytest.mark.parametrize("width, height", SIZES)
