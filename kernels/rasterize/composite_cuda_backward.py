@@ -44,7 +44,8 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
     rows_at = WARP * RECORD
     sums_at = rows_at + WARP
     size = sums_at + slots * values * PITCH
-    arena_type, sync, any_of, ballot, put, put_int, get_int, _, get4 = shared_memory(size)
+    memory = shared_memory(size)
+    arena_type = memory.arena
     place, stage = placing(parts), staging(channels, size)
     pixels = SUB_TILES // parts  # of a lane
     part_blocks = (1 << 16 // parts) - 1
@@ -55,6 +56,21 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
     resident = 20 if channels < 4 else 16  # warps of a multiprocessor, as registers allow
 
     @wp.func
+    def of_part(bits: wp.int32, part: wp.int32, wanted: wp.int32) -> wp.int32:
+        # of a pair's bits, those of a part of the tile, of blocks only the wanted ones
+        stops = bits >> (STOP + part * wp.static(pixels)) & wp.static(part_stops)
+        blocks = bits >> (part * wp.static(16 // parts)) & wp.static(part_blocks)
+        return blocks & wanted | stops << STOP
+
+    @wp.func
+    def leave(arena: arena_type, lane: wp.int32, slot: wp.int32, row: wp.int32, sums: values_type):
+        # a lane's sums of a pair, to be completed together with those of other pairs
+        at = wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
+        for v in range(wp.static(values)):
+            memory.put(arena, at + wp.static(v * PITCH), sums[v])
+        memory.put_int(arena, wp.static(rows_at) + slot, row)
+
+    @wp.func
     def complete(
         arena: arena_type,
         gaussians: Gaussians,
@@ -62,14 +78,14 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         count: wp.int32,
         v_pairs: wp.array2d[wp.float32],
     ):
-        # each lane adds up one value of one of the waiting pairs, over the 32 lanes
+        # each lane adds up one value of one of the pairs left, over the 32 lanes
         if lane < count * wp.static(values):
             at = wp.static(sums_at) + lane * PITCH
-            total = get4(arena, at)
+            total = memory.get4(arena, at)
             for i in range(1, wp.static(WARP // 4)):
-                total += get4(arena, at + 4 * i)
+                total += memory.get4(arena, at + 4 * i)
             value = (total[0] + total[1]) + (total[2] + total[3])
-            row = wp.int64(get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
+            row = wp.int64(memory.get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
             row *= wp.int64(gaussians.channels + 6)
             column = lane % wp.static(values)
             if column >= wp.static(moments):
@@ -99,12 +115,10 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
         p = place(frame, index, lane)
-        T = (
-            pixels_type()
-        )  # as forward left it: negative until the walk comes to where the pixel stopped
-        R = (
-            pixels_type()
-        )  # README eq. 10, less the gradient of alpha, which is the same for all pairs
+        # as forward left it: negative until the walk comes to where the pixel stopped
+        T = pixels_type()
+        # README eq. 10, less the gradient of alpha, which is the same for all pairs
+        R = pixels_type()
         upstream = upstream_type()
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         some = wp.int32(0)
@@ -125,7 +139,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                 # NaN is not taken for zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
-        wanted = any_of(arena, lane, some)
+        wanted = memory.any_of(arena, lane, some)
         if wanted == 0:
             walked = 0
         if walked > 0 and lane == 0:
@@ -137,30 +151,20 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
             k = begin + walked - 1 - done - lane
             bits = wp.int32(0)
             if k >= begin:
-                bits = load_int(blocks_in, k)
-                stops = bits >> (STOP + p.part * wp.static(pixels)) & wp.static(part_stops)
-                bits = bits >> (p.part * wp.static(16 // parts)) & wp.static(part_blocks) & wanted
-                bits |= stops << STOP
+                bits = of_part(load_int(blocks_in, k), p.part, wanted)
                 if bits != 0:
                     g = load_int(pairs_in, k)
-                    stage(
-                        arena,
-                        frame,
-                        gaussians,
-                        lane,
-                        g,
-                        bits,
-                        load_int(rows_in, k) * wp.static(parts) + p.part,
-                    )
-            todo = ballot(arena, lane, bits)
-            sync()
+                    row = load_int(rows_in, k) * wp.static(parts) + p.part
+                    stage(arena, frame, gaussians, lane, g, bits, row)
+            todo = memory.ballot(arena, lane, bits)
+            memory.sync()
             while todo != 0:
                 i = lowest_bit(todo)
                 todo &= todo - 1
-                shape = get4(arena, i * RECORD)
-                level = get4(arena, i * RECORD + 4)
-                color = get4(arena, i * RECORD + 8)
-                bits = get_int(arena, i * RECORD + 6)
+                shape = memory.get4(arena, i * RECORD)
+                level = memory.get4(arena, i * RECORD + 4)
+                color = memory.get4(arena, i * RECORD + 8)
+                bits = memory.get_int(arena, i * RECORD + 6)
                 sums = values_type()
                 for j in range(wp.static(pixels)):
                     if (bits & wp.static(3 << first_block(j))) != 0:
@@ -189,15 +193,12 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                                     sums[4] += hu * dy
                                     sums[5] += hy * dy
                 if (bits & wp.static(_BLOCKS)) != 0:
-                    at = wp.static(sums_at) + waiting * wp.static(values * PITCH) + lane
-                    for v in range(wp.static(values)):
-                        put(arena, at + wp.static(v * PITCH), sums[v])
-                    put_int(arena, wp.static(rows_at) + waiting, get_int(arena, i * RECORD + 7))
+                    leave(arena, lane, waiting, memory.get_int(arena, i * RECORD + 7), sums)
                     waiting += 1
                     if waiting == wp.static(slots):
-                        sync()
+                        memory.sync()
                         complete(arena, gaussians, lane, waiting, v_pairs_out)
-                        sync()
+                        memory.sync()
                         waiting = 0
                 if (bits >> STOP) != 0:
                     # what stopped here takes part from the next pair on
@@ -207,8 +208,8 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                             if T[j] < 0.0:
                                 if load_stop(stops_in, p.place, j * WARP) == k:
                                     T[j] = -T[j]
-            sync()
-        sync()
+            memory.sync()
+        memory.sync()
         complete(arena, gaussians, lane, waiting, v_pairs_out)
 
     return composite_vjp

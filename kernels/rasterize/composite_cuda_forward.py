@@ -41,7 +41,7 @@ _T_MIN = wp.constant(T_MIN)
 @functools.cache
 def forward_kernel(channels: int, parts: int):
     """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4."""
-    arena_type, sync, any_of, ballot, _, _, get_int, _, get4 = shared_memory(_SIZE)
+    memory = shared_memory(_SIZE)
     place, touched, stage = placing(parts), touching(parts), staging(channels, _SIZE)
     pixels = SUB_TILES // parts  # of a lane
     pixels_type = wp.types.vector(pixels, wp.float32)
@@ -67,16 +67,15 @@ def forward_kernel(channels: int, parts: int):
         arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
         p = place(frame, index, lane)
         half = lane // 4 % 2  # of a sub-tile: blocks of 4 x 4 pixels
-        T = (
-            pixels_type()
-        )  # positive: the pixel goes on; negative: it stopped; 0: outside the picture
+        # positive: the pixel goes on; negative: it stopped; 0: it is outside the picture
+        T = pixels_type()
         sums = sums_type()
         inside = wp.int32(0)
         for j in range(wp.static(pixels)):
             if p.px + j % 2 * WIDTH < frame.width and p.py + j // 2 * HEIGHT < frame.height:
                 T[j] = 1.0
                 inside |= 1 << j
-        live = any_of(arena, lane, inside)
+        live = memory.any_of(arena, lane, inside)
 
         begin = starts_in[p.tile]
         end = starts_in[p.tile + 1]
@@ -97,16 +96,16 @@ def forward_kernel(channels: int, parts: int):
                     frame.alpha_min,
                 )
                 stage(arena, frame, gaussians, lane, g, mask, 0)
-            todo = ballot(arena, lane, mask)
-            sync()
+            todo = memory.ballot(arena, lane, mask)
+            memory.sync()
             mine = wp.int32(0)
             while todo != 0 and live != 0:
                 i = lowest_bit(todo)
                 todo &= todo - 1
-                shape = get4(arena, i * RECORD)
-                level = get4(arena, i * RECORD + 4)
-                color = get4(arena, i * RECORD + 8)
-                mask = live & get_int(arena, i * RECORD + 6)
+                shape = memory.get4(arena, i * RECORD)
+                level = memory.get4(arena, i * RECORD + 4)
+                color = memory.get4(arena, i * RECORD + 8)
+                mask = live & memory.get_int(arena, i * RECORD + 6)
                 used = word()
                 stopped = word()
                 for j in range(wp.static(pixels)):
@@ -124,7 +123,7 @@ def forward_kernel(channels: int, parts: int):
                                     sums[j, c] += weight * color[c]
                             else:
                                 stopped[0] += wp.static(1 << (STOP + j))
-                bits = any_of(arena, lane, (used[0] << half) | stopped[0])
+                bits = memory.any_of(arena, lane, (used[0] << half) | stopped[0])
                 if lane == i:
                     mine = bits
                 if (bits >> STOP) != 0:
@@ -136,7 +135,7 @@ def forward_kernel(channels: int, parts: int):
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1
-                            if ballot(arena, lane, going) == 0:
+                            if memory.ballot(arena, lane, going) == 0:
                                 live &= wp.static(~(1 << j))
                     if live == 0:
                         walked = k0 + i - begin + 1
@@ -149,7 +148,7 @@ def forward_kernel(channels: int, parts: int):
                     shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
                     shifted |= (mine & wp.static(~((1 << STOP) - 1))) << shift_stop
                     wp.atomic_or(blocks_out, k, shifted)
-            sync()
+            memory.sync()
 
         if lane == 0:
             wp.atomic_max(walked_out, p.tile, walked)

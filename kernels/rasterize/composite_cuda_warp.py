@@ -354,7 +354,8 @@ def staging(channels: int, size: int):
 
     A record holds mean x, y, -a log2(e)/2, k; -e log2(e)/2, log2 of opacity, two integers; colours.
     """
-    arena_type, _, _, _, put, put_int, _, put4, _ = shared_memory(size)
+    memory = shared_memory(size)
+    arena_type = memory.arena
 
     @wp.func
     def stage(
@@ -369,13 +370,13 @@ def staging(channels: int, size: int):
         at = lane * RECORD
         mean = load2(gaussians.means2d, g)
         conic = load3(gaussians.conics, g)
-        put4(arena, at, wp.vec4(mean[0], mean[1], -_LOG2_E_HALF * conic[0], conic[1]))
-        put(arena, at + 4, -_LOG2_E_HALF * conic[2])
-        put(arena, at + 5, wp.log2(load1(gaussians.opacities, g)))
-        put_int(arena, at + 6, bits)
-        put_int(arena, at + 7, row)
+        memory.put4(arena, at, wp.vec4(mean[0], mean[1], -_LOG2_E_HALF * conic[0], conic[1]))
+        memory.put(arena, at + 4, -_LOG2_E_HALF * conic[2])
+        memory.put(arena, at + 5, wp.log2(load1(gaussians.opacities, g)))
+        memory.put_int(arena, at + 6, bits)
+        memory.put_int(arena, at + 7, row)
         source = wp.int64(color_row(frame, g)) * wp.int64(gaussians.channels)
         for c in range(wp.static(channels)):
-            put(arena, at + 8 + c, load(gaussians.colors, source, gaussians.first + c))
+            memory.put(arena, at + 8 + c, load(gaussians.colors, source, gaussians.first + c))
 
     return stage
