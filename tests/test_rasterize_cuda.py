@@ -1,6 +1,7 @@
 """The CUDA kernels without a GPU: small shapes on CPU blocks, and compiled ahead of time."""
 
 import json
+from dataclasses import fields
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from helpers import assert_rel_rms, resources, shared_bytes
 from test_rasterize import leaves, make
 
 from gamba_warp.kernels.constants import ALPHA_MIN
-from gamba_warp.kernels.rasterize import composite_cpu, composite_cuda, ops, rasterization
+from gamba_warp.kernels.rasterize import Skip, composite_cpu, composite_cuda, ops, rasterization
 from gamba_warp.kernels.rasterize.composite_cuda_backward import backward_kernel
 from gamba_warp.kernels.rasterize.composite_cuda_forward import forward_kernel
 from gamba_warp.kernels.rasterize.composite_cuda_warp import WARP, touching
@@ -26,7 +27,7 @@ def run(scene, v_renders, v_alphas, mode, needs=None, **options):
     renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)
     ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
     grads = {k: v.grad for k, v in tensors.items() if getattr(v, "grad", None) is not None}
-    counts = {k: meta[k] for k in ("pairs_walked", "blocks_used", "tiles_skipped")}
+    counts = {k: meta[k] for k in ("pairs_walked", "blocks_walked", "blocks_used", "tiles_skipped")}
     return {"renders": renders, "alphas": alphas, **grads}, counts
 
 
@@ -47,6 +48,21 @@ def on_blocks(monkeypatch):
         monkeypatch.setattr(torch.Tensor, "new_empty", poisoned)
 
     return switch
+
+
+def test_skips_change_nothing(on_blocks):
+    scene = crowded(3)
+    v_renders, v_alphas = torch.randn(1, 2, 21, 37, 3), torch.randn(1, 2, 21, 37, 1)
+    v_renders[:, :, :16, :16] = v_alphas[:, :, :16, :16] = 0
+    on_blocks(2)
+    want, counts = run(scene, v_renders, v_alphas, "RGB")
+    off = dict.fromkeys([field.name for field in fields(Skip)], False)
+    got, all_counts = run(scene, v_renders, v_alphas, "RGB", skip=Skip(**off))
+    for name, value in want.items():
+        assert_rel_rms(got[name], value, SAME, name)
+    assert all_counts["pairs_walked"] > counts["pairs_walked"]
+    assert all_counts["tiles_skipped"] < counts["tiles_skipped"]
+    assert all_counts["blocks_walked"] > counts["blocks_walked"] > 0
 
 
 def crowded(channels):
@@ -75,6 +91,8 @@ def test_block_kernels_equal_lane_kernels(on_blocks, channels, mode, parts):
     # the CPU counts blocks of which only pixels outside the picture are covered
     used, lanes_used = block_counts.pop("blocks_used"), lane_counts.pop("blocks_used")
     assert 0.99 * lanes_used <= used <= lanes_used
+    # a sub-tile is two blocks
+    assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
     assert block_counts == lane_counts and lane_counts["tiles_skipped"] >= 2
 
 
@@ -100,6 +118,8 @@ def test_a_first_gaussian_may_stop_a_pixel(on_blocks):
     lanes, lane_counts = run(scene, v_renders, v_alphas, "RGB", **options)
     on_blocks()
     blocks, block_counts = run(scene, v_renders, v_alphas, "RGB", **options)
+    # a sub-tile is two blocks
+    assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
     assert (lanes["alphas"] == 0).any() and block_counts == lane_counts
     for name, value in lanes.items():
         assert_rel_rms(blocks[name], value, SAME, name)

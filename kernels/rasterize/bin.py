@@ -178,7 +178,8 @@ def _bin_views(grid: Grid, depths: Tensor, inputs: list, check) -> tuple[Tensor,
         outputs = [tile_of, gaussians]
         launch(_emit, order.numel(), [grid, order, *inputs, offsets], outputs, device)
     tiles = images * grid.tiles_x * grid.tiles_y
-    per_tile = torch.bincount(tile_of, minlength=tiles)
-    starts = torch.nn.functional.pad(per_tile.cumsum(0), (1, 0)).int()
-    rows = torch.argsort(tile_of, stable=True)
+    sorted_tiles, rows = torch.sort(tile_of, stable=True)
+    # not bincount: on CUDA it reads the largest value back
+    firsts = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+    starts = torch.searchsorted(sorted_tiles, firsts, out_int32=True)
     return order, offsets, gaussians[rows], rows.int(), starts, box_counts.sum()

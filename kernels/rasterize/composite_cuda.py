@@ -93,6 +93,7 @@ def composite_forward(
                 walk.stops,
                 walk.blocks,
                 walk.walked,
+                walk.blocks_walked,
                 renders.view(-1, channels),
                 alphas.view(-1, 1),
             ],

@@ -28,8 +28,11 @@ from .composite_cuda_warp import (
     store,
 )
 from .frame import Frame
+from .skip import UNUSED, ZERO_UPSTREAM
 
 _BLOCKS = (1 << STOP) - 1
+_ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
+_UNUSED = wp.constant(UNUSED)
 
 
 @functools.cache
@@ -139,6 +142,8 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                 # NaN is not taken for zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
+        if (frame.skip & _ZERO_UPSTREAM) == 0:
+            some = wp.static(part_blocks)
         wanted = memory.any_of(arena, lane, some)
         if wanted == 0:
             walked = 0
@@ -152,6 +157,8 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
             bits = wp.int32(0)
             if k >= begin:
                 bits = of_part(load_int(blocks_in, k), p.part, wanted)
+                if (frame.skip & _UNUSED) == 0:
+                    bits |= wanted
                 if bits != 0:
                     g = load_int(pairs_in, k)
                     row = load_int(rows_in, k) * wp.static(parts) + p.part

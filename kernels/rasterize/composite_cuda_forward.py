@@ -14,6 +14,7 @@ from .composite_cuda_warp import (
     WIDTH,
     Gaussians,
     anew,
+    count_bits,
     exp2,
     exponent,
     first_block,
@@ -33,9 +34,12 @@ from .composite_cuda_warp import (
     word,
 )
 from .frame import Frame
+from .skip import BLOCK_TEST, STOPPED
 
 _SIZE = WARP * RECORD
 _T_MIN = wp.constant(T_MIN)
+_BLOCK_TEST = wp.constant(BLOCK_TEST)
+_STOPPED = wp.constant(STOPPED)
 
 
 @functools.cache
@@ -60,6 +64,7 @@ def forward_kernel(channels: int, parts: int):
         stops_out: wp.array2d[wp.int32],
         blocks_out: wp.array[wp.int32],
         walked_out: wp.array[wp.int32],
+        blocks_walked_out: wp.array[wp.int64],
         renders_out: wp.array2d[wp.float32],
         alphas_out: wp.array2d[wp.float32],
     ):
@@ -80,6 +85,7 @@ def forward_kernel(channels: int, parts: int):
         begin = starts_in[p.tile]
         end = starts_in[p.tile + 1]
         walked = end - begin
+        evaluated = wp.int32(0)
         for k0 in range(begin, end, WARP):
             if live == 0:
                 break
@@ -95,6 +101,8 @@ def forward_kernel(channels: int, parts: int):
                     load1(gaussians.opacities, g),
                     frame.alpha_min,
                 )
+                if (frame.skip & _BLOCK_TEST) == 0:
+                    mask = live
                 stage(arena, frame, gaussians, lane, g, mask, 0)
             todo = memory.ballot(arena, lane, mask)
             memory.sync()
@@ -106,6 +114,7 @@ def forward_kernel(channels: int, parts: int):
                 level = memory.get4(arena, i * RECORD + 4)
                 color = memory.get4(arena, i * RECORD + 8)
                 mask = live & memory.get_int(arena, i * RECORD + 6)
+                evaluated += count_bits(mask)
                 used = word()
                 stopped = word()
                 for j in range(wp.static(pixels)):
@@ -135,7 +144,8 @@ def forward_kernel(channels: int, parts: int):
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1
-                            if memory.ballot(arena, lane, going) == 0:
+                            over = memory.ballot(arena, lane, going) == 0
+                            if over and (frame.skip & _STOPPED) != 0:
                                 live &= wp.static(~(1 << j))
                     if live == 0:
                         walked = k0 + i - begin + 1
@@ -152,6 +162,8 @@ def forward_kernel(channels: int, parts: int):
 
         if lane == 0:
             wp.atomic_max(walked_out, p.tile, walked)
+        if lane == 0 and gaussians.first == 0:
+            wp.atomic_add(blocks_walked_out, p.tile, wp.int64(evaluated))
         p = place(frame, anew(index), lane)
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):

@@ -156,6 +156,18 @@ def lowest_bit(x: wp.int32) -> wp.int32:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(x);
+#else
+    return __builtin_popcount(x);
+#endif
+""")
+def count_bits(x: wp.int32) -> wp.int32:
+    """The number of bits that are set."""
+    ...
+
+
 _SYNC = """
 #if defined(__CUDA_ARCH__)
     __syncwarp();

@@ -69,6 +69,17 @@ def _rotation_vjp(q: wp.vec4, v: wp.mat33) -> wp.vec4:
     return vq - q * wp.dot(q, vq)
 
 
+@wp.func
+def _all_zero(v_mean2d: wp.vec2, v_conic: wp.vec3, v_depth: float, v_opacity: float) -> bool:
+    # exactly: NaN is not
+    return (
+        v_mean2d == wp.vec2(0.0, 0.0)
+        and v_conic == wp.vec3(0.0, 0.0, 0.0)
+        and v_depth == 0.0
+        and v_opacity == 0.0
+    )
+
+
 @wp.kernel
 def _project_vjp(
     offset: wp.int32,
@@ -108,16 +119,10 @@ def _project_vjp(
     for view_index in range(views):
         image = b * views + view_index
         i = image * num + g % num
-        wanted = status_in[i] == _VISIBLE
-        if wanted and lens.skip_unused != 0:
-            # false only for exact zeros: NaN passes on
-            wanted = not (
-                v_means2d_in[i] == wp.vec2(0.0, 0.0)
-                and v_conics_in[i] == wp.vec3(0.0, 0.0, 0.0)
-                and v_depths_in[i] == 0.0
-                and v_view_opacities_in[i] == 0.0
-            )
-        if wanted:
+        unused = lens.skip_unused != 0 and _all_zero(
+            v_means2d_in[i], v_conics_in[i], v_depths_in[i], v_view_opacities_in[i]
+        )
+        if status_in[i] == _VISIBLE and not unused:
             viewmat = viewmats_in[image]
             W = rotation_of(viewmat)
             t = W * means_in[g] + translation_of(viewmat)
