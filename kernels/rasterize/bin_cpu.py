@@ -22,7 +22,18 @@ _DIGITS = wp.constant(2048)
 _COUNT, _FIRST_ROW, _LAST_ROW, _SPANS = (wp.constant(i) for i in range(4))
 _ROWS = wp.constant(9)
 _RECORD = 12
+_AHEAD = wp.constant(12)  # Gaussians, for a record to come from memory
 _PARTS_PER_THREAD = 4  # Gaussians differ in size, and so do parts
+
+
+@wp.func_native("""
+const int* record = records.data + (size_t)i * records.shape[1];
+__builtin_prefetch(record);
+__builtin_prefetch(record + records.shape[1] - 1);
+""")
+def _fetch(records: wp.array2d[wp.int32], i: wp.int32):
+    """Brings a record near: records are read in the order of depth, that is, at random."""
+    ...
 
 
 @wp.func
@@ -184,6 +195,7 @@ def _count(
         image * grid.num + _part(grid.num, part + 1, parts),
     ):
         i = order_in[j]
+        _fetch(records_in, order_in[wp.min(j + _AHEAD, order_in.shape[0] - 1)])
         counts_out[j] = records_in[i, _COUNT]
         for ty in range(records_in[i, _FIRST_ROW], records_in[i, _LAST_ROW] + 1):
             columns = _columns(
@@ -221,6 +233,7 @@ def _emit(
         image * grid.num + _part(grid.num, part + 1, parts),
     ):
         i = order_in[j]
+        _fetch(records_in, order_in[wp.min(j + _AHEAD, order_in.shape[0] - 1)])
         p = offsets_in[j]
         for ty in range(records_in[i, _FIRST_ROW], records_in[i, _LAST_ROW] + 1):
             columns = _columns(

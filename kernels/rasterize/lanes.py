@@ -103,6 +103,21 @@ def count_bits(bits: wp.int32) -> wp.int32:
     ...
 
 
+@wp.func_native("""
+__builtin_prefetch(means2d.data + g);
+__builtin_prefetch(conics.data + g);
+__builtin_prefetch(view_opacities.data + g);
+""")
+def fetch(
+    means2d: wp.array[wp.vec2],
+    conics: wp.array[wp.vec3],
+    view_opacities: wp.array[wp.float32],
+    g: wp.int32,
+):
+    """Brings a Gaussian near that a later pair needs."""
+    ...
+
+
 @wp.func_native("return __atomic_fetch_add(counter.data, 1, __ATOMIC_RELAXED);")
 def take(counter: wp.array[wp.int32]) -> wp.int32:
     """The next number that no other worker has taken."""
