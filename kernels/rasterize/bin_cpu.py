@@ -18,7 +18,8 @@ wp.set_module_options({"enable_backward": False})
 
 _BITS = wp.constant(11)
 _DIGITS = wp.constant(2048)
-# A Gaussian's record: number of pairs, first and last row of tiles, columns of the first rows.
+# A Gaussian's record: number of pairs, first and last row of tiles, columns of the first rows,
+# two numbers of 16 bits each: a picture has at most 2^11 tiles in a row.
 _COUNT, _FIRST_ROW, _LAST_ROW, _SPANS = (wp.constant(i) for i in range(4))
 _ROWS = wp.constant(9)
 _RECORD = 12
@@ -92,12 +93,6 @@ def _part(num: wp.int32, part: wp.int32, parts: wp.int32) -> wp.int32:
 
 
 @wp.func
-def _rows_kept(grid: Grid) -> wp.int32:
-    # a span is two numbers of 16 bits
-    return wp.where(grid.tiles_x < 32768, _ROWS, 0)
-
-
-@wp.func
 def _ellipse(
     grid: Grid,
     means2d: wp.array[wp.vec2],
@@ -143,7 +138,7 @@ def _prepare(
             rows = tile_rows(grid, ellipse.mean[1], extent[1])
             for ty in range(rows[0], rows[1] + 1):
                 columns = tile_columns(grid, ellipse, extent, ty)
-                if ty - rows[0] < _rows_kept(grid):
+                if ty - rows[0] < _ROWS:
                     records_out[i, _SPANS + ty - rows[0]] = columns[0] | columns[1] << 16
                 count += wp.max(columns[1] - columns[0] + 1, 0)
             box_count += box_pairs(grid, ellipse.mean, extent)
@@ -165,7 +160,7 @@ def _columns(
     ty: wp.int32,
 ) -> wp.vec2i:
     row = ty - records[i, _FIRST_ROW]
-    if row < _rows_kept(grid):
+    if row < _ROWS:
         span = records[i, _SPANS + row]
         return wp.vec2i(span & 0xFFFF, span >> 16)
     ellipse = _ellipse(grid, means2d, conics, view_opacities, i)

@@ -42,6 +42,7 @@ def rasterization(
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
     skip: Skip = EVERYTHING,
+    **gsplat_options,
 ) -> tuple[Tensor, Tensor, Meta]:
     """Renders N Gaussians of each object in each of its V views, all in single launches.
 
@@ -74,6 +75,9 @@ def rasterization(
         alpha_min: fainter contributions are skipped; > 0.
         alpha_max: alpha is clamped here, and has zero gradient then; < 1.
         skip: what work to leave out; changes neither picture nor gradients.
+        gsplat_options: what else gsplat's function takes, so that its callers need no change:
+            ``packed, tile_size, channel_chunk, segmented`` have no effect, others are accepted at
+            the values that ask for nothing.
 
     Returns:
         ``renders [.., V, H, W, C]``, ``alphas [.., V, H, W, 1]`` and ``meta``, a dict with
@@ -81,7 +85,7 @@ def rasterization(
         (see ``Meta``).
 
     Raises:
-        TypeError: a tensor has another dtype, or is no tensor.
+        TypeError: a tensor has another dtype, or is no tensor; an unknown option.
         ValueError: a shape, device or option is not as above; the message names it. Or there are
             over 2^31 pairs of tiles and Gaussians.
     """
@@ -94,7 +98,7 @@ def rasterization(
         alpha_max=alpha_max, sh_degree=sh_degree, render_mode=render_mode,
         rasterize_mode=rasterize_mode,
     )  # fmt: skip
-    lead = check_inputs(tensors, options)
+    lead = check_inputs(tensors, options, gsplat_options)
     views, size = viewmats.shape[-3], math.prod(lead)
     flat = [_flat(x, size, len(lead)) for x in tensors.values()]
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat
@@ -112,10 +116,8 @@ def rasterization(
     size2d = [width, height, views, int(channels.dim() == 4), skip.bits()]
     channels = channels.reshape(-1, channels.shape[-1])
     skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
-    limits = [alpha_min, alpha_max]
-    renders, alphas, *walk = composite(
-        means2d, conics, view_opacities, channels, list(bins), size2d, limits, skipped
-    )
+    splats = means2d, conics, view_opacities, channels
+    renders, alphas, *walk = composite(*splats, list(bins), size2d, [alpha_min, alpha_max], skipped)
     renders = _finish(render_mode, renders, alphas, backgrounds)
     meta = Meta(Bins(*bins), Walk(*walk), status, skipped)
     meta.update(zip(("means2d", "conics", "depths", "opacities"), projected))
