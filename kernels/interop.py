@@ -1,7 +1,8 @@
 """The bridge between torch and Warp: checked views without copies, and launches.
 
-On the CPU a launch is cut along its first dimension and run on torch's number of threads (a Warp
-CPU launch releases the GIL). On CUDA it goes to torch's current stream. Nothing here synchronises.
+On the CPU a launch is cut along its first dimension and run on as many threads as torch's own
+operators, by ``team.py`` on the very same ones. On CUDA it goes to torch's current stream. Nothing
+here synchronises.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compositing on the CPU: one task per tile, 16 lanes = the pixels of a 4 x 4 block.
+"""Compositing on the CPU: threads take tile after tile, 16 lanes = the pixels of a 4 x 4 block.
 
 A tile of 16 x 16 pixels is 16 such blocks. For each Gaussian of the tile the 16 blocks are tested
 at once (lanes = blocks), and only those that its ellipse touches are evaluated (lanes = pixels).
