@@ -8,7 +8,14 @@ from helpers import rel_rms
 
 from gamba_warp.errors import UserError
 from gamba_warp.eval.metrics import Points, mask_iou, psnr, ssim, surface_metrics, volume_iou
-from gamba_warp.eval.report import check_finite, failure, mean_of, write_report
+from gamba_warp.eval.report import (
+    check_finite,
+    failure,
+    intervals_of,
+    mean_of,
+    print_summary,
+    write_report,
+)
 from gamba_warp.open3d import import_open3d
 
 
@@ -153,3 +160,33 @@ def test_report_counts_failures(tmp_path):
 def test_nan_is_named():
     with pytest.raises(UserError, match="nest.y is nan"):
         check_finite({"x": 1.0, "nest": {"y": math.nan}})
+
+
+def test_interval_is_that_of_the_normal_law():
+    """Of many objects: the mean, 1.96 standard errors to each side."""
+    values = np.random.default_rng(3).normal(5, 2, 400)
+    low, high = intervals_of([{"x": float(v)} for v in values])["x"]
+    error = values.std() / 20
+    # quantiles of 10,000 resamples have a standard error of 0.02 standard errors here
+    assert abs((values.mean() - low) / error - 1.96) < 0.15
+    assert abs((high - values.mean()) / error - 1.96) < 0.15
+
+
+def test_interval_of_few_objects():
+    records = [{"x": 1.0, "nest": {"y": None, "on": True}}, {"x": 1.0, "nest": {"y": 2.0}}]
+    got = intervals_of(records)
+    assert got == {"x": [1.0, 1.0], "nest": {"y": None}}
+    assert intervals_of(records[:1])["x"] is None and intervals_of([]) == {}
+    two = [{"x": 0.0}, {"x": 1.0}]
+    assert intervals_of(two) == {"x": [0.0, 1.0]}  # a quarter of the draws each
+    assert intervals_of(two, level=0.4) == {"x": [0.5, 0.5]}
+    many = [{"x": float(i)} for i in range(1500)]  # several batches
+    assert intervals_of(many) == intervals_of(many) != intervals_of(many, seed=1)
+
+
+def test_summary_shows_the_interval(tmp_path, capsys):
+    objects = [{"name": n, "status": "ok", "x": v} for n, v in (("a", 1.0), ("b", 3.0))]
+    report = write_report(tmp_path, {}, objects, {})
+    assert report["interval"] == {"x": [1.0, 3.0]}
+    assert print_summary(report, tmp_path) == 0
+    assert "2 [1, 3]" in capsys.readouterr().out
