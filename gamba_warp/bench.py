@@ -18,6 +18,7 @@ from .kernels.bench import FORMAT, Case, Settings, Target, measure
 from .kernels.bench.page import page
 from .kernels.bench.peers import versions
 from .kernels.bench.report import judge, markdown, ratio_table
+from .kernels.bench.static import NoCompiler, static_markdown, static_report
 from .reconstruct import pick_device
 
 # what is measured -> the module with ``cases(settings)`` and ``targets(settings)``, loaded if asked
@@ -45,6 +46,7 @@ def bench_command(
     threads: int | None = None,
     compare: Path | None = None,
     render: tuple[Path, ...] = (),
+    static: bool = False,
 ) -> int:
     """Measures run time against error, with what is installed beside us.
 
@@ -61,7 +63,11 @@ def bench_command(
         threads: CPU threads; default: torch's.
         compare: An older bench.json; prints the ratios of the times.
         render: Measure nothing; make the tables and the page of these JSON files.
+        static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
+            (registers, stack, shared memory, occupancy) to static.json and static.md.
     """
+    if static:
+        return _static(out)
     if render:
         return _render(render, out)
     settings, modules = _settings(what, device, quick, full, peers, threads)
@@ -151,6 +157,19 @@ def _render(paths: tuple[Path, ...], out: Path) -> int:
     _write(folder / "bench.md", markdown(documents))
     _write(folder / "bench.html", page(documents))
     print(f"wrote {folder / 'bench.md'} and bench.html")
+    return 0
+
+
+def _static(out: Path) -> int:
+    folder = output_folder(out)
+    with tqdm(unit="kernel", desc="static", disable=None) as bar:
+        try:
+            document = static_report(lambda kernel: bar.set_postfix_str(kernel) or bar.update())
+        except NoCompiler as error:
+            raise UserError(f"--static: {error}") from error
+    write_json(folder / "static.json", document)
+    _write(folder / "static.md", static_markdown(document))
+    print(f"{len(document['kernels'])} rows; wrote {folder / 'static.json'} and static.md")
     return 0
 
 

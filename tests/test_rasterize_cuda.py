@@ -1,19 +1,16 @@
-"""The CUDA kernels without a GPU: small shapes on CPU blocks, and compiled ahead of time."""
+"""The CUDA kernels without a GPU: small shapes on CPU blocks."""
 
-import json
 from dataclasses import fields
 
 import pytest
 import torch
 import warp as wp
-from helpers import assert_rel_rms, resources, shared_bytes
+from helpers import assert_rel_rms
 from test_rasterize import leaves, make
 
 from gamba_warp.kernels.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize import Skip, composite_cpu, composite_cuda, ops, rasterization
-from gamba_warp.kernels.rasterize.composite_cuda_backward import backward_kernel
-from gamba_warp.kernels.rasterize.composite_cuda_forward import forward_kernel
-from gamba_warp.kernels.rasterize.composite_cuda_warp import WARP, touching
+from gamba_warp.kernels.rasterize.composite_cuda_warp import touching
 
 SAME = 2e-6  # the two sum in another order
 
@@ -229,55 +226,6 @@ def test_a_cpu_needs_blocks(monkeypatch):
 def test_devices_have_their_compositor():
     assert ops._compositor(torch.device("cpu")) is composite_cpu
     assert ops._compositor(torch.device("cuda")) is composite_cuda
-
-
-# Registers per thread that leave at least 4 blocks of 256 threads on a processor.
-@pytest.mark.parametrize(
-    "name, registers", [("project", 80), ("project_vjp", 128), ("bin", 64), ("reduce", 64)]
-)
-def test_compiles_ahead_of_time(tmp_path, name, registers):
-    module = f"gamba_warp.kernels.rasterize.{name}"
-    __import__(module)
-    files = wp.compile_aot_module(module, device=None, arch=[80, 90], module_dir=tmp_path)
-    cubins = sorted(tmp_path.glob("*.cubin"))
-    assert len(files) == len(cubins) == 2
-    for cubin in cubins:
-        used, stack = resources(cubin.read_bytes())
-        assert 0 < used <= registers and stack == 0, (
-            f"{cubin.name}: {used} registers, {stack} stack"
-        )
-
-
-# Registers, stack (on sm_80 and sm_90: a few values that the loops do not use), shared bytes of a
-# warp: 24, 20, 20 and 16 warps fit on a multiprocessor.
-COMPOSITORS = {
-    "forward, 3 channels": (forward_kernel, (3, 1), (80, (40, 0), 3200)),
-    "forward, 4 channels": (forward_kernel, (4, 1), (96, (8, 8), 3200)),
-    "forward, quarters": (forward_kernel, (3, 4), (80, (40, 0), 3200)),
-    "gradient, 3 channels": (backward_kernel, (3, True, 1), (96, (0, 0), 7600)),
-    "gradient, 4 channels": (backward_kernel, (4, True, 1), (128, (0, 0), 7600)),
-    "gradient, quarters": (backward_kernel, (3, True, 4), (96, (0, 0), 7600)),
-}
-
-
-@pytest.mark.parametrize("name", COMPOSITORS)
-def test_compositor_compiles_ahead_of_time(tmp_path, name):
-    factory, arguments, (most_registers, most_stack, most_shared) = COMPOSITORS[name]
-    module = factory(*arguments).module
-    before = module.options["block_dim"]
-    module.options["block_dim"] = WARP
-    try:
-        paths = wp.compile_aot_module(module, arch=[80, 90], module_dir=tmp_path, use_ptx=False)
-    finally:
-        module.options["block_dim"] = before
-    assert len(paths) == 2
-    dynamic = json.loads(next(tmp_path.glob("*.meta")).read_text())
-    for path in paths:
-        registers, stack = resources(path.read_bytes())
-        shared = shared_bytes(path.read_bytes()) + sum(dynamic.values())
-        assert 16 <= registers <= most_registers, (path.name, registers)
-        assert stack <= most_stack[path.name.endswith("sm90.cubin")], (path.name, stack)
-        assert most_shared / 4 <= shared <= most_shared, (path.name, shared)
 
 
 @pytest.mark.gpu

@@ -106,7 +106,8 @@ def rasterization(
         colors = colors_from_harmonics(sh_degree, colors, means, viewmats).contiguous()
     lens = [width, height, near_plane, far_plane, radius_clip, eps2d, alpha_min]
     lens = [float(x) for x in (*lens, rasterize_mode == "antialiased", skip.unused)]
-    *projected, status = project(means, quats, scales, opacities, colors, viewmats, Ks, lens)
+    seen = colors.detach()  # for what is culled: no reason to compute the geometry's gradients
+    *projected, status = project(means, quats, scales, opacities, seen, viewmats, Ks, lens)
     # with the caller's dimensions first: a gradient retained on meta's tensors must be on the way
     projected = [x.view(*lead, *x.shape[1:]) for x in projected]
     per_view = [x.reshape(size * views, *x.shape[len(lead) + 1 :]) for x in projected]
