@@ -22,7 +22,8 @@ def _input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
     if x.is_complex():
         raise TypeError(f"{name} has dtype {x.dtype}; complex states are not supported")
     if x.dim() == 2:
-        return x.expand(u.shape[0], u.shape[2], *x.shape)
+        # float32, or the sum of its gradient over all tokens would be in x's own few bits
+        return x.float().expand(u.shape[0], u.shape[2], *x.shape)
     if x.dim() == 3:
         return x.transpose(1, 2)[:, :, None]
     if x.dim() == 4:
@@ -71,10 +72,10 @@ def selective_scan_fn(
     tokens = u.transpose(1, 2)
     B, C = _input_matrix(B, tokens, "B"), _input_matrix(C, tokens, "C")
     groups = max(B.shape[2], C.shape[2])
-    if B.shape[2] != groups and groups % B.shape[2] == 0:
-        B = B.repeat_interleave(groups // B.shape[2], dim=2)
+    if B.shape[2] != groups and groups % B.shape[2] == 0:  # float32: gradients are summed again
+        B = B.float().repeat_interleave(groups // B.shape[2], dim=2)
     if C.shape[2] != groups and groups % C.shape[2] == 0:
-        C = C.repeat_interleave(groups // C.shape[2], dim=2)
+        C = C.float().repeat_interleave(groups // C.shape[2], dim=2)
     result = selective_scan(
         u,
         _tokens(delta, "delta"),

@@ -1,0 +1,36 @@
+"""Random and hostile cases of the operators, each against float64. ``gamba stress`` runs it."""
+
+from .case import DTYPES, Case, Comparison, Op, Outcome, generator, judge, run_case
+from .report import (
+    FORMAT,
+    document,
+    failure_text,
+    markdown,
+    read_reproducer,
+    reproducer,
+    table,
+)
+from .runner import Row, Tally, draw_cases, run_cases, shrink
+
+__all__ = [
+    "DTYPES",
+    "FORMAT",
+    "Case",
+    "Comparison",
+    "Op",
+    "Outcome",
+    "Row",
+    "Tally",
+    "document",
+    "draw_cases",
+    "failure_text",
+    "generator",
+    "judge",
+    "markdown",
+    "read_reproducer",
+    "reproducer",
+    "run_case",
+    "run_cases",
+    "shrink",
+    "table",
+]

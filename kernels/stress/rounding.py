@@ -1,0 +1,139 @@
+"""What rounding to float32 does to a formula: the yardstick of every limit (see README.md)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SAMPLES = 8  # evaluations side by side: one exact, six rounded at random, one to float32
+UNIT = 2.0**-24  # half of float32's last bit, relative
+# numbers below 2^-126 may count as 0, and decays are not smaller; products of several factors meet
+# that in any order
+UNDERFLOW = 2.0**-124
+
+
+def _softplus(x: Tensor) -> Tensor:
+    return torch.logaddexp(x, torch.zeros_like(x))
+
+
+class _Round(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, rounding: Rounding, ulps: float, back: float) -> Tensor:
+        ctx.rounding, ctx.back = rounding, back
+        return rounding.rounded(x, ulps)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor):
+        return ctx.rounding.rounded(gradient, ctx.back, up=False), None, None, None
+
+
+class _Map(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, function, slope, rounding: Rounding, ulps: float) -> Tensor:
+        ctx.rounding = rounding
+        y = rounding.rounded(function(x), ulps)
+        ctx.save_for_backward(rounding.rounded(slope(x, y), ulps))
+        return y
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor):
+        rounded = ctx.rounding.rounded(gradient * ctx.saved_tensors[0], 1.0, up=False)
+        return rounded, None, None, None, None
+
+
+class _Decay(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, f: Tensor, h: Tensor, rounding: Rounding) -> Tensor:
+        ctx.rounding = rounding
+        ctx.save_for_backward(f, h)
+        return rounding.rounded(f * h, 1.0)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor):
+        f, h = ctx.saved_tensors
+        gradient = ctx.rounding.rounded(gradient, 1.0, up=False)
+        lost = ctx.rounding.underflow(gradient * f)  # the slope of e^x is used as (gradient f) h
+        return (gradient + lost / f.abs().clamp_min(UNDERFLOW)) * h, gradient * f, None
+
+
+class Rounding:
+    """Rounds an intermediate result and its gradient, differently in each sample.
+
+    Dimension 0 of every tensor are the ``SAMPLES``: 0 stays as it is; in 1 to 6 each number is off
+    by a random share of its last bit (Monte Carlo arithmetic; Parker 1997), the same share for the
+    same number, so that equal steps err equally, as they do in float32; 7 is rounded to float32.
+    Gradients are rounded on their way back as values are on theirs.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.generator = torch.Generator().manual_seed(seed)
+        self.salt = torch.randint(2**31, (SAMPLES - 2,), generator=self.generator)
+        # an approximation errs to one side all along: in each sample by another share
+        self.share = torch.tensor([0.0, *torch.linspace(-1, 1, SAMPLES - 2).tolist(), 0.0])
+
+    def __call__(self, x: Tensor, ulps: float = 1.0) -> Tensor:
+        """``x [SAMPLES, ..]`` float64, rounded; ``ulps``: how coarse the operation may be."""
+        return _Round.apply(x, self, ulps, 1.0)
+
+    def stored(self, x: Tensor, dtype: torch.dtype) -> Tensor:
+        """``x`` as it is; its gradient on this path is rounded to ``dtype`` before it is added."""
+        return _Round.apply(x, self, 0.0, torch.finfo(dtype).eps / 2 / UNIT)
+
+    def exp(self, x: Tensor, ulps: float) -> Tensor:
+        """The exponential of ``x``, with a relative error that grows with |x| by ``ulps``."""
+        share = self.share.double().view(-1, *[1] * (x.dim() - 1))
+        x = x + x.abs() * share * (ulps * UNIT)
+        return _Map.apply(self(x), torch.exp, lambda _, y: y, self, 1.0)
+
+    def softplus(self, x: Tensor, ulps: float) -> Tensor:
+        """log(1 + e^x), and its slope, the sigmoid, to ``ulps``."""
+        return _Map.apply(x, _softplus, lambda v, _: v.sigmoid(), self, ulps)
+
+    def decay(self, f: Tensor, h: Tensor) -> Tensor:
+        """The product of a decay and a state."""
+        return _Decay.apply(f, h, self)
+
+    def sigmoid(self, x: Tensor, ulps: float) -> Tensor:
+        """1 / (1 + e^-x) to ``ulps``."""
+        return _Map.apply(x, torch.sigmoid, lambda _, y: y * (1 - y), self, ulps)
+
+    def rounded(self, x: Tensor, ulps: float, up: bool = True) -> Tensor:
+        """As the call, without a gradient; ``up``: underflow errs upwards in half of the samples.
+
+        Upwards as decays do that are held at the smallest normal number.
+        """
+        out = x.clone()
+        part = x[1:-1]
+        out[1:-1] += self._noise(part) * part.abs() * (ulps * UNIT)
+        out += self.underflow(x, up)
+        out[-1] = x[-1].float().to(x.dtype)
+        return out
+
+    def underflow(self, x: Tensor, up: bool = False) -> Tensor | float:
+        """What may be lost where ``x`` is tiny; ``up`` as in ``rounded``."""
+        small = x[1:-1].abs() < 2.0**-100
+        if not small.any():
+            return 0.0
+        noise = torch.rand(small.shape, dtype=x.dtype, generator=self.generator)
+        signed = len(small) // 2 if up else len(small)
+        noise[:signed] = noise[:signed] * 2 - 1
+        lost = torch.zeros_like(x)
+        lost[1:-1] = torch.where(small, noise * UNDERFLOW, 0.0)
+        return lost
+
+    def _noise(self, x: Tensor) -> Tensor:
+        """In ±1, a function of sample and number alone: a hash of its float32 bits."""
+        bits = x.float().contiguous().view(torch.int32).long()
+        bits ^= self.salt.view(-1, *[1] * (x.dim() - 1))
+        for multiplier in (0x2545F4914F6CDD1D, 0x5851F42D4C957F2D):
+            bits *= multiplier
+            bits ^= bits >> 31
+        return (bits & 0xFFFFFF).double().mul_(2.0**-23).sub_(1.0)
+
+
+def samples_of(x: Tensor | None) -> Tensor | None:
+    """A float64 leaf ``[SAMPLES, ..]`` on the CPU, the same number in each sample."""
+    if x is None:
+        return None
+    x = x.detach().cpu().double()
+    return x.expand(SAMPLES, *x.shape).clone().requires_grad_()
