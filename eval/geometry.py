@@ -2,149 +2,30 @@
 
 from __future__ import annotations
 
-import hashlib
-import math
-import time
-from dataclasses import asdict, dataclass, field
+import json as json_module
+import os
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 from tqdm import tqdm
 
-from gamba_warp.cameras import DEFAULT_DISTANCE, intrinsics, orbit, relative_to_reference
+from gamba_warp.cameras import relative_to_reference
 from gamba_warp.dataset import ViewDataset, open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
-from gamba_warp.gaussians import Gaussians
-from gamba_warp.meshes import default_up, load_mesh
 
-from .alignment import icp, match_moments
-from .metrics import Points, surface_metrics, volume_iou
-from .occupancy import PARITY_RULE, SOLID_RULE, grid_around, parity, solid, syncdreamer_grid
-from .report import OK, check_finite, failure, print_summary, versions, write_report
-from .shapes import SUFFIXES, Mesh, Shape, Similarity, load_shape, sample, visible_points
-from .surfaces import Method, SurfaceOptions, to_surface
-
-Protocol = Literal["default", "syncdreamer"]
-Align = Literal["none", "scale", "icp"]
-Frame = Literal["gt", "unit", "reference"]
-Up = Literal["auto", "y", "z"]
-
-
-@dataclass(frozen=True)
-class GeometryProtocol:
-    """What the numbers of ``eval-geometry`` mean. Lengths: the truth's longest side is 1.
-
-    Attributes:
-        name: preset.
-        points: how points are put on surfaces.
-        num_points: a shape (for area-uniform points).
-        seed: of the random points; predicted and true points have different seeds.
-        thresholds: of the F-score.
-        occupancy: rule of the Volume IoU.
-        grid: of the Volume IoU.
-        iou_voxels: its voxels a unit.
-        align: of predictions with the truth; anything but none makes the numbers another protocol.
-        frame: in which frame predictions are (see the command).
-        up: axis of the truth's files.
-        surface: how Gaussians become a surface.
-        normalization: of the truth.
-        chamfer: definition.
-        noise_floor: definition.
-        normal_consistency: definition.
-    """
-
-    name: Protocol
-    points: str
-    occupancy: str
-    grid: str
-    iou_voxels: int
-    num_points: int = 100_000
-    seed: int = 0
-    thresholds: tuple[float, ...] = (0.01, 0.02, 0.05)
-    align: Align = "none"
-    frame: Frame = "gt"
-    up: Up = "auto"
-    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
-    normalization: str = "truth centred on its bounding box, longest side 1, turned to z-up"
-    chamfer: str = "mean of the two mean nearest distances between points, not squared"
-    noise_floor: str = "chamfer between two samples of the truth itself"
-    normal_consistency: str = "mean absolute cosine at nearest points, mean of both ways"
-
-
-PRESETS: dict[str, dict[str, Any]] = {
-    "default": {
-        "points": "area-uniform on the whole surface, inner faces included",
-        "occupancy": SOLID_RULE,
-        "grid": "voxels around both shapes, within [-1, 1]^3",
-        "iou_voxels": 64,
-    },
-    "syncdreamer": {
-        "points": "depth maps of 16 cameras (256 pixels, focal length 280, distance 1.5, elevation "
-        "30 degrees, azimuths 22.5 apart) back-projected, one mean point a voxel of 0.01",
-        "occupancy": PARITY_RULE,
-        "grid": "64 points a side from -1 in steps of 1/32",
-        "iou_voxels": 32,
-    },
-}
-
-
-def syncdreamer_points(mesh: Mesh) -> Points:
-    """What SyncDreamer's ``eval_mesh.py`` samples: the surface that 16 cameras see."""
-    viewmats = orbit(np.arange(16) * 22.5, 30.0, 1.5).double().numpy()
-    # from y-down, z-forward (the reference camera's world) to the truth's z-up
-    turn = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    fov = 2 * math.degrees(math.atan(128 / 280))
-    K = intrinsics(256, 256, fov).double().numpy()
-    return visible_points(mesh, viewmats @ turn, K, 256, 0.01)
-
-
-def take_points(shape: Mesh | Points, protocol: GeometryProtocol, seed: int) -> Points:
-    """Points by the protocol; of a point cloud always a random draw."""
-    if protocol.name == "syncdreamer" and isinstance(shape, Mesh):
-        return syncdreamer_points(shape)
-    return sample(shape, protocol.num_points, seed)
-
-
-def compare(predicted: Mesh | Points, truth: Mesh, protocol: GeometryProtocol) -> dict[str, Any]:
-    """All metrics of one pair, in one frame and unit, after the protocol's alignment.
-
-    Raises:
-        UserError: a shape cannot be sampled.
-    """
-    seed = 2 * protocol.seed
-    true_points = take_points(truth, protocol, seed)
-    points = take_points(predicted, protocol, seed + 1)
-    result: dict[str, Any] = {}
-    if protocol.align != "none":
-        motion, residual = match_moments(points, true_points), {}
-        if protocol.align == "icp":
-            motion, residual = icp(points, true_points)
-        predicted = motion.apply(predicted)
-        points = take_points(predicted, protocol, seed + 1)
-        result["alignment"] = motion.record() | residual
-    metrics = surface_metrics(points, true_points, protocol.thresholds)
-    iou = None
-    if isinstance(predicted, Mesh):
-        if protocol.name == "syncdreamer":
-            grid, rule = syncdreamer_grid(), parity
-        else:
-            grid = grid_around(predicted, truth, resolution=protocol.iou_voxels)
-            rule = solid
-        iou = volume_iou(rule(predicted, grid), rule(truth, grid))
-    other = take_points(truth, protocol, seed + 1)
-    floor = surface_metrics(other, true_points, ())["chamfer"]
-    return {**metrics, "iou": iou, "noise_floor": floor, **result}
-
-
-def load_truth(path: Path, up: Up) -> tuple[Mesh, Similarity]:
-    """A true mesh, normalised, and the motion that did it. Raises UserError."""
-    mesh = load_mesh(path)
-    unit, transform, scale = mesh.normalized(default_up(path) if up == "auto" else up)
-    motion = Similarity(transform[:, :3], scale * transform[:, 3], scale)
-    return Mesh(unit.vertices, unit.faces), motion
+from .compare import evaluate_pair
+from .protocol import Align, Frame, GeometryProtocol, Up, checked, read_protocol
+from .report import OK, csv_of, failure, make_report, print_summary, save_report, versions
+from .shapes import SUFFIXES, Similarity
+from .surfaces import Method
 
 
 def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: float) -> Similarity:
@@ -152,46 +33,6 @@ def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: f
     viewmat = dataset.load(uid, views=[reference]).cameras.viewmats[0].double()
     _, scale = relative_to_reference(viewmat[None], viewmat, distance)
     return Similarity(viewmat[:3, :3].T.numpy(), np.zeros(3), float(1 / scale))
-
-
-def evaluate_pair(
-    name: str, pred: Path, gt: Path, protocol: GeometryProtocol, to_world: Similarity | None
-) -> dict[str, Any]:
-    """One object's record.
-
-    Args:
-        name: of the object.
-        pred: file.
-        gt: file.
-        protocol: what to do.
-        to_world: motion of the prediction into the truth's unit frame; None: the truth's own.
-
-    Raises:
-        UserError: a file cannot be read, or has no surface.
-    """
-    start = time.perf_counter()
-    shape: Shape = load_shape(pred)
-    truth, motion = load_truth(gt, protocol.up)
-    shape = (motion if to_world is None else to_world).apply(shape)
-    kind = {Gaussians: "gaussians", Mesh: "mesh", Points: "points"}[type(shape)]
-    if isinstance(shape, Gaussians):
-        shape = to_surface(shape, protocol.surface, protocol.seed, protocol.num_points)
-    extracted = time.perf_counter()
-    metrics = check_finite(compare(shape, truth, protocol))
-    return {
-        "name": name,
-        "status": OK,
-        **metrics,
-        "kind": kind,
-        "pred_closed": shape.is_closed() if isinstance(shape, Mesh) else None,
-        "gt_closed": truth.is_closed(),
-        "gt_sha256": hashlib.sha256(gt.read_bytes()).hexdigest()[:16],
-        "gt_normalization": motion.record(),
-        "seconds": {
-            "surface": round(extracted - start, 3),
-            "compare": round(time.perf_counter() - extracted, 3),
-        },
-    }
 
 
 def find_pairs(pred: Path, gt: Path) -> tuple[list[tuple[str, Path, Path]], list[dict[str, str]]]:
@@ -233,31 +74,112 @@ def find_pairs(pred: Path, gt: Path) -> tuple[list[tuple[str, Path, Path]], list
     return pairs, failures
 
 
+def evaluate_pairs(
+    pairs: list[tuple[str, Path, Path]], protocol: GeometryProtocol, dataset: ViewDataset | None
+) -> list[dict[str, Any]]:
+    """One record a pair; what goes wrong with one is its failure and stops no other.
+
+    Args:
+        pairs: ``(name, pred, gt)``.
+        protocol: what to do.
+        dataset: for the frame "reference".
+    """
+    objects = []
+    for name, pred, gt in tqdm(pairs, unit="object", disable=None):
+        motion = None
+        try:
+            if protocol.frame == "unit":
+                motion = Similarity(np.eye(3), np.zeros(3))
+            elif dataset is not None:
+                motion = out_of_reference(dataset, name, protocol.reference, protocol.distance)
+            objects.append(evaluate_pair(name, pred, gt, protocol, motion))
+        except UserError as error:
+            objects.append(failure(name, error))
+        except Exception as error:  # whatever a library runs into, the others are still evaluated
+            objects.append(failure(name, f"{type(error).__name__}: {error}"))
+    return objects
+
+
+@contextmanager
+def stdout_to_stderr() -> Iterator[None]:
+    """What is printed meanwhile, by libraries too, goes to stderr; stdout is for the report."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        os.dup2(2, 1)
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def flag_counts(objects: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """How many evaluated shapes of each side have which flag."""
+    done = [record for record in objects if record["status"] == OK]
+    return {
+        side: dict(Counter(flag for record in done for flag in record[f"{side}_flags"]))
+        for side in ("pred", "gt")
+    }
+
+
+def _show(report: dict[str, Any], protocol: GeometryProtocol, folder: Path | None) -> int:
+    changes = f", changed: {', '.join(protocol.changes())}" if protocol.changes() else ""
+    print(f"protocol {protocol.name}{changes}")
+    for side, counts in report["flags"].items():
+        if counts:
+            text = ", ".join(f"{count} {flag}" for flag, count in counts.items())
+            print(f"{side + ' flags':<24} {text} of {report['num_ok']}")
+    return print_summary(report, folder)
+
+
+def _chosen(
+    protocol: str, points: int | None, surface: dict[str, Any], **options: Any
+) -> GeometryProtocol:
+    """The protocol with the options that were given. Raises UserError."""
+    base = read_protocol(protocol)
+    given = {name: value for name, value in options.items() if value is not None}
+    if points is not None:
+        given["num_points"] = points
+    nested = {name: value for name, value in surface.items() if value is not None}
+    for name, value in {"points": points, **nested}.items():
+        if isinstance(value, int) and value < 8:
+            raise UserError(f"--{name} {value}: must be at least 8")
+    return checked(replace(base, **given, surface=replace(base.surface, **nested)), "options")
+
+
 def eval_geometry_command(
-    pred: tyro.conf.Positional[Path],
-    gt: tyro.conf.Positional[Path],
-    out: Path,
-    protocol: Protocol = "default",
-    surface: Method = "tsdf",
-    align: Align = "none",
-    frame: Frame = "gt",
-    up: Up = "auto",
+    pred: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PRED")],
+    gt: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GT")],
+    out: Path | None = None,
+    protocol: str = "default",
+    surface: Method | None = None,
+    align: Align | None = None,
+    frame: Frame | None = None,
+    up: Up | None = None,
     data: Path | None = None,
-    reference: int = 0,
-    distance: float = DEFAULT_DISTANCE,
-    points: int = 100_000,
-    voxels: int = 128,
-    views: int = 64,
-    pixels: int = 256,
-    seed: int = 0,
+    reference: int | None = None,
+    distance: float | None = None,
+    points: int | None = None,
+    voxels: int | None = None,
+    views: int | None = None,
+    pixels: int | None = None,
+    seed: int | None = None,
+    strict: bool = False,
+    json: bool = False,
+    csv: bool = False,
 ) -> int:
     """Chamfer distance, F-score, normal consistency and Volume IoU of shapes.
 
+    Prints the means with 95 % intervals over objects. Options that are not given are those of the
+    protocol. Exit code 1 where an object failed (each is listed), 2 where nothing could start.
+
     Args:
         pred: Gaussians (.ply), a mesh or a point cloud; or a folder of them.
-        gt: a mesh; or a folder, paired with PRED by name.
+        gt: a mesh or a point cloud; or a folder, paired with PRED by name.
         out: folder for report.json and objects.csv.
-        protocol: default, or syncdreamer (points that 16 cameras see, parity on a 64^3 lattice).
+        protocol: default, syncdreamer (points that 16 cameras see, parity on a 64^3 lattice), or a
+            JSON file: a protocol, or the report.json of an evaluation to repeat.
         surface: how Gaussians become a surface; centers is a diagnostic.
         align: of predictions with the truth before comparing; scale also moves, icp also turns.
         frame: of predictions: that of the GT file, its unit frame (z-up, longest side 1, centred),
@@ -271,41 +193,39 @@ def eval_geometry_command(
         views: of the TSDF.
         pixels: side of its depth maps.
         seed: of the random points.
+        strict: meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
+            are failures; else they are evaluated and flagged.
+        json: print the report, as report.json holds it, in place of the summary.
+        csv: print the objects, as objects.csv holds them, in place of the summary.
     """
-    limits = {"points": points, "voxels": voxels, "views": views, "pixels": pixels}
-    for name, value in limits.items():
-        if value < 8:
-            raise UserError(f"--{name} {value}: must be at least 8")
-    if (frame == "reference") != (data is not None):
-        raise UserError("--frame reference and --data: give both or neither")
-    chosen = GeometryProtocol(
-        name=protocol,
-        num_points=points,
-        seed=seed,
-        align=align,
-        frame=frame,
-        up=up,
-        surface=SurfaceOptions(method=surface, voxels=voxels, views=views, pixels=pixels),
-        **PRESETS[protocol],
+    if json and csv:
+        raise UserError("--json and --csv: give one of them")
+    extraction = {"method": surface, "voxels": voxels, "views": views, "pixels": pixels}
+    options = {"align": align, "frame": frame, "up": up, "reference": reference, "seed": seed}
+    chosen = _chosen(
+        protocol, points, extraction, **options, distance=distance, strict=strict or None
     )
+    if (chosen.frame == "reference") != (data is not None):
+        raise UserError("--frame reference and --data: give both or neither")
     pairs, objects = find_pairs(pred, gt)
     dataset = open_dataset(data) if data is not None else None
-    folder = output_folder(out)
-    for name, pred_file, gt_file in tqdm(pairs, unit="object"):
-        try:
-            motion = None
-            if frame == "unit":
-                motion = Similarity(np.eye(3), np.zeros(3))
-            elif dataset is not None:
-                motion = out_of_reference(dataset, name, reference, distance)
-            objects.append(evaluate_pair(name, pred_file, gt_file, chosen, motion))
-        except (UserError, ValueError, RuntimeError) as error:
-            objects.append(failure(name, error))
-    report = write_report(
-        folder,
-        asdict(chosen) | {"pred": pred.name, "gt": gt.name},
+    folder = output_folder(out) if out is not None else None
+    with stdout_to_stderr():
+        objects += evaluate_pairs(pairs, chosen, dataset)
+    report = make_report(
+        chosen.to_json(),
         objects,
-        versions("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh"),
-        left_out=("alignment", "gt_normalization"),
+        versions("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch"),
+        left_out=("alignment", "gt_normalization", "iou_voxel"),
+        inputs={"pred": pred.name, "gt": gt.name, "data": data.name if data else None},
+        flags=flag_counts(objects),
     )
-    return print_summary(report, folder)
+    if folder is not None:
+        save_report(report, folder)
+    if json or csv:
+        text = (
+            json_module.dumps(report, indent=2, allow_nan=False) + "\n" if json else csv_of(report)
+        )
+        print(text, end="")
+        return 1 if report["failures"] else 0
+    return _show(report, chosen, folder)

@@ -115,8 +115,9 @@ def surface_metrics(
         ``accuracy`` (mean distance from predicted to true points), ``completeness`` (from true to
         predicted), ``chamfer`` (mean of the two, distances not squared), ``chamfer_squared`` (mean
         of the two mean squared distances), ``fscore`` ``{str(threshold): 0..1}`` (harmonic mean of
-        precision and recall) and ``normal_consistency`` (mean absolute cosine of nearest points'
-        normals, both ways, averaged; None without normals).
+        precision and recall), ``hausdorff`` (the largest distance of either way) and
+        ``normal_consistency`` (mean absolute cosine of nearest points' normals, both ways,
+        averaged; None without normals).
     """
     there, there_at = nearest(predicted.positions, truth.positions)
     back, back_at = nearest(truth.positions, predicted.positions)
@@ -136,6 +137,7 @@ def surface_metrics(
         "chamfer_squared": float((there**2).mean() + (back**2).mean()) / 2,
         "accuracy": float(there.mean()),
         "completeness": float(back.mean()),
+        "hausdorff": float(max(there.max(), back.max())),
         "fscore": fscore,
         "normal_consistency": consistency,
     }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -41,22 +43,21 @@ class Grid:
         return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
 
 
-def grid_around(*meshes: Mesh, resolution: int, limit: float = 1.0) -> Grid:
+def grid_around(*meshes: Mesh, resolution: int) -> Grid:
     """Voxel centres around several meshes, with one empty voxel on each side.
 
-    Voxel faces lie on multiples of ``1 / resolution``, so the grid does not depend on the meshes'
-    extents.
+    Voxel faces lie on multiples of their side, so the grid does not depend on the meshes' extents
+    as long as they fit into a cube of side 2; around larger ones the voxels grow with them.
 
     Args:
         meshes: at least one.
         resolution: voxels a unit of length.
-        limit: what lies outside [-limit, limit]^3 is left out.
     """
-    low = np.min([mesh.vertices.min(0) for mesh in meshes], axis=0).clip(-limit, limit)
-    high = np.max([mesh.vertices.max(0) for mesh in meshes], axis=0).clip(-limit, limit)
-    first = np.floor(low * resolution).astype(int) - 1
-    last = np.ceil(high * resolution).astype(int) + 1
-    step = 1.0 / resolution
+    low = np.min([mesh.vertices.min(0) for mesh in meshes], axis=0)
+    high = np.max([mesh.vertices.max(0) for mesh in meshes], axis=0)
+    step = max(1.0, (high - low).max() / 2) / resolution
+    first = np.floor(low / step).astype(int) - 1
+    last = np.ceil(high / step).astype(int) + 1
     return Grid((first + 0.5) * step, step, tuple(int(n) for n in last - first))
 
 
@@ -76,6 +77,13 @@ def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
 def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Occupancy ``[X, Y, Z]`` bool by ``PARITY_RULE``, what mesh2sdf does without its repair."""
     return _crossings(mesh.scene(), grid.points(), np.array([-1.0, 0, 0])) % 2 == 1
+
+
+Rule = Literal["solid", "parity"]
+RULES: dict[Rule, tuple[str, Callable[[Mesh, Grid], np.ndarray]]] = {
+    "solid": (SOLID_RULE, solid),
+    "parity": (PARITY_RULE, parity),
+}
 
 
 def _crossings(scene, points: np.ndarray, direction: np.ndarray) -> np.ndarray:

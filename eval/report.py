@@ -165,13 +165,20 @@ def make_report(
 
 
 def csv_of(report: dict[str, Any]) -> str:
-    """One line an object, failed ones too; nested numbers as ``outer.inner``."""
-    rows = [flat(record) for record in report["objects"]]
+    """One line an object, failed ones too; nested numbers as ``outer.inner``, words by a blank."""
+    rows = [
+        flat({key: " ".join(value) if _is_words(value) else value for key, value in record.items()})
+        for record in report["objects"]
+    ]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)))
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
+
+
+def _is_words(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
 
 
 def save_report(report: dict[str, Any], folder: Path) -> None:

@@ -15,9 +15,11 @@ from gamba_warp.meshes import load_mesh
 from gamba_warp.open3d import import_open3d
 from gamba_warp.ply import load_ply
 
+from .headers import check_counts
 from .metrics import Points
 
 CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
+HUGE = 1e18  # the squares of larger coordinates overflow float32
 SUFFIXES = (*MESH_SUFFIXES, *CLOUD_SUFFIXES)
 
 
@@ -40,13 +42,27 @@ class Mesh:
         return scene
 
     def is_closed(self) -> bool:
-        """Whether every edge has two faces, after vertices at one place are merged."""
-        import trimesh
+        """Whether every edge has an even number of faces, after vertices at one place are merged.
 
-        return bool(trimesh.Trimesh(self.vertices, self.faces, process=True).is_watertight)
+        The parity of crossings then means inside and outside, whatever the faces' orientation.
+        """
+        faces = merged(self.vertices)[1][self.faces]
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        edges = edges[edges[:, 0] != edges[:, 1]]  # of faces without area
+        counts = np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1]
+        return bool((counts % 2 == 0).all())
 
 
 Shape = Mesh | Points | Gaussians
+
+
+def merged(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct rows of ``[V, 3]`` and ``[V]`` the index of each row among them."""
+    rows = np.ascontiguousarray(vertices, np.float64) + 0.0  # one zero, not two
+    _, first, index = np.unique(
+        rows.view([("", rows.dtype)] * 3)[:, 0], return_index=True, return_inverse=True
+    )
+    return rows[first], index.reshape(-1)
 
 
 @dataclass
@@ -94,17 +110,19 @@ def _ply_kind(path: Path) -> str:
         header = file.read(1 << 16).split(b"end_header")[0].decode("ascii", "replace")
     words = [line.split() for line in header.splitlines()]
     properties = {w[-1] for w in words if w[:1] == ["property"]}
-    if {"opacity", "scale_0", "f_dc_0"} <= properties:
-        return "gaussians"
     faces = [w for w in words if w[:2] == ["element", "face"]]
-    return "mesh" if faces and faces[0][-1] != "0" else "points"
+    if faces and faces[0][-1] != "0":
+        return "mesh"
+    # one is enough, so that a file that lacks the others is not taken for a point cloud
+    return "gaussians" if {"opacity", "scale_0", "rot_0", "f_dc_0"} & properties else "points"
 
 
 def load_shape(path: Path) -> Shape:
     """Reads Gaussians (3DGS ``.ply``), a mesh, or a point cloud, by what the file holds.
 
     Raises:
-        UserError: missing, unreadable, empty, or with values that are not finite.
+        UserError: missing, unreadable, empty, untrue about its counts, or with values that are not
+            finite or beyond ``HUGE``.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -113,12 +131,38 @@ def load_shape(path: Path) -> Shape:
         raise UserError(f"{path}: no such file")
     if path.stat().st_size == 0:
         raise UserError(f"{path}: the file is empty")
+    check_counts(path)
     kind = _ply_kind(path) if suffix == ".ply" else "mesh"
     if kind == "gaussians":
-        return load_ply(path)
-    if kind == "points" or suffix in CLOUD_SUFFIXES:
-        return _load_points(path)
-    mesh = load_mesh(path)
+        shape, positions = (gaussians := load_ply(path)), gaussians.means.numpy()
+    elif kind == "points" or suffix in CLOUD_SUFFIXES:
+        shape, positions = (points := _load_points(path)), points.positions
+    else:
+        shape = _load_triangles(path)
+        positions = shape.vertices
+    if np.abs(positions).max() > HUGE:
+        raise UserError(f"{path}: coordinates reach {np.abs(positions).max():.3g}, over {HUGE:g}")
+    return shape
+
+
+def _load_triangles(path: Path) -> Mesh:
+    try:
+        mesh = load_mesh(path)
+    except UserError as error:
+        mixed = path.suffix.lower() == ".ply" and "cannot be read" in str(error)
+        if not mixed:  # trimesh reads no binary .ply whose faces differ in their corners
+            raise
+        import pymeshlab
+
+        meshes = pymeshlab.MeshSet()
+        try:
+            meshes.load_new_mesh(str(path))
+        except pymeshlab.PyMeshLabException:
+            raise error from None
+        read = meshes.current_mesh()
+        mesh = Mesh(read.vertex_matrix(), read.face_matrix().astype(np.int64))
+        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+            raise
     return Mesh(mesh.vertices, mesh.faces)
 
 
@@ -163,6 +207,19 @@ def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
     o3d.utility.random.seed(seed)
     cloud = mesh.sample_points_uniformly(count, use_triangle_normal=True)
     return Points(np.asarray(cloud.points), np.asarray(cloud.normals))
+
+
+def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:
+    """Two random parts of a cloud without a common point, ``count`` points each at most.
+
+    Args:
+        points: at least two.
+        count: at least one.
+        seed: of the draw.
+    """
+    order = np.random.default_rng(seed).permutation(len(points.positions))
+    size = min(count, len(order) // 2)
+    return tuple(Points(points.positions[part]) for part in (order[:size], order[-size:]))
 
 
 def visible_points(

@@ -23,7 +23,7 @@ GREY = 0.6  # display value of a surface whose colour is not known
 MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
 CREASE = np.cos(np.radians(40))  # a vertex normal farther than this from its face's is not used
 
-_Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 @dataclass
@@ -75,7 +75,7 @@ class TexturedMesh:
         Returns:
             The mesh, ``transform [3, 4]`` and ``scale``: x_new = scale · (transform · [x, 1]).
         """
-        turn = _Y_TO_Z_UP if up == "y" else np.eye(3)
+        turn = Y_TO_Z_UP if up == "y" else np.eye(3)
         if rotation is not None:
             turn = turn @ np.asarray(rotation, dtype=np.float64)
         points = self.vertices @ turn.T

@@ -25,7 +25,8 @@ _OPENGL_COMMENT = "frame opengl"
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
 _MIN_SCALE = 1e-12  # keeps the logarithm finite
 _MAX_HEADER = 1 << 16
-_TYPES = {
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}  # of bytes, numpy's sign
+TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
@@ -195,11 +196,10 @@ def _parse(path: Path, data: bytes) -> tuple[np.ndarray, list[str]]:
     comments = [line.partition(" ")[2].strip() for line in lines if line.startswith("comment")]
     words = [line.split() for line in lines[1:] if line.split()]
     layouts = [w[1] for w in words if w[0] == "format" and len(w) > 1]
-    orders = {"binary_little_endian": "<", "binary_big_endian": ">"}
-    if not layouts or layouts[0] not in orders:
+    if not layouts or layouts[0] not in ORDERS:
         found = layouts[0] if layouts else "none"
         raise UserError(f"{path}: .ply format is {found}, only binary is read")
-    count, fields, alone = _vertex_fields(path, words, orders[layouts[0]])
+    count, fields, alone = _vertex_fields(path, words, ORDERS[layouts[0]])
     dtype = np.dtype(fields)
     size, there = count * dtype.itemsize, len(data) - start
     if there < size or (alone and there > size):
@@ -223,11 +223,11 @@ def _vertex_fields(
     for word in words[elements[0] + 1 : stop]:
         if word[0] != "property":
             continue
-        if len(word) != 3 or word[1] not in _TYPES:
+        if len(word) != 3 or word[1] not in TYPES:
             raise UserError(f"{path}: vertex property '{' '.join(word[1:])}' is not a plain number")
         if word[2] in dict(fields):
             raise UserError(f"{path}: vertex property {word[2]} is given twice")
-        fields.append((word[2], order + _TYPES[word[1]]))
+        fields.append((word[2], order + TYPES[word[1]]))
     if not fields:
         raise UserError(f"{path}: vertices have no properties")
     return int(head[2]), fields, len(elements) == 1
