@@ -129,6 +129,14 @@ def relative_to_reference(
     return out, scale
 
 
+def _inverse(matrices: Tensor) -> Tensor:
+    """Of ``[.., 3, 3]`` by cofactors: torch's own waits for the GPU to see whether it failed."""
+    a, b, c = matrices.unbind(-2)
+    pairs = ((b, c), (c, a), (a, b))
+    columns = torch.stack([torch.linalg.cross(x, y) for x, y in pairs], -1)
+    return columns / (a * columns[..., 0]).sum(-1)[..., None, None]
+
+
 def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
     """Plücker coordinates (o × d, d) of the ray through every pixel centre, world frame.
 
@@ -147,7 +155,7 @@ def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tenso
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     pixels = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], -1)
     # d_world = Rᵀ K⁻¹ p, row vectors
-    to_world = torch.linalg.inv(Ks).mT @ rotation
+    to_world = _inverse(Ks).mT @ rotation
     directions = pixels.reshape(-1, 3) @ to_world
     directions = directions / directions.norm(dim=-1, keepdim=True)
     origin = -(rotation.mT @ translation[..., None])[..., 0]

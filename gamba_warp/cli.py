@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "eval-geometry": ("gamba_warp.eval.geometry:eval_geometry_command", "Chamfer, IoU, F-score."),
     "bench": ("gamba_warp.bench:bench_command", "Run time against error, on this machine."),
     "stress": ("gamba_warp.stress:stress_command", "Random hostile cases against float64."),
+    "gpu-check": ("gamba_warp.gpu_check:gpu_check_command", "Test and measure on a CUDA machine."),
     "weights lpips": ("gamba_warp.lpips:weights_command", "Fetch the LPIPS-VGG weights."),
     "doctor": ("gamba_warp.doctor:doctor_command", "Say what this machine can run."),
 }

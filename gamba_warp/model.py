@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -15,7 +13,7 @@ from .block import GambaBlock, State, make_norm, prefix_states
 from .cameras import Cameras
 from .config import GambaConfig
 from .decoder import GaussianDecoder
-from .encoders import build_encoder
+from .encoders import ImageEncoder, build_encoder
 from .errors import UserError
 from .files import atomic_path
 from .gaussians import Gaussians
@@ -38,12 +36,18 @@ class Gamba(nn.Module):
             less memory, a third more time.
     """
 
-    def __init__(self, config: GambaConfig, encoder_weights: str | Path | None = None) -> None:
+    def __init__(
+        self,
+        config: GambaConfig,
+        encoder_weights: str | Path | None = None,
+        encoder: ImageEncoder | None = None,
+    ) -> None:
         """Builds the network with fresh weights, the encoder's excepted.
 
         Args:
             config: what to build.
             encoder_weights: see ``build_encoder``; not used where there is nothing to encode for.
+            encoder: taken instead of the one that ``config`` names.
 
         Raises:
             UserError: the encoder cannot be built or its weights are not there.
@@ -51,7 +55,9 @@ class Gamba(nn.Module):
         super().__init__()
         self.config = config
         self.recompute = False
-        self.encoder = build_encoder(config, encoder_weights) if config.prepend else None
+        self.encoder = None
+        if config.prepend:
+            self.encoder = encoder or build_encoder(config, encoder_weights)
         image_channels = self.encoder.channels if self.encoder else 0
         camera_channels = 0
         if config.prepend and config.camera_token:
@@ -167,6 +173,8 @@ def save_model(
     Raises:
         UserError: the file cannot be written.
     """
+    from safetensors.torch import save_file
+
     metadata = dict(extra_metadata or {})
     taken = [key for key in _OWN_KEYS if key in metadata]
     if taken:
@@ -216,6 +224,8 @@ def load_model(
 
 
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    from safetensors import SafetensorError, safe_open
+
     if not path.is_file():
         raise UserError(f"{path}: no such checkpoint")
     try:

@@ -15,7 +15,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 def normalize_imagenet(images: Tensor) -> Tensor:
     """``[.., 3]`` colours in [0, 1] to zero mean and unit deviation over ImageNet."""
-    return (images - images.new_tensor(IMAGENET_MEAN)) / images.new_tensor(IMAGENET_STD)
+    # a tensor made of numbers would be a copy from the host, which no CUDA graph can hold
+    planes = zip(images.unbind(-1), IMAGENET_MEAN, IMAGENET_STD)
+    return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
 
 
 def scan_orders(height: int, width: int) -> Tensor:
@@ -49,10 +51,9 @@ def camera_numbers(cameras: Cameras) -> Tensor:
     The intrinsics are divided by the picture's width or height, so they do not depend on its size.
     """
     extrinsics = cameras.viewmats[:, :3, :].flatten(1)
-    size = cameras.Ks.new_tensor([cameras.width, cameras.height])
-    focal = cameras.Ks.diagonal(dim1=1, dim2=2)[:, :2] / size
-    centre = cameras.Ks[:, :2, 2] / size
-    return torch.cat([extrinsics, focal, centre], dim=1)
+    x, y = cameras.Ks[:, 0] / cameras.width, cameras.Ks[:, 1] / cameras.height
+    intrinsics = torch.stack([x[:, 0], y[:, 1], x[:, 2], y[:, 2]], dim=1)
+    return torch.cat([extrinsics, intrinsics], dim=1)
 
 
 class SplatTokens(nn.Module):
