@@ -37,8 +37,8 @@ from .reconstruct import pick_device
 # what is stressed -> modules with an ``OP``, loaded when asked for
 SUITES = {
     "scan": ("gamba_warp.kernels.stress.scan", "gamba_warp.kernels.stress.conv"),
-    "raster": (),
-    "model": (),
+    "raster": ("gamba_warp.kernels.stress.raster",),
+    "model": ("gamba_warp.stress_model",),
 }
 _MINUTES = 1.0
 _SHRUNK = 5  # failures of a run that are made small; all are written

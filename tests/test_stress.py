@@ -7,19 +7,20 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 
-from gamba_warp import cli, stress
-from gamba_warp.kernels.selective_scan import selective_scan_fn
+from gamba_warp import cli, stress, stress_model
+from gamba_warp.kernels.rasterize.reference import rasterization_reference
+from gamba_warp.kernels.selective_scan import selective_scan_fn, selective_scan_state
 from gamba_warp.kernels.selective_scan.reference import (
     causal_conv1d_reference,
     selective_scan_reference,
 )
-from gamba_warp.kernels.stress import Case, conv, draw_cases, run_case, scan, shrink
+from gamba_warp.kernels.stress import Case, conv, draw_cases, raster, run_case, scan, shrink
 from gamba_warp.kernels.stress import scan_oracle as oracle
 from gamba_warp.kernels.stress.rounding import Rounding, samples_of
 
 CPU = torch.device("cpu")
 OPS = {op.name: op for op in stress._ops(("all",))}
-SHORT = {"scan": 18, "conv": 11}  # cases: each kind once
+SHORT = {"scan": 18, "conv": 11, "raster": 19, "model": 3}  # cases; but for the model each kind
 
 
 def exit_code(*arguments):
@@ -88,6 +89,84 @@ def test_conv_oracle_is_the_reference():
     want = causal_conv1d_reference(**doubles, activation="silu")
     for name, a, b in zip(("out", "final"), got, want):
         assert_rel_rms(a[0], b, 1e-14, name)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_raster_oracle_is_the_reference(antialiased):
+    case = Case("raster", "uniform", 3, raster.OP.plain | dict(
+        lead="two", views=2, num=20, width=13, height=9, channels=3, backgrounds=True,
+        use_quats=True, mode="RGB+D", antialiased=antialiased,
+    ))  # fmt: skip
+    x = raster.build(case, CPU)
+    leaves = {k: t.double().detach().requires_grad_(k != "Ks") for k, t in x.items()}
+    truth = raster._Truth(case, x)
+    color, depth, alpha = rasterization_reference(
+        **leaves, width=13, height=9, antialiased=antialiased
+    )
+    want = torch.cat([color, depth], -1)
+    assert_rel_rms(truth.renders[0], want, 1e-12, "renders")
+    assert_rel_rms(truth.alphas[0], alpha, 1e-12, "alphas")
+    assert truth.alphas[0].mean() > 0.1 and truth.undecided.double().mean() < 0.02
+    v, v_alpha = torch.randn_like(want), torch.randn_like(alpha)
+    del leaves["Ks"]
+    total = (truth.renders * v).sum() + (truth.alphas * v_alpha).sum()
+    grads = torch.autograd.grad(total, [truth.leaves[k] for k in leaves])
+    wants = torch.autograd.grad((want * v).sum() + (alpha * v_alpha).sum(), [*leaves.values()])
+    for name, got, expected in zip(leaves, grads, wants):
+        assert_rel_rms(got[0], expected, 1e-10, name)
+        spread = (got[1:] - got[0]).abs().amax() / expected.abs().amax()
+        assert 1e-8 < spread < 1e-4, f"{name}: the samples are {spread:.1e} off"
+
+
+def test_an_error_of_the_picture_is_caught_and_a_flip_is_not(monkeypatch):
+    """A thousandth more of one Gaussian's colour fails; a cut moved within rounding passes."""
+    right = raster.rasterization
+    case = Case("raster", "uniform", 1, raster.OP.plain | dict(
+        num=40, width=17, height=23, channels=3, use_quats=True
+    ))  # fmt: skip
+
+    def run(**changed):
+        def other(**x):
+            for name, factor in changed.items():
+                x[name] = x[name] * factor
+            return right(**x)
+
+        monkeypatch.setattr(raster, "rasterization", other)
+        return run_case(raster.OP, case, CPU).failure()
+
+    assert run() is None
+    # a few rounding errors of alpha_min: pixels on it fall on the other side
+    assert run(alpha_min=1 + 2e-7) is None
+    assert run(alpha_min=1.01)["what"] == "limit"
+    brighter = torch.ones(40, 1)
+    brighter[7] = 1.001
+    assert run(colors=brighter)["what"] == "limit"
+
+
+def test_poison_that_leaks_is_a_failure(monkeypatch):
+    case = Case("raster", "not finite", 1, raster.OP.plain | dict(
+        num=30, width=9, height=9, poison=4, use_quats=True
+    ))  # fmt: skip
+    assert run_case(raster.OP, case, CPU).failure() is None
+    right = raster.rasterization
+
+    def leaking(**x):
+        renders, alphas, meta = right(**x)
+        return renders * (1 + 1e-6 * (x["means"].shape[-2] > 30)), alphas, meta
+
+    monkeypatch.setattr(raster, "rasterization", leaking)
+    assert "changed by Gaussians" in run_case(raster.OP, case, CPU).faults[0]
+
+
+def test_model_with_a_small_error_fails(monkeypatch):
+    options = stress_model.OP.plain | dict(patches=2, width=8, state_size=2, camera_token=True)
+    case = Case("model", "uniform", 1, options)
+    assert run_case(stress_model.OP, case, CPU).failure() is None
+    monkeypatch.setattr(
+        "gamba_warp.block.selective_scan_state",
+        lambda *a, **k: (1 + 1e-3) * selective_scan_state(*a, **k),
+    )
+    assert run_case(stress_model.OP, case, CPU).failure()["what"] == "limit"
 
 
 def test_same_seed_same_cases():

@@ -71,9 +71,30 @@ class Rounding:
         # an approximation errs to one side all along: in each sample by another share
         self.share = torch.tensor([0.0, *torch.linspace(-1, 1, SAMPLES - 2).tolist(), 0.0])
 
-    def __call__(self, x: Tensor, ulps: float = 1.0) -> Tensor:
-        """``x [SAMPLES, ..]`` float64, rounded; ``ulps``: how coarse the operation may be."""
-        return _Round.apply(x, self, ulps, 1.0)
+    def __call__(self, x: Tensor, ulps: float = 1.0, back: float = 1.0) -> Tensor:
+        """``x [SAMPLES, ..]`` float64, rounded.
+
+        Args:
+            x: the result of an operation.
+            ulps: how coarse it may be, in last bits.
+            back: likewise its gradient.
+        """
+        return _Round.apply(x, self, ulps, back)
+
+    def drift(self, x: Tensor, steps: Tensor) -> Tensor:
+        """``x [S, .., n]`` as if reckoned from the last entry to the first; without a gradient.
+
+        ``steps [.., n]`` says which entries are a step: a product and a quotient, each rounded.
+        """
+        shape = (SAMPLES - 2, *steps.shape)
+        noise = torch.rand(shape, dtype=x.dtype, generator=self.generator) * 4 - 2
+        out = x.detach().clone()
+        out[1:-1] *= 1 + UNIT * (noise * steps).flip(-1).cumsum(-1).flip(-1)
+        return out
+
+    def constant(self, value: float) -> Tensor:
+        """A number that is not differentiated, rounded: ``[SAMPLES, 1]``."""
+        return self.rounded(torch.full((SAMPLES, 1), float(value), dtype=torch.float64), 1.0)
 
     def stored(self, x: Tensor, dtype: torch.dtype) -> Tensor:
         """``x`` as it is; its gradient on this path is rounded to ``dtype`` before it is added."""
