@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import over_background
 from gamba_warp.ply import load_ply
+from gamba_warp.weights import sha256
 
 
 class Predictions(ABC):
@@ -20,7 +22,8 @@ class Predictions(ABC):
 
     Attributes:
         distance: of the reference camera from the origin of that world, object units.
-        source: what is under test, for the report.
+        source: what is under test, for the report: kind, name and SHA-256 of the file, or of the
+            names and SHA-256s of a folder's files.
     """
 
     distance: float
@@ -36,7 +39,10 @@ class PlyPredictions(Predictions):
 
     def __init__(self, folder: Path, distance: float, device: str) -> None:
         self.folder, self.distance, self.device = folder, distance, device
-        self.source = {"kind": "ply", "path": folder.name}
+        digest = hashlib.sha256()
+        for path in sorted(folder.rglob("*.ply")):
+            digest.update(f"{path.relative_to(folder).as_posix()} {sha256(path)}\n".encode())
+        self.source = {"kind": "ply", "path": folder.name, "sha256": digest.hexdigest()}
 
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
         """Reads the file."""
@@ -47,11 +53,12 @@ class ModelPredictions(Predictions):
     """A checkpoint, shown the reference view alone."""
 
     def __init__(self, path: Path, device: str, encoder_weights: Path | None) -> None:
-        from gamba_warp.model import load_model
+        from gamba_warp.model import FILE_NAME, load_model
 
         self.model, self.device = load_model(path, device, encoder_weights), device
         self.distance = self.model.config.distance
-        self.source = {"kind": "checkpoint", "path": path.name}
+        file = path / FILE_NAME if path.is_dir() else path
+        self.source = {"kind": "checkpoint", "path": path.name, "sha256": sha256(file)}
 
     @torch.no_grad()
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:

@@ -53,7 +53,10 @@ def demo_command(
     model = run / "model.safetensors"
     _gamba("reconstruct", starter / "icons", "--checkpoint", model, "--out", out / "icons")
     views, shapes = out / "views", out / "geometry"
-    _gamba("eval-views", model, data, "--out", views, "--save-gaussians")
+    _gamba(
+        *("eval-views", "--checkpoint", model, "--data", data),
+        *("--out", views, "--save-gaussians"),
+    )
     _gamba(
         *("eval-geometry", views / "gaussians", _true_meshes(views, starter, out / "truth")),
         *("--frame", "reference", "--data", data, "--out", shapes),

@@ -102,8 +102,9 @@ def painted(monkeypatch):
 
 
 def evaluate(folder, *options, pred="pred"):
-    arguments = [str(folder / pred), str(folder / "data"), "--out", str(folder / "out")]
-    code = run("eval-views", [*arguments, "--split", "all", "--device", "cpu", *options])
+    places = ["--checkpoint", str(folder / pred), "--data", str(folder / "data")]
+    arguments = [*places, "--out", str(folder / "out"), "--split", "all", "--device", "cpu"]
+    code = run("eval-views", [*arguments, *options])
     path = folder / "out" / "report.json"
     return code, json.loads(path.read_text()) if path.exists() else None
 
@@ -126,7 +127,8 @@ def test_perfect_predictions(data, painted):
     assert [item["name"] for item in report["objects"]] == sorted(POINTS)
     assert report["mean"]["lpips"] is None
     assert report["protocol"]["lpips_reason"] == "not asked for"
-    assert report["protocol"]["source"] == {"kind": "ply", "path": "pred"}
+    source = report["protocol"]["source"]
+    assert (source["kind"], source["path"], len(source["sha256"])) == ("ply", "pred", 64)
 
 
 def test_a_wrong_distance_shows(data, painted):
@@ -136,11 +138,11 @@ def test_a_wrong_distance_shows(data, painted):
 
 def test_baselines_have_known_values(data, painted):
     _, report = evaluate(data, "--no-lpips")
-    white, copy = report["baselines"]["white"], report["baselines"]["input_copy"]
+    empty, copy = report["baselines"]["background"], report["baselines"]["input_copy"]
     rounded = (COLOR * 255 + 0.5).floor() / 255
     mse = 81 / SIZE**2 * float((1 - rounded).square().mean())
-    assert white["psnr"] == pytest.approx(-10 * math.log10(mse), abs=1e-4)
-    assert white["mask_iou"] == 0
+    assert empty["psnr"] == pytest.approx(-10 * math.log10(mse), abs=1e-4)
+    assert empty["mask_iou"] == 0
     assert copy["input"]["psnr"] == 100 and copy["input"]["mask_iou"] == 1
     assert copy["psnr"] < 30  # a mean with the input in it would be over 35
     options = ["--no-lpips", "--no-baselines", "--limit", "1"]
@@ -199,7 +201,7 @@ def test_lpips_with_weights(data, painted):
     _, report = evaluate(data, "--limit", "1", "--views", "2")
     assert report["protocol"]["lpips"] == "VGG16, version 0.1"
     # a prediction that differs by rounding, against an empty picture
-    assert report["mean"]["lpips"] < 1e-3 < report["baselines"]["white"]["lpips"]
+    assert report["mean"]["lpips"] < 1e-3 < report["baselines"]["background"]["lpips"]
 
 
 @pytest.mark.parametrize("case", ["pred", "data", "empty", "limit", "distance", "split"])
@@ -292,6 +294,7 @@ def test_saved_gaussians_evaluate_to_the_same(data, painted):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_cuda_without_a_device_is_refused(data, capsys):
-    options = [str(data / "pred"), str(data / "data"), "--out", str(data / "out")]
-    assert run("eval-views", [*options, "--device", "cuda"]) == 2
+    options = ["--checkpoint", str(data / "pred"), "--data", str(data / "data")]
+    options += ["--out", str(data / "out"), "--device", "cuda"]
+    assert run("eval-views", options) == 2
     assert "no CUDA device" in capsys.readouterr().err and not (data / "out").exists()

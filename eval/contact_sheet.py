@@ -1,0 +1,85 @@
+"""One picture of the best, median and worst objects of an evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont, ImageOps
+from torch import Tensor
+
+from gamba_warp.files import atomic_path
+from gamba_warp.images import to_uint8
+
+TILE = 128  # pixels a side; pictures are fitted into it
+_LABEL, _HEADER, _GAP, _LINE = 200, 22, 4, 16  # pixels
+RULE = "by PSNR of the novel views, of the input view where there are no others"
+
+
+@dataclass
+class Row:
+    """One object.
+
+    Attributes:
+        lines: its label.
+        shown: the input picture ``[H, W, 3]`` in [0, 1].
+        truth: k true views ``[k, H, W, 3]``.
+        predicted: the same views as predicted.
+    """
+
+    lines: list[str]
+    shown: Tensor
+    truth: Tensor
+    predicted: Tensor
+
+
+def choose_ranks(count: int, each: int) -> dict[int, str]:
+    """Labels by rank, 0 being the best: ``each`` of the best, about the median, and of the worst.
+
+    An object that is in two groups is listed once; of few objects all are listed.
+    """
+    middle = max(0, (count - each) // 2)
+    groups = {
+        "best": range(each),
+        "median": range(middle, middle + each),
+        "worst": range(count - each, count),
+    }
+    labels: dict[int, str] = {}
+    for name, ranks in groups.items():
+        for rank in ranks:
+            if 0 <= rank < count:
+                labels.setdefault(rank, name)
+    return dict(sorted(labels.items()))
+
+
+def contact_sheet(path: Path, rows: list[Row]) -> None:
+    """Writes a PNG: label | input | true novel views | the same predicted, a row an object.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    most = max(len(row.truth) for row in rows)
+    step = TILE + _GAP
+    starts = [_LABEL, _LABEL + step + 2 * _GAP, _LABEL + step + 4 * _GAP + most * step]
+    sheet = Image.new("RGB", (starts[2] + most * step, _HEADER + len(rows) * step), (255, 255, 255))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default()
+    for start, title in zip(starts, ("input", "truth", "prediction") if most else ("input",)):
+        draw.text((start, 4), title, fill=(0, 0, 0), font=font)
+    for number, row in enumerate(rows):
+        top = _HEADER + number * step
+        for k, line in enumerate(row.lines):
+            bold = (0, 0, 0) if k == 0 else (80, 80, 80)
+            draw.text((6, top + 4 + k * _LINE), line, fill=bold, font=font)
+        for start, pictures in zip(starts, (row.shown[None], row.truth, row.predicted)):
+            for k, picture in enumerate(pictures):
+                sheet.paste(_tile(picture), (start + k * step, top))
+    with atomic_path(path) as temporary:
+        sheet.save(temporary)
+
+
+def _tile(picture: Tensor) -> Image.Image:
+    pixels = to_uint8(np.asarray(picture.cpu()))
+    tile = ImageOps.pad(Image.fromarray(pixels), (TILE, TILE), color=(255, 255, 255))
+    ImageDraw.Draw(tile).rectangle((0, 0, TILE - 1, TILE - 1), outline=(225, 225, 225))
+    return tile
