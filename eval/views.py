@@ -248,7 +248,9 @@ def _add_baselines(job: Job, data: Path) -> None:
         job.fail(f"{uid} (retrieval)", UserError(reason))
 
 
-def _check(out: Path | None, distance: float, save_gaussians: bool, **least: tuple) -> None:
+def _check(
+    out: Path | None, distance: float, save_gaussians: bool, both: bool, **least: tuple
+) -> None:
     """Raises UserError for the first option that is out of its range."""
     for name, (value, bound) in least.items():
         if value is not None and value < bound:
@@ -258,6 +260,8 @@ def _check(out: Path | None, distance: float, save_gaussians: bool, **least: tup
         raise UserError(f"--distance {distance}: must be above 0")
     if save_gaussians and out is None:
         raise UserError("--save-gaussians: needs --out")
+    if both:
+        raise UserError("--json and --csv: give one of them")
 
 
 def _tell(report: dict[str, Any], out: Path | None, json: bool, csv: bool) -> None:
@@ -321,14 +325,14 @@ def eval_views_command(
         sheet: so many best, median and worst objects in the contact sheet; 0 for none.
         save_gaussians: also write OUT/gaussians/NAME.ply, in the input camera's world
             (eval-geometry --frame reference reads them).
-        json: print the report as JSON in place of the table.
-        csv: print a line an object as CSV in place of the table.
+        json: print the report, as report.json holds it, in place of the table.
+        csv: print the objects, as objects.csv holds them, in place of the table.
         distance: of the input camera, for .ply files; a checkpoint states its own.
         encoder_weights: the image encoder's file, for a checkpoint that does not hold it.
         device: where to run.
     """
     least = dict(views=(views, 1), size=(size, 16), limit=(limit, 1), sheet=(sheet, 0))
-    _check(out, distance, save_gaussians, **least, ceiling_steps=(ceiling_steps, 1))
+    _check(out, distance, save_gaussians, json and csv, **least, ceiling_steps=(ceiling_steps, 1))
     place = str(pick_device(device))
     dataset = open_dataset(data, split)
     uids = choose_objects(dataset.uids, (), limit)

@@ -7,6 +7,7 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
 from gamba_warp.cli import run
 from gamba_warp.dataset import open_dataset
 from gamba_warp.errors import UserError
+from gamba_warp.eval import baselines
 from gamba_warp.eval.baselines import Retrieval, background, billboard, input_copy
 from gamba_warp.eval.ceiling import open_ceiling
 from gamba_warp.eval.compare_views import Truth, ViewsProtocol, compare, load_truth, summary
@@ -176,8 +177,9 @@ def test_retrieval_minds_both_shape_and_color(data):
     assert same < 0.01 and 0.05 < recolored <= 0.31 and moved > 0.05
 
 
-def test_retrieval_is_by_both_terms_not_by_shape_alone(data):
+def test_retrieval_is_by_both_terms_not_by_shape_alone(data, monkeypatch):
     """Exhaustive comparison, against the search that stops early."""
+    monkeypatch.setattr(baselines, "_CHUNK", 2)
     retrieval = Retrieval(open_dataset(data, "train"))
     truth = load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu")
     for view in range(6):
@@ -244,7 +246,8 @@ def test_no_output_folder(data, tmp_path, capsys, monkeypatch):
     assert run("eval-views", [*places, "--csv"]) == 0
     assert capsys.readouterr().out.startswith("name,status,psnr")
     assert sorted(tmp_path.iterdir()) == before
-    assert run("eval-views", [*places, "--save-gaussians"]) == 2
+    for refused in (["--save-gaussians"], ["--json", "--csv"]):
+        assert run("eval-views", [*places, *refused]) == 2
 
 
 def test_single_view_objects_have_no_novel_views(data, tmp_path):

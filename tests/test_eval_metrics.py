@@ -190,3 +190,26 @@ def test_summary_shows_the_interval(tmp_path, capsys):
     assert report["interval"] == {"x": [1.0, 3.0]}
     assert print_summary(report, tmp_path) == 0
     assert "2 [1, 3]" in capsys.readouterr().out
+
+
+def test_equal_to_scikit_image_and_kornia():
+    """Their own settings, in float64: 11x11 windows without padding, all three the same numbers."""
+    from kornia.metrics import psnr as kornia_psnr
+    from kornia.metrics import ssim as kornia_ssim
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+    a = torch.rand(37, 29, 3, dtype=torch.float64)
+    b = (a + 0.1 * torch.randn_like(a)).clamp(0, 1)
+    planes = [x.permute(2, 0, 1)[None] for x in (a, b)]
+    kornia = (
+        kornia_psnr(*planes, max_val=1.0).item(),
+        kornia_ssim(*planes, window_size=11, padding="valid").mean().item(),
+    )
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    pictures = a.numpy(), b.numpy()
+    skimage = (
+        peak_signal_noise_ratio(*pictures, data_range=1.0),
+        structural_similarity(*pictures, channel_axis=2, data_range=1.0, **window),
+    )
+    assert [psnr(a, b).item(), ssim(a, b).item()] == pytest.approx(kornia, abs=1e-6)
+    assert [psnr(a, b).item(), ssim(a, b).item()] == pytest.approx(skimage, abs=1e-6)
