@@ -23,6 +23,7 @@ from gamba_warp.kernels.bench.page import charts_of, page
 from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.bench.report import judge, markdown, ratio_table, ratios
 from gamba_warp.kernels.bench.scan_problem import ScanProblem, make_inputs
+from gamba_warp.kernels.bench.scan_variants import make_variant
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
@@ -115,7 +116,7 @@ def test_a_wrong_kernel_is_caught(monkeypatch):
     for function, status in ((real, "ok"), (wrong, "check failed")):
         monkeypatch.setattr(scan_problem, "selective_scan", function)
         problem = ScanProblem(inputs, torch.device("cpu"), 40)
-        made = [scan_suite._variant(problem, "x", d) for d in ("forward", scan_suite.BOTH)]
+        made = [make_variant(problem, "x", d) for d in ("forward", "forward+backward")]
         records = run(case(*made))["records"]
         assert all(r["status"].startswith(status) for r in records)
 

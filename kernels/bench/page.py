@@ -26,6 +26,7 @@ _AXES = {
     "threads": "threads",
     "side": "side of the picture, pixels",
     "views": "views",
+    "spacing": "tokens between kept states",
 }
 
 
@@ -35,9 +36,13 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
     done = [r for r in records if r["status"] == "ok"]
     if axis is None or not done:
         return []
+    if "," in axis:
+        return [svg for one in axis.split(",") for svg in charts_of(case, _on_axis(records, one))]
     if axis == "error":
         directions = dict.fromkeys(r["direction"] for r in done)
         return [_error_chart([r for r in done if r["direction"] == d], d) for d in directions]
+    if axis == "memory":
+        return [_memory_chart(done)]
     if axis == "skipped":
         return [_skip_chart(done)]
     series = []
@@ -52,18 +57,28 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
 
 def _error_chart(records: Sequence[dict], direction: str) -> str:
     """Time against error: less is better in both; the front is what no other variant beats."""
-    points = [
-        Point(
-            r["ms_p50"],
-            r["rel_rms_error"] or 0.0,
-            r["variant"],
-            "peer" if r["is_peer"] else "default" if r["is_default"] else "",
-        )
-        for r in records
-    ]
+    points = [_marked(r, r["rel_rms_error"] or 0.0) for r in records]
     front = pareto([p for p in points if p.y > 0])
     series = [Series(direction, points), Series("Pareto front", front, "steps")]
     return chart(series, Axis("milliseconds"), Axis("relative rms error to float64"))
+
+
+def _on_axis(records: Sequence[dict], axis: str) -> list[dict]:
+    return [r | {"axis": axis} for r in records]
+
+
+def _marked(record: dict, y: float) -> Point:
+    mark = "peer" if record["is_peer"] else "default" if record["is_default"] else ""
+    return Point(record["ms_p50"], y, record["variant"], mark)
+
+
+def _memory_chart(records: Sequence[dict]) -> str:
+    """Time against what is kept for the gradient."""
+    kept = [r for r in records if "saved_bytes" in r["work"]]
+    points = [_marked(r, r["work"]["saved_bytes"] / 2**20) for r in kept]
+    front = Series("Pareto front", pareto(points), "steps")
+    series = [Series("forward+backward", points), front]
+    return chart(series, Axis("milliseconds"), Axis("kept for the gradient, MiB"))
 
 
 def _skip_chart(records: Sequence[dict]) -> str:

@@ -8,31 +8,36 @@ from functools import partial
 
 import torch
 
-from . import peers
+from . import peers, scan_knobs
 from .case import Case, Error, Key, Settings, Target, Variant
-from .measure import peak_bytes, saved_bytes
 from .probe import probe_rate, probe_scan
 from .scan_problem import ScanProblem, make_inputs
-
-# Allowed relative rms error to float64. Half precision: what rounding inputs and output explains.
-FORWARD_LIMIT, BACKWARD_LIMIT = 1e-6, 1e-5
-HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
-BOTH = "forward+backward"
-# Tokens, channels, and tokens that the oracle looks at.
-_SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (16961, 1024, 16961)}
+from .scan_variants import (
+    BOTH,
+    HALF_LIMITS,
+    SIZES,
+    count_memory,
+    make_pair,
+    make_problem,
+    make_variant,
+)
 
 
 def cases(settings: Settings) -> list[Case]:
     """All cases of the scan at the level's sizes."""
+    cpu = settings.device.type == "cpu"
     builders = [
         ("operator", _operator, None),
         ("reference loop", _reference_loop, None),
         ("knobs", _knobs, "error"),
+        *([("exponential", scan_knobs.exponential, "error")] if cpu else []),
+        *([("boundary spacing", scan_knobs.spacings, "error,memory,spacing")] if cpu else []),
+        ("chunk size", scan_knobs.chunks if cpu else scan_knobs.cuda_variants, "error"),
         ("length", _lengths, "L"),
         ("batch", _batches, "B"),
         ("states", _states, "N"),
     ]
-    if settings.device.type == "cpu":
+    if cpu:
         builders.append(("threads", _threads, "threads"))
     else:
         builders.append(("training batch", _training_batch, None))
@@ -42,48 +47,14 @@ def cases(settings: Settings) -> list[Case]:
     ]
 
 
-def _problem(settings: Settings, **changes) -> ScanProblem:
-    length, width, tokens = _SIZES[settings.level]
-    inputs = make_inputs(**({"batch": 1, "length": length, "channels": width} | changes))
-    return ScanProblem(inputs, settings.device, tokens)
-
-
-def _variant(
-    problem: ScanProblem,
-    name: str,
-    direction: str = "forward",
-    dtype: torch.dtype = torch.float32,
-    options: dict | None = None,
-    **changes,
-) -> Variant:
-    """A variant that calls the operator with ``options``."""
-    forward, options = direction == "forward", options or {}
-    batch, length, width = problem.inputs["u"].shape
-    return Variant(
-        name,
-        partial(problem.forward if forward else problem.backward, dtype, **options),
-        partial(problem.check_forward if forward else problem.check_backward, dtype, **options),
-        HALF_LIMITS.get(dtype, FORWARD_LIMIT if forward else BACKWARD_LIMIT),
-        problem.oracle,
-        direction,
-        str(dtype).removeprefix("torch."),
-        parameters={"B": batch, "L": length, "D": width, "N": problem.inputs["A"].shape[1]},
-        **changes,
-    )
-
-
-def _pair(problem: ScanProblem, name: str, **changes) -> list[Variant]:
-    return [_variant(problem, name, direction, **changes) for direction in ("forward", BOTH)]
-
-
 def _operator(settings: Settings) -> list[Variant]:
     """The whole operator (softplus, bias, skip and gate) beside a bare probe: a native loop over
     given steps, without gate, skip or gradient, into a given output.
     """
-    problem = _problem(settings)
-    made = _pair(problem, "default", default=True)
+    problem = make_problem(settings)
+    made = make_pair(problem, "default", default=True)
     bare = problem.bare()
-    made.append(_variant(bare, "given steps, no gate or skip"))
+    made.append(make_variant(bare, "given steps, no gate or skip"))
     if settings.device.type == "cpu":
         made += [_probe(bare, threads) for threads in sorted({1, settings.threads})]
     return made
@@ -110,19 +81,19 @@ def _probe(bare: ScanProblem, threads: int) -> Variant:
 
 def _loop_length(settings: Settings) -> int:
     """At 16961 tokens the loop takes seconds and its factors gigabytes."""
-    return 2048 if settings.level == "normal" else _SIZES[settings.level][0]
+    return 2048 if settings.level == "normal" else SIZES[settings.level][0]
 
 
 def _reference_loop(settings: Settings) -> list[Variant]:
     """The operator against the formula as a torch loop (as Mamba's reference does it), and against
     peers where they are installed, all on the same input.
     """
-    length, tokens = _loop_length(settings), _SIZES[settings.level][2]
-    width = _SIZES[settings.level][1]
+    length, tokens = _loop_length(settings), SIZES[settings.level][2]
+    width = SIZES[settings.level][1]
     inputs = make_inputs(1, length, width)
     problem = ScanProblem(inputs, settings.device, tokens)
     made = [
-        _variant(problem, "default", default=True),
+        make_variant(problem, "default", default=True),
         _peer(problem, "torch loop", peers.scan_loop, channels_first=True, rounds=2),
     ]
     if settings.peers:
@@ -177,18 +148,18 @@ def _knobs(settings: Settings) -> list[Variant]:
     inputs. The discretisations are different models, each compared with its own formula, so that
     the one of Mamba's weights is the default at any cost.
     """
-    problem = _problem(settings)
-    made = _pair(problem, "float32", default=True)
+    problem = make_problem(settings)
+    made = make_pair(problem, "float32", default=True)
     for dtype in (torch.bfloat16, torch.float16):
         name = str(dtype).removeprefix("torch.") + " inputs and output"
-        made += _pair(problem, name, dtype=dtype)
+        made += make_pair(problem, name, dtype=dtype)
     for discretization in ("bilinear", "zoh"):
-        made += _pair(problem, discretization, options={"discretization": discretization})
+        made += make_pair(problem, discretization, options={"discretization": discretization})
     start = ScanProblem(problem.inputs, problem.device, problem.tokens)
     batch, _, width = problem.inputs["u"].shape
     start.initial_state = torch.randn(batch, width, 16, generator=torch.Generator().manual_seed(2))
-    made += _pair(start, "with an initial state")
-    made += _pair(_problem(settings, groups=4), "4 groups of B and C")
+    made += make_pair(start, "with an initial state")
+    made += make_pair(make_problem(settings, groups=4), "4 groups of B and C")
     return made
 
 
@@ -199,24 +170,12 @@ def _lengths(settings: Settings) -> list[Variant]:
     lengths = {"quick": (256, 1024)}.get(settings.level, (4096, 16384, 65536))
     made = []
     for length in lengths:
-        problem = _problem(settings, length=length)
+        problem = make_problem(settings, length=length)
         problem.channels = 8 if length > 16961 else 32
         for direction in ("forward", BOTH):
-            made.append(_variant(problem, f"L {length}", direction, rounds=20))
-            made[-1].work = partial(_memory, problem, direction)
+            made.append(make_variant(problem, f"L {length}", direction, rounds=20))
+            made[-1].work = partial(count_memory, problem, direction)
     return made
-
-
-def _memory(problem: ScanProblem, direction: str) -> dict[str, int]:
-    batch, length, width = problem.inputs["u"].shape
-    history = 4 * batch * length * width * problem.inputs["A"].shape[1]
-    run = problem.forward if direction == "forward" else problem.backward
-    counts = {"state_history_bytes": history}
-    if direction == BOTH:
-        leaves = problem.leaves()
-        counts["saved_bytes"] = saved_bytes(lambda: problem.call(leaves), leaves.values())
-    peak = peak_bytes(run, problem.device)
-    return counts if peak is None else counts | {"peak_bytes": peak}
 
 
 def _batches(settings: Settings) -> list[Variant]:
@@ -225,7 +184,9 @@ def _batches(settings: Settings) -> list[Variant]:
     length = 512 if quick else 4096
     made = []
     for batch in (1, 4) if quick else (1, 2, 4, 8):
-        made += _pair(_problem(settings, batch=batch, length=length, channels=256), f"B {batch}")
+        made += make_pair(
+            make_problem(settings, batch=batch, length=length, channels=256), f"B {batch}"
+        )
     return made
 
 
@@ -235,18 +196,18 @@ def _states(settings: Settings) -> list[Variant]:
     length = 512 if settings.level == "quick" else 4096
     made = []
     for states in counts:
-        made += _pair(_problem(settings, length=length, states=states), f"N {states}")
+        made += make_pair(make_problem(settings, length=length, states=states), f"N {states}")
     return made
 
 
 def _threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, from one to the machine's cores."""
-    problem = _problem(settings)
+    problem = make_problem(settings)
     cores = os.cpu_count() or 1
     counts = sorted({1, cores, *(2**i for i in range(1, 10) if 2**i < cores)})
     made = []
     for threads in counts:
-        variants = _pair(problem, f"{threads} thread{'s' * (threads > 1)}", threads=threads)
+        variants = make_pair(problem, f"{threads} thread{'s' * (threads > 1)}", threads=threads)
         for variant in variants:
             variant.parameters["threads"] = threads
         made += variants
@@ -256,11 +217,11 @@ def _threads(settings: Settings) -> list[Variant]:
 def _training_batch(settings: Settings) -> list[Variant]:
     """A layer of the paper's training: 16 sequences in bfloat16, beside mamba-ssm."""
     batch = 2 if settings.level == "quick" else 16
-    problem = _problem(settings, batch=batch)
+    problem = make_problem(settings, batch=batch)
     problem.tokens = min(problem.tokens, 2048)
-    made = _pair(problem, "default", dtype=torch.bfloat16, default=True)
-    single = _problem(settings)
-    made.append(_variant(single, "one sequence", dtype=torch.bfloat16))
+    made = make_pair(problem, "default", dtype=torch.bfloat16, default=True)
+    single = make_problem(settings)
+    made.append(make_variant(single, "one sequence", dtype=torch.bfloat16))
     if settings.peers:
         made += [
             _peer(

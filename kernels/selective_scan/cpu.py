@@ -8,8 +8,9 @@ from torch import Tensor
 from ..interop import empty, lane_contiguous, parallel_launch, view
 from . import cpu_kernels
 from .cpu_kernels import SPAN, Sizes
+from .cpu_variant import current
 from .lanes import W, lanes
-from .layout import CHUNK, Layout
+from .layout import Layout
 from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ, SCALES
 
 
@@ -36,7 +37,7 @@ class _Operands:
 
     def __init__(self, layout, u, delta, A, z, delta_bias, discretization):
         self.layout = layout
-        self.kinds = (u.dtype, delta.dtype, discretization)
+        self.kinds = (current(), u.dtype, delta.dtype, discretization)
         self.u, self.delta = lane_contiguous(u), lane_contiguous(delta)
         self.z = self.u if z is None else lane_contiguous(z)
         self.a, self.widest = view(layout.pack(A), lanes), view(layout.pack(A.abs().amax(1)), lanes)
@@ -81,7 +82,7 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
     Returns:
         ``out [B, L, D]``, the last state ``[B, D, N]`` and the saved states (a private layout).
     """
-    layout = Layout(u, A, B, SPAN)
+    layout = Layout(u, A, B, SPAN, current().chunk)
     s = _Operands(layout, u, delta, A, z, delta_bias, discretization)
     sizes = _sizes(layout, softplus, z is not None)
     b = B.float()
@@ -106,7 +107,7 @@ def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discre
 
 def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save):
     """The last state alone, ``[B, D, N]``, and the saved states; arguments as ``forward``."""
-    layout = Layout(u, A, B, SPAN, split=not save)
+    layout = Layout(u, A, B, SPAN, current().chunk, split=not save)
     s = _Operands(layout, u, delta, A, None, delta_bias, discretization)
     h, starts = layout.states_of(initial_state)[None], s.starts(save)
     if layout.segments > 1:
@@ -128,7 +129,7 @@ def backward(
     Returns:
         Nine tensors, None where not needed.
     """
-    layout = Layout(u, A, B, SPAN)
+    layout = Layout(u, A, B, SPAN, current().chunk)
     s = _Operands(layout, u, delta, A, z, delta_bias, discretization)
     need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
     through = need_u or need_delta or need_A or need_B or need_bias or need_h
@@ -142,7 +143,7 @@ def backward(
 
     def partial(needed: bool) -> tuple[Tensor, Tensor]:
         rows = layout.states if needed else 0
-        sums = torch.empty(layout.tasks, rows * CHUNK, W)
+        sums = torch.empty(layout.tasks, rows * current().chunk, W)
         return sums, empty((layout.parts, rows * layout.length), torch.float32)
 
     dh = layout.states_of(dlast)[None]
@@ -202,5 +203,5 @@ def final_state_backward(
 
 def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    layout = Layout(u, A, B, SPAN)
+    layout = Layout(u, A, B, SPAN, current().chunk)
     return (layout.batch, layout.chunks if save else 0, layout.blocks, layout.states, W)

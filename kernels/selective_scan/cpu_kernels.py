@@ -11,23 +11,17 @@ import torch
 import warp as wp
 
 from . import recurrence, tokens
+from .cpu_variant import Variant
 from .lanes import WARP_DTYPES, W, flush_denormals, lanes, restore_denormals
-from .layout import BLOCKS, CHUNK
-from .recurrence import NEED_DB, NEED_DC, SCALES, sum_lanes
+from .layout import BLOCKS
+from .recurrence import NEED_DB, NEED_DC, SCALES
 from .tokens import GRAD_TOKEN, KEPT, TOKEN
 
 SPAN = 32  # lane groups of a task at most: long pieces of rows, and what a core's own cache holds
-STRIP = 64
 
-_K = wp.constant(CHUNK)
-_S = wp.constant(STRIP)
 _P = wp.constant(BLOCKS)
 _W = wp.constant(W)
 _DC, _DB = wp.constant(NEED_DC), wp.constant(NEED_DB)
-# room for alignment to cache lines: one more
-_TOKENS = wp.constant(TOKEN * STRIP + 1)
-_GRAD_TOKENS = wp.constant(GRAD_TOKEN * CHUNK + 1)
-_KEPT = wp.constant(KEPT * CHUNK + 1)
 
 
 @wp.struct
@@ -87,17 +81,21 @@ def _place(sizes: Sizes, task: int) -> Place:
 
 
 @functools.cache
-def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str, output: bool):
+def forward_kernel(
+    variant: Variant, io: torch.dtype, delta_io: torch.dtype, discretization: str, output: bool
+):
     """From the states before each segment, in ``h_out``, to those after it.
 
     With ``output`` it computes y; else it multiplies the decays into ``product_out``, and z, C and
     skip are not used.
     """
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
-    token, state = tokens.forward_leaves(io, delta_io), recurrence.forward_leaves(discretization)
+    token = tokens.forward_leaves(io, delta_io)
+    state = recurrence.forward_leaves(discretization, variant.degree)
     prepare, finish = token.prepare, token.finish
     advance, accumulate = state.advance, state.accumulate
-    scale = SCALES[discretization]
+    scale, chunk_size, strip_size = SCALES[discretization], variant.chunk, variant.strip
+    room = TOKEN * strip_size + 1  # one more, for alignment to cache lines
 
     @wp.kernel(enable_backward=False, module="unique")
     def scan_forward(
@@ -120,21 +118,21 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str, 
         y_out: wp.array3d(dtype=scalar),
     ):
         p = _place(sizes, offset + wp.tid())
-        token = wp.zeros(shape=(_TOKENS,), dtype=lanes)
+        token = wp.zeros(shape=(room,), dtype=lanes)
         before = flush_denormals()
-        for strip in range((p.end - p.begin + _S - 1) / _S):
-            t0 = p.begin + strip * _S
-            count = wp.min(_S, p.end - t0)
+        for strip in range((p.end - p.begin + strip_size - 1) / strip_size):
+            t0 = p.begin + strip * strip_size
+            count = wp.min(strip_size, p.end - t0)
             for j in range(p.blocks):
                 k = p.k + j
                 d = p.d + j * _W
                 width = p.width - j * _W
                 h = h_out[p.state, k]
-                if starts_out.shape[1] > 0 and t0 % _K == 0:
+                if starts_out.shape[1] > 0 and t0 % chunk_size == 0:
                     for n in range(sizes.states):
-                        starts_out[p.b, t0 / _K, k, n] = h[n]
+                        starts_out[p.b, t0 / chunk_size, k, n] = h[n]
                 tame = prepare(
-                    u_in, delta_in, z_in, p.b, t0, count, d, width, j, p.blocks, _S, p.end,
+                    u_in, delta_in, z_in, p.b, t0, count, d, width, j, p.blocks, strip_size, p.end,
                     widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus, sizes.use_z,
                     wp.static(scale), token,
                 )  # fmt: skip
@@ -154,12 +152,15 @@ def forward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str, 
 
 
 @functools.cache
-def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
+def gradient_states_kernel(
+    variant: Variant, io: torch.dtype, delta_io: torch.dtype, discretization: str
+):
     """What a segment's outputs send back to the state before it, and the products of the decays."""
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
     prepare = tokens.backward_leaves(io, delta_io).prepare
-    gather = recurrence.backward_leaves(discretization).gather
-    scale = SCALES[discretization]
+    gather = recurrence.backward_leaves(discretization, variant).gather
+    scale, chunk_size = SCALES[discretization], variant.chunk
+    room = GRAD_TOKEN * chunk_size + 1
 
     @wp.kernel(enable_backward=False, module="unique")
     def scan_gradient_states(
@@ -179,16 +180,16 @@ def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretizatio
         product_out: wp.array3d(dtype=lanes),
     ):
         p = _place(sizes, offset + wp.tid())
-        token = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
+        token = wp.zeros(shape=(room,), dtype=lanes)
         before = flush_denormals()
-        for chunk in range((p.end - p.begin + _K - 1) / _K):
-            t0 = p.begin + chunk * _K
-            count = wp.min(_K, p.end - t0)
+        for chunk in range((p.end - p.begin + chunk_size - 1) / chunk_size):
+            t0 = p.begin + chunk * chunk_size
+            count = wp.min(chunk_size, p.end - t0)
             for j in range(p.blocks):
                 k = p.k + j
                 tame = prepare(
                     u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d + j * _W,
-                    p.width - j * _W, j, p.blocks, _K, p.end, widest_in[k], bias_in[k],
+                    p.width - j * _W, j, p.blocks, chunk_size, p.end, widest_in[k], bias_in[k],
                     bias_in[k], sizes.use_softplus, sizes.use_z, wp.static(scale), token,
                 )  # fmt: skip
                 gather(
@@ -201,12 +202,15 @@ def gradient_states_kernel(io: torch.dtype, delta_io: torch.dtype, discretizatio
 
 
 @functools.cache
-def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str):
+def backward_kernel(variant: Variant, io: torch.dtype, delta_io: torch.dtype, discretization: str):
     """From the gradients of the states after each segment, in ``dh_out``, to all others."""
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
-    token, state = tokens.backward_leaves(io, delta_io), recurrence.backward_leaves(discretization)
+    token = tokens.backward_leaves(io, delta_io)
+    state = recurrence.backward_leaves(discretization, variant)
     prepare, finish = token.prepare, token.finish
-    retreat, scale = state.retreat, SCALES[discretization]
+    retreat, sum_lanes, scale = state.retreat, state.sum_lanes, SCALES[discretization]
+    chunk_size = variant.chunk
+    room, kept_room = GRAD_TOKEN * chunk_size + 1, KEPT * chunk_size + 1
 
     @wp.kernel(enable_backward=False, module="unique")
     def scan_backward(
@@ -240,26 +244,26 @@ def backward_kernel(io: torch.dtype, delta_io: torch.dtype, discretization: str)
     ):
         task = offset + wp.tid()
         p = _place(sizes, task)
-        token = wp.zeros(shape=(_GRAD_TOKENS,), dtype=lanes)
-        kept = wp.zeros(shape=(_KEPT,), dtype=lanes)
+        token = wp.zeros(shape=(room,), dtype=lanes)
+        kept = wp.zeros(shape=(kept_room,), dtype=lanes)
         before = flush_denormals()
-        chunks = (p.end - p.begin + _K - 1) / _K
+        chunks = (p.end - p.begin + chunk_size - 1) / chunk_size
         for reverse in range(chunks):
-            t0 = p.begin + (chunks - 1 - reverse) * _K
-            count = wp.min(_K, p.end - t0)
+            t0 = p.begin + (chunks - 1 - reverse) * chunk_size
+            count = wp.min(chunk_size, p.end - t0)
             for j in range(p.blocks):
                 k = p.k + j
                 d = p.d + j * _W
                 width = p.width - j * _W
                 tame = prepare(
-                    u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, j, p.blocks, -_K,
-                    p.end, widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus,
+                    u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, j, p.blocks,
+                    -chunk_size, p.end, widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus,
                     sizes.use_z, wp.static(scale), token,
                 )  # fmt: skip
                 retreat(
                     sizes.states, tame, p.b, p.group, t0, count, int(j % _P == 0),
-                    sizes.needs, a_in[k], b_in, c_in, starts_in[p.b, t0 / _K, k], token, kept,
-                    db_lanes_out[task], dc_lanes_out[task], dh_out[p.state, k],
+                    sizes.needs, a_in[k], b_in, c_in, starts_in[p.b, t0 / chunk_size, k], token,
+                    kept, db_lanes_out[task], dc_lanes_out[task], dh_out[p.state, k],
                     da_out[p.state, k],
                 )  # fmt: skip
                 finish(

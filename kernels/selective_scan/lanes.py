@@ -22,10 +22,37 @@ typedef int I __attribute__((vector_size(64), aligned(4)));
 auto splat = [](float x) -> F { return (F){x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; };
 """
 
-# exp2: round to an integer by adding 1.5 * 2^23 (+127, the exponent bias), then a minimax
-# polynomial of the rest with the constant term held at 1, so that exp2(x) - 1 keeps its relative
-# accuracy for small x: the errors of slow decays add up over thousands of steps. NaN stays NaN.
-PRELUDE = (
+# 2^x for |x| <= 1/2 by degree: minimax polynomials with the constant term held at 1, so that
+# 2^x - 1 keeps its relative accuracy for small x: the errors of slow decays add up over thousands
+# of steps. Highest power first.
+_EXP2 = {
+    2: (0.2398640364408493, 0.7029417753219604, 1.0),
+    3: (5.500893294811249e-2, 0.24221095442771912, 0.6932829022407532, 1.0),
+    4: (
+        *(9.582852944731712e-3, 5.5906426161527634e-2, 0.24024099111557007),
+        *(0.6931241750717163, 1.0),
+    ),
+    5: (
+        *(1.3400436146184802e-3, 9.666373021900654e-3, 5.550333112478256e-2),
+        *(0.2402234822511673, 0.6931471824645996, 1.0),
+    ),
+    6: (
+        *(1.546973508084193e-4, 1.3390866806730628e-3, 9.618030861020088e-3),
+        *(5.5503569543361664e-2, 0.24022650718688965, 0.6931471824645996, 1.0),
+    ),
+}
+
+
+def _polynomial(degree: int) -> str:
+    """C++ that makes p of f."""
+    first, *rest = _EXP2[degree]
+    lines = [f"F p = splat({first!r}f);", *(f"p = fma_(p, f, splat({c!r}f));" for c in rest)]
+    return "\n    ".join(lines)
+
+
+# exp2: round to an integer by adding 1.5 * 2^23 (+127, the exponent bias), then the polynomial of
+# the rest. NaN stays NaN.
+_PRELUDE = (
     VECTORS
     + """
 auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
@@ -41,13 +68,7 @@ const F shifter = splat(12583039.0f);
 auto exp2_clamped_ = [&](F x) -> F {
     F r = x + shifter;
     F f = x - (r - shifter);
-    F p = splat(1.546973508084193e-4f);
-    p = fma_(p, f, splat(1.3390866806730628e-3f));
-    p = fma_(p, f, splat(9.618030861020088e-3f));
-    p = fma_(p, f, splat(5.5503569543361664e-2f));
-    p = fma_(p, f, splat(0.24022650718688965f));
-    p = fma_(p, f, splat(0.6931471824645996f));
-    p = fma_(p, f, splat(1.0f));
+    ACCURATE
     return p * (F)((I)r << 23);
 };
 auto exp2_ = [&](F x) -> F {
@@ -59,21 +80,24 @@ auto decay_ = [&](F x) -> F {
     x = (F)((I)x | (int)0x80000000) * LOG2E;
     return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
 };
-// the same of degree 5 for |x| <= 125, NaN excluded: the exponent is added as an integer
+// the same of another degree for |x| <= 125, NaN excluded: the exponent is added as an integer
 auto exp2_tame_ = [&](F x) -> F {
     const F plain = splat(12582912.0f);
     F r = x + plain;
     F f = x - (r - plain);
-    F p = splat(1.3400436146184802e-3f);
-    p = fma_(p, f, splat(9.666373021900654e-3f));
-    p = fma_(p, f, splat(5.550333112478256e-2f));
-    p = fma_(p, f, splat(0.2402234822511673f));
-    p = fma_(p, f, splat(0.6931471824645996f));
-    p = fma_(p, f, splat(1.0f));
+    TAME
     return (F)((I)p + ((I)r << 23));
 };
 """
-)
+).replace("ACCURATE", _polynomial(6))
+
+
+def prelude(degree: int) -> str:
+    """Arithmetic on lanes; ``degree`` of the recurrence's exp2 where |x| <= 125."""
+    return _PRELUDE.replace("TAME", _polynomial(degree))
+
+
+PRELUDE = prelude(5)
 
 # softplus(x) = max(x, 0) + log1p(e), e = exp(-|x|), log1p(e) = 2 atanh(e / (2 + e)): no branch,
 # relatively accurate for x << 0, and x itself in float32 well before 20. NaN stays NaN.

@@ -8,9 +8,8 @@ from torch import Tensor
 
 from .lanes import W
 
-CHUNK = 64  # tokens; a state is saved at the start of each chunk
 BLOCKS = 4  # lane groups whose dB and dC are one partial sum, whatever the number of threads
-_SEGMENT = 4 * CHUNK  # tokens of a segment at least
+_SEGMENT = 4  # chunks of a segment at least
 
 
 class Layout:
@@ -21,13 +20,14 @@ class Layout:
     with fewer channels than feed torch's threads; finding their first states costs a second walk.
     """
 
-    def __init__(self, u: Tensor, A: Tensor, B: Tensor, most: int, split: bool = True):
+    def __init__(self, u: Tensor, A: Tensor, B: Tensor, most: int, chunk: int, split: bool = True):
         """
         Args:
             u: ``[B, L, D]``.
             A: ``[D, N]``.
             B: ``[B, L, G, N]``.
             most: blocks of a span at most, a multiple of BLOCKS.
+            chunk: tokens; a state is saved at the start of each chunk.
             split: whether there may be several segments.
         """
         self.batch, self.length, self.channels = u.shape
@@ -35,15 +35,15 @@ class Layout:
         self.group_width = self.channels // self.groups
         self.group_blocks = -(-self.group_width // W)
         self.blocks = self.groups * self.group_blocks
-        self.chunks = -(-self.length // CHUNK)
+        self.chunks = -(-self.length // chunk)
         threads = torch.get_num_threads()
         per_thread = max(1, min(self.group_blocks, -(-self.batch * self.blocks // threads)))
         self.span = min(most, -(-per_thread // BLOCKS) * BLOCKS)
         spans = self.batch * self.groups * -(-self.group_blocks // self.span)
         self.segments = 1
         if split and 0 < spans < threads:
-            self.segments = max(1, min(-(-threads // spans), self.length // _SEGMENT))
-        self.segment = max(1, -(-self.chunks // self.segments)) * CHUNK
+            self.segments = max(1, min(-(-threads // spans), self.length // (_SEGMENT * chunk)))
+        self.segment = max(1, -(-self.chunks // self.segments)) * chunk
         self.segments = max(1, -(-self.length // self.segment))
         self.tasks = self.segments * spans
         self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .lanes import PRELUDE, lanes
-from .layout import CHUNK
+from .cpu_variant import Variant
+from .lanes import lanes, prelude
 from .tokens import TOKENS
 
 # gradients that cost work inside the loops, as bits of ``needs``
@@ -44,8 +44,7 @@ _SLOPES = {
     "zoh": _PHI + "const F df = f, dg = small ? slope : (f - g) / safe;",
 }
 _OPEN = (
-    PRELUDE
-    + TOKENS
+    TOKENS
     + """
 const F* const rates = (const F*)a_in.data;
 auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
@@ -195,11 +194,11 @@ _GRADIENTS = {
 
 
 @functools.cache
-def forward_leaves(discretization: str) -> SimpleNamespace:
+def forward_leaves(discretization: str, degree: int) -> SimpleNamespace:
     """``advance`` and ``accumulate``: the states of a lane group from before the strip to after."""
-    factors = _FACTORS[discretization]
+    factors, head = _FACTORS[discretization], prelude(degree)
 
-    @wp.func_native(_ADVANCE.replace("FACTORS", factors))
+    @wp.func_native(head + _ADVANCE.replace("FACTORS", factors))
     def advance(
         states: int,
         tame: int,
@@ -214,7 +213,7 @@ def forward_leaves(discretization: str) -> SimpleNamespace:
         h_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_ACCUMULATE.replace("FACTORS", factors))
+    @wp.func_native(head + _ACCUMULATE.replace("FACTORS", factors))
     def accumulate(
         states: int,
         tame: int,
@@ -233,15 +232,17 @@ def forward_leaves(discretization: str) -> SimpleNamespace:
 
 
 @functools.cache
-def backward_leaves(discretization: str) -> SimpleNamespace:
-    """``retreat`` and ``gather``: gradients of states from after the strip to before.
+def backward_leaves(discretization: str, variant: Variant) -> SimpleNamespace:
+    """``retreat`` and ``gather``: gradients of states from after the chunk to before.
 
     ``first`` says that the sums of dB and dC are empty yet.
     """
     factors = _FACTORS[discretization]
-    retreat_text = _RETREAT.replace("GRADIENT", _GRADIENTS[discretization])
+    head, chunk = prelude(variant.degree), str(variant.chunk)
+    retreat_text = _OPEN + _RETREAT.replace("GRADIENT", _GRADIENTS[discretization])
+    retreat_text = retreat_text.replace("FACTORS", factors).replace("CHUNK", chunk)
 
-    @wp.func_native(_OPEN + retreat_text.replace("FACTORS", factors).replace("CHUNK", str(CHUNK)))
+    @wp.func_native(head + retreat_text)
     def retreat(
         states: int,
         tame: int,
@@ -263,7 +264,7 @@ def backward_leaves(discretization: str) -> SimpleNamespace:
         da_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_GATHER.replace("FACTORS", factors))
+    @wp.func_native(head + _GATHER.replace("FACTORS", factors))
     def gather(
         states: int,
         tame: int,
@@ -278,12 +279,11 @@ def backward_leaves(discretization: str) -> SimpleNamespace:
         product_out: wp.array(dtype=lanes),
     ): ...
 
-    return SimpleNamespace(retreat=retreat, gather=gather)
+    return SimpleNamespace(retreat=retreat, gather=gather, sum_lanes=_sum_lanes(variant.chunk))
 
 
 # Rows of ``sums`` [states, CHUNK] to their sums over lanes, eight rows at a time.
-@wp.func_native(
-    """
+_SUM_LANES = """
 typedef float E __attribute__((vector_size(32), aligned(4)));
 const E* const rows = (const E*)sums.data;
 auto pair = [](E a, E b) -> E {
@@ -307,13 +307,19 @@ for (int n = 0; n < states; ++n)
         if (t + 8 <= count) *(E*)out = all;
         else for (int i = 0; i < count - t; ++i) out[i] = all[i];
     }
-""".replace("CHUNK", str(CHUNK))
-)
-def sum_lanes(
-    states: int,
-    length: int,
-    t0: int,
-    count: int,
-    sums: wp.array(dtype=lanes),
-    total: wp.array(dtype=wp.float32),
-): ...
+"""
+
+
+@functools.cache
+def _sum_lanes(chunk: int):
+    @wp.func_native(_SUM_LANES.replace("CHUNK", str(chunk)))
+    def sum_lanes(
+        states: int,
+        length: int,
+        t0: int,
+        count: int,
+        sums: wp.array(dtype=lanes),
+        total: wp.array(dtype=wp.float32),
+    ): ...
+
+    return sum_lanes
