@@ -21,6 +21,7 @@ from gamba_warp.kernels.bench.charts import Axis, Point, Series, chart, pareto
 from gamba_warp.kernels.bench.measure import peak_bytes, saved_bytes
 from gamba_warp.kernels.bench.page import charts_of, page
 from gamba_warp.kernels.bench.peers import scan_loop
+from gamba_warp.kernels.bench.raster_variants import make_scene
 from gamba_warp.kernels.bench.report import judge, markdown, ratio_table, ratios
 from gamba_warp.kernels.bench.scan_problem import ScanProblem, make_inputs
 from gamba_warp.kernels.bench.scan_variants import make_variant
@@ -400,7 +401,7 @@ def test_quick_scan_and_conv_from_the_command_line(tmp_path, capsys):
 
 def test_the_scene_and_its_crop():
     """The rasterizer is right on the oracle's crop; a wrong colour is seen."""
-    scene = raster_suite._scene(QUICK, 2, count=300, size=64)
+    scene = make_scene(QUICK, 2, count=300, size=64)
     assert scene.check(True).rel_rms < 1e-4
     wrong = scene.changed(exact={"alpha_min": 0.2})
     assert wrong.check(False).rel_rms > 1e-2

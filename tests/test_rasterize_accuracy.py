@@ -56,7 +56,7 @@ class Cuts:
         self.blend = reference._blend
         self.views = []
 
-    def __call__(self, mean2d, conic, opacity, channels, pixels, alpha_min, alpha_max):
+    def __call__(self, mean2d, conic, opacity, channels, pixels, alpha_min, alpha_max, t_min):
         key = (pixels // 8).long() @ torch.tensor([1, 100_000])
         order = torch.argsort(key, stable=True)
         out = []
@@ -65,7 +65,8 @@ class Cuts:
                 reach, raw = alphas_in_reach(mean2d, conic, opacity, pixels[index], alpha_min)
                 distance = to_the_cuts(raw, alpha_min, alpha_max)
             chosen = (x[reach] for x in (mean2d, conic, opacity, channels))
-            out.append((*self.blend(*chosen, pixels[index], alpha_min, alpha_max), distance))
+            blended = self.blend(*chosen, pixels[index], alpha_min, alpha_max, t_min)
+            out.append((*blended, distance))
         back = torch.argsort(order)
         blended, alpha, distance = (torch.cat(parts)[back] for parts in zip(*out))
         self.views.append(distance)

@@ -119,6 +119,23 @@ class Variant:
     work: Callable[[], dict[str, int | float]] | None = None
 
 
+def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Variant]:
+    """Has ``made`` run, be checked and counted inside ``use(choice)``, which chooses kernels."""
+
+    def inside(function: Callable) -> Callable:
+        def run():
+            with use(choice):
+                return function()
+
+        return run
+
+    for variant in made:
+        variant.run, variant.check = inside(variant.run), inside(variant.check)
+        if variant.work is not None:
+            variant.work = inside(variant.work)
+    return made
+
+
 @dataclass
 class Case:
     """Variants that are timed in turn, so that their ratios come from one run.

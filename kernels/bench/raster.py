@@ -10,22 +10,20 @@ from functools import partial
 import torch
 
 from ..rasterize import Skip
-from . import peers
+from . import peers, raster_knobs
 from .case import Case, Error, Key, Settings, Target, Variant, compare
 from .raster_scene import LEAVES, Scene, orbit_cameras, shell
-
-# Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
-FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 1.0
-BOTH = "forward+backward"
-_COUNT = 16384
-_SIZE = 512
+from .raster_variants import BOTH, make_pair, make_scene, make_variant, sizes_of
 
 
 def cases(settings: Settings) -> list[Case]:
     """All cases of the rasterizer at the level's sizes."""
+    cpu = settings.device.type == "cpu"
     builders = [
         ("scene", _scenes, None),
-        ("knobs", _knobs, "error"),
+        ("knobs", raster_knobs.trades, "error"),
+        *([("exponential", raster_knobs.exponential, "error")] if cpu else []),
+        *([("tiles", raster_knobs.tiles, "error")] if cpu else []),
         ("skipping", _skipping, "skipped"),
         ("switches", _switches, "skipped"),
         ("one call", _one_call, None),
@@ -33,7 +31,7 @@ def cases(settings: Settings) -> list[Case]:
         ("pixels", _pixels, "side"),
         ("views", _views, "views"),
     ]
-    if settings.device.type == "cpu":
+    if cpu:
         builders.append(("threads", _threads, "threads"))
     else:
         builders.append(("32 views", _many_views, None))
@@ -43,54 +41,14 @@ def cases(settings: Settings) -> list[Case]:
     ]
 
 
-def _scene(
-    settings: Settings,
-    scale: float = 1.0,
-    count: int | None = None,
-    size: int | None = None,
-    views: int = 1,
-) -> Scene:
-    """The shell; a quick run has an eighth of the Gaussians and a quarter of the pixels."""
-    quick = settings.level == "quick"
-    count = count or (_COUNT // 8 if quick else _COUNT)
-    size = size or (_SIZE // 2 if quick else _SIZE)
-    return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
-
-
-def _parameters(scene: Scene) -> dict[str, int]:
-    count, views = scene.gaussians["opacities"].shape[-1], scene.viewmats.shape[:-2].numel()
-    return {"N": count, "side": scene.size, "views": views}
-
-
-def _variant(
-    scene: Scene, name: str, direction: str = "forward", limit: float | None = None, **changes
-) -> Variant:
-    backward = direction == BOTH
-    return Variant(
-        name,
-        scene.backward if backward else scene.forward,
-        partial(scene.check, backward),
-        limit or (BACKWARD_LIMIT if backward else FORWARD_LIMIT),
-        scene.oracle(backward),
-        direction,
-        parameters=_parameters(scene),
-        work=partial(scene.work, backward),
-        **changes,
-    )
-
-
-def _pair(scene: Scene, name: str, **changes) -> list[Variant]:
-    return [_variant(scene, name, direction, **changes) for direction in ("forward", BOTH)]
-
-
 def _scenes(settings: Settings) -> list[Variant]:
     """The probe scene: 16,384 Gaussians on a shell, one view of 512², whole operator (project,
     sort, bin, blend), with standard deviations of 0.01, 0.02 and 0.04 of the object's size.
     """
     made = []
     for scale in (1, 2, 4):
-        scene = _scene(settings, scale)
-        variants = _pair(scene, f"scale {scale}", default=True)
+        scene = make_scene(settings, scale)
+        variants = make_pair(scene, f"scale {scale}", default=True)
         if settings.peers:
             variants += _peers(scene, f"scale {scale}")
         for variant in variants:
@@ -101,7 +59,7 @@ def _scenes(settings: Settings) -> list[Variant]:
 
 def _peers(scene: Scene, name: str) -> list[Variant]:
     """On CUDA gsplat; on a CPU the projection of its torch code, all that runs there."""
-    parameters = _parameters(scene)
+    parameters = sizes_of(scene)
     if scene.device.type == "cuda":
         runs = {"forward": scene.forward, BOTH: scene.backward}
 
@@ -145,42 +103,21 @@ def _own() -> tuple:
     return (rasterization,)
 
 
-def _knobs(settings: Settings) -> list[Variant]:
-    """What a caller may trade for time, at scale 2; the truth has no alpha threshold, no radius
-    clip and all Gaussians.
-    """
-    scene = _scene(settings, 2).changed(exact={"alpha_min": 1e-9})
-    made = _pair(scene, "alpha_min 1/255", limit=TRADE_LIMIT, default=True)
-    for denominator in (4096, 1024, 64, 32, 16):
-        options = {"alpha_min": 1 / denominator}
-        name = f"alpha_min 1/{denominator}"
-        made += _pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
-    for radius in (scene.size / 32, scene.size / 16):
-        name = f"radius_clip {radius:g}"
-        made += _pair(scene.changed(options={"radius_clip": radius}), name, limit=TRADE_LIMIT)
-    for opacity in (0.35, 0.4):
-        kept = scene.gaussians["opacities"] >= opacity
-        pruned = {k: x[kept] for k, x in scene.gaussians.items()}
-        pruned = scene.changed(gaussians=pruned, truth=scene.gaussians)
-        made.append(_variant(pruned, f"without opacities < {opacity}", limit=TRADE_LIMIT))
-    return made
-
-
 def _skipping(settings: Settings) -> list[Variant]:
     """What is not computed because nobody needs it, at scale 2, against the same call that needs
     all. Skipped: share of the pairs of Gaussians and tiles, or of the gradients.
     """
-    scene = _scene(settings, 2)
-    made = [_variant(scene, "all gradients, whole picture", BOTH, default=True)]
+    scene = make_scene(settings, 2)
+    made = [make_variant(scene, "all gradients, whole picture", BOTH, default=True)]
     for name in ("colors", "means"):
-        made.append(_variant(scene.changed(wanted=(name,)), f"gradient of {name} alone", BOTH))
+        made.append(make_variant(scene.changed(wanted=(name,)), f"gradient of {name} alone", BOTH))
         made[-1].work = partial(_gradients_skipped, scene, 1 - 1 / len(LEAVES))
     half = scene.size // 2
     for name, rows in (("half", scene.size), ("a quarter", half)):
         part = torch.zeros_like(scene.cotangent)
         part[:, :rows, :half] = scene.cotangent[:, :rows, :half]
         part = scene.changed(cotangent=part)
-        made.append(_variant(part, f"upstream gradient on {name} of the picture", BOTH))
+        made.append(make_variant(part, f"upstream gradient on {name} of the picture", BOTH))
         made[-1].work = partial(_tiles_skipped, part)
     return made
 
@@ -190,14 +127,14 @@ def _switches(settings: Settings) -> list[Variant]:
     of the picture and for means alone. Same picture and gradients; what the switch is worth is
     the difference to the default. Skipped: the share of that switch's own count in the default.
     """
-    scene = _scene(settings, 2)
+    scene = make_scene(settings, 2)
     part = torch.zeros_like(scene.cotangent)
     part[:, :, : scene.size // 2] = scene.cotangent[:, :, : scene.size // 2]
     scene = scene.changed(cotangent=part, wanted=("means",))
-    made = _pair(scene, "all skips", default=True)
+    made = make_pair(scene, "all skips", default=True)
     for field in fields(Skip):
         off = scene.changed(options={"skip": replace(Skip(), **{field.name: False})})
-        pair = _pair(off, f"without {field.name}")
+        pair = make_pair(off, f"without {field.name}")
         for variant in pair[field.name in ("zero_upstream", "unused", "unasked") :]:
             variant.work = partial(_share, field.name, scene)
             made.append(variant)
@@ -244,9 +181,9 @@ def _one_call(settings: Settings) -> list[Variant]:
         for b in range(objects)
         for v in range(views)
     ]
-    made = _pair(together, "one call", default=True)
+    made = make_pair(together, "one call", default=True)
     for direction in ("forward", BOTH):
-        variant = _variant(single[0], f"{len(single)} calls", direction)
+        variant = make_variant(single[0], f"{len(single)} calls", direction)
         runs = [s.forward if direction == "forward" else s.backward for s in single]
         variant.run = partial(_call_all, runs)
         variant.work = None
@@ -269,8 +206,8 @@ def _counts(settings: Settings) -> list[Variant]:
     }[settings.level]
     made = []
     for count in counts:
-        scene = _scene(settings, math.sqrt(counts[0] / count), count)
-        made += _pair(scene, f"{count} Gaussians")
+        scene = make_scene(settings, math.sqrt(counts[0] / count), count)
+        made += make_pair(scene, f"{count} Gaussians")
     return made
 
 
@@ -279,7 +216,7 @@ def _pixels(settings: Settings) -> list[Variant]:
     sides = (64, 128) if settings.level == "quick" else (128, 256, 512, 1024)
     made = []
     for side in sides:
-        made += _pair(_scene(settings, 2, size=side), f"{side} x {side}")
+        made += make_pair(make_scene(settings, 2, size=side), f"{side} x {side}")
     return made
 
 
@@ -288,17 +225,19 @@ def _views(settings: Settings) -> list[Variant]:
     numbers, size = ((1, 2), 64) if settings.level == "quick" else ((1, 2, 4, 8, 16), 256)
     made = []
     for views in numbers:
-        made += _pair(_scene(settings, size=size, views=views), f"{views} view{'s' * (views > 1)}")
+        made += make_pair(
+            make_scene(settings, size=size, views=views), f"{views} view{'s' * (views > 1)}"
+        )
     return made
 
 
 def _threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, at scale 2."""
     cores = os.cpu_count() or 1
-    scene = _scene(settings, 2)
+    scene = make_scene(settings, 2)
     made = []
     for threads in sorted({1, cores, *(2**i for i in range(1, 10) if 2**i < cores)}):
-        for variant in _pair(scene, f"{threads} thread{'s' * (threads > 1)}", threads=threads):
+        for variant in make_pair(scene, f"{threads} thread{'s' * (threads > 1)}", threads=threads):
             variant.parameters["threads"] = threads
             made.append(variant)
     return made
@@ -306,8 +245,8 @@ def _threads(settings: Settings) -> list[Variant]:
 
 def _many_views(settings: Settings) -> list[Variant]:
     """32 views of 512² in one launch, beside gsplat."""
-    scene = _scene(settings, views=32)
-    return _pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
+    scene = make_scene(settings, views=32)
+    return make_pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
 
 
 def _raster(case: str, variant: str, direction: str = "forward", field: str = "ms_p50") -> Key:

@@ -69,7 +69,7 @@ class Scene:
         options: of ``rasterization``.
         wanted: what gradients are asked for.
         exact: options of the oracle where it shall not have ours, as ``alpha_min``.
-        truth: Gaussians of the oracle, where ours are not all; then there are no gradients.
+        truth: Gaussians of the oracle, where ours are others; where fewer, without gradients.
         cotangent: of the picture, ``[.., V, H, W, 3]``; None: drawn at random, as for the alphas.
     """
 
@@ -141,7 +141,7 @@ class Scene:
         """What the check compares with, in words."""
         width, height = self._crop(backward)[2:]
         text = f"float64, all Gaussians dense, a crop of {width} x {height} pixels"
-        return text + (" without the alpha threshold" if "alpha_min" in self.exact else "")
+        return text + (" without thresholds" if "t_min" in self.exact else "")
 
     def _crop(self, backward: bool) -> tuple[int, int, int, int]:
         """Left, top, width and height: within the object, off its centre."""

@@ -2,31 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 from ..selective_scan import cpu_variant, cuda_variant
-from .case import Settings, Variant
+from .case import Settings, Variant, on_kernels
 from .scan_problem import ScanProblem
 from .scan_variants import BOTH, TRADE_LIMIT, count_memory, make_pair, make_problem, make_variant
-
-
-def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Variant]:
-    """Has ``made`` run, be checked and be counted on kernels that ``use(choice)`` chooses."""
-
-    def inside(function: Callable) -> Callable:
-        def run():
-            with use(choice):
-                return function()
-
-        return run
-
-    for variant in made:
-        variant.run, variant.check = inside(variant.run), inside(variant.check)
-        if variant.work is not None:
-            variant.work = inside(variant.work)
-    return made
 
 
 def _shorter(settings: Settings) -> ScanProblem:

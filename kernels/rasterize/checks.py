@@ -66,6 +66,8 @@ def _check_options(options: dict) -> None:
     low, high = options["alpha_min"], options["alpha_max"]
     if not 0 < low <= high < 1:
         raise ValueError(f"alpha_min, alpha_max are {low}, {high}, allowed is 0 < min <= max < 1")
+    if not 1e-30 <= options["t_min"] < 1:
+        raise ValueError(f"t_min is {options['t_min']}, allowed is 1e-30 <= t_min < 1")
     for name, allowed in (("render_mode", _RENDER_MODES), ("rasterize_mode", _RASTERIZE_MODES)):
         if options[name] not in allowed:
             raise ValueError(f"{name} is {options[name]!r}, allowed are {', '.join(allowed)}")

@@ -1,31 +1,32 @@
 """Compositing on the CPU: threads take tile after tile, 16 lanes = the pixels of a 4 x 4 block.
 
-A tile of 16 x 16 pixels is 16 such blocks. For each Gaussian of the tile the 16 blocks are tested
-at once (lanes = blocks), and only those that its ellipse touches are evaluated (lanes = pixels).
+A tile of 16 x 16 pixels is 16 such blocks (cpu_variant.py has other sizes). For each Gaussian of
+the tile its blocks are tested at once (lanes = blocks), and only those that the ellipse touches are
+evaluated (lanes = pixels).
 Backward walks back to front and writes one gradient row per (tile, Gaussian) pair, which are summed
 by Gaussian afterwards: no atomics. README.md §3 and §5 hold the maths.
 """
+
+import functools
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from ..constants import T_MIN, TILE
 from ..interop import parallel_launch, view
 from . import lanes as L
 from .bin import Bins
-from .blend import blend, unblend
+from .blend import blend_leaves
+from .cpu_variant import Variant, current
 from .frame import Frame, Walk, color_row
-from .lanes import lanes, lanes_int
+from .lanes import block_leaves, lanes, lanes_int
 from .launch import vectors
 from .skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
 from .tiles import q_limit
 
 # Unrolled, the loops over blocks and pixels would take the compiler long for no gain.
-wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+_OPTIONS = {"enable_backward": False, "max_unroll": 1}
 
-_TILE = wp.constant(TILE)
-_T_MIN = wp.constant(T_MIN)
 _BLOCK_TEST = wp.constant(BLOCK_TEST)
 _STOPPED = wp.constant(STOPPED)
 _EMPTY_TILES = wp.constant(EMPTY_TILES)
@@ -37,213 +38,233 @@ _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
 
 
 @wp.func
-def _blocks_inside(frame: Frame, x: int, y: int) -> int:
+def _blocks_inside(frame: Frame, columns: int, x: int, y: int) -> int:
     # bit b is set if block b of the tile at (x, y) has a pixel in the picture
     bits = wp.int32(0)
-    for b in range(16):
-        if x + (b % 4) * 4 < frame.width and y + (b // 4) * 4 < frame.height:
+    for b in range(columns * columns):
+        if x + (b % columns) * 4 < frame.width and y + (b // columns) * 4 < frame.height:
             bits = bits | (1 << b)
     return bits
 
 
-@wp.kernel
-def _composite(
-    offset: wp.int32,
-    frame: Frame,
-    tiles: wp.int32,
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    colors_in: wp.array2d[wp.float32],
-    pairs_in: wp.array[wp.int32],
-    starts_in: wp.array[wp.int32],
-    counter_out: wp.array[wp.int32],
-    room_out: wp.array2d[lanes],
-    transmittances_out: wp.array[lanes],
-    stops_out: wp.array[lanes_int],
-    blocks_out: wp.array[wp.int32],
-    walked_out: wp.array[wp.int32],
-    blocks_walked_out: wp.array[wp.int64],
-    renders_out: wp.array4d[wp.float32],
-    alphas_out: wp.array4d[wp.float32],
-):
-    """Room to work: counter, the next tile to take; room, the colour sums of a worker's tile."""
-    worker = offset + wp.tid()
-    channels = colors_in.shape[1]
-    tile = L.take(counter_out)
-    while tile < tiles:
-        begin = starts_in[tile]
-        end = starts_in[tile + 1]
-        walked_out[tile] = 0
-        blocks_walked_out[tile] = wp.int64(0)
-        if begin < end or (frame.skip & _EMPTY_TILES) == 0:
+@functools.cache
+def _forward_kernel(variant: Variant):
+    columns, blocks, side = variant.columns, variant.blocks, variant.tile
+    leaves, blend = block_leaves(variant), blend_leaves(variant).blend
+    first_x, first_y, touched = leaves.first_x, leaves.first_y, leaves.touched
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def composite(
+        offset: wp.int32,
+        frame: Frame,
+        tiles: wp.int32,
+        means2d_in: wp.array[wp.vec2],
+        conics_in: wp.array[wp.vec3],
+        view_opacities_in: wp.array[wp.float32],
+        colors_in: wp.array2d[wp.float32],
+        pairs_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        counter_out: wp.array[wp.int32],
+        room_out: wp.array2d[lanes],
+        transmittances_out: wp.array[lanes],
+        stops_out: wp.array[lanes_int],
+        blocks_out: wp.array[wp.int32],
+        walked_out: wp.array[wp.int32],
+        blocks_walked_out: wp.array[wp.int64],
+        renders_out: wp.array4d[wp.float32],
+        alphas_out: wp.array4d[wp.float32],
+    ):
+        """Room to work: counter, the next tile to take; room, a worker's sums of colours."""
+        worker = offset + wp.tid()
+        channels = colors_in.shape[1]
+        tile = L.take(counter_out)
+        while tile < tiles:
+            begin = starts_in[tile]
+            end = starts_in[tile + 1]
+            walked_out[tile] = 0
+            blocks_walked_out[tile] = wp.int64(0)
+            if begin < end or (frame.skip & _EMPTY_TILES) == 0:
+                image = tile // (frame.tiles_x * frame.tiles_y)
+                x = tile % frame.tiles_x * side
+                y = tile // frame.tiles_x % frame.tiles_y * side
+                xs = first_x(float(x) + 0.5)
+                ys = first_y(float(y) + 0.5)
+                first = tile * blocks
+                for b in range(blocks):
+                    transmittances_out[first + b] = lanes(1.0)
+                    stops_out[first + b] = lanes_int(_NEVER)
+                for i in range(blocks * channels):
+                    room_out[worker, i] = lanes(0.0)
+
+                inside = _blocks_inside(frame, columns, x, y)
+                alive = inside
+                evaluated = wp.int64(0)
+                k = begin
+                while k < end and alive != 0:
+                    g = pairs_in[k]
+                    L.fetch(
+                        means2d_in,
+                        conics_in,
+                        view_opacities_in,
+                        pairs_in[wp.min(k + _AHEAD, end - 1)],
+                    )
+                    mean = means2d_in[g]
+                    conic = conics_in[g]
+                    shear = conic[1]
+                    opacity = view_opacities_in[g]
+                    bits = alive
+                    if (frame.skip & _BLOCK_TEST) != 0:
+                        slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
+                        limit = q_limit(opacity, frame.alpha_min)
+                        bits = alive & touched(
+                            xs, ys, mean[0], mean[1], conic[0], shear, conic[2], slope, limit
+                        )
+                    used = wp.int32(0)
+                    if bits != 0:
+                        used = blend(
+                            bits,
+                            k,
+                            float(x) + 0.5 - mean[0],
+                            float(y) + 0.5 - mean[1],
+                            shear,
+                            _EXP2 * conic[0],
+                            _EXP2 * conic[2],
+                            opacity,
+                            frame.alpha_min,
+                            frame.alpha_max,
+                            frame.t_min,
+                            colors_in,
+                            color_row(frame, g),
+                            first,
+                            worker,
+                            transmittances_out,
+                            stops_out,
+                            room_out,
+                        )
+                        evaluated += wp.int64(L.count_bits(bits))
+                        if (frame.skip & _STOPPED) != 0:
+                            alive = alive & ~(used >> 16)
+                    blocks_out[k] = used & 0xFFFF
+                    k += 1
+                walked_out[tile] = k - begin
+                blocks_walked_out[tile] = evaluated
+
+                while inside != 0:
+                    b = L.lowest_bit(inside)
+                    inside = inside & (inside - 1)
+                    px = x + (b % columns) * 4
+                    py = y + (b // columns) * 4
+                    L.store_block(
+                        alphas_out, image, py, px, 0, L.coverage(transmittances_out[first + b])
+                    )
+                    for c in range(channels):
+                        L.store_block(
+                            renders_out, image, py, px, c, room_out[worker, b * channels + c]
+                        )
+            tile = L.take(counter_out)
+
+    return composite
+
+
+@functools.cache
+def _backward_kernel(variant: Variant):
+    columns, blocks, side = variant.columns, variant.blocks, variant.tile
+    unblend = blend_leaves(variant).unblend
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def composite_vjp(
+        offset: wp.int32,
+        frame: Frame,
+        tiles: wp.int32,
+        geometry: wp.int32,
+        means2d_in: wp.array[wp.vec2],
+        conics_in: wp.array[wp.vec3],
+        view_opacities_in: wp.array[wp.float32],
+        colors_in: wp.array2d[wp.float32],
+        pairs_in: wp.array[wp.int32],
+        rows_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        transmittances_in: wp.array[lanes],
+        stops_in: wp.array[lanes_int],
+        blocks_in: wp.array[wp.int32],
+        walked_in: wp.array[wp.int32],
+        v_renders_in: wp.array4d[wp.float32],
+        v_alphas_in: wp.array4d[wp.float32],
+        counter_out: wp.array[wp.int32],
+        room_out: wp.array2d[lanes],
+        v_pairs_out: wp.array2d[wp.float32],
+        written_out: wp.array[wp.uint8],
+        skipped_out: wp.array[wp.int32],
+    ):
+        """Room to work: counter, the next tile to take; room as ``unblend`` has it."""
+        worker = offset + wp.tid()
+        channels = colors_in.shape[1]
+        upstream = 32 + channels
+        tile = L.take(counter_out)
+        while tile < tiles:
             image = tile // (frame.tiles_x * frame.tiles_y)
-            x = tile % frame.tiles_x * _TILE
-            y = tile // frame.tiles_x % frame.tiles_y * _TILE
-            xs = L.block_x(float(x) + 0.5)
-            ys = L.block_y(float(y) + 0.5)
-            first = tile * 16
-            for b in range(16):
-                transmittances_out[first + b] = lanes(1.0)
-                stops_out[first + b] = lanes_int(_NEVER)
-            for i in range(16 * channels):
-                room_out[worker, i] = lanes(0.0)
-
-            inside = _blocks_inside(frame, x, y)
-            alive = inside
-            evaluated = wp.int64(0)
-            k = begin
-            while k < end and alive != 0:
-                g = pairs_in[k]
-                L.fetch(
-                    means2d_in, conics_in, view_opacities_in, pairs_in[wp.min(k + _AHEAD, end - 1)]
-                )
-                mean = means2d_in[g]
-                conic = conics_in[g]
-                shear = conic[1]
-                opacity = view_opacities_in[g]
-                bits = alive
-                if (frame.skip & _BLOCK_TEST) != 0:
-                    slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
-                    limit = q_limit(opacity, frame.alpha_min)
-                    bits = alive & L.blocks_touched(
-                        xs, ys, mean[0], mean[1], conic[0], shear, conic[2], slope, limit
-                    )
-                used = wp.int32(0)
-                if bits != 0:
-                    used = blend(
-                        bits,
-                        k,
-                        float(x) + 0.5 - mean[0],
-                        float(y) + 0.5 - mean[1],
-                        shear,
-                        _EXP2 * conic[0],
-                        _EXP2 * conic[2],
-                        opacity,
-                        frame.alpha_min,
-                        frame.alpha_max,
-                        _T_MIN,
-                        colors_in,
-                        color_row(frame, g),
-                        first,
-                        worker,
-                        transmittances_out,
-                        stops_out,
-                        room_out,
-                    )
-                    evaluated += wp.int64(L.count_bits(bits))
-                    if (frame.skip & _STOPPED) != 0:
-                        alive = alive & ~(used >> 16)
-                blocks_out[k] = used & 0xFFFF
-                k += 1
-            walked_out[tile] = k - begin
-            blocks_walked_out[tile] = evaluated
-
+            x = tile % frame.tiles_x * side
+            y = tile // frame.tiles_x % frame.tiles_y * side
+            first = tile * blocks
+            any_v = wp.int32(0)
+            inside = wp.int32(0)
+            if walked_in[tile] > 0:
+                inside = _blocks_inside(frame, columns, x, y)
+            every = inside
             while inside != 0:
                 b = L.lowest_bit(inside)
                 inside = inside & (inside - 1)
-                px = x + (b % 4) * 4
-                py = y + (b // 4) * 4
-                L.store_block(
-                    alphas_out, image, py, px, 0, L.coverage(transmittances_out[first + b])
-                )
+                px = x + (b % columns) * 4
+                py = y + (b // columns) * 4
+                place = upstream + b * (channels + 1)
+                v_alpha = L.load_block(v_alphas_in, image, py, px, 0)
+                room_out[worker, place + channels] = v_alpha
+                any_v = any_v | L.any_nonzero(v_alpha)
                 for c in range(channels):
-                    L.store_block(renders_out, image, py, px, c, room_out[worker, b * channels + c])
-        tile = L.take(counter_out)
+                    v_c = L.load_block(v_renders_in, image, py, px, c)
+                    room_out[worker, place + c] = v_c
+                    any_v = any_v | L.any_nonzero(v_c)
+            wanted = any_v != 0 or ((frame.skip & _ZERO_UPSTREAM) == 0 and every != 0)
+            skipped_out[tile] = wp.where(wanted, 0, 1)
+            if wanted:
+                for b in range(blocks):
+                    room_out[worker, b] = L.absolute(transmittances_in[first + b])
+                    room_out[worker, 16 + b] = lanes(0.0)
+                k = starts_in[tile] + walked_in[tile] - 1
+                while k >= starts_in[tile]:
+                    bits = blocks_in[k]
+                    if (frame.skip & _UNUSED) == 0:
+                        bits = every
+                    if bits != 0:
+                        g = pairs_in[k]
+                        mean = means2d_in[g]
+                        conic = conics_in[g]
+                        unblend(
+                            bits,
+                            k,
+                            geometry,
+                            float(x) + 0.5 - mean[0],
+                            float(y) + 0.5 - mean[1],
+                            conic[1],
+                            _EXP2 * conic[0],
+                            _EXP2 * conic[2],
+                            view_opacities_in[g],
+                            frame.alpha_min,
+                            frame.alpha_max,
+                            colors_in,
+                            color_row(frame, g),
+                            first,
+                            worker,
+                            stops_in,
+                            room_out,
+                            rows_in[k],
+                            v_pairs_out,
+                        )
+                        written_out[rows_in[k]] = wp.uint8(1)
+                    k -= 1
+            tile = L.take(counter_out)
 
-
-@wp.kernel
-def _composite_vjp(
-    offset: wp.int32,
-    frame: Frame,
-    tiles: wp.int32,
-    geometry: wp.int32,
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    colors_in: wp.array2d[wp.float32],
-    pairs_in: wp.array[wp.int32],
-    rows_in: wp.array[wp.int32],
-    starts_in: wp.array[wp.int32],
-    transmittances_in: wp.array[lanes],
-    stops_in: wp.array[lanes_int],
-    blocks_in: wp.array[wp.int32],
-    walked_in: wp.array[wp.int32],
-    v_renders_in: wp.array4d[wp.float32],
-    v_alphas_in: wp.array4d[wp.float32],
-    counter_out: wp.array[wp.int32],
-    room_out: wp.array2d[lanes],
-    v_pairs_out: wp.array2d[wp.float32],
-    written_out: wp.array[wp.uint8],
-    skipped_out: wp.array[wp.int32],
-):
-    """Room to work: counter, the next tile to take; room as ``unblend`` has it."""
-    worker = offset + wp.tid()
-    channels = colors_in.shape[1]
-    upstream = 32 + channels
-    tile = L.take(counter_out)
-    while tile < tiles:
-        image = tile // (frame.tiles_x * frame.tiles_y)
-        x = tile % frame.tiles_x * _TILE
-        y = tile // frame.tiles_x % frame.tiles_y * _TILE
-        first = tile * 16
-        any_v = wp.int32(0)
-        inside = wp.int32(0)
-        if walked_in[tile] > 0:
-            inside = _blocks_inside(frame, x, y)
-        every = inside
-        while inside != 0:
-            b = L.lowest_bit(inside)
-            inside = inside & (inside - 1)
-            px = x + (b % 4) * 4
-            py = y + (b // 4) * 4
-            place = upstream + b * (channels + 1)
-            v_alpha = L.load_block(v_alphas_in, image, py, px, 0)
-            room_out[worker, place + channels] = v_alpha
-            any_v = any_v | L.any_nonzero(v_alpha)
-            for c in range(channels):
-                v_c = L.load_block(v_renders_in, image, py, px, c)
-                room_out[worker, place + c] = v_c
-                any_v = any_v | L.any_nonzero(v_c)
-        wanted = any_v != 0 or ((frame.skip & _ZERO_UPSTREAM) == 0 and every != 0)
-        skipped_out[tile] = wp.where(wanted, 0, 1)
-        if wanted:
-            for b in range(16):
-                room_out[worker, b] = L.absolute(transmittances_in[first + b])
-                room_out[worker, 16 + b] = lanes(0.0)
-            k = starts_in[tile] + walked_in[tile] - 1
-            while k >= starts_in[tile]:
-                bits = blocks_in[k]
-                if (frame.skip & _UNUSED) == 0:
-                    bits = every
-                if bits != 0:
-                    g = pairs_in[k]
-                    mean = means2d_in[g]
-                    conic = conics_in[g]
-                    unblend(
-                        bits,
-                        k,
-                        geometry,
-                        float(x) + 0.5 - mean[0],
-                        float(y) + 0.5 - mean[1],
-                        conic[1],
-                        _EXP2 * conic[0],
-                        _EXP2 * conic[2],
-                        view_opacities_in[g],
-                        frame.alpha_min,
-                        frame.alpha_max,
-                        colors_in,
-                        color_row(frame, g),
-                        first,
-                        worker,
-                        stops_in,
-                        room_out,
-                        rows_in[k],
-                        v_pairs_out,
-                    )
-                    written_out[rows_in[k]] = wp.uint8(1)
-                k -= 1
-        tile = L.take(counter_out)
+    return composite_vjp
 
 
 def composite_forward(
@@ -271,16 +292,16 @@ def composite_forward(
     tiles = images * frame.tiles_x * frame.tiles_y
     renders = colors.new_zeros(images, frame.height, frame.width, channels)
     alphas = colors.new_zeros(images, frame.height, frame.width, 1)
-    workers = torch.get_num_threads()
+    workers, blocks = torch.get_num_threads(), current().blocks
     walk = Walk(
-        colors.new_empty(tiles * 16, 16),
-        bins.pairs.new_empty(tiles * 16, 16),
+        colors.new_empty(tiles * blocks, 16),
+        bins.pairs.new_empty(tiles * blocks, 16),
         torch.zeros_like(bins.pairs),
         bins.pairs.new_empty(tiles),
         bins.pairs.new_empty(tiles, dtype=torch.int64),
     )
     parallel_launch(
-        _composite,
+        _forward_kernel(current()),
         workers,
         [
             frame,
@@ -343,7 +364,7 @@ def composite_backward(
     skipped = torch.empty_like(walk.walked)
     workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)
     parallel_launch(
-        _composite_vjp,
+        _backward_kernel(current()),
         workers,
         [
             frame,

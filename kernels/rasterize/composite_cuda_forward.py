@@ -4,7 +4,6 @@ import functools
 
 import warp as wp
 
-from ..constants import T_MIN
 from .composite_cuda_warp import (
     HEIGHT,
     RECORD,
@@ -37,7 +36,6 @@ from .frame import Frame
 from .skip import BLOCK_TEST, STOPPED
 
 _SIZE = WARP * RECORD
-_T_MIN = wp.constant(T_MIN)
 _BLOCK_TEST = wp.constant(BLOCK_TEST)
 _STOPPED = wp.constant(STOPPED)
 
@@ -125,7 +123,7 @@ def forward_kernel(channels: int, parts: int):
                         weight = T[j] * wp.min(alpha, frame.alpha_max)
                         after = T[j] - weight
                         if alpha >= frame.alpha_min and T[j] > 0.0:
-                            if after > _T_MIN:
+                            if after > frame.t_min:
                                 used[0] += wp.static(1 << first_block(j))
                                 T[j] = after
                                 for c in range(wp.static(channels)):

@@ -21,6 +21,7 @@ class Frame:
     colors_per_view: wp.int32
     alpha_min: wp.float32
     alpha_max: wp.float32
+    t_min: wp.float32
     skip: wp.int32
 
 
@@ -59,6 +60,7 @@ def make_frame(
     colors_per_view: bool,
     alpha_min: float,
     alpha_max: float,
+    t_min: float,
     skip: int,
 ) -> Frame:
     """The scalars of a composite launch as one kernel argument."""
@@ -66,5 +68,6 @@ def make_frame(
     frame.width, frame.height = width, height
     frame.tiles_x, frame.tiles_y = tile_grid(width, height)
     frame.views, frame.num, frame.colors_per_view = views, num, int(colors_per_view)
-    frame.alpha_min, frame.alpha_max, frame.skip = alpha_min, alpha_max, skip
+    frame.alpha_min, frame.alpha_max = alpha_min, alpha_max
+    frame.t_min, frame.skip = t_min, skip
     return frame

@@ -7,9 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from ..constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TILE
+from ..constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
 from .bin import Bins
 from .checks import check_inputs
+from .cpu_variant import current
 from .frame import Walk
 from .harmonics import colors_from_harmonics
 from .meta import Meta
@@ -41,6 +42,7 @@ def rasterization(
     rasterize_mode: str = "classic",
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
+    t_min: float = T_MIN,
     skip: Skip = EVERYTHING,
     **gsplat_options,
 ) -> tuple[Tensor, Tensor, Meta]:
@@ -74,6 +76,7 @@ def rasterization(
         rasterize_mode: "classic", or "antialiased": opacity times sqrt(det Σ / det(Σ + eps2d)).
         alpha_min: fainter contributions are skipped; > 0.
         alpha_max: alpha is clamped here, and has zero gradient then; < 1.
+        t_min: a pixel stops before its transmittance would fall to this; 1e-30 to < 1.
         skip: what work to leave out; changes neither picture nor gradients.
         gsplat_options: what else gsplat's function takes, so that its callers need no change:
             ``packed, tile_size, channel_chunk, segmented`` have no effect, others are accepted at
@@ -95,7 +98,7 @@ def rasterization(
     )  # fmt: skip
     options = dict(
         width=width, height=height, near_plane=near_plane, eps2d=eps2d, alpha_min=alpha_min,
-        alpha_max=alpha_max, sh_degree=sh_degree, render_mode=render_mode,
+        alpha_max=alpha_max, t_min=t_min, sh_degree=sh_degree, render_mode=render_mode,
         rasterize_mode=rasterize_mode,
     )  # fmt: skip
     lead = check_inputs(tensors, options, gsplat_options)
@@ -118,11 +121,15 @@ def rasterization(
     channels = channels.reshape(-1, channels.shape[-1])
     skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
     splats = means2d, conics, view_opacities, channels
-    renders, alphas, *walk = composite(*splats, list(bins), size2d, [alpha_min, alpha_max], skipped)
+    renders, alphas, *walk = composite(
+        *splats, list(bins), size2d, [alpha_min, alpha_max, t_min], skipped
+    )
     renders = _finish(render_mode, renders, alphas, backgrounds)
     meta = Meta(Bins(*bins), Walk(*walk), status, skipped)
     meta.update(zip(("means2d", "conics", "depths", "opacities"), projected))
-    meta.update(radii=projected[4].ceil().int(), width=width, height=height, tile_size=TILE)
+    meta.update(
+        radii=projected[4].ceil().int(), width=width, height=height, tile_size=current().tile
+    )
     renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
     return renders, alphas, meta
 
@@ -130,6 +137,13 @@ def rasterization(
 def _flat(x: Tensor | None, size: int, lead: int) -> Tensor | None:
     """One batch dimension of the given size for the leading ones; contiguous float32."""
     return None if x is None else x.reshape(size, *x.shape[lead:]).float().contiguous()
+
+
+def _describe(meta: Meta, projected: list[Tensor], width: int, height: int) -> None:
+    """What gsplat's ``meta`` has under the same names."""
+    meta.update(zip(("means2d", "conics", "depths", "opacities"), projected))
+    meta.update(radii=projected[4].ceil().int(), width=width, height=height)
+    meta["tile_size"] = current().tile
 
 
 def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:

@@ -4,7 +4,12 @@ A leaf is a few lines of C++ with the compiler's vector types, which become AVX-
 instructions. The loops around them are Warp kernels. In a block, lane l is pixel (l % 4, l // 4).
 """
 
+import functools
+from types import SimpleNamespace
+
 import warp as wp
+
+from .cpu_variant import Variant
 
 LANES = 16
 lanes = wp.types.vector(LANES, wp.float32)
@@ -40,25 +45,11 @@ def _leaf(body: str, result: str = "F") -> str:
     )
 
 
-@wp.func_native(_leaf("out = X * 4.0f + x;"))
-def block_x(x: wp.float32) -> lanes:
-    """Abscissa of the first pixel of each of the 16 blocks of a tile; the tile begins at x."""
-    ...
-
-
-@wp.func_native(_leaf("out = Y * 4.0f + y;"))
-def block_y(y: wp.float32) -> lanes:
-    """Ordinate of the first pixel of each of the 16 blocks of a tile; the tile begins at y."""
-    ...
-
-
 # README eq. 6 as in bin.py, for 16 blocks at once; the mask is gathered lane by lane at the end.
-@wp.func_native(
-    TYPES
-    + """
+_TOUCHED = """
     F x0 = *(const F*)&xs, y0 = *(const F*)&ys, zero = F{};
     x0 = x0 - center_x; y0 = y0 - center_y;
-    F x1 = x0 + 3.0f, y1 = y0 + 3.0f;
+    F x1 = x0 + WIDTH.0f, y1 = y0 + HEIGHT.0f;
     F ny = max_(y0, min_(zero, y1)), nx = max_(x0, min_(zero, x1));
     F kny = k * ny;
     F u = max_(x0, min_(-kny, x1)) + kny;
@@ -68,21 +59,42 @@ def block_y(y: wp.float32) -> lanes:
     q = min_(q, a * u * u + e * y * y);
     const I bit = {1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768};
     return __builtin_reduce_or((I)(q <= limit) & bit);
+"""
+
+
+@functools.cache
+def block_leaves(variant: Variant) -> SimpleNamespace:
+    """``first_x, first_y``: first pixels of the blocks' sub-tiles, x or y the tile's; ``touched``.
+
+    Of ``touched`` bit b is set if the sub-tile of block b may hold a pixel with q <= limit;
+    slope = -a k / (a k² + e). Lanes without a block mean nothing.
     """
-)
-def blocks_touched(
-    xs: lanes,
-    ys: lanes,
-    center_x: wp.float32,
-    center_y: wp.float32,
-    a: wp.float32,
-    k: wp.float32,
-    e: wp.float32,
-    slope: wp.float32,
-    limit: wp.float32,
-) -> wp.int32:
-    """Bit b is set if block b may hold a pixel with q <= limit; slope = -a k / (a k² + e)."""
-    ...
+    blocks = range(LANES)
+    firsts_x = [4 * (b % variant.columns) // variant.width * variant.width for b in blocks]
+    firsts_y = [4 * (b // variant.columns) // variant.height * variant.height for b in blocks]
+    text = _TOUCHED.replace("WIDTH", str(variant.width - 1))
+    text = text.replace("HEIGHT", str(variant.height - 1))
+
+    @wp.func_native(_leaf(f"const F first = {{{', '.join(map(str, firsts_x))}}}; out = first + x;"))
+    def first_x(x: wp.float32) -> lanes: ...
+
+    @wp.func_native(_leaf(f"const F first = {{{', '.join(map(str, firsts_y))}}}; out = first + y;"))
+    def first_y(y: wp.float32) -> lanes: ...
+
+    @wp.func_native(TYPES + text)
+    def touched(
+        xs: lanes,
+        ys: lanes,
+        center_x: wp.float32,
+        center_y: wp.float32,
+        a: wp.float32,
+        k: wp.float32,
+        e: wp.float32,
+        slope: wp.float32,
+        limit: wp.float32,
+    ) -> wp.int32: ...
+
+    return SimpleNamespace(first_x=first_x, first_y=first_y, touched=touched)
 
 
 @wp.func_native("return __builtin_ctz(bits);")

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from . import composite_cpu, composite_cuda
 from .bin import Bins, bin_gaussians
+from .cpu_variant import Variant, current
 from .frame import Walk, make_frame
 from .project import make_lens, project_forward
 from .project_vjp import project_backward
@@ -19,7 +20,11 @@ _OP = "gamba_warp::rasterize_"
 
 
 def _compositor(device: torch.device):
-    return composite_cpu if device.type == "cpu" else composite_cuda
+    if device.type == "cpu":
+        return composite_cpu
+    if current() != Variant():
+        raise ValueError(f"device is {device}: {current()} is for a CPU")
+    return composite_cuda
 
 
 @torch.library.custom_op(_OP + "project", mutates_args=())
@@ -156,15 +161,16 @@ def _(means2d, conics, view_opacities, colors, bins, size, alpha_range, skipped)
     width, height = size[:2]
     tiles_x, tiles_y = tile_grid(width, height)
     images, pairs = means2d.shape[0], Bins(*bins).pairs
-    blocks = images * tiles_x * tiles_y * 16
+    tiles = images * tiles_x * tiles_y
+    blocks = tiles * current().blocks
     return (
         colors.new_empty(images, height, width, colors.shape[1]),
         colors.new_empty(images, height, width, 1),
         colors.new_empty(blocks, 16),
         pairs.new_empty(blocks, 16),
         torch.empty_like(pairs),
-        pairs.new_empty(blocks // 16),
-        pairs.new_empty(blocks // 16, dtype=torch.int64),
+        pairs.new_empty(tiles),
+        pairs.new_empty(tiles, dtype=torch.int64),
     )
 
 

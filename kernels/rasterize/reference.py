@@ -50,14 +50,14 @@ def _jacobian(points: Tensor, K: Tensor, width: int, height: int) -> Tensor:
     )
 
 
-def _blend(mean2d, conic, opacity, channels, pixels, alpha_min, alpha_max):
+def _blend(mean2d, conic, opacity, channels, pixels, alpha_min, alpha_max, t_min):
     dx, dy = (pixels[:, None] - mean2d[None]).unbind(-1)
     q = conic[:, 0, 0] * dx * dx + 2 * conic[:, 0, 1] * dx * dy + conic[:, 1, 1] * dy * dy
     alpha = (opacity * torch.exp(-0.5 * q)).clamp_max(alpha_max)
     alpha = torch.where(alpha >= alpha_min, alpha, 0.0)
     after = torch.cumprod(1 - alpha, 1)
-    # a pixel stops before the Gaussian that would bring it to T_MIN; those behind change nothing
-    alpha = torch.where((after > T_MIN).cummin(1).values, alpha, 0.0)
+    # a pixel stops before the Gaussian that would bring it to t_min; those behind change nothing
+    alpha = torch.where((after > t_min).cummin(1).values, alpha, 0.0)
     after = torch.cumprod(1 - alpha, 1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
     weight = before * alpha
@@ -81,6 +81,7 @@ def render_view(
     antialiased: bool = False,
     alpha_min: float = ALPHA_MIN,
     alpha_max: float = ALPHA_MAX,
+    t_min: float = T_MIN,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One object in one view: colours ``[H, W, C]``, depth Σ w z and alpha ``[H, W, 1]``.
 
@@ -100,6 +101,7 @@ def render_view(
         antialiased: as ``rasterize_mode="antialiased"``.
         alpha_min: as ``rasterization``.
         alpha_max: as ``rasterization``.
+        t_min: as ``rasterization``.
     """
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = points[:, 2].detach()
@@ -120,7 +122,7 @@ def render_view(
     channels = torch.cat([colors, points[:, 2:]], 1)
     size = max(1, math.ceil(_CHUNK * 64 / max(1, len(order))))
     parts = [
-        _blend(mean2d, conic, opacity, channels, chunk, alpha_min, alpha_max)
+        _blend(mean2d, conic, opacity, channels, chunk, alpha_min, alpha_max, t_min)
         for chunk in pixels.split(size)
     ]
     blended = torch.cat([p[0] for p in parts]).view(height, width, -1)

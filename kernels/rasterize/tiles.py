@@ -5,12 +5,11 @@ README.md §2 proves the test. Counting and writing call the same functions.
 
 import warp as wp
 
-from ..constants import TILE
+from .cpu_variant import current
 from .skip import TILE_TEST
 
 wp.set_module_options({"enable_backward": False})
 
-_TILE = wp.constant(TILE)
 # Rounding of q, relative and absolute; the test may keep too much, never too little.
 SLACK = 1.0 + 1e-4
 SLACK_ABS = 1e-4
@@ -21,7 +20,8 @@ _TILE_TEST = wp.constant(TILE_TEST)
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
     """Columns and rows of tiles."""
-    return -(-width // TILE), -(-height // TILE)
+    tile = current().tile
+    return -(-width // tile), -(-height // tile)
 
 
 @wp.struct
@@ -33,6 +33,7 @@ class Grid:
     height: wp.int32
     tiles_x: wp.int32
     tiles_y: wp.int32
+    shift: wp.int32  # a tile has 2^shift pixels in a row
     alpha_min: wp.float32
     skip: wp.int32
 
@@ -43,6 +44,7 @@ def make_grid(num: int, width: int, height: int, alpha_min: float, skip: int) ->
     grid.num, grid.width, grid.height = num, width, height
     grid.alpha_min, grid.skip = alpha_min, skip
     grid.tiles_x, grid.tiles_y = tile_grid(width, height)
+    grid.shift = current().tile.bit_length() - 1
     return grid
 
 
@@ -60,15 +62,16 @@ class Ellipse:
 
 
 @wp.func
-def to_tile(x: wp.float32, size: wp.int32) -> wp.int32:
+def to_tile(grid: Grid, x: wp.float32, size: wp.int32) -> wp.int32:
     # clamped before the cast: a footprint may be larger than an int32
-    return wp.int32(wp.clamp(x, 0.0, float(size - 1))) // _TILE
+    return wp.int32(wp.clamp(x, 0.0, float(size - 1))) >> grid.shift
 
 
 @wp.func
 def tile_rows(grid: Grid, y: wp.float32, extent: wp.float32) -> wp.vec2i:
     # first and last row with a pixel centre (at +0.5) in reach, with a pixel to spare
-    return wp.vec2i(to_tile(y - extent - 1.0, grid.height), to_tile(y + extent + 1.0, grid.height))
+    top = to_tile(grid, y - extent - 1.0, grid.height)
+    return wp.vec2i(top, to_tile(grid, y + extent + 1.0, grid.height))
 
 
 @wp.func
@@ -93,7 +96,7 @@ def make_ellipse(mean: wp.vec2, conic: wp.vec3, limit: wp.float32) -> Ellipse:
 
 @wp.func
 def _box_columns(grid: Grid, x: wp.float32, extent: wp.float32) -> wp.vec2i:
-    return wp.vec2i(to_tile(x - extent, grid.width), to_tile(x + extent, grid.width))
+    return wp.vec2i(to_tile(grid, x - extent, grid.width), to_tile(grid, x + extent, grid.width))
 
 
 @wp.func
@@ -102,8 +105,8 @@ def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) ->
     if (grid.skip & _TILE_TEST) == 0:
         return _box_columns(grid, ellipse.mean[0], extent[0])
     # exact numbers first, the mean once: rounding must not turn one row of pixels into none
-    y0 = wp.max(float(ty * _TILE) + 0.5 - ellipse.mean[1], -ellipse.reach)
-    end = float(wp.min(ty * _TILE + _TILE, grid.height)) - 0.5
+    y0 = wp.max(float(ty << grid.shift) + 0.5 - ellipse.mean[1], -ellipse.reach)
+    end = float(wp.min((ty + 1) << grid.shift, grid.height)) - 0.5
     y1 = wp.min(end - ellipse.mean[1], ellipse.reach)
     if y0 > y1:
         return wp.vec2i(0, -1)
@@ -118,7 +121,7 @@ def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) ->
     if x1 < 0.5 or x0 > float(grid.width) - 0.5:
         return wp.vec2i(0, -1)
     # a tile spans pixel centres 0.5 to 15.5; a gap between two tiles belongs to neither
-    return wp.vec2i(to_tile(x0 + 0.5, grid.width), to_tile(x1 - 0.5, grid.width))
+    return wp.vec2i(to_tile(grid, x0 + 0.5, grid.width), to_tile(grid, x1 - 0.5, grid.width))
 
 
 @wp.func
