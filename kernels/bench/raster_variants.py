@@ -29,6 +29,7 @@ def make_scene(
 
 
 def sizes_of(scene: Scene) -> dict[str, int]:
+    """A scene's sizes, for tables and charts."""
     count, views = scene.gaussians["opacities"].shape[-1], scene.viewmats.shape[:-2].numel()
     return {"N": count, "side": scene.size, "views": views}
 
@@ -36,6 +37,7 @@ def sizes_of(scene: Scene) -> dict[str, int]:
 def make_variant(
     scene: Scene, name: str, direction: str = "forward", limit: float | None = None, **changes
 ) -> Variant:
+    """A variant that calls the operator on a scene."""
     backward = direction == BOTH
     return Variant(
         name,
@@ -51,4 +53,5 @@ def make_variant(
 
 
 def make_pair(scene: Scene, name: str, **changes) -> list[Variant]:
+    """Forward, and forward with all gradients."""
     return [make_variant(scene, name, direction, **changes) for direction in ("forward", BOTH)]

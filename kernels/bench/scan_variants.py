@@ -20,6 +20,7 @@ SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (1696
 
 
 def make_problem(settings: Settings, **changes) -> ScanProblem:
+    """A problem of the level's size, but for ``changes`` of ``make_inputs``."""
     length, width, tokens = SIZES[settings.level]
     inputs = make_inputs(**({"batch": 1, "length": length, "channels": width} | changes))
     return ScanProblem(inputs, settings.device, tokens)
@@ -50,10 +51,12 @@ def make_variant(
 
 
 def make_pair(problem: ScanProblem, name: str, **changes) -> list[Variant]:
+    """Forward, and forward with all gradients."""
     return [make_variant(problem, name, direction, **changes) for direction in ("forward", BOTH)]
 
 
 def count_memory(problem: ScanProblem, direction: str) -> dict[str, int]:
+    """Bytes: of all states, of what is kept for the gradient, and the peak."""
     batch, length, width = problem.inputs["u"].shape
     history = 4 * batch * length * width * problem.inputs["A"].shape[1]
     run = problem.forward if direction == "forward" else problem.backward

@@ -120,16 +120,11 @@ def rasterization(
     size2d = [width, height, views, int(channels.dim() == 4), skip.bits()]
     channels = channels.reshape(-1, channels.shape[-1])
     skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
-    splats = means2d, conics, view_opacities, channels
-    renders, alphas, *walk = composite(
-        *splats, list(bins), size2d, [alpha_min, alpha_max, t_min], skipped
-    )
+    splats, limits = (means2d, conics, view_opacities, channels), [alpha_min, alpha_max, t_min]
+    renders, alphas, *walk = composite(*splats, list(bins), size2d, limits, skipped)
     renders = _finish(render_mode, renders, alphas, backgrounds)
     meta = Meta(Bins(*bins), Walk(*walk), status, skipped)
-    meta.update(zip(("means2d", "conics", "depths", "opacities"), projected))
-    meta.update(
-        radii=projected[4].ceil().int(), width=width, height=height, tile_size=current().tile
-    )
+    _describe(meta, projected, width, height)
     renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
     return renders, alphas, meta
 
