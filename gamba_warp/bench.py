@@ -58,7 +58,7 @@ def bench_command(
         device: Where; auto is the GPU if there is one.
         quick: Small sizes, a few rounds: seconds.
         full: All sizes, many rounds, the torch loop at full length.
-        peers: Also measure mambapy, mamba-ssm, causal-conv1d and gsplat, where installed.
+        peers: Also measure mambapy, mamba-ssm, causal-conv1d, gsplat and gswarp, where installed.
         out: Folder for the results. With --render it may be a .md or .html file.
         threads: CPU threads; default: torch's.
         compare: An older bench.json; prints the ratios of the times.

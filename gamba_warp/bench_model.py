@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from functools import partial
 
@@ -10,12 +11,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from .bench_picture import background_tokens, batches, pictures
 from .block import GambaBlock, prefix_states
-from .cameras import Cameras, intrinsics, reference_viewmat
 from .config import PRESETS, GambaConfig
-from .kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
+from .kernels.bench import Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
 from .kernels.selective_scan.reference import causal_conv1d_reference, selective_scan_reference
-from .model import SEGMENT, Gamba
+from .model import SEGMENT
 
 BOTH = "forward+backward"
 LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # of the relative rms error to float64
@@ -31,16 +32,27 @@ def cases(settings: Settings) -> list[Case]:
     builders = [
         ("block", "one block", partial(_blocks, depth=1)),
         ("block", "backbone", partial(_blocks, depth=2 if settings.level == "quick" else 14)),
-        ("model", "one picture", _pictures),
+        ("block", "compiled", compiled),
+        ("model", "one picture", pictures),
+        ("model", "batch", batches),
+        ("model", "background tokens", background_tokens),
     ]
     texts = {
         "one block": "A block of the paper's size on one picture's tokens, beside its matrix "
-        "products alone, repeated on operands of the same shapes into given outputs.",
+        "products alone, repeated on operands of the same shapes into given outputs. Prefix states "
+        "off: condition prepended and dropped, as the paper has it.",
         "backbone": "All blocks of the paper's size, the condition's states included, beside "
         "their matrix products alone, and with the condition prepended and dropped in each block.",
-        "one picture": "A posed picture to Gaussians by preset, without the image encoder.",
     }
-    return [Case(op, name, texts[name], partial(build, settings)) for op, name, build in builders]
+    axes = {"one block": "error", "backbone": "error", "compiled": "error", "batch": "B"}
+    axes["background tokens"] = "error,skipped"
+    return [
+        Case(
+            *(op, name, texts.get(name) or " ".join(build.__doc__.split())),
+            *(partial(build, settings), axes.get(name)),
+        )
+        for op, name, build in builders
+    ]
 
 
 class _Recorder(TorchDispatchMode):
@@ -230,7 +242,7 @@ def _blocks(settings: Settings, depth: int) -> list[Variant]:
             **common,
         ),
         Variant(
-            "condition prepended and dropped",
+            "prefix states off",
             backbone.prepended,
             partial(backbone.check, backbone.prepended),
             LIMIT,
@@ -260,39 +272,71 @@ def _blocks(settings: Settings, depth: int) -> list[Variant]:
     return made
 
 
-def _pictures(settings: Settings) -> list[Variant]:
-    """Whole models with fresh weights; two runs must give the same bits."""
-    names = ("tiny",) if settings.level == "quick" else ("tiny", "small", "paper")
-    made = []
-    for name in names:
-        torch.manual_seed(0)
-        config = PRESETS[name]
-        if config.encoder != "none":
-            config = GambaConfig(**(vars(config) | {"encoder": "none"}))
-        model = Gamba(config).to(settings.device).eval()
-        size = config.image_size
-        image = torch.rand(1, size, size, 3).to(settings.device)
-        K = intrinsics(size, size, config.fov)[None]
-        cameras = Cameras(reference_viewmat(config.distance)[None], K, size, size)
-        run = torch.no_grad()(partial(model, image, cameras.to(settings.device)))
-        made.append(
-            Variant(
-                name,
-                run,
-                partial(_check_repeats, run),
-                0.0,
-                "a first run (0: the same bits); the blocks have the float64 oracle",
-                default=True,
-                rounds=10,
-                parameters={"N": config.num_gaussians, "side": size},
-            )
+class _Graph:
+    """A function's launches, recorded once and played again."""
+
+    def __init__(self, function: Callable[[], Tensor]) -> None:
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):  # kernels are compiled and buffers made before
+            for _ in range(3):
+                function()
+        torch.cuda.current_stream().wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph):
+            self._result = function()
+
+    def __call__(self) -> Tensor:
+        self._graph.replay()
+        return self._result
+
+
+class _Lazy:
+    """Makes a function at its first call, so that what fails there fails alone."""
+
+    def __init__(self, make: Callable[[], Callable[[], Tensor]]) -> None:
+        self._make, self._function = make, None
+
+    def __call__(self) -> Tensor:
+        if self._function is None:
+            self._function = self._make()
+        return self._function()
+
+
+def compiled(settings: Settings) -> list[Variant]:
+    """A block of the paper's size as it is, through torch.compile, and on CUDA as a CUDA graph. The
+    first call has the compilation, a minute or so; what it can join are a few elementwise
+    operations between the products and our kernels.
+    """
+    backbone = _Backbone(settings, 1)
+    (block,) = backbone.blocks
+    with torch.no_grad():
+        (state,) = prefix_states(backbone.blocks, backbone.camera, backbone.image)
+
+    @torch.no_grad()
+    def plain() -> Tensor:
+        return block(backbone.tokens, state)[0]
+
+    def compiled_block() -> Callable[[], Tensor]:
+        if settings.device.type == "cpu" and not any(map(shutil.which, ("g++", "clang++", "c++"))):
+            raise NotInstalled("a C++ compiler")
+        function = torch.compile(block)
+        return torch.no_grad()(lambda: function(backbone.tokens, state)[0])
+
+    runs = {"as it is": plain}
+    if settings.level != "quick":
+        runs["torch.compile"] = _Lazy(compiled_block)
+    if settings.device.type == "cuda":
+        runs["CUDA graph"] = _Lazy(lambda: _Graph(plain))
+    oracle = f"float64 with the condition prepended, first {_TOKENS} of {backbone.length} tokens"
+    return [
+        Variant(
+            *(name, run, partial(backbone.check, run), LIMIT, oracle),
+            default=run is plain,
+            parameters=backbone.parameters,
         )
-    return made
-
-
-def _check_repeats(run: Callable) -> Error:
-    first, second = ({k: x for k, x in vars(run()).items() if x is not None} for _ in range(2))
-    return compare(second, first)
+        for name, run in runs.items()
+    ]
 
 
 def targets(settings: Settings) -> list[Target]:

@@ -84,7 +84,11 @@ class Gamba(nn.Module):
         return prefix_states(self.blocks, camera, image)
 
     def forward(
-        self, images: Tensor, cameras: Cameras, condition: list[State | None] | None = None
+        self,
+        images: Tensor,
+        cameras: Cameras,
+        condition: list[State | None] | None = None,
+        background_margin: int | None = None,
     ) -> Gaussians:
         """Predicts the Gaussians of each picture's object.
 
@@ -93,17 +97,26 @@ class Gamba(nn.Module):
                 ``config.image_size``.
             cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same picture size.
             condition: of ``condition`` for the same pictures and cameras, if it is there already.
+            background_margin: drop the 3DGS tokens of patches that are plain background in every
+                picture, but for those within so many patches of one that is not; 0 keeps the
+                object's own. Faster, and another result than the one trained for: ``gamba bench
+                model`` states the error. None drops nothing. On CUDA it reads one number back.
 
         Returns:
-            ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N = ``num_gaussians``.
+            ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N = ``num_gaussians``, or as
+            many as tokens were kept, in their order.
 
         Raises:
-            ValueError: a shape that does not fit.
+            ValueError: a shape that does not fit, or a negative margin.
         """
         self._check(images, cameras)
         if condition is None:
             condition = self.condition(images, cameras)
-        tokens = self._refine(self.tokens(images, cameras), condition)
+        tokens = self.tokens(images, cameras)
+        if background_margin is not None:
+            background = self.config.background_color
+            tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
+        tokens = self._refine(tokens, condition)
         return self.decoder(self.norm(tokens))
 
     def _refine(self, tokens: Tensor, states: list[State | None]) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from .cameras import Cameras, plucker_rays
 from .config import GambaConfig
@@ -61,7 +62,7 @@ class SplatTokens(nn.Module):
 
     def __init__(self, config: GambaConfig) -> None:
         super().__init__()
-        grid = config.grid_size
+        grid, self.patch_size = config.grid_size, config.patch_size
         self.patchify = None
         if config.additive_image_tokens:
             patch = config.patch_size
@@ -84,3 +85,24 @@ class SplatTokens(nn.Module):
             pixels = torch.cat([normalize_imagenet(images.float()), rays], dim=-1)
         patches = self.patchify(pixels.permute(0, 3, 1, 2)).flatten(2).mT
         return patches[:, self.orders] + self.embedding
+
+    def foreground(self, images: Tensor, background: float, margin: int) -> Tensor:
+        """Which tokens belong to patches that are not plain background, or near one that is not.
+
+        Args:
+            images: ``[B, H, W, 3]``; a patch counts if it does so in any of them.
+            background: grey value; what differs by more than half of 1/255 is no background.
+            margin: how near, patches; 0 or more.
+
+        Returns:
+            Positions among the L tokens, int64, ascending.
+
+        Raises:
+            ValueError: a negative margin.
+        """
+        if margin < 0:
+            raise ValueError(f"background_margin is {margin}, it must be 0 or more")
+        pixels = ((images - background).abs() > 0.5 / 255).any(-1).any(0).float()[None]
+        patches = F.max_pool2d(pixels, self.patch_size)
+        near = F.max_pool2d(patches, 2 * margin + 1, stride=1, padding=margin)
+        return near.flatten().bool()[self.orders].nonzero()[:, 0]

@@ -14,6 +14,7 @@ from gamba_warp import bench, cli
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare, measure
 from gamba_warp.kernels.bench import conv as conv_suite
+from gamba_warp.kernels.bench import peers
 from gamba_warp.kernels.bench import raster as raster_suite
 from gamba_warp.kernels.bench import scan as scan_suite
 from gamba_warp.kernels.bench.case import LEVELS, Level, NotInstalled
@@ -298,7 +299,10 @@ def test_charts_leave_out_what_they_cannot_place():
     assert chart([Series("", [*points, Point(1, 1, "ok")])], Axis("x"), Axis("y")).count("<g>") == 1
 
 
-@pytest.mark.parametrize("axis, count", [("error", 2), ("L", 1), ("skipped", 1), (None, 0)])
+@pytest.mark.parametrize(
+    "axis, count",
+    [("error", 2), ("L", 1), ("skipped", 1), ("memory", 1), ("error,memory,L", 4), (None, 0)],
+)
 def test_a_case_has_the_charts_of_its_axis(axis, count):
     made = [
         variant(
@@ -306,7 +310,7 @@ def test_a_case_has_the_charts_of_its_axis(axis, count):
             direction=direction,
             default=length == 8,
             parameters={"L": length},
-            work=lambda: {"skipped": 0.5},
+            work=lambda: {"skipped": 0.5, "saved_bytes": 2**20},
         )
         for length in (8, 16)
         for direction in ("forward", "forward+backward")
@@ -316,7 +320,7 @@ def test_a_case_has_the_charts_of_its_axis(axis, count):
     assert len(svgs) == count
     for svg in svgs:
         ET.fromstring(svg)
-    assert ("Pareto" in "".join(svgs)) == (axis == "error")
+    assert ("Pareto" in "".join(svgs)) == (axis not in ("L", "skipped", None))
 
 
 def test_render_makes_the_same_files_again(monkeypatch, tmp_path, capsys):
@@ -409,7 +413,7 @@ def test_the_scene_and_its_crop():
     assert counts["pairs"] > 100 and counts["tiles"] == 16 and counts["gaussians"] == 300
 
 
-@pytest.mark.parametrize("name", ["one call", "skipping"])
+@pytest.mark.parametrize("name", ["one call", "skipping", "batch", "exponential"])
 def test_raster_cases_run(name):
     chosen = [c for c in raster_suite.cases(QUICK) if c.name == name]
     records = measure(chosen, QUICK)["records"]
@@ -417,6 +421,9 @@ def test_raster_cases_run(name):
     if name == "skipping":
         shares = {r["variant"]: r["work"].get("skipped") for r in records}
         assert 0.3 < shares["upstream gradient on half of the picture"] < 0.7
+    if name == "exponential":  # the variant reaches check, clock and counts
+        error = {r["variant"]: r["rel_rms_error"] for r in records}
+        assert error["degree 3"] > 10 * error["degree 5"]
 
 
 @pytest.mark.parametrize("op", ["block", "train-step"])
@@ -448,3 +455,34 @@ def test_unwritable_result_is_one_line(monkeypatch, tmp_path):
     with pytest.raises(UserError, match="bench.md"):
         bench.bench_command(("scan",), quick=True, out=tmp_path)
     assert (tmp_path / "bench.json").is_file()
+
+
+def test_kept_states_are_counted_on_their_own_kernels():
+    (case,) = [c for c in scan_suite.cases(QUICK) if c.name == "boundary spacing"]
+    wide, narrow = measure([case], QUICK)["records"][::-1]
+    assert narrow["status"] == wide["status"] == "ok" and wide["is_default"]
+    assert narrow["work"]["saved_bytes"] == 2 * wide["work"]["saved_bytes"]
+
+
+def test_dropped_background_is_measured_against_the_full_model():
+    (case,) = [c for c in bench.load_suite("model").cases(QUICK) if c.name == "background tokens"]
+    full, none = measure([case], QUICK)["records"]
+    assert full["rel_rms_error"] == 0 and full["work"]["skipped"] == 0
+    assert 0 < none["rel_rms_error"] < 0.3 and 0.3 < none["work"]["skipped"] < 1
+
+
+def test_gsplats_parts_agree_with_ours():
+    pytest.importorskip("gsplat")
+    settings = Settings(torch.device("cpu"), "quick", peers=True, threads=1)
+    (case,) = [c for c in raster_suite.cases(settings) if c.name == "gsplat's parts"]
+    records = measure([case], settings)["records"]
+    assert [r["status"] for r in records] == ["ok"] * 6, records
+    assert sum(r["rel_rms_error"] is not None for r in records) == 2
+
+
+def test_gswarp_is_reported_where_it_is_not():
+    scene = make_scene(QUICK, count=8, size=16)
+    with pytest.raises(NotInstalled, match="gswarp"):
+        scene.forward(peers.gswarp_rasterization)
+    with pytest.raises(ValueError, match="alpha_min"):
+        scene.changed(options={"alpha_min": 0.1}).forward(peers.gswarp_rasterization)

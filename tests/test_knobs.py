@@ -6,6 +6,8 @@ import pytest
 import torch
 from helpers import rel_rms
 
+from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
+from gamba_warp.config import GambaConfig
 from gamba_warp.kernels.bench.raster_scene import Scene, orbit_cameras, shell
 from gamba_warp.kernels.bench.scan_problem import make_inputs
 from gamba_warp.kernels.rasterize import cpu_variant as raster_variant
@@ -13,6 +15,7 @@ from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import cpu_variant as scan_variant
 from gamba_warp.kernels.selective_scan import selective_scan
+from gamba_warp.model import Gamba
 
 
 def scan(**choice):
@@ -117,3 +120,45 @@ def test_a_choice_ends_with_its_block(module):
         assert module.current() == other
         raise RuntimeError
     assert module.current() == module.Variant()
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    config = GambaConfig(
+        image_size=32, patch_size=4, width=16, depth=2, state_size=4, encoder="none",
+        encoder_size=32,
+    )  # fmt: skip
+    return Gamba(config).eval()
+
+
+def pictures(*squares):
+    """White pictures with a grey pixel each, at row and column."""
+    images = torch.ones(len(squares), 32, 32, 3)
+    for image, (y, x) in zip(images, squares):
+        image[y, x] = 0.9
+    viewmats = reference_viewmat(1.9).repeat(len(squares), 1, 1)
+    K = intrinsics(32, 32).repeat(len(squares), 1, 1)
+    return images, Cameras(viewmats, K, 32, 32)
+
+
+@torch.no_grad()
+def test_background_tokens_are_dropped(model):
+    full = model(*pictures((5, 9)))
+    assert full.means.shape == (1, 4 * 64, 3)
+    for margin, patches in ((0, 1), (1, 9), (2, 4 * 5), (100, 64)):  # row 1, column 2 of 8 x 8
+        made = model(*pictures((5, 9)), background_margin=margin)
+        assert made.means.shape == (1, 4 * patches, 3)
+    assert torch.equal(made.means, full.means) and torch.equal(made.scales, full.scales)
+    kept = model.tokens.foreground(pictures((5, 9))[0], 1.0, 0)
+    first = 1 * 8 + 2, 64 + 2 * 8 + 1  # by rows, then by columns; then each backward
+    assert kept.tolist() == [first[0], first[1], 191 - first[0], 255 - (first[1] - 64)]
+
+
+@torch.no_grad()
+def test_a_token_is_kept_if_any_picture_of_the_batch_needs_it(model):
+    images, cameras = pictures((5, 9), (30, 30))
+    assert model(images, cameras, background_margin=0).means.shape == (2, 8, 3)
+    assert model(torch.ones_like(images), cameras, background_margin=3).means.shape == (2, 0, 3)
+    with pytest.raises(ValueError, match="background_margin is -1"):
+        model(images, cameras, background_margin=-1)

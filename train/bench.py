@@ -18,6 +18,7 @@ from .optim import build_optimizer
 from .step import forward
 
 _BATCH, _NOVEL, _SIZE = 2, 2, 128
+_BATCHES = {"quick": (1,), "normal": (1, 2, 4), "full": (1, 2, 4, 8)}
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -27,7 +28,11 @@ def cases(settings: Settings) -> list[Case]:
         "rendering, loss without LPIPS, gradients, clipping and AdamW; no reading of files. It is "
         "checked to be finite, no more."
     )
-    return [Case("train-step", "tiny", text, partial(_steps, settings))]
+    batches = "Cost of that step against the number of objects."
+    return [
+        Case("train-step", "tiny", text, partial(_steps, settings)),
+        Case("train-step", "batch", batches, partial(_batches, settings), "B"),
+    ]
 
 
 def targets(settings: Settings) -> list[Target]:
@@ -38,7 +43,7 @@ def targets(settings: Settings) -> list[Target]:
 class _Step:
     """A model with its optimizer, and one batch of made-up views."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, batch: int = _BATCH) -> None:
         torch.manual_seed(0)
         config = PRESETS["tiny"]
         self.model = Gamba(config).to(settings.device)
@@ -51,18 +56,18 @@ class _Step:
         size = config.image_size
         first = reference_viewmat(config.distance)
         novel = orbit(torch.linspace(0, 360, _NOVEL + 2)[1:-1], distance=config.distance)
-        viewmats = torch.cat([first[None], novel]).repeat(_BATCH, 1, 1, 1)
-        K = intrinsics(_SIZE, _SIZE, config.fov).repeat(_BATCH, _NOVEL + 1, 1, 1)
-        alpha = _disc(_SIZE).expand(_BATCH, _NOVEL + 1, -1, -1, 1)
+        viewmats = torch.cat([first[None], novel]).repeat(batch, 1, 1, 1)
+        K = intrinsics(_SIZE, _SIZE, config.fov).repeat(batch, _NOVEL + 1, 1, 1)
+        alpha = _disc(_SIZE).expand(batch, _NOVEL + 1, -1, -1, 1)
         self.batch = Batch(
-            uids=[str(i) for i in range(_BATCH)],
-            inputs=torch.rand(_BATCH, size, size, 3),
+            uids=[str(i) for i in range(batch)],
+            inputs=torch.rand(batch, size, size, 3),
             input_cameras=Cameras(
-                viewmats[:, 0], intrinsics(size, size, config.fov).repeat(_BATCH, 1, 1), size, size
+                viewmats[:, 0], intrinsics(size, size, config.fov).repeat(batch, 1, 1), size, size
             ),
             targets=torch.cat([torch.rand(*alpha.shape[:-1], 3), alpha], -1),
             cameras=Cameras(viewmats, K, _SIZE, _SIZE),
-            background=torch.ones(_BATCH, 1, 3),
+            background=torch.ones(batch, 1, 3),
         ).to(settings.device)
 
     @torch.no_grad()
@@ -110,3 +115,20 @@ def _steps(settings: Settings) -> list[Variant]:
             parameters=parameters,
         ),
     ]
+
+
+def _batches(settings: Settings) -> list[Variant]:
+    made = []
+    for batch in _BATCHES[settings.level]:
+        step = _Step(settings, batch)
+        made.append(
+            Variant(
+                f"{batch} object{'s' * (batch > 1)}",
+                step.step,
+                partial(step.check, step.step),
+                direction="forward+backward",
+                rounds=10,
+                parameters={"B": batch, "views": _NOVEL + 1, "side": _SIZE},
+            )
+        )
+    return made

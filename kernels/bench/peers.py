@@ -162,3 +162,65 @@ def gsplat_projection(
     covariances, _ = torch_code._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     projected = torch_code._fully_fused_projection(means, covariances, viewmats, Ks, size, size)
     return projected[1]
+
+
+def gswarp_rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    **options,
+) -> tuple[Tensor, Tensor, dict]:
+    """The whole operator of gswarp, view after view as it takes them; CUDA only.
+
+    Arguments as ``rasterization``, without leading dimensions; the principal point must be the
+    centre. Alphas are those it returns beside the picture.
+
+    Raises:
+        NotInstalled: gswarp is not there.
+        ValueError: an option that it does not have.
+    """
+    if options:
+        raise ValueError(f"gswarp has no {', '.join(options)}")
+    module = load("gswarp", "gswarp")
+    pictures, alphas = [], []
+    for view, K in zip(viewmats, Ks):
+        tangents = width / (2 * K[0, 0].item()), height / (2 * K[1, 1].item())
+        settings = module.GaussianRasterizationSettings(
+            image_height=height,
+            image_width=width,
+            tanfovx=tangents[0],
+            tanfovy=tangents[1],
+            bg=means.new_zeros(3),
+            scale_modifier=1.0,
+            viewmatrix=view.T.contiguous(),
+            projmatrix=(_perspective(*tangents).to(view) @ view).T.contiguous(),
+            sh_degree=0,
+            campos=torch.linalg.inv(view)[:3, 3],
+            prefiltered=False,
+            debug=False,
+        )
+        picture, _, meta = module.GaussianRasterizer(settings)(
+            means3D=means,
+            means2D=torch.zeros_like(means, requires_grad=True),
+            opacities=opacities[:, None],
+            colors_precomp=colors,
+            scales=scales,
+            rotations=quats,
+        )
+        pictures.append(picture.permute(1, 2, 0))
+        alphas.append(meta.alpha.reshape(height, width, 1))
+    return torch.stack(pictures), torch.stack(alphas), {}
+
+
+def _perspective(tangent_x: float, tangent_y: float, near: float = 0.01, far: float = 100.0):
+    """The projection that diff-gaussian-rasterization's callers make: z forward, w = z."""
+    matrix = torch.zeros(4, 4)
+    matrix[0, 0], matrix[1, 1] = 1 / tangent_x, 1 / tangent_y
+    matrix[2, 2], matrix[2, 3], matrix[3, 2] = far / (far - near), -far * near / (far - near), 1
+    return matrix

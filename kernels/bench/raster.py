@@ -12,6 +12,7 @@ import torch
 from ..rasterize import Skip
 from . import peers, raster_knobs
 from .case import Case, Error, Key, Settings, Target, Variant, compare
+from .raster_parts import Parts
 from .raster_scene import LEAVES, Scene, orbit_cameras, shell
 from .raster_variants import BOTH, make_pair, make_scene, make_variant, sizes_of
 
@@ -30,9 +31,12 @@ def cases(settings: Settings) -> list[Case]:
         ("Gaussians", _counts, "N"),
         ("pixels", _pixels, "side"),
         ("views", _views, "views"),
+        ("batch", _batches, "B"),
     ]
     if cpu:
         builders.append(("threads", _threads, "threads"))
+        if settings.peers:
+            builders.append(("gsplat's parts", _gsplat_parts, None))
     else:
         builders.append(("32 views", _many_views, None))
     return [
@@ -58,49 +62,52 @@ def _scenes(settings: Settings) -> list[Variant]:
 
 
 def _peers(scene: Scene, name: str) -> list[Variant]:
-    """On CUDA gsplat; on a CPU the projection of its torch code, all that runs there."""
-    parameters = sizes_of(scene)
-    if scene.device.type == "cuda":
-        runs = {"forward": scene.forward, BOTH: scene.backward}
+    """On CUDA gsplat and gswarp, the whole operator; a CPU has ``_gsplat_parts``."""
+    if scene.device.type != "cuda":
+        return []
+    made = []
+    for package, function in (
+        ("gsplat", peers.gsplat_rasterization),
+        ("gswarp", peers.gswarp_rasterization),
+    ):
 
-        def error() -> Error:
-            got, want = (scene.forward(f)[0] for f in (peers.gsplat_rasterization, *_own()))
+        def error(function=function) -> Error:
+            got, want = scene.forward(function)[0], scene.forward()[0]
             return compare({"picture": got}, {"picture": want})
 
-        return [
-            Variant(
-                f"gsplat, {name}",
-                partial(run, peers.gsplat_rasterization),
-                error,
-                1e-2,
-                "our float32 picture",
-                direction,
-                peer=True,
-                parameters=dict(parameters),
+        for direction, run in (("forward", scene.forward), (BOTH, scene.backward)):
+            made.append(
+                Variant(
+                    *(f"{package}, {name}", partial(run, function), error, 1e-2),
+                    *("our float32 picture", direction),
+                    peer=True,
+                    parameters=sizes_of(scene),
+                )
             )
-            for direction, run in runs.items()
-        ]
-    x = scene.gaussians
-    arguments = (x["means"], x["quats"], x["scales"], scene.viewmats, scene.Ks, scene.size)
-    run = partial(peers.gsplat_projection, *arguments)
-
-    def check() -> Error:
-        return compare({"means2d": run()}, {"means2d": scene.forward()[2]["means2d"]})
-
-    name = f"gsplat's torch projection alone, {name}"
-    return [
-        Variant(
-            *(name, run, check, 1e-4, "our float32 centres", "projection"),
-            peer=True,
-            parameters=parameters,
-        )
-    ]
+    return made
 
 
-def _own() -> tuple:
-    from ..rasterize import rasterization
-
-    return (rasterization,)
+def _gsplat_parts(settings: Settings) -> list[Variant]:
+    """Those of gsplat's torch functions that run on a CPU beside the same part of ours, at scale 1:
+    projection, tile lists (theirs of boxes, ours of ellipses) and harmonics of degree 3. Its
+    compositing needs CUDA.
+    """
+    scene, made = make_scene(settings), []
+    parts = Parts(scene)
+    for part, (ours, theirs, check) in parts.pairs().items():
+        for name, run, peer in (("ours", ours, False), ("gsplat", theirs, True)):
+            made.append(
+                Variant(
+                    *(name, run, check if peer else None, 1e-4),
+                    "our float32 result" if peer and check else "",
+                    direction=part,
+                    peer=peer,
+                    default=not peer,
+                    rounds=3 if peer and part == "tile lists" else None,
+                    parameters=sizes_of(scene),
+                )
+            )
+    return made
 
 
 def _skipping(settings: Settings) -> list[Variant]:
@@ -172,12 +179,13 @@ def _tiles_skipped(scene: Scene) -> dict[str, float]:
 def _one_call(settings: Settings) -> list[Variant]:
     """8 objects of 4,096 Gaussians in 4 views of 128² each: in one call, and in 32."""
     objects, views, size = (2, 2, 64) if settings.level == "quick" else (8, 4, 128)
-    shells = [shell(4096, 2, seed) for seed in range(objects)]
-    gaussians = {k: torch.stack([x[k] for x in shells]) for k in shells[0]}
-    viewmats, Ks = (x.expand(objects, *x.shape) for x in orbit_cameras(views, size))
-    together = Scene(gaussians, viewmats, Ks, size, settings.device)
+    together = _objects(settings, objects, views, size)
+    x, viewmats, Ks = together.gaussians, together.viewmats, together.Ks
     single = [
-        Scene(shells[b], viewmats[b, v : v + 1], Ks[b, v : v + 1], size, settings.device)
+        Scene(
+            *({k: values[b] for k, values in x.items()}, viewmats[b, v : v + 1], Ks[b, v : v + 1]),
+            *(size, settings.device),
+        )
         for b in range(objects)
         for v in range(views)
     ]
@@ -229,6 +237,25 @@ def _views(settings: Settings) -> list[Variant]:
             make_scene(settings, size=size, views=views), f"{views} view{'s' * (views > 1)}"
         )
     return made
+
+
+def _batches(settings: Settings) -> list[Variant]:
+    """Cost against the number of objects of 4,096 Gaussians in one call, a view of 256² each."""
+    numbers, size = ((1, 2), 64) if settings.level == "quick" else ((1, 2, 4, 8, 16), 256)
+    made = []
+    for number in numbers:
+        for variant in make_pair(_objects(settings, number, 1, size), f"B {number}"):
+            variant.parameters["B"] = number
+            made.append(variant)
+    return made
+
+
+def _objects(settings: Settings, number: int, views: int, size: int) -> Scene:
+    """Shells of 4,096 Gaussians, one for each object, in one call."""
+    shells = [shell(4096, 2, seed) for seed in range(number)]
+    gaussians = {k: torch.stack([x[k] for x in shells]) for k in shells[0]}
+    viewmats, Ks = (x.expand(number, *x.shape) for x in orbit_cameras(views, size))
+    return Scene(gaussians, viewmats, Ks, size, settings.device)
 
 
 def _threads(settings: Settings) -> list[Variant]:

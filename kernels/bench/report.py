@@ -19,6 +19,8 @@ _WORK = {
     "saved_bytes": "saved",
     "peak_bytes": "peak",
     "products": "products",
+    "tokens": "tokens",
+    "psnr_to_full": "PSNR to the full model's",
     "flops": "",
 }
 
