@@ -12,9 +12,18 @@ from helpers import rel_rms
 
 from gamba_warp import bench, cli
 from gamba_warp.errors import UserError
-from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare, measure
+from gamba_warp.kernels.bench import (
+    Case,
+    Error,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    compare,
+    measure,
+    peers,
+)
 from gamba_warp.kernels.bench import conv as conv_suite
-from gamba_warp.kernels.bench import peers
 from gamba_warp.kernels.bench import raster as raster_suite
 from gamba_warp.kernels.bench import scan as scan_suite
 from gamba_warp.kernels.bench.case import LEVELS, Level, NotInstalled
