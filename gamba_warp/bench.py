@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Literal
@@ -14,7 +13,8 @@ from tqdm import tqdm
 
 from .errors import UserError
 from .files import atomic_path, output_folder, write_json
-from .kernels.bench import FORMAT, Case, Settings, Target, measure
+from .kernels.bench import Case, Settings, Target, measure
+from .kernels.bench.document import parse_document
 from .kernels.bench.page import page
 from .kernels.bench.peers import versions
 from .kernels.bench.report import judge, markdown, ratio_table
@@ -30,7 +30,6 @@ SUITES = {
     "model": "gamba_warp.bench_model",
     "train-step": "gamba_warp.train.bench",
 }
-_NEEDED = ("op", "case", "variant", "direction", "dtype", "device", "ms_p50", "status", "work")
 
 
 def bench_command(
@@ -131,20 +130,13 @@ def read_document(path: Path) -> dict:
         UserError: no such file, not JSON, or not of this format.
     """
     try:
-        document = json.loads(path.read_text())
+        return parse_document(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"{path}: {error.strerror or 'cannot be read'}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: not JSON (not even text)") from error
     except ValueError as error:
-        raise UserError(f"{path}: not JSON ({error})") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise UserError(f"{path}: not a result of 'gamba bench' (format is not {FORMAT})")
-    records = document.get("records")
-    whole = isinstance(records, list) and all(
-        isinstance(r, dict) and all(name in r for name in _NEEDED) for r in records
-    )
-    if not whole or not isinstance(document.get("machine"), dict):
-        raise UserError(f"{path}: damaged: records or machine are missing or incomplete")
-    return document
+        raise UserError(f"{path}: {error}") from error
 
 
 def _render(paths: tuple[Path, ...], out: Path) -> int:

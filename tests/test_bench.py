@@ -495,3 +495,36 @@ def test_gswarp_is_reported_where_it_is_not():
         scene.forward(peers.gswarp_rasterization)
     with pytest.raises(ValueError, match="alpha_min"):
         scene.changed(options={"alpha_min": 0.1}).forward(peers.gswarp_rasterization)
+
+
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        (lambda d: d["records"][0].update(ms_p50=math.nan), "NaN is no number"),
+        (lambda d: d["records"][0].update(ms_p50=math.inf), "Infinity is no number"),
+        (lambda d: d["records"][0].update(ms_p50="fast"), r"records\[0\].ms_p50 is 'fast'"),
+        (lambda d: d["records"][0].update(ms_p20=None), "no times, but its status is ok"),
+        (lambda d: d["records"][0].update(work={"pairs": "many"}), "what is no number"),
+        (lambda d: d["records"][0].pop("text"), r"records\[0\] has no text"),
+        (lambda d: d["records"].append(7), r"records\[1\] is missing or is no object"),
+        (lambda d: d.update(records={}), "records is missing or is no list"),
+        (lambda d: d.pop("machine"), "machine is missing"),
+        (lambda d: d["machine"].pop("warp"), "machine has no warp"),
+        (lambda d: d.pop("interrupted"), "interrupted is missing"),
+        (lambda d: d.update(targets=[{"op": "scan"}]), r"targets\[0\] has no text"),
+        (lambda d: d.update(format="gamba_warp.bench.0"), "not a result of"),
+    ],
+)
+def test_damaged_results_are_refused(tmp_path, change, reason):
+    document = run(case(variant()))
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps(document))
+    assert bench.read_document(path) == document
+    change(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError, match=reason):
+        bench.read_document(path)
+    for data in (b"\xff\xfe", b"[" * 10**5, b"", b"null"):
+        path.write_bytes(data)
+        with pytest.raises(UserError, match="not JSON|not a result"):
+            bench.read_document(path)
