@@ -86,6 +86,7 @@ class Inference:
         cameras = Cameras(reference_viewmat(self.config.distance)[None], K, size, size)
         self.cameras = cameras.to(self.device)
         self._graphs: dict[torch.dtype, tuple] = {}
+        self._graph_bytes: dict[torch.dtype, int] = {}
         self._truths: dict[torch.dtype, Gaussians] = {}
 
     @torch.no_grad()
@@ -117,9 +118,19 @@ class Inference:
                 self.eager(dtype)
         torch.cuda.current_stream(self.device).wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
+        torch.cuda.empty_cache()
+        before = torch.cuda.memory_reserved(self.device)
         with torch.cuda.graph(graph):
             result = self.eager(dtype)
+        self._graph_bytes[dtype] = torch.cuda.memory_reserved(self.device) - before
         return graph, result
+
+    def peak(self, function: Callable, dtype: torch.dtype) -> dict[str, int]:
+        """Memory beside weights and input: what eager takes meanwhile, or what a graph keeps."""
+        if function == self.graph:
+            return {"peak_bytes": self._graph_bytes[dtype]}
+        peak = peak_bytes(partial(function, dtype), self.device)
+        return {} if peak is None else {"peak_bytes": peak}
 
     @torch.no_grad()
     def view(self, gaussians: Gaussians) -> Tensor:
@@ -177,7 +188,7 @@ def _variants(settings: Settings) -> list[Variant]:
                 dtype=str(dtype).removeprefix("torch."),
                 default=name == HEADLINE,
                 parameters=parameters,
-                work=partial(_peak, run, settings.device),
+                work=partial(inference.peak, function, dtype),
             )
         )
     return [*made, *_pictures(inference, parameters)]
@@ -200,11 +211,6 @@ def _pictures(inference: Inference, parameters: dict) -> list[Variant]:
         Variant(name, picture, partial(check, picture), 0.0, "a second run", parameters=parameters)
         for name, picture in runs.items()
     ]
-
-
-def _peak(run: Callable, device: torch.device) -> dict[str, int]:
-    peak = peak_bytes(run, device)
-    return {} if peak is None else {"peak_bytes": peak}
 
 
 def targets(settings: Settings) -> list[Target]:

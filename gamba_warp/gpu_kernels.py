@@ -6,6 +6,7 @@ Each compares with the float64 oracle, or a run with another run; ``gamba gpu-ch
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -42,6 +43,10 @@ RASTERS = [
     (300, 75, 3, {}), (1, 33, 1, {}), (2000, 130, 1, {"rasterize_mode": "antialiased"}),
     (700, 61, 40, {}), (500, 48, 2, {"quats": None}), (4000, 257, 12, {}),
 ]  # fmt: skip
+
+
+class LeftOut(Exception):
+    """A check that cannot be done here; ``str(error)`` says why."""
 
 
 @dataclass(frozen=True)
@@ -177,8 +182,11 @@ def _layer(problem: ScanProblem) -> tuple[Callable[..., Tensor], list[Tensor]]:
 
 
 def _compiled(backend: str, device: torch.device) -> str:
-    if backend == "inductor" and importlib.util.find_spec("triton") is None:
-        return "left out: triton is not installed"
+    if backend == "inductor":
+        if importlib.util.find_spec("triton") is None:
+            raise LeftOut("triton is not installed")
+        if not any(map(shutil.which, ("cc", "gcc", "clang"))):
+            raise LeftOut("triton needs a C compiler, and there is none")
     layer, inputs = _layer(_problem((1, 139, 37, 16, 1), device))
     results = []
     for function in (layer, torch.compile(layer, fullgraph=True, backend=backend)):

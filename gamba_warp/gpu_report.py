@@ -59,6 +59,9 @@ def headline(document: dict) -> list[tuple[str, str]]:
     inference = document["results"].get("inference", {})
     for name, value in inference.get("ceilings", {}).items():
         rows.append((name.replace("_per_", "/").replace("_", " "), f"{value:.3g}"))
+    if "reserved_gib" in inference:
+        text = f"{inference['reserved_gib']:.1f} GiB, graphs and both precisions together"
+        rows.append(("inference, memory taken", text))
     for record in document["bench"]["records"]:
         if record["op"] != "inference":
             continue

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -16,19 +16,25 @@ import warp as wp
 
 from . import bench_inference, bench_model
 from .files import write_json
-from .gpu_kernels import checks
+from .gpu_kernels import LeftOut, checks
 from .kernels.bench import Case, Settings, Target, conv, measure, raster, scan
 from .kernels.bench.report import judge
 from .kernels.bench.static import find_kernels
 
-# What is timed first, since time may end before the list does; then all other cases.
 _SUITES = (raster, scan, conv, bench_model)
+# What is timed first, since time may end before the list does; then all other cases.
 _FIRST = [
-    ("scan", "reference loop"), ("raster", "scene"), ("scan", "operator"), ("conv", "operator"),
-    ("block", "one block"), ("block", "backbone"), ("raster", "32 views"),
-    ("scan", "training batch"), ("model", "one picture"),
+    ("scan", "operator"), ("raster", "scene"), ("conv", "operator"), ("block", "one block"),
+    ("block", "backbone"), ("raster", "32 views"), ("scan", "training batch"),
+    ("model", "one picture"),
 ]  # fmt: skip
 _ON_A_CPU = [("conv", "operator")]  # of a quick run there, which only tries the command
+# The cases with other people's packages: what breaks there must not take ours along.
+_BESIDE = {
+    "peers-conv": [("conv", "operator")],
+    "peers-scan": [("scan", "reference loop")],
+    "peers-raster": [("raster", "scene"), ("raster", "32 views")],
+}
 
 
 @dataclass
@@ -71,9 +77,13 @@ def run_step(name: str, part: Part, settings: Settings) -> None:
     """Runs the step of that name to its end, or until its time is up."""
     torch.set_num_threads(settings.threads)
     part.write()
-    {"compile": _compile, "checks": _checks, "inference": _inference, "bench": _bench}[name](
-        part, settings
-    )
+    if name in _BESIDE:
+        _bench(part, replace(settings, peers=True), _BESIDE[name])
+    elif name == "bench":
+        quick, cpu = settings.level == "quick", settings.device.type == "cpu"
+        _bench(part, settings, _ON_A_CPU if quick and cpu else _FIRST, alone=quick)
+    else:
+        {"compile": _compile, "checks": _checks, "inference": _inference}[name](part, settings)
     part.whole = True
     part.write()
 
@@ -109,6 +119,9 @@ def _checks(part: Part, settings: Settings) -> None:
         row = {"name": check.name, "status": "passed"}
         try:
             row["found"] = check.run(settings.device)
+        except LeftOut as reason:
+            part.leave_out(check.name, str(reason))
+            continue
         except Exception as error:  # a kernel that does not work raises anything: that is the news
             row |= {"status": "failed", "found": _first_line(error)}
             part.failures.append(f"{check.name}: {row['found']}")
@@ -127,6 +140,7 @@ def _inference(part: Part, settings: Settings) -> None:
     if settings.device.type != "cuda":
         part.leave_out("inference from a CUDA graph", "needs CUDA")
     else:
+        part.result["reserved_gib"] = torch.cuda.memory_reserved(settings.device) / 2**30
         reason = "the number of pairs is read back to make the lists, which no graph can hold"
         part.leave_out("the view in the CUDA graph", reason)
 
@@ -155,17 +169,16 @@ def _seconds(run, settings: Settings, rounds: int = 5) -> float:
     return best
 
 
-def _bench(part: Part, settings: Settings) -> None:
-    """The cases of ``gamba bench``, the most telling first, with the peers that are there."""
+def _bench(part: Part, settings: Settings, first: list[tuple[str, str]], alone=True) -> None:
+    """Cases of ``gamba bench`` by op and name, where there are such; unless alone, then others."""
     found: dict[tuple[str, str], Case] = {}
     targets: list[Target] = []
     for suite in _SUITES:
         found |= {(case.op, case.name): case for case in suite.cases(settings)}
         targets += suite.targets(settings)
-    first = [key for key in _FIRST if key in found]
-    keys = first if settings.level == "quick" else list(dict.fromkeys([*first, *found]))
-    if settings.level == "quick" and settings.device.type == "cpu":
-        keys = _ON_A_CPU
+    keys = [key for key in first if key in found]
+    if not alone:
+        keys += [key for key in found if key not in keys]
     _measure(part, settings, [found[key] for key in keys], targets)
 
 

@@ -16,7 +16,7 @@ from gamba_warp import bench_inference, gpu_check, gpu_kernels, gpu_steps
 from gamba_warp.cameras import Cameras
 from gamba_warp.config import PRESETS
 from gamba_warp.files import write_json
-from gamba_warp.gpu_check import gpu_check_command, main, make_settings
+from gamba_warp.gpu_check import gpu_check_command, main, make_settings, new_part
 from gamba_warp.gpu_steps import Part, run_step
 from gamba_warp.kernels.bench import dry_run
 from gamba_warp.model import Gamba
@@ -286,12 +286,60 @@ def test_the_whole_run_ends_in_its_time(monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_check, "gpu_test_files", lambda folder: [Path("test_x.py")])
     monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpu_check, "versions", lambda: dict.fromkeys(gpu_check.PACKAGES, "1"))
     assert gpu_check_command(out=tmp_path) == 0
-    assert len(given) == len(gpu_check.STEPS) and now[0] < 8 * 60
+    assert given[:4] == [step.seconds for step in gpu_check.STEPS[:4]] and len(given) == 5
+    assert 8 * 60 - 5 < now[0] < 8 * 60
+    document = json.loads((tmp_path / "gpu-check.json").read_text())
+    assert [step["status"] for step in document["steps"]] == 5 * ["stopped"] + 3 * ["not done"]
+    assert {step["reason"] for step in document["steps"][5:]} == {"time was up"}
     now[0], given[:] = 0.0, []
     assert gpu_check_command(out=tmp_path, minutes=0.2) == 0
+    assert sum(given) == now[0] <= 12
+
+
+def test_peers_have_steps_of_their_own(monkeypatch, tmp_path):
+    """What breaks there takes nothing along, and what is not installed is not begun."""
+    part = new_part() | {"whole": True}
+    part["result"] = {"bench": document_of(("conv", "operator", "default", 1.0), target=None)}
+    runs = []
+
+    def run(arguments, seconds, look, cwd=None):
+        name = arguments[arguments.index("--child") + 1]
+        runs.append(name)
+        if name == "peers-scan":
+            return -11, "a core"
+        if name == "peers-conv":
+            new = (("conv", "operator", "default", 2.0), ("conv", "operator", "theirs", 3.0))
+            part["result"] = {"bench": document_of(*new, target=1.5)}
+        return child(part, 0)(arguments, seconds, look)
+
+    found = {"causal-conv1d": "1", "mamba-ssm": "2"}
+    monkeypatch.setattr(gpu_check, "versions", lambda: found)
+    monkeypatch.setattr(gpu_check, "run_python", run)
+    monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    steps = "bench", "peers-conv", "peers-scan", "peers-raster"
+    assert gpu_check_command(out=tmp_path, steps=steps) == 1
+    assert runs == ["bench", "peers-conv", "peers-scan"]
     document = json.loads((tmp_path / "gpu-check.json").read_text())
-    assert now[0] <= 12 and document["steps"][0]["reason"] == "time was up"
+    assert [step["status"] for step in document["steps"]] == [
+        *("passed", "passed", "failed", "not done")
+    ]
+    times = [(r["variant"], r["ms_p50"]) for r in document["bench"]["records"]]
+    assert times == [("default", 2.0), ("theirs", 3.0)]
+    assert [t["value"] for t in document["bench"]["targets"]] == [1.5]
+    assert "not installed: gsplat, gswarp" in (tmp_path / "gpu-check.md").read_text()
+
+
+def document_of(*records, target):
+    """A benchmark's document with records of an op, a case, a variant and a time."""
+    rest = dict(ms_p20=1.0, ms_p80=1.0, jit_ms=1.0, rel_rms_error=0.0, oracle="x", text="y.")
+    rest |= dict(direction="forward", dtype="float32", status="ok", work={}, peer=None)
+    rest |= dict(peer_ms=None, is_default=False, is_peer=False)
+    names = "op", "case", "variant", "ms_p50"
+    wanted = dict(op="conv", text="t", wanted="1", value=target, reached=None)
+    return {"records": [dict(zip(names, r)) | rest for r in records], "targets": [wanted]}
 
 
 def test_a_process_that_hangs_is_ended_with_its_children(tmp_path):
