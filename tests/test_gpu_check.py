@@ -36,10 +36,11 @@ class Watch(TorchDispatchMode):
 
     def __init__(self):
         super().__init__()
-        self.found = []
+        self.found, self.names = [], set()
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         out = function(*args, **(kwargs or {}))
+        self.names.add(function.name())
         if function.name() in WAITS:
             self.found.append(function.name())
         leaves = torch.utils._pytree.tree_leaves((args, kwargs, out))
@@ -50,24 +51,30 @@ class Watch(TorchDispatchMode):
 
 
 @pytest.fixture
-def on_paper(monkeypatch):
-    """Tensors on a GPU that is not there, so that autocast does not turn itself off."""
+def on_paper():
+    """Tensors on a GPU that is not there."""
     with dry_run.dry_run() as launches:
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda *_: True)
         yield launches
 
 
-def test_a_graph_can_hold_the_model(on_paper):
+def autocast(monkeypatch):
+    """Made as if there were a GPU, else it turns itself off."""
+    with monkeypatch.context() as patched:
+        patched.setattr(torch.cuda, "is_available", lambda: True)
+        patched.setattr(torch.cuda, "is_bf16_supported", lambda *_: True)
+        return torch.autocast("cuda", torch.bfloat16)
+
+
+def test_a_graph_can_hold_the_model(monkeypatch, on_paper):
     """No operator of the forward pass, and none inside our own operators, waits for the GPU."""
     config = replace(PRESETS["paper"], depth=2)
     with torch.device("cuda"):
         model = Gamba(config, "random").eval()
         cameras = Cameras(torch.empty(1, 4, 4), torch.empty(1, 3, 3), 512, 512)
         image = torch.empty(1, 512, 512, 3)
-    with torch.no_grad(), torch.autocast("cuda", torch.bfloat16), Watch() as watch:
+    with torch.no_grad(), autocast(monkeypatch), Watch() as watch:
         gaussians = model(image, cameras)
-    assert watch.found == []
+    assert watch.found == [] and "aten::_to_copy" in watch.names  # autocast is on
     assert gaussians.means.device.type == "cuda" and gaussians.num == 16384
     names = [launch.kernel.func.__name__ for launch in on_paper]
     # the states of the prefix, then two blocks, each scan cut into pieces
