@@ -227,7 +227,10 @@ class _Oracle:
             "position", "opacity", "scale", "color"
         )}  # fmt: skip
         points = torch.linspace(-config.position_range, config.position_range, config.position_bins)
-        share = r(heads["position"].unflatten(-1, (3, -1)).softmax(-1), EXP_ULPS)
+        # in steps: the gradient of a saturated softmax is a difference that cancels
+        logits = heads["position"].unflatten(-1, (3, -1))
+        powers = r.exp(r(logits - logits.detach().amax(-1, keepdim=True)), EXP_ULPS)
+        share = r(powers / r(powers.sum(-1, keepdim=True)))
         made = {
             "means": r(r(share * points.double()).sum(-1)),
             "scales": r(r.softplus(heads["scale"], EXP_ULPS) + MIN_SCALE),

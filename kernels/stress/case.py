@@ -145,6 +145,7 @@ def judge(
     samples: Tensor,
     parts: tuple[int, ...],
     extra: Tensor | None = None,
+    shown: Tensor | None = None,
 ) -> Comparison:
     """Compares a result with the samples of its formula; README.md says what the limit means.
 
@@ -154,6 +155,7 @@ def judge(
         samples: ``[SAMPLES, *got.shape]`` float64; sample 0 is the truth.
         parts: dimensions of ``got`` that are taken together, as one rms; () compares each number.
         extra: added to the limit, of ``got``'s shape without ``parts``.
+        shown: which numbers make up ``error``; the limit holds for all.
 
     Raises:
         ValueError: the shapes do not fit.
@@ -182,6 +184,7 @@ def judge(
     limit = limit + absolute * FACTOR + (0.0 if extra is None else extra)
     ratio = (rms(difference) / limit).max().item()
     parts = tuple(range(want.dim()))
+    fits = fits if shown is None else fits & shown
     total, spread = rms(want).item(), rms(samples[1:] - want).max().item()
     counts = got.dtype == torch.float32 and total > 1e-30 and spread < 1e-3 * total
     return Comparison(name, rms(difference).item() / total if total else 0.0, ratio, 0, counts)

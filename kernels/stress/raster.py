@@ -175,8 +175,8 @@ def evaluate(case: Case, device: torch.device) -> Outcome:
     named = {"renders": truth.renders, "alphas": truth.alphas}
     true_grads = gradients_of(named, truth.leaves, cotangents)
     made: list[Comparison] = [
-        judge("renders", results["renders"], truth.renders, (), truth.extra),
-        judge("alphas", results["alphas"], truth.alphas, (), truth.extra_alpha),
+        judge("renders", results["renders"], truth.renders, (), truth.extra, ~truth.undecided),
+        judge("alphas", results["alphas"], truth.alphas, (), truth.extra_alpha, ~truth.undecided),
     ]
     made += [judge(f"gradient of {k}", g, true_grads[k], _PARTS[k]) for k, g in grads.items()]
     if case.options["poison"]:
