@@ -216,7 +216,7 @@ def eval_geometry_command(
         chosen.to_json(),
         objects,
         versions("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch"),
-        left_out=("alignment", "gt_normalization", "iou_voxel"),
+        left_out=("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed"),
         inputs={"pred": pred.name, "gt": gt.name, "data": data.name if data else None},
         flags=flag_counts(objects),
     )

@@ -8,19 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from .shapes import Mesh
+from .shapes import Mesh, merged
 
 VOTERS = 26
-SOLID_RULE = (
-    "solid: a voxel is outside if its centre can be reached from the grid's border by steps "
-    "between the centres of face neighbours that do not cross the surface; so closed cavities are "
-    "filled and parts may overlap. In meshes with open edges a voxel is also inside if "
-    f"more than half of {VOTERS} rays, in {VOTERS // 2} fixed directions and their opposites, "
-    "cross the surface an odd number of times."
-)
-PARITY_RULE = (
-    "parity: a point is inside if a ray along -x crosses the surface an odd number of times"
-)
 
 
 @dataclass
@@ -67,31 +57,74 @@ def syncdreamer_grid(size: int = 64) -> Grid:
 
 
 def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
-    """Occupancy ``[X, Y, Z]`` bool by ``SOLID_RULE``; the grid's border must be outside."""
-    inside = _enclosed(mesh, grid)
-    if not mesh.is_closed():
-        inside |= _majority(mesh, grid)
+    """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
+    inside = enclosed(mesh, grid)
+    parts = [part for part in connected_parts(mesh) if not part.is_closed()]
+    if parts:
+        inside |= majority(mesh, grid)
+    if len(parts) > 1 or (parts and len(parts[0].faces) < len(mesh.faces)):
+        points = grid.points()
+        for part in parts:  # nowhere else than in its box can more than half of the rays cross it
+            low, high = part.vertices.min(0), part.vertices.max(0)
+            first = np.maximum(np.ceil((low - grid.origin) / grid.step).astype(int), 0)
+            last = np.floor((high - grid.origin) / grid.step).astype(int) + 1
+            if (last > first).all() and not _is_flat(part):
+                box = tuple(slice(i, j) for i, j in zip(first, last))
+                inside[box] |= _majority_at(part, points[box])
     return inside
 
 
+def joint(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
+    inside = enclosed(mesh, grid)
+    return inside if mesh.is_closed() else inside | majority(mesh, grid)
+
+
+def majority(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool. See ``RULES``."""
+    return _majority_at(mesh, grid.points())
+
+
 def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
-    """Occupancy ``[X, Y, Z]`` bool by ``PARITY_RULE``, what mesh2sdf does without its repair."""
+    """Occupancy ``[X, Y, Z]`` bool, what mesh2sdf does without its repair. See ``RULES``."""
     return _crossings(mesh.scene(), grid.points(), np.array([-1.0, 0, 0])) % 2 == 1
 
 
-Rule = Literal["solid", "parity"]
-RULES: dict[Rule, tuple[str, Callable[[Mesh, Grid], np.ndarray]]] = {
-    "solid": (SOLID_RULE, solid),
-    "parity": (PARITY_RULE, parity),
-}
+def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool. See ``RULES``.
+
+    The generalised winding number (Jacobson et al. 2013) is the mean, over all directions, of the
+    signed crossings of a ray; here over the directions of ``majority``.
+    """
+    scene, points = mesh.scene(), grid.points().reshape(-1, 3)
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros(len(points))
+    for direction in directions():
+        found = scene.list_intersections(_rays(points, direction))
+        ray, face = (found[key].numpy().astype(np.int64) for key in ("ray_ids", "primitive_ids"))
+        total += np.bincount(ray, np.sign(normals @ direction)[face], len(points))
+    return (2 * np.abs(total) > VOTERS).reshape(grid.shape)
+
+
+def _rays(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    return np.concatenate([points, np.broadcast_to(direction.astype(np.float32), points.shape)], -1)
 
 
 def _crossings(scene, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    rays = np.concatenate([points, np.broadcast_to(direction.astype(np.float32), points.shape)], -1)
-    return scene.count_intersections(rays).numpy()
+    return scene.count_intersections(_rays(points, direction)).numpy()
 
 
-def _enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
+def _majority_at(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    scene = mesh.scene()
+    votes = np.zeros(points.shape[:-1], np.int32)
+    for direction in directions():
+        votes += _crossings(scene, points, direction) % 2
+    return 2 * votes > VOTERS
+
+
+def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -116,14 +149,38 @@ def _enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
     return ~np.isin(labels, np.unique(labels[border]))
 
 
-def _majority(mesh: Mesh, grid: Grid) -> np.ndarray:
-    scene, points = mesh.scene(), grid.points()
-    votes = np.zeros(grid.shape, np.int32)
+def _is_flat(part: Mesh) -> bool:
+    """Whether all faces of a connected part lie in one plane, which bounds nothing."""
+    corners = part.vertices[part.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return bool(np.abs(np.cross(normals, normals[0])).max() < 1e-6)
+
+
+def directions() -> np.ndarray:
+    """``[VOTERS, 3]`` in opposite pairs, so that a flat sheet never gets more than half."""
     half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
-    # opposite pairs, so that a flat sheet never gets more than half of the votes
-    for direction in np.concatenate([half, -half]):
-        votes += _crossings(scene, points, direction) % 2
-    return 2 * votes > VOTERS
+    return np.concatenate([half, -half])
+
+
+def connected_parts(mesh: Mesh) -> list[Mesh]:
+    """The mesh in parts that share no edge, vertices at one place taken as one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    vertices, index = merged(mesh.vertices)
+    faces = index[mesh.faces]
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edge = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)[1].reshape(-1)
+    face, size = np.repeat(np.arange(len(faces)), 3), len(faces) + edge.max() + 1
+    links = coo_array((np.ones(len(face), bool), (face, len(faces) + edge)), shape=(size, size))
+    label = connected_components(links, directed=False)[1][: len(faces)]
+    order = np.argsort(label, kind="stable")
+    parts = []
+    for ids in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        used, corners = np.unique(faces[ids], return_inverse=True)
+        parts.append(Mesh(vertices[used], corners.reshape(-1, 3)))
+    return parts
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
@@ -133,3 +190,38 @@ def fibonacci_sphere(count: int) -> np.ndarray:
     angle = np.pi * (1 + 5**0.5) * k
     radius = np.sqrt(1 - z * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+_RAYS = f"{VOTERS} rays, in {VOTERS // 2} fixed directions and their opposites,"
+ENCLOSED = (
+    "a voxel is outside if its centre can be reached from the grid's border by steps between the "
+    "centres of face neighbours that do not cross the surface; so closed cavities are filled and "
+    "parts may overlap"
+)
+Rule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
+RULES: dict[Rule, tuple[str, Callable[[Mesh, Grid], np.ndarray]]] = {
+    "solid": (
+        f"{ENCLOSED}. Where a part (faces joined by edges) is open, a voxel is also inside if more "
+        f"than half of {_RAYS} cross an odd number of times the whole mesh, or one open part alone",
+        solid,
+    ),
+    "joint": (
+        f"{ENCLOSED}. If the mesh is open, a voxel is also inside if more than half of {_RAYS} "
+        "cross it an odd number of times",
+        joint,
+    ),
+    "enclosed": (ENCLOSED, enclosed),
+    "majority": (
+        f"a point is inside if more than half of {_RAYS} cross the surface an odd number of times",
+        majority,
+    ),
+    "winding": (
+        "a point is inside if its generalised winding number, estimated by the signed crossings "
+        f"of {_RAYS} is over 1/2 or under -1/2",
+        winding,
+    ),
+    "parity": (
+        "a point is inside if a ray along -x crosses the surface an odd number of times",
+        parity,
+    ),
+}

@@ -1,6 +1,7 @@
 """What ``gamba eval-geometry`` reads, refuses and says about its input."""
 
 import json
+import os
 import struct
 
 import numpy as np
@@ -357,3 +358,24 @@ def test_bad_protocol_files(tmp_path, text, reason, capsys):
 def test_json_or_csv(tmp_path, capsys):
     assert run("eval-geometry", [str(tmp_path), str(tmp_path), "--json", "--csv"]) == 2
     assert "--json and --csv" in capsys.readouterr().err
+
+
+def test_one_crash_stops_no_other(tmp_path, capfd, monkeypatch):
+    """Nor does what a library prints get into the report on stdout."""
+    from gamba_warp.eval import geometry
+
+    def broken(name, *rest):
+        os.write(1, b"a library talks\n")
+        if name == "bad":
+            raise MemoryError("no room")
+        return evaluate_pair(name, *rest)
+
+    evaluate_pair = geometry.evaluate_pair
+    monkeypatch.setattr(geometry, "evaluate_pair", broken)
+    for folder in ("pred", "gt"):
+        (tmp_path / folder).mkdir()
+        for name in ("bad", "good"):
+            box().export(tmp_path / folder / f"{name}.ply")
+    code, report = evaluate(capfd, tmp_path / "pred", tmp_path / "gt")
+    assert code == 1 and report["failures"] == [{"name": "bad", "reason": "MemoryError: no room"}]
+    assert report["num_ok"] == 1

@@ -112,17 +112,20 @@ def test_a_constant_shift():
         assert abs(got[name] - want) < 1e-6, name
 
 
-def test_chamfer_and_fscore_equal_open3d():
+def test_surface_metrics_equal_open3d():
     o3d = import_open3d()
     random = np.random.default_rng(1)
     one, two = random.random((400, 3)), random.random((300, 3))
     clouds = [o3d.t.geometry.PointCloud(points.astype(np.float32)) for points in (one, two)]
     radii = (0.05, 0.1)
     params = o3d.t.geometry.MetricParameters(fscore_radius=radii)
-    kinds = [o3d.t.geometry.Metric.ChamferDistance, o3d.t.geometry.Metric.FScore]
-    chamfer, *fscores = clouds[0].compute_metrics(clouds[1], kinds, params).numpy().tolist()
+    metric = o3d.t.geometry.Metric
+    kinds = [metric.ChamferDistance, metric.HausdorffDistance, metric.FScore]
+    values = clouds[0].compute_metrics(clouds[1], kinds, params).numpy().tolist()
+    chamfer, hausdorff, *fscores = values
     got = surface_metrics(Points(one), Points(two), radii)
     assert abs(got["chamfer"] - chamfer / 2) < 1e-6  # its Chamfer is the sum, ours the mean
+    assert abs(got["hausdorff"] - hausdorff) < 1e-6
     assert np.allclose(list(got["fscore"].values()), np.array(fscores) / 100, atol=1e-5)
 
 
