@@ -528,3 +528,18 @@ def test_damaged_results_are_refused(tmp_path, change, reason):
         path.write_bytes(data)
         with pytest.raises(UserError, match="not JSON|not a result"):
             bench.read_document(path)
+
+
+@pytest.mark.parametrize("axis, saved", [("skipped", 75), ("switched off", -300)])
+def test_saved_time_is_told_by_direction(axis, saved):
+    """A variant takes a quarter of its own direction's default."""
+    made = [
+        variant(name, direction=d, default=name == "all", work=lambda: {"skipped": 0.5})
+        for d in ("forward", "forward+backward")
+        for name in ("all", "less")
+    ]
+    records = run(case(*made, axis=axis))["records"]
+    for record, ms in zip(records, (8.0, 2.0, 80.0, 20.0)):
+        record["ms_p50"] = ms
+    (svg,) = charts_of("one", records)
+    assert svg.count(f"less: 50, {saved}") == 2

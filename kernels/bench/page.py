@@ -43,8 +43,8 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
         return [_error_chart([r for r in done if r["direction"] == d], d) for d in directions]
     if axis == "memory":
         return [_memory_chart(done)]
-    if axis == "skipped":
-        return [_skip_chart(done)]
+    if axis in ("skipped", "switched off"):
+        return [_skip_chart(done, axis == "switched off")]
     series = []
     for direction in dict.fromkeys(r["direction"] for r in done):
         found = [r for r in done if r["direction"] == direction]
@@ -81,17 +81,24 @@ def _memory_chart(records: Sequence[dict]) -> str:
     return chart(series, Axis("milliseconds"), Axis("kept for the gradient, MiB"))
 
 
-def _skip_chart(records: Sequence[dict]) -> str:
-    """Work skipped against time saved, both as shares of the default's."""
-    base = next((r["ms_p50"] for r in records if r["is_default"]), None)
-    if base is None:
-        return ""
-    points = [
-        Point(100 * r["work"]["skipped"], 100 * (1 - r["ms_p50"] / base), r["variant"])
-        for r in records
-        if "skipped" in r["work"]
-    ]
-    return chart([Series("", points)], Axis("work skipped, %", False), Axis("time saved, %", False))
+def _skip_chart(records: Sequence[dict], switched_off: bool) -> str:
+    """Work skipped against time saved, as shares of the time of whoever does all the work.
+
+    That is the default of the same direction; or, where variants are without a skip that the
+    default has, the variant.
+    """
+    series = []
+    for direction in dict.fromkeys(r["direction"] for r in records):
+        found = [r for r in records if r["direction"] == direction]
+        base = next((r["ms_p50"] for r in found if r["is_default"]), None)
+        points = []
+        for r in found if base else []:
+            if "skipped" in r["work"] and not (switched_off and r["is_default"]):
+                less, all_of_it = (base, r["ms_p50"]) if switched_off else (r["ms_p50"], base)
+                saved = 100 * (1 - less / all_of_it)
+                points.append(Point(100 * r["work"]["skipped"], saved, r["variant"]))
+        series.append(Series(direction, points))
+    return chart(series, Axis("work skipped, %", False), Axis("time saved, %", False))
 
 
 _STYLE = """

@@ -26,7 +26,7 @@ def cases(settings: Settings) -> list[Case]:
         *([("exponential", raster_knobs.exponential, "error")] if cpu else []),
         *([("tiles", raster_knobs.tiles, "error")] if cpu else []),
         ("skipping", _skipping, "skipped"),
-        ("switches", _switches, "skipped"),
+        ("switches", _switches, "switched off"),
         ("one call", _one_call, None),
         ("Gaussians", _counts, "N"),
         ("pixels", _pixels, "side"),
