@@ -96,7 +96,8 @@ def _skip_chart(records: Sequence[dict], switched_off: bool) -> str:
             if "skipped" in r["work"] and not (switched_off and r["is_default"]):
                 less, all_of_it = (base, r["ms_p50"]) if switched_off else (r["ms_p50"], base)
                 saved = 100 * (1 - less / all_of_it)
-                points.append(Point(100 * r["work"]["skipped"], saved, r["variant"]))
+                name = r["variant"].removeprefix("without ") if switched_off else r["variant"]
+                points.append(Point(100 * r["work"]["skipped"], saved, name))
         series.append(Series(direction, points))
     return chart(series, Axis("work skipped, %", False), Axis("time saved, %", False))
 
