@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -101,6 +102,15 @@ def orbit(
     viewmats[:, 2, 3] = d
     viewmats[:, 3, 3] = one
     return viewmats.float()
+
+
+def fibonacci_sphere(count: int) -> np.ndarray:
+    """``[count, 3]`` float64 unit vectors spread evenly, none along an axis."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    angle = np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
 
 
 def relative_to_reference(

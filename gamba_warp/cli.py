@@ -19,6 +19,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "data render": ("gamba_warp.train.data.render:render_command", "Meshes to posed views."),
     "eval-views": ("gamba_warp.eval.views:eval_views_command", "PSNR, SSIM, LPIPS of views."),
     "eval-geometry": ("gamba_warp.eval.geometry:eval_geometry_command", "Chamfer, IoU, F-score."),
+    "export": ("gamba_warp.export:export_command", "Gaussians to meshes, splats and pages."),
+    "view": ("gamba_warp.view:view_command", "Gaussians in the browser."),
     "bench": ("gamba_warp.bench:bench_command", "Run time against error, on this machine."),
     "stress": ("gamba_warp.stress:stress_command", "Random hostile cases against float64."),
     "gpu-check": ("gamba_warp.gpu_check:gpu_check_command", "Test and measure on a CUDA machine."),

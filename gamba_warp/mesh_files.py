@@ -1,0 +1,48 @@
+"""Surfaces as mesh files, by trimesh: .obj, .glb, .ply and .stl."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .errors import UserError
+from .files import atomic_path
+from .images import to_uint8
+from .meshes import to_linear
+from .surfaces import Surface
+
+MESH_FORMATS = ("obj", "glb", "ply", "stl")
+
+
+def save_mesh(path: str | Path, surface: Surface) -> None:
+    """Writes a surface, atomically, with vertex colours where the format has them (not .stl).
+
+    The frame is left as it is, but for ``.glb``, which is turned from OpenCV's (y down) to glTF's
+    (y up) as ``save_glb`` does; there colours are linear light, as the format asks.
+
+    Args:
+        path: ends in .obj, .glb, .ply or .stl.
+        surface: what to write.
+
+    Raises:
+        UserError: another suffix, or the file cannot be written.
+    """
+    import trimesh
+
+    kind = Path(path).suffix.lower()[1:]
+    if kind not in MESH_FORMATS:
+        raise UserError(f"{path}: a mesh is a {', '.join('.' + name for name in MESH_FORMATS)}")
+    vertices, colors = surface.vertices, surface.colors
+    if kind == "glb":
+        vertices = vertices * [1.0, -1.0, -1.0]
+        colors = None if colors is None else to_linear(colors)
+    mesh = trimesh.Trimesh(vertices, surface.faces, process=False)
+    if colors is not None and kind != "stl":
+        opaque = np.ones((len(colors), 1), np.float32)
+        mesh.visual = trimesh.visual.ColorVisuals(
+            mesh, vertex_colors=to_uint8(np.hstack([colors, opaque]))
+        )
+    content = mesh.export(file_type=kind)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content if isinstance(content, bytes) else content.encode())

@@ -1,0 +1,107 @@
+"""Depth at which a ray's transmittance has fallen to a given value, from a rendering's own lists.
+
+``render_mode="ED"`` is the mean of all depths that a ray meets, and where the front is half
+transparent that lies between front and back. A quantile lies on one of the surfaces.
+"""
+
+import math
+
+import warp as wp
+from torch import Tensor
+
+from ..constants import ALPHA_MAX, ALPHA_MIN, TILE
+from .launch import launch, vectors
+from .meta import Meta
+from .tiles import tile_grid
+
+wp.set_module_options({"enable_backward": False})
+
+_TILE = wp.constant(TILE)
+
+
+@wp.kernel
+def _quantile(
+    offset: wp.int32,
+    width: wp.int32,
+    height: wp.int32,
+    tiles_x: wp.int32,
+    tiles: wp.int32,
+    transmittance: wp.float32,
+    limit: wp.float32,
+    alpha_min: wp.float32,
+    alpha_max: wp.float32,
+    means2d_in: wp.array[wp.vec2],
+    conics_in: wp.array[wp.vec3],
+    view_opacities_in: wp.array[wp.float32],
+    depths_in: wp.array[wp.float32],
+    pairs_in: wp.array[wp.int32],
+    starts_in: wp.array[wp.int32],
+    depths_out: wp.array[wp.float32],
+):
+    pixel = offset + wp.tid()
+    image = pixel // (width * height)
+    x = pixel % width
+    y = pixel // width % height
+    tile = image * tiles + y // _TILE * tiles_x + x // _TILE
+    clear = wp.float32(1.0)  # a variable: plain literals would be constants in the loop
+    depth = wp.float32(0.0)
+    k = starts_in[tile]
+    end = starts_in[tile + 1]
+    while k < end:
+        g = pairs_in[k]
+        conic = conics_in[g]
+        dy = float(y) + 0.5 - means2d_in[g][1]
+        dx = float(x) + 0.5 - means2d_in[g][0] + conic[1] * dy
+        q = conic[0] * dx * dx + conic[2] * dy * dy
+        if q <= limit:
+            alpha = wp.min(alpha_max, view_opacities_in[g] * wp.exp(-0.5 * q))
+            if alpha >= alpha_min:
+                clear *= 1.0 - alpha
+                if clear <= transmittance:
+                    depth = depths_in[g]
+                    k = end
+        k += 1
+    depths_out[pixel] = depth
+
+
+def depth_quantile(
+    meta: Meta,
+    transmittance: float = 0.5,
+    *,
+    alpha_min: float = ALPHA_MIN,
+    alpha_max: float = ALPHA_MAX,
+) -> Tensor:
+    """Depth of the first Gaussian behind which each pixel's transmittance is no larger than asked.
+
+    ``z_i`` of the least i with ``Π_{j<=i} (1 - α_j) <= transmittance``: 0.5 is the median depth of
+    2DGS (Huang et al. 2024). Without gradient.
+
+    Args:
+        meta: as ``rasterization`` returned it, of any device and render mode.
+        transmittance: in (0, 1).
+        alpha_min: as in that call.
+        alpha_max: as in that call.
+
+    Returns:
+        ``[.., V, H, W, 1]`` float32, world units along the camera's axis; 0 where the whole ray
+        stays clearer than that.
+
+    Raises:
+        ValueError: the transmittance is out of range.
+    """
+    if not 0 < transmittance < 1:
+        raise ValueError(f"transmittance is {transmittance}, allowed is 0 < transmittance < 1")
+    width, height, centers = meta["width"], meta["height"], meta["depths"].detach()
+    tiles_x, tiles_y = tile_grid(width, height)
+    depths = centers.new_empty(*centers.shape[:-1], height, width, 1)
+    limit = 2 * math.log(1 / alpha_min) + 1e-3  # of q: beyond it no opacity reaches alpha_min
+    sizes = [width, height, tiles_x, tiles_x * tiles_y, transmittance, limit, alpha_min, alpha_max]
+    splats = [
+        vectors(meta["means2d"].detach().contiguous(), wp.vec2),
+        vectors(meta["conics"].detach().contiguous(), wp.vec3),
+        meta["opacities"].detach().flatten(),
+        centers.flatten(),
+    ]
+    inputs = [*sizes, *splats, meta._bins.pairs, meta._bins.starts]
+    launch(_quantile, depths.numel(), inputs, [depths.view(-1)], depths.device)
+    return depths
