@@ -40,6 +40,7 @@ def level_set(gaussians: Gaussians, voxels: int, level: float) -> tuple[np.ndarr
         raise UserError(f"the density's maximum is {volume.max():.3g}, under {level}")
     volume[_cavities(volume)] = 1.0
     vertices, faces, _, _ = marching_cubes(volume, level)
+    faces = faces[:, ::-1]  # scikit-image winds them so that larger values are in front
     return origin + vertices.astype(np.float64) / voxels, faces.astype(np.int64)
 
 

@@ -121,6 +121,7 @@ def export_command(
         largest=largest,
         smooth=smooth,
     )
+    options.check()
     files, failures = find_gaussians(inputs)
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))

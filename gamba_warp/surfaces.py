@@ -65,11 +65,12 @@ class SurfaceOptions:
     faces: int = 0
     colors: bool = False
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raises UserError, with the option's name, where a number is out of range."""
         bounds = {
             "voxels": (8, 1024),
-            "views": (4, 1000),
-            "pixels": (16, 4096),
+            "views": (8, 1000),
+            "pixels": (8, 4096),
             "close_holes": (0, 10000),
             "smooth": (0, 1000),
             "faces": (0, 2**31 - 1),
@@ -115,6 +116,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
     """
     if options.method not in ("tsdf", "density"):
         raise ValueError(f"method is {options.method!r}, which has no surface")
+    options.check()
     gaussians = near_and_visible(gaussians.detach())
     views = None
     if options.method == "tsdf" or options.colors:
