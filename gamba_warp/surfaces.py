@@ -55,7 +55,7 @@ class SurfaceOptions:
     min_alpha: float = 0.3
     clear_alpha: float = 0.1
     max_slope: float = 1.5
-    min_support: float = 0.1
+    min_support: float = 0.03
     level: float = 0.5
     min_component: float = 0.01
     min_diameter: float = 0.0

@@ -69,7 +69,7 @@ def test_a_cube(method):
     size = np.ptp(np.quantile(surface.vertices, [0.02, 0.98], axis=0), axis=0)
     assert np.abs(size - 0.7).max() < 4 * sigma + 1 / 64  # their widths on both sides, a voxel
     distance = np.abs(np.abs(surface.vertices).max(1) - 0.35)  # exact beside edges
-    assert distance.mean() < 1.5 * sigma
+    assert distance.mean() < 1.8 * sigma  # the bias: near edges, or the level
     assert as_trimesh(surface).volume > 0.7**3
 
 
