@@ -183,3 +183,38 @@ def connected_parts(mesh: Mesh) -> list[Mesh]:
         used, corners = np.unique(faces[ids], return_inverse=True)
         parts.append(Mesh(vertices[used], corners.reshape(-1, 3)))
     return parts
+
+
+_RAYS = f"{VOTERS} rays, in {VOTERS // 2} fixed directions and their opposites,"
+ENCLOSED = (
+    "a voxel is outside if its centre can be reached from the grid's border by steps between the "
+    "centres of face neighbours that do not cross the surface; so closed cavities are filled and "
+    "parts may overlap"
+)
+Rule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
+RULES: dict[Rule, tuple[str, Callable[[Mesh, Grid], np.ndarray]]] = {
+    "solid": (
+        f"{ENCLOSED}. Where a part (faces joined by edges) is open, a voxel is also inside if more "
+        f"than half of {_RAYS} cross an odd number of times the whole mesh, or one open part alone",
+        solid,
+    ),
+    "joint": (
+        f"{ENCLOSED}. If the mesh is open, a voxel is also inside if more than half of {_RAYS} "
+        "cross it an odd number of times",
+        joint,
+    ),
+    "enclosed": (ENCLOSED, enclosed),
+    "majority": (
+        f"a point is inside if more than half of {_RAYS} cross the surface an odd number of times",
+        majority,
+    ),
+    "winding": (
+        "a point is inside if its generalised winding number, estimated by the signed crossings "
+        f"of {_RAYS} is over 1/2 or under -1/2",
+        winding,
+    ),
+    "parity": (
+        "a point is inside if a ray along -x crosses the surface an odd number of times",
+        parity,
+    ),
+}
