@@ -116,6 +116,7 @@ class Retrieval:
             raise UserError("no training object can be read")
         self._thumbnails = torch.cat(found)  # [M, THUMBNAIL², 4]; 8 bits: 4 kB a view
         self._alphas = self._thumbnails[..., 3].float() / 255
+        self._areas = self._alphas.sum(1)
 
     def nearest(self, image: Tensor, uid: str) -> tuple[str, int, float] | None:
         """The nearest view of another object than ``uid``.
@@ -128,7 +129,9 @@ class Retrieval:
             Its uid, its view, and the distance in [0, 2]; None where there is no other object.
         """
         query = thumbnails(image[None])[0]
-        shape = 1 - _ratio(self._alphas, query[:, 3])
+        both = torch.minimum(self._alphas, query[:, 3]).sum(1)
+        either = (self._areas + query[:, 3].sum() - both).clamp(min=1e-6)
+        shape = 1 - both / either  # 1 where both are empty: nothing tells them apart
         shape[torch.tensor([place[0] == uid for place in self._places])] = torch.inf
         best, at = torch.inf, -1
         # by the first term, which the colours only add to: most need never be looked at
@@ -170,10 +173,3 @@ def thumbnails(images: Tensor) -> Tensor:
     premultiplied = torch.cat([images[..., :3] * images[..., 3:], images[..., 3:]], -1)
     small = adaptive_avg_pool2d(premultiplied.permute(0, 3, 1, 2), THUMBNAIL).flatten(2).mT
     return torch.cat([small[..., :3] / small[..., 3:].clamp(min=1e-6), small[..., 3:]], -1)
-
-
-def _ratio(alphas: Tensor, alpha: Tensor) -> Tensor:
-    """Intersection over union ``[M]`` of soft masks ``[M, P]`` and ``[P]``; 1 if both are empty."""
-    both = torch.minimum(alphas, alpha).sum(1)
-    either = torch.maximum(alphas, alpha).sum(1)
-    return torch.where(either > 0, both / either.clamp(min=1e-6), 1.0)
