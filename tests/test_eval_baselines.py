@@ -9,10 +9,11 @@ from gamba_warp.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.eval import baselines
 from gamba_warp.eval.baselines import Retrieval, background, billboard, input_copy
-from gamba_warp.eval.ceiling import open_ceiling
+from gamba_warp.eval.ceiling import Ceiling, open_ceiling
 from gamba_warp.eval.compare_views import Truth, ViewsProtocol, compare, load_truth, summary
 from gamba_warp.eval.contact_sheet import Row, choose_ranks, contact_sheet
 from gamba_warp.eval.views_table import differences_of, markdown, table_of
+from gamba_warp.fit import FitConfig
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.ply import load_ply, save_ply
@@ -300,7 +301,8 @@ def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
     dataset = open_dataset(data)
 
     def make(steps=25, protocol=PROTOCOL):
-        return open_ceiling("1", dataset, dataset.uids, protocol, "cpu", tmp_path / "out", steps)
+        config = FitConfig(steps=steps, gaussians=150)
+        return Ceiling(dataset, protocol, "cpu", tmp_path / "ceiling", ["flat"], config)
 
     truth = load_truth(dataset, "flat", PROTOCOL, "cpu")
     first = make()(truth)
@@ -310,7 +312,7 @@ def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
     assert torch.allclose(make()(truth)[0], first[0], atol=1e-5) and len(calls) == 1  # .ply logits
     make(26)(truth)
     assert len(calls) == 2  # other settings
-    path = tmp_path / "out" / "ceiling" / "flat.ply"
+    path = tmp_path / "ceiling" / "flat.ply"
     assert load_ply(path).num > 0
     assert make(26)(load_truth(dataset, "other", PROTOCOL, "cpu")) is None
     path.with_suffix(".json").write_text("{")
@@ -321,6 +323,13 @@ def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
     again = make(26, moved)(load_truth(dataset, "flat", moved, "cpu"))
     same = make(26)(truth)
     assert (again[0][0] - same[0][2]).abs().max() < 1e-3 and len(calls) == 3
+
+
+def test_ceiling_of_so_many_objects(data, tmp_path):
+    dataset = open_dataset(data)
+    ceiling = open_ceiling("2", dataset, dataset.uids, PROTOCOL, "cpu", tmp_path, 7)
+    assert ceiling.uids == ["flat", "seen"] and ceiling.config.steps == 7  # of 4, evenly spaced
+    assert ceiling.folder == tmp_path / "ceiling"
 
 
 @pytest.mark.parametrize("wanted", ["0", "absent", "-3"])
