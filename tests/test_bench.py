@@ -543,3 +543,12 @@ def test_saved_time_is_told_by_direction(axis, saved):
         record["ms_p50"] = ms
     (svg,) = charts_of("one", records)
     assert svg.count(f"less: 50, {saved}") == 2
+
+
+@pytest.mark.parametrize("low, high", [(75.8, 81.7), (5.1, 5.2), (0.097, 0.099), (88, 150)])
+def test_narrow_axes_have_ticks_and_room(low, high):
+    axis = Axis("ms")
+    svg = chart([Series("", [Point(low, low), Point(high, high)])], axis, axis)
+    assert svg.count('text-anchor="middle"') >= 3 and svg.count('text-anchor="end"') >= 3
+    left, right = (float(x) for x in re.findall(r'cx="([^"]+)"', svg))
+    assert (right - left) / 522 == pytest.approx(math.log10(high / low) / 0.4, rel=0.2)

@@ -85,6 +85,8 @@ def _scale(values: list[float], axis: Axis, start: float, end: float):
     bend = math.log10 if axis.logarithmic else float
     low, high = bend(min(values)), bend(max(values))
     room = 0.08 * (high - low) or (0.3 if axis.logarithmic else abs(high) or 1.0)
+    if axis.logarithmic:  # at least a factor of 2.5: noise shall not look like more
+        room = max(room, (0.4 - high + low) / 2)
     low, high = low - room, high + room
 
     def place(value: float) -> float:
@@ -119,7 +121,7 @@ def _ticks(low: float, high: float, logarithmic: bool) -> list[float]:
     if logarithmic:
         powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
         close = high < 8 * low
-        leads = (1, 1.5, 2, 3, 4, 5, 7) if close else (1, 2, 5) if high < 200 * low else (1,)
+        leads = (1, 1.5, 2, 3, 4, 5, 6, 7, 8) if close else (1, 2, 5) if high < 200 * low else (1,)
         values = [float(f"{lead}e{power}") for power in powers for lead in leads]
     else:
         raw = (high - low) / 5
