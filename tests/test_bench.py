@@ -552,3 +552,11 @@ def test_narrow_axes_have_ticks_and_room(low, high):
     assert svg.count('text-anchor="middle"') >= 3 and svg.count('text-anchor="end"') >= 3
     left, right = (float(x) for x in re.findall(r'cx="([^"]+)"', svg))
     assert (right - left) / 522 == pytest.approx(math.log10(high / low) / 0.4, rel=0.2)
+
+
+def test_an_error_of_zero_is_drawn_at_the_bottom():
+    document = run(case(variant("all", error=0.0, default=True), variant("part"), axis="error"))
+    (svg,) = charts_of("one", document["records"])
+    assert "all (error 0): " in svg and svg.count("<g>") == 2
+    all_zero = run(case(variant("all", error=0.0), axis="error"))
+    assert charts_of("one", all_zero["records"]) == [""]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 from .charts import Axis, Point, Series, chart, pareto
 from .report import (
@@ -57,10 +58,17 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
 
 def _error_chart(records: Sequence[dict], direction: str) -> str:
     """Time against error: less is better in both; the front is what no other variant beats."""
-    points = [_marked(r, r["rel_rms_error"] or 0.0) for r in records]
+    errors = [r["rel_rms_error"] for r in records if r["rel_rms_error"]]
+    bottom = min(errors, default=0.0) / 3  # where an error of 0 is drawn, and said to be so
+    points = []
+    for r in records:
+        point = _marked(r, r["rel_rms_error"] or 0.0)
+        if r["rel_rms_error"] == 0:
+            point = replace(point, y=bottom, label=f"{point.label} (error 0)")
+        points.append(point)
     front = pareto([p for p in points if p.y > 0])
     series = [Series(direction, points), Series("Pareto front", front, "steps")]
-    return chart(series, Axis("milliseconds"), Axis("relative rms error to float64"))
+    return chart(series, Axis("milliseconds"), Axis("relative rms error"))
 
 
 def _on_axis(records: Sequence[dict], axis: str) -> list[dict]:
