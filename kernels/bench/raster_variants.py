@@ -8,7 +8,7 @@ from .case import Settings, Variant
 from .raster_scene import Scene, orbit_cameras, shell
 
 # Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
-FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 1.0
+FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 10.0
 BOTH = "forward+backward"
 _COUNT = 16384
 _SIZE = 512
