@@ -40,7 +40,8 @@ def cases(settings: Settings) -> list[Case]:
     texts = {
         "one block": "A block of the paper's size on one picture's tokens, beside its matrix "
         "products alone, repeated on operands of the same shapes into given outputs. Prefix states "
-        "off: condition prepended and dropped, as the paper has it.",
+        "off: condition prepended and dropped, as the paper has it. For one block alone that costs the "
+        "same; the states of all blocks are computed at once, which pays over the depth (backbone).",
         "backbone": "All blocks of the paper's size, the condition's states included, beside "
         "their matrix products alone, and with the condition prepended and dropped in each block.",
     }
@@ -305,8 +306,8 @@ class _Lazy:
 
 def compiled(settings: Settings) -> list[Variant]:
     """A block of the paper's size as it is, through torch.compile, and on CUDA as a CUDA graph. The
-    first call has the compilation, a minute or so; what it can join are a few elementwise
-    operations between the products and our kernels.
+    first call has the compilation; what it can join are a few elementwise operations between the
+    products and our kernels, and no gain is to be seen: blocks are not compiled by default.
     """
     backbone = _Backbone(settings, 1)
     (block,) = backbone.blocks
