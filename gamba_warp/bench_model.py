@@ -40,8 +40,9 @@ def cases(settings: Settings) -> list[Case]:
     texts = {
         "one block": "A block of the paper's size on one picture's tokens, beside its matrix "
         "products alone, repeated on operands of the same shapes into given outputs. Prefix states "
-        "off: condition prepended and dropped, as the paper has it. For one block alone that costs the "
-        "same; the states of all blocks are computed at once, which pays over the depth (backbone).",
+        "off: condition prepended and dropped, as the paper has it. For one block alone that costs "
+        "the same; the states of all blocks are computed at once, which pays over the depth "
+        "(backbone).",
         "backbone": "All blocks of the paper's size, the condition's states included, beside "
         "their matrix products alone, and with the condition prepended and dropped in each block.",
     }
