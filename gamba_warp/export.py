@@ -17,15 +17,14 @@ from .errors import UserError
 from .files import output_folder
 from .gaussians import Gaussians
 from .gltf import save_glb
-from .mesh_files import save_mesh
+from .mesh_files import MeshFormat, write_meshes
 from .page import Section, reconstruction_page
 from .ply import Frame, load_ply, save_ply
 from .reconstruct import pick_device, unique_names
 from .splat import save_splat
-from .surfaces import Surface, SurfaceOptions, extract_surface, unit_frame
+from .surfaces import SurfaceOptions, moved_to_unit, unit_frame
 from .turntable import save_turntable, turntable_frames
 
-MeshFormat = Literal["obj", "glb", "ply", "stl"]
 Format = Literal["ply", "splat", "glb", "html", "gif", "mp4"]
 
 
@@ -189,38 +188,10 @@ def export(name: str, path: Path, job: Job) -> str:
     if not job.mesh:
         return f"{name}: {gaussians.num:,} Gaussians"
     start = time.perf_counter()
-    found = surface_of(gaussians, job.surface, job.device)
-    for kind in job.mesh:
-        turned = found
-        if job.frame == "opengl" and kind != "glb":  # which is turned in any case
-            turned = Surface(found.vertices * [1.0, -1.0, -1.0], found.faces, found.colors)
-        save_mesh(job.folder / f"{name}-mesh.{kind}", turned)
+    found = write_meshes(job.folder / name, gaussians, job.mesh, job.surface, job.frame, job.device)
     closed = "closed" if found.is_closed() else "open"
     counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
     return f"{name}: {counts}, {time.perf_counter() - start:.1f} s"
-
-
-def surface_of(gaussians: Gaussians, options: SurfaceOptions, device: torch.device) -> Surface:
-    """The surface of an object of any size anywhere, in its own frame.
-
-    Raises:
-        UserError: there is no surface.
-    """
-    center, side = unit_frame(gaussians)
-    found = extract_surface(moved_to_unit(gaussians, center, side).to(device), options)
-    vertices = found.vertices * side + center.double().numpy()
-    return Surface(vertices, found.faces, found.colors)
-
-
-def moved_to_unit(gaussians: Gaussians, center: torch.Tensor, side: float) -> Gaussians:
-    """``gaussians`` with ``center [3]`` at the origin and ``side`` as the unit."""
-    return Gaussians(
-        means=(gaussians.means - center) / side,
-        quats=gaussians.quats,
-        scales=gaussians.scales / side,
-        opacities=gaussians.opacities,
-        colors=gaussians.colors,
-    )
 
 
 def _write_pictures(name: str, gaussians: Gaussians, job: Job) -> None:

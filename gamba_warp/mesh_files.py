@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
+import torch
 
 from .errors import UserError
 from .files import atomic_path
+from .gaussians import Gaussians
 from .images import to_uint8
 from .meshes import to_linear
-from .surfaces import Surface
+from .ply import Frame
+from .surfaces import Surface, SurfaceOptions, surface_of
 
-MESH_FORMATS = ("obj", "glb", "ply", "stl")
+MeshFormat = Literal["obj", "glb", "ply", "stl"]
+MESH_FORMATS = get_args(MeshFormat)
 
 
 def save_mesh(path: str | Path, surface: Surface) -> None:
@@ -46,3 +52,36 @@ def save_mesh(path: str | Path, surface: Surface) -> None:
     content = mesh.export(file_type=kind)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def write_meshes(
+    base: Path,
+    gaussians: Gaussians,
+    formats: Sequence[MeshFormat],
+    options: SurfaceOptions,
+    frame: Frame,
+    device: torch.device,
+) -> Surface:
+    """Makes an object's surface and writes it as ``NAME-mesh.FORMAT``.
+
+    Args:
+        base: folder and NAME.
+        gaussians: an object of any size anywhere.
+        formats: of the files.
+        options: how the surface is made.
+        frame: axes of all but .glb, which is y up in any case.
+        device: where to render.
+
+    Returns:
+        The surface in the Gaussians' own frame.
+
+    Raises:
+        UserError: there is no surface, or a file cannot be written.
+    """
+    found = surface_of(gaussians, options, device)
+    for kind in formats:
+        turned = found
+        if frame == "opengl" and kind != "glb":
+            turned = Surface(found.vertices * [1.0, -1.0, -1.0], found.faces, found.colors)
+        save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), turned)
+    return found

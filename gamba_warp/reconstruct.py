@@ -19,10 +19,12 @@ from .errors import UserError
 from .files import output_folder
 from .gaussians import Gaussians
 from .gltf import save_glb
+from .mesh_files import MeshFormat, write_meshes
 from .page import Section, reconstruction_page
 from .ply import Frame, save_ply
 from .preprocess import SamSegmenter, composite, prepare
 from .splat import save_splat
+from .surfaces import SurfaceOptions
 from .turntable import save_turntable, turntable_frames
 
 if TYPE_CHECKING:
@@ -66,6 +68,7 @@ class Outputs:
     Attributes:
         folder: where.
         formats: Gaussian files.
+        mesh: formats of a mesh of the surface.
         turntable: ``gif``, ``mp4`` or ``none``.
         size: side of the turntable's frames, pixels.
         frames: views of one turn.
@@ -77,6 +80,7 @@ class Outputs:
 
     folder: Path
     formats: tuple[Format, ...]
+    mesh: tuple[MeshFormat, ...]
     turntable: str
     size: int
     frames: int
@@ -93,6 +97,7 @@ def reconstruct_command(
     encoder_weights: Path | None = None,
     out: Path = Path("out"),
     formats: tuple[Format, ...] = ("ply",),
+    mesh: tuple[MeshFormat, ...] = (),
     turntable: Literal["gif", "mp4", "none"] = "gif",
     size: int = 256,
     frames: int = 48,
@@ -111,6 +116,7 @@ def reconstruct_command(
         encoder_weights: The image encoder's weights, where the model has a pretrained one.
         out: Folder for the results.
         formats: Files of Gaussians to write.
+        mesh: Also files of a coloured mesh (gamba export has its options).
         turntable: Moving picture of one turn.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
@@ -137,6 +143,7 @@ def reconstruct_command(
     outputs = Outputs(
         folder=output_folder(out),
         formats=formats,
+        mesh=mesh,
         turntable=turntable,
         size=size,
         frames=frames,
@@ -231,6 +238,10 @@ def write_outputs(
             {"splat": save_splat, "glb": save_glb}[kind](
                 path, gaussians, min_opacity=outputs.min_opacity
             )
+    if outputs.mesh:
+        visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
+        options, where = SurfaceOptions(colors=True), gaussians.means.device
+        write_meshes(base, visible, outputs.mesh, options, outputs.ply_frame, where)
     if outputs.turntable == "none" and not outputs.page:
         return
     frames = turntable_frames(

@@ -188,6 +188,29 @@ def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
     return torch.from_numpy(ends.mean(0)).to(gaussians.means), side
 
 
+def surface_of(gaussians: Gaussians, options: SurfaceOptions, device: torch.device) -> Surface:
+    """The surface of an object of any size anywhere, in its own frame.
+
+    Raises:
+        UserError: there is no surface.
+    """
+    center, side = unit_frame(gaussians)
+    found = extract_surface(moved_to_unit(gaussians, center, side).to(device), options)
+    vertices = found.vertices * side + center.double().numpy()
+    return Surface(vertices, found.faces, found.colors)
+
+
+def moved_to_unit(gaussians: Gaussians, center: Tensor, side: float) -> Gaussians:
+    """``gaussians`` with ``center [3]`` at the origin and ``side`` as the unit."""
+    return Gaussians(
+        means=(gaussians.means - center) / side,
+        quats=gaussians.quats,
+        scales=gaussians.scales / side,
+        opacities=gaussians.opacities,
+        colors=gaussians.colors,
+    )
+
+
 def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:
     """Mean colour of each vertex in the views that see it, those in front counting most.
 

@@ -11,10 +11,9 @@ from pathlib import Path
 import tyro
 
 from .errors import UserError
-from .export import moved_to_unit
 from .page import Section, reconstruction_page
 from .ply import load_ply
-from .surfaces import unit_frame
+from .surfaces import moved_to_unit, unit_frame
 
 
 def view_command(

@@ -14,7 +14,9 @@ from gamba_warp import reconstruct as module
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
 from gamba_warp.config import GambaConfig
 from gamba_warp.errors import UserError
+from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
+from gamba_warp.meshes import load_mesh
 from gamba_warp.model import Gamba, load_model, save_model
 from gamba_warp.ply import load_ply
 from gamba_warp.preprocess import composite, prepare
@@ -177,6 +179,26 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     source = (out / "thing.html").read_text()
     assert "<h1>thing</h1>" in source and "model.safetensors" in source and ">64<" in source
     assert "1 pictures, 0 failures" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("frame", ["opencv", "opengl"])
+def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeypatch, frame):
+    ends = torch.tensor([0.35, -0.1, 0.0])
+    stick = Gaussians(
+        means=(torch.arange(64.0)[:, None] / 63) * ends,
+        quats=None,
+        scales=torch.full((64, 3), 0.04),
+        opacities=torch.full((64,), 0.9),
+        colors=torch.tensor([0.9, 0.1, 0.1]).expand(64, 3),
+    )
+    monkeypatch.setattr("gamba_warp.reconstruct.reconstruct", lambda *_: stick)
+    options = [*quick(checkpoint, tmp_path), "--mesh", "ply", "--ply-frame", frame]
+    assert run(picture, *options) == 0
+    mesh = load_mesh(tmp_path / "thing-mesh.ply")
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    want = [0.175, -0.05 if frame == "opencv" else 0.05, 0.0]
+    assert np.abs(middle - want).max() < 0.02  # half a Gaussian
+    assert run(picture, *options, "--min-opacity", 0.95) == 1  # nothing is left
 
 
 def test_options_reach_the_files(tmp_path, picture, checkpoint):

@@ -12,6 +12,7 @@ from .scan_problem import ScanProblem, make_inputs
 
 # Allowed relative rms error to float64. Half precision: what rounding inputs and output explains.
 FORWARD_LIMIT, BACKWARD_LIMIT = 1e-6, 1e-5
+CUDA_LIMIT = 1e-5  # both ways: ex2.approx there is off by 2^-22 at every token
 HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
 TRADE_LIMIT = 1.0  # where accuracy is the knob
 BOTH = "forward+backward"
@@ -37,11 +38,14 @@ def make_variant(
     """A variant that calls the operator with ``options``."""
     forward, options = direction == "forward", options or {}
     batch, length, width = problem.inputs["u"].shape
+    limit = FORWARD_LIMIT if forward else BACKWARD_LIMIT
+    if problem.device.type == "cuda":
+        limit = CUDA_LIMIT
     return Variant(
         name,
         partial(problem.forward if forward else problem.backward, dtype, **options),
         partial(problem.check_forward if forward else problem.check_backward, dtype, **options),
-        HALF_LIMITS.get(dtype, FORWARD_LIMIT if forward else BACKWARD_LIMIT),
+        HALF_LIMITS.get(dtype, limit),
         problem.oracle,
         direction,
         str(dtype).removeprefix("torch."),
