@@ -13,8 +13,6 @@ from .config import PRESETS, GambaConfig
 from .gaussians import Gaussians
 from .kernels.bench import Error, NotInstalled, Settings, Variant, compare
 from .model import Gamba, load_model
-from .preprocess import composite, prepare
-from .reconstruct import DEFAULT_CHECKPOINT
 from .render import render
 
 _REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
@@ -79,6 +77,14 @@ class _Pictures:
     """The starter model on some of its icons; errors are of pictures from three sides."""
 
     def __init__(self, settings: Settings) -> None:
+        # here, not above: these need more than torch and warp, the other cases nothing else
+        try:
+            import safetensors  # noqa: F401, of load_model
+
+            from .preprocess import composite, prepare
+            from .reconstruct import DEFAULT_CHECKPOINT
+        except ModuleNotFoundError as error:
+            raise NotInstalled(str(error.name)) from None
         icons = sorted((DEFAULT_CHECKPOINT.parent / "icons").glob("*.png"))
         count = 1 if settings.level == "quick" else 8
         if not DEFAULT_CHECKPOINT.exists() or not icons:

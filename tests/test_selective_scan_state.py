@@ -61,7 +61,7 @@ def test_state_refuses_bad_input():
 def test_segments_match_oracle(threads, discretization):
     """Too few channels for the threads: the tokens are cut, and states carried over the cuts."""
     inputs = make(1, 1111, 21, 3)
-    layout = Layout(inputs["u"], inputs["A"], inputs["B"], 4)
+    layout = Layout(inputs["u"], inputs["A"], inputs["B"], 4, 64)
     assert layout.segments == {2: 2, 5: 4}[threads]
     compare(inputs, delta_softplus=True, discretization=discretization)
     alone = {name: inputs[name] for name in NAMES}

@@ -8,13 +8,15 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import torch
 import warp as wp
 
 from gamba_warp.bench import bench_command
 from gamba_warp.kernels.bench import static
 from gamba_warp.kernels.bench.cubin import read_cubin
-from gamba_warp.kernels.bench.dry_run import Launch
+from gamba_warp.kernels.bench.dry_run import Launch, dry_run
 from gamba_warp.kernels.bench.static import MACHINES, occupancy
+from gamba_warp.kernels.interop import view
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs" / "benchmarks"
@@ -41,6 +43,7 @@ BOUNDS = {
     ("raster", "count", "32 views"): (64, 0, 2000, 32),
     ("raster", "emit", "32 views"): (64, 0, 2000, 32),
     ("raster", "reduce", "32 views"): (64, 0, 2000, 32),
+    ("raster", "quantile", "depth of a transmittance"): (64, 0, 2000, 32),
     ("raster", "composite", "32 views"): (80, 40, 3200, 24),
     ("raster", "composite", "1 view, a tile in quarters"): (80, 0, 3200, 24),
     ("raster", "composite", "32 views with depth"): (96, 8, 3200, 20),
@@ -86,6 +89,15 @@ def kernels_of_the_sources():
                 if "wp.kernel" in decorators:
                     names.add(node.name.lstrip("_"))
     return names
+
+
+def test_a_dry_run_leaves_nothing_behind():
+    """A description of memory that is not there would be taken for that of a like CPU tensor."""
+    shape = (2, 77, 33)
+    with dry_run():
+        view(torch.empty(shape, device="cuda"))
+    found = view(torch.ones(shape))
+    assert tuple(found.shape)[:3] == shape and tuple(found.strides)[:3] == (77 * 33 * 4, 33 * 4, 4)
 
 
 def test_no_kernel_is_forgotten(entries):

@@ -19,6 +19,8 @@ from torch._library.custom_ops import OPDEFS
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from .. import interop
+
 _READ_BACK = (torch.ops.aten.item.default, torch.ops.aten._local_scalar_dense.default)
 # What an operator reads back from the device, the number of pairs, is taken to be this.
 COUNT = 1 << 20
@@ -72,6 +74,11 @@ def dry_run() -> Iterator[list[Launch]]:
         (torch.cuda, "current_device", lambda: 0),
         (torch.cuda, "get_device_properties", lambda index=None: device),
         (torch.Tensor, "data_ptr", lambda tensor: 0),
+        (
+            interop,
+            "_descriptors",
+            {},
+        ),  # those made here describe nothing
     ]
     with ExitStack() as stack:
         for where, name, function in replaced:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gamba_warp._version import __version__
 
-from ..rasterize import rasterization
+from ..rasterize import depth_quantile, rasterization
 from ..selective_scan import causal_conv1d, selective_scan, selective_scan_state
 from .cubin import RESERVED, Resources, read_cubin
 from .dry_run import Launch, launches_of
@@ -133,6 +133,15 @@ def _raster(views: int, mode: str = "RGB", geometry: bool = True) -> list[Tensor
     return [renders, alphas]
 
 
+def _depth() -> list[Tensor]:
+    """Of a rendering without gradients."""
+    num, views = 16384, 32
+    tensor = partial(_tensor, gradient=False)
+    splats = tensor(num, 3), tensor(num, 4), tensor(num, 3), tensor(num), tensor(num, 3)
+    *_, meta = rasterization(*splats, tensor(views, 4, 4), tensor(views, 3, 3), 512, 512)
+    return [depth_quantile(meta)]
+
+
 _HALF = {"dtype": torch.bfloat16}
 _SCANS = {
     "bfloat16": _HALF,
@@ -157,6 +166,7 @@ CASES: dict[tuple[str, str], Callable[[], list[Tensor]]] = {
     ("conv", "bfloat16"): partial(_conv, torch.bfloat16),
     ("conv", "float32"): partial(_conv, torch.float32),
     **{("raster", name): partial(_raster, **options) for name, options in _RASTERS.items()},
+    ("raster", "depth of a transmittance"): _depth,
 }
 
 
