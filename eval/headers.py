@@ -71,7 +71,12 @@ def ply_elements(path: Path, lines: list[bytes]) -> list[tuple[str, int, list[li
     return elements
 
 
-def _check_ply(path: Path, file: BinaryIO, size: int) -> None:
+def ply_header(path: Path, file: BinaryIO) -> tuple[list[bytes], int]:
+    """Lines of a ``.ply`` header, and where the data begin.
+
+    Raises:
+        UserError: it is not one, or it does not end.
+    """
     head = file.read(MAX_HEADER)
     if not head.startswith(b"ply"):
         raise UserError(f"{path}: not a .ply file")
@@ -79,7 +84,11 @@ def _check_ply(path: Path, file: BinaryIO, size: int) -> None:
     start = head.find(b"\n", end) + 1
     if end < 0 or start == 0:
         raise UserError(f"{path}: the .ply header has no end")
-    lines = head[:end].splitlines()
+    return head[:end].splitlines(), start
+
+
+def _check_ply(path: Path, file: BinaryIO, size: int) -> None:
+    lines, start = ply_header(path, file)
     elements = ply_elements(path, lines)
     says = ", ".join(f"{count} {name}" for name, count, _ in elements)
     layout = next((line.split()[1:2] for line in lines if line.startswith(b"format")), [])

@@ -15,7 +15,7 @@ from gamba_warp.meshes import load_mesh
 from gamba_warp.open3d import import_open3d
 from gamba_warp.ply import load_ply
 
-from .headers import check_counts
+from .headers import check_counts, ply_elements, ply_header
 from .metrics import Points
 
 CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
@@ -107,12 +107,10 @@ class Similarity:
 def _ply_kind(path: Path) -> str:
     """What a ``.ply`` holds, by its header: "gaussians", "mesh" or "points"."""
     with open(path, "rb") as file:
-        header = file.read(1 << 16).split(b"end_header")[0].decode("ascii", "replace")
-    words = [line.split() for line in header.splitlines()]
-    properties = {w[-1] for w in words if w[:1] == ["property"]}
-    faces = [w for w in words if w[:2] == ["element", "face"]]
-    if faces and faces[0][-1] != "0":
+        elements = ply_elements(path, ply_header(path, file)[0])
+    if any(name == "face" and count for name, count, _ in elements):
         return "mesh"
+    properties = {words[-1] for _, _, rows in elements for words in rows}
     # one is enough, so that a file that lacks the others is not taken for a point cloud
     return "gaussians" if {"opacity", "scale_0", "rot_0", "f_dc_0"} & properties else "points"
 

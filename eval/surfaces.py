@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gamba_warp.cleaning import cleaned_mesh
-from gamba_warp.density import opacity_volume
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces import Method, SurfaceOptions, extract_surface
@@ -13,7 +11,7 @@ from gamba_warp.surfaces import Method, SurfaceOptions, extract_surface
 from .metrics import Points
 from .shapes import Mesh
 
-__all__ = ["Method", "SurfaceOptions", "centers", "cleaned", "opacity_volume", "to_surface"]
+__all__ = ["Method", "SurfaceOptions", "centers", "to_surface"]
 
 
 def to_surface(
@@ -41,12 +39,3 @@ def centers(gaussians: Gaussians, count: int, seed: int) -> Points:
         raise UserError("no Gaussian has any opacity")
     chosen = np.random.default_rng(seed).choice(len(weights), count, p=weights / weights.sum())
     return Points(gaussians.means.double().cpu().numpy()[chosen])
-
-
-def cleaned(mesh: Mesh, min_component: float) -> Mesh:
-    """Without duplicate and null faces and without parts of a smaller share of all faces.
-
-    Raises:
-        UserError: nothing is left.
-    """
-    return Mesh(*cleaned_mesh(mesh.vertices, mesh.faces, min_component=min_component))

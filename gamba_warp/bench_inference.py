@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from .cameras import Cameras, intrinsics, reference_viewmat
+from .cameras import reference_cameras
 from .config import PRESETS, GambaConfig
 from .encoders import ImageEncoder
 from .errors import UserError
@@ -82,8 +82,7 @@ class Inference:
         size = self.config.image_size
         g = torch.Generator().manual_seed(1)
         self.image = torch.rand(1, size, size, 3, generator=g).to(self.device)
-        K = intrinsics(size, size, self.config.fov)[None]
-        cameras = Cameras(reference_viewmat(self.config.distance)[None], K, size, size)
+        cameras = reference_cameras(1, size, self.config.fov, self.config.distance)
         self.cameras = cameras.to(self.device)
         self._graphs: dict[torch.dtype, tuple] = {}
         self._graph_bytes: dict[torch.dtype, int] = {}

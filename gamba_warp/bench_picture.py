@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from .cameras import Cameras, intrinsics, orbit, reference_viewmat
+from .cameras import Cameras, intrinsics, orbit, reference_cameras, reference_viewmat
 from .config import PRESETS, GambaConfig
 from .gaussians import Gaussians
 from .kernels.bench import Error, NotInstalled, Settings, Variant, compare
@@ -18,12 +18,6 @@ from .render import render
 _REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
 
 
-def _reference_cameras(config: GambaConfig, count: int) -> Cameras:
-    size = config.image_size
-    viewmats = reference_viewmat(config.distance).repeat(count, 1, 1)
-    return Cameras(viewmats, intrinsics(size, size, config.fov).repeat(count, 1, 1), size, size)
-
-
 def _model(preset: str, settings: Settings, count: int) -> tuple[Gamba, Callable[[], Gaussians]]:
     """A model with fresh weights and no image encoder, and its run on ``count`` pictures."""
     torch.manual_seed(0)
@@ -31,7 +25,7 @@ def _model(preset: str, settings: Settings, count: int) -> tuple[Gamba, Callable
     model = Gamba(config).to(settings.device).eval()
     size = config.image_size
     images = torch.rand(count, size, size, 3).to(settings.device)
-    cameras = _reference_cameras(config, count).to(settings.device)
+    cameras = reference_cameras(count, size, config.fov, config.distance).to(settings.device)
     return model, torch.no_grad()(partial(model, images, cameras))
 
 
@@ -95,7 +89,8 @@ class _Pictures:
         chosen = icons[:: max(1, len(icons) // count)][:count]
         images = [composite(prepare(path), size, config.background_color) for path in chosen]
         self.images = [image[None].to(self.device) for image in images]
-        self.camera = _reference_cameras(config, 1).to(self.device)
+        camera = reference_cameras(1, size, config.fov, config.distance)
+        self.camera = camera.to(self.device)
         around = orbit(torch.tensor([90.0, 180.0]), distance=config.distance)
         viewmats = torch.cat([reference_viewmat(config.distance)[None], around])
         K = intrinsics(size, size, config.fov).repeat(3, 1, 1)

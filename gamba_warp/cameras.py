@@ -76,6 +76,19 @@ def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
     return viewmat
 
 
+def reference_cameras(count: int, size: int, fov: float, distance: float) -> Cameras:
+    """``count`` times the camera that a model's square picture is seen by.
+
+    Args:
+        count: of the cameras, ``[count]``.
+        size: pixels.
+        fov: degrees.
+        distance: object units.
+    """
+    viewmats = reference_viewmat(distance).repeat(count, 1, 1)
+    return Cameras(viewmats, intrinsics(size, size, fov).repeat(count, 1, 1), size, size)
+
+
 def orbit(
     azimuths: Tensor, elevation: float | Tensor = 0.0, distance: float | Tensor = DEFAULT_DISTANCE
 ) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import torch
 import tyro
 from tqdm import tqdm
 
+from .batch import for_each, report
 from .errors import UserError
 from .files import output_folder
 from .gaussians import Gaussians
@@ -126,17 +126,12 @@ def export_command(
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     where = pick_device(device)
     job = Job(output_folder(out), mesh, formats, options, frame, min_opacity, size, frames, where)
-    named = unique_names(files)
-    for name, path in tqdm(named.items(), desc="export", unit="file", disable=None):
-        try:
-            tqdm.write(export(name, path, job))
-        except (UserError, ValueError, OSError, RuntimeError, MemoryError) as error:
-            lines = str(error).splitlines() or [type(error).__name__]
-            failures.append((path, lines[0].removeprefix(f"{path}: ")))
-    for path, reason in failures:
-        print(f"gamba: failed: {path}: {reason}", file=sys.stderr)
-    print(f"{len(files)} files, {len(failures)} failures, results in {out}")
-    return 1 if failures else 0
+
+    def one(name: str, path: Path) -> None:
+        tqdm.write(export(name, path, job))
+
+    failures += for_each(unique_names(files), one, "export", "file")
+    return report(len(files), "file", failures, out)
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:

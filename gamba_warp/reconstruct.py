@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -12,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import torch
 import tyro
-from tqdm import tqdm
 
-from .cameras import Cameras, intrinsics, reference_viewmat
+from .batch import for_each, report
+from .cameras import reference_cameras
 from .errors import UserError
 from .files import output_folder
 from .gaussians import Gaussians
@@ -52,12 +51,7 @@ def reconstruct(model: Gamba, rgba: np.ndarray) -> Gaussians:
     size = config.image_size
     device = next(model.parameters()).device
     images = composite(rgba, size, config.background_color)[None].to(device)
-    cameras = Cameras(
-        reference_viewmat(config.distance)[None],
-        intrinsics(size, size, config.fov)[None],
-        size,
-        size,
-    )
+    cameras = reference_cameras(1, size, config.fov, config.distance)
     return model(images, cameras.to(device))[0]
 
 
@@ -160,11 +154,8 @@ def reconstruct_command(
         seconds = time.perf_counter() - started
         write_outputs(name, rgba, gaussians.to(where), outputs, model.config, seconds)
 
-    failures += _for_each(unique_names(pictures), one)
-    for path, reason in failures:
-        print(f"gamba: failed: {path}: {reason}", file=sys.stderr)
-    print(f"{len(pictures)} pictures, {len(failures)} failures, results in {out}")
-    return 1 if failures else 0
+    failures += for_each(unique_names(pictures), one, "reconstruct", "picture")
+    return report(len(pictures), "picture", failures, out)
 
 
 def find_pictures(images: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
@@ -290,17 +281,3 @@ def _load(checkpoint: Path, encoder_weights: Path | None, device: torch.device) 
             "or give --checkpoint FILE"
         )
     return load_model(checkpoint, device, encoder_weights)
-
-
-def _for_each(
-    pictures: dict[str, Path], function: Callable[[str, Path], None]
-) -> list[tuple[Path, str]]:
-    """Calls ``function`` on each; one that fails is noted and the rest go on."""
-    failures = []
-    for name, path in tqdm(pictures.items(), desc="reconstruct", unit="picture", disable=None):
-        try:
-            function(name, path)
-        except (UserError, OSError, RuntimeError, MemoryError) as error:
-            lines = str(error).splitlines() or [type(error).__name__]
-            failures.append((path, lines[0].removeprefix(f"{path}: ")))
-    return failures

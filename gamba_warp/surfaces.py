@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -202,13 +202,8 @@ def surface_of(gaussians: Gaussians, options: SurfaceOptions, device: torch.devi
 
 def moved_to_unit(gaussians: Gaussians, center: Tensor, side: float) -> Gaussians:
     """``gaussians`` with ``center [3]`` at the origin and ``side`` as the unit."""
-    return Gaussians(
-        means=(gaussians.means - center) / side,
-        quats=gaussians.quats,
-        scales=gaussians.scales / side,
-        opacities=gaussians.opacities,
-        colors=gaussians.colors,
-    )
+    means, scales = (gaussians.means - center) / side, gaussians.scales / side
+    return replace(gaussians, means=means, scales=scales)
 
 
 def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:

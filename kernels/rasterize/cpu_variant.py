@@ -5,10 +5,10 @@ The tile is that of the lists too. On CUDA there is one choice, see CUDA.md.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
+from ..choice import Choice
 from ..constants import TILE
 
 BLOCK = 4  # pixels, side of the block whose pixels are lanes
@@ -52,24 +52,18 @@ class Variant:
         return self.columns**2
 
 
-_current = Variant()
+_choice = Choice(Variant())
 
 
 def current() -> Variant:
     """What the rasterizer runs on now."""
-    return _current
+    return _choice.value
 
 
-@contextlib.contextmanager
-def use_variant(variant: Variant) -> Iterator[None]:
+def use_variant(variant: Variant) -> AbstractContextManager[None]:
     """Every rasterization on the CPU runs on ``variant`` inside; a gradient must as its forward.
 
     It holds for all threads of the process: autograd may compute gradients on threads of its own.
     On CUDA a call raises ``ValueError`` inside, unless it is the default variant.
     """
-    global _current
-    before, _current = _current, variant
-    try:
-        yield
-    finally:
-        _current = before
+    return _choice.use(variant)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
+
+from ..choice import Choice
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,23 +34,17 @@ class Variant:
             raise ValueError(f"degree is {self.degree}, allowed are 2 to 6")
 
 
-_current = Variant()
+_choice = Choice(Variant())
 
 
 def current() -> Variant:
     """What a scan on the CPU runs on now."""
-    return _current
+    return _choice.value
 
 
-@contextlib.contextmanager
-def use_variant(variant: Variant) -> Iterator[None]:
+def use_variant(variant: Variant) -> AbstractContextManager[None]:
     """Every scan on the CPU runs on ``variant`` inside; a gradient must run inside as its forward.
 
     It holds for all threads of the process: autograd may compute gradients on threads of its own.
     """
-    global _current
-    before, _current = _current, variant
-    try:
-        yield
-    finally:
-        _current = before
+    return _choice.use(variant)

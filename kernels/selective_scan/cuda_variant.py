@@ -7,13 +7,13 @@ twice: first from zero for what it adds, then from its right state.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 import torch
 
+from ..choice import Choice
 from .cuda_blocks import MARK, frame
 
 MOST_PIECES = 256  # the carry between them is serial
@@ -44,21 +44,15 @@ class Variant:
     block: int = 128
 
 
-_forced: Variant | None = None
+_choice: Choice[Variant | None] = Choice(None)
 
 
-@contextlib.contextmanager
-def use_variant(variant: Variant) -> Iterator[None]:
+def use_variant(variant: Variant) -> AbstractContextManager[None]:
     """Every scan on CUDA runs on ``variant`` inside; the gradient, where it runs inside.
 
     It holds for all threads of the process: autograd computes gradients on threads of its own.
     """
-    global _forced
-    before, _forced = _forced, variant
-    try:
-        yield
-    finally:
-        _forced = before
+    return _choice.use(variant)
 
 
 @functools.cache
@@ -106,8 +100,8 @@ def scan_variant(shape: tuple, states: int, groups: int, device: torch.device) -
 
     On a CPU, where only tests run these kernels, the default one without pieces.
     """
-    if _forced is not None:
-        return _forced
+    if _choice.value is not None:
+        return _choice.value
     if device.type != "cuda":
         return Variant()
     index = torch.cuda.current_device() if device.index is None else device.index
