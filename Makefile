@@ -8,7 +8,7 @@ STAMP := $(VENV)/.ready
 
 setup: $(STAMP)
 
-$(STAMP): setup.cfg pyproject.toml gamba_warp/_version.py
+$(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 		{ echo "Python >= 3.10 is needed; set PYTHON=..." >&2; exit 1; }
 	@# Some systems ship Python without ensurepip: virtualenv, from pip, then serves.

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ._version import __version__
+from .versions import __version__
 
 _root = Path(__file__).resolve().parent.parent
 if (_root / "setup.cfg").is_file():  # a checkout: sub-packages sit beside this folder

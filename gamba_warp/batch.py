@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from .errors import UserError
+
+if TYPE_CHECKING:
+    pass
 
 
 def for_each(
@@ -35,3 +39,15 @@ def report(count: int, unit: str, failures: list[tuple[Path, str]], out: Path) -
         print(f"gamba: failed: {path}: {reason}", file=sys.stderr)
     print(f"{count} {unit}s, {len(failures)} failures, results in {out}")
     return 1 if failures else 0
+
+
+def unique_names(paths: Sequence[Path]) -> dict[str, Path]:
+    """A distinct output name for each path: its stem, with a number where stems meet."""
+    names: dict[str, Path] = {}
+    for path in paths:
+        name, number = path.stem, 1
+        while name in names:
+            number += 1
+            name = f"{path.stem}-{number}"
+        names[name] = path
+    return names

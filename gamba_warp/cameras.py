@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-DEFAULT_FOV = 49.1  # degrees, vertical; the released data's camera
-DEFAULT_DISTANCE = 1.5  # of the reference camera from the object's centre, object units
+from .conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
@@ -64,29 +63,11 @@ def from_opengl(camera_to_world: Tensor) -> Tensor:
     return (_FLIP @ inverse).to(camera_to_world.dtype)
 
 
-def to_opengl(viewmats: Tensor) -> Tensor:
-    """Camera-to-world OpenGL matrices from world-to-camera OpenCV ones, both ``[.., 4, 4]``."""
-    return torch.linalg.inv(_FLIP @ viewmats.double()).to(viewmats.dtype)
-
-
 def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
     """``[4, 4]`` float32: the reference camera in its own frame, looking at the origin along +z."""
     viewmat = torch.eye(4)
     viewmat[2, 3] = distance
     return viewmat
-
-
-def reference_cameras(count: int, size: int, fov: float, distance: float) -> Cameras:
-    """``count`` times the camera that a model's square picture is seen by.
-
-    Args:
-        count: of the cameras, ``[count]``.
-        size: pixels.
-        fov: degrees.
-        distance: object units.
-    """
-    viewmats = reference_viewmat(distance).repeat(count, 1, 1)
-    return Cameras(viewmats, intrinsics(size, size, fov).repeat(count, 1, 1), size, size)
 
 
 def orbit(

@@ -6,26 +6,53 @@ import importlib
 import os
 import sys
 
-from ._version import __version__
 from .errors import UserError
+from .versions import __version__
 
 # command (one or two words) -> ("module:function", one line of help). Modules load when called.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("gamba_warp.demo:demo_command", "Train, reconstruct and evaluate on the starter set."),
-    "reconstruct": ("gamba_warp.reconstruct:reconstruct_command", "Pictures to 3D Gaussians."),
-    "train": ("gamba_warp.train.__main__:train_command", "Train a model on posed views."),
-    "fit": ("gamba_warp.fit_command:fit_command", "Posed views of an object to 3D Gaussians."),
+    "demo": (
+        "gamba_warp.commands.demo:demo_command",
+        "Train, reconstruct and evaluate on the starter set.",
+    ),
+    "reconstruct": (
+        "gamba_warp.commands.reconstruct:reconstruct_command",
+        "Pictures to 3D Gaussians.",
+    ),
+    "train": ("gamba_warp.train.command:train_command", "Train a model on posed views."),
+    "fit": ("gamba_warp.commands.fit:fit_command", "Posed views of an object to 3D Gaussians."),
     "data furniture": ("gamba_warp.train.data.furniture:furniture_command", "Get 820 models."),
     "data render": ("gamba_warp.train.data.render:render_command", "Meshes to posed views."),
-    "eval-views": ("gamba_warp.eval.views:eval_views_command", "PSNR, SSIM, LPIPS of views."),
-    "eval-geometry": ("gamba_warp.eval.geometry:eval_geometry_command", "Chamfer, IoU, F-score."),
-    "export": ("gamba_warp.export:export_command", "Gaussians to meshes, splats and pages."),
-    "view": ("gamba_warp.view:view_command", "Gaussians in the browser."),
-    "bench": ("gamba_warp.bench:bench_command", "Run time against error, on this machine."),
-    "stress": ("gamba_warp.stress:stress_command", "Random hostile cases against float64."),
-    "gpu-check": ("gamba_warp.gpu_check:gpu_check_command", "Test and measure on a CUDA machine."),
-    "weights lpips": ("gamba_warp.lpips:weights_command", "Fetch the LPIPS-VGG weights."),
-    "doctor": ("gamba_warp.doctor:doctor_command", "Say what this machine can run."),
+    "eval-views": (
+        "gamba_warp.eval.views.command:eval_views_command",
+        "PSNR, SSIM, LPIPS of views.",
+    ),
+    "eval-geometry": (
+        "gamba_warp.eval.shapes.command:eval_geometry_command",
+        "Chamfer, IoU, F-score.",
+    ),
+    "export": (
+        "gamba_warp.commands.export:export_command",
+        "Gaussians to meshes, splats and pages.",
+    ),
+    "view": ("gamba_warp.commands.view:view_command", "Gaussians in the browser."),
+    "bench": (
+        "gamba_warp.commands.bench:bench_command",
+        "Run time against error, on this machine.",
+    ),
+    "stress": (
+        "gamba_warp.commands.stress:stress_command",
+        "Random hostile cases against float64.",
+    ),
+    "gpu-check": (
+        "gamba_warp.gpu_check.check:gpu_check_command",
+        "Test and measure on a CUDA machine.",
+    ),
+    "weights lpips": (
+        "gamba_warp.commands.weights:weights_command",
+        "Fetch the LPIPS-VGG weights.",
+    ),
+    "doctor": ("gamba_warp.commands.doctor:doctor_command", "Say what this machine can run."),
 }
 
 

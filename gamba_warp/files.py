@@ -1,5 +1,6 @@
 """Atomic writes: a file is either whole or not there."""
 
+import hashlib
 import json
 import os
 import tempfile
@@ -8,6 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from .errors import UserError
+
+# The folder of a checkout: of this package, tests/ and starter/. An installed package has neither.
+CHECKOUT = Path(__file__).resolve().parent.parent
 
 
 @contextmanager
@@ -61,3 +65,29 @@ def output_folder(path: str | Path) -> Path:
     except OSError as error:
         raise UserError(f"cannot write into {path}: {error.strerror}") from error
     return path
+
+
+def sha256(path: str | Path) -> str:
+    """The SHA-256 of a file, 64 hexadecimal digits.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except AttributeError:  # Python 3.10 has no file_digest
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from error
+
+
+def check_sha256(path: str | Path, want: str) -> None:
+    """Compares a file's SHA-256, or as many of its leading digits as ``want`` has.
+
+    Raises:
+        UserError: the file cannot be read or has another content.
+    """
+    got = sha256(path)
+    if not got.startswith(want):
+        raise UserError(f"{path}: SHA-256 is {got[: len(want)]}, expected {want}")

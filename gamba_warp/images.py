@@ -1,12 +1,17 @@
 """Reading and writing pictures: any common file to float RGBA, with errors that name the file."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from .errors import UserError
 from .files import atomic_path
+
+if TYPE_CHECKING:
+    pass
 
 MAX_PIXELS = 64 * 1024 * 1024
 
@@ -87,3 +92,33 @@ def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
         pixels = pixels[..., 0]
     with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, **options)
+
+
+PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
+
+
+def find_pictures(images: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
+    """Resolves files and folders to picture files.
+
+    Args:
+        images: files are taken as they are; of a folder, the files in it that have a picture's
+            suffix, sorted, without sub-folders.
+
+    Returns:
+        The files, each once, and the folders that hold none with the reason.
+    """
+    pictures: dict[Path, None] = {}
+    failures = []
+    for path in images:
+        if not path.is_dir():
+            pictures[path] = None
+            continue
+        try:
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+        except OSError as error:
+            failures.append((path, error.strerror))
+            continue
+        pictures.update(dict.fromkeys(inside))
+        if not inside:
+            failures.append((path, "the folder holds no pictures"))
+    return list(pictures), failures

@@ -8,9 +8,9 @@ from functools import partial
 import torch
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
-from gamba_warp.config import PRESETS
 from gamba_warp.kernels.bench import Case, Settings, Target, Variant
-from gamba_warp.model import Gamba
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.gamba import Gamba
 
 from .batches import Batch
 from .config import LossConfig, OptimConfig

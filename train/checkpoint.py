@@ -18,10 +18,11 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 
-from gamba_warp.config import GambaConfig
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json
-from gamba_warp.model import Gamba, save_model
+from gamba_warp.model.checkpoint import save_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
 
 _NAME = re.compile(r"step_(\d+)")
 _TEMPORARY = ".partial-"

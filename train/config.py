@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from gamba_warp.config import PRESETS, GambaConfig
 from gamba_warp.errors import UserError
+from gamba_warp.model.config import PRESETS, GambaConfig
 
 
 @dataclass(frozen=True, kw_only=True)

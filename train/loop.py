@@ -15,18 +15,16 @@ from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
-from gamba_warp.model import Gamba, save_model
+from gamba_warp.model.checkpoint import save_model
+from gamba_warp.model.gamba import Gamba
 
-from .batches import BatchSource, Prefetcher, fixed_batches
+from .batches import BatchSource, Prefetcher, TrainingData, fixed_batches
 from .checkpoint import load_weights, read_state, save_checkpoint
 from .config import TrainConfig, config_differences
 from .ddp import World
 from .log import RunLog, save_strip
-from .optim import Ema, build_optimizer
-from .prepare import TrainingData
-from .schedule import learning_rate, novel_views, radial_weight
-from .step import collapse_reason, forward, health
-from .validate import validate
+from .optim import Ema, build_optimizer, learning_rate, novel_views, radial_weight
+from .step import collapse_reason, forward, health, validate
 
 STATE_VERSION = 1
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import over_background
+from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 
 from .batches import Batch
@@ -106,3 +107,47 @@ def collapse_reason(figures: Mapping[str, float]) -> str | None:
     if figures["spread"] < 0.01:
         return f"the Gaussians sit in one point (spread {figures['spread']:.2g})"
     return None
+
+
+STRIP_VIEWS, STRIP_OBJECTS = 6, 4
+
+
+@torch.no_grad()
+def validate(
+    model: Gamba,
+    batches: Iterable[Batch],
+    weights: Mapping[str, float],
+    lpips: Callable[[Tensor, Tensor], Tensor] | None,
+    device: torch.device,
+) -> tuple[dict[str, float], list[Tensor]]:
+    """Means over objects, in float32, on white.
+
+    Args:
+        model: switched to eval mode, and back.
+        batches: one object each, the input view first.
+        weights: of the loss terms.
+        lpips: as ``forward``.
+        device: the model's.
+
+    Returns:
+        ``loss``, ``psnr_input`` and ``psnr_novel`` (mean over views, then over objects, whole
+        picture, dB; ``psnr_novel`` is left out where there are no novel views); and rows
+        ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the first objects.
+    """
+    was_training = model.training
+    model.eval()
+    sums: dict[str, list[float]] = {}
+    rows: list[Tensor] = []
+    for batch in batches:
+        batch = batch.to(device)
+        result = forward(model, batch, weights, lpips)
+        quality = psnr(result.rendering.rgb, result.target)[0]
+        figures = {"loss": result.loss.item(), "psnr_input": quality[0].item()}
+        if len(quality) > 1:
+            figures["psnr_novel"] = quality[1:].mean().item()
+        for name, value in figures.items():
+            sums.setdefault(name, []).append(value)
+        if len(rows) < 2 * STRIP_OBJECTS:
+            rows += [result.target[0, :STRIP_VIEWS], result.rendering.rgb[0, :STRIP_VIEWS]]
+    model.train(was_training)
+    return {name: sum(values) / len(values) for name, values in sums.items()}, rows

@@ -1,7 +1,7 @@
 """Run time against error: what is measured, and how. ``gamba bench`` runs it."""
 
-from .case import LEVELS, Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
-from .measure import FORMAT, measure
+from .core.case import LEVELS, Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
+from .core.measure import FORMAT, measure
 
 __all__ = [
     "FORMAT",

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .case import NotInstalled
+from .core.case import NotInstalled
 
 PACKAGES = ("mambapy", "mamba-ssm", "causal-conv1d", "gsplat", "gswarp")
 

@@ -10,7 +10,7 @@ import functools
 import warp as wp
 from torch import Tensor
 
-from ..interop import parallel_launch
+from ..runtime.launch import parallel_launch
 
 LANES = STATES = 16
 _LOG2E = 1.4426950408889634

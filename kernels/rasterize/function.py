@@ -7,15 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-from ..constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
-from .bin import Bins
 from .checks import check_inputs
-from .cpu_variant import current
-from .frame import Walk
+from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
+from .cpu.tuning import current
 from .harmonics import colors_from_harmonics
 from .meta import Meta
 from .ops import bin_op, composite, project
 from .skip import Skip
+from .tiles import Bins, Walk
 
 EVERYTHING = Skip()
 _DEPTH_EPS = 1e-10  # alpha below this has no expected depth

@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor
 
-from .bin import Bins
-from .frame import Walk
 from .project import STATUS_NAMES
+from .tiles import Bins, Walk
 
 
 class Meta(dict):

@@ -4,19 +4,29 @@ They hold no arithmetic: each calls the launchers of its file. ``function.py`` j
 """
 
 import torch
+import warp as wp
 from torch import Tensor
 
-from . import composite_cpu, composite_cuda
-from .bin import Bins, bin_gaussians
-from .cpu_variant import Variant, current
-from .frame import Walk, make_frame
+from ..runtime.views import vectors
+from .cpu import bin as bin_cpu
+from .cpu import composite as composite_cpu
+from .cpu.tuning import Variant, current
+from .cuda import bin as bin_cuda
+from .cuda import composite as composite_cuda
 from .project import make_lens, project_forward
 from .project_vjp import project_backward
 from .reduce import reduce_pairs
 from .skip import UNASKED
-from .tiles import tile_grid
+from .tiles import (
+    Bins,
+    Walk,
+    make_frame,
+    make_grid,
+    tile_grid,
+)
 
 _OP = "gamba_warp::rasterize_"
+MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 
 
 def _compositor(device: torch.device):
@@ -97,6 +107,57 @@ def _project_backward(ctx, v_means2d, v_conics, v_depths, v_view_opacities, _ext
 
 
 project.register_autograd(_project_backward, setup_context=_project_setup)
+
+
+def bin_gaussians(
+    means2d: Tensor,
+    conics: Tensor,
+    depths: Tensor,
+    view_opacities: Tensor,
+    extents: Tensor,
+    width: int,
+    height: int,
+    alpha_min: float,
+    skip: int,
+) -> Bins:
+    """Makes the tile lists of all views; reads the number of pairs back (the one synchronisation).
+
+    Args:
+        means2d: ``[I, N, 2]``, and so on as ``project_forward`` returns them, with I = B * V.
+        conics: ``[I, N, 3]``.
+        depths: ``[I, N]``.
+        view_opacities: ``[I, N]``.
+        extents: ``[I, N, 2]``, zero where culled.
+        width: pixels.
+        height: pixels.
+        alpha_min: what is fainter than this is not drawn.
+        skip: from ``Skip.bits``.
+
+    Raises:
+        ValueError: there are more than 2^31 - 1 pairs, or more tiles.
+    """
+    images, num = depths.shape
+    tiles_x, tiles_y = tile_grid(width, height)
+    tiles = images * tiles_x * tiles_y
+    if max(tiles, depths.numel()) >= MAX_PAIRS:
+        raise ValueError(f"{images} views of {tiles_x * tiles_y} tiles, {num} Gaussians: over 2^31")
+    grid = make_grid(num, width, height, alpha_min, skip)
+    inputs = [
+        vectors(means2d, wp.vec2),
+        vectors(conics, wp.vec3),
+        view_opacities.view(-1),
+        vectors(extents, wp.vec2),
+    ]
+    bin_views = (bin_cpu if depths.device.type == "cpu" else bin_cuda).bin_views
+    return Bins(*bin_views(grid, depths, inputs, _refuse_too_many))
+
+
+def _refuse_too_many(pairs: int) -> None:
+    if pairs > MAX_PAIRS:
+        raise ValueError(
+            f"{pairs} pairs of tiles and Gaussians; at most 2^31 - 1 fit: fewer views, a smaller "
+            "picture or smaller scales are needed"
+        )
 
 
 @torch.library.custom_op(_OP + "bin", mutates_args=())

@@ -7,8 +7,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ..constants import COMPENSATION_MIN, FRUSTUM_MARGIN
-from .launch import launch, vectors
+from ..runtime.launch import launch
+from ..runtime.views import vectors
+from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 
 wp.set_module_options({"enable_backward": False})
 

@@ -8,7 +8,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from .launch import launch, vectors
+from ..runtime.launch import launch
+from ..runtime.views import vectors
 from .project import (
     COMPENSATION_FLOOR,
     VISIBLE,

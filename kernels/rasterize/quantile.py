@@ -9,8 +9,9 @@ import math
 import warp as wp
 from torch import Tensor
 
-from ..constants import ALPHA_MAX, ALPHA_MIN, TILE
-from .launch import launch, vectors
+from ..runtime.launch import launch
+from ..runtime.views import vectors
+from .constants import ALPHA_MAX, ALPHA_MIN, TILE
 from .meta import Meta
 from .tiles import tile_grid
 

@@ -3,8 +3,9 @@
 import warp as wp
 from torch import Tensor
 
-from .bin import Bins
-from .launch import launch, vectors
+from ..runtime.launch import launch
+from ..runtime.views import vectors
+from .tiles import Bins
 
 wp.set_module_options({"enable_backward": False})
 

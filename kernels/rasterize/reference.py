@@ -9,14 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..constants import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    COMPENSATION_MIN,
-    EPS2D,
-    FRUSTUM_MARGIN,
-    T_MIN,
-)
+from .constants import ALPHA_MAX, ALPHA_MIN, COMPENSATION_MIN, EPS2D, FRUSTUM_MARGIN, T_MIN
 
 _CHUNK = 4096  # pixels at once
 

@@ -3,9 +3,12 @@
 README.md §2 proves the test. Counting and writing call the same functions.
 """
 
-import warp as wp
+from typing import NamedTuple
 
-from .cpu_variant import current
+import warp as wp
+from torch import Tensor
+
+from .cpu.tuning import current
 from .skip import TILE_TEST
 
 wp.set_module_options({"enable_backward": False})
@@ -130,3 +133,88 @@ def box_pairs(grid: Grid, mean: wp.vec2, extent: wp.vec2) -> wp.int64:
     rows = tile_rows(grid, mean[1], extent[1])
     columns = _box_columns(grid, mean[0], extent[0])
     return wp.int64(rows[1] - rows[0] + 1) * wp.int64(columns[1] - columns[0] + 1)
+
+
+class Bins(NamedTuple):
+    """P pairs of I views; everything int32.
+
+    Attributes:
+        order: ``[I * N]`` view-major Gaussian indices, front to back within each view.
+        offsets: ``[I * N + 1]`` where the pairs of ``order[j]`` begin, in emission order.
+        pairs: ``[P]`` view-major Gaussian index of each pair, in tile order.
+        rows: ``[P]`` emission number of each pair, in tile order.
+        starts: ``[I * tiles + 1]`` where each tile begins in ``pairs``.
+        box_pairs: ``[]`` int64, number of pairs if tiles were tested against boxes only.
+    """
+
+    order: Tensor
+    offsets: Tensor
+    pairs: Tensor
+    rows: Tensor
+    starts: Tensor
+    box_pairs: Tensor
+
+
+@wp.struct
+class Frame:
+    """Per launch: picture and list sizes."""
+
+    width: wp.int32
+    height: wp.int32
+    tiles_x: wp.int32
+    tiles_y: wp.int32
+    views: wp.int32
+    num: wp.int32
+    colors_per_view: wp.int32
+    alpha_min: wp.float32
+    alpha_max: wp.float32
+    t_min: wp.float32
+    skip: wp.int32
+
+
+@wp.func
+def color_row(frame: Frame, g: int) -> int:
+    # of view-major Gaussian g; shared colours have one row per object
+    row = g
+    if frame.colors_per_view == 0:
+        row = g // (frame.views * frame.num) * frame.num + g % frame.num
+    return row
+
+
+class Walk(NamedTuple):
+    """What forward leaves for backward, by tiles and blocks.
+
+    Attributes:
+        transmittances: ``[tiles * 16, 16]`` final T; negative where the pixel stopped early.
+        stops: ``[tiles * 16, 16]`` int32, the pair at which the pixel stopped.
+        blocks: ``[P]`` int32, one bit per 4 x 4 block to which the pair contributed.
+        walked: ``[tiles]`` int32, pairs walked until every pixel had stopped.
+        blocks_walked: ``[tiles]`` int64, blocks evaluated in them.
+    """
+
+    transmittances: Tensor
+    stops: Tensor
+    blocks: Tensor
+    walked: Tensor
+    blocks_walked: Tensor
+
+
+def make_frame(
+    width: int,
+    height: int,
+    views: int,
+    num: int,
+    colors_per_view: bool,
+    alpha_min: float,
+    alpha_max: float,
+    t_min: float,
+    skip: int,
+) -> Frame:
+    """The scalars of a composite launch as one kernel argument."""
+    frame = Frame()
+    frame.width, frame.height = width, height
+    frame.tiles_x, frame.tiles_y = tile_grid(width, height)
+    frame.views, frame.num, frame.colors_per_view = views, num, int(colors_per_view)
+    frame.alpha_min, frame.alpha_max = alpha_min, alpha_max
+    frame.t_min, frame.skip = t_min, skip
+    return frame

@@ -1,18 +1,11 @@
-"""mamba-ssm's and causal-conv1d's own signatures and ``[B, D, L]`` layout over our operators."""
+"""mamba-ssm's own signature and ``[B, D, L]`` layout over our scan."""
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from .conv import causal_conv1d
+from ..runtime.views import tokens_first
 from .function import selective_scan
-
-
-def _tokens(x: Tensor | None, name: str) -> Tensor | None:
-    if isinstance(x, Tensor) and x.dim() != 3:
-        raise ValueError(f"{name} has shape {tuple(x.shape)}, must be [B, D, L]")
-    return x.transpose(1, 2) if isinstance(x, Tensor) else x
 
 
 def _input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
@@ -66,7 +59,7 @@ def selective_scan_fn(
     """
     if isinstance(A, Tensor) and A.is_complex():
         raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
-    u = _tokens(u, "u")
+    u = tokens_first(u, "u")
     if not isinstance(u, Tensor):
         raise TypeError(f"u is {type(u).__name__}, must be a tensor")
     tokens = u.transpose(1, 2)
@@ -78,12 +71,12 @@ def selective_scan_fn(
         C = C.float().repeat_interleave(groups // C.shape[2], dim=2)
     result = selective_scan(
         u,
-        _tokens(delta, "delta"),
+        tokens_first(delta, "delta"),
         A,
         B,
         C,
         D,
-        _tokens(z, "z"),
+        tokens_first(z, "z"),
         delta_bias,
         delta_softplus,
         return_last_state=return_last_state,
@@ -91,49 +84,3 @@ def selective_scan_fn(
     if return_last_state:
         return result[0].transpose(1, 2), result[1]
     return result.transpose(1, 2)
-
-
-def causal_conv1d_fn(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    seq_idx: None = None,
-    initial_states: Tensor | None = None,
-    return_final_states: bool = False,
-    final_states_out: Tensor | None = None,
-    activation: str | None = None,
-) -> Tensor | tuple[Tensor, Tensor]:
-    """``causal_conv1d.causal_conv1d_fn``, same arguments and layout.
-
-    Args:
-        x: ``[B, D, L]`` float32, bfloat16 or float16.
-        weight: ``[D, W]``, W from 2 to 4.
-        bias: ``[D]``, or None.
-        seq_idx: must be None.
-        initial_states: ``[B, D, W-1]``, or None.
-        return_final_states: also return ``[B, D, W-1]``.
-        final_states_out: where to write the final states, or None.
-        activation: None, "silu" or "swish".
-
-    Returns:
-        ``[B, D, L]`` in x's dtype, and the final states if asked for.
-
-    Raises:
-        TypeError: as ``causal_conv1d``.
-        ValueError: as ``causal_conv1d``; also for a ``seq_idx``.
-    """
-    if seq_idx is not None:
-        raise ValueError("seq_idx is given; packed sequences are not supported")
-    out, final = causal_conv1d(
-        _tokens(x, "x"),
-        weight,
-        bias,
-        activation=activation,
-        initial_state=_tokens(initial_states, "initial_states"),
-        return_final_state=True,
-    )
-    out, final = out.transpose(1, 2), final.transpose(1, 2)
-    if final_states_out is not None:
-        with torch.no_grad():
-            final_states_out.copy_(final)
-    return (out, final) if return_final_states else out

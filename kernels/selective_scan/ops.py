@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from . import cpu
+from .cpu import launch as cpu
 
 
 def _implementation(tensor: Tensor):
     if tensor.device.type == "cpu":
         return cpu
-    from . import cuda
+    from .cuda import launch as cuda
 
     return cuda
 

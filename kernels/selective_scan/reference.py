@@ -1,8 +1,4 @@
-"""The selective scan, the convolution and their states as plain torch loops, for belief.
-
-They run in the dtype they are given (float64 for an oracle), are differentiable by autograd, and
-share nothing with the kernels.
-"""
+"""The oracle: the selective scan as a plain torch loop, in any float dtype."""
 
 from __future__ import annotations
 
@@ -64,24 +60,3 @@ def selective_scan_reference(
     if z is not None:
         y = y * F.silu(z)
     return y, h
-
-
-def causal_conv1d_reference(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
-    initial_state: Tensor | None = None,
-    activation: str | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Depthwise causal convolution, channels last. Returns (out, final state [B, W-1, D])."""
-    width = weight.shape[1]
-    if initial_state is None:
-        initial_state = x.new_zeros(x.shape[0], width - 1, x.shape[2])
-    padded = torch.cat([initial_state, x], 1)
-    length = x.shape[1]
-    out = sum(weight[:, k] * padded[:, k : k + length] for k in range(width))
-    if bias is not None:
-        out = out + bias
-    if activation is not None:
-        out = F.silu(out)
-    return out, padded[:, padded.shape[1] - (width - 1) :]

@@ -1,7 +1,7 @@
 """Random and hostile cases of the operators, each against float64. ``gamba stress`` runs it."""
 
-from .case import DTYPES, Case, Comparison, Op, Outcome, generator, judge, run_case
-from .report import (
+from .core.case import DTYPES, Case, Comparison, Op, Outcome, generator, judge, run_case
+from .core.report import (
     FORMAT,
     document,
     failure_text,
@@ -10,7 +10,7 @@ from .report import (
     reproducer,
     table,
 )
-from .runner import Row, Tally, draw_cases, run_cases, shrink
+from .core.runner import Row, Tally, draw_cases, run_cases, shrink
 
 __all__ = [
     "DTYPES",

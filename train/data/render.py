@@ -1,4 +1,4 @@
-"""`gamba data render`: mesh files to posed RGBA views, as ``gamba_warp.dataset`` reads them.
+"""`gamba data render`: mesh files to posed RGBA views, as ``gamba_warp.data.dataset`` reads them.
 
 The world of the views is z-up, the object's bounding box is centred in it, its longest side is 1.
 ``applied_transform`` and ``applied_scale`` in ``transforms.json`` say how the file's points got
@@ -25,13 +25,14 @@ import tyro
 from PIL import Image
 from tqdm import tqdm
 
-from gamba_warp.cameras import DEFAULT_FOV, intrinsics
-from gamba_warp.dataset import write_split
+from gamba_warp.cameras import intrinsics
+from gamba_warp.conventions import DEFAULT_FOV
+from gamba_warp.data.dataset import write_split
+from gamba_warp.data.layouts import read_json
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
+from gamba_warp.formats.meshes import SUFFIXES, default_up, load_mesh
 from gamba_warp.images import to_uint8
-from gamba_warp.layouts import read_json
-from gamba_warp.meshes import SUFFIXES, default_up, load_mesh
 
 from .poses import sample_poses
 from .raycast import Lights, RayCaster

@@ -2,8 +2,9 @@
 
 ``gamba data furniture --out FURNITURE``, then
 ``python -m gamba_warp.train.data.starter FURNITURE --out starter``. The same call makes the same
-files again. The split is that of the whole furniture set (by group, see ``gamba_warp.dataset``), so
-nothing that is held out here is trained on there.
+files again. The split is that of the whole furniture set (by group, see
+``gamba_warp.data.dataset``),
+so nothing that is held out here is trained on there.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from pathlib import Path
 import tyro
 from tqdm import tqdm
 
-from gamba_warp.cameras import DEFAULT_FOV
-from gamba_warp.dataset import split_of, write_split
+from gamba_warp.conventions import DEFAULT_FOV
+from gamba_warp.data.dataset import split_of, write_split
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, output_folder
+from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import load_rgba
-from gamba_warp.meshes import default_up, load_mesh
 
 from .render import Mesh, Settings, find_meshes, render_object
 

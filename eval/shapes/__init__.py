@@ -1,0 +1,1 @@
+"""Shapes against true ones: ``gamba eval-geometry``."""

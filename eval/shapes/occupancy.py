@@ -1,0 +1,220 @@
+"""Which voxels a mesh fills, for meshes that are not closed as well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gamba_warp.cameras import fibonacci_sphere
+
+from .shape import Mesh, merged
+
+VOTERS = 26
+
+
+@dataclass
+class Grid:
+    """Points of a regular grid.
+
+    Attributes:
+        origin: ``[3]`` the first point.
+        step: distance of neighbours.
+        shape: points along x, y, z.
+    """
+
+    origin: np.ndarray
+    step: float
+    shape: tuple[int, int, int]
+
+    def points(self) -> np.ndarray:
+        """``[X, Y, Z, 3]`` float32."""
+        axes = [self.origin[k] + self.step * np.arange(self.shape[k]) for k in range(3)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
+
+
+def grid_around(*meshes: Mesh, resolution: int) -> Grid:
+    """Voxel centres around several meshes, with one empty voxel on each side.
+
+    Voxel faces lie on multiples of their side, so the grid does not depend on the meshes' extents
+    as long as they fit into a cube of side 2; around larger ones the voxels grow with them.
+
+    Args:
+        meshes: at least one.
+        resolution: voxels a unit of length.
+    """
+    low = np.min([mesh.vertices.min(0) for mesh in meshes], axis=0)
+    high = np.max([mesh.vertices.max(0) for mesh in meshes], axis=0)
+    step = max(1.0, (high - low).max() / 2) / resolution
+    first = np.floor(low / step).astype(int) - 1
+    last = np.ceil(high / step).astype(int) + 1
+    return Grid((first + 0.5) * step, step, tuple(int(n) for n in last - first))
+
+
+def syncdreamer_grid(size: int = 64) -> Grid:
+    """The lattice of mesh2sdf: ``size`` points a side from -1 in steps of 2 / size."""
+    return Grid(np.full(3, -1.0), 2.0 / size, (size, size, size))
+
+
+def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
+    inside = enclosed(mesh, grid)
+    parts = [part for part in connected_parts(mesh) if not part.is_closed()]
+    if parts:
+        inside |= majority(mesh, grid)
+    if len(parts) > 1 or (parts and len(parts[0].faces) < len(mesh.faces)):
+        points = grid.points()
+        for part in parts:  # nowhere else than in its box can more than half of the rays cross it
+            low, high = part.vertices.min(0), part.vertices.max(0)
+            first = np.maximum(np.ceil((low - grid.origin) / grid.step).astype(int), 0)
+            last = np.floor((high - grid.origin) / grid.step).astype(int) + 1
+            if (last > first).all() and not _is_flat(part):
+                box = tuple(slice(i, j) for i, j in zip(first, last))
+                inside[box] |= _majority_at(part, points[box])
+    return inside
+
+
+def joint(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
+    inside = enclosed(mesh, grid)
+    return inside if mesh.is_closed() else inside | majority(mesh, grid)
+
+
+def majority(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool. See ``RULES``."""
+    return _majority_at(mesh, grid.points())
+
+
+def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool, what mesh2sdf does without its repair. See ``RULES``."""
+    return _crossings(mesh.scene(), grid.points(), np.array([-1.0, 0, 0])) % 2 == 1
+
+
+def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool. See ``RULES``.
+
+    The generalised winding number (Jacobson et al. 2013) is the mean, over all directions, of the
+    signed crossings of a ray; here over the directions of ``majority``.
+    """
+    scene, points = mesh.scene(), grid.points().reshape(-1, 3)
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros(len(points))
+    for direction in directions():
+        found = scene.list_intersections(_rays(points, direction))
+        ray, face = (found[key].numpy().astype(np.int64) for key in ("ray_ids", "primitive_ids"))
+        total += np.bincount(ray, np.sign(normals @ direction)[face], len(points))
+    return (2 * np.abs(total) > VOTERS).reshape(grid.shape)
+
+
+def _rays(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    return np.concatenate([points, np.broadcast_to(direction.astype(np.float32), points.shape)], -1)
+
+
+def _crossings(scene, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    return scene.count_intersections(_rays(points, direction)).numpy()
+
+
+def _majority_at(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    scene = mesh.scene()
+    votes = np.zeros(points.shape[:-1], np.int32)
+    for direction in directions():
+        votes += _crossings(scene, points, direction) % 2
+    return 2 * votes > VOTERS
+
+
+def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Occupancy ``[X, Y, Z]`` bool; the grid's border must be outside. See ``RULES``."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    scene, points = mesh.scene(), grid.points()
+    number = np.arange(points[..., 0].size).reshape(grid.shape)
+    starts, ends = [], []
+    for axis in range(3):
+        cut = [slice(None)] * 3
+        cut[axis] = slice(None, -1)
+        origins = points[tuple(cut)]
+        step = np.zeros_like(origins)
+        step[..., axis] = grid.step
+        blocked = scene.test_occlusions(np.concatenate([origins, step], -1), 0.0, 1.0).numpy()
+        neighbours = np.roll(number, -1, axis)[tuple(cut)]
+        starts.append(number[tuple(cut)][~blocked])
+        ends.append(neighbours[~blocked])
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    links = coo_array((np.ones(len(start), bool), (start, end)), shape=(number.size, number.size))
+    labels = connected_components(links, directed=False)[1].reshape(grid.shape)
+    border = np.ones(grid.shape, bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    return ~np.isin(labels, np.unique(labels[border]))
+
+
+def _is_flat(part: Mesh) -> bool:
+    """Whether all faces of a connected part lie in one plane, which bounds nothing."""
+    corners = part.vertices[part.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return bool(np.abs(np.cross(normals, normals[0])).max() < 1e-6)
+
+
+def directions() -> np.ndarray:
+    """``[VOTERS, 3]`` in opposite pairs, so that a flat sheet never gets more than half."""
+    half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
+    return np.concatenate([half, -half])
+
+
+def connected_parts(mesh: Mesh) -> list[Mesh]:
+    """The mesh in parts that share no edge, vertices at one place taken as one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    vertices, index = merged(mesh.vertices)
+    faces = index[mesh.faces]
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edge = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)[1].reshape(-1)
+    face, size = np.repeat(np.arange(len(faces)), 3), len(faces) + edge.max() + 1
+    links = coo_array((np.ones(len(face), bool), (face, len(faces) + edge)), shape=(size, size))
+    label = connected_components(links, directed=False)[1][: len(faces)]
+    order = np.argsort(label, kind="stable")
+    parts = []
+    for ids in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        used, corners = np.unique(faces[ids], return_inverse=True)
+        parts.append(Mesh(vertices[used], corners.reshape(-1, 3)))
+    return parts
+
+
+_RAYS = f"{VOTERS} rays, in {VOTERS // 2} fixed directions and their opposites,"
+ENCLOSED = (
+    "a voxel is outside if its centre can be reached from the grid's border by steps between the "
+    "centres of face neighbours that do not cross the surface; so closed cavities are filled and "
+    "parts may overlap"
+)
+Rule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
+RULES: dict[Rule, tuple[str, Callable[[Mesh, Grid], np.ndarray]]] = {
+    "solid": (
+        f"{ENCLOSED}. Where a part (faces joined by edges) is open, a voxel is also inside if more "
+        f"than half of {_RAYS} cross an odd number of times the whole mesh, or one open part alone",
+        solid,
+    ),
+    "joint": (
+        f"{ENCLOSED}. If the mesh is open, a voxel is also inside if more than half of {_RAYS} "
+        "cross it an odd number of times",
+        joint,
+    ),
+    "enclosed": (ENCLOSED, enclosed),
+    "majority": (
+        f"a point is inside if more than half of {_RAYS} cross the surface an odd number of times",
+        majority,
+    ),
+    "winding": (
+        "a point is inside if its generalised winding number, estimated by the signed crossings "
+        f"of {_RAYS} is over 1/2 or under -1/2",
+        winding,
+    ),
+    "parity": (
+        "a point is inside if a ray along -x crosses the surface an odd number of times",
+        parity,
+    ),
+}

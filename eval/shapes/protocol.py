@@ -1,0 +1,218 @@
+"""What the numbers of ``eval-geometry`` mean: the protocol, its presets and its JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import types
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from gamba_warp.conventions import DEFAULT_DISTANCE
+from gamba_warp.errors import UserError
+from gamba_warp.surfaces.extract import SurfaceOptions
+
+from .occupancy import RULES, Rule
+
+VERSION = 2  # goes up whenever the same protocol would give other numbers
+
+Align = Literal["none", "scale", "icp"]
+Frame = Literal["gt", "unit", "reference"]
+Up = Literal["auto", "y", "z"]
+PointRule = Literal["area", "views"]
+GridRule = Literal["around", "lattice"]
+
+POINTS: dict[PointRule, str] = {
+    "area": "area-uniform on the whole surface, inner faces included; faces given twice and faces "
+    "without area do not count; of a point cloud a random draw without repetition, all where it "
+    "has no more",
+    "views": "depth maps of 16 cameras (256 pixels, focal length 280, distance 1.5, elevation "
+    "30 degrees, azimuths 22.5 apart) back-projected, one mean point a voxel of 0.01; of a point "
+    "cloud as 'area'",
+}
+GRIDS: dict[GridRule, str] = {
+    "around": "voxels around both shapes, 'iou_voxels' a unit, faces on multiples of their side; "
+    "larger where the longest side of both together would have more than twice as many",
+    "lattice": "64 points a side from -1 in steps of 1/32",
+}
+DEFINITIONS = {
+    "normalization": "truth centred on its bounding box, longest side 1, turned to z-up",
+    "chamfer": "mean of the two mean nearest distances between points, not squared",
+    "chamfer_squared": "mean of the two mean squared nearest distances",
+    "accuracy": "mean nearest distance from predicted to true points",
+    "completeness": "mean nearest distance from true to predicted points",
+    "hausdorff": "largest nearest distance, of either way, between the points",
+    "fscore": "harmonic mean of the shares of predicted and of true points within the threshold",
+    "normal_consistency": "mean absolute cosine at nearest points, mean of both ways",
+    "noise_floor": "chamfer between two samples of the truth itself; of a point cloud between two "
+    "halves that share no point",
+}
+
+
+@dataclass(frozen=True)
+class GeometryProtocol:
+    """All that decides a number of ``eval-geometry``. Lengths: the truth's longest side is 1.
+
+    Attributes:
+        name: of the preset, or whatever a file says.
+        points: how points are put on surfaces, one of ``POINTS``.
+        num_points: a shape (for "area", and for point clouds).
+        seed: of the random points; predicted and true points have different seeds.
+        thresholds: of the F-score.
+        occupancy: rule of the Volume IoU, one of ``occupancy.RULES``.
+        grid: of the Volume IoU, one of ``GRIDS``.
+        iou_voxels: its voxels a unit, for "around".
+        align: of predictions with the truth; anything but none makes the numbers another protocol.
+        frame: in which frame predictions are (see the command).
+        up: axis of the truth's files.
+        reference: index of the input view, for the frame "reference".
+        distance: of the input camera in the model's world, for the frame "reference".
+        strict: shapes that are not manifold, cut themselves, are turned inside out or have
+            degenerate or doubled faces count as failures.
+        surface: how Gaussians become a surface.
+    """
+
+    name: str = "default"
+    points: PointRule = "area"
+    num_points: int = 100_000
+    seed: int = 0
+    thresholds: tuple[float, ...] = (0.01, 0.02, 0.05)
+    occupancy: Rule = "solid"
+    grid: GridRule = "around"
+    iou_voxels: int = 64
+    align: Align = "none"
+    frame: Frame = "gt"
+    up: Up = "auto"
+    reference: int = 0
+    distance: float = DEFAULT_DISTANCE
+    strict: bool = False
+    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+
+    def definitions(self) -> dict[str, str]:
+        """The words for the names: rules chosen, and what each metric is."""
+        return {
+            "points": POINTS[self.points],
+            "occupancy": RULES[self.occupancy][0],
+            "grid": GRIDS[self.grid],
+            **DEFINITIONS,
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """For a report; ``read_protocol`` reads it back."""
+        values = asdict(self) | {"thresholds": list(self.thresholds)}
+        return {"version": VERSION, **values, "definitions": self.definitions()}
+
+    def changes(self) -> list[str]:
+        """Names of the fields that differ from the preset of its name (from default without)."""
+        preset = asdict(PRESETS.get(self.name, PRESETS["default"]))
+        mine = asdict(self)
+        changed = [key for key in mine if mine[key] != preset[key] and key not in ("name",)]
+        nested = [k for k, v in mine["surface"].items() if v != preset["surface"][k]]
+        return [key for key in changed if key != "surface"] + [f"surface.{k}" for k in nested]
+
+
+PRESETS = {
+    "default": GeometryProtocol(),
+    "syncdreamer": GeometryProtocol(
+        name="syncdreamer", points="views", occupancy="parity", grid="lattice", iou_voxels=32
+    ),
+}
+
+
+def checked(protocol: GeometryProtocol, where: str) -> GeometryProtocol:
+    """Returns the protocol.
+
+    Args:
+        protocol: any.
+        where: names the file or option in errors.
+
+    Raises:
+        UserError: a number is out of its range.
+    """
+    surface = protocol.surface
+    least = {
+        "num_points": (protocol.num_points, 1),
+        "iou_voxels": (protocol.iou_voxels, 8),
+        "seed": (protocol.seed, 0),
+        "reference": (protocol.reference, 0),
+        **{f"surface.{k}": (getattr(surface, k), 8) for k in ("voxels", "views", "pixels")},
+    }
+    for name, (value, bound) in least.items():
+        if not bound <= value < 2**31:
+            raise UserError(f"{where}: {name} is {value}, must be at least {bound}")
+    if not (math.isfinite(protocol.distance) and protocol.distance > 0):
+        raise UserError(f"{where}: distance is {protocol.distance}, must be above 0")
+    if not protocol.thresholds or not all(0 < t < math.inf for t in protocol.thresholds):
+        raise UserError(f"{where}: thresholds must be numbers above 0, at least one")
+    return protocol
+
+
+def read_protocol(choice: str) -> GeometryProtocol:
+    """A preset by its name, or a JSON file: a protocol, or a report that holds one.
+
+    Fields that a file leaves out are those of the preset that its ``name`` gives, or of default.
+
+    Raises:
+        UserError: neither a preset nor a readable file; an unknown field, a value of the wrong type
+            or out of its range, or another version.
+    """
+    if choice in PRESETS:
+        return PRESETS[choice]
+    path = Path(choice)
+    if not path.is_file():
+        raise UserError(f"--protocol {choice}: neither {', '.join(PRESETS)} nor a file")
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not a protocol, not JSON ({error})") from error
+    if isinstance(value, dict) and isinstance(value.get("protocol"), dict):
+        value = value["protocol"]
+    if not isinstance(value, dict):
+        raise UserError(f"{path}: not a protocol, which is a JSON object")
+    value = dict(value)
+    version, words = value.pop("version", VERSION), value.pop("definitions", None)
+    if version != VERSION:
+        raise UserError(f"{path}: protocol version {version}, this program has version {VERSION}")
+    base = PRESETS["default"]
+    if isinstance(value.get("name"), str):
+        base = PRESETS.get(value["name"], base)
+    protocol = checked(_filled(base, value, f"{path}: "), str(path))
+    if words is not None and words != protocol.definitions():
+        raise UserError(f"{path}: its definitions are not those of this program's version")
+    return protocol
+
+
+def _filled(base: Any, values: dict[str, Any], where: str) -> Any:
+    """The dataclass ``base`` with the fields of ``values`` in place of its own."""
+    kinds = get_type_hints(type(base))
+    known = {item.name for item in fields(base)}
+    result = {}
+    for name, value in values.items():
+        if name not in known:
+            raise UserError(f"{where}{name} is unknown; known: {', '.join(sorted(known))}")
+        if isinstance(getattr(base, name), SurfaceOptions) and isinstance(value, dict):
+            result[name] = _filled(getattr(base, name), value, f"{where}{name}.")
+        else:
+            result[name] = _typed(kinds[name], value, where + name)
+    return replace(base, **result)
+
+
+def _typed(kind: Any, value: Any, where: str) -> Any:
+    """The value where it is of the kind (tuples come as lists). Raises UserError."""
+    choices = get_args(kind)
+    if get_origin(kind) is Literal:
+        if isinstance(value, str) and value in choices:
+            return value
+        raise UserError(f"{where} is {value!r}, must be one of {', '.join(map(str, choices))}")
+    if get_origin(kind) is tuple and isinstance(value, list):
+        return tuple(_typed(choices[0], item, where) for item in value)
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None and type(None) in choices:
+            return None
+        return _typed(next(c for c in choices if c is not type(None)), value, where)
+    allowed = (int, float) if kind is float else (kind,) if isinstance(kind, type) else ()
+    if isinstance(value, allowed) and (kind is bool or not isinstance(value, bool)):
+        return float(value) if kind is float else value
+    name = "a list" if get_origin(kind) is tuple else getattr(kind, "__name__", "an object")
+    raise UserError(f"{where} is {value!r}, must be of type {name}")

@@ -1,0 +1,80 @@
+"""Points on shapes: drawn at random, or seen by cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gamba_warp.errors import UserError
+from gamba_warp.open3d import import_open3d
+
+from .shape import Mesh, Points
+
+
+def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
+    """Points on a shape: area-uniform on a mesh; of a cloud, ``count`` at most, drawn at random.
+
+    Raises:
+        UserError: the mesh has no area.
+    """
+    if isinstance(shape, Points):
+        if len(shape.positions) <= count:
+            return shape
+        keep = np.random.default_rng(seed).choice(len(shape.positions), count, replace=False)
+        normals = None if shape.normals is None else shape.normals[keep]
+        return Points(shape.positions[keep], normals)
+    o3d = import_open3d()
+    corners = shape.vertices[shape.faces]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    solid = np.linalg.norm(sides, axis=1) > 0
+    if not solid.any():
+        raise UserError("the mesh has no area")
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(shape.vertices),
+        o3d.utility.Vector3iVector(shape.faces[solid].astype(np.int32)),
+    )
+    o3d.utility.random.seed(seed)
+    cloud = mesh.sample_points_uniformly(count, use_triangle_normal=True)
+    return Points(np.asarray(cloud.points), np.asarray(cloud.normals))
+
+
+def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:
+    """Two random parts of a cloud without a common point, ``count`` points each at most.
+
+    Args:
+        points: at least two.
+        count: at least one.
+        seed: of the draw.
+    """
+    order = np.random.default_rng(seed).permutation(len(points.positions))
+    size = min(count, len(order) // 2)
+    return tuple(Points(points.positions[part]) for part in (order[:size], order[-size:]))
+
+
+def visible_points(
+    mesh: Mesh, viewmats: np.ndarray, K: np.ndarray, size: int, voxel: float
+) -> Points:
+    """Back-projected depth maps of a mesh, thinned to one mean point a voxel; without normals.
+
+    Args:
+        mesh: what is seen.
+        viewmats: ``[V, 4, 4]`` world to camera, OpenCV.
+        K: ``[3, 3]`` pixels.
+        size: side of the square pictures.
+        voxel: its side, object units.
+
+    Raises:
+        UserError: no camera sees the mesh.
+    """
+    o3d = import_open3d()
+    scene = mesh.scene()
+    seen = []
+    for viewmat in viewmats.astype(np.float64):
+        rays = scene.create_rays_pinhole(K.astype(np.float64), viewmat, size, size)
+        depth = scene.cast_rays(rays)["t_hit"].numpy()
+        rays, hit = rays.numpy(), np.isfinite(depth)
+        seen.append(rays[hit][:, :3] + depth[hit][:, None] * rays[hit][:, 3:])
+    points = np.concatenate(seen)
+    if len(points) == 0:
+        raise UserError("no camera sees the mesh")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    return Points(np.asarray(cloud.voxel_down_sample(voxel).points))

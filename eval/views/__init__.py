@@ -1,0 +1,1 @@
+"""Views against true ones: ``gamba eval-views``."""

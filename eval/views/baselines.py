@@ -1,0 +1,175 @@
+"""What a single-view model has to beat: views that need no model.
+
+Each baseline is called with a ``Truth`` and gives what it shows in place of every view of it. It
+sees the input view and the cameras alone, the retrieval also the training split.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, grid_sample
+from tqdm import tqdm
+
+from gamba_warp.cameras import from_opengl, relative_to_reference
+from gamba_warp.data.dataset import ViewDataset
+from gamba_warp.errors import UserError
+
+from .compare import WHITE, Shown, Truth, shown
+
+Baseline = Callable[[Truth], Shown | None]
+
+THUMBNAIL = 32  # pixels a side, for the retrieval
+_CHUNK = 512  # thumbnails whose colours are compared at once
+MEANING = {
+    "background": "an empty picture for every view",
+    "input_copy": "the input picture for every view",
+    "billboard": "the input picture, with its alpha, as a plane through the object's centre "
+    "parallel to the input's image plane, seen from both sides; bilinear at pixel centres",
+    "retrieval": f"the training view nearest to the input among all views of all other training "
+    f"objects; distance: 1 - IoU of the alphas (sum of minima over sum of maxima) + mean absolute "
+    f"colour difference weighted with the smaller alpha, at {THUMBNAIL}x{THUMBNAIL} pixels. In "
+    f"place of the input it shows the view found, in place of a novel view the true view of that "
+    f"object whose camera, relative to the view found, is turned least against the novel one's, "
+    f"relative to the input",
+    "ceiling": "gamba fit on all views of the object itself, those compared included: an upper "
+    "bound of what so many Gaussians show",
+}
+
+
+def background(truth: Truth) -> Shown:
+    """An empty picture for every view."""
+    return (
+        torch.full_like(truth.rgb[:1], WHITE).expand_as(truth.rgb),
+        torch.zeros_like(truth.mask),
+    )
+
+
+def input_copy(truth: Truth) -> Shown:
+    """The input picture for every view."""
+    return truth.rgb[:1].expand_as(truth.rgb), truth.mask[:1].expand_as(truth.mask)
+
+
+def billboard(truth: Truth) -> Shown:
+    """The input picture as a plane through the object's centre, parallel to its image plane.
+
+    The centre is the origin and the input camera's axes are those of the world, so the plane is
+    z = 0. Every pixel's ray is cut with it, and the point projected into the input camera: exact,
+    mirrored from behind, and gone where a camera sees the plane edge-on.
+    """
+    viewmats, Ks = truth.cameras.viewmats.double(), truth.cameras.Ks.double()
+    count, height, width = truth.mask.shape
+    x = torch.arange(width, device=Ks.device, dtype=Ks.dtype) + 0.5
+    y = torch.arange(height, device=Ks.device, dtype=Ks.dtype) + 0.5
+    pixels = torch.stack([*torch.meshgrid(x, y, indexing="xy"), x.new_ones(height, width)], -1)
+    rotations = viewmats[:, :3, :3]
+    # row vectors: d_world = p K⁻ᵀ R, of depth 1; the camera's centre = -t R
+    rays = pixels.reshape(-1, 3) @ torch.linalg.inv(Ks).mT @ rotations
+    centres = -viewmats[:, None, :3, 3] @ rotations
+    depth = -centres[..., 2] / rays[..., 2]
+    points = centres + depth[..., None] * rays
+    seen = (points + viewmats[0, :3, 3]) @ Ks[0].mT  # into the input camera, which is not turned
+    size = seen.new_tensor([width, height])
+    where = seen[..., :2] / seen[..., 2:] / size * 2 - 1
+    # a ray within 1e-5 of the plane sees a sliver far below a pixel, if not only rounding
+    hit = (depth > 0) & (rays[..., 2].abs() > 1e-5) & where.isfinite().all(-1) & (seen[..., 2] > 0)
+    where = torch.where(hit[..., None], where, 2.0)  # outside
+    rgba = truth.images[0].double()
+    premultiplied = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
+    sampled = grid_sample(
+        premultiplied.permute(2, 0, 1).expand(count, -1, -1, -1),
+        where.view(count, height, width, 2),
+        align_corners=False,
+    ).permute(0, 2, 3, 1)
+    rgb, alpha = sampled[..., :3], sampled[..., 3:]
+    return (rgb + WHITE * (1 - alpha)).to(truth.rgb), alpha[..., 0] > 0.5
+
+
+class Retrieval:
+    """The nearest training view, and for novel views its object's views from about there.
+
+    Attributes:
+        failures: reasons by uid, for training objects that cannot be read.
+    """
+
+    def __init__(self, training: ViewDataset) -> None:
+        """Reads every view of every training object once, as thumbnails.
+
+        Raises:
+            UserError: none can be read.
+        """
+        self.training = training
+        self.failures: dict[str, str] = {}
+        self._places: list[tuple[str, int]] = []  # (uid, view) of each thumbnail
+        found = []
+        for uid in tqdm(training.uids, desc="retrieval index", unit="object", disable=None):
+            try:
+                small = thumbnails(training.load(uid, size=THUMBNAIL).images)
+            except UserError as error:
+                self.failures[uid] = str(error)
+                continue
+            found.append((255 * small).round().byte())
+            self._places += [(uid, view) for view in range(len(small))]
+        if not found:
+            raise UserError("no training object can be read")
+        self._thumbnails = torch.cat(found)  # [M, THUMBNAIL², 4]; 8 bits: 4 kB a view
+        self._alphas = self._thumbnails[..., 3].float() / 255
+        self._areas = self._alphas.sum(1)
+
+    def nearest(self, image: Tensor, uid: str) -> tuple[str, int, float] | None:
+        """The nearest view of another object than ``uid``.
+
+        Args:
+            image: ``[H, W, 4]`` straight RGBA in [0, 1].
+            uid: the object shown.
+
+        Returns:
+            Its uid, its view, and the distance in [0, 2]; None where there is no other object.
+        """
+        query = thumbnails(image[None])[0]
+        both = torch.minimum(self._alphas, query[:, 3]).sum(1)
+        either = (self._areas + query[:, 3].sum() - both).clamp(min=1e-6)
+        shape = 1 - both / either  # 1 where both are empty: nothing tells them apart
+        shape[torch.tensor([place[0] == uid for place in self._places])] = torch.inf
+        best, at = torch.inf, -1
+        # by the first term, which the colours only add to: most need never be looked at
+        for part in shape.argsort().split(_CHUNK):
+            if shape[part[0]] >= best:
+                break
+            rgba = self._thumbnails[part].float() / 255
+            common = torch.minimum(rgba[..., 3], query[:, 3])
+            apart = (rgba[..., :3] - query[:, :3]).abs().mean(-1)
+            color = (common * apart).sum(1) / common.sum(1).clamp(min=1e-6)
+            value, place = (shape[part] + color).min(0)
+            if value < best:
+                best, at = value.item(), part[place].item()
+        return None if at < 0 else (*self._places[at], best)
+
+    def __call__(self, truth: Truth) -> Shown | None:
+        """The pictures; None without another object. Raises UserError for a bad picture."""
+        found = self.nearest(truth.images[0].cpu(), truth.uid)
+        if found is None:
+            return None
+        uid, view, _ = found
+        poses = torch.from_numpy(self.training.files(uid).camera_to_world)
+        viewmats = from_opengl(poses).double()
+        there, _ = relative_to_reference(viewmats, viewmats[view])
+        wanted = truth.cameras.viewmats[:, :3, :3].cpu().double()
+        # trace of R_a R_bᵀ = 1 + 2 cos(angle between them)
+        chosen = torch.einsum("vij,wij->vw", wanted, there[:, :3, :3]).argmax(1)
+        chosen[0] = view
+        needed, places = chosen.unique(return_inverse=True)
+        images = self.training.load(uid, needed.tolist(), truth.rgb.shape[1]).images
+        if images.shape[1:3] != truth.rgb.shape[1:3]:
+            raise UserError(f"{uid}: its pictures have another shape")
+        rgb, mask = shown(images[places].to(truth.images.device))
+        return rgb, mask
+
+
+def thumbnails(images: Tensor) -> Tensor:
+    """``[V, THUMBNAIL², 4]`` straight RGBA of ``[V, H, W, 4]``: averages over areas."""
+    premultiplied = torch.cat([images[..., :3] * images[..., 3:], images[..., 3:]], -1)
+    small = adaptive_avg_pool2d(premultiplied.permute(0, 3, 1, 2), THUMBNAIL).flatten(2).mT
+    return torch.cat([small[..., :3] / small[..., 3:].clamp(min=1e-6), small[..., 3:]], -1)

@@ -1,0 +1,156 @@
+"""What the Gaussians themselves could show: every object fitted to its own true views."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from gamba_warp.cameras import relative_to_reference
+from gamba_warp.conventions import DEFAULT_DISTANCE
+from gamba_warp.data.dataset import ObjectViews, ViewDataset
+from gamba_warp.errors import UserError
+from gamba_warp.files import output_folder, write_json
+from gamba_warp.fitting.config import FitConfig
+from gamba_warp.fitting.objects import FitJob, load_views
+from gamba_warp.fitting.optimize import fit
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.gaussians import Gaussians
+
+from .compare import Shown, Truth, ViewsProtocol, render_views
+
+
+class Ceiling:
+    """``gamba fit`` on all views of an object, or its results of an earlier day.
+
+    Files are ``<uid>.ply`` in the world of view 0, as ``gamba fit`` writes them.
+    """
+
+    def __init__(
+        self,
+        dataset: ViewDataset,
+        protocol: ViewsProtocol,
+        device: str,
+        folder: Path | None,
+        uids: list[str] | None = None,
+        config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
+    ) -> None:
+        """Nothing is fitted yet.
+
+        Args:
+            dataset: whose objects are fitted.
+            protocol: size of the pictures, input view and distance.
+            device: torch device.
+            folder: of the files; None: nothing is kept.
+            uids: to fit where the folder does not have them with these settings; None: none, only
+                the files that are there count.
+            config: of the fit.
+        """
+        self.dataset, self.protocol, self.device = dataset, protocol, device
+        self.folder, self.uids, self.config = folder, uids, config
+
+    def __call__(self, truth: Truth) -> Shown | None:
+        """The pictures, or None for an object that is not to be fitted.
+
+        Raises:
+            UserError: its views cannot be used, or a file is bad.
+            ValueError: see ``fit``.
+            FloatingPointError: see ``fit``.
+        """
+        uid = truth.uid
+        if self.uids is None:
+            path = self.folder / f"{uid}.ply"
+            found = load_ply(path).to(self.device) if path.exists() else None
+        else:
+            found = self._fitted(uid) if uid in self.uids else None
+        return None if found is None else render_views(self._moved(found, uid), truth.cameras)
+
+    def _moved(self, gaussians: Gaussians, uid: str) -> Gaussians:
+        """From the world of view 0, its camera at ``DEFAULT_DISTANCE``, to that of the truth."""
+        views = self.dataset.load(uid, views=[0, self.protocol.reference])
+        first, reference = views.cameras.viewmats
+        scale = self.protocol.distance / reference[:3, 3].norm()
+        scale = scale / (DEFAULT_DISTANCE / first[:3, 3].norm())
+        turn = (reference[:3, :3] @ first[:3, :3].T).to(self.device)
+        return gaussians.transformed(turn, turn.new_zeros(3), scale.item())
+
+    def _fitted(self, uid: str) -> Gaussians:
+        """Fits, or reads what the same settings gave for the same views before."""
+        size, device = self.protocol.size, torch.device(self.device)
+        job = FitJob(self.dataset, self.folder or Path(), self.config, 0, size, device)
+        views = load_views(job, uid, list(range(self.dataset.num_views(uid))))
+        key = _key(views, self.config)
+        path = self.folder / f"{uid}.ply" if self.folder else None
+        if path and path.exists() and _stated(path.with_suffix(".json")) == key:
+            return load_ply(path).to(device)
+        with tqdm(total=100, desc=f"ceiling {uid}", unit="%", leave=False, disable=None) as bar:
+            images, cameras = views.images.to(device), views.cameras.to(device)
+            result = fit(
+                images, cameras, self.config, lambda d, _: bar.update(int(100 * d) - bar.n)
+            )
+        first = cameras.viewmats[0]
+        _, scale = relative_to_reference(first[None], first)
+        moved = result.gaussians.transformed(first[:3, :3], first.new_zeros(3), scale.item())
+        if path:
+            output_folder(path.parent)
+            path.with_suffix(".json").unlink(missing_ok=True)  # it vouches for the .ply
+            save_ply(path, moved, comments=[f"fitted to all views of {uid}"])
+            write_json(path.with_suffix(".json"), {"key": key, "fit": asdict(self.config)})
+        return moved
+
+
+def _key(views: ObjectViews, config: FitConfig) -> str:
+    """Names the settings and the views that a fit comes from."""
+    digest = hashlib.sha256(json.dumps(asdict(config)).encode())
+    for tensor in (views.images, views.cameras.viewmats, views.cameras.Ks):
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _stated(path: Path) -> str | None:
+    try:
+        return json.loads(path.read_text())["key"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def open_ceiling(
+    wanted: str,
+    dataset: ViewDataset,
+    uids: list[str],
+    protocol: ViewsProtocol,
+    device: str,
+    out: Path | None,
+    steps: int,
+) -> Ceiling:
+    """The ceiling that ``--ceiling`` asks for.
+
+    Args:
+        wanted: a number of objects, or a folder of fitted ``.ply`` files.
+        dataset: where the views come from.
+        uids: objects under evaluation.
+        protocol: as for ``Ceiling``.
+        device: torch device.
+        out: the report's folder, where fitted objects are kept; or None.
+        steps: of a fit.
+
+    Raises:
+        UserError: neither a number above 0 nor a folder with a file for any of ``uids``.
+    """
+    if wanted.isdecimal() and int(wanted) > 0:
+        from gamba_warp.fitting.objects import choose_objects
+
+        chosen, config = choose_objects(uids, (), int(wanted)), FitConfig(steps=steps)
+        folder = out / "ceiling" if out else None
+        return Ceiling(dataset, protocol, device, folder, chosen, config)
+    folder = Path(wanted)
+    if not folder.is_dir():
+        raise UserError(f"--ceiling {wanted}: neither a number above 0 nor a folder")
+    folder = folder / "gaussians" if (folder / "gaussians").is_dir() else folder
+    if not any((folder / f"{uid}.ply").exists() for uid in uids):
+        raise UserError(f"--ceiling {wanted}: has a .ply file of none of the {len(uids)} objects")
+    return Ceiling(dataset, protocol, device, folder)

@@ -1,0 +1,174 @@
+"""True views of an object, predicted views of it, and how far these are from those."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gamba_warp.cameras import Cameras, relative_to_reference
+from gamba_warp.data.dataset import SPLIT_VERSION, ViewDataset
+from gamba_warp.errors import UserError
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.image_metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
+from gamba_warp.images import over_background
+from gamba_warp.model.lpips import LPIPS
+
+from ..report import mean_of
+
+WHITE = 1.0
+BATCH = 4  # views compared at once: bounds the memory of LPIPS features
+METRICS = ("psnr", "ssim", "lpips", "mask_iou")
+
+Shown = tuple[Tensor, Tensor]  # rgb [V, H, W, 3] on white in [0, 1], mask [V, H, W] bool
+Values = dict[str, float | None]  # one view's metrics
+
+
+@dataclass(frozen=True)
+class ViewsProtocol:
+    """What the numbers of ``eval-views`` mean.
+
+    Attributes:
+        split: of the dataset.
+        reference: index of the input view.
+        views: how many views an object, input included, evenly spaced in file order; None: all.
+        size: height of the pictures compared; None: the files' own.
+        background: grey value both sides are composited on.
+        region: over what the picture metrics run.
+        rendering: how predicted values are compared.
+        max_psnr: dB, given to equal pictures.
+        ssim: window and convention.
+        lpips: network, or None.
+        lpips_reason: why there is no LPIPS, or None.
+        mask_iou: when a pixel counts as covered.
+        averaging: order of the means.
+        poses: frame and distance of the cameras.
+        distance: of the input camera from the object's centre, object units.
+        split_version: of the rule or file that made the split.
+    """
+
+    split: str
+    reference: int
+    views: int | None
+    size: int | None
+    lpips: str | None
+    lpips_reason: str | None
+    distance: float
+    background: float = WHITE
+    region: str = "full image"
+    rendering: str = "clipped to [0, 1], not rounded to 8 bits"
+    max_psnr: float = MAX_PSNR
+    ssim: str = f"Gaussian {SSIM_WINDOW}x{SSIM_WINDOW}, sigma {SSIM_SIGMA}, no padding, range 1"
+    mask_iou: str = "alpha > 0.5 on both sides"
+    averaging: str = "views, then objects; input view apart"
+    poses: str = "relative to the input view, its distance normalised"
+    split_version: int = SPLIT_VERSION
+
+
+@dataclass
+class Truth:
+    """One object's views to compare with.
+
+    Attributes:
+        uid: the object.
+        images: ``[V, H, W, 4]`` straight RGBA in [0, 1]; view 0 is the input.
+        cameras: V cameras in the input camera's world.
+        views: their V indices in the dataset.
+        rgb: ``[V, H, W, 3]``, the pictures on white.
+        mask: ``[V, H, W]`` bool.
+        digest: SHA-256 of the pictures, 16 digits.
+    """
+
+    uid: str
+    images: Tensor
+    cameras: Cameras
+    views: list[int]
+
+    def __post_init__(self) -> None:
+        self.rgb, self.mask = shown(self.images)
+        pixels = self.images.cpu().numpy().tobytes()
+        self.digest = hashlib.sha256(pixels).hexdigest()[:16]
+
+
+def shown(images: Tensor) -> Shown:
+    """What is compared of straight RGBA ``[V, H, W, 4]``."""
+    return over_background(images, WHITE), images[..., 3] > 0.5
+
+
+def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
+    """The input view first, then ``wanted - 1`` others evenly spaced (all of them for None).
+
+    Raises:
+        UserError: there is no view ``reference``.
+    """
+    if not 0 <= reference < count:
+        raise UserError(f"no view {reference} for the input among its {count}")
+    others = [view for view in range(count) if view != reference]
+    if wanted is not None and wanted - 1 < len(others):
+        step = len(others) / max(1, wanted - 1)
+        others = [others[int(k * step)] for k in range(wanted - 1)]
+    return [reference, *others]
+
+
+def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: str) -> Truth:
+    """Loads one object's views and moves the cameras. Raises UserError."""
+    views = choose_views(dataset.num_views(uid), protocol.reference, protocol.views)
+    loaded = dataset.load(uid, views=views, size=protocol.size)
+    viewmats, _ = relative_to_reference(
+        loaded.cameras.viewmats, loaded.cameras.viewmats[0], protocol.distance
+    )
+    cameras = Cameras(viewmats, loaded.cameras.Ks, loaded.cameras.width, loaded.cameras.height)
+    return Truth(uid, loaded.images.to(device), cameras.to(device), views)
+
+
+def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
+    """RGB ``[V, H, W, 3]`` on white, clipped to [0, 1], and mask ``[V, H, W]`` bool."""
+    from gamba_warp.render import render
+
+    with torch.no_grad():
+        out = render(gaussians, cameras, background=cameras.viewmats.new_full((3,), WHITE))
+    return out.rgb.clamp(0, 1), out.alpha[..., 0] > 0.5
+
+
+def compare(candidates: dict[str, Shown], truth: Truth) -> dict[str, list[Values]]:
+    """PSNR, SSIM and mask IoU of each view for each candidate; LPIPS is None."""
+    result: dict[str, list[Values]] = {}
+    for name, (rgb, mask) in candidates.items():
+        values = {
+            "psnr": psnr(rgb, truth.rgb).tolist(),
+            "ssim": ssim(rgb, truth.rgb).tolist(),
+            "lpips": [None] * len(rgb),
+            "mask_iou": mask_iou(mask, truth.mask).tolist(),
+        }
+        result[name] = [dict(zip(values, row)) for row in zip(*values.values())]
+    return result
+
+
+@torch.no_grad()
+def add_lpips(
+    values: dict[str, list[Values]], candidates: dict[str, Shown], truth: Truth, lpips: LPIPS
+) -> None:
+    """Puts LPIPS into what ``compare`` returned.
+
+    Nearly all the time goes into features. They are computed once for the truth, and once for a
+    candidate that shows every view the same picture (an expanded tensor).
+    """
+    fixed = {
+        name: lpips.features(rgb[0]) for name, (rgb, _) in candidates.items() if not rgb.stride(0)
+    }
+    for start in range(0, len(truth.rgb), BATCH):
+        part = slice(start, start + BATCH)
+        features = lpips.features(truth.rgb[part])
+        for name, (rgb, _) in candidates.items():
+            found = fixed[name] if name in fixed else lpips.features(rgb[part])
+            for row, value in zip(values[name][part], lpips.distance(found, features).tolist()):
+                row["lpips"] = value
+
+
+def summary(views: list[Values]) -> dict[str, Any]:
+    """Means over the novel views (None without any), and the input view (the first) apart."""
+    novel = mean_of(views[1:]) if len(views) > 1 else dict.fromkeys(METRICS)
+    return {**novel, "input": views[0]}

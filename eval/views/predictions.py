@@ -1,0 +1,98 @@
+"""Where the Gaussians under test come from: a checkpoint, or a folder of ``.ply`` files."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import torch
+
+from gamba_warp.cameras import Cameras, relative_to_reference
+from gamba_warp.data.dataset import ViewDataset
+from gamba_warp.errors import UserError
+from gamba_warp.files import sha256
+from gamba_warp.formats.ply import load_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import over_background
+
+
+class Predictions(ABC):
+    """Gaussians by object, in the world of the reference camera.
+
+    Attributes:
+        distance: of the reference camera from the origin of that world, object units.
+        source: what is under test, for the report: kind, name and SHA-256 of the file, or of the
+            names and SHA-256s of a folder's files.
+    """
+
+    distance: float
+    source: dict[str, str]
+
+    @abstractmethod
+    def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
+        """One object's Gaussians (no batch dimension). Raises UserError where there are none."""
+
+
+class PlyPredictions(Predictions):
+    """``<folder>/<uid>.ply``, 3DGS layout, in the reference camera's world."""
+
+    def __init__(self, folder: Path, distance: float, device: str) -> None:
+        self.folder, self.distance, self.device = folder, distance, device
+        digest = hashlib.sha256()
+        for path in sorted(folder.rglob("*.ply")):
+            digest.update(f"{path.relative_to(folder).as_posix()} {sha256(path)}\n".encode())
+        self.source = {"kind": "ply", "path": folder.name, "sha256": digest.hexdigest()}
+
+    def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
+        """Reads the file."""
+        return load_ply(self.folder / f"{uid}.ply").to(self.device)
+
+
+class ModelPredictions(Predictions):
+    """A checkpoint, shown the reference view alone."""
+
+    def __init__(self, path: Path, device: str, encoder_weights: Path | None) -> None:
+        from gamba_warp.model.checkpoint import FILE_NAME, load_model
+
+        self.model, self.device = load_model(path, device, encoder_weights), device
+        self.distance = self.model.config.distance
+        file = path / FILE_NAME if path.is_dir() else path
+        self.source = {"kind": "checkpoint", "path": path.name, "sha256": sha256(file)}
+
+    @torch.no_grad()
+    def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
+        """Runs the model on the reference view, on the model's own background."""
+        config = self.model.config
+        views = dataset.load(uid, views=[reference], size=config.image_size)
+        images = over_background(views.images, config.background_color)
+        viewmats, _ = relative_to_reference(
+            views.cameras.viewmats, views.cameras.viewmats[0], self.distance
+        )
+        cameras = Cameras(viewmats, views.cameras.Ks, views.cameras.width, views.cameras.height).to(
+            self.device
+        )
+        return self.model(images.to(self.device), cameras)[0]
+
+
+def open_predictions(
+    path: Path, distance: float, device: str, encoder_weights: Path | None = None
+) -> Predictions:
+    """A folder with ``.ply`` files, else a checkpoint.
+
+    Args:
+        path: what the user gave.
+        distance: of the reference camera, for ``.ply`` files; a checkpoint states its own.
+        device: torch device.
+        encoder_weights: see ``load_model``.
+
+    Raises:
+        UserError: there is nothing, or the checkpoint cannot be read.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: no such checkpoint or folder of .ply files")
+    if path.is_dir() and next(path.rglob("*.ply"), None) is not None:
+        return PlyPredictions(path, distance, device)
+    if path.is_dir() and next(path.glob("*.safetensors"), None) is None:
+        raise UserError(f"{path}: holds neither .ply files nor a checkpoint")
+    return ModelPredictions(path, device, encoder_weights)

@@ -1,0 +1,1 @@
+"""The commands of ``gamba``, a file each; only ``cli.py`` imports them."""

@@ -1,0 +1,1 @@
+"""Datasets of posed views, pictures prepared for a model, and pretrained weights."""

@@ -1,0 +1,273 @@
+"""Posed views on disk: ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
+
+Layouts are described in ``layouts.py``. ``split.json`` in the root names the uids of ``train``,
+``val`` and ``test``; where a uid is in none, ``split_of`` decides by the hash of its name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from ..cameras import Cameras, from_opengl
+from ..errors import UserError
+from ..files import write_json
+from ..images import load_rgba, to_uint8
+from .layouts import LAYOUTS, ObjectFiles, find_objects, read_json
+
+SPLITS = ("train", "val", "test")
+SPLIT_VERSION = 1
+
+
+@dataclass
+class ObjectViews:
+    """V views of one object.
+
+    Attributes:
+        uid: the object's name within its dataset.
+        name: for people.
+        images: ``[V, H, W, 4]`` float32 RGBA in [0, 1], colour not premultiplied.
+        cameras: V cameras, float32, in object units (the object's bounding cube has side 1).
+        depths: ``[V, H, W]`` float32 along the optical axis, 0 where nothing; or None.
+        attribution: creator, licence, source; may be empty.
+    """
+
+    uid: str
+    name: str
+    images: Tensor
+    cameras: Cameras
+    depths: Tensor | None
+    attribution: dict[str, str]
+
+
+def split_of(key: str) -> str:
+    """The split (train 80 %, val 10 %, test 10 %) by the hash of the uid or its group alone."""
+    part = int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "big") % 100
+    return "train" if part < 80 else "val" if part < 90 else "test"
+
+
+def write_split(folder: str | Path, groups: Mapping[str, str]) -> None:
+    """Writes ``split.json`` into the dataset's root, atomically.
+
+    Args:
+        folder: the root.
+        groups: uid -> group. Variants of one thing share a group, so that none is in the test
+            split while its twin is in train; an object on its own has its uid as group.
+    """
+    parts: dict[str, list[str]] = {name: [] for name in SPLITS}
+    for uid in sorted(groups):
+        parts[split_of(groups[uid])].append(uid)
+    write_json(Path(folder) / "split.json", {"version": SPLIT_VERSION, **parts})
+
+
+def _read_split(root: Path) -> dict[str, str]:
+    """The split of each uid, as ``split.json`` states it; empty without the file."""
+    path = root / "split.json"
+    if not path.exists():
+        return {}
+    parts = read_json(path)
+    if parts.get("version") != SPLIT_VERSION:
+        raise UserError(f"{path}: version {parts.get('version')!r}, expected {SPLIT_VERSION}")
+    chosen: dict[str, str] = {}
+    for name in SPLITS:
+        uids = parts.get(name, [])
+        if not isinstance(uids, list):
+            raise UserError(f"{path}: {name} must be a list of uids")
+        for uid in uids:
+            if chosen.setdefault(str(uid), name) != name:
+                raise UserError(f"{path}: {uid} is in both {chosen[uid]} and {name}")
+    return chosen
+
+
+def open_dataset(
+    folder: str | Path, split: str = "all", layout: str = "auto", cache: bool = False
+) -> ViewDataset:
+    """Finds the objects under a folder; nothing is decoded yet.
+
+    Args:
+        folder: a dataset, or the folder of a single object.
+        split: "all", "train", "val" or "test".
+        layout: "auto", "transforms", "gobjaverse" or "openlrm".
+        cache: keep decoded views in memory, 8 bits a channel.
+
+    Raises:
+        UserError: no such folder, no objects in it, none in the split, or a bad ``split.json``.
+    """
+    root = Path(folder)
+    if split not in ("all", *SPLITS):
+        raise UserError(f"split '{split}': expected all, train, val or test")
+    if layout not in ("auto", *LAYOUTS):
+        raise UserError(f"layout '{layout}': expected auto, {', '.join(LAYOUTS)}")
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder")
+    layout, folders = find_objects(root, layout)
+    if not folders:
+        marks = ", ".join(mark for mark, _ in LAYOUTS.values())
+        raise UserError(f"{root}: no objects found (none of {marks} in any folder)")
+    if folders == [root]:
+        objects = {root.resolve().name: root}
+    else:
+        objects = {folder.relative_to(root).as_posix(): folder for folder in folders}
+    if split != "all":
+        stated = _read_split(root)
+        objects = {u: f for u, f in objects.items() if stated.get(u, split_of(u)) == split}
+        if not objects:
+            raise UserError(f"{root}: none of its {len(folders)} objects is in the {split} split")
+    return ViewDataset(objects, layout, cache)
+
+
+class ViewDataset:
+    """Objects with posed views. Make it with ``open_dataset``; safe to send to worker processes.
+
+    Attributes:
+        uids: names of the objects, sorted: their paths under the root.
+        layout: the layout found.
+    """
+
+    def __init__(self, objects: dict[str, Path], layout: str, cache: bool) -> None:
+        self.uids = list(objects)
+        self.layout = layout
+        self._folders = objects
+        self._files: dict[str, ObjectFiles] = {}
+        self._pictures: dict[tuple, np.ndarray] | None = {} if cache else None
+
+    def __len__(self) -> int:
+        return len(self.uids)
+
+    def _uid(self, index: int | str) -> str:
+        if isinstance(index, str):
+            if index not in self._folders:
+                raise UserError(f"no object '{index}' among the {len(self)} of this dataset")
+            return index
+        return self.uids[index]
+
+    def files(self, index: int | str) -> ObjectFiles:
+        """Paths, poses and intrinsics of one object, read once.
+
+        Raises:
+            UserError: the object's camera files are missing or bad; names the file.
+        """
+        uid = self._uid(index)
+        if uid not in self._files:
+            self._files[uid] = LAYOUTS[self.layout][1](self._folders[uid])
+        return self._files[uid]
+
+    def num_views(self, index: int | str) -> int:
+        """V of one object. Raises as ``files``."""
+        return len(self.files(index).images)
+
+    def check(self) -> dict[str, str]:
+        """Reasons by uid, for the objects whose cameras are bad or whose pictures are missing."""
+        bad = {}
+        for uid in self.uids:
+            try:
+                files = self.files(uid)
+                for path in files.images + (files.depths or []):
+                    if not path.exists():
+                        raise UserError(f"{path}: no such file")
+            except UserError as error:
+                bad[uid] = str(error)
+        return bad
+
+    def load(
+        self, index: int | str, views: Sequence[int] | None = None, size: int | None = None
+    ) -> ObjectViews:
+        """Decodes views of one object.
+
+        Args:
+            index: position in ``uids``, or a uid.
+            views: which, in this order; None means all. Only these files are opened.
+            size: height of the returned pictures (the width follows); None keeps the files' size.
+                Area filter on premultiplied colour, so that no background bleeds in; depth takes
+                the nearest.
+
+        Raises:
+            UserError: a file is missing, broken, or not of the size that the cameras state.
+        """
+        uid = self._uid(index)
+        files = self.files(uid)
+        wanted = list(range(len(files.images))) if views is None else [int(v) for v in views]
+        if not wanted:
+            raise UserError(f"{uid}: no views asked for")
+        outside = [v for v in wanted if not 0 <= v < len(files.images)]
+        if outside:
+            raise UserError(f"{uid}: view {outside[0]} asked for, it has {len(files.images)}")
+        if size is not None and size < 1:
+            raise UserError(f"size {size}: must be at least 1")
+        pictures, Ks = zip(*(self._view(files, v, size) for v in wanted))
+        height, width = pictures[0].shape[:2]
+        for v, picture in zip(wanted, pictures):
+            if picture.shape[:2] != (height, width):
+                got = f"{picture.shape[1]}x{picture.shape[0]}"
+                raise UserError(
+                    f"{files.images[v]}: is {got}, the object's others {width}x{height}"
+                )
+        depths = None
+        if files.depths is not None:
+            maps = [_read_depth(files.depths[v], width, height) for v in wanted]
+            depths = torch.from_numpy(np.stack(maps)) * files.depth_unit
+        poses = torch.from_numpy(files.camera_to_world[wanted])
+        return ObjectViews(
+            uid=uid,
+            name=files.name or uid,
+            images=torch.from_numpy(np.stack(pictures)).float() / 255.0,
+            cameras=Cameras(
+                from_opengl(poses).float(), torch.from_numpy(np.stack(Ks)).float(), width, height
+            ),
+            depths=depths,
+            attribution=files.attribution,
+        )
+
+    def _view(
+        self, files: ObjectFiles, view: int, size: int | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the size asked for."""
+        path = files.images[view]
+        key = (path, size)
+        if self._pictures is not None and key in self._pictures:
+            picture, original = self._pictures[key]
+        else:
+            picture = to_uint8(load_rgba(path))
+            original = (picture.shape[1], picture.shape[0])
+            stated = files.sizes[view]
+            if stated is not None and stated != original:
+                got, want = (f"{w}x{h}" for w, h in (original, stated))
+                raise UserError(f"{path}: is {got}, but its cameras are for {want}")
+            picture = _resize(picture, size)
+            if self._pictures is not None:
+                self._pictures[key] = (picture, original)
+        from_size = (1.0, 1.0) if files.sizes[view] is None else original
+        factor = [picture.shape[1] / from_size[0], picture.shape[0] / from_size[1], 1.0]
+        return picture, files.Ks[view] * np.array(factor)[:, None]
+
+
+def _resize(picture: np.ndarray, size: int | None) -> np.ndarray:
+    height, width = picture.shape[:2]
+    if size is None or size == height:
+        return picture
+    new = (max(1, round(width * size / height)), size)
+    # PIL premultiplies RGBA by itself; its box filter is the exact area average.
+    kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
+    return np.asarray(Image.fromarray(picture).resize(new, kind))
+
+
+def _read_depth(path: Path, width: int, height: int) -> np.ndarray:
+    """``[height, width]`` float32, in the file's steps."""
+    try:
+        with Image.open(path) as image:
+            if len(image.getbands()) != 1:
+                raise UserError(f"{path}: has {len(image.getbands())} channels, depth has one")
+            if image.size != (width, height):
+                image = image.resize((width, height), Image.Resampling.NEAREST)
+            return np.asarray(image, dtype=np.float32)
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such file") from error
+    except (OSError, SyntaxError, ValueError) as error:
+        raise UserError(f"{path}: cannot be decoded ({str(error).splitlines()[0]})") from error

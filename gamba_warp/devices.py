@@ -1,0 +1,23 @@
+"""The device that a command computes on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from .errors import UserError
+
+if TYPE_CHECKING:
+    pass
+
+
+def pick_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is a device, else the CPU.
+
+    Raises:
+        UserError: CUDA is asked for and is not there.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("--device cuda: no CUDA device is available")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

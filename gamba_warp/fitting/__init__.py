@@ -1,0 +1,1 @@
+"""Gaussians of one object by optimisation, without a model."""

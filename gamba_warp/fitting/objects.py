@@ -1,0 +1,210 @@
+"""Objects of a dataset, each fitted on its own and measured on held-out views."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ..cameras import Cameras, relative_to_reference
+from ..commands.doctor import versions
+from ..conventions import DEFAULT_DISTANCE
+from ..data.dataset import ObjectViews, ViewDataset
+from ..errors import UserError
+from ..files import atomic_path, output_folder, write_json
+from ..formats.ply import save_ply
+from ..gaussians import Gaussians
+from ..image_metrics import psnr
+from ..images import over_background, save_image
+from ..render import render
+from .config import FitConfig
+from .optimize import fit
+
+WHITE = 1.0
+PROTOCOL = {
+    "background": WHITE,
+    "region": "full image",
+    "rendering": "clipped to [0, 1], not rounded to 8 bits",
+    "averaging": "views, then objects",
+    "gaussians": f"in the world of view 0, its camera at distance {DEFAULT_DISTANCE}",
+}
+_TABLE = (
+    ("held-out PSNR [dB]", "psnr_held_out", "{:.2f}"),
+    ("train PSNR [dB]", "psnr_train", "{:.2f}"),
+    ("seconds", "seconds", "{:.1f}"),
+    ("CPU seconds", "cpu_seconds", "{:.1f}"),
+    ("Gaussians", "gaussians", "{:.0f}"),
+)
+
+
+@dataclass
+class FitJob:
+    """What is the same for every object.
+
+    Attributes:
+        dataset: where the views come from.
+        folder: for the results.
+        config: of the fit.
+        held_out: every so many-th view is held out; 0: none.
+        size: height of the pictures; None: the files' own.
+        device: where to compute.
+    """
+
+    dataset: ViewDataset
+    folder: Path
+    config: FitConfig
+    held_out: int
+    size: int | None
+    device: torch.device
+
+
+def choose_objects(uids: list[str], names: tuple[str, ...], limit: int | None) -> list[str]:
+    """The named ones, or all; of these ``limit``, evenly spaced (index ``⌊k · count / limit⌋``).
+
+    Raises:
+        UserError: a name is not among them.
+    """
+    unknown = [name for name in names if name not in uids]
+    if unknown:
+        raise UserError(f"--objects {unknown[0]}: not among the {len(uids)} objects")
+    chosen = list(dict.fromkeys(names)) or uids
+    if limit is not None and limit < len(chosen):
+        chosen = [chosen[k * len(chosen) // limit] for k in range(limit)]
+    return chosen
+
+
+def split_views(count: int, held_out: int) -> tuple[list[int], list[int]]:
+    """Views for the fit, and the last of every ``held_out`` in file order (5, 11, 17, 23 for 6)."""
+    kept = [v for v in range(count) if held_out and v % held_out == held_out - 1]
+    return [v for v in range(count) if v not in kept], kept
+
+
+def load_views(job: FitJob, uid: str, fitted: list[int]) -> ObjectViews:
+    """Loads all views of one object.
+
+    Raises:
+        UserError: a file is bad, or the pictures of the ``fitted`` views are of no use.
+    """
+    if len(fitted) < 2:
+        raise UserError(f"{uid}: {len(fitted)} views to fit, at least 2 are needed")
+    views = job.dataset.load(uid, size=job.size)
+    alphas = views.images[fitted, ..., 3]
+    if alphas.min() == 1:
+        raise UserError(f"{uid}: its pictures have no transparent pixel; a background is needed")
+    if alphas.max() == 0:
+        raise UserError(f"{uid}: its pictures are empty")
+    return views
+
+
+def fit_object(job: FitJob, uid: str, title: str) -> dict[str, Any]:
+    """Fits one object and writes its files; returns its record.
+
+    Raises:
+        UserError: its views cannot be used, or a file cannot be written.
+        ValueError: no silhouette meets the unit cube.
+        FloatingPointError: the fit diverged.
+    """
+    fitted, kept = split_views(job.dataset.num_views(uid), job.held_out)
+    views = load_views(job, uid, fitted)
+    images, cameras = views.images.to(job.device), views.cameras.to(job.device)
+    wall, cpu = time.perf_counter(), time.process_time()
+    with tqdm(total=100, desc=title, unit="%", disable=None) as bar:
+
+        def show(done: float, loss: float) -> None:
+            bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
+            bar.update(int(100 * done) - bar.n)
+
+        result = fit(images[fitted], cameras[fitted], job.config, show)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    with torch.no_grad():
+        white = images.new_full((3,), WHITE)
+        mode = job.config.rasterize_mode
+        rgb = render(result.gaussians, cameras, white, rasterize_mode=mode).rgb.clamp(0, 1)
+    truth = over_background(images, WHITE)
+    by_view = psnr(rgb, truth).tolist()
+    record = {
+        "name": uid,
+        "views_train": fitted,
+        "views_held_out": kept,
+        "size": [cameras.width, cameras.height],
+        "psnr_train": _mean([by_view[v] for v in fitted]),
+        "psnr_held_out": _mean([by_view[v] for v in kept]),
+        "psnr_by_view": by_view,
+        "gaussians": result.gaussians.num,
+        "relocated": result.relocated,
+        "steps": len(result.losses),
+        "loss_first": result.losses[0],
+        "loss_last": result.losses[-1],
+        "seconds": wall,
+        "cpu_seconds": cpu,
+    }
+    _write_object(
+        job, record, result.gaussians, cameras, torch.cat([truth, rgb], 2)[kept or fitted]
+    )
+    return record
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _write_object(
+    job: FitJob,
+    record: dict[str, Any],
+    gaussians: Gaussians,
+    cameras: Cameras,
+    rows: Tensor,
+) -> None:
+    """Writes the ``.ply``, the strip ``[V, H, 2W, 3]`` (at most 4 views) and, last, the record."""
+    paths = {
+        kind: job.folder / kind / f"{record['name']}{suffix}"
+        for kind, suffix in (("gaussians", ".ply"), ("strips", ".png"), ("objects", ".json"))
+    }
+    for path in paths.values():
+        output_folder(path.parent)
+    # where eval-views and eval-geometry expect predictions: in the input camera's world
+    reference = cameras.viewmats[0]
+    _, scale = relative_to_reference(cameras.viewmats[:1], reference)
+    moved = gaussians.transformed(reference[:3, :3], reference.new_zeros(3), scale.item())
+    note = f"fitted to {record['name']} by gamba fit, rasterize_mode {job.config.rasterize_mode}"
+    save_ply(paths["gaussians"], moved, comments=[note])
+    save_image(paths["strips"], rows[:4].flatten(0, 1).cpu().numpy())
+    write_json(paths["objects"], {**_settings(job), **record})
+
+
+def _settings(job: FitJob) -> dict[str, Any]:
+    return {
+        "protocol": {**PROTOCOL, "held_out": job.held_out, "size": job.size},
+        "settings": {**asdict(job.config), "device": job.device.type},
+        "versions": dict(versions()),
+    }
+
+
+def write_report(job: FitJob, records: list[dict[str, Any]], failures: list[dict[str, str]]) -> str:
+    """Writes ``report.json`` and ``report.md``; returns the summary as Markdown."""
+    summary = {}
+    lines = ["| | mean | min | max |", "| --- | --- | --- | --- |"]
+    for label, key, form in _TABLE:
+        values = [record[key] for record in records if record[key] is not None]
+        if not values:
+            continue
+        summary[key] = {"mean": _mean(values), "min": min(values), "max": max(values)}
+        cells = " | ".join(form.format(value) for value in summary[key].values())
+        lines.append(f"| {label} | {cells} |")
+    text = "\n".join(lines) if summary else "no object was fitted"
+    report = {**_settings(job), "summary": summary, "objects": records, "failures": failures}
+    write_json(job.folder / "report.json", report)
+    table = ["| object | " + " | ".join(label for label, *_ in _TABLE) + " |"]
+    table.append("| --- " * (len(_TABLE) + 1) + "|")
+    for record in records:
+        cells = [form.format(record[k]) if record[k] is not None else "" for _, k, form in _TABLE]
+        table.append(f"| {record['name']} | " + " | ".join(cells) + " |")
+    table += ["", *(f"failed: {item['name']}: {item['reason']}" for item in failures)]
+    with atomic_path(job.folder / "report.md") as temporary:
+        temporary.write_text(f"{text}\n\n" + "\n".join(table).rstrip() + "\n")
+    return text

@@ -1,0 +1,101 @@
+"""Gaussians that hardly show are moved to where the pictures still differ."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ..cameras import Cameras
+from ..gaussians import Gaussians, quat_multiply
+from ..images import over_background
+from ..render import render
+from .config import FitConfig, RasterizeMode
+
+
+def shares(
+    gaussians: Gaussians, images: Tensor, cameras: Cameras, mode: RasterizeMode = "classic"
+) -> tuple[Tensor, Tensor]:
+    """What each Gaussian has to do with the pictures, from one backward pass.
+
+    A rendered channel is linear in the colours, so the gradient of ``Σ_p u_p C_p`` to a colour is
+    ``Σ_p u_p w_p``, w being the blending weight: with u = 1 its weight, with u = the squared error
+    of the pixel its share in the error.
+
+    Args:
+        gaussians: ``[N]``.
+        images: ``[V, H, W, 4]``.
+        cameras: V cameras.
+        mode: of ``rasterization``.
+
+    Returns:
+        Weight in pixels, and share in the squared error: two ``[N]``, over all views.
+    """
+    gaussians = gaussians.detach()
+    gaussians.colors.requires_grad_()
+    rgb = render(gaussians, cameras, images.new_ones(3), rasterize_mode=mode).rgb
+    error = (rgb.detach() - over_background(images, 1.0)).square().mean(-1)
+    upstream = torch.stack([torch.ones_like(error), error, torch.zeros_like(error)], -1)
+    (gradient,) = torch.autograd.grad(rgb, gaussians.colors, upstream)
+    return gradient[:, 0], gradient[:, 1]
+
+
+@torch.no_grad()
+def relocate(
+    parameters: dict[str, Tensor],
+    optimizer: torch.optim.Adam,
+    weight: Tensor,
+    error: Tensor,
+    config: FitConfig,
+    rng: torch.Generator,
+) -> int:
+    """Moves Gaussians of too little weight onto others, drawn by their share in the error.
+
+    The ones moved become copies, set off by a draw from the Gaussian itself. All copies of one
+    together are about as opaque as it was (Kheradmand et al. 2024, with a fixed shrinking of the
+    scales) and start with empty moments.
+
+    Args:
+        parameters: changed in place.
+        optimizer: of the parameters; its state is changed in place.
+        weight: ``[N]``, see ``shares``.
+        error: ``[N]``, see ``shares``.
+        config: ``min_weight`` and ``relocate_share``.
+        rng: on the parameters' device.
+
+    Returns:
+        How many were moved.
+    """
+    order = weight.argsort()
+    least = order[: int(config.relocate_share * len(order))]
+    moved = least[weight[least] < config.min_weight]
+    stay = torch.ones_like(weight, dtype=torch.bool)
+    stay[moved] = False
+    chances = torch.where(stay, error, 0.0)
+    if len(moved) == 0 or not chances.sum() > 0:
+        return 0
+    onto = torch.multinomial(chances, len(moved), replacement=True, generator=rng)
+    chosen, copies = onto.unique(return_counts=True)
+    clear = 1 - parameters["opacities"][chosen].sigmoid()
+    opacity = 1 - clear ** (1.0 / (copies + 1))
+    parameters["opacities"][chosen] = opacity.clamp(0.005, 0.995).logit()
+    parameters["scales"][chosen] -= math.log(1.25)
+    for value in parameters.values():
+        value[moved] = value[onto]
+        for moment in ("exp_avg", "exp_avg_sq"):
+            optimizer.state[value][moment][moved] = 0
+            optimizer.state[value][moment][chosen] = 0
+    draw = torch.randn(len(moved), 3, generator=rng, device=weight.device)
+    parameters["means"][moved] += _rotate(
+        parameters["quats"][moved], draw * parameters["scales"][moved].exp()
+    )
+    return len(moved)
+
+
+def _rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """``vectors [N, 3]`` turned by ``quats [N, 4]`` of any length > 0."""
+    unit = torch.nn.functional.normalize(quats, dim=-1)
+    inverse = unit * unit.new_tensor([1.0, -1.0, -1.0, -1.0])
+    pure = torch.cat([torch.zeros_like(vectors[:, :1]), vectors], -1)
+    return quat_multiply(quat_multiply(unit, pure), inverse)[:, 1:]

@@ -1,0 +1,369 @@
+"""``gamba gpu-check``: all that only a CUDA machine can tell, in one run of a few minutes.
+
+Needs torch, numpy and warp-lang, nothing else, and no installation: in a bare checkout
+``python -m gamba_warp.gpu_check`` is the same command. Each step runs in a process of its own,
+within its time; both files are written after every item, and say what was not done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree
+
+import torch
+
+from ..errors import UserError
+from ..files import CHECKOUT, atomic_path, output_folder, write_json
+from ..kernels.bench import Settings
+from ..kernels.bench.peers import PACKAGES, versions
+from .report import headline, machine_facts, page
+
+FORMAT = "gamba_warp.gpu_check.1"
+_GRACE = 15.0  # seconds that the last item of a step may take
+_LEAST = 5.0  # seconds below which no step begins
+
+
+@dataclass(frozen=True)
+class Step:
+    """A part of the run.
+
+    Attributes:
+        name: see ``gpu_steps.run_step``; "tests" runs pytest.
+        seconds: at most, in a run of 8 minutes.
+        cuda: whether a CPU leaves it out.
+        packages: of which at least one is needed.
+    """
+
+    name: str
+    seconds: float
+    cuda: bool = False
+    packages: tuple[str, ...] = ()
+
+
+# What matters most comes first; together they may want more than 8 minutes.
+STEPS = (
+    Step("compile", 100, cuda=True),
+    Step("checks", 100),
+    Step("inference", 100),
+    Step("tests", 90, cuda=True),
+    Step("bench", 130),
+    Step("peers-conv", 60, True, ("causal-conv1d",)),
+    Step("peers-scan", 90, True, ("mamba-ssm", "mambapy")),
+    Step("peers-raster", 480, True, ("gsplat", "gswarp")),  # gsplat compiles itself on first use
+)
+_STEP_NAMES = Literal[
+    "compile", "checks", "inference", "tests", "bench", "peers-conv", "peers-scan", "peers-raster"
+]
+
+
+def gpu_check_command(
+    *,
+    device: Literal["cuda", "cpu"] = "cuda",
+    quick: bool = False,
+    out: Path = Path("out/gpu-check"),
+    minutes: float = 8.0,
+    steps: tuple[_STEP_NAMES, ...] = (),
+) -> int:
+    """Runs kernel checks, GPU tests, full-size inference and the benchmark on this machine.
+
+    Writes gpu-check.json and gpu-check.md, after every item, and says what it could not do. Exit
+    code: 0 all that could be run passed, 1 something failed, 2 no CUDA device.
+
+    Args:
+        device: "cpu" tries the command itself, with --quick in seconds.
+        quick: Tiny sizes.
+        out: Folder for the results.
+        minutes: The whole run takes no longer.
+        steps: Only these; default: all.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("no CUDA device here; --device cpu --quick tries the command itself")
+    if not 0 < minutes < float("inf"):
+        raise UserError(f"--minutes is {minutes}, it must be positive")
+    run = Run(make_settings(device, quick), output_folder(out), 60 * minutes)
+    try:
+        for step in STEPS:
+            if not steps or step.name in steps:
+                run.do(step, step.seconds * minutes / 8)
+    except KeyboardInterrupt:
+        run.finish("interrupted; what was done is here")
+        return 130
+    failures = len(run.document()["failures"])
+    run.finish(f"{failures} failed" if failures else "all that could be run passed")
+    return 1 if failures else 0
+
+
+def make_settings(device: str, quick: bool) -> Settings:
+    """Of the benchmark's cases."""
+    level = "quick" if quick else "normal"
+    return Settings(torch.device(device), level, False, torch.get_num_threads())
+
+
+class Run:
+    """A run under way; its files are written whenever something is added."""
+
+    def __init__(self, settings: Settings, folder: Path, seconds: float) -> None:
+        self.settings, self.folder = settings, folder
+        self.ends = time.time() + seconds
+        self.verdict = "not finished"
+        self.machine = machine_facts(settings)
+        self.steps: list[dict] = []
+        self.parts: dict[str, dict] = {"packages": new_part()}
+        for package in sorted(set(PACKAGES) - versions().keys()):
+            self._leave_out("packages", f"comparison with {package}", "not installed")
+        self.write()
+
+    def _leave_out(self, name: str, what: str, reason: str) -> None:
+        self.parts[name]["not_done"].append({"what": what, "reason": reason})
+
+    def document(self) -> dict:
+        """All there is so far, ready for JSON.
+
+        ``{format, verdict, machine, settings, steps, results, failures, not_done, bench}``; the
+        last is one document as ``gamba bench`` writes it, inference included.
+        """
+        parts = list(self.parts.values())
+        results = {
+            name: {key: value for key, value in part["result"].items() if key != "bench"}
+            for name, part in self.parts.items()
+        }
+        return {
+            "format": FORMAT,
+            "verdict": self.verdict,
+            "machine": self.machine,
+            "settings": {"device": self.settings.device.type, "level": self.settings.level},
+            "steps": self.steps,
+            "results": {name: result for name, result in results.items() if result},
+            "failures": [failure for part in parts for failure in part["failures"]],
+            "not_done": [row for part in parts for row in part["not_done"]],
+            "bench": join_benches([p["result"]["bench"] for p in parts if "bench" in p["result"]]),
+        }
+
+    def write(self) -> None:
+        """Replaces both files."""
+        document = self.document()
+        write_json(self.folder / "gpu-check.json", document)
+        with atomic_path(self.folder / "gpu-check.md") as temporary:
+            temporary.write_text(page(document), encoding="utf-8")
+
+    def finish(self, verdict: str) -> None:
+        """Writes the files for the last time, and prints the table."""
+        self.verdict = verdict
+        self.write()
+        document = self.document()
+        rows = headline(document)
+        width = min(60, max(len(name) for name, _ in rows))
+        print("\n".join(f"{name:<{width}}  {value}" for name, value in rows))
+        for name in ("failures", "not_done"):
+            for row in document[name]:
+                text = row if isinstance(row, str) else f"{row['what']}: {row['reason']}"
+                print(f"{name.replace('_', ' ').replace('failures', 'failed')}: {text}")
+        print(f"{verdict}; wrote {self.folder / 'gpu-check.json'} and gpu-check.md")
+
+    def do(self, step: Step, seconds: float) -> None:
+        """Runs a step in a process of its own, for so many seconds or the rest of the run."""
+        started = time.time()
+        seconds = min(seconds, self.ends - started - 1)
+        row = {"name": step.name, "status": "not done", "reason": "", "seconds": 0.0}
+        self.steps.append(row)
+        self.parts[step.name] = new_part()
+        if step.cuda and self.settings.device.type != "cuda":
+            row["reason"] = "needs CUDA"
+        elif step.packages and not versions().keys() & set(step.packages):
+            row["reason"] = f"not installed: {', '.join(step.packages)}"
+        elif seconds < _LEAST:
+            row["reason"] = "time was up"
+        elif step.name == "tests":
+            self._tests(row, seconds)
+        else:
+            self._child(row, seconds)
+        row["seconds"] = time.time() - started
+        if row["status"] in ("not done", "stopped"):
+            rest = "the rest of " if row["status"] == "stopped" else ""
+            self._leave_out(step.name, f"{rest}step {step.name}", row["reason"])
+        self.write()
+        reason = f" ({row['reason']})" if row["reason"] else ""
+        print(f"{step.name:<10} {row['status']}{reason}, {row['seconds']:.0f} s", flush=True)
+
+    def _child(self, row: dict, seconds: float) -> None:
+        """A step of ``gpu_steps``; what it writes is taken over while it runs."""
+        name = row["name"]
+        until = time.time() + max(seconds - _GRACE, seconds / 2)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "part.json"
+
+            def look() -> None:
+                if path.exists():
+                    part = json.loads(path.read_text())
+                    if part != self.parts[name]:
+                        self.parts[name] = part
+                        self.write()
+
+            command = ["-m", "gamba_warp.gpu_check", "--child", name, "--out", str(path)]
+            command += ["--device", self.settings.device.type, "--until", str(until)]
+            command += ["--quick"] * (self.settings.level == "quick")
+            code, said = run_python(command, seconds, look)
+        self._judge(row, code, said, seconds)
+
+    def _judge(self, row: dict, code: int | None, said: str, seconds: float) -> None:
+        part = self.parts[row["name"]]
+        row["status"] = "passed"
+        if code is None:
+            row.update(status="stopped", reason=f"its {seconds:.0f} s were up")
+        elif not part["whole"]:
+            row["reason"] = f"ended with code {code}: {said}"
+            part["failures"].append(f"step {row['name']} {row['reason']}")
+        if part["failures"]:
+            row["status"] = "failed"
+
+    def _tests(self, row: dict, seconds: float) -> None:
+        """The tests that are marked gpu, where pytest and a checkout are there."""
+        part = self.parts["tests"]
+        files = gpu_test_files(CHECKOUT / "tests")
+        if not files or importlib.util.find_spec("pytest") is None:
+            row["reason"] = "pytest is not installed" if files else "no checkout, so no tests"
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "junit.xml"
+            command = ["-m", "pytest", "-m", "gpu", "-q", "-p", "no:cacheprovider"]
+            command += ["--continue-on-collection-errors", f"--junitxml={path}", *map(str, files)]
+            code, said = run_python(command, seconds, lambda: None, cwd=CHECKOUT)
+            if path.exists():
+                part.update(read_junit(path.read_text()), whole=True)
+        self._judge(row, code, said, seconds)
+
+
+def join_benches(documents: list[dict]) -> dict:
+    """One document of several; a later one's case, or target that it measured, takes the place."""
+    records: list[dict] = []
+    targets: dict[tuple, dict] = {}
+    for document in documents:
+        new = {(r["op"], r["case"]) for r in document["records"]}
+        records = [r for r in records if (r["op"], r["case"]) not in new] + document["records"]
+        for target in document.get("targets", []):
+            key = target["op"], target["text"]
+            if key not in targets or target["value"] is not None:
+                targets[key] = target
+    joined = documents[0] if documents else {}
+    return joined | {"records": records, "targets": list(targets.values())}
+
+
+def new_part() -> dict:
+    """As ``Part.write``, of a step that has done nothing."""
+    return {"result": {}, "not_done": [], "failures": [], "whole": False}
+
+
+def run_python(
+    arguments: list[str], seconds: float, look: Callable[[], None], cwd: Path | None = None
+) -> tuple[int | None, str]:
+    """Runs Python in a process group of its own, and ends the group when its time is up.
+
+    Args:
+        arguments: of Python.
+        seconds: at most.
+        look: called every half a second, and at the end.
+        cwd: where; None: here.
+
+    Returns:
+        The exit code, None if it was ended, and the last line that it printed.
+    """
+    paths = [str(CHECKOUT), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    ends = time.time() + seconds
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(
+            [sys.executable, *arguments],
+            **{"stdout": said, "stderr": subprocess.STDOUT, "stdin": subprocess.DEVNULL},
+            **{"cwd": cwd, "env": environment, "start_new_session": True},
+        )
+        try:
+            while process.poll() is None and time.time() < ends:
+                time.sleep(0.1)
+                look()
+            code = process.poll()
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        look()
+        said.seek(0)
+        lines = said.read().decode(errors="replace").strip().splitlines()
+    return code, lines[-1] if lines else "nothing was printed"
+
+
+def gpu_test_files(folder: Path) -> list[Path]:
+    """Files of a folder of tests with a test that is marked gpu."""
+    files = sorted(folder.rglob("test_*.py"))
+    return [path for path in files if "@pytest.mark.gpu" in path.read_text(encoding="utf-8")]
+
+
+def read_junit(text: str) -> dict:
+    """A part as ``new_part``, from pytest's XML.
+
+    A module that cannot be imported for want of a package is not done, not failed.
+    """
+    part, counts = new_part(), {"passed": 0, "failed": 0, "skipped": 0}
+    for case in ElementTree.fromstring(text).iter("testcase"):
+        name = ".".join(filter(None, (case.get("classname"), case.get("name"))))
+        wrong = [case.find(kind) for kind in ("failure", "error")]
+        wrong = next((element for element in wrong if element is not None), None)
+        skipped = case.find("skipped")
+        if skipped is not None:
+            counts["skipped"] += 1
+            part["not_done"].append({"what": name, "reason": skipped.get("message", "")})
+        elif wrong is None:
+            counts["passed"] += 1
+        elif "ModuleNotFoundError" in (wrong.text or ""):
+            line = next(x for x in wrong.text.splitlines() if "ModuleNotFoundError" in x)
+            part["not_done"].append({"what": name, "reason": line.removeprefix("E").strip()})
+        else:
+            counts["failed"] += 1
+            message = (wrong.get("message") or "").strip().splitlines() or [""]
+            part["failures"].append(f"{name}: {message[0]}")
+    part["result"] = {"counts": counts}
+    return part
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """``python -m gamba_warp.gpu_check``: the command without tyro; with --child, one step."""
+    parser = argparse.ArgumentParser(
+        prog="gamba gpu-check", description=gpu_check_command.__doc__.split("\n\n")[0]
+    )
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes")
+    parser.add_argument("--out", type=Path, default=Path("out/gpu-check"), help="folder")
+    parser.add_argument("--minutes", type=float, default=8.0, help="the run takes no longer")
+    names = [step.name for step in STEPS]
+    parser.add_argument("--steps", nargs="+", choices=names, default=(), help="only these")
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    parser.add_argument("--until", type=float, help=argparse.SUPPRESS)
+    o = parser.parse_args(arguments)
+    if o.child:
+        # here, not above: what a step imports may be what breaks it, and that ends the step alone
+        from .steps import Part, run_step
+
+        run_step(o.child, Part(o.out, o.until), make_settings(o.device, o.quick))
+        return 0
+    try:
+        return gpu_check_command(
+            device=o.device, quick=o.quick, out=o.out, minutes=o.minutes, steps=tuple(o.steps)
+        )
+    except UserError as error:
+        print(f"gamba: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

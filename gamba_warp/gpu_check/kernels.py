@@ -1,0 +1,232 @@
+"""Checks of the kernels on a device, for a machine that has torch and warp-lang only.
+
+Each compares with the float64 oracle, or a run with another run; ``gamba gpu-check`` runs them all.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from ..kernels.bench import Error, compare
+from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
+from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
+from ..kernels.causal_conv1d import causal_conv1d
+from ..kernels.causal_conv1d.reference import causal_conv1d_reference
+from ..kernels.selective_scan.cuda.tuning import Variant, use_variant
+
+# Allowed relative rms errors. A GPU's exponential errs by up to 2^-22 a step; half precision rounds
+# inputs and outputs; of a picture a few pixels may cross the cut at the faintest alpha.
+LIMIT, HALF_LIMIT, PICTURE_LIMIT = 1e-5, 3e-2, 1e-3
+# batch, tokens, channels, states, groups
+SCANS = [
+    (2, 139, 37, 3, 1), (1, 65, 40, 3, 2), (1, 1, 1, 1, 1), (1, 577, 70, 16, 1),
+    (2, 128, 64, 16, 1), (1, 67, 35, 17, 1), (1, 100, 20, 40, 1), (3, 64, 96, 16, 3),
+    (1, 9, 3, 256, 1), (1, 1031, 129, 16, 1), (1, 66, 5, 64, 1), (2, 200, 33, 8, 1),
+]  # fmt: skip
+VARIANTS = [
+    Variant(pieces=2, back_pieces=3),
+    Variant(pieces=7, channels=1, states=16, back_channels=1, back_states=8),
+    Variant(channels=4, states=4, back_pieces=4, back_channels=4, back_states=4),
+    Variant(channels=1, states=4, back_channels=2, back_states=8, block=64),
+]
+# batch, tokens, channels, taps
+CONVS = [(2, 300, 19, 4), (1, 1, 1, 2), (1, 33, 130, 3), (3, 257, 64, 4)]
+# Gaussians, side of the picture, views, options; few views are cut into parts of tiles
+RASTERS = [
+    (300, 75, 3, {}), (1, 33, 1, {}), (2000, 130, 1, {"rasterize_mode": "antialiased"}),
+    (700, 61, 40, {}), (500, 48, 2, {"quats": None}), (4000, 257, 12, {}),
+]  # fmt: skip
+
+
+class LeftOut(Exception):
+    """A check that cannot be done here; ``str(error)`` says why."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Something that must hold on a device.
+
+    Attributes:
+        name: what.
+        run: given the device, returns what was found, in words; raises what is wrong.
+        cuda: whether only a GPU can do it.
+    """
+
+    name: str
+    run: Callable[[torch.device], str]
+    cuda: bool = False
+
+
+def checks(quick: bool) -> Iterator[Check]:
+    """Yields all checks, or a few in each kind."""
+    few = 2 if quick else None
+    for shape in SCANS[:few]:
+        yield Check(f"scan {shape}", partial(_scan, shape, torch.float32))
+    for shape in SCANS[: few and 1]:
+        yield Check(f"scan {shape}, bfloat16", partial(_scan, shape, torch.bfloat16))
+    for variant in VARIANTS:
+        text = ", ".join(f"{name} {value}" for name, value in vars(variant).items())
+        yield Check(f"scan, {text}", partial(_variant, variant), cuda=True)
+    for shape in CONVS[:few]:
+        yield Check(f"convolution {shape}", partial(_conv, shape))
+    for count, size, views, options in RASTERS[:few]:
+        name = f"rasterizer, {count} Gaussians, {views} views of {size}²" + str(options or "")
+        yield Check(name, partial(_raster, count, size, views, options))
+    yield Check("scan: two runs, the same bits", _scan_twice)
+    yield Check("rasterizer: two runs, the same bits", _raster_twice)
+    yield Check("torch.compile, whole graph, AOTAutograd", partial(_compiled, "aot_eager"))
+    yield Check("torch.compile, whole graph, inductor", partial(_compiled, "inductor"), cuda=True)
+    yield Check("scan and convolution on a stream of their own", _side_stream, cuda=True)
+    yield Check("scan and convolution in a CUDA graph", _graph, cuda=True)
+
+
+def _within(error: Error, limit: float) -> str:
+    if not error.rel_rms <= limit:
+        raise AssertionError(
+            f"{error.worst}: relative rms error {error.rel_rms:.2g}, allowed {limit:.2g}"
+        )
+    return f"{error.rel_rms:.1e}"
+
+
+def _problem(shape: tuple, device: torch.device) -> ScanProblem:
+    batch, length, channels, states, groups = shape
+    inputs = make_inputs(batch, length, channels, states, groups)
+    g = torch.Generator().manual_seed(2)
+    state = torch.randn(batch, channels, states, generator=g)
+    return ScanProblem(inputs, device, length, channels, state)
+
+
+def _scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> str:
+    """Output and all gradients, from a given first state."""
+    error = _problem(shape, device).check_backward(dtype)
+    return _within(error, LIMIT if dtype == torch.float32 else HALF_LIMIT)
+
+
+def _variant(variant: Variant, device: torch.device) -> str:
+    with use_variant(variant):
+        return _scan(SCANS[3], torch.float32, device)
+
+
+def _scan_twice(device: torch.device) -> str:
+    problem = _problem((2, 577, 70, 16, 1), device)
+    for dtype in (torch.float32, torch.bfloat16):
+        _same(problem.backward(dtype), problem.backward(dtype))
+    return "equal"
+
+
+def _same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
+    for i, (a, b) in enumerate(zip(first, second)):
+        if not torch.equal(a, b):
+            raise AssertionError(f"result {i} differs by up to {(a - b).abs().max().item():.2g}")
+
+
+def _conv(shape: tuple, device: torch.device) -> str:
+    """Output and all gradients, from given first tokens."""
+    batch, length, channels, taps = shape
+    g = torch.Generator().manual_seed(0)
+    sizes = {"x": (batch, length, channels), "weight": (channels, taps), "bias": (channels,)}
+    sizes["initial_state"] = (batch, taps - 1, channels)
+    inputs = {name: torch.randn(*size, generator=g) for name, size in sizes.items()}
+    cotangent = torch.randn(*sizes["x"], generator=g)
+    mine = {name: x.to(device).requires_grad_() for name, x in inputs.items()}
+    exact = {name: x.double().requires_grad_() for name, x in inputs.items()}
+    out = causal_conv1d(**mine, activation="silu")
+    want, _ = causal_conv1d_reference(**exact, activation="silu")
+    grads = torch.autograd.grad(out, list(mine.values()), cotangent.to(device))
+    wants = torch.autograd.grad(want, list(exact.values()), cotangent.double())
+    got = {"out": out} | dict(zip(mine, grads))
+    return _within(compare(got, {"out": want} | dict(zip(exact, wants))), LIMIT)
+
+
+def _scene(count: int, size: int, views: int, options: dict, device: torch.device) -> Scene:
+    gaussians = shell(count, scale=3.0)
+    if "quats" in options:
+        gaussians["quats"] = None
+    rest = {name: value for name, value in options.items() if name != "quats"}
+    return Scene(gaussians, *orbit_cameras(views, size), size, device, rest)
+
+
+def _raster(count: int, size: int, views: int, options: dict, device: torch.device) -> str:
+    """Picture, alphas and all gradients on a crop of the first view."""
+    scene = _scene(count, size, views, options, device)
+    picture, alphas, _ = scene.forward()
+    if not (picture.isfinite().all() and alphas.max() <= 1):
+        raise AssertionError("the picture is not finite, or alpha is over 1")
+    return _within(scene.check(backward=True), PICTURE_LIMIT)
+
+
+def _raster_twice(device: torch.device) -> str:
+    scene = _scene(700, 75, 3, {}, device)
+    _same(scene.forward()[:2], scene.forward()[:2])
+    _same(scene.backward(), scene.backward())
+    return "equal"
+
+
+def _layer(problem: ScanProblem) -> tuple[Callable[..., Tensor], list[Tensor]]:
+    """Convolution, then scan, and their inputs on the device."""
+    inputs = problem.at(torch.float32)
+    weight = torch.linspace(-0.5, 0.5, 4 * inputs["u"].shape[2], device=problem.device)
+
+    def layer(u: Tensor, weight: Tensor) -> Tensor:
+        u = causal_conv1d(u, weight, activation="silu")
+        return problem.call(inputs | {"u": u})
+
+    return layer, [inputs["u"], weight.view(-1, 4)]
+
+
+def _compiled(backend: str, device: torch.device) -> str:
+    if backend == "inductor":
+        if importlib.util.find_spec("triton") is None:
+            raise LeftOut("triton is not installed")
+        if not any(map(shutil.which, ("cc", "gcc", "clang"))):
+            raise LeftOut("triton needs a C compiler, and there is none")
+    layer, inputs = _layer(_problem((1, 139, 37, 16, 1), device))
+    results = []
+    for function in (layer, torch.compile(layer, fullgraph=True, backend=backend)):
+        leaves = [x.detach().clone().requires_grad_() for x in inputs]
+        out = function(*leaves)
+        results.append({"out": out} | dict(zip("uw", torch.autograd.grad(out.sum(), leaves))))
+    return _within(compare(results[1], results[0]), 1e-6)
+
+
+def _side_stream(device: torch.device) -> str:
+    layer, inputs = _layer(_problem((1, 577, 70, 16, 1), device))
+    want = layer(*inputs)
+    stream = torch.cuda.Stream(device)
+    torch.cuda.synchronize(device)
+    with torch.cuda.stream(stream):
+        big = torch.randn(4096, 4096, device=device)
+        for _ in range(8):  # so that what is launched on another stream would come too early
+            big = big @ big * 1e-3
+        out = layer(*(x + 0 * big[0, 0].nan_to_num(0.0, 0.0, 0.0) for x in inputs))
+    stream.synchronize()
+    _same((out,), (want,))
+    return "equal"
+
+
+def _graph(device: torch.device) -> str:
+    """A replay gives the bits of a plain run, with inputs changed since the capture too."""
+    layer, inputs = _layer(_problem((1, 577, 70, 16, 1), device))
+    with torch.no_grad():
+        stream = torch.cuda.Stream(device)
+        stream.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(stream):
+            layer(*inputs)
+        torch.cuda.current_stream(device).wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            out = layer(*inputs)
+        for scale in (1.0, 0.5):
+            inputs[0].mul_(scale)
+            out.fill_(torch.nan)
+            graph.replay()
+            torch.cuda.synchronize(device)
+            _same((out,), (layer(*inputs),))
+    return "equal"

@@ -1,0 +1,120 @@
+"""The page of ``gamba gpu-check``: one table, what was not done, and the benchmark's tables."""
+
+from __future__ import annotations
+
+import importlib.metadata
+
+import torch
+import warp as wp
+
+from ..kernels.bench import Settings
+from ..kernels.bench.core.measure import machine
+from ..kernels.bench.core.report import groups, oracles, table
+from ..kernels.bench.peers import versions
+
+_OTHERS = ("timm", "pytest", "triton", "tyro", "safetensors")
+
+
+def machine_facts(settings: Settings) -> dict:
+    """As ``gamba bench``'s machine, with what it says of the GPU, and the other packages found."""
+    facts = machine(settings)
+    if settings.device.type == "cuda":
+        gpu = torch.cuda.get_device_properties(settings.device)
+        free, total = torch.cuda.mem_get_info(settings.device)
+        facts |= {
+            "architecture": f"sm_{gpu.major}{gpu.minor}",
+            "multiprocessors": gpu.multi_processor_count,
+            "memory_gib": round(total / 2**30, 1),
+            "free_gib": round(free / 2**30, 1),
+            "driver": ".".join(map(str, wp.get_cuda_driver_version() or ())),
+        }
+    packages = {name: _version(name) for name in _OTHERS} | versions()
+    return facts | {"packages": {name: v for name, v in packages.items() if v}}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def headline(document: dict) -> list[tuple[str, str]]:
+    """What was found, in rows of a name and a value."""
+    facts = document["machine"] | {"packages": _joined(document["machine"]["packages"])}
+    rows = [(name.replace("_", " "), str(value)) for name, value in facts.items() if value]
+    for step in document["steps"]:
+        reason = f": {step['reason']}" if step["reason"] else ""
+        rows.append((f"step {step['name']}", f"{step['status']}, {step['seconds']:.0f} s{reason}"))
+    compiled = document["results"].get("compile", {})
+    if "seconds" in compiled:
+        text = f"{compiled['kernels']} of {compiled['of']} in {compiled['seconds']:.1f} s"
+        rows.append(("kernels compiled or loaded", text))
+    for name in ("checks", "tests"):
+        result = document["results"].get(name, {})
+        counts = _counts(result.get("checks", [])) if name == "checks" else result.get("counts")
+        if counts:
+            text = ", ".join(f"{count} {word}" for word, count in counts.items())
+            rows.append(("checks of the kernels" if name == "checks" else "GPU tests", text))
+    inference = document["results"].get("inference", {})
+    for name, value in inference.get("ceilings", {}).items():
+        rows.append((name.replace("_per_", "/").replace("_", " "), f"{value:.3g}"))
+    if "reserved_gib" in inference:
+        text = f"{inference['reserved_gib']:.1f} GiB, graphs and both precisions together"
+        rows.append(("inference, memory taken", text))
+    for record in document["bench"]["records"]:
+        if record["op"] != "inference":
+            continue
+        rows.append((f"inference, {record['variant']}", _time(record)))
+    for target in document["bench"]["targets"]:
+        words = {True: "reached", False: "missed", None: "not measured"}[target["reached"]]
+        value = "" if target["value"] is None else f"{target['value']:.3g}, "
+        rows.append((f"{target['op']}: {target['text']}", f"{value}{target['wanted']}: {words}"))
+    return rows
+
+
+def _joined(values: dict) -> str:
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def _counts(checks: list[dict]) -> dict[str, int]:
+    words = [check["status"] for check in checks]
+    return {word: words.count(word) for word in dict.fromkeys(words)}
+
+
+def _time(record: dict) -> str:
+    if record["status"] != "ok":
+        return record["status"]
+    text = f"{record['ms_p50']:.3g} ms ({record['ms_p20']:.3g} to {record['ms_p80']:.3g})"
+    if "peak_bytes" in record["work"]:
+        text += f", {record['work']['peak_bytes'] / 2**20:,.0f} MiB more at the peak"
+    if record["rel_rms_error"] is not None:
+        text += f", error {record['rel_rms_error']:.2g} to {record['oracle']}"
+    return text
+
+
+def page(document: dict) -> str:
+    """The document as Markdown."""
+    title = document["verdict"]
+    lines = ["# gamba gpu-check", "", f"Written by `gamba gpu-check`, not by hand. **{title}**", ""]
+    lines += _table(("what", "found"), headline(document))
+    for name, rows in (("Failed", document["failures"]), ("Not done", _reasons(document))):
+        if rows:
+            lines += ["", f"## {name}", "", *(f"- {row}" for row in rows)]
+    records = document["bench"]["records"]
+    for op, cases in groups({"records": records}).items():
+        for case, found in cases.items():
+            header, cells = table(found)
+            lines += ["", f"## {op}: {case}", "", f"{found[0]['text']} {oracles(found)}", ""]
+            lines += _table(header, cells)
+    return "\n".join([*lines, ""])
+
+
+def _reasons(document: dict) -> list[str]:
+    return [f"{row['what']}: {row['reason']}" for row in document["not_done"]]
+
+
+def _table(header, rows) -> list[str]:
+    cells = [[str(cell).replace("|", "\\|") for cell in row] for row in (header, *rows)]
+    lines = [f"| {' | '.join(row)} |" for row in cells]
+    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]

@@ -1,0 +1,209 @@
+"""The steps of ``gamba gpu-check``, each run in a process of its own.
+
+A step writes what it has to a file after every item, so that whatever ends it, a crash of somebody
+else's package or the clock, loses no more than the item under way.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+import warp as wp
+
+from ..files import write_json
+from ..kernels.bench import Case, Settings, Target, measure
+from ..kernels.bench.cases import conv, raster, scan
+from ..kernels.bench.core.report import judge
+from ..kernels.bench.static.report import find_kernels
+from ..measure import blocks as bench_model
+from ..measure import inference as bench_inference
+from .kernels import LeftOut, checks
+
+_SUITES = (raster, scan, conv, bench_model)
+# What is timed first, since time may end before the list does; then all other cases.
+_FIRST = [
+    ("scan", "operator"), ("raster", "scene"), ("conv", "operator"), ("block", "one block"),
+    ("block", "backbone"), ("raster", "32 views"), ("scan", "training batch"),
+    ("model", "one picture"),
+]  # fmt: skip
+_ON_A_CPU = [("conv", "operator")]  # of a quick run there, which only tries the command
+# The cases with other people's packages: what breaks there must not take ours along.
+_BESIDE = {
+    "peers-conv": [("conv", "operator")],
+    "peers-scan": [("scan", "reference loop")],
+    "peers-raster": [("raster", "scene"), ("raster", "32 views")],
+}
+
+
+@dataclass
+class Part:
+    """What a step has done so far.
+
+    Attributes:
+        path: where it is written.
+        until: seconds since the epoch; no item is begun later.
+        parent: the process that asked; when it is gone nothing more is begun.
+        result: for JSON.
+        not_done: ``{what, reason}`` each.
+        failures: what was wrong, in words.
+        whole: whether the step came to its end.
+    """
+
+    path: Path
+    until: float
+    parent: int = field(default_factory=os.getppid)
+    result: dict = field(default_factory=dict)
+    not_done: list[dict] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    whole: bool = False
+
+    def write(self) -> None:
+        """Replaces the file."""
+        names = ("result", "not_done", "failures", "whole")
+        write_json(self.path, {name: getattr(self, name) for name in names})
+
+    def leave_out(self, what: str, reason: str) -> None:
+        """Notes what is not done."""
+        self.not_done.append({"what": what, "reason": reason})
+
+    def time_is_up(self) -> bool:
+        """Whether no further item may begin."""
+        return time.time() > self.until or os.getppid() != self.parent
+
+
+def run_step(name: str, part: Part, settings: Settings) -> None:
+    """Runs the step of that name to its end, or until its time is up."""
+    torch.set_num_threads(settings.threads)
+    part.write()
+    if name in _BESIDE:
+        _bench(part, replace(settings, peers=True), _BESIDE[name])
+    elif name == "bench":
+        quick, cpu = settings.level == "quick", settings.device.type == "cpu"
+        _bench(part, settings, _ON_A_CPU if quick and cpu else _FIRST, alone=quick)
+    else:
+        {"compile": _compile, "checks": _checks, "inference": _inference}[name](part, settings)
+    part.whole = True
+    part.write()
+
+
+def _compile(part: Part, settings: Settings) -> None:
+    """Every kernel of ``gamba bench --static``, for the GPU that is there, into Warp's cache."""
+    device = wp.device_from_torch(settings.device)
+    entries = find_kernels()
+    part.result = {"kernels": 0, "of": len(entries), "seconds": 0.0}
+    for entry in entries:
+        if part.time_is_up():
+            part.leave_out(f"compile {entry.name}, {entry.case}", "time was up")
+            continue
+        started = time.perf_counter()
+        kernel, block = entry.launch.kernel, entry.launch.block
+        if not kernel.module.load(device, block):
+            part.failures.append(f"{entry.name}, {entry.case}: does not load on {device}")
+        part.result["kernels"] += 1
+        part.result["seconds"] += time.perf_counter() - started
+        part.write()
+
+
+def _checks(part: Part, settings: Settings) -> None:
+    found = part.result["checks"] = []
+    for check in checks(settings.level == "quick"):
+        if check.cuda and settings.device.type != "cuda":
+            part.leave_out(check.name, "needs CUDA")
+            continue
+        if part.time_is_up():
+            part.leave_out(check.name, "time was up")
+            continue
+        started = time.perf_counter()
+        row = {"name": check.name, "status": "passed"}
+        try:
+            row["found"] = check.run(settings.device)
+        except LeftOut as reason:
+            part.leave_out(check.name, str(reason))
+            continue
+        except Exception as error:  # a kernel that does not work raises anything: that is the news
+            row |= {"status": "failed", "found": _first_line(error)}
+            part.failures.append(f"{check.name}: {row['found']}")
+        found.append(row | {"seconds": time.perf_counter() - started})
+        part.write()
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def _inference(part: Part, settings: Settings) -> None:
+    part.result["ceilings"] = _ceilings(settings)
+    _measure(part, settings, bench_inference.cases(settings), bench_inference.targets(settings))
+    if settings.device.type != "cuda":
+        part.leave_out("inference from a CUDA graph", "needs CUDA")
+    else:
+        part.result["reserved_gib"] = torch.cuda.memory_reserved(settings.device) / 2**30
+        reason = "the number of pairs is read back to make the lists, which no graph can hold"
+        part.leave_out("the view in the CUDA graph", reason)
+
+
+def _ceilings(settings: Settings) -> dict[str, float]:
+    """What the device does at best, to judge times by: a copy and a product of matrices."""
+    count = 1 << (20 if settings.level == "quick" else 30)
+    side = 256 if settings.level == "quick" else 8192
+    source = torch.ones(count // 4, device=settings.device)
+    target = torch.empty_like(source)
+    a = torch.randn(side, side, device=settings.device).bfloat16()
+    return {
+        "copy_gb_per_s": 2 * count / _seconds(lambda: target.copy_(source), settings) / 1e9,
+        "bfloat16_tflop_per_s": 2 * side**3 / _seconds(lambda: a @ a, settings) / 1e12,
+    }
+
+
+def _seconds(run, settings: Settings, rounds: int = 5) -> float:
+    best = float("inf")
+    for _ in range(rounds):
+        started = time.perf_counter()
+        run()
+        if settings.device.type == "cuda":
+            torch.cuda.synchronize(settings.device)
+        best = min(best, time.perf_counter() - started)
+    return best
+
+
+def _bench(part: Part, settings: Settings, first: list[tuple[str, str]], alone=True) -> None:
+    """Cases of ``gamba bench`` by op and name, where there are such; unless alone, then others."""
+    found: dict[tuple[str, str], Case] = {}
+    targets: list[Target] = []
+    for suite in _SUITES:
+        found |= {(case.op, case.name): case for case in suite.cases(settings)}
+        targets += suite.targets(settings)
+    keys = [key for key in first if key in found]
+    if not alone:
+        keys += [key for key in found if key not in keys]
+    _measure(part, settings, [found[key] for key in keys], targets)
+
+
+def _measure(part: Part, settings: Settings, cases: list[Case], targets: list[Target]) -> None:
+    """Measures case after case; what is wrong with ours is a failure, with a peer a note."""
+    document = part.result["bench"] = measure([], settings)
+    for case in cases:
+        if part.time_is_up():
+            part.leave_out(f"{case.op}: {case.name}", "time was up")
+            continue
+        records = measure([case], settings)["records"]
+        document["records"] += records
+        document["targets"] = judge(targets, document["records"])
+        for record in records:
+            _note(part, record)
+        part.write()
+
+
+def _note(part: Part, record: dict) -> None:
+    name = f"{record['op']}: {record['case']}: {record['variant']}, {record['direction']}"
+    if record["status"] == "ok":
+        return
+    if record["is_peer"] or record["status"].startswith("not"):
+        part.leave_out(name, record["status"])
+    else:
+        part.failures.append(f"{name}: {record['status']}")

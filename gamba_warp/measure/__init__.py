@@ -1,0 +1,1 @@
+"""Benchmark and stress cases that need the model."""

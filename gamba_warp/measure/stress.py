@@ -1,0 +1,276 @@
+"""Random and hostile cases of the model: a picture to Gaussians against float64."""
+
+from __future__ import annotations
+
+from random import Random
+
+import torch
+from torch import Tensor
+
+from ..cameras import Cameras, intrinsics, orbit, plucker_rays
+from ..kernels.stress import Case, Op, Outcome, generator, judge
+from ..kernels.stress.cases.scan import gradients_of, repeated
+from ..kernels.stress.core.rounding import SAMPLES, Rounding, samples_of
+from ..kernels.stress.oracles.scan import EXP_ULPS, conv, scan
+from ..model.block import GambaBlock, prefix_states
+from ..model.config import GambaConfig
+from ..model.decoder import MIN_SCALE
+from ..model.gamba import Gamba
+from ..model.tokens import normalize_imagenet
+
+KINDS = (
+    "uniform", "white", "black", "checkerboard", "one pixel", "out of range", "tiny weights",
+    "large weights", "long steps", "short steps", "slow decay", "fast decay", "saturated heads",
+)  # fmt: skip
+_BFLOAT16 = 2.0**16  # last bits of float32 in half the last bit of bfloat16
+_IMAGE_CHANNELS = 6
+_PLAIN = {
+    "batch": 1, "patches": 1, "patch_size": 1, "width": 1, "depth": 1, "state_size": 1,
+    "conv_size": 2, "expand": 1, "dt_rank": 1, "norm": "rms", "discretization": "mamba",
+    "additive_image_tokens": False, "camera_token": False, "image_tokens": 0,
+    "predict_rotation": False, "position_bins": 2, "autocast": False,
+}  # fmt: skip
+_CHOICES = {"norm": ("layer", "rms"), "discretization": ("mamba", "bilinear", "zoh")}
+
+
+def draw(rng: Random, kind: str) -> dict:
+    """Random options."""
+    flag = lambda chance=0.5: rng.random() < chance  # noqa: E731
+    return valid(dict(
+        batch=rng.choice((1, 2, 3)), patches=rng.choice((1, 2, 3, 4)),
+        patch_size=rng.choice((1, 2, 4)), width=rng.choice((4, 8, 12, 16, 20, 24)),
+        depth=rng.choice((1, 1, 2, 3)), state_size=rng.choice((1, 2, 4, 5, 16)),
+        conv_size=rng.choice((2, 3, 4, 4)), expand=rng.choice((1, 2, 2)),
+        dt_rank=rng.choice((1, 2, 3)), norm=rng.choice(_CHOICES["norm"]),
+        discretization=rng.choice(("mamba", *_CHOICES["discretization"])),
+        additive_image_tokens=flag(0.8), camera_token=flag(0.7),
+        image_tokens=rng.choice((0, 1, 3, 9)), predict_rotation=flag(0.3),
+        position_bins=rng.choice((2, 5, 21)), autocast=flag(0.3),
+    ))  # fmt: skip
+
+
+def valid(options: dict) -> dict:
+    """Sizes within the configuration's limits."""
+    least = {k: 1 for k in ("patches", "patch_size", "width", "depth", "expand", "dt_rank")}
+    least |= {"state_size": 1, "conv_size": 2, "position_bins": 2}
+    most = {"state_size": 16, "conv_size": 4, "position_bins": 21, "width": 32, "depth": 4,
+            "patches": 6, "patch_size": 4, "expand": 3, "dt_rank": 4, "batch": 4,
+            "image_tokens": 16}  # fmt: skip
+    o = {k: max(v, least.get(k, 0)) for k, v in options.items() if k in most} | {
+        k: v for k, v in options.items() if k not in most
+    }
+    return {k: min(o[k], most[k]) if k in most else o[k] for k in options}
+
+
+def _config(o: dict) -> GambaConfig:
+    names = (
+        "patch_size", "width", "depth", "state_size", "conv_size", "expand", "dt_rank", "norm",
+        "discretization", "additive_image_tokens", "camera_token", "predict_rotation",
+        "position_bins",
+    )  # fmt: skip
+    prepend = o["camera_token"]
+    size = o["patches"] * o["patch_size"]
+    return GambaConfig(**{k: o[k] for k in names}, image_size=size, encoder="none", prepend=prepend)
+
+
+def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], Cameras]:
+    """The model, its inputs that ask for gradients by name, and the cameras."""
+    o, kind = case.options, case.kind
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(case.seed)
+        config = _config(o)
+        model = Gamba(config)
+        if o["image_tokens"]:  # as if an encoder had made them
+            camera = config.width if config.camera_token else 0
+            blocks = (GambaBlock(config, camera, _IMAGE_CHANNELS) for _ in range(config.depth))
+            model.blocks = torch.nn.ModuleList(blocks)
+        _change(model, kind)
+        size, batch = config.image_size, o["batch"]
+        images = torch.rand(batch, size, size, 3)
+        angles = 360 * torch.rand(batch)
+    images = _picture(kind, images)
+    inputs = {"images": images}
+    if o["image_tokens"]:
+        shape = batch, o["image_tokens"], _IMAGE_CHANNELS
+        inputs["image_tokens"] = 3 * torch.randn(shape, generator=generator(case, "tokens"))
+    inputs = {k: x.to(device).requires_grad_() for k, x in inputs.items()}
+    cameras = Cameras(orbit(angles, 20.0), intrinsics(size, size).repeat(batch, 1, 1), size, size)
+    return model.to(device), inputs, cameras.to(device)
+
+
+@torch.no_grad()
+def _change(model: Gamba, kind: str) -> None:
+    """Every parameter away from its start, then what the kind does to some."""
+    for parameter in model.parameters():
+        parameter += 0.05 * torch.randn_like(parameter)
+        if kind in ("tiny weights", "large weights"):
+            parameter *= 1e-3 if kind == "tiny weights" else 4.0
+    for block in model.blocks:
+        mamba = block.mamba
+        mamba.dt_proj.bias += {"long steps": 8.0, "short steps": -25.0}.get(kind, 0.0)
+        mamba.A_log += {"slow decay": -14.0, "fast decay": 7.0}.get(kind, 0.0)
+    if kind == "saturated heads":
+        for head in (model.decoder.position, model.decoder.opacity, model.decoder.scale):
+            head.weight *= 300
+
+
+def _picture(kind: str, images: Tensor) -> Tensor:
+    if kind in ("white", "black"):
+        return torch.full_like(images, float(kind == "white"))
+    if kind == "checkerboard":
+        rows, columns = (torch.arange(n) for n in images.shape[1:3])
+        return images * 0 + ((rows[:, None] + columns) % 2)[:, :, None]
+    if kind == "one pixel":
+        images = torch.zeros_like(images)
+        images[:, 0, 0] = 1
+    return images * 1e3 if kind == "out of range" else images
+
+
+class _Oracle:
+    """The network in float64 from its parameters, sample by sample, the condition prepended."""
+
+    def __init__(self, case: Case, model: Gamba) -> None:
+        self.config, self.r = model.config, Rounding(case.seed)
+        self.ulps = _BFLOAT16 if case.options["autocast"] else 1.0
+        self.weights = {k: samples_of(p) for k, p in model.named_parameters()}
+        self.orders = model.tokens.orders.cpu()
+
+    def linear(self, x: Tensor, name: str, ulps: float | None = None) -> Tensor:
+        """``x [S, B, .., in]``; its product's operands and result are rounded."""
+        ulps = self.ulps if ulps is None else ulps
+        W, bias = self.weights[f"{name}.weight"], self.weights.get(f"{name}.bias")
+        axes = (1,) * (x.dim() - 3)
+        W = self.r(W, ulps, ulps).reshape(len(W), *axes, *W.shape[1:])
+        y = self.r(self.r(x, ulps, ulps) @ W.mT, ulps, ulps)
+        if bias is None:
+            return y
+        return self.r(y + self.r(bias).reshape(len(bias), *axes, 1, -1), ulps, ulps)
+
+    def norm(self, x: Tensor, name: str) -> Tensor:
+        """The configuration's norm."""
+        x = self.r(x)
+        if self.config.norm == "layer":
+            x = self.r(x - x.mean(-1, keepdim=True))
+        x = self.r(x * (x.square().mean(-1, keepdim=True) + 1e-5).rsqrt(), 4.0)
+        x = x * self.weights[f"{name}.weight"][:, None, None]
+        bias = self.weights.get(f"{name}.bias")
+        return self.r(x if bias is None else x + bias[:, None, None])
+
+    def silu(self, x: Tensor) -> Tensor:
+        """The activation."""
+        return self.r(x * self.r.sigmoid(x, EXP_ULPS), self.ulps)
+
+    def tokens(self, images: Tensor, cameras: Cameras) -> Tensor:
+        """The 3DGS tokens."""
+        r, embedding = self.r, self.r(self.weights["tokens.embedding"])[:, None]
+        if not self.config.additive_image_tokens:
+            return embedding.expand(-1, images.shape[1], -1, -1)
+        viewmats, Ks = cameras.viewmats.cpu().double(), cameras.Ks.cpu().double()
+        rays = plucker_rays(viewmats, Ks, cameras.width, cameras.height)
+        rays = rays.expand(SAMPLES, *rays.shape)
+        rays = r.rounded(rays + 2, 4.0) - 2  # differences of products of size 2
+        pixels = torch.cat([r(normalize_imagenet(images)), rays], -1)
+        size, grid = self.config.patch_size, self.config.grid_size
+        patches = pixels.unflatten(2, (grid, size)).unflatten(4, (grid, size))
+        patches = patches.permute(0, 1, 2, 4, 6, 3, 5).flatten(4).flatten(2, 3)
+        weight = self.weights["tokens.patchify.weight"].flatten(2)
+        x = r(patches, self.ulps) @ r(weight, self.ulps, self.ulps)[:, None].mT
+        x = r(x + self.weights["tokens.patchify.bias"][:, None, None], self.ulps, self.ulps)
+        return r(x[:, :, self.orders] + embedding)
+
+    def mamba(self, x: Tensor, name: str) -> Tensor:
+        """One Mamba block over ``[S, B, L, width]``."""
+        r, w = self.r, {k: self.weights[f"{name}.{k}"] for k in (
+            "conv_weight", "conv_bias", "A_log", "D", "dt_proj.bias"
+        )}  # fmt: skip
+        x, z = self.linear(x, f"{name}.in_proj").chunk(2, dim=-1)
+        parts = {"x": x, "weight": w["conv_weight"], "bias": w["conv_bias"], "initial_state": None}
+        x = r(conv(parts, True, torch.float32, r)[0], self.ulps, self.ulps)
+        rank, n = self.config.step_rank, self.config.state_size
+        low, B, C = self.linear(x, f"{name}.x_proj").split([rank, n, n], dim=-1)
+        dt = self.r(self.weights[f"{name}.dt_proj.weight"], self.ulps, self.ulps)[:, None]
+        delta = r(r(low, self.ulps) @ dt.mT, self.ulps, self.ulps)
+        parts = {
+            "u": x, "delta": delta, "A": r(-torch.exp(r(w["A_log"]))), "B": B[:, :, :, None],
+            "C": C[:, :, :, None], "D": w["D"], "z": z, "delta_bias": w["dt_proj.bias"],
+            "initial_state": None,
+        }  # fmt: skip
+        y, _ = scan(parts, True, self.config.discretization, r)
+        return self.linear(r(y, self.ulps, self.ulps), f"{name}.out_proj")
+
+    def run(self, inputs: dict[str, Tensor], cameras: Cameras) -> dict[str, Tensor]:
+        """Attributes of the Gaussians by name."""
+        tokens, prefix = self.tokens(inputs["images"], cameras), []
+        if self.config.prepend:
+            numbers = torch.cat([
+                cameras.viewmats[:, :3].flatten(1), cameras.Ks.diagonal(dim1=1, dim2=2)[:, :2] /
+                cameras.width, cameras.Ks[:, :2, 2] / cameras.width,
+            ], 1).cpu().double()  # fmt: skip
+            x = numbers[:, None].expand(SAMPLES, -1, -1, -1)
+            x = self.silu(self.linear(x, "camera_token.mlp.0"))
+            prefix.append((self.linear(x, "camera_token.mlp.2"), "project_camera"))
+        if "image_tokens" in inputs:
+            prefix.append((inputs["image_tokens"], "project_image"))
+        for i in range(self.config.depth):
+            front = [self.linear(x, f"blocks.{i}.{name}") for x, name in prefix]
+            whole = self.norm(torch.cat([*front, tokens], 2), f"blocks.{i}.norm")
+            hidden = self.mamba(whole, f"blocks.{i}.mamba")
+            tokens = self.r(tokens + hidden[:, :, -tokens.shape[2] :])
+        return self.decode(self.norm(tokens, "norm"))
+
+    def decode(self, x: Tensor) -> dict[str, Tensor]:
+        """The heads."""
+        r, config = self.r, self.config
+        x = self.silu(self.linear(x, "decoder.mlp.0"))
+        x = self.silu(self.linear(x, "decoder.mlp.2"))
+        heads = {k: self.linear(x, f"decoder.{k}", 1.0) for k in (
+            "position", "opacity", "scale", "color"
+        )}  # fmt: skip
+        points = torch.linspace(-config.position_range, config.position_range, config.position_bins)
+        # in steps: the gradient of a saturated softmax is a difference that cancels
+        logits = heads["position"].unflatten(-1, (3, -1))
+        powers = r.exp(r(logits - logits.detach().amax(-1, keepdim=True)), EXP_ULPS)
+        share = r(powers / r(powers.sum(-1, keepdim=True)))
+        made = {
+            "means": r(r(share * points.double()).sum(-1)),
+            "scales": r(r.softplus(heads["scale"], EXP_ULPS) + MIN_SCALE),
+            "opacities": r.sigmoid(heads["opacity"], EXP_ULPS)[..., 0],
+            "colors": r.sigmoid(heads["color"], EXP_ULPS),
+        }
+        if config.predict_rotation:
+            made["quats"] = self.linear(x, "decoder.rotation", 1.0)
+        return made
+
+
+def _run(model: Gamba, o: dict, inputs: dict, cameras: Cameras) -> dict[str, Tensor]:
+    with torch.autocast(inputs["images"].device.type, torch.bfloat16, enabled=o["autocast"]):
+        condition = None
+        if o["image_tokens"]:
+            camera = model.camera_token(cameras) if model.camera_token else None
+            condition = prefix_states(model.blocks, camera, inputs["image_tokens"])
+        gaussians = model(inputs["images"], cameras, condition)
+    return {k: x for k, x in vars(gaussians).items() if x is not None}
+
+
+def evaluate(case: Case, device: torch.device) -> Outcome:
+    """Runs the model; all attributes, the gradients of all parameters and inputs."""
+    model, inputs, cameras = build(case, device)
+    leaves = inputs | dict(model.named_parameters())
+    oracle = _Oracle(case, model)
+    samples = {k: samples_of(x) for k, x in inputs.items()}
+    truths = oracle.run(samples, cameras)
+    cotangents = {
+        k: torch.randn(t.shape[1:], generator=generator(case, f"v_{k}")) for k, t in truths.items()
+    }
+    results, grads, faults = repeated(
+        lambda: _run(model, case.options, inputs, cameras), cotangents, leaves
+    )
+    true_grads = gradients_of(truths, samples | oracle.weights, cotangents)
+    made = [judge(k, x, truths[k], tuple(range(x.dim()))) for k, x in results.items()]
+    made += [
+        judge(f"gradient of {k}", g, true_grads[k], tuple(range(g.dim()))) for k, g in grads.items()
+    ]
+    return Outcome(made, faults)
+
+
+OP = Op("model", KINDS, _PLAIN, _CHOICES, draw, valid, evaluate)

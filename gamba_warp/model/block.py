@@ -1,0 +1,232 @@
+"""The Gamba block: prepend the condition, run a Mamba block, drop the condition (paper eq. 2).
+
+A token of a Mamba block depends on those before it through two small states alone. What a block
+puts in front is dropped behind it and made afresh in the next block, so all that it leaves is the
+states after it, and these depend on the condition, not on the tokens: ``prefix_states`` computes
+them for all blocks at once, and each block then runs over the 3DGS tokens only. The result is that
+of prepending and dropping.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ..kernels.causal_conv1d import causal_conv1d
+from ..kernels.selective_scan import selective_scan, selective_scan_state
+from .config import GambaConfig
+
+STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
+
+
+def make_norm(config: GambaConfig) -> nn.Module:
+    """LayerNorm or RMSNorm over a token's channels, with eps 1e-5."""
+    kind = nn.LayerNorm if config.norm == "layer" else nn.RMSNorm
+    norm = kind(config.width, eps=1e-5)
+    for parameter in norm.parameters():
+        parameter._no_weight_decay = True
+    return norm
+
+
+class State(NamedTuple):
+    """What a Mamba block keeps of the tokens that it has seen.
+
+    Attributes:
+        conv: ``[B, conv_size - 1, inner_width]``, the convolution's last inputs.
+        scan: ``[B, inner_width, state_size]`` float32, the SSM's state.
+    """
+
+    conv: Tensor
+    scan: Tensor
+
+
+class Mamba(nn.Module):
+    """The vanilla Mamba block (Gu & Dao 2023), channels last.
+
+    Parameters have mamba-ssm's names, shapes and row order (``x_proj``: step rank, B, C), so its
+    weights load unchanged, but for the convolution's, which lack its middle axis of length 1.
+    """
+
+    def __init__(self, config: GambaConfig) -> None:
+        super().__init__()
+        inner, rank, states = config.inner_width, config.step_rank, config.state_size
+        self.split = [rank, states, states]
+        self.discretization = config.discretization
+        self.in_proj = nn.Linear(config.width, 2 * inner, bias=False)
+        self.conv_weight = nn.Parameter(torch.empty(inner, config.conv_size))
+        self.conv_bias = nn.Parameter(torch.empty(inner))
+        self.x_proj = nn.Linear(inner, rank + 2 * states, bias=False)
+        self.dt_proj = nn.Linear(rank, inner)
+        self.A_log = nn.Parameter(torch.empty(inner, states))
+        self.D = nn.Parameter(torch.ones(inner))
+        self.out_proj = nn.Linear(inner, config.width, bias=False)
+        self._init_weights(config)
+
+    @torch.no_grad()
+    def _init_weights(self, config: GambaConfig) -> None:
+        """As mamba-ssm's defaults (version 2.2)."""
+        bound = config.conv_size**-0.5
+        nn.init.uniform_(self.conv_weight, -bound, bound)
+        nn.init.uniform_(self.conv_bias, -bound, bound)
+        bound = config.step_rank**-0.5
+        nn.init.uniform_(self.dt_proj.weight, -bound, bound)
+        low, high = map(math.log, STEP_RANGE)
+        step = torch.empty_like(self.dt_proj.bias).uniform_(low, high).exp().clamp(min=1e-4)
+        self.dt_proj.bias.copy_(step + torch.log(-torch.expm1(-step)))  # softplus's inverse
+        states = torch.arange(1, config.state_size + 1, dtype=torch.float32)
+        self.A_log.copy_(states.log().expand_as(self.A_log))
+        # One residual branch per block: the sum over the depth keeps the variance of one branch.
+        self.out_proj.weight.div_(math.sqrt(config.depth))
+        for parameter in (self.A_log, self.D, self.conv_bias, self.dt_proj.bias):
+            parameter._no_weight_decay = True
+
+    def forward(self, tokens: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        """``[B, L, width]`` to ``[B, L, width]``; a token sees itself and those before it.
+
+        ``state`` is what earlier tokens left, None for none; that after the last token is returned.
+        """
+        conv_state, scan_state = state or (None, None)
+        x, z = self.in_proj(tokens).chunk(2, dim=-1)
+        if conv_state is not None:
+            conv_state = conv_state.to(x.dtype)
+        x, conv_state = causal_conv1d(
+            x,
+            self.conv_weight,
+            self.conv_bias,
+            activation="silu",
+            initial_state=conv_state,
+            return_final_state=True,
+        )
+        low_rank, B, C = self.x_proj(x).split(self.split, dim=-1)
+        # The bias is added inside the scan, in float32: δ of 1e-3 does not survive bfloat16.
+        delta = F.linear(low_rank, self.dt_proj.weight)
+        y, scan_state = selective_scan(
+            x,
+            delta,
+            -torch.exp(self.A_log.float()),
+            B,
+            C,
+            D=self.D.float(),
+            z=z,
+            delta_bias=self.dt_proj.bias.float(),
+            delta_softplus=True,
+            initial_state=scan_state,
+            return_last_state=True,
+            discretization=self.discretization,
+        )
+        return self.out_proj(y), State(conv_state, scan_state)
+
+
+class GambaBlock(nn.Module):
+    """One Gamba block: G_n = G_{n-1} + Drop(Mamba(Norm(Prepend(P_c T, P_x X, G_{n-1})))).
+
+    The prefix has no residual of its own, since it is dropped and made afresh in each block; it
+    enters as the state that it leaves, from ``prefix_states``.
+    """
+
+    def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
+        """Zero channels mean that there is no such condition."""
+        super().__init__()
+        width = config.width
+        self.project_camera = nn.Linear(camera_channels, width) if camera_channels else None
+        self.project_image = nn.Linear(image_channels, width) if image_channels else None
+        self.norm = make_norm(config)
+        self.mamba = Mamba(config)
+
+    def forward(self, tokens: Tensor, state: State | None) -> tuple[Tensor, State]:
+        """Refines 3DGS tokens, all or the next ones.
+
+        Args:
+            tokens: ``[B, L, width]``.
+            state: this block's own of ``prefix_states``, or after the tokens before these.
+
+        Returns:
+            ``[B, L, width]``, and the state after the last token.
+        """
+        hidden, state = self.mamba(self.norm(tokens), state)
+        return tokens + hidden, state
+
+
+def prefix_states(
+    blocks: Sequence[GambaBlock], camera: Tensor | None, image: Tensor | None
+) -> list[State | None]:
+    """The state in which each block is after its prefix P_c T, P_x X, camera first.
+
+    All blocks are computed together: a product for each of their matrices, one convolution and one
+    scan in which a block is a group of channels. What only the dropped outputs need is left out:
+    the gate z, C, D and the output projection.
+
+    Args:
+        blocks: of one configuration.
+        camera: ``[B, 1, camera_channels]``, or None where the blocks have no such condition.
+        image: ``[B, K, image_channels]``, likewise.
+
+    Returns:
+        One for each block; None where there is neither condition.
+    """
+    projections = {"project_camera": camera, "project_image": image}
+    prefix = [
+        F.linear(tokens, _joined(blocks, f"{name}.weight"), _joined(blocks, f"{name}.bias"))
+        for name, tokens in projections.items()
+        if tokens is not None
+    ]
+    if not prefix:
+        return [None] * len(blocks)
+    mamba = blocks[0].mamba
+    inner, (rank, states, _) = len(mamba.D), mamba.split
+    tokens = _normalized(blocks, torch.cat(prefix, dim=1))
+    x, conv_state = causal_conv1d(
+        _product(tokens, _stacked(blocks, "mamba.in_proj.weight", inner)).flatten(2),
+        _joined(blocks, "mamba.conv_weight"),
+        _joined(blocks, "mamba.conv_bias"),
+        activation="silu",
+        return_final_state=True,
+    )
+    rows = _stacked(blocks, "mamba.x_proj.weight", rank + states)
+    low_rank, B = _product(x.unflatten(2, (-1, inner)), rows).split([rank, states], dim=-1)
+    delta = _product(low_rank, _stacked(blocks, "mamba.dt_proj.weight")).flatten(2)
+    scan_state = selective_scan_state(
+        x,
+        delta,
+        -torch.exp(_joined(blocks, "mamba.A_log").float()),
+        B,
+        delta_bias=_joined(blocks, "mamba.dt_proj.bias").float(),
+        delta_softplus=True,
+        discretization=mamba.discretization,
+    )
+    pairs = zip(conv_state.split(inner, dim=2), scan_state.split(inner, dim=1))
+    return [State(*pair) for pair in pairs]
+
+
+def _joined(blocks: Sequence[GambaBlock], name: str) -> Tensor:
+    """A parameter of all blocks, one after the other along the first dimension."""
+    return torch.cat([attrgetter(name)(block) for block in blocks])
+
+
+def _stacked(blocks: Sequence[GambaBlock], name: str, rows: int | None = None) -> Tensor:
+    """The first ``rows`` of a matrix of all blocks, ``[depth, rows, columns]``."""
+    return torch.stack([attrgetter(name)(block)[:rows] for block in blocks])
+
+
+def _product(tokens: Tensor, matrices: Tensor) -> Tensor:
+    """``[B, K, depth, in]`` to ``[B, K, depth, out]``: each block's tokens times its matrix."""
+    rows = tokens.flatten(0, 1).transpose(0, 1)
+    return torch.bmm(rows, matrices.mT).transpose(0, 1).unflatten(0, tokens.shape[:2])
+
+
+def _normalized(blocks: Sequence[GambaBlock], tokens: Tensor) -> Tensor:
+    """``[B, K, depth·width]`` to ``[B, K, depth, width]``, each block's by its own norm."""
+    norm = blocks[0].norm
+    tokens = tokens.unflatten(2, (len(blocks), -1)).float()
+    if isinstance(norm, nn.RMSNorm):
+        return F.rms_norm(tokens, norm.normalized_shape, None, norm.eps) * _stacked(
+            blocks, "norm.weight"
+        )
+    tokens = F.layer_norm(tokens, norm.normalized_shape, None, None, norm.eps)
+    return torch.addcmul(_stacked(blocks, "norm.bias"), tokens, _stacked(blocks, "norm.weight"))

@@ -1,0 +1,80 @@
+"""From tokens to Gaussians: the only place with activations (paper §3.2, Gaussian Decoder)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ..gaussians import Gaussians
+from .config import GambaConfig
+
+MIN_SCALE = 1e-6  # object units; keeps the logarithm that files store finite
+
+
+class GaussianDecoder(nn.Module):
+    """A shared MLP with one hidden layer, then one linear head for each attribute."""
+
+    def __init__(self, config: GambaConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.decoder_width or config.width
+        # The last SiLU keeps the heads from merging with the MLP's second layer.
+        self.mlp = nn.Sequential(
+            nn.Linear(config.width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+        )
+        self.position = nn.Linear(width, 3 * config.position_bins)
+        self.opacity = nn.Linear(width, 1)
+        self.scale = nn.Linear(width, 3)
+        self.color = nn.Linear(width, 3)
+        self.rotation = nn.Linear(width, 4) if config.predict_rotation else None
+        limit = config.position_range
+        points = torch.linspace(-limit, limit, config.position_bins)
+        self.register_buffer("points", points, persistent=False)
+        self._init_weights()
+
+    def _init_weights(self) -> None:
+        config = self.config
+        for layer in (self.mlp[0], self.mlp[2]):
+            nn.init.zeros_(layer.bias)
+        # Unit variance before each SiLU, whose mean square on a unit normal is 0.356.
+        nn.init.normal_(self.mlp[0].weight, std=self.mlp[0].in_features ** -0.5)
+        nn.init.normal_(self.mlp[2].weight, std=(0.356 * self.mlp[2].in_features) ** -0.5)
+        for head in (self.opacity, self.scale, self.color, self.rotation):
+            if head is not None:
+                nn.init.normal_(head.weight, std=0.02)
+                nn.init.zeros_(head.bias)
+        # A softmax over near-zero logits puts every Gaussian at the centre, and a heap of opaque
+        # Gaussians at one point is the collapse that the radial mask loss is there to prevent.
+        # Logits of deviation 1.5 spread the centres by about 0.1 per axis: inside any object,
+        # and far from the saturated softmax, whose gradient would vanish.
+        fan_in = 0.356 * self.position.in_features
+        nn.init.normal_(self.position.weight, std=config.position_init * fan_in**-0.5)
+        nn.init.zeros_(self.position.bias)
+        odds = config.opacity_init / (1 - config.opacity_init)
+        nn.init.constant_(self.opacity.bias, math.log(odds))
+        nn.init.constant_(self.scale.bias, math.log(math.expm1(config.scale_init)))
+        if self.rotation is not None:
+            with torch.no_grad():
+                self.rotation.bias[0] = 1.0
+
+    def forward(self, tokens: Tensor) -> Gaussians:
+        """Decodes ``tokens [B, L, width]`` to ``[B, L]`` Gaussians in float32.
+
+        Positions lie within ±``position_range``, opacities and colours in [0, 1],
+        scales above 0.
+        """
+        hidden = self.mlp(tokens)
+        # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
+        with torch.autocast(tokens.device.type, enabled=False):
+            hidden = hidden.float()
+            logits = self.position(hidden).unflatten(-1, (3, -1))
+            return Gaussians(
+                means=logits.softmax(-1) @ self.points,
+                quats=None if self.rotation is None else self.rotation(hidden),
+                scales=F.softplus(self.scale(hidden)) + MIN_SCALE,
+                opacities=self.opacity(hidden)[..., 0].sigmoid(),
+                colors=self.color(hidden).sigmoid(),
+            )

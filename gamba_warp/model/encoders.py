@@ -1,0 +1,189 @@
+"""Image tokens X from a pretrained network (paper §3.2, condition image tokens)."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ..errors import UserError
+from .config import GambaConfig
+from .tokens import IMAGENET_MEAN, IMAGENET_STD
+
+
+class ImageEncoder(nn.Module):
+    """A network from pictures to tokens, at one picture size; get one from ``build_encoder``.
+
+    While frozen it stays in eval mode and makes no graph.
+
+    Attributes:
+        channels: C, the size of a token.
+    """
+
+    def __init__(self, network: nn.Module, channels: int, config: GambaConfig) -> None:
+        super().__init__()
+        self.network = network
+        self.channels = channels
+        self.name = config.encoder
+        self.size = config.encoder_size
+        self.frozen = config.encoder_frozen
+        network.requires_grad_(not self.frozen)
+        self.train(self.training)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """``[B, K, channels]`` from ``images [B, H, W, 3]`` in [0, 1]; they are resized here."""
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
+            if images.shape[1:3] != (self.size, self.size):
+                planes = images.permute(0, 3, 1, 2)
+                size = (self.size, self.size)
+                planes = F.interpolate(planes, size, mode="bicubic", antialias=True)
+                images = planes.permute(0, 2, 3, 1).clamp(0, 1)  # bicubic overshoots at edges
+            return self.network(images)
+
+    def train(self, mode: bool = True) -> ImageEncoder:
+        """As ``nn.Module.train``, but a frozen network stays in eval mode."""
+        super().train(mode)
+        self.network.train(mode and not self.frozen)
+        return self
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 over the network's tensors, names and values as float32, 64 hexadecimal digits.
+
+        A checkpoint keeps it instead of a frozen network's weights.
+        """
+        digest = hashlib.sha256()
+        for name, value in sorted(self.network.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(value.detach().float().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+
+class _ViT(nn.Module):
+    """A timm ViT's last tokens, normalised input to patches; register tokens dropped."""
+
+    def __init__(self, vit: nn.Module, config: GambaConfig) -> None:
+        super().__init__()
+        self.vit = vit
+        self.class_token = config.encoder_class_token
+        known = vit.pretrained_cfg
+        mean = known.get("mean", IMAGENET_MEAN) if config.encoder_normalize else (0.0, 0.0, 0.0)
+        std = known.get("std", IMAGENET_STD) if config.encoder_normalize else (1.0, 1.0, 1.0)
+        self.register_buffer("mean", torch.tensor(mean), persistent=False)
+        self.register_buffer("std", torch.tensor(std), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        planes = ((images - self.mean) / self.std).permute(0, 3, 1, 2)
+        tokens = self.vit.forward_features(planes)
+        patches = tokens[:, self.vit.num_prefix_tokens :]
+        return torch.cat([tokens[:, :1], patches], dim=1) if self.class_token else patches
+
+
+def build_encoder(config: GambaConfig, weights: str | Path | None) -> ImageEncoder | None:
+    """The encoder that ``config`` names, with its weights.
+
+    Args:
+        config: names the encoder.
+        weights: for a timm ViT a file (timm's safetensors or .pth, or Meta's DINOv2 .pth), "hub"
+            to fetch timm's own, or "random" for an untrained one, the same on every call. For
+            "vgg16" torchvision's file, or None for the one in the cache.
+
+    Returns:
+        None where the encoder is "none".
+
+    Raises:
+        UserError: no such network or file, weights that do not fit, or ``weights`` not given.
+    """
+    if config.encoder == "none":
+        return None
+    if config.encoder == "vgg16":
+        return _build_vgg(config, weights)
+    return _build_vit(config, weights)
+
+
+def _build_vgg(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
+    from .vgg import vgg16_features
+
+    if str(weights) in ("hub", "random"):
+        raise UserError(f"encoder vgg16: takes the cached weights or a file, not '{weights}'")
+    network = vgg16_features(weights)
+    return ImageEncoder(network, network.dim, config)
+
+
+def _build_vit(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
+    name = config.encoder
+    if weights is None:
+        raise UserError(
+            f"encoder {name}: its weights must be named: a file, 'hub' to fetch them, "
+            "or 'random' for an untrained one"
+        )
+    if str(weights) == "random":
+        # No global seed must decide a network that checkpoints do not store.
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            vit = _create_vit(config, pretrained=False)
+    else:
+        vit = _create_vit(config, pretrained=str(weights) == "hub")
+        if str(weights) != "hub":
+            _load_vit(vit, Path(weights))
+    return ImageEncoder(_ViT(vit, config), vit.num_features, config)
+
+
+def _create_vit(config: GambaConfig, pretrained: bool) -> nn.Module:
+    import timm
+    from timm.models.vision_transformer import VisionTransformer
+
+    name, size = config.encoder, config.encoder_size
+    if not timm.is_model(name):
+        raise UserError(f"encoder {name}: neither 'none', 'vgg16' nor a model of timm")
+    try:
+        vit = timm.create_model(name, pretrained=pretrained, img_size=size, num_classes=0)
+    except Exception as error:  # timm and its download raise many classes
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        action = "fetched" if pretrained else f"built for {size}x{size} pixels"
+        raise UserError(f"encoder {name}: cannot be {action} ({reason})") from error
+    if not isinstance(vit, VisionTransformer):
+        raise UserError(f"encoder {name}: not a plain ViT, so it has no list of patch tokens")
+    patch = vit.patch_embed.patch_size[0]
+    if size % patch:
+        raise UserError(f"encoder {name}: encoder_size {size} is not a multiple of {patch}")
+    if config.encoder_class_token and not vit.has_class_token:
+        raise UserError(f"encoder {name}: has no class token to keep")
+    return vit
+
+
+def _load_vit(vit: nn.Module, path: Path) -> None:
+    """Loads timm's or Meta's weights; timm resizes the positions to another picture size."""
+    from timm.models.vision_transformer import checkpoint_filter_fn
+
+    state = _read_state(path)
+    state = state.get("model", state.get("state_dict", state))
+    if "register_tokens" in state:
+        state.setdefault("mask_token", None)  # timm knows Meta's layout by this key, then drops it
+    try:
+        state = checkpoint_filter_fn(state, vit)
+        state = {k: v for k, v in state.items() if not k.startswith("head.")}
+        vit.load_state_dict(state)
+    except (RuntimeError, KeyError, AttributeError, TypeError, AssertionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: not weights of this encoder ({reason})") from error
+
+
+def _read_state(path: Path) -> dict:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file of encoder weights")
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # pickle, zip and safetensors each raise their own classes
+        raise UserError(f"{path}: cannot be read as encoder weights") from error
+    if not isinstance(state, dict):
+        raise UserError(f"{path}: holds no state dict")
+    return state

@@ -1,0 +1,80 @@
+"""LPIPS with VGG16: how far two pictures are apart for a person (Zhang et al. 2018)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ..data.vgg_weights import WIDTHS, read_cached
+from .vgg import VGG16Trunk
+
+# LPIPS's own normalisation of pictures in [-1, 1] (its "scaling layer").
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+
+
+class LPIPS(nn.Module):
+    """Learned perceptual distance, VGG16, version 0.1; frozen. Get one from ``load_lpips``."""
+
+    def __init__(self, state: dict[str, Tensor]) -> None:
+        """Args: state: torchvision's ``features.N.*`` and ``lin0`` .. ``lin4``, each ``[C]``."""
+        super().__init__()
+        self.trunk = VGG16Trunk()
+        for k, width in enumerate(WIDTHS):
+            self.register_buffer(f"lin{k}", torch.empty(width))
+        self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None], persistent=False)
+        self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None], persistent=False)
+        renamed = {n if n.startswith("lin") else f"trunk.{n}": v for n, v in state.items()}
+        self.load_state_dict(renamed)
+        self.eval()
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """Distance of picture pairs; gradients reach whichever input asks for them.
+
+        Args:
+            a: ``[.., H, W, 3]`` RGB in [0, 1], H and W at least 16.
+            b: the same shape.
+
+        Returns:
+            ``[..]`` float32, 0 for equal pictures.
+
+        Raises:
+            ValueError: shapes differ, are not RGB, or are smaller than 16 pixels.
+        """
+        if a.shape != b.shape or a.ndim < 3 or a.shape[-1] != 3:
+            raise ValueError(
+                f"a is {tuple(a.shape)} and b {tuple(b.shape)}; both must be [.., H, W, 3]"
+            )
+        return self.distance(self.features(a), self.features(b)).reshape(a.shape[:-3])
+
+    def features(self, pictures: Tensor) -> list[Tensor]:
+        """What ``distance`` compares: five maps ``[B, C, h, w]``, each pixel of unit length.
+
+        Args:
+            pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
+        """
+        x = pictures.reshape(-1, *pictures.shape[-3:]).permute(0, 3, 1, 2)
+        return [_unit(y) for y in self.trunk((2 * x - 1 - self.shift) / self.scale)]
+
+    def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
+        """``[B]`` from two pictures' ``features``, for those who compare one picture with many."""
+        total = 0.0
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            weighted = torch.einsum("bchw,c->bhw", (x - y).square(), getattr(self, f"lin{k}"))
+            total = total + weighted.mean((1, 2))
+        return total
+
+
+def _unit(x: Tensor) -> Tensor:
+    # The 1e-20 keeps the gradient of a pixel without any feature finite; elsewhere it is lost.
+    x = x.float()
+    return x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()
+
+
+def load_lpips() -> LPIPS:
+    """LPIPS-VGG from the cache, on the CPU.
+
+    Raises:
+        UserError: no weights there, with the command that fetches them; or a damaged file.
+    """
+    return LPIPS(read_cached())

@@ -1,0 +1,108 @@
+"""What enters the blocks: the camera token and the 3DGS tokens (paper §3.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ..cameras import Cameras, plucker_rays
+from .config import GambaConfig
+
+# Mean and deviation of ImageNet's pictures; every pretrained encoder here was trained with them.
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+def normalize_imagenet(images: Tensor) -> Tensor:
+    """``[.., 3]`` colours in [0, 1] to zero mean and unit deviation over ImageNet."""
+    # a tensor made of numbers would be a copy from the host, which no CUDA graph can hold
+    planes = zip(images.unbind(-1), IMAGENET_MEAN, IMAGENET_STD)
+    return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
+
+
+def scan_orders(height: int, width: int) -> Tensor:
+    """The four orders in which a map is read (VMamba's cross-scan; paper §3.2).
+
+    Row by row from the top left, column by column from the top left, and each of the two backward.
+
+    Returns:
+        ``[4, height·width]`` int64 positions in the row-major map; each row is a permutation.
+    """
+    rows = torch.arange(height * width)
+    columns = rows.reshape(height, width).T.flatten()
+    return torch.stack([rows, columns, rows.flip(0), columns.flip(0)])
+
+
+class CameraToken(nn.Module):
+    """The camera embedding T: an MLP of the camera's 16 numbers (paper §3.2, after LRM)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(16, channels), nn.SiLU(), nn.Linear(channels, channels))
+
+    def forward(self, cameras: Cameras) -> Tensor:
+        """``[B, 1, channels]`` from ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]``."""
+        return self.mlp(camera_numbers(cameras))[:, None]
+
+
+def camera_numbers(cameras: Cameras) -> Tensor:
+    """``[B, 16]``: the world-to-camera matrix's 12 numbers, row by row, then fx, fy, cx, cy.
+
+    The intrinsics are divided by the picture's width or height, so they do not depend on its size.
+    """
+    extrinsics = cameras.viewmats[:, :3, :].flatten(1)
+    x, y = cameras.Ks[:, 0] / cameras.width, cameras.Ks[:, 1] / cameras.height
+    intrinsics = torch.stack([x[:, 0], y[:, 1], x[:, 2], y[:, 2]], dim=1)
+    return torch.cat([extrinsics, intrinsics], dim=1)
+
+
+class SplatTokens(nn.Module):
+    """The 3DGS tokens G = Scan(Conv(s)) + E (paper eq. 1), or G = E without image tokens."""
+
+    def __init__(self, config: GambaConfig) -> None:
+        super().__init__()
+        grid, self.patch_size = config.grid_size, config.patch_size
+        self.patchify = None
+        if config.additive_image_tokens:
+            patch = config.patch_size
+            self.patchify = nn.Conv2d(9, config.width, kernel_size=patch, stride=patch)
+        self.embedding = nn.Parameter(torch.empty(config.num_gaussians, config.width))
+        # Nearly as large as an image token: where the picture is plain background, E alone
+        # tells the tokens apart, and positions start spread only if the tokens differ.
+        nn.init.normal_(self.embedding, std=config.embedding_init)
+        self.embedding._no_weight_decay = True
+        self.register_buffer("orders", scan_orders(grid, grid).flatten(), persistent=False)
+
+    def forward(self, images: Tensor, cameras: Cameras) -> Tensor:
+        """``[B, L, width]`` from ``images [B, H, W, 3]`` in [0, 1] and one camera per picture."""
+        if self.patchify is None:
+            return self.embedding.expand(len(images), -1, -1)
+        # Autocast would round the matrix products inside to 8 bits: far too coarse for rays.
+        with torch.autocast(images.device.type, enabled=False):
+            height, width = images.shape[1:3]
+            rays = plucker_rays(cameras.viewmats.float(), cameras.Ks.float(), width, height)
+            pixels = torch.cat([normalize_imagenet(images.float()), rays], dim=-1)
+        patches = self.patchify(pixels.permute(0, 3, 1, 2)).flatten(2).mT
+        return patches[:, self.orders] + self.embedding
+
+    def foreground(self, images: Tensor, background: float, margin: int) -> Tensor:
+        """Which tokens belong to patches that are not plain background, or near one that is not.
+
+        Args:
+            images: ``[B, H, W, 3]``; a patch counts if it does so in any of them.
+            background: grey value; what differs by more than half of 1/255 is no background.
+            margin: how near, patches; 0 or more.
+
+        Returns:
+            Positions among the L tokens, int64, ascending.
+
+        Raises:
+            ValueError: a negative margin.
+        """
+        if margin < 0:
+            raise ValueError(f"background_margin is {margin}, it must be 0 or more")
+        pixels = ((images - background).abs() > 0.5 / 255).any(-1).any(0).float()[None]
+        patches = F.max_pool2d(pixels, self.patch_size)
+        near = F.max_pool2d(patches, 2 * margin + 1, stride=1, padding=margin)
+        return near.flatten().bool()[self.orders].nonzero()[:, 0]

@@ -1,0 +1,1 @@
+"""What people look at: turntables and HTML pages with a viewer."""

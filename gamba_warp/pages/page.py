@@ -1,0 +1,264 @@
+"""Self-contained HTML pages: pictures, a 3D viewer and numbers in one file, no network needed."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
+from ..files import atomic_path
+from ..formats.splat import splat_bytes
+from ..gaussians import Gaussians
+from ..images import to_uint8
+from .turntable import SECONDS
+
+# Nothing may be loaded but what is inlined here.
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+_VIEWER_CAPTION = (
+    '<span class="when-idle">Press 3D to turn it by hand</span>'
+    '<span class="when-running">Drag to turn, wheel to zoom, double-click to reset</span>'
+    '<span class="when-without">This browser has no WebGL2, so no 3D view</span>'
+)
+
+
+@dataclass
+class Section:
+    """One block of a page; every part but the title may be left out.
+
+    Attributes:
+        title: heading.
+        text: a sentence or two.
+        picture: the input, ``[H, W, 3|4]`` floats in [0, 1].
+        turntable: frames ``[F, H, W, 3]`` uint8.
+        gaussians: one object ``[N]``, for the 3D viewer.
+        views: label to pictures ``[V, H, W, 3]`` floats in [0, 1]; rows with view beside view, such
+            as "Predicted" above "Truth".
+        table: rows of cells; text to the left, numbers to the right.
+        header: of the table's columns.
+        curves: label to ``(x, y)`` points, drawn as one chart.
+        curves_label: what the chart's vertical axis is.
+        distance: of the viewer's camera from the origin, object units.
+        fov: of the viewer's camera, vertical, degrees.
+    """
+
+    title: str
+    text: str = ""
+    picture: np.ndarray | None = None
+    turntable: np.ndarray | None = None
+    gaussians: Gaussians | None = None
+    views: Mapping[str, np.ndarray] = field(default_factory=dict)
+    table: Sequence[Sequence[str | int | float]] = ()
+    header: Sequence[str] = ()
+    curves: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict)
+    curves_label: str = ""
+    distance: float = DEFAULT_DISTANCE
+    fov: float = DEFAULT_FOV
+
+
+def reconstruction_page(path: str | Path, section: Section) -> None:
+    """Writes the page of one reconstruction, its viewer running, atomically.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    _write(path, section.title, "", [section], auto=True)
+
+
+def demo_page(
+    path: str | Path, sections: Sequence[Section], *, title: str = "Gamba demo", text: str = ""
+) -> None:
+    """Writes a page of many sections, atomically; its viewers start when asked to.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    _write(path, title, text, sections, auto=False)
+
+
+def _write(
+    path: str | Path, title: str, text: str, sections: Sequence[Section], auto: bool
+) -> None:
+    here = Path(__file__).parent
+    body = "\n".join(_section(s, f"splat{i}", auto) for i, s in enumerate(sections))
+    document = f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)}</title>
+<style>
+{(here / "page.css").read_text()}</style>
+</head>
+<body>
+<header><h1>{html.escape(title)}</h1>{_paragraph(text)}</header>
+{body}
+<script>
+{(here / "viewer.js").read_text()}</script>
+</body>
+</html>
+"""
+    with atomic_path(path) as temporary:
+        temporary.write_text(document, encoding="utf-8")
+
+
+def _section(section: Section, name: str, auto: bool) -> str:
+    figures = []
+    if section.picture is not None:
+        figures.append(_figure(_image(section.picture, "frame", "input"), "Input"))
+    turning = "" if section.turntable is None else _animation(section.turntable)
+    if turning and (auto or section.gaussians is None):
+        figures.append(_figure(f'<div class="frame">{turning}</div>', "Turntable"))
+        turning = ""
+    if section.gaussians is not None:  # where it waits to be started it shows the turntable
+        figures.append(_figure(_viewer(section, name, auto, turning), _VIEWER_CAPTION))
+    parts = [f"<h2>{html.escape(section.title)}</h2>" if not auto else ""]
+    parts += [
+        _paragraph(section.text),
+        f'<div class="media">{"".join(figures)}</div>' if figures else "",
+        _views(section.views) if section.views else "",
+        _table(section.header, section.table) if section.table else "",
+        svg_chart(section.curves, section.curves_label) if section.curves else "",
+    ]
+    return "<section>" + "\n".join(filter(None, parts)) + "</section>"
+
+
+def _paragraph(text: str) -> str:
+    return f"<p>{html.escape(text)}</p>" if text else ""
+
+
+def _figure(content: str, caption: str) -> str:
+    return f"<figure>{content}<figcaption>{caption}</figcaption></figure>"
+
+
+def _data(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _image(picture: np.ndarray, css: str, label: str) -> str:
+    content = io.BytesIO()
+    Image.fromarray(to_uint8(picture)).save(content, "PNG", optimize=True)
+    source = _data(content.getvalue(), "image/png")
+    return f'<img class="{css}" alt="{html.escape(label)}" src="{source}">'
+
+
+def _animation(frames: np.ndarray) -> str:
+    # WebP: a third of a GIF's size, and no palette.
+    content = io.BytesIO()
+    first, *rest = (Image.fromarray(frame) for frame in frames)
+    duration = round(1000 * SECONDS / len(frames))
+    first.save(
+        content, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, quality=90
+    )
+    return f'<img alt="turntable" src="{_data(content.getvalue(), "image/webp")}">'
+
+
+def _viewer(section: Section, name: str, auto: bool, poster: str) -> str:
+    splats = base64.b64encode(splat_bytes(section.gaussians, name=section.title)).decode()
+    return (
+        f'<div class="viewer" data-splat="{name}" data-distance="{section.distance:g}" '
+        f'data-fov="{section.fov:g}"{" data-auto" if auto else ""}>{poster}'
+        '<button type="button">3D</button></div>'
+        f'<script type="text/plain" id="{name}">{splats}</script>'
+    )
+
+
+def _views(rows: Mapping[str, np.ndarray]) -> str:
+    columns = max(len(views) for views in rows.values())
+    cells = []
+    for label, views in rows.items():
+        cells.append(f"<span>{html.escape(label)}</span>")
+        cells += [_image(view, "", f"{label}, view {i + 1}") for i, view in enumerate(views)]
+        cells += ["<i></i>"] * (columns - len(views))
+    style = f"grid-template-columns: auto repeat({columns}, minmax(5rem, 10rem))"
+    return f'<div class="scroll"><div class="views" style="{style}">{"".join(cells)}</div></div>'
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str | int | float]]) -> str:
+    def cell(value: str | int | float) -> str:
+        if isinstance(value, str):
+            return f"<td>{html.escape(value)}</td>"
+        text = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+        return f'<td class="number">{text}</td>'
+
+    last = [*rows[-1], *[""] * len(header)]
+    head = "".join(
+        f"<th{'' if isinstance(last[i], str) else ' class=number'}>{html.escape(name)}</th>"
+        for i, name in enumerate(header)
+    )
+    lines = [f"<tr>{head}</tr>"] if head else []
+    lines += [f"<tr>{''.join(map(cell, row))}</tr>" for row in rows]
+    return f'<div class="scroll"><table>{"".join(lines)}</table></div>'
+
+
+def svg_chart(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = "") -> str:
+    """A line chart as inline SVG; the vertical axis is logarithmic where values span over 20 times.
+
+    Args:
+        curves: name to ``(x, y)`` points; points that are not finite are left out.
+        label: of the vertical axis.
+
+    Returns:
+        The ``<svg>`` element, empty text where there is no finite point.
+    """
+    series = {
+        name: [(x, y) for x, y in points if math.isfinite(x) and math.isfinite(y)]
+        for name, points in curves.items()
+    }
+    xs = [x for points in series.values() for x, _ in points]
+    ys = [y for points in series.values() for _, y in points]
+    if not xs:
+        return ""
+    logarithmic = min(ys) > 0 and max(ys) > 20 * min(ys)
+    bend = math.log10 if logarithmic else float
+    low, high = bend(min(ys)), bend(max(ys))
+    left, right, top, bottom = 56, 624, 34, 214
+
+    def place_x(x: float) -> float:
+        return left + (right - left) * (x - min(xs)) / ((max(xs) - min(xs)) or 1)
+
+    def place_y(value: float) -> float:
+        return bottom - (bottom - top) * (value - low) / ((high - low) or 1)
+
+    parts = []
+    for value in _ticks(min(ys), max(ys), logarithmic):
+        y = place_y(bend(value))
+        parts.append(f'<line class="grid" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{left - 6}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>')
+    for value in _ticks(min(xs), max(xs), False):
+        at = f'x="{place_x(value):.1f}" y="{bottom + 20}"'
+        parts.append(f'<text {at} text-anchor="middle">{value:,.6g}</text>')
+    note = f"{label} (logarithmic)" if logarithmic else label
+    parts.append(f'<text x="{left}" y="16">{html.escape(note)}</text>')
+    for i, (name, points) in enumerate(series.items()):
+        colour = f"var(--s{i % 4})"
+        path = " ".join(f"{place_x(x):.1f},{place_y(bend(y)):.1f}" for x, y in points)
+        parts.append(f'<polyline class="line" style="stroke: {colour}" points="{path}"/>')
+        at = right - 110 * (len(series) - 1 - i)
+        style = f'text-anchor="end" style="fill: {colour}"'
+        parts.append(f'<text x="{at}" y="16" {style}>{html.escape(name)}</text>')
+    return f'<svg viewBox="0 0 640 240" role="img">{"".join(parts)}</svg>'
+
+
+def _ticks(low: float, high: float, logarithmic: bool) -> list[float]:
+    """Round values within the bounds: multiples of 1, 2 or 5, or these times powers of ten."""
+    if high <= low:
+        return [low]
+    if logarithmic:
+        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+        leads = (1, 2, 5) if high < 1000 * low else (1,)
+        values = [float(f"{lead}e{power}") for power in powers for lead in leads]
+    else:
+        raw = (high - low) / 5
+        unit = 10.0 ** math.floor(math.log10(raw))
+        step = next(unit * lead for lead in (1, 2, 5, 10) if unit * lead >= raw)
+        values = [step * i for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
+    return [value for value in values if low <= value <= high]

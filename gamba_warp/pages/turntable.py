@@ -1,0 +1,124 @@
+"""Turntables: a reconstruction seen from all around, as GIF or MP4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ..cameras import Cameras, intrinsics, orbit
+from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
+from ..errors import UserError
+from ..files import atomic_path
+from ..gaussians import Gaussians
+from ..images import to_uint8
+from ..render import render
+
+SECONDS = 3.0  # one turn
+_CHUNK_PIXELS = 1 << 20  # rendered in one launch: keeps a turntable within a few hundred MB
+
+
+@torch.inference_mode()
+def turntable_frames(
+    gaussians: Gaussians,
+    *,
+    size: int = 256,
+    frames: int = 48,
+    elevation: float = 0.0,
+    distance: float = DEFAULT_DISTANCE,
+    fov: float = DEFAULT_FOV,
+) -> np.ndarray:
+    """Renders one full turn on white, beginning at the reference view, several views a launch.
+
+    Args:
+        gaussians: one object, no batch dimension, in the reference frame; its device renders.
+        size: side of the square frames, pixels, >= 1.
+        frames: number of views, >= 1.
+        elevation: degrees, positive looks down.
+        distance: of the camera from the object's centre, object units.
+        fov: vertical field of view, degrees.
+
+    Returns:
+        ``[frames, size, size, 3]`` uint8.
+    """
+    device = gaussians.means.device
+    viewmats = orbit(torch.arange(frames) * (360.0 / frames), elevation, distance)
+    Ks = intrinsics(size, size, fov).expand(frames, 3, 3)
+    cameras = Cameras(viewmats, Ks, size, size).to(device)
+    white = torch.ones(3, device=device)
+    chunk = max(1, _CHUNK_PIXELS // (size * size))
+    pictures = [
+        render(gaussians, cameras[i : i + chunk], background=white).rgb.cpu().numpy()
+        for i in range(0, frames, chunk)
+    ]
+    return to_uint8(np.concatenate(pictures))
+
+
+def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECONDS) -> None:
+    """Writes frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
+
+    Args:
+        path: ends in ``.gif`` or ``.mp4``.
+        frames: ``[F, H, W, 3]`` uint8; for MP4 an odd row or column is repeated, which H.264 needs.
+        seconds: length of one turn.
+
+    Raises:
+        UserError: another suffix, or the file cannot be written.
+    """
+    writers = {".gif": _write_gif, ".mp4": _write_mp4}
+    suffix = Path(path).suffix.lower()
+    if suffix not in writers:
+        raise UserError(f"{path}: a turntable is a .gif or an .mp4")
+    with atomic_path(path) as temporary:
+        writers[suffix](temporary, frames, seconds)
+
+
+def _write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
+    palette = _palette(frames[:: max(1, len(frames) // 8)])
+    pictures = []
+    for frame in frames:
+        picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
+        # Pillow looks colours up coarsely: white may become a neighbour of white.
+        picture.paste(0, mask=Image.fromarray((frame == 255).all(-1)))
+        pictures.append(picture)
+    # GIF counts time in units of 10 ms, and viewers slow down anything under 20 ms.
+    duration = max(20, round(seconds * 100 / len(frames)) * 10)
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, optimize=True
+    )
+
+
+def _palette(frames: np.ndarray) -> Image.Image:
+    """One palette for all frames, so that colours do not flicker: white and 255 others."""
+    pixels = frames.reshape(-1, 3)
+    pixels = pixels[(pixels < 255).any(1)]
+    if len(pixels) == 0:
+        pixels = frames.reshape(-1, 3)[:1]
+    colours = Image.fromarray(pixels[None]).quantize(255, kmeans=1).getpalette()
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([255, 255, 255, *colours[: 3 * 255]])
+    return palette
+
+
+def _write_mp4(path: Path, frames: np.ndarray, seconds: float) -> None:
+    import imageio_ffmpeg
+
+    count, height, width = frames.shape[:3]
+    even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        (even.shape[2], even.shape[1]),
+        fps=count / seconds,
+        codec="libx264",
+        macro_block_size=2,
+        quality=8,
+        output_params=["-movflags", "+faststart"],
+    )
+    writer.send(None)
+    try:
+        for frame in even:
+            writer.send(np.ascontiguousarray(frame))
+    finally:
+        writer.close()

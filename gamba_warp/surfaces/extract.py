@@ -1,0 +1,249 @@
+"""Gaussians to a surface: fused depth (TSDF) or a density's level set, made clean and coloured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import UserError
+from ..gaussians import Gaussians
+from .cleaning import cleaned_mesh
+from .density import level_set
+from .tsdf import CLEAR, Views, fuse, look_around
+
+VISIBLE = 0.05  # opacity from which a Gaussian counts for the object's extent
+Method = Literal["tsdf", "density", "centers"]
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How Gaussians become a surface; lengths in units of the object's longest side.
+
+    Attributes:
+        method: tsdf (depth of many views, fused), density (marching cubes on 1 - prod(1 - alpha)),
+            or centers (opacity-weighted centres; biased inwards, a diagnostic without volume).
+        voxels: voxels a unit, of the TSDF and of the density; 8 to 1024.
+        views: TSDF cameras, on a Fibonacci sphere; also of the colours.
+        pixels: side of a depth map.
+        truncation: of the TSDF, in voxels.
+        transmittance: depth is where a ray's transmittance has fallen to this. Fitted and predicted
+            Gaussians are half transparent, so the median (0.5) lies behind the surface.
+        min_alpha: pixels with less have no depth.
+        clear_alpha: pixels with less say that nothing is there.
+        max_slope: pixels of a steeper surface, depth over width, have no depth.
+        min_support: fused voxels that a smaller share of the views support are dropped.
+        level: of the density.
+        min_component: smaller parts are removed, as a share of all faces.
+        min_diameter: shorter parts are removed, as a share of the whole's diagonal.
+        largest: only the largest part is kept.
+        close_holes: holes with at most so many edges are closed.
+        smooth: steps of Taubin smoothing.
+        faces: at most so many, by decimation; 0: as many as there are.
+        colors: give vertices the colour that the views show.
+    """
+
+    method: Method = "tsdf"
+    voxels: int = 128
+    views: int = 64
+    pixels: int = 256
+    truncation: float = 5.0
+    transmittance: float = 0.92
+    min_alpha: float = 0.3
+    clear_alpha: float = 0.1
+    max_slope: float = 1.5
+    min_support: float = 0.03
+    level: float = 0.5
+    min_component: float = 0.01
+    min_diameter: float = 0.0
+    largest: bool = False
+    close_holes: int = 30
+    smooth: int = 0
+    faces: int = 0
+    colors: bool = False
+
+    def check(self) -> None:
+        """Raises UserError, with the option's name, where a number is out of range."""
+        bounds = {
+            "voxels": (8, 1024),
+            "views": (8, 1000),
+            "pixels": (8, 4096),
+            "close_holes": (0, 10000),
+            "smooth": (0, 1000),
+            "faces": (0, 2**31 - 1),
+        }
+        for name, (low, high) in bounds.items():
+            if not low <= getattr(self, name) <= high:
+                raise UserError(f"--{name.replace('_', '-')}: {low} to {high} are possible")
+
+
+@dataclass
+class Surface:
+    """Triangles, outside in front.
+
+    Attributes:
+        vertices: ``[V, 3]`` float64.
+        faces: ``[F, 3]`` int64, F > 0.
+        colors: ``[V, 3]`` float32 RGB in [0, 1] (display values), or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None = None
+
+    def is_closed(self) -> bool:
+        """Whether every edge has two faces."""
+        import trimesh
+
+        return bool(trimesh.Trimesh(self.vertices, self.faces, process=False).is_watertight)
+
+
+def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
+    """The surface of one object that is about the origin and has a longest side of about 1.
+
+    What lies outside [-1, 1]^3 is left out.
+
+    Args:
+        gaussians: one object, on the device that renders.
+        options: any method but centers.
+
+    Raises:
+        UserError: there is no surface, or a value is not finite.
+        ValueError: the method has no surface.
+    """
+    if options.method not in ("tsdf", "density"):
+        raise ValueError(f"method is {options.method!r}, which has no surface")
+    options.check()
+    gaussians = near_and_visible(gaussians.detach())
+    views = None
+    if options.method == "tsdf" or options.colors:
+        views = look_around(
+            gaussians,
+            options.views,
+            options.pixels,
+            options.transmittance,
+            options.min_alpha,
+            options.clear_alpha,
+            options.max_slope,
+        )
+    if options.method == "tsdf":
+        support = max(1.0, options.min_support * options.views)
+        mesh = fuse(views, options.voxels, options.truncation, support)
+    else:
+        mesh = level_set(gaussians, options.voxels, options.level)
+    vertices, faces = cleaned_mesh(
+        *mesh,
+        min_component=options.min_component,
+        min_diameter=options.min_diameter,
+        largest=options.largest,
+        close_holes=options.close_holes,
+        smooth=options.smooth,
+        max_faces=options.faces,
+    )
+    colors = vertex_colors(vertices, faces, views, options.voxels) if options.colors else None
+    return Surface(vertices, faces, colors)
+
+
+def near_and_visible(gaussians: Gaussians) -> Gaussians:
+    """Those with opacity whose centre is within [-1, 1]^3.
+
+    Raises:
+        UserError: a value is not finite, no Gaussian is visible, or all are outside.
+    """
+    parts = (gaussians.means, gaussians.scales, gaussians.opacities[:, None], gaussians.colors)
+    finite = torch.cat(parts, -1).isfinite().all(-1)
+    if not finite.all():
+        raise UserError(f"{int((~finite).sum())} of {gaussians.num} Gaussians are not finite")
+    visible = gaussians.opacities > VISIBLE
+    if not visible.any():
+        raise UserError(f"no Gaussian has an opacity above {VISIBLE}")
+    near = (gaussians.means.abs() < 1).all(-1)
+    if not (near & visible).any():
+        raise UserError("no visible Gaussian is within [-1, 1]^3")
+    return gaussians.select(near)
+
+
+def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
+    """Centre ``[3]`` and longest side of an object anywhere, whatever floats far from it.
+
+    Of the visible Gaussians' centres, half a percent on each side is left out along each axis.
+
+    Raises:
+        UserError: a value is not finite, no Gaussian is visible, or all are at one point.
+    """
+    means = gaussians.means[gaussians.opacities > VISIBLE].double().cpu()
+    if not gaussians.means.isfinite().all():
+        raise UserError("a Gaussian's position is not finite")
+    if len(means) == 0:
+        raise UserError(f"no Gaussian has an opacity above {VISIBLE}")
+    ends = np.quantile(means.numpy(), [0.005, 0.995], axis=0)
+    # a single Gaussian has an extent as well
+    width = float(gaussians.scales.median())
+    side = float((ends[1] - ends[0]).max()) + 4 * width
+    if not 0 < side < float("inf"):
+        raise UserError("the Gaussians have no extent")
+    return torch.from_numpy(ends.mean(0)).to(gaussians.means), side
+
+
+def surface_of(gaussians: Gaussians, options: SurfaceOptions, device: torch.device) -> Surface:
+    """The surface of an object of any size anywhere, in its own frame.
+
+    Raises:
+        UserError: there is no surface.
+    """
+    center, side = unit_frame(gaussians)
+    found = extract_surface(moved_to_unit(gaussians, center, side).to(device), options)
+    vertices = found.vertices * side + center.double().numpy()
+    return Surface(vertices, found.faces, found.colors)
+
+
+def moved_to_unit(gaussians: Gaussians, center: Tensor, side: float) -> Gaussians:
+    """``gaussians`` with ``center [3]`` at the origin and ``side`` as the unit."""
+    means, scales = (gaussians.means - center) / side, gaussians.scales / side
+    return replace(gaussians, means=means, scales=scales)
+
+
+def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:
+    """Mean colour of each vertex in the views that see it, those in front counting most.
+
+    Args:
+        vertices: ``[V, 3]``.
+        faces: ``[F, 3]``.
+        views: pictures and depth.
+        voxels: a unit; a view sees a vertex if its depth there differs by less than four.
+
+    Returns:
+        ``[V, 3]`` float32 in [0, 1]; a vertex that no view sees has the nearest one's colour.
+    """
+    import trimesh
+    from scipy.spatial import cKDTree
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    points = torch.from_numpy(vertices).float()
+    normals = torch.from_numpy(np.array(mesh.vertex_normals)).float()
+    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
+    cameras = views.cameras
+    size = torch.tensor([cameras.width, cameras.height])
+    for depth, rgb, viewmat, K in zip(views.depth, views.rgb, cameras.viewmats, cameras.Ks):
+        seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        facing = -(normals @ viewmat[:3, :3].T * seen).sum(-1) / seen.norm(dim=-1)
+        at = seen[:, :2] / seen[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
+        pixel = at.floor().long()
+        inside = ((pixel >= 0) & (pixel < size)).all(-1)
+        x, y = torch.where(inside[:, None], pixel, 0).unbind(-1)
+        found = depth[y, x]
+        near = (found - seen[:, 2]).abs() < 4.0 / voxels
+        share = torch.where(inside & near & (found < CLEAR), facing.clamp_min(0), 0)[:, None] ** 2
+        total += share * rgb[y, x]
+        weight += share
+    known = weight[:, 0] > 0
+    if not known.any():
+        raise UserError("no view sees the surface")
+    colors = (total / weight.clamp_min(1e-12)).clamp(0, 1).numpy()
+    if not known.all():
+        known = known.numpy()
+        colors[~known] = colors[known][cKDTree(vertices[known]).query(vertices[~known])[1]]
+    return colors

@@ -1,0 +1,1 @@
+"""What is measured, one subject a file: cases, problems and knobs of each operator."""

@@ -1,0 +1,1 @@
+"""What every benchmark stands on: cases, the clock, reports, pages and charts."""

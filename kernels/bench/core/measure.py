@@ -1,0 +1,303 @@
+"""Runs cases: first call, check, clock, counts; what fails its check gets no time."""
+
+from __future__ import annotations
+
+import ctypes
+import datetime
+import gc
+import math
+import os
+import platform
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+from gamba_warp.versions import __version__
+
+from .case import LEVELS, Case, NotInstalled, Settings, Variant
+
+FORMAT = "gamba_warp.bench.1"
+_TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
+
+
+@dataclass
+class _Timed:
+    """A variant under way: its record and the seconds measured so far."""
+
+    variant: Variant
+    record: dict
+    seconds: list[float] = field(default_factory=list)
+
+    def done(self, fewest: int, time_is_up: bool, most: int) -> bool:
+        count = len(self.seconds)
+        most = min(most, self.variant.rounds or most)
+        return count >= most or (time_is_up and count >= fewest)
+
+
+def synchronize(device: torch.device) -> None:
+    """Waits for the GPU, if it is one."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def measure(
+    cases: Iterable[Case],
+    settings: Settings,
+    say: Callable[[str, str], None] = lambda case, variant: None,
+) -> dict:
+    """Measures cases and returns the document: machine, settings and records.
+
+    A variant that raises, and a check that fails, are recorded in ``status``; the rest goes on.
+    Ctrl-C ends the run: ``interrupted`` is set and what was measured is kept.
+
+    Args:
+        cases: in this order.
+        settings: what was asked for.
+        say: called with the case's and the variant's name before each step.
+
+    Returns:
+        ``{format, machine, settings, interrupted, records}``, ready for JSON. A record has ``op,
+        case, variant, device, dtype, direction, ms_p20, ms_p50, ms_p80`` (milliseconds, quantiles
+        of ``rounds`` runs), ``jit_ms`` (the first call, compilation or its cache included),
+        ``rel_rms_error, max_error`` (see ``Error``), ``peer, peer_ms`` (the fastest peer of the
+        same case, direction and sizes), ``work`` (counts); and ``status`` ("ok" or what is wrong),
+        ``is_peer, is_default, oracle, limit, parameters, threads, rounds, axis``. Times are None
+        unless the status is "ok".
+    """
+    records: list[dict] = []
+    document = {
+        "format": FORMAT,
+        "machine": machine(settings),
+        "settings": {"level": settings.level, "peers": settings.peers},
+        "interrupted": False,
+        "records": records,
+    }
+    try:
+        for case in cases:
+            _run_case(case, settings, records, say)
+    except KeyboardInterrupt:
+        document["interrupted"] = True
+    finally:
+        torch.set_num_threads(settings.threads)
+    return document
+
+
+def _run_case(case: Case, settings: Settings, records: list[dict], say: Callable) -> None:
+    torch.set_num_threads(settings.threads)
+    say(f"{case.op}: {case.name}", "inputs")
+    try:
+        variants = case.build()
+    except Exception as error:
+        variants = [Variant("all", lambda: None, None)]
+        records.append(_record(case, variants[0], settings) | {"status": _reason(error)})
+        return
+    timed = [_Timed(v, _record(case, v, settings)) for v in variants]
+    try:
+        for t in timed:
+            say(f"{case.op}: {case.name}", t.variant.name)
+            _prepare(t, settings)
+        ready = [t for t in timed if t.record["status"] == "ok"]
+        _clock(ready, settings, lambda t: say(f"{case.op}: {case.name}", t.variant.name))
+        for t in ready:
+            if t.variant.work is not None and t.record["status"] == "ok":
+                torch.set_num_threads(t.variant.threads or settings.threads)
+                t.record["work"] = t.variant.work()
+    finally:  # an interrupt keeps what there is
+        for t in timed:
+            _summarize(t)
+            if t.record["status"] != "not measured":
+                records.append(t.record)
+        _set_peers([t.record for t in timed])
+
+
+def _record(case: Case, variant: Variant, settings: Settings) -> dict:
+    return {
+        "op": case.op,
+        "case": case.name,
+        "variant": variant.name,
+        "device": settings.device.type,
+        "dtype": variant.dtype,
+        "direction": variant.direction,
+        **dict.fromkeys(_TIMES),
+        "rel_rms_error": None,
+        "max_error": None,
+        "peer": None,
+        "peer_ms": None,
+        "work": {},
+        "status": "not measured",
+        "is_peer": variant.peer,
+        "is_default": variant.default,
+        "oracle": variant.oracle,
+        "limit": variant.limit if variant.oracle else None,
+        "parameters": variant.parameters,
+        "threads": variant.threads or settings.threads,
+        "rounds": 0,
+        "axis": case.axis,
+        "text": case.text,
+    }
+
+
+def _prepare(t: _Timed, settings: Settings) -> None:
+    """First call and check; sets the status."""
+    torch.set_num_threads(t.variant.threads or settings.threads)
+    try:
+        started = time.perf_counter()
+        t.variant.run()
+        synchronize(settings.device)
+        t.record["jit_ms"] = 1e3 * (time.perf_counter() - started)
+        error = t.variant.check() if t.variant.check else None
+        if error is not None:
+            if math.isfinite(error.rel_rms):
+                t.record.update(rel_rms_error=error.rel_rms, max_error=error.maximum)
+            if not error.rel_rms <= t.variant.limit:
+                t.record["status"] = (
+                    f"check failed: {error.worst} has relative rms error {error.rel_rms:.2g}, "
+                    f"allowed {t.variant.limit:.2g}"
+                )
+                return
+        t.record["status"] = "ok"
+    except Exception as error:
+        t.record["status"] = _reason(error)
+
+
+def _clock(ready: list[_Timed], settings: Settings, say: Callable) -> None:
+    """Times the variants in turn until each has its rounds and the case its time."""
+    level = LEVELS[settings.level]
+    ends = time.perf_counter() + level.seconds * len(ready)
+    gc.collect()
+    gc.disable()
+    try:
+        while True:
+            time_is_up = time.perf_counter() >= ends
+            todo = [t for t in ready if not t.done(level.fewest, time_is_up, level.most)]
+            if not todo:
+                return
+            for t in todo:
+                say(t)
+                torch.set_num_threads(t.variant.threads or settings.threads)
+                try:
+                    synchronize(settings.device)
+                    started = time.perf_counter()
+                    result = t.variant.run()
+                    synchronize(settings.device)
+                    t.seconds.append(time.perf_counter() - started)
+                    del result  # freeing is not timed, nor is it in the next variant's time
+                except Exception as error:
+                    t.record["status"] = _reason(error)
+                    ready.remove(t)
+    finally:
+        gc.enable()
+
+
+def _summarize(t: _Timed) -> None:
+    record = t.record
+    if record["status"] == "ok" and not t.seconds:
+        record["status"] = "not measured"
+    if record["status"] != "ok":
+        record.update(dict.fromkeys(_TIMES))
+        return
+    quantiles = np.quantile(t.seconds, [0.2, 0.5, 0.8]) * 1e3
+    record.update(zip(_TIMES, map(float, quantiles)))
+    record["rounds"] = len(t.seconds)
+
+
+def _set_peers(records: list[dict]) -> None:
+    """The fastest peer of the same direction and sizes."""
+    for record in records:
+        same = [
+            r
+            for r in records
+            if all(r[k] == record[k] for k in ("direction", "parameters")) and r["ms_p50"]
+        ]
+        peers = [r for r in same if r["is_peer"]]
+        if peers and not record["is_peer"]:
+            fastest = min(peers, key=lambda r: r["ms_p50"])
+            record.update(peer=fastest["variant"], peer_ms=fastest["ms_p50"])
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, NotInstalled):
+        return f"not installed: {error}"
+    lines = str(error).strip().splitlines()
+    return f"failed: {type(error).__name__}: {lines[0] if lines else ''}"
+
+
+def machine(settings: Settings) -> dict:
+    """What decides the figures: processor, threads, versions, day. No names, no paths."""
+    gpu = None
+    if settings.device.type == "cuda":
+        gpu = torch.cuda.get_device_name(settings.device)
+    return {
+        "cpu": _cpu_model(),
+        "simd": torch.backends.cpu.get_cpu_capability(),
+        "cores": os.cpu_count(),
+        "threads": settings.threads,
+        "gpu": gpu,
+        "cuda": torch.version.cuda if gpu else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "warp": wp.__version__,
+        "gamba_warp": __version__,
+        "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
+    """Growth of memory while ``run`` runs, its result included; None where it cannot be seen.
+
+    On CUDA torch's own count; on Linux the process's resident memory, whose high-water mark the
+    kernel lets us reset.
+    """
+    if device.type == "cuda":
+        synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        result = run()
+        synchronize(device)
+        del result
+        return torch.cuda.max_memory_allocated(device) - before
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # else memory that is free, but kept, serves unseen
+        Path("/proc/self/clear_refs").write_text("5")
+        before = _resident("VmRSS")
+        result = run()
+        after = _resident("VmHWM")
+    except (OSError, AttributeError, StopIteration):
+        return None
+    del result
+    return after - before
+
+
+def _resident(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
+
+
+def saved_bytes(forward: Callable[[], object], inputs: Iterable[torch.Tensor]) -> int:
+    """Bytes that a forward pass keeps for its backward, the inputs themselves not counted."""
+    own = {x.untyped_storage().data_ptr() for x in inputs}
+    seen: dict[int, int] = {}
+
+    def pack(x: torch.Tensor) -> torch.Tensor:
+        seen[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
+        return x
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda x: x):
+        result = forward()
+    del result
+    return sum(size for pointer, size in seen.items() if pointer not in own)

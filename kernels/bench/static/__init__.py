@@ -1,0 +1,1 @@
+"""What the CUDA kernels take of a GPU, told without one."""

@@ -1,0 +1,129 @@
+"""Which kernels an operator launches on CUDA, found without a GPU.
+
+The operators run on tensors that have a shape, a dtype and the device cuda, but no memory; a launch
+is noted instead of made. So the code that chooses kernels is the operators' own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from types import SimpleNamespace
+from unittest import mock
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch._library.custom_ops import OPDEFS
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ...runtime import views as interop
+
+_READ_BACK = (torch.ops.aten.item.default, torch.ops.aten._local_scalar_dense.default)
+# What an operator reads back from the device, the number of pairs, is taken to be this.
+COUNT = 1 << 20
+# Multiprocessors of the device that is imagined; an A100 has 108, an H100 or H200 has 132.
+MULTIPROCESSORS = 132
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A kernel and the threads of its block."""
+
+    kernel: wp.Kernel
+    block: int
+
+
+class _Inside(TorchDispatchMode):
+    """Runs the body of our operators on the fake tensors, where their fake results would do."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        if function in _READ_BACK:
+            return COUNT
+        body = OPDEFS.get(function.name()) if function.namespace == "gamba_warp" else None
+        if body is None:
+            return function(*args, **(kwargs or {}))
+        with self:
+            return body._init_fn(*args, **(kwargs or {}))
+
+
+@contextmanager
+def dry_run() -> Iterator[list[Launch]]:
+    """Inside, tensors made with the device cuda are fake, and launches on it are only noted.
+
+    Gives the list of launches, which grows. Gradients come from ``run_backward``.
+    """
+    launches: list[Launch] = []
+
+    def note(kernel, dim, inputs=(), outputs=(), *, block_dim=256, **_) -> None:
+        launches.append(Launch(kernel, block_dim))
+
+    def array(tensor, dtype=None, return_ctype=False, **_):
+        rank = tensor.dim() - len(getattr(dtype, "_shape_", ()))
+        made = wp.array(shape=(0,) * max(rank, 1), dtype=dtype or float, device="cpu")
+        return made.__ctype__() if return_ctype else made
+
+    device = SimpleNamespace(multi_processor_count=MULTIPROCESSORS)
+    replaced = [
+        (wp, "launch", note),
+        (wp, "from_torch", array),
+        (wp, "stream_from_torch", lambda stream: None),
+        (torch.cuda, "current_stream", lambda device=None: None),
+        (torch.cuda, "current_device", lambda: 0),
+        (torch.cuda, "get_device_properties", lambda index=None: device),
+        (torch.Tensor, "data_ptr", lambda tensor: 0),
+        (
+            interop,
+            "_descriptors",
+            {},
+        ),  # those made here describe nothing
+    ]
+    with ExitStack() as stack:
+        for where, name, function in replaced:
+            stack.enter_context(mock.patch.object(where, name, function))
+        stack.enter_context(FakeTensorMode())
+        stack.enter_context(_Inside())
+        yield launches
+
+
+def run_backward(outputs: Sequence[Tensor]) -> None:
+    """All gradients of the outputs, node by node: torch's engine would look for the GPU."""
+    pending: dict = {}
+
+    def give(node, index: int, gradient: Tensor | None) -> None:
+        if node is None or gradient is None:
+            return
+        waiting = pending.setdefault(node, [None] * len(node._input_metadata))
+        waiting[index] = gradient if waiting[index] is None else waiting[index] + gradient
+
+    for x in outputs:
+        give(x.grad_fn, x.output_nr, torch.ones_like(x))
+    while pending:
+        node = max(pending, key=lambda node: node._sequence_nr())
+        gradients = pending.pop(node)
+        if node.name() == "torch::autograd::AccumulateGrad":
+            continue
+        for (following, index), gradient in zip(*_gradients(node, gradients)):
+            give(following, index, gradient)
+
+
+def _gradients(node, gradients: list) -> tuple[list, list]:
+    """What follows a node, and the gradient for each."""
+    following = list(node.next_functions)
+    if not hasattr(node, "needs_input_grad"):  # of C++
+        results = node(*gradients)
+        return following, list(results) if isinstance(results, tuple) else [results]
+    results = zip(node.apply(*gradients), node.needs_input_grad)
+    return [f for f in following if f[0] is not None], [x for x, needed in results if needed]
+
+
+def launches_of(run: Callable[[], Sequence[Tensor]]) -> dict[str, list[Launch]]:
+    """The different launches of ``run`` on CUDA: "forward", and "gradient" of what it returns."""
+    with dry_run() as launches:
+        outputs = run()
+        forward = len(launches)
+        run_backward([x for x in outputs if x.requires_grad])
+    parts = {"forward": launches[:forward], "gradient": launches[forward:]}
+    return {name: list(dict.fromkeys(part)) for name, part in parts.items()}

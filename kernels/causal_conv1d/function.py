@@ -1,0 +1,74 @@
+"""The public convolution: checks at the door, then the operators of ``ops.py``."""
+
+import torch
+from torch import Tensor
+
+from .kernels import TAPS
+from .ops import conv
+
+DTYPES = (torch.float32, torch.bfloat16, torch.float16)
+ACTIVATIONS = (None, "silu", "swish")
+
+
+def causal_conv1d(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    *,
+    activation: str | None = None,
+    initial_state: Tensor | None = None,
+    return_final_state: bool = False,
+) -> Tensor | tuple[Tensor, Tensor]:
+    """Depthwise causal convolution along tokens, channels last (README, equation 13).
+
+    Args:
+        x: ``[B, L, D]`` float32, bfloat16 or float16.
+        weight: ``[D, W]`` float dtype, W from 2 to 4; the last tap meets the present token.
+        bias: ``[D]`` float dtype, or None for 0.
+        activation: None, "silu" or "swish" (the same).
+        initial_state: ``[B, W-1, D]`` in x's dtype, the tokens before the first; None for 0.
+        return_final_state: also return the last W-1 tokens, ``[B, W-1, D]``.
+
+    Returns:
+        ``[B, L, D]`` in x's dtype, and the final state if asked for.
+
+    Raises:
+        TypeError: an argument is not a tensor or has another dtype.
+        ValueError: a shape, a device or ``activation`` is not one of the above.
+    """
+    _check(x, weight, bias, activation, initial_state)
+    out = conv(x, weight, bias, initial_state, activation is not None)
+    if not return_final_state:
+        return out
+    history = weight.shape[1] - 1
+    if initial_state is None:
+        initial_state = x.new_zeros(x.shape[0], history, x.shape[2])
+    recent = torch.cat([initial_state, x[:, max(0, x.shape[1] - history) :]], 1)
+    return out, recent[:, recent.shape[1] - history :]
+
+
+def _check(x, weight, bias, activation, initial_state) -> None:
+    tensors = {"x": x, "weight": weight, "bias": bias, "initial_state": initial_state}
+    for name, value in tensors.items():
+        if value is None and name in ("bias", "initial_state"):
+            continue
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{name} is {type(value).__name__}, must be a tensor")
+        if value.dtype not in DTYPES:
+            raise TypeError(f"{name} has dtype {value.dtype}, allowed: {DTYPES}")
+        if value.device != x.device or x.device.type not in ("cpu", "cuda"):
+            raise ValueError(f"{name} is on {value.device}, x is on {x.device}; cpu or cuda")
+    if x.dim() != 3 or x.shape[2] == 0:
+        raise ValueError(f"x has shape {tuple(x.shape)}, must be [B, L, D] with D >= 1")
+    batch, _, channels = x.shape
+    if weight.dim() != 2 or weight.shape[0] != channels or not 2 <= weight.shape[1] <= TAPS:
+        raise ValueError(f"weight has shape {tuple(weight.shape)}, must be ({channels}, 2 to 4)")
+    if bias is not None and tuple(bias.shape) != (channels,):
+        raise ValueError(f"bias has shape {tuple(bias.shape)}, must be ({channels},)")
+    want = (batch, weight.shape[1] - 1, channels)
+    if initial_state is not None and tuple(initial_state.shape) != want:
+        raise ValueError(f"initial_state has shape {tuple(initial_state.shape)}, must be {want}")
+    if initial_state is not None and initial_state.dtype != x.dtype:
+        raise TypeError(f"initial_state has dtype {initial_state.dtype}, x has {x.dtype}")
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")

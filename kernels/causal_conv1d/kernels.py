@@ -1,0 +1,157 @@
+"""Causal depthwise convolution of at most four taps, with SiLU: the step before the scan.
+
+One kernel body serves both devices: its values are lanes of sixteen channels on a CPU and single
+floats, one thread each, on CUDA. Equations 1 and 2 of README.md.
+"""
+
+import functools
+
+import torch
+import warp as wp
+
+from ..runtime import rows as cpu_values
+from ..runtime import scalars as cuda_values
+from ..runtime.lanes import WARP_DTYPES
+
+TAPS = 4
+STRIP = 16  # tokens of a forward task: few rows at once, for each is of another page
+CHUNK = 64  # of a backward one; the gradient of the weight is summed in these, then over them
+_S = wp.constant(STRIP)
+_K = wp.constant(CHUNK)
+_HISTORY = wp.constant(TAPS - 1)
+
+
+def _values(device_type: str, io: torch.dtype):
+    """Value type, its channels, load, store and the arithmetic of one device."""
+    m = cpu_values if device_type == "cpu" else cuda_values
+    load, store = m.ACCESSORS[io]
+    return m.VALUE, m.WIDTH, load, store, m.times, m.fma, m.sigmoid
+
+
+@functools.cache
+def forward_kernel(device_type: str, io: torch.dtype):
+    """The kernel for tensors of dtype ``io`` on a device of that type (README, equation 1)."""
+    value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
+    scalar = WARP_DTYPES[io]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def conv_forward(
+        offset: int,
+        # in
+        strips: int,
+        use_silu: int,
+        x_in: wp.array3d(dtype=scalar),
+        weight_in: wp.array2d(dtype=value),
+        bias_in: wp.array(dtype=value),
+        state_in: wp.array3d(dtype=scalar),
+        # out
+        y_out: wp.array3d(dtype=scalar),
+    ):
+        task, k = wp.tid()
+        task = task + offset
+        b = task / strips
+        t0 = (task % strips) * _S
+        d = k * wp.static(channels_of_value)
+        width = wp.min(wp.static(channels_of_value), x_in.shape[2] - d)
+        w0, w1, w2, w3 = weight_in[0, k], weight_in[1, k], weight_in[2, k], weight_in[3, k]
+        x0, x1, x2 = value(0.0), value(0.0), value(0.0)
+        for i in range(_HISTORY):
+            x0 = x1
+            x1 = x2
+            t = t0 - _HISTORY + i
+            if t >= 0:
+                x2 = load(x_in, b, t, d, width)
+            elif state_in.shape[1] > 0:
+                x2 = load(state_in, b, t + _HISTORY, d, width)
+        for t in range(t0, wp.min(t0 + _S, x_in.shape[1])):
+            x3 = load(x_in, b, t, d, width)
+            y = fma(w0, x0, fma(w1, x1, fma(w2, x2, fma(w3, x3, bias_in[k]))))
+            if use_silu != 0:
+                y = times(y, sigmoid(y))
+            store(y_out, b, t, d, width, y)
+            x0 = x1
+            x1 = x2
+            x2 = x3
+
+    return conv_forward
+
+
+@functools.cache
+def backward_kernel(device_type: str, io: torch.dtype):
+    """Its gradients (README, equation 2); those of the weight in one partial sum a chunk."""
+    value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
+    scalar = WARP_DTYPES[io]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def conv_backward(
+        offset: int,
+        # in
+        chunks: int,
+        use_silu: int,
+        x_in: wp.array3d(dtype=scalar),
+        weight_in: wp.array2d(dtype=value),
+        bias_in: wp.array(dtype=value),
+        state_in: wp.array3d(dtype=scalar),
+        dout_in: wp.array3d(dtype=scalar),
+        # out
+        dx_out: wp.array3d(dtype=scalar),
+        dstate_out: wp.array3d(dtype=scalar),
+        dweight_out: wp.array3d(dtype=value),
+    ):
+        task, k = wp.tid()
+        task = task + offset
+        b = task / chunks
+        t0 = (task % chunks) * _K
+        length = x_in.shape[1]
+        end = wp.min(t0 + _K, length)
+        d = k * wp.static(channels_of_value)
+        width = wp.min(wp.static(channels_of_value), x_in.shape[2] - d)
+        w0, w1, w2, w3 = weight_in[0, k], weight_in[1, k], weight_in[2, k], weight_in[3, k]
+        x0, x1, x2, x3 = value(0.0), value(0.0), value(0.0), value(0.0)
+        for i in range(_HISTORY):
+            x0 = x1
+            x1 = x2
+            t = t0 - _HISTORY + i
+            if t >= 0:
+                x2 = load(x_in, b, t, d, width)
+            elif state_in.shape[1] > 0:
+                x2 = load(state_in, b, t + _HISTORY, d, width)
+        g0, g1, g2, g3 = value(0.0), value(0.0), value(0.0), value(0.0)
+        v0, v1, v2, v3, vb = value(0.0), value(0.0), value(0.0), value(0.0), value(0.0)
+        # dx of token t needs the gradients g of t to t + 3: the loop runs three tokens behind
+        for t in range(t0, end + _HISTORY):
+            g3 = value(0.0)
+            if t < length:
+                x3 = load(x_in, b, t, d, width)
+                g3 = load(dout_in, b, t, d, width)
+                if use_silu != 0:
+                    y = fma(w0, x0, fma(w1, x1, fma(w2, x2, fma(w3, x3, bias_in[k]))))
+                    s = sigmoid(y)
+                    g3 = times(g3, fma(times(y, s), value(1.0) - s, s))
+                if t < end:
+                    v0 = fma(g3, x0, v0)
+                    v1 = fma(g3, x1, v1)
+                    v2 = fma(g3, x2, v2)
+                    v3 = fma(g3, x3, v3)
+                    vb = vb + g3
+            dx = fma(w3, g0, fma(w2, g1, fma(w1, g2, times(w0, g3))))
+            at = t - _HISTORY
+            if at >= t0:
+                if dx_out.shape[1] > 0:
+                    store(dx_out, b, at, d, width, dx)
+            elif at < 0 and dstate_out.shape[1] > 0:
+                store(dstate_out, b, t, d, width, dx)
+            x0 = x1
+            x1 = x2
+            x2 = x3
+            g0 = g1
+            g1 = g2
+            g2 = g3
+        if dweight_out.shape[1] > 0:
+            dweight_out[task, 0, k] = v0
+            dweight_out[task, 1, k] = v1
+            dweight_out[task, 2, k] = v2
+            dweight_out[task, 3, k] = v3
+            dweight_out[task, 4, k] = vb
+
+    return conv_backward

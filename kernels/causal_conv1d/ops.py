@@ -1,0 +1,133 @@
+"""The convolution as torch operators: launches, fake results and gradients."""
+
+import torch
+from torch import Tensor
+
+from ..runtime import rows as cpu_values
+from ..runtime import scalars as cuda_values
+from ..runtime.launch import cuda_launch, parallel_launch
+from ..runtime.memory import empty
+from ..runtime.views import lane_contiguous, view
+from .kernels import CHUNK, STRIP, TAPS, backward_kernel, forward_kernel
+
+
+def _empty(like: Tensor, shape: tuple[int, ...]) -> Tensor:
+    return empty(shape, like.dtype) if like.device.type == "cpu" else like.new_empty(shape)
+
+
+def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
+    """``[D, rows]`` to float32 ``[rows, channels]``, zeros in front of too few rows."""
+    packed = torch.zeros(rows, channels, device=like.device)
+    if x is not None:
+        x = x.reshape(like.shape[2], -1)
+        packed[rows - x.shape[1] :, : like.shape[2]] = x.T
+    return packed
+
+
+def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None):
+    """Channels padded to whole values, views of the parameters, and the state's three rows."""
+    m = cpu_values if x.device.type == "cpu" else cuda_values
+    blocks = -(-x.shape[2] // m.WIDTH)
+    shape = (m.WIDTH,) if m.WIDTH > 1 else ()
+    w = _pack(weight, TAPS, blocks * m.WIDTH, x).view(TAPS, blocks, *shape)
+    v = _pack(bias, 1, blocks * m.WIDTH, x).view(blocks, *shape)
+    rows = x.new_zeros(x.shape[0], 0 if state is None else TAPS - 1, x.shape[2])
+    if state is not None:
+        rows[:, TAPS - 1 - state.shape[1] :] = state
+    return blocks, view(w, m.VALUE), view(v, m.VALUE), rows
+
+
+def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list) -> None:
+    if x.device.type == "cpu":
+        parallel_launch(kernel, dim, inputs, outputs)
+    else:
+        cuda_launch(kernel, dim, [0, *inputs], outputs, device=x.device, block_dim=128)
+
+
+@torch.library.custom_op("gamba_warp::causal_conv1d", mutates_args=())
+def conv(
+    x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None, silu: bool
+) -> Tensor:
+    """``causal_conv1d`` after its checks: ``x [B, L, D]`` to ``[B, L, D]``."""
+    strips = -(-x.shape[1] // STRIP)
+    x = lane_contiguous(x)
+    blocks, w, v, rows = _operands(x, weight, bias, state)
+    out = torch.empty(x.shape, dtype=x.dtype, device=x.device)
+    kernel = forward_kernel(x.device.type, x.dtype)
+    _launch(x, kernel, (x.shape[0] * strips, blocks), [strips, int(silu), x, w, v, rows], [out])
+    return out
+
+
+@conv.register_fake
+def _(x, weight, bias, state, silu):
+    return torch.empty_like(x, memory_format=torch.contiguous_format)
+
+
+@torch.library.custom_op("gamba_warp::causal_conv1d_backward", mutates_args=())
+def _conv_backward(
+    dout: Tensor,
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    state: Tensor | None,
+    silu: bool,
+    needs: list[bool],
+) -> list[Tensor]:
+    need_x, need_weight, need_bias, need_state = needs
+    batch, length, channels = x.shape
+    chunks = -(-length // CHUNK)
+    x = lane_contiguous(x)
+    m = cpu_values if x.device.type == "cpu" else cuda_values
+    blocks, w, v, rows = _operands(x, weight, bias, state)
+    dx = _empty(x, (batch, length if need_x else 0, channels))
+    dstate = x.new_zeros(batch, TAPS - 1 if need_state else 0, channels)
+    dweight = torch.empty(
+        batch * chunks, 5 if need_weight or need_bias else 0, blocks * m.WIDTH, device=x.device
+    )
+    shaped = dweight.view(*dweight.shape[:2], blocks, m.WIDTH) if m.WIDTH > 1 else dweight
+    _launch(
+        x,
+        backward_kernel(x.device.type, x.dtype),
+        (batch * chunks, blocks),
+        [chunks, int(silu), x, w, v, rows, lane_contiguous(dout)],
+        [dx, dstate, view(shaped, m.VALUE)],
+    )
+    grads = [dx] if need_x else []
+    total = dweight.sum(0)[:, :channels] if need_weight or need_bias else None
+    if need_weight:
+        grads.append(total[TAPS - weight.shape[1] : TAPS].T.to(weight.dtype).contiguous())
+    if need_bias:
+        grads.append(total[TAPS].to(bias.dtype).clone())
+    if need_state:
+        grads.append(dstate[:, TAPS - 1 - state.shape[1] :].clone())
+    return grads
+
+
+@_conv_backward.register_fake
+def _(dout, x, weight, bias, state, silu, needs):
+    return [
+        torch.empty_like(a, memory_format=torch.contiguous_format)
+        for a, needed in zip((x, weight, bias, state), needs)
+        if needed
+    ]
+
+
+def _setup_context(ctx, inputs, output):
+    x, weight, bias, state, ctx.silu = inputs
+    ctx.save_for_backward(x, weight, bias, state)
+
+
+def _gradient(ctx, dout):
+    needs = list(ctx.needs_input_grad[:4])
+    grads = iter(_conv_backward(dout, *ctx.saved_tensors, ctx.silu, needs))
+    return (*(next(grads) if needed else None for needed in needs), None)
+
+
+def _no_second_gradient(ctx, *grads):
+    raise RuntimeError("causal_conv1d: second derivatives are not supported")
+
+
+conv.register_autograd(_gradient, setup_context=_setup_context)
+
+
+_conv_backward.register_autograd(_no_second_gradient)

@@ -1,0 +1,393 @@
+"""Compositing on the CPU: threads take tile after tile, 16 lanes = the pixels of a 4 x 4 block.
+
+A tile of 16 x 16 pixels is 16 such blocks (cpu_variant.py has other sizes). For each Gaussian of
+the tile its blocks are tested at once (lanes = blocks), and only those that the ellipse touches are
+evaluated (lanes = pixels).
+Backward walks back to front and writes one gradient row per (tile, Gaussian) pair, which are summed
+by Gaussian afterwards: no atomics. README.md §3 and §5 hold the maths.
+"""
+
+import functools
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ...runtime.launch import parallel_launch
+from ...runtime.views import vectors, view
+from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
+from ..tiles import Bins, Frame, Walk, color_row, q_limit
+from . import lanes as L
+from .blend import blend_leaves
+from .lanes import block_leaves, lanes, lanes_int
+from .tuning import Variant, current
+
+# Unrolled, the loops over blocks and pixels would take the compiler long for no gain.
+_OPTIONS = {"enable_backward": False, "max_unroll": 1}
+
+_BLOCK_TEST = wp.constant(BLOCK_TEST)
+_STOPPED = wp.constant(STOPPED)
+_EMPTY_TILES = wp.constant(EMPTY_TILES)
+_ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
+_UNUSED = wp.constant(UNUSED)
+_AHEAD = wp.constant(6)  # pairs, for a Gaussian to come from memory
+_NEVER = wp.constant(2**31 - 1)
+_EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
+
+
+@wp.func
+def _blocks_inside(frame: Frame, columns: int, x: int, y: int) -> int:
+    # bit b is set if block b of the tile at (x, y) has a pixel in the picture
+    bits = wp.int32(0)
+    for b in range(columns * columns):
+        if x + (b % columns) * 4 < frame.width and y + (b // columns) * 4 < frame.height:
+            bits = bits | (1 << b)
+    return bits
+
+
+@functools.cache
+def _forward_kernel(variant: Variant):
+    columns, blocks, side = variant.columns, variant.blocks, variant.tile
+    leaves, blend = block_leaves(variant), blend_leaves(variant).blend
+    first_x, first_y, touched = leaves.first_x, leaves.first_y, leaves.touched
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def composite(
+        offset: wp.int32,
+        frame: Frame,
+        tiles: wp.int32,
+        means2d_in: wp.array[wp.vec2],
+        conics_in: wp.array[wp.vec3],
+        view_opacities_in: wp.array[wp.float32],
+        colors_in: wp.array2d[wp.float32],
+        pairs_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        counter_out: wp.array[wp.int32],
+        room_out: wp.array2d[lanes],
+        transmittances_out: wp.array[lanes],
+        stops_out: wp.array[lanes_int],
+        blocks_out: wp.array[wp.int32],
+        walked_out: wp.array[wp.int32],
+        blocks_walked_out: wp.array[wp.int64],
+        renders_out: wp.array4d[wp.float32],
+        alphas_out: wp.array4d[wp.float32],
+    ):
+        """Room to work: counter, the next tile to take; room, a worker's sums of colours."""
+        worker = offset + wp.tid()
+        channels = colors_in.shape[1]
+        tile = L.take(counter_out)
+        while tile < tiles:
+            begin = starts_in[tile]
+            end = starts_in[tile + 1]
+            walked_out[tile] = 0
+            blocks_walked_out[tile] = wp.int64(0)
+            if begin < end or (frame.skip & _EMPTY_TILES) == 0:
+                image = tile // (frame.tiles_x * frame.tiles_y)
+                x = tile % frame.tiles_x * side
+                y = tile // frame.tiles_x % frame.tiles_y * side
+                xs = first_x(float(x) + 0.5)
+                ys = first_y(float(y) + 0.5)
+                first = tile * blocks
+                for b in range(blocks):
+                    transmittances_out[first + b] = lanes(1.0)
+                    stops_out[first + b] = lanes_int(_NEVER)
+                for i in range(blocks * channels):
+                    room_out[worker, i] = lanes(0.0)
+
+                inside = _blocks_inside(frame, columns, x, y)
+                alive = inside
+                evaluated = wp.int64(0)
+                k = begin
+                while k < end and alive != 0:
+                    g = pairs_in[k]
+                    L.fetch(
+                        means2d_in,
+                        conics_in,
+                        view_opacities_in,
+                        pairs_in[wp.min(k + _AHEAD, end - 1)],
+                    )
+                    mean = means2d_in[g]
+                    conic = conics_in[g]
+                    shear = conic[1]
+                    opacity = view_opacities_in[g]
+                    bits = alive
+                    if (frame.skip & _BLOCK_TEST) != 0:
+                        slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
+                        limit = q_limit(opacity, frame.alpha_min)
+                        bits = alive & touched(
+                            xs, ys, mean[0], mean[1], conic[0], shear, conic[2], slope, limit
+                        )
+                    used = wp.int32(0)
+                    if bits != 0:
+                        used = blend(
+                            bits,
+                            k,
+                            float(x) + 0.5 - mean[0],
+                            float(y) + 0.5 - mean[1],
+                            shear,
+                            _EXP2 * conic[0],
+                            _EXP2 * conic[2],
+                            opacity,
+                            frame.alpha_min,
+                            frame.alpha_max,
+                            frame.t_min,
+                            colors_in,
+                            color_row(frame, g),
+                            first,
+                            worker,
+                            transmittances_out,
+                            stops_out,
+                            room_out,
+                        )
+                        evaluated += wp.int64(L.count_bits(bits))
+                        if (frame.skip & _STOPPED) != 0:
+                            alive = alive & ~(used >> 16)
+                    blocks_out[k] = used & 0xFFFF
+                    k += 1
+                walked_out[tile] = k - begin
+                blocks_walked_out[tile] = evaluated
+
+                while inside != 0:
+                    b = L.lowest_bit(inside)
+                    inside = inside & (inside - 1)
+                    px = x + (b % columns) * 4
+                    py = y + (b // columns) * 4
+                    L.store_block(
+                        alphas_out, image, py, px, 0, L.coverage(transmittances_out[first + b])
+                    )
+                    for c in range(channels):
+                        L.store_block(
+                            renders_out, image, py, px, c, room_out[worker, b * channels + c]
+                        )
+            tile = L.take(counter_out)
+
+    return composite
+
+
+@functools.cache
+def _backward_kernel(variant: Variant):
+    columns, blocks, side = variant.columns, variant.blocks, variant.tile
+    unblend = blend_leaves(variant).unblend
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def composite_vjp(
+        offset: wp.int32,
+        frame: Frame,
+        tiles: wp.int32,
+        geometry: wp.int32,
+        means2d_in: wp.array[wp.vec2],
+        conics_in: wp.array[wp.vec3],
+        view_opacities_in: wp.array[wp.float32],
+        colors_in: wp.array2d[wp.float32],
+        pairs_in: wp.array[wp.int32],
+        rows_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        transmittances_in: wp.array[lanes],
+        stops_in: wp.array[lanes_int],
+        blocks_in: wp.array[wp.int32],
+        walked_in: wp.array[wp.int32],
+        v_renders_in: wp.array4d[wp.float32],
+        v_alphas_in: wp.array4d[wp.float32],
+        counter_out: wp.array[wp.int32],
+        room_out: wp.array2d[lanes],
+        v_pairs_out: wp.array2d[wp.float32],
+        written_out: wp.array[wp.uint8],
+        skipped_out: wp.array[wp.int32],
+    ):
+        """Room to work: counter, the next tile to take; room as ``unblend`` has it."""
+        worker = offset + wp.tid()
+        channels = colors_in.shape[1]
+        upstream = 32 + channels
+        tile = L.take(counter_out)
+        while tile < tiles:
+            image = tile // (frame.tiles_x * frame.tiles_y)
+            x = tile % frame.tiles_x * side
+            y = tile // frame.tiles_x % frame.tiles_y * side
+            first = tile * blocks
+            any_v = wp.int32(0)
+            inside = wp.int32(0)
+            if walked_in[tile] > 0:
+                inside = _blocks_inside(frame, columns, x, y)
+            every = inside
+            while inside != 0:
+                b = L.lowest_bit(inside)
+                inside = inside & (inside - 1)
+                px = x + (b % columns) * 4
+                py = y + (b // columns) * 4
+                place = upstream + b * (channels + 1)
+                v_alpha = L.load_block(v_alphas_in, image, py, px, 0)
+                room_out[worker, place + channels] = v_alpha
+                any_v = any_v | L.any_nonzero(v_alpha)
+                for c in range(channels):
+                    v_c = L.load_block(v_renders_in, image, py, px, c)
+                    room_out[worker, place + c] = v_c
+                    any_v = any_v | L.any_nonzero(v_c)
+            wanted = any_v != 0 or ((frame.skip & _ZERO_UPSTREAM) == 0 and every != 0)
+            skipped_out[tile] = wp.where(wanted, 0, 1)
+            if wanted:
+                for b in range(blocks):
+                    room_out[worker, b] = L.absolute(transmittances_in[first + b])
+                    room_out[worker, 16 + b] = lanes(0.0)
+                k = starts_in[tile] + walked_in[tile] - 1
+                while k >= starts_in[tile]:
+                    bits = blocks_in[k]
+                    if (frame.skip & _UNUSED) == 0:
+                        bits = every
+                    if bits != 0:
+                        g = pairs_in[k]
+                        mean = means2d_in[g]
+                        conic = conics_in[g]
+                        unblend(
+                            bits,
+                            k,
+                            geometry,
+                            float(x) + 0.5 - mean[0],
+                            float(y) + 0.5 - mean[1],
+                            conic[1],
+                            _EXP2 * conic[0],
+                            _EXP2 * conic[2],
+                            view_opacities_in[g],
+                            frame.alpha_min,
+                            frame.alpha_max,
+                            colors_in,
+                            color_row(frame, g),
+                            first,
+                            worker,
+                            stops_in,
+                            room_out,
+                            rows_in[k],
+                            v_pairs_out,
+                        )
+                        written_out[rows_in[k]] = wp.uint8(1)
+                    k -= 1
+            tile = L.take(counter_out)
+
+    return composite_vjp
+
+
+def composite_forward(
+    means2d: Tensor,
+    conics: Tensor,
+    view_opacities: Tensor,
+    colors: Tensor,
+    bins: Bins,
+    frame: Frame,
+) -> tuple[Tensor, Tensor, Walk]:
+    """Blends I views; float32, contiguous tensors on the CPU.
+
+    Args:
+        means2d: ``[I, N, 2]``.
+        conics: ``[I, N, 3]``.
+        view_opacities: ``[I, N]``.
+        colors: ``[rows, C]``, rows = B * N, or I * N if ``frame.colors_per_view``.
+        bins: from ``bin_gaussians``.
+        frame: from ``make_frame``.
+
+    Returns:
+        ``renders [I, H, W, C]``, ``alphas [I, H, W, 1]`` and a ``Walk``.
+    """
+    images, channels = means2d.shape[0], colors.shape[1]
+    tiles = images * frame.tiles_x * frame.tiles_y
+    renders = colors.new_zeros(images, frame.height, frame.width, channels)
+    alphas = colors.new_zeros(images, frame.height, frame.width, 1)
+    workers, blocks = torch.get_num_threads(), current().blocks
+    walk = Walk(
+        colors.new_empty(tiles * blocks, 16),
+        bins.pairs.new_empty(tiles * blocks, 16),
+        torch.zeros_like(bins.pairs),
+        bins.pairs.new_empty(tiles),
+        bins.pairs.new_empty(tiles, dtype=torch.int64),
+    )
+    parallel_launch(
+        _forward_kernel(current()),
+        workers,
+        [
+            frame,
+            tiles,
+            vectors(means2d, wp.vec2),
+            vectors(conics, wp.vec3),
+            view_opacities.view(-1),
+            colors,
+            bins.pairs,
+            bins.starts,
+        ],
+        [
+            bins.pairs.new_zeros(1),
+            view(colors.new_empty(workers, 16 * channels, 16), lanes),
+            view(walk.transmittances, lanes),
+            view(walk.stops, lanes_int),
+            walk.blocks,
+            walk.walked,
+            walk.blocks_walked,
+            renders,
+            alphas,
+        ],
+    )
+    return renders, alphas, walk
+
+
+def composite_backward(
+    means2d: Tensor,
+    conics: Tensor,
+    view_opacities: Tensor,
+    colors: Tensor,
+    bins: Bins,
+    frame: Frame,
+    walk: Walk,
+    v_renders: Tensor,
+    v_alphas: Tensor,
+    geometry: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient sums of each pair, in emission order, for ``reduce_pairs``.
+
+    Args:
+        means2d: and the rest as forward.
+        conics: as forward.
+        view_opacities: as forward.
+        colors: as forward.
+        bins: as forward.
+        frame: as forward.
+        walk: as returned forward.
+        v_renders: ``[I, H, W, C]``.
+        v_alphas: ``[I, H, W, 1]``.
+        geometry: whether anything but colours is asked for.
+
+    Returns:
+        ``v_pairs [P, 6 + C]``, ``written [P]`` uint8, 0 where a row was left as it was, and
+        ``skipped [tiles]`` int32, 1 where a tile was not walked.
+    """
+    tiles, channels = walk.walked.numel(), colors.shape[1]
+    v_pairs = colors.new_empty(bins.pairs.numel(), 6 + channels)
+    written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
+    skipped = torch.empty_like(walk.walked)
+    workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)
+    parallel_launch(
+        _backward_kernel(current()),
+        workers,
+        [
+            frame,
+            tiles,
+            int(geometry),
+            vectors(means2d, wp.vec2),
+            vectors(conics, wp.vec3),
+            view_opacities.view(-1),
+            colors,
+            bins.pairs,
+            bins.rows,
+            bins.starts,
+            view(walk.transmittances, lanes),
+            view(walk.stops, lanes_int),
+            walk.blocks,
+            walk.walked,
+            v_renders,
+            v_alphas,
+        ],
+        [
+            bins.pairs.new_zeros(1),
+            view(colors.new_empty(workers, room, 16), lanes),
+            v_pairs,
+            written,
+            skipped,
+        ],
+    )
+    return v_pairs, written, skipped

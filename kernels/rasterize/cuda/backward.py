@@ -1,0 +1,222 @@
+"""The CUDA compositor's gradient kernel: back to front over the pairs of a tile (README §5)."""
+
+import functools
+
+import warp as wp
+
+from ..skip import UNUSED, ZERO_UPSTREAM
+from ..tiles import Frame
+from .warp import (
+    HEIGHT,
+    PITCH,
+    RECORD,
+    STOP,
+    SUB_TILES,
+    WARP,
+    WIDTH,
+    Gaussians,
+    exp2,
+    exponent,
+    first_block,
+    load,
+    load_int,
+    load_stop,
+    lowest_bit,
+    placing,
+    reciprocal,
+    shared_memory,
+    sheared,
+    staging,
+    store,
+)
+
+_BLOCKS = (1 << STOP) - 1
+_ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
+_UNUSED = wp.constant(UNUSED)
+
+
+@functools.cache
+def backward_kernel(channels: int, geometry: bool, parts: int):
+    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
+
+    Without ``geometry`` it is for colours alone. Each part has a row of its own for a pair.
+    """
+    moments = 6 if geometry else 0
+    values = moments + channels  # sums of a pair
+    slots = WARP // values  # pairs whose sums are completed at once, a lane for each
+    rows_at = WARP * RECORD
+    sums_at = rows_at + WARP
+    size = sums_at + slots * values * PITCH
+    memory = shared_memory(size)
+    arena_type = memory.arena
+    place, stage = placing(parts), staging(channels, size)
+    pixels = SUB_TILES // parts  # of a lane
+    part_blocks = (1 << 16 // parts) - 1
+    part_stops = (1 << pixels) - 1
+    pixels_type = wp.types.vector(pixels, wp.float32)
+    values_type = wp.types.vector(values, wp.float32)
+    upstream_type = wp.types.matrix((pixels, channels), wp.float32)
+    resident = 20 if channels < 4 else 16  # warps of a multiprocessor, as registers allow
+
+    @wp.func
+    def of_part(bits: wp.int32, part: wp.int32, wanted: wp.int32) -> wp.int32:
+        # of a pair's bits, those of a part of the tile, of blocks only the wanted ones
+        stops = bits >> (STOP + part * wp.static(pixels)) & wp.static(part_stops)
+        blocks = bits >> (part * wp.static(16 // parts)) & wp.static(part_blocks)
+        return blocks & wanted | stops << STOP
+
+    @wp.func
+    def leave(arena: arena_type, lane: wp.int32, slot: wp.int32, row: wp.int32, sums: values_type):
+        # a lane's sums of a pair, to be completed together with those of other pairs
+        at = wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
+        for v in range(wp.static(values)):
+            memory.put(arena, at + wp.static(v * PITCH), sums[v])
+        memory.put_int(arena, wp.static(rows_at) + slot, row)
+
+    @wp.func
+    def complete(
+        arena: arena_type,
+        gaussians: Gaussians,
+        lane: wp.int32,
+        count: wp.int32,
+        v_pairs: wp.array2d[wp.float32],
+    ):
+        # each lane adds up one value of one of the pairs left, over the 32 lanes
+        if lane < count * wp.static(values):
+            at = wp.static(sums_at) + lane * PITCH
+            total = memory.get4(arena, at)
+            for i in range(1, wp.static(WARP // 4)):
+                total += memory.get4(arena, at + 4 * i)
+            value = (total[0] + total[1]) + (total[2] + total[3])
+            row = wp.int64(memory.get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
+            row *= wp.int64(gaussians.channels + 6)
+            column = lane % wp.static(values)
+            if column >= wp.static(moments):
+                column += wp.static(6 - moments) + gaussians.first
+            elif gaussians.first > 0:
+                value += load(v_pairs, row, column)
+            store(v_pairs, row, column, value)
+
+    @wp.kernel(
+        enable_backward=False, module="unique", launch_bounds=(WARP, resident), grid_stride=False
+    )
+    def composite_vjp(
+        frame: Frame,
+        gaussians: Gaussians,
+        pairs_in: wp.array[wp.int32],
+        rows_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        transmittances_in: wp.array2d[wp.float32],
+        stops_in: wp.array2d[wp.int32],
+        blocks_in: wp.array[wp.int32],
+        walked_in: wp.array[wp.int32],
+        v_renders_in: wp.array2d[wp.float32],
+        v_alphas_in: wp.array2d[wp.float32],
+        v_pairs_out: wp.array2d[wp.float32],
+        skipped_out: wp.array[wp.int32],
+    ):
+        index, lane = wp.tid()
+        arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
+        p = place(frame, index, lane)
+        # as forward left it: negative until the walk comes to where the pixel stopped
+        T = pixels_type()
+        # README eq. 10, less the gradient of alpha, which is the same for all pairs
+        R = pixels_type()
+        upstream = upstream_type()
+        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
+        some = wp.int32(0)
+        walked = walked_in[p.tile]
+        for j in range(wp.static(pixels)):
+            if walked > 0:
+                T[j] = load(transmittances_in, p.place, j * WARP)
+            if T[j] != 0.0:
+                step = j // 2 * HEIGHT * frame.width + j % 2 * WIDTH
+                largest = wp.float32(0.0)
+                if gaussians.first == 0:
+                    R[j] = -load(v_alphas_in, p.pixel, step)
+                    largest += wp.abs(R[j])
+                step *= gaussians.channels
+                for c in range(wp.static(channels)):
+                    upstream[j, c] = load(v_renders_in, first, step + c)
+                    largest += wp.abs(upstream[j, c])
+                # NaN is not taken for zero
+                if not (largest <= 0.0):
+                    some |= wp.static(3 << first_block(j))
+        if (frame.skip & _ZERO_UPSTREAM) == 0:
+            some = wp.static(part_blocks)
+        wanted = memory.any_of(arena, lane, some)
+        if wanted == 0:
+            walked = 0
+        if walked > 0 and lane == 0:
+            skipped_out[p.tile] = 0
+
+        begin = starts_in[p.tile]
+        waiting = wp.int32(0)
+        for done in range(0, walked, WARP):
+            k = begin + walked - 1 - done - lane
+            bits = wp.int32(0)
+            if k >= begin:
+                bits = of_part(load_int(blocks_in, k), p.part, wanted)
+                if (frame.skip & _UNUSED) == 0:
+                    bits |= wanted
+                if bits != 0:
+                    g = load_int(pairs_in, k)
+                    row = load_int(rows_in, k) * wp.static(parts) + p.part
+                    stage(arena, frame, gaussians, lane, g, bits, row)
+            todo = memory.ballot(arena, lane, bits)
+            memory.sync()
+            while todo != 0:
+                i = lowest_bit(todo)
+                todo &= todo - 1
+                shape = memory.get4(arena, i * RECORD)
+                level = memory.get4(arena, i * RECORD + 4)
+                color = memory.get4(arena, i * RECORD + 8)
+                bits = memory.get_int(arena, i * RECORD + 6)
+                sums = values_type()
+                for j in range(wp.static(pixels)):
+                    if (bits & wp.static(3 << first_block(j))) != 0:
+                        dy = p.y[j // 2] - shape[1]
+                        u = sheared(shape[3], p.x[j % 2] - shape[0], dy)
+                        alpha = exp2(exponent(shape[2], level[0], level[1], u, dy))
+                        clamped = wp.min(alpha, frame.alpha_max)
+                        if alpha >= frame.alpha_min and T[j] > 0.0:
+                            T[j] = T[j] * reciprocal(1.0 - clamped)
+                            weight = T[j] * clamped
+                            for c in range(wp.static(channels)):
+                                sums[wp.static(moments) + c] += weight * upstream[j, c]
+                            if wp.static(geometry):
+                                diff = -R[j]
+                                for c in range(wp.static(channels)):
+                                    diff += color[c] * upstream[j, c]
+                                R[j] = R[j] + clamped * diff
+                                if alpha < frame.alpha_max:
+                                    h = weight * diff
+                                    hu = h * u
+                                    hy = h * dy
+                                    sums[0] += h
+                                    sums[1] += hu
+                                    sums[2] += hy
+                                    sums[3] += hu * u
+                                    sums[4] += hu * dy
+                                    sums[5] += hy * dy
+                if (bits & wp.static(_BLOCKS)) != 0:
+                    leave(arena, lane, waiting, memory.get_int(arena, i * RECORD + 7), sums)
+                    waiting += 1
+                    if waiting == wp.static(slots):
+                        memory.sync()
+                        complete(arena, gaussians, lane, waiting, v_pairs_out)
+                        memory.sync()
+                        waiting = 0
+                if (bits >> STOP) != 0:
+                    # what stopped here takes part from the next pair on
+                    k = begin + walked - 1 - done - i
+                    for j in range(wp.static(pixels)):
+                        if (bits & wp.static(1 << (STOP + j))) != 0:
+                            if T[j] < 0.0:
+                                if load_stop(stops_in, p.place, j * WARP) == k:
+                                    T[j] = -T[j]
+            memory.sync()
+        memory.sync()
+        complete(arena, gaussians, lane, waiting, v_pairs_out)
+
+    return composite_vjp

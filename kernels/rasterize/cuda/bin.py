@@ -1,0 +1,102 @@
+"""Tile lists on CUDA: a sort by depth, then counting, writing, and a stable sort by tile."""
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ...runtime.launch import launch
+from ..tiles import (
+    Grid,
+    box_pairs,
+    make_ellipse,
+    q_limit,
+    tile_columns,
+    tile_rows,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _count(
+    offset: wp.int32,
+    grid: Grid,
+    order_in: wp.array[wp.int32],
+    means2d_in: wp.array[wp.vec2],
+    conics_in: wp.array[wp.vec3],
+    view_opacities_in: wp.array[wp.float32],
+    extents_in: wp.array[wp.vec2],
+    counts_out: wp.array[wp.int32],
+    box_counts_out: wp.array[wp.int64],
+):
+    j = offset + wp.tid()
+    i = order_in[j]
+    extent = extents_in[i]
+    count = wp.int32(0)
+    box_count = wp.int64(0)
+    if extent[0] > 0.0:
+        limit = q_limit(view_opacities_in[i], grid.alpha_min)
+        ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
+        rows = tile_rows(grid, ellipse.mean[1], extent[1])
+        for ty in range(rows[0], rows[1] + 1):
+            columns = tile_columns(grid, ellipse, extent, ty)
+            count += wp.max(columns[1] - columns[0] + 1, 0)
+        box_count = box_pairs(grid, ellipse.mean, extent)
+    counts_out[j] = count
+    box_counts_out[j] = box_count
+
+
+@wp.kernel
+def _emit(
+    offset: wp.int32,
+    grid: Grid,
+    order_in: wp.array[wp.int32],
+    means2d_in: wp.array[wp.vec2],
+    conics_in: wp.array[wp.vec3],
+    view_opacities_in: wp.array[wp.float32],
+    extents_in: wp.array[wp.vec2],
+    offsets_in: wp.array[wp.int32],
+    tiles_out: wp.array[wp.int32],
+    gaussians_out: wp.array[wp.int32],
+):
+    j = offset + wp.tid()
+    i = order_in[j]
+    p = offsets_in[j]
+    extent = extents_in[i]
+    if extent[0] > 0.0:
+        limit = q_limit(view_opacities_in[i], grid.alpha_min)
+        ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
+        rows = tile_rows(grid, ellipse.mean[1], extent[1])
+        for ty in range(rows[0], rows[1] + 1):
+            columns = tile_columns(grid, ellipse, extent, ty)
+            row = ((i // grid.num) * grid.tiles_y + ty) * grid.tiles_x
+            for tx in range(columns[0], columns[1] + 1):
+                tiles_out[p] = row + tx
+                gaussians_out[p] = i
+                p += 1
+
+
+def bin_views(grid: Grid, depths: Tensor, inputs: list, check) -> tuple[Tensor, ...]:
+    """The fields of ``Bins``; ``check`` is given the number of pairs before they are made."""
+    device, (images, num) = depths.device, depths.shape
+    # stable: equal depths stay in the order of the Gaussians
+    order = torch.argsort(depths, dim=1, stable=True)
+    order += torch.arange(images, device=device)[:, None] * num
+    order = order.view(-1).int()
+    counts = torch.empty_like(order)
+    box_counts = torch.empty_like(order, dtype=torch.int64)
+    launch(_count, order.numel(), [grid, order, *inputs], [counts, box_counts], device)
+    offsets = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0))
+    total = int(offsets[-1])
+    check(total)
+    offsets = offsets.int()
+    tile_of, gaussians = order.new_empty(2, total)
+    if total:
+        outputs = [tile_of, gaussians]
+        launch(_emit, order.numel(), [grid, order, *inputs, offsets], outputs, device)
+    tiles = images * grid.tiles_x * grid.tiles_y
+    sorted_tiles, rows = torch.sort(tile_of, stable=True)
+    # not bincount: on CUDA it reads the largest value back
+    firsts = torch.arange(tiles + 1, dtype=torch.int32, device=device)
+    starts = torch.searchsorted(sorted_tiles, firsts, out_int32=True)
+    return order, offsets, gaussians[rows], rows.int(), starts, box_counts.sum()

@@ -1,0 +1,145 @@
+"""Compositing on CUDA: launches of one warp per tile of 16 x 16 pixels, or per part of one.
+
+Channels go in chunks of at most four: a chunk is a launch, and the geometry's gradients of chunks
+add up. Sums are written per pair and reduced by Gaussian afterwards: no atomics. README.md §3 and
+§5 hold the maths, CUDA.md the design.
+"""
+
+import functools
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ...runtime.launch import cuda_launch
+from ..tiles import Bins, Frame, Walk
+from .backward import backward_kernel
+from .forward import forward_kernel
+from .warp import CHUNK, WARP, Gaussians
+
+
+@functools.cache
+def _multiprocessors(index: int) -> int:
+    return torch.cuda.get_device_properties(index).multi_processor_count
+
+
+def parts_of_tile(tiles: int, device: torch.device) -> int:
+    """Into how many warps' work a tile is cut: 1, or where tiles are few, 2 or 4.
+
+    A few views do not fill the machine: the tile with the longest list sets the time, and its parts
+    run side by side. With more views parts only repeat the work that a Gaussian costs once per
+    warp. CUDA.md has the estimate behind the limits; no GPU has timed it.
+    """
+    if device.type != "cuda":
+        return 1
+    few = 10 * _multiprocessors(device.index or 0)
+    return 4 if tiles <= few else 2 if tiles <= 2 * few else 1
+
+
+def _gaussians(
+    means2d: Tensor, conics: Tensor, view_opacities: Tensor, colors: Tensor
+) -> Gaussians:
+    if means2d.device.type == "cpu" and not wp.config.enable_cpu_blocks:
+        raise ValueError("device is cpu: these kernels run there with enable_cpu_blocks only")
+    gaussians = Gaussians()
+    gaussians.means2d = wp.from_torch(means2d.detach().view(-1, 2), dtype=wp.vec2)
+    gaussians.conics = wp.from_torch(conics.detach().view(-1, 3), dtype=wp.vec3)
+    gaussians.opacities = wp.from_torch(view_opacities.detach().view(-1))
+    gaussians.colors = wp.from_torch(colors.detach())
+    gaussians.channels = colors.shape[1]
+    return gaussians
+
+
+def composite_forward(
+    means2d: Tensor,
+    conics: Tensor,
+    view_opacities: Tensor,
+    colors: Tensor,
+    bins: Bins,
+    frame: Frame,
+) -> tuple[Tensor, Tensor, Walk]:
+    """As ``composite_cpu.composite_forward``.
+
+    A ``Walk``'s pixels are in the order of the lanes, its ``stops`` are set where a pixel stopped
+    only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
+    """
+    images, channels = means2d.shape[0], colors.shape[1]
+    gaussians = _gaussians(means2d, conics, view_opacities, colors)
+    tiles = images * frame.tiles_x * frame.tiles_y
+    renders = colors.new_empty(images, frame.height, frame.width, channels)
+    alphas = colors.new_empty(images, frame.height, frame.width, 1)
+    parts = parts_of_tile(tiles, colors.device)
+    walk = Walk(
+        colors.new_empty(tiles * 16, 16),
+        bins.pairs.new_empty(tiles * 16, 16),
+        torch.zeros_like(bins.pairs),
+        bins.pairs.new_zeros(tiles),
+        bins.pairs.new_zeros(tiles, dtype=torch.int64),
+    )
+    for first in range(0, channels if tiles else 0, CHUNK):
+        gaussians.first = first
+        cuda_launch(
+            forward_kernel(min(CHUNK, channels - first), parts),
+            (tiles * parts, WARP),
+            [
+                frame,
+                gaussians,
+                bins.pairs,
+                bins.starts,
+            ],
+            [
+                walk.transmittances,
+                walk.stops,
+                walk.blocks,
+                walk.walked,
+                walk.blocks_walked,
+                renders.view(-1, channels),
+                alphas.view(-1, 1),
+            ],
+            device=colors.device,
+            block_dim=WARP,
+        )
+    return renders, alphas, walk
+
+
+def composite_backward(
+    means2d: Tensor,
+    conics: Tensor,
+    view_opacities: Tensor,
+    colors: Tensor,
+    bins: Bins,
+    frame: Frame,
+    walk: Walk,
+    v_renders: Tensor,
+    v_alphas: Tensor,
+    geometry: bool,
+) -> tuple[Tensor, None, Tensor]:
+    """As ``composite_cpu.composite_backward``; all rows are written."""
+    tiles, channels = walk.walked.numel(), colors.shape[1]
+    gaussians = _gaussians(means2d, conics, view_opacities, colors)
+    parts = parts_of_tile(tiles, colors.device)
+    v_pairs = colors.new_zeros(bins.pairs.numel(), parts, 6 + channels)
+    skipped = torch.ones_like(walk.walked)
+    for first in range(0, channels if tiles else 0, CHUNK):
+        gaussians.first = first
+        cuda_launch(
+            backward_kernel(min(CHUNK, channels - first), geometry, parts),
+            (tiles * parts, WARP),
+            [
+                frame,
+                gaussians,
+                bins.pairs,
+                bins.rows,
+                bins.starts,
+                walk.transmittances,
+                walk.stops,
+                walk.blocks,
+                walk.walked,
+                v_renders.view(-1, channels),
+                v_alphas.view(-1, 1),
+            ],
+            [v_pairs.view(-1, 6 + channels), skipped],
+            device=colors.device,
+            block_dim=WARP,
+        )
+    return v_pairs[:, 0] if parts == 1 else v_pairs.sum(1), None, skipped

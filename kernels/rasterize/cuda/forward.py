@@ -1,0 +1,176 @@
+"""The CUDA compositor's forward kernel: front to back over the pairs of a tile (README §3)."""
+
+import functools
+
+import warp as wp
+
+from ..skip import BLOCK_TEST, STOPPED
+from ..tiles import Frame
+from .warp import (
+    HEIGHT,
+    RECORD,
+    STOP,
+    SUB_TILES,
+    WARP,
+    WIDTH,
+    Gaussians,
+    anew,
+    count_bits,
+    exp2,
+    exponent,
+    first_block,
+    load1,
+    load2,
+    load3,
+    load_int,
+    lowest_bit,
+    placing,
+    shared_memory,
+    sheared,
+    staging,
+    store,
+    store_int,
+    store_stop,
+    touching,
+    word,
+)
+
+_SIZE = WARP * RECORD
+_BLOCK_TEST = wp.constant(BLOCK_TEST)
+_STOPPED = wp.constant(STOPPED)
+
+
+@functools.cache
+def forward_kernel(channels: int, parts: int):
+    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4."""
+    memory = shared_memory(_SIZE)
+    place, touched, stage = placing(parts), touching(parts), staging(channels, _SIZE)
+    pixels = SUB_TILES // parts  # of a lane
+    pixels_type = wp.types.vector(pixels, wp.float32)
+    sums_type = wp.types.matrix((pixels, channels), wp.float32)
+    resident = 24 if channels < 4 else 20  # warps of a multiprocessor, as registers allow
+
+    @wp.kernel(
+        enable_backward=False, module="unique", launch_bounds=(WARP, resident), grid_stride=False
+    )
+    def composite(
+        frame: Frame,
+        gaussians: Gaussians,
+        pairs_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        transmittances_out: wp.array2d[wp.float32],
+        stops_out: wp.array2d[wp.int32],
+        blocks_out: wp.array[wp.int32],
+        walked_out: wp.array[wp.int32],
+        blocks_walked_out: wp.array[wp.int64],
+        renders_out: wp.array2d[wp.float32],
+        alphas_out: wp.array2d[wp.float32],
+    ):
+        index, lane = wp.tid()
+        arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
+        p = place(frame, index, lane)
+        half = lane // 4 % 2  # of a sub-tile: blocks of 4 x 4 pixels
+        # positive: the pixel goes on; negative: it stopped; 0: it is outside the picture
+        T = pixels_type()
+        sums = sums_type()
+        inside = wp.int32(0)
+        for j in range(wp.static(pixels)):
+            if p.px + j % 2 * WIDTH < frame.width and p.py + j // 2 * HEIGHT < frame.height:
+                T[j] = 1.0
+                inside |= 1 << j
+        live = memory.any_of(arena, lane, inside)
+
+        begin = starts_in[p.tile]
+        end = starts_in[p.tile + 1]
+        walked = end - begin
+        evaluated = wp.int32(0)
+        for k0 in range(begin, end, WARP):
+            if live == 0:
+                break
+            # each lane looks at one of the next 32 Gaussians
+            k = k0 + lane
+            mask = wp.int32(0)
+            if k < end:
+                g = load_int(pairs_in, k)
+                mask = live & touched(
+                    p.corner,
+                    load2(gaussians.means2d, g),
+                    load3(gaussians.conics, g),
+                    load1(gaussians.opacities, g),
+                    frame.alpha_min,
+                )
+                if (frame.skip & _BLOCK_TEST) == 0:
+                    mask = live
+                stage(arena, frame, gaussians, lane, g, mask, 0)
+            todo = memory.ballot(arena, lane, mask)
+            memory.sync()
+            mine = wp.int32(0)
+            while todo != 0 and live != 0:
+                i = lowest_bit(todo)
+                todo &= todo - 1
+                shape = memory.get4(arena, i * RECORD)
+                level = memory.get4(arena, i * RECORD + 4)
+                color = memory.get4(arena, i * RECORD + 8)
+                mask = live & memory.get_int(arena, i * RECORD + 6)
+                evaluated += count_bits(mask)
+                used = word()
+                stopped = word()
+                for j in range(wp.static(pixels)):
+                    if (mask & wp.static(1 << j)) != 0:
+                        dy = p.y[j // 2] - shape[1]
+                        u = sheared(shape[3], p.x[j % 2] - shape[0], dy)
+                        alpha = exp2(exponent(shape[2], level[0], level[1], u, dy))
+                        weight = T[j] * wp.min(alpha, frame.alpha_max)
+                        after = T[j] - weight
+                        if alpha >= frame.alpha_min and T[j] > 0.0:
+                            if after > frame.t_min:
+                                used[0] += wp.static(1 << first_block(j))
+                                T[j] = after
+                                for c in range(wp.static(channels)):
+                                    sums[j, c] += weight * color[c]
+                            else:
+                                stopped[0] += wp.static(1 << (STOP + j))
+                bits = memory.any_of(arena, lane, (used[0] << half) | stopped[0])
+                if lane == i:
+                    mine = bits
+                if (bits >> STOP) != 0:
+                    for j in range(wp.static(pixels)):
+                        if (bits & wp.static(1 << (STOP + j))) != 0:
+                            if (stopped[0] & wp.static(1 << (STOP + j))) != 0:
+                                T[j] = -T[j]
+                                store_stop(stops_out, p.place, j * WARP, k0 + i)
+                            going = wp.int32(0)
+                            if T[j] > 0.0:
+                                going = 1
+                            over = memory.ballot(arena, lane, going) == 0
+                            if over and (frame.skip & _STOPPED) != 0:
+                                live &= wp.static(~(1 << j))
+                    if live == 0:
+                        walked = k0 + i - begin + 1
+            if k < end:
+                if wp.static(parts == 1):
+                    store_int(blocks_out, k, mine)
+                elif mine != 0:
+                    shift_used = p.part * wp.static(16 // parts)
+                    shift_stop = p.part * wp.static(pixels)
+                    shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
+                    shifted |= (mine & wp.static(~((1 << STOP) - 1))) << shift_stop
+                    wp.atomic_or(blocks_out, k, shifted)
+            memory.sync()
+
+        if lane == 0:
+            wp.atomic_max(walked_out, p.tile, walked)
+        if lane == 0 and gaussians.first == 0:
+            wp.atomic_add(blocks_walked_out, p.tile, wp.int64(evaluated))
+        p = place(frame, anew(index), lane)
+        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
+        for j in range(wp.static(pixels)):
+            store(transmittances_out, p.place, j * WARP, T[j])
+            if T[j] != 0.0:
+                step = j // 2 * HEIGHT * frame.width + j % 2 * WIDTH
+                store(alphas_out, p.pixel, step, 1.0 - wp.abs(T[j]))
+                step *= gaussians.channels
+                for c in range(wp.static(channels)):
+                    store(renders_out, first, step + c, sums[j, c])
+
+    return composite

@@ -1,0 +1,393 @@
+"""What the CUDA compositor's kernels share: a warp, its pixels, its shared memory, and the test.
+
+A tile of 16 x 16 pixels is eight sub-tiles of 8 x 4. A block is one warp and works on a tile, or on
+a half or a quarter of it: on 8, 4 or 2 sub-tiles, in each of which a lane owns one pixel. Leaf
+functions are C++ with a CPU form, for tests on CPU blocks. CUDA.md has the design.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+from ..constants import TILE
+from ..tiles import Frame, color_row, q_limit
+
+wp.set_module_options({"enable_backward": False})
+
+WARP = 32
+WIDTH, HEIGHT = 8, 4  # pixels of a sub-tile; two of them side by side
+SUB_TILES = 8  # of a tile
+STOP = 16  # bit STOP + j of a pair: a pixel of sub-tile j stopped at it; below are 4 x 4 blocks
+RECORD = 12  # floats of a Gaussian in shared memory
+PITCH = WARP + 4  # floats of a row of partial sums: aligned, and without bank conflicts
+CHUNK = 4  # channels of a launch, at most
+
+# An integer that branches change in place; of a plain one Warp keeps a copy for each branch.
+word = wp.types.vector(1, wp.int32)
+
+_TILE = wp.constant(TILE)
+_LOG2_E_HALF = wp.constant(0.72134752044)  # exp(-q/2) = 2^(-this q)
+# The rounding of a position: the test of a sub-tile may keep too much, never too little.
+_SLACK_PIXELS = wp.constant(0.01)
+
+
+def first_block(j: int) -> int:
+    """The left one of the two blocks of 4 x 4 pixels that make up sub-tile j."""
+    return j // 2 * 4 + j % 2 * 2
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return exp2f(x);
+#endif
+""")
+def exp2(x: wp.float32) -> wp.float32:
+    """2^x, to 2 units in the last place."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return 1.0f / x;
+#endif
+""")
+def reciprocal(x: wp.float32) -> wp.float32:
+    """1/x of a normal number, to 1 unit in the last place; of 1 exactly 1."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return sqrtf(x);
+#endif
+""")
+def root(x: wp.float32) -> wp.float32:
+    """The square root, to 2 units in the last place."""
+    ...
+
+
+# Arrays are dense. Warp's own indexing multiplies by strides that it reads from the array, which
+# costs instructions and, in loops, registers.
+@wp.func_native("return values.data[i];")
+def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("values.data[i] = v;")
+def store_int(values: wp.array[wp.int32], i: wp.int32, v: wp.int32): ...
+
+
+@wp.func_native("return values.data[i];")
+def load1(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
+
+
+@wp.func_native("return values.data[i];")
+def load2(values: wp.array[wp.vec2], i: wp.int32) -> wp.vec2: ...
+
+
+@wp.func_native("return values.data[i];")
+def load3(values: wp.array[wp.vec3], i: wp.int32) -> wp.vec3: ...
+
+
+@wp.func_native("return values.data[i + step];")
+def load(values: wp.array2d[wp.float32], i: wp.int64, step: wp.int32) -> wp.float32: ...
+
+
+@wp.func_native("values.data[i + step] = v;")
+def store(values: wp.array2d[wp.float32], i: wp.int64, step: wp.int32, v: wp.float32): ...
+
+
+@wp.func_native("return values.data[i + step];")
+def load_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("values.data[i + step] = v;")
+def store_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32, v: wp.int32): ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(x));
+#endif
+    return x;
+""")
+def anew(x: wp.int32) -> wp.int32:
+    """The same; what is computed from it is not kept in registers from before."""
+    ...
+
+
+# fmaf by name: forward and backward must see the same alpha, so no choice is left to the compiler.
+@wp.func_native("return fmaf(k, dy, dx);")
+def sheared(k: wp.float32, dx: wp.float32, dy: wp.float32) -> wp.float32:
+    """The u of README §5."""
+    ...
+
+
+@wp.func_native("return fmaf(a * u, u, fmaf(e * dy, dy, level));")
+def exponent(
+    a: wp.float32, e: wp.float32, level: wp.float32, u: wp.float32, dy: wp.float32
+) -> wp.float32:
+    """log2 of alpha; ``a, e`` are the conic's times -log2(e)/2, ``level`` is log2 of opacity."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(x) - 1;
+#else
+    return __builtin_ctz(x);
+#endif
+""")
+def lowest_bit(x: wp.int32) -> wp.int32:
+    """The number of the lowest bit that is set; one must be."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(x);
+#else
+    return __builtin_popcount(x);
+#endif
+""")
+def count_bits(x: wp.int32) -> wp.int32:
+    """The number of bits that are set."""
+    ...
+
+
+_SYNC = """
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#else
+    WP_TILE_SYNC();
+#endif
+"""
+_GATHER = """
+    unsigned* votes = (unsigned*)arena.data.ptr;
+    votes[lane] = vote;
+    WP_TILE_SYNC();
+    unsigned r = 0;
+    for (int i = 0; i < 32; ++i) r |= votes[i];
+    WP_TILE_SYNC();
+    return (int)r;
+#endif
+"""
+_ANY_OF = f"""
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
+    for (int i = 16; i > 0; i /= 2) x |= __shfl_xor_sync(0xffffffffu, x, i);
+    return x;
+#elif defined(__CUDA_ARCH__)
+    int r;
+    asm volatile("redux.sync.or.b32 %0, %1, 0xffffffff;" : "=r"(r) : "r"(x));
+    return r;
+#else
+    const unsigned vote = x;
+{_GATHER}"""
+_BALLOT = f"""
+#if defined(__CUDA_ARCH__)
+    return (int)__ballot_sync(0xffffffffu, x != 0);
+#else
+    const unsigned vote = x != 0 ? 1u << lane : 0u;
+{_GATHER}"""
+# A tile begins at a multiple of 16 bytes on CUDA, anywhere on the CPU.
+_GET4 = f"""
+    wp::vec_t<4, float> v;
+#if defined(__CUDA_ARCH__)
+    const float4 r = *(const float4*)(arena.data.ptr + {WARP} + i);
+    v.c[0] = r.x, v.c[1] = r.y, v.c[2] = r.z, v.c[3] = r.w;
+#else
+    memcpy(&v, arena.data.ptr + {WARP} + i, 16);
+#endif
+    return v;
+"""
+_PUT4 = f"""
+#if defined(__CUDA_ARCH__)
+    float4 r;
+    r.x = v.c[0], r.y = v.c[1], r.z = v.c[2], r.w = v.c[3];
+    *(float4*)(arena.data.ptr + {WARP} + i) = r;
+#else
+    memcpy(arena.data.ptr + {WARP} + i, &v, 16);
+#endif
+"""
+
+
+class Memory(NamedTuple):
+    """A warp's shared memory: ``arena`` is the tile's type, the rest are functions."""
+
+    arena: type
+    sync: wp.Function
+    any_of: wp.Function  # the or of all lanes' integers
+    ballot: wp.Function  # bit l: lane l's integer is not 0
+    put: wp.Function
+    put_int: wp.Function
+    get_int: wp.Function
+    put4: wp.Function  # at a multiple of 4
+    get4: wp.Function
+
+
+@functools.cache
+def shared_memory(size: int) -> Memory:
+    """Access to ``size`` floats, which lie behind 32 words for the CPU's votes."""
+    arena_type = wp.tile[float, WARP + size]
+
+    @wp.func_native(_SYNC)
+    def sync(): ...
+
+    @wp.func_native(_ANY_OF)
+    def any_of(arena: arena_type, lane: wp.int32, x: wp.int32) -> wp.int32: ...
+
+    @wp.func_native(_BALLOT)
+    def ballot(arena: arena_type, lane: wp.int32, x: wp.int32) -> wp.int32: ...
+
+    @wp.func_native(f"arena.data.ptr[{WARP} + i] = v;")
+    def put(arena: arena_type, i: wp.int32, v: wp.float32): ...
+
+    @wp.func_native(f"memcpy(arena.data.ptr + {WARP} + i, &v, 4);")
+    def put_int(arena: arena_type, i: wp.int32, v: wp.int32): ...
+
+    @wp.func_native(f"int v; memcpy(&v, arena.data.ptr + {WARP} + i, 4); return v;")
+    def get_int(arena: arena_type, i: wp.int32) -> wp.int32: ...
+
+    @wp.func_native(_PUT4)
+    def put4(arena: arena_type, i: wp.int32, v: wp.vec4): ...
+
+    @wp.func_native(_GET4)
+    def get4(arena: arena_type, i: wp.int32) -> wp.vec4: ...
+
+    return Memory(arena_type, sync, any_of, ballot, put, put_int, get_int, put4, get4)
+
+
+@wp.struct
+class Place:
+    """Where a warp and a lane work."""
+
+    tile: wp.int32
+    part: wp.int32  # of the tile
+    px: wp.int32  # the lane's pixel in the first sub-tile
+    py: wp.int32
+    pixel: wp.int64  # its number in all pictures
+    place: wp.int64  # its number by tiles and sub-tiles; those of the next ones are WARP apart
+    x: wp.vec2  # centres of the lane's pixels, by columns of sub-tiles
+    y: wp.vec4  # by rows of sub-tiles
+    corner: wp.vec2  # the centre of the part's first pixel
+
+
+@functools.cache
+def placing(parts: int):
+    """The function that finds a lane's place, with tiles cut into so many parts."""
+    pixels = SUB_TILES // parts
+
+    @wp.func
+    def place(frame: Frame, index: wp.int32, lane: wp.int32) -> Place:
+        p = Place()
+        p.tile = index // wp.static(parts)
+        p.part = index % wp.static(parts)
+        image = p.tile // (frame.tiles_x * frame.tiles_y)
+        x = p.tile % frame.tiles_x * _TILE
+        y = p.tile // frame.tiles_x % frame.tiles_y * _TILE + p.part * wp.static(TILE // parts)
+        p.px = x + lane % WIDTH
+        p.py = y + lane // WIDTH
+        p.pixel = wp.int64(image * frame.height + p.py) * wp.int64(frame.width) + wp.int64(p.px)
+        p.place = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
+        for i in range(2):
+            p.x[i] = float(p.px + i * WIDTH) + 0.5
+        for i in range(wp.static(pixels // 2)):
+            p.y[i] = float(p.py + i * HEIGHT) + 0.5
+        p.corner = wp.vec2(float(x) + 0.5, float(y) + 0.5)
+        return p
+
+    return place
+
+
+@functools.cache
+def touching(parts: int):
+    """The test of a Gaussian against the sub-tiles of a part of a tile (README eq. 6)."""
+
+    @wp.func
+    def touched(
+        corner: wp.vec2, mean: wp.vec2, conic: wp.vec3, opacity: wp.float32, alpha_min: wp.float32
+    ) -> wp.int32:
+        # bit j: the ellipse alpha >= alpha_min touches sub-tile j
+        a, k, e = conic[0], conic[1], conic[2]
+        limit = q_limit(opacity, alpha_min)
+        reach = root(limit * reciprocal(e))
+        over_a = reciprocal(a)
+        # top = -k a sqrt(limit / (a e (a k² + e)))
+        top = -k * a * reach * root(over_a * reciprocal(a * k * k + e))
+        x = corner[0] - mean[0]
+        y = corner[1] - mean[1]
+        bits = word()
+        for row in range(wp.static(SUB_TILES // parts // 2)):
+            y0 = wp.max(y + float(row * HEIGHT), -reach)
+            y1 = wp.min(y + float(row * HEIGHT + HEIGHT - 1), reach)
+            if y0 <= y1:
+                right = wp.clamp(top, y0, y1)
+                left = wp.clamp(-top, y0, y1)
+                x1 = root(wp.max(limit - e * right * right, 0.0) * over_a) - k * right
+                x0 = -root(wp.max(limit - e * left * left, 0.0) * over_a) - k * left
+                x1 += _SLACK_PIXELS - x
+                x0 -= _SLACK_PIXELS + x
+                for column in range(2):
+                    if x1 >= float(column * WIDTH) and x0 <= float(column * WIDTH + WIDTH - 1):
+                        bits[0] += wp.static(1) << (row * 2 + column)
+        return bits[0]
+
+    return touched
+
+
+@wp.struct
+class Gaussians:
+    """What is composited; dense arrays over view-major Gaussians."""
+
+    means2d: wp.array[wp.vec2]
+    conics: wp.array[wp.vec3]
+    opacities: wp.array[wp.float32]
+    colors: wp.array2d[wp.float32]
+    channels: wp.int32  # of ``colors``
+    first: wp.int32  # the first one of this launch
+
+
+@functools.cache
+def staging(channels: int, size: int):
+    """The function that puts a lane's Gaussian into its record.
+
+    A record holds mean x, y, -a log2(e)/2, k; -e log2(e)/2, log2 of opacity, two integers; colours.
+    """
+    memory = shared_memory(size)
+    arena_type = memory.arena
+
+    @wp.func
+    def stage(
+        arena: arena_type,
+        frame: Frame,
+        gaussians: Gaussians,
+        lane: wp.int32,
+        g: wp.int32,
+        bits: wp.int32,
+        row: wp.int32,
+    ):
+        at = lane * RECORD
+        mean = load2(gaussians.means2d, g)
+        conic = load3(gaussians.conics, g)
+        memory.put4(arena, at, wp.vec4(mean[0], mean[1], -_LOG2_E_HALF * conic[0], conic[1]))
+        memory.put(arena, at + 4, -_LOG2_E_HALF * conic[2])
+        memory.put(arena, at + 5, wp.log2(load1(gaussians.opacities, g)))
+        memory.put_int(arena, at + 6, bits)
+        memory.put_int(arena, at + 7, row)
+        source = wp.int64(color_row(frame, g)) * wp.int64(gaussians.channels)
+        for c in range(wp.static(channels)):
+            memory.put(arena, at + 8 + c, load(gaussians.colors, source, gaussians.first + c))
+
+    return stage

@@ -1,0 +1,140 @@
+"""Launches: over torch's own threads on the CPU, on torch's current stream on CUDA."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from . import team
+from .start import start_without_gpu
+from .views import view
+
+if wp.config.log_level == wp.LOG_INFO:  # the default; a level that somebody chose stays
+    wp.config.log_level = wp.LOG_WARNING
+
+
+if not torch.cuda.is_available():
+    start_without_gpu()
+
+
+_lock = threading.Lock()
+_pool: ThreadPoolExecutor | None = None
+
+
+def _get_pool() -> ThreadPoolExecutor:
+    global _pool
+    with _lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="gamba-warp")
+        return _pool
+
+
+def _forget_pool() -> None:
+    """A forked child has the executor's object but none of its threads."""
+    global _pool, _lock
+    _pool, _lock = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pool)
+
+
+def parallel_launch(
+    kernel: wp.Kernel,
+    dim: int | Sequence[int],
+    inputs: Sequence,
+    outputs: Sequence = (),
+    threads: int | None = None,
+    pieces: int | None = None,
+) -> None:
+    """Runs a CPU kernel over several threads by cutting dimension 0 of the launch.
+
+    The kernel's first parameter is ``offset: wp.int32``, which it adds to its first ``wp.tid()``;
+    this function passes it, so ``inputs`` starts with the second parameter. Pieces must not write
+    to the same places. Returns when all are done.
+
+    Args:
+        kernel: not generic.
+        dim: launch dimensions.
+        inputs: arguments after ``offset``; tensors are viewed, other values passed on.
+        outputs: more arguments, by convention those that are written.
+        threads: how many at once; None means ``torch.get_num_threads()``.
+        pieces: how many pieces; None means one per thread. More of them even out uneven work.
+
+    Raises:
+        Exception: the first one that a piece raised.
+    """
+    dim = (dim,) if isinstance(dim, int) else tuple(dim)
+    if 0 in dim:
+        return
+    threads = max(1, min(threads or torch.get_num_threads(), dim[0]))
+    pieces = max(threads, min(pieces or threads, dim[0]))
+    arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
+    cuts = [dim[0] * i // pieces for i in range(pieces + 1)]
+    if threads > 1 and team.has_team():
+        dims = [(end - begin, *dim[1:]) for begin, end in zip(cuts[:-1], cuts[1:])]
+        return team.run(kernel, dims, arguments, threads)
+    kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
+    todo = iter(list(zip(cuts[:-1], cuts[1:])))
+
+    def work() -> None:
+        while (piece := next(todo, None)) is not None:  # list iterators are atomic under the GIL
+            begin, end = piece
+            wp.launch(
+                kernel,
+                (end - begin, *dim[1:]),
+                [begin, *arguments],
+                device="cpu",
+                record_tape=False,
+            )
+
+    helpers = [_get_pool().submit(work) for _ in range(threads - 1)] if threads > 1 else []
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            helper.exception()  # waits: no thread may write after this call returns
+    for helper in helpers:
+        helper.result()
+
+
+def cuda_launch(
+    kernel: wp.Kernel,
+    dim: int | Sequence[int],
+    inputs: Sequence,
+    outputs: Sequence = (),
+    *,
+    device: torch.device,
+    block_dim: int = 256,
+) -> None:
+    """Launches on torch's current stream of ``device``; on a CPU device, on the CPU (for tests).
+
+    Args:
+        kernel: not generic.
+        dim: launch dimensions; for a tile kernel the last one is ``block_dim``.
+        inputs: all arguments; tensors are viewed, other values passed on.
+        outputs: more arguments, by convention those that are written.
+        device: of the tensors.
+        block_dim: threads of a block; on a CPU it needs ``wp.config.enable_cpu_blocks``.
+    """
+    arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
+    where = {"device": "cpu"}
+    if device.type == "cuda":
+        where = {"stream": wp.stream_from_torch(torch.cuda.current_stream(device))}
+    wp.launch(kernel, dim, arguments, block_dim=block_dim, record_tape=False, **where)
+
+
+def launch(kernel: wp.Kernel, dim: int, inputs, outputs, device: torch.device) -> None:
+    """Launches a plain kernel whose first parameter is ``offset``; ``dim`` 0 is no launch."""
+    if dim == 0:
+        return
+    if device.type == "cpu":
+        parallel_launch(kernel, dim, inputs, outputs)
+    else:
+        cuda_launch(kernel, dim, [0, *inputs], outputs, device=device)

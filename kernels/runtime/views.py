@@ -1,0 +1,79 @@
+"""Checked views of tensors as Warp arrays, without copies."""
+
+from __future__ import annotations
+
+import warp as wp
+from torch import Tensor
+
+_INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
+
+
+def view(tensor: Tensor, dtype=None, name: str = "tensor"):
+    """A Warp array descriptor on the tensor's own memory, strides kept; it keeps the tensor alive.
+
+    Args:
+        tensor: float32, float64, bfloat16, float16 or integer, at most 4 dimensions.
+        dtype: a Warp dtype; a vector or matrix type takes up trailing, contiguous dimensions.
+        name: the argument's name in errors.
+
+    Raises:
+        TypeError: the dtype has no Warp counterpart or is not the one asked for.
+        ValueError: too many dimensions, a broken vector dimension, or over 2^31 bytes per stride.
+    """
+    key = (tensor.dtype, tensor.shape, tensor.stride(), dtype)
+    if key not in _descriptors:
+        if len(_descriptors) >= _MOST_DESCRIPTORS:
+            _descriptors.clear()
+        _descriptors[key] = _describe(tensor.detach(), dtype, name)
+    known = _descriptors[key]
+    descriptor = type(known).from_buffer_copy(known)  # a tenth of the time of making it
+    descriptor.data = tensor.data_ptr()
+    descriptor.owner = tensor
+    return descriptor
+
+
+_MOST_DESCRIPTORS = 4096
+
+
+_descriptors: dict[tuple, object] = {}  # of the first tensor of each dtype, shape and strides
+
+
+def _describe(tensor: Tensor, dtype, name: str):
+    reach = max((s * tensor.element_size() for s in tensor.stride()), default=0)
+    if max(reach, *tensor.shape, 0) > _INT32_MAX:
+        raise ValueError(
+            f"{name} has shape {tuple(tensor.shape)} and strides {tensor.stride()}; "
+            "each length, and each stride in bytes, must be below 2^31"
+        )
+    if dtype is not None:
+        scalar = wp.dtype_to_torch(getattr(dtype, "_wp_scalar_type_", dtype))
+        if tensor.dtype != scalar:
+            raise TypeError(f"{name} has dtype {tensor.dtype}, allowed is {scalar}")
+    try:
+        made = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
+    except RuntimeError as error:
+        raise ValueError(f"{name}: {error}") from error
+    return type(made).from_buffer_copy(made)  # without the tensor
+
+
+def lane_contiguous(tensor: Tensor) -> Tensor:
+    """The tensor itself if its last dimension is dense (rows may be strided), else a dense copy."""
+    return tensor if tensor.stride(-1) == 1 or tensor.shape[-1] == 1 else tensor.contiguous()
+
+
+def vectors(tensor: Tensor | None, dtype):
+    """A contiguous tensor as a flat Warp array of vectors or matrices; None stays None."""
+    if tensor is None:
+        return None
+    return view(tensor.view(-1, *dtype._shape_), dtype)
+
+
+def tokens_first(x: Tensor | None, name: str) -> Tensor | None:
+    """A view ``[B, L, D]`` of mamba-ssm's layout ``[B, D, L]``; what is no tensor stays as it is.
+
+    Raises:
+        ValueError: the tensor, called ``name``, has not three dimensions.
+    """
+    if isinstance(x, Tensor) and x.dim() != 3:
+        raise ValueError(f"{name} has shape {tuple(x.shape)}, must be [B, D, L]")
+    return x.transpose(1, 2) if isinstance(x, Tensor) else x

@@ -1,0 +1,361 @@
+"""How a block of threads maps to channels, states and tokens, and its shared memory.
+
+A block holds adjacent channels of one group. For the recurrence a thread owns ``channels`` times
+``states`` of them (an outer product, so that what it reads from shared memory is used more than
+once), and ``lanes`` threads share a channel; for loads, stores and what depends on a channel alone,
+a thread owns one channel and every ``rows``-th token, so that a warp touches adjacent addresses.
+"""
+
+import dataclasses
+import functools
+
+import torch
+import warp as wp
+
+from ...runtime.lanes import WARP_DTYPES
+from ...runtime.scalars import WIDE
+
+STATES = 16  # of a state block, the most that a channel holds in registers
+MARK = 64  # tokens between the states that the forward saves for the gradient
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """The static shape of a block."""
+
+    block: int  # threads
+    channels: int  # of a thread
+    states: int  # of a thread, in one state block
+    lanes: int  # threads that share a channel
+    walks: int  # state blocks, walked one after the other; 1 up to 16 states
+
+    @property
+    def width(self) -> int:
+        """States of a state block, padded."""
+        return self.lanes * self.states
+
+    @property
+    def padded(self) -> int:
+        """All states, padded."""
+        return self.width * self.walks
+
+    @property
+    def slots(self) -> int:
+        """Groups of ``lanes`` threads."""
+        return self.block // self.lanes
+
+    @property
+    def span(self) -> int:
+        """Channels of a block."""
+        return self.slots * self.channels
+
+    @property
+    def rows(self) -> int:
+        """Threads that load one channel, each other tokens of it."""
+        return self.block // self.span
+
+    @property
+    def held(self) -> int:
+        """Elements (channel, state) of a thread."""
+        return self.channels * self.states
+
+    @property
+    def pad(self) -> int:
+        """Floats between the lanes' partial sums, against bank conflicts."""
+        return 32 // self.lanes if self.lanes > 1 else 0
+
+
+def frame(block: int, channels: int, states: int, total: int) -> Frame:
+    """The frame of ``total`` states for a variant's block, channels and states of a thread."""
+    width = min(STATES, 1 << (total - 1).bit_length())
+    states = min(states, width)
+    lanes = width // states
+    return Frame(block, min(channels, lanes), states, lanes, -(-total // width))
+
+
+# A type, an integer of its bits, and the float that such an integer means.
+_BITS = {
+    torch.float32: ("float", "unsigned", "float f; memcpy(&f, &bits, 4); return f;"),
+    torch.float16: (
+        "wp::float16",
+        "unsigned short",
+        "wp::half h; h.u = (unsigned short)bits; return wp::half_to_float(h);",
+    ),
+    torch.bfloat16: (
+        "wp::bfloat16",
+        "unsigned short",
+        "unsigned v = bits << 16; float f; memcpy(&f, &v, 4); return f;",
+    ),
+}
+
+
+@functools.cache
+def widening(io: torch.dtype):
+    """The function from the bits of ``io`` to a float."""
+
+    @wp.func_native(_BITS[io][2])
+    def widen(bits: wp.uint32) -> float: ...
+
+    return widen
+
+
+@wp.struct
+class Sizes:
+    """What all kernels know: the shapes, and how block indices map to them."""
+
+    length: int
+    states: int
+    group_width: int
+    groups: int
+    parts: int  # blocks of channels in a group
+    pieces: int  # of the sequence, each a block's own
+    piece: int  # tokens of one, a multiple of MARK
+    save: int
+
+
+@wp.struct
+class Place:
+    """Where a thread works."""
+
+    b: int
+    group: int
+    part: int
+    piece: int
+    at: int  # row of arrays [B * pieces, ...]
+    begin: int  # tokens
+    end: int
+    lane: int  # of the block
+    d0: int  # the block's first channel
+    count: int  # its channels inside the group
+    d: int  # the thread's own channel; threads past the last share that one and are not active
+    c: int  # the same, within the block
+    active: int
+    row: int  # the thread's first token of a tile
+    slot: int  # the recurrence: which channels
+    q: int  # and which states
+    states: int  # of all
+
+
+# Shared memory is one tile of floats, addressed by plain offsets: assigning to elements of a tile
+# has a barrier each.
+def offsets(parts: dict) -> tuple[dict, int]:
+    """Where parts of so many floats begin in shared memory, and their sum."""
+    at, size = {}, 0
+    for name, count in parts.items():
+        at[name] = size
+        size += -(-count // 4) * 4
+    return at, size
+
+
+@functools.cache
+def arena_io(size: int):
+    """The type of a block's shared memory of ``size`` floats, and access to it."""
+    arena_type = wp.tile[float, size]
+
+    @wp.func_native("arena.data.ptr[i] = v;")
+    def put(arena: arena_type, i: int, v: float): ...
+
+    @wp.func_native("return arena.data.ptr[i];")
+    def get(arena: arena_type, i: int) -> float: ...
+
+    return arena_type, put, get
+
+
+@wp.func_native("WP_TILE_SYNC();")
+def sync(): ...
+
+
+@functools.cache
+def placing(f: Frame):
+    """The function that finds a thread's place."""
+
+    @wp.func
+    def place(sizes: Sizes, index: int, lane: int) -> Place:
+        p = Place()
+        p.part = index % sizes.parts
+        rest = index / sizes.parts
+        p.group = rest % sizes.groups
+        rest = rest / sizes.groups
+        p.piece = rest % sizes.pieces
+        p.b = rest / sizes.pieces
+        p.at = rest
+        p.begin = p.piece * sizes.piece
+        p.end = wp.min(p.begin + sizes.piece, sizes.length)
+        p.lane = lane
+        p.d0 = p.group * sizes.group_width + p.part * wp.static(f.span)
+        p.count = wp.min(wp.static(f.span), sizes.group_width - p.part * wp.static(f.span))
+        p.c = lane % wp.static(f.span)
+        p.row = lane / wp.static(f.span)
+        p.active = int(p.c < p.count)
+        p.d = p.d0 + wp.min(p.c, p.count - 1)
+        p.slot = lane / wp.static(f.lanes)
+        p.q = lane % wp.static(f.lanes)
+        p.states = sizes.states
+        return p
+
+    return place
+
+
+@functools.cache
+def states_io(f: Frame):
+    """The vector of a thread's states, walk by walk, and its load from and store to ``[*, D, N]``.
+
+    States past the last are 0.
+    """
+    vec = wp.types.vector(f.walks * f.held, wp.float32)
+
+    def loop(body: str) -> str:
+        return f"""
+float* row = x.data + (size_t)i * (x.strides[0] / 4);
+WP_PRAGMA_UNROLL
+for (int k = 0; k < {f.walks * f.held}; ++k) {{
+    const int c = slot * {f.channels} + k % {f.held} / {f.states};
+    const int n = k / {f.held} * {f.width} + q * {f.states} + k % {f.states};
+    float* at = row + (size_t)(d0 + c) * states + n;
+    {body}
+}}
+"""
+
+    @wp.func_native(
+        f"wp::vec_t<{f.walks * f.held}, float> h;"
+        + loop("h.c[k] = c < count && n < states ? *at : 0.0f;")
+        + "return h;"
+    )
+    def load(
+        x: wp.array3d(dtype=float), i: int, d0: int, count: int, states: int, slot: int, q: int
+    ) -> vec: ...
+
+    @wp.func_native(loop("if (c < count && n < states) *at = h.c[k];"))
+    def store(
+        x: wp.array3d(dtype=float),
+        i: int,
+        d0: int,
+        count: int,
+        states: int,
+        slot: int,
+        q: int,
+        h: vec,
+    ): ...
+
+    @wp.func
+    def read(x: wp.array3d(dtype=float), i: int, p: Place) -> vec:
+        return load(x, i, p.d0, p.count, p.states, p.slot, p.q)
+
+    @wp.func
+    def write(x: wp.array3d(dtype=float), i: int, p: Place, h: vec):
+        store(x, i, p.d0, p.count, p.states, p.slot, p.q, h)
+
+    return vec, read, write
+
+
+@functools.cache
+def halves(f: Frame):
+    """Two vectors of a thread's states as one, for a native function to return."""
+    n = f.walks * f.held
+    vec = wp.types.vector(n, wp.float32)
+    pair = wp.types.vector(2 * n, wp.float32)
+    loop = f"WP_PRAGMA_UNROLL for (int k = 0; k < {n}; ++k) "
+    one = f"wp::vec_t<{n}, float> r; {loop}"
+
+    @wp.func_native(
+        f"wp::vec_t<{2 * n}, float> r; {loop} r.c[k] = x.c[k], r.c[{n} + k] = y.c[k]; return r;"
+    )
+    def join(x: vec, y: vec) -> pair: ...
+
+    @wp.func_native(f"{one} r.c[k] = v.c[k]; return r;")
+    def first(v: pair) -> vec: ...
+
+    @wp.func_native(f"{one} r.c[k] = v.c[{n} + k]; return r;")
+    def second(v: pair) -> vec: ...
+
+    return pair, join, first, second
+
+
+@functools.cache
+def channel_io(f: Frame, io: torch.dtype, tokens: int):
+    """Access to a thread's own elements of a tile of ``[B, L, D]``.
+
+    ``fetch`` loads their bits: the loads are on their way while the tile before is worked on, and
+    converting would wait for them. Elements from ``end`` on are 0.
+    """
+    scalar = WARP_DTYPES[io]
+    element, word, _ = _BITS[io]
+    count = tokens // f.rows
+    raw = wp.types.vector(count, wp.uint32)
+    address = (
+        WIDE
+        + f"""
+char* at = (char*)(({element}*)x.data + d) + wide_(b, x.strides[0]);
+at += wide_(t, x.strides[1]);
+"""
+    )
+    snippet = f"""
+{address}
+wp::vec_t<{count}, unsigned> r;
+const long long step = wide_({f.rows}, x.strides[1]);
+WP_PRAGMA_UNROLL
+for (int i = 0; i < {count}; ++i, at += step) {{
+    r.c[i] = 0;
+    if ({f.rows} * i < left) r.c[i] = *(const {word}*)at;
+}}
+return r;
+"""
+
+    @wp.func_native(snippet)
+    def fetch_own(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, left: int) -> raw: ...
+
+    @wp.func
+    def fetch(x: wp.array3d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+        left = wp.where(t0 < 0, 0, end - t0 - p.row)  # a tile before the first is not there
+        return fetch_own(x, p.b, p.d, t0 + p.row, left)
+
+    @wp.func_native(f"{address} *({element}*)at = ({element})v;")
+    def store(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, v: float): ...
+
+    return count, raw, fetch, store
+
+
+@functools.cache
+def matrix_io(f: Frame, io: torch.dtype, tokens: int, arena_size: int):
+    """As ``channel_io`` for a block's tile of B or C, ``[B, L, G, N]``; ``put_rows`` as floats."""
+    scalar = WARP_DTYPES[io]
+    size = tokens * f.padded
+    count = -(-size // f.block)
+    raw = wp.types.vector(count, wp.uint32)
+    arena_type, put, _ = arena_io(arena_size)
+    widen = widening(io)
+    snippet = f"""
+{WIDE}
+const char* from = (const char*)x.data + wide_(b, x.strides[0]) + wide_(group, x.strides[2]);
+wp::vec_t<{count}, unsigned> r;
+WP_PRAGMA_UNROLL
+for (int i = 0; i < {count}; ++i) {{
+    const int e = {f.block} * i + lane, t = e / {f.padded}, n = e % {f.padded};
+    r.c[i] = 0;
+    if (t < left && n < states && e < {size})
+        r.c[i] = *(const {_BITS[io][1]}*)(
+            from + wide_(n, x.strides[3]) + wide_(t0 + t, x.strides[1]));
+}}
+return r;
+"""
+
+    @wp.func_native(snippet)
+    def fetch_all(
+        x: wp.array4d(dtype=scalar), b: int, group: int, lane: int, states: int, t0: int, left: int
+    ) -> raw: ...
+
+    @wp.func
+    def fetch(x: wp.array4d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+        left = wp.where(t0 < 0, 0, end - t0)
+        return fetch_all(x, p.b, p.group, p.lane, p.states, t0, left)
+
+    @wp.func
+    def put_rows(arena: arena_type, base: int, p: Place, r: raw):
+        for i in range(wp.static(count)):
+            e = wp.static(i * f.block) + p.lane
+            if wp.static(size % f.block == 0):
+                put(arena, base + e, widen(r[i]))
+            elif e < wp.static(size):
+                put(arena, base + e, widen(r[i]))
+
+    return raw, fetch, put_rows

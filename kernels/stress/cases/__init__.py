@@ -1,0 +1,1 @@
+"""Random and hostile cases, one file an operator."""

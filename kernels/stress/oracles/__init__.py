@@ -1,0 +1,1 @@
+"""The operators' formulas in float64, rounded sample by sample."""

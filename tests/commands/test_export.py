@@ -1,0 +1,164 @@
+import threading
+import urllib.error
+import urllib.request
+from http.server import HTTPServer
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from gamba_warp.cameras import fibonacci_sphere
+from gamba_warp.cli import run
+from gamba_warp.commands import view
+from gamba_warp.formats.meshes import load_mesh, to_linear
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.surfaces.extract import Surface
+from gamba_warp.surfaces.files import MESH_FORMATS, save_mesh
+
+QUICK = ["--voxels", "48", "--views", "16", "--pixels", "64"]
+
+
+@pytest.fixture
+def ball(tmp_path):
+    """An egg away from the origin, longest side 6, red towards +y: a file of Gaussians."""
+    axes, center = np.array([2.0, 3.0, 2.0]), [10.0, 20.0, 30.0]
+    points = fibonacci_sphere(2500) * axes
+    red = torch.from_numpy(points[:, 1:2] > 0)
+    gaussians = Gaussians(
+        means=torch.from_numpy(points + center).float(),
+        quats=None,
+        scales=torch.full((2500, 3), 0.1),
+        opacities=torch.full((2500,), 0.95),
+        colors=torch.where(red, torch.tensor([0.8, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.8])),
+    )
+    path = tmp_path / "egg.ply"
+    save_ply(path, gaussians)
+    return path
+
+
+def export(*arguments):
+    return run("export", [str(a) for a in (*arguments, *QUICK)])
+
+
+@pytest.mark.parametrize("surface", ["tsdf", "density"])
+def test_meshes_lie_where_the_gaussians_are(ball, tmp_path, surface):
+    out = tmp_path / "out"
+    code = export(ball, "--out", out, "--mesh", *MESH_FORMATS, "--surface", surface)
+    assert code == 0 and sorted(p.name for p in out.iterdir()) == sorted(
+        f"egg-mesh.{kind}" for kind in MESH_FORMATS
+    )
+    for kind in MESH_FORMATS:
+        mesh = trimesh.load(out / f"egg-mesh.{kind}", force="mesh")
+        center, size = mesh.bounds.mean(0), np.ptp(mesh.bounds, axis=0)
+        assert np.abs(center - [10, -20, -30]).max() < 0.15  # y up
+        assert np.abs(size - [4, 6, 4]).max() < 0.6  # the Gaussians' width, and a voxel
+        assert mesh.volume > 0
+        if kind == "stl":
+            continue
+        colors = mesh.visual.vertex_colors[:, :3] / 255
+        top = mesh.vertices[:, 1] > -19.5  # what had y < 20
+        want = np.array([[0.8, 0.1, 0.1], [0.1, 0.1, 0.8]])
+        want = to_linear(want) if kind == "glb" else want
+        assert np.abs(colors[top].mean(0) - want[1]).max() < 0.1
+        assert np.abs(colors[mesh.vertices[:, 1] < -20.5].mean(0) - want[0]).max() < 0.1
+
+
+def test_frame_faces_and_colors_follow_the_options(ball, tmp_path):
+    options = ["--frame", "opencv", "--faces", "300", "--no-colors", "--mesh", "ply"]
+    assert export(ball, "--out", tmp_path / "out", *options) == 0
+    mesh = trimesh.load(tmp_path / "out" / "egg-mesh.ply")
+    assert np.abs(mesh.bounds.mean(0) - [10, 20, 30]).max() < 0.2
+    assert len(mesh.faces) <= 300 and mesh.visual.kind != "vertex"
+
+
+def test_formats_of_gaussians(ball, tmp_path, capsys):
+    out = tmp_path / "out"
+    kinds = ["ply", "splat", "glb", "html", "gif", "mp4"]
+    options = ["--mesh", "--formats", *kinds, "--size", "32", "--frames", "3"]
+    assert export(ball, "--out", out, *options) == 0
+    assert sorted(p.name for p in out.iterdir()) == sorted(f"egg.{kind}" for kind in kinds)
+    again, before = load_ply(out / "egg.ply"), load_ply(ball)
+    assert torch.allclose(again.means, before.means, atol=1e-5)
+    assert (out / "egg.splat").stat().st_size == 32 * 2500
+    picture = np.array(Image.open(out / "egg.gif").convert("RGB"))
+    assert (picture < 250).any(-1).mean() > 0.1  # it is in the picture, wherever it was
+    assert "<script" in (out / "egg.html").read_text()
+    assert "2,500 Gaussians" in capsys.readouterr().out
+
+
+def test_a_folder_and_failures(ball, tmp_path, capsys):
+    folder = tmp_path / "many"
+    folder.mkdir()
+    (folder / "a.ply").write_bytes(ball.read_bytes())
+    (folder / "bad.ply").write_bytes(b"ply\nnothing")
+    trimesh.creation.box().export(folder / "box.ply")
+    (folder / "notes.txt").write_text("no")
+    code = export(folder, tmp_path / "gone.ply", "--out", tmp_path / "out", "--mesh", "stl")
+    assert code == 1
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["a-mesh.stl"]
+    captured = capsys.readouterr()
+    for name in ("bad.ply", "box.ply", "gone.ply"):
+        assert f"{name}: " in captured.err
+    assert "3 files, 3 failures" in captured.out
+
+
+@pytest.mark.parametrize(
+    "options, reason",
+    [
+        (["--voxels", "3"], "--voxels"),
+        (["--mesh"], "--mesh or --formats"),
+        (["--min-component", "2"], "--min-component"),
+        (["--size", "3"], "--size"),
+        (["--close-holes", "-1"], "--close-holes"),
+    ],
+)
+def test_what_cannot_start(ball, tmp_path, options, reason, capsys):
+    assert run("export", [str(ball), "--out", str(tmp_path / "out"), *options]) == 2
+    assert reason in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_missing_inputs(tmp_path, capsys):
+    assert export(tmp_path / "gone.ply", "--out", tmp_path / "out") == 2
+    (tmp_path / "empty").mkdir()
+    assert export(tmp_path / "empty", "--out", tmp_path / "out") == 2
+    assert "gone.ply: no such file" in capsys.readouterr().err
+
+
+def test_the_input_is_not_overwritten(ball, tmp_path, capsys):
+    before = ball.read_bytes()
+    code = export(ball, "--out", tmp_path, "--mesh", "--formats", "ply")
+    assert code == 1 and ball.read_bytes() == before
+    assert "would be overwritten" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", MESH_FORMATS)
+def test_mesh_files_are_read_back(tmp_path, kind):
+    ball = trimesh.creation.icosphere(2, 0.4)
+    colors = np.linspace(0, 1, 3 * len(ball.vertices)).reshape(-1, 3).astype(np.float32)
+    save_mesh(tmp_path / f"a.{kind}", Surface(ball.vertices, ball.faces, colors))
+    again = load_mesh(tmp_path / f"a.{kind}")
+    assert len(again.faces) == len(ball.faces)
+    assert abs(np.linalg.norm(again.vertices, axis=1) - 0.4).max() < 1e-6
+
+
+def test_view_writes_the_page_and_serves_only_it(ball, tmp_path, monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr(view.webbrowser, "open", opened.append)
+    page = tmp_path / "page.html"
+    assert run("view", [str(ball), "--out", str(page)]) == 0
+    assert opened == [page.as_uri()] and "<script" in page.read_text()
+    server = HTTPServer(("127.0.0.1", 0), view.page_handler(b"hello"))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}"
+    try:
+        assert urllib.request.urlopen(f"{address}/").read() == b"hello"
+        with pytest.raises(urllib.error.HTTPError):
+            urllib.request.urlopen(f"{address}/etc/passwd")
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert run("view", [str(tmp_path / "gone.ply")]) == 2
+    assert run("view", [str(ball), "--port", "70000"]) == 2

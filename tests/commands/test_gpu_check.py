@@ -1,0 +1,411 @@
+"""``gamba gpu-check`` on a CPU: its steps, its files, what it says when something is not there."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gamba_warp.cameras import Cameras
+from gamba_warp.files import write_json
+from gamba_warp.gpu_check import check as gpu_check
+from gamba_warp.gpu_check import kernels as gpu_kernels
+from gamba_warp.gpu_check import steps as gpu_steps
+from gamba_warp.gpu_check.check import gpu_check_command, main, make_settings, new_part
+from gamba_warp.gpu_check.steps import Part, run_step
+from gamba_warp.kernels.bench.static import dry_run
+from gamba_warp.measure import inference as bench_inference
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.gamba import Gamba
+
+ROOT = Path(__file__).resolve().parents[2]
+# Operators that wait for the GPU, or make a tensor on the host.
+WAITS = {
+    "aten::item", "aten::_local_scalar_dense", "aten::nonzero", "aten::is_nonzero", "aten::equal",
+    "aten::masked_select", "aten::_unique2", "aten::unique_dim", "aten::bincount",
+    "aten::linalg_inv_ex", "aten::_linalg_check_errors", "aten::linalg_solve_ex",
+    "aten::lift_fresh", "aten::repeat_interleave.Tensor",
+}  # fmt: skip
+
+
+class Watch(TorchDispatchMode):
+    """Notes operators that no CUDA graph can hold."""
+
+    def __init__(self):
+        super().__init__()
+        self.found, self.names = [], set()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        self.names.add(function.name())
+        if function.name() in WAITS:
+            self.found.append(function.name())
+        leaves = torch.utils._pytree.tree_leaves((args, kwargs, out))
+        devices = {x.device.type for x in leaves if isinstance(x, torch.Tensor) and x.dim()}
+        if len(devices) > 1:
+            self.found.append(f"{function.name()} between {sorted(devices)}")
+        return out
+
+
+@pytest.fixture
+def on_paper():
+    """Tensors on a GPU that is not there."""
+    with dry_run.dry_run() as launches:
+        yield launches
+
+
+def autocast(monkeypatch):
+    """Made as if there were a GPU, else it turns itself off."""
+    with monkeypatch.context() as patched:
+        patched.setattr(torch.cuda, "is_available", lambda: True)
+        patched.setattr(torch.cuda, "is_bf16_supported", lambda *_: True)
+        return torch.autocast("cuda", torch.bfloat16)
+
+
+def test_a_graph_can_hold_the_model(monkeypatch, on_paper):
+    """No operator of the forward pass, and none inside our own operators, waits for the GPU."""
+    config = replace(PRESETS["paper"], depth=2)
+    with torch.device("cuda"):
+        model = Gamba(config, "random").eval()
+        cameras = Cameras(torch.empty(1, 4, 4), torch.empty(1, 3, 3), 512, 512)
+        image = torch.empty(1, 512, 512, 3)
+    with torch.no_grad(), autocast(monkeypatch), Watch() as watch:
+        gaussians = model(image, cameras)
+    assert watch.found == [] and "aten::_to_copy" in watch.names  # autocast is on
+    assert gaussians.means.device.type == "cuda" and gaussians.num == 16384
+    names = [launch.kernel.func.__name__ for launch in on_paper]
+    # the states of the prefix, then two blocks, each scan cut into pieces
+    assert [names.count(n) for n in ("conv_forward", "scan_forward", "carry")] == [3, 6, 3]
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda x: x.new_tensor([1.0, 2.0]),
+        lambda x: x.sum().item(),
+        lambda x: torch.linalg.inv(x),
+        lambda x: x.nonzero(),
+        lambda x: x.cpu(),
+    ],
+    ids=["from numbers", "item", "inverse", "nonzero", "to the host"],
+)
+def test_the_watch_sees_what_waits(on_paper, wait):
+    x = torch.empty(3, 3, device="cuda")
+    with Watch() as watch:
+        try:
+            wait(x)
+        except torch._subclasses.fake_tensor.DynamicOutputShapeException:
+            watch.found.append("no shape without the values")
+    assert watch.found
+
+
+def test_inference_on_cuda_has_the_headline(monkeypatch, on_paper):
+    monkeypatch.setattr(bench_inference, "_on", lambda model, settings: model.eval())
+    (case,) = bench_inference.cases(make_settings("cuda", quick=True))
+    with torch.device("cuda"):
+        variants = {variant.name: variant for variant in case.build()}
+    assert variants[bench_inference.HEADLINE].dtype == "bfloat16"
+    (target,) = bench_inference.targets(make_settings("cuda", quick=False))
+    assert target.times[0].variant in variants and target.at_most == 10
+
+
+HIDE = """
+from importlib.machinery import PathFinder
+find = PathFinder.find_spec
+def hide(name, path=None, target=None):
+    return None if name.split(".")[0] in {names!r} else find(name, path, target)
+PathFinder.find_spec = hide
+"""
+OTHERS = (
+    *("tyro", "tqdm", "timm", "kornia", "safetensors", "PIL", "skimage", "scipy", "trimesh"),
+    *("imageio", "imageio_ffmpeg", "pytest", "open3d", "pymeshlab", "tensorboard", "torchvision"),
+)
+
+
+def test_torch_and_warp_are_enough(tmp_path):
+    """A real run with everything else hidden."""
+    (tmp_path / "sitecustomize.py").write_text(HIDE.format(names=OTHERS))
+    environment = os.environ | {"PYTHONPATH": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    out = tmp_path / "out"
+    command = "-m gamba_warp.gpu_check --device cpu --quick --steps inference tests --out".split()
+    done = subprocess.run(
+        [sys.executable, *command, out], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr + done.stdout
+    document = json.loads((out / "gpu-check.json").read_text())
+    assert document["verdict"] == "all that could be run passed" and document["failures"] == []
+    assert [(s["name"], s["status"]) for s in document["steps"]] == [
+        ("inference", "passed"),
+        ("tests", "not done"),
+    ]
+    records = {record["variant"]: record for record in document["bench"]["records"]}
+    assert {r["status"] for r in records.values()} == {"ok"}
+    assert 0 < records["eager, bfloat16"]["rel_rms_error"] < 0.03
+    assert "given tokens" in records["eager, bfloat16"]["parameters"]["encoder"]
+    reasons = {row["what"]: row["reason"] for row in document["not_done"]}
+    assert reasons["inference from a CUDA graph"] == reasons["step tests"] == "needs CUDA"
+    page = (out / "gpu-check.md").read_text()
+    assert "| inference, eager, bfloat16 |" in page and "## Not done" in page
+    assert "inference, eager, float32" in done.stdout and "not done: step tests" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments, reason",
+    [([], "no CUDA device here"), (["--device", "cpu", "--minutes", "0"], "--minutes is 0")],
+)
+def test_nothing_to_start_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, arguments, reason):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main([*arguments, "--out", str(tmp_path / "new")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("gamba: ") and reason in said and said.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+
+def part_of(tmp_path, name, until=float("inf")):
+    part = Part(tmp_path / "part.json", until)
+    run_step(name, part, make_settings("cpu", quick=True))
+    return json.loads(part.path.read_text())
+
+
+def test_the_checks_of_the_kernels(tmp_path):
+    part = part_of(tmp_path, "checks")
+    assert part["whole"] and part["failures"] == []
+    assert all(c["status"] == "passed" for c in part["result"]["checks"])
+    assert len(part["result"]["checks"]) == 10
+    needs = {row["what"] for row in part["not_done"] if row["reason"] == "needs CUDA"}
+    assert "scan and convolution in a CUDA graph" in needs and len(needs) == 7
+
+
+def test_a_wrong_kernel_fails_its_check(monkeypatch, tmp_path):
+    right, call = gpu_kernels.causal_conv1d, gpu_kernels.ScanProblem.call
+    monkeypatch.setattr(gpu_kernels, "causal_conv1d", lambda *a, **k: right(*a, **k) + 1e-4)
+    monkeypatch.setattr(gpu_kernels.ScanProblem, "call", lambda *a, **k: call(*a, **k) * 1.0001)
+    names = (
+        "scan (2, 139, 37, 3, 1)",
+        "convolution (2, 300, 19, 4)",
+        "scan: two runs, the same bits",
+    )
+    found = [check for check in gpu_kernels.checks(quick=True) if check.name in names]
+    monkeypatch.setattr(gpu_steps, "checks", lambda quick: found)
+    part = part_of(tmp_path, "checks")
+    states = {c["name"]: c["status"] for c in part["result"]["checks"]}
+    assert states == dict(zip(names, ("failed", "failed", "passed")))
+    assert len(part["failures"]) == 2 and "relative rms error" in part["failures"][0]
+
+
+def test_no_item_begins_when_time_is_up(tmp_path):
+    for name in ("checks", "bench"):
+        part = part_of(tmp_path, name, until=time.time() - 1)
+        reasons = {row["reason"] for row in part["not_done"]} - {"needs CUDA"}
+        assert part["whole"] and reasons == {"time was up"}
+
+
+def test_the_benchmark_step(tmp_path):
+    part = part_of(tmp_path, "bench")
+    records = part["result"]["bench"]["records"]
+    assert {record["op"] for record in records} == {"conv"} and part["failures"] == []
+    assert all(record["ms_p50"] > 0 for record in records)
+
+
+def test_the_compile_step(monkeypatch, tmp_path):
+    from helpers.kernels import plain_kernel
+
+    entry = gpu_steps.find_kernels.__globals__["Entry"]
+    launch = dry_run.Launch(plain_kernel, 256)
+    monkeypatch.setattr(gpu_steps, "find_kernels", lambda: [entry("op", "c", "forward", launch)])
+    part = part_of(tmp_path, "compile")
+    assert part["result"]["kernels"] == part["result"]["of"] == 1 and part["failures"] == []
+    assert part["result"]["seconds"] > 0
+
+
+def child(part, code, said=""):
+    """Stands for a process that writes a part and ends with a code; None: its time was up."""
+
+    def run(arguments, seconds, look, cwd=None):
+        write_json(arguments[arguments.index("--out") + 1], part)
+        look()
+        return code, said
+
+    return run
+
+
+def result(failures=(), whole=True):
+    row = {"name": "scan", "status": "passed", "found": "1e-7", "seconds": 1.0}
+    return {
+        "result": {"checks": [row]},
+        "not_done": [{"what": "a", "reason": "b"}],
+        "failures": list(failures),
+        "whole": whole,
+    }
+
+
+@pytest.mark.parametrize(
+    "part, code, status, exit_code, words",
+    [
+        (result(), 0, "passed", 0, ""),
+        (result(["scan: wrong"]), 0, "failed", 1, "scan: wrong"),
+        (result(whole=False), -11, "failed", 1, "step checks ended with code -11: a core"),
+        (result(whole=False), None, "stopped", 0, "the rest of step checks: its 100 s were up"),
+        (result(["scan: wrong"], whole=False), None, "failed", 1, "scan: wrong"),
+    ],
+)
+def test_what_a_step_left_is_kept(monkeypatch, tmp_path, part, code, status, exit_code, words):
+    monkeypatch.setattr(gpu_check, "run_python", child(part, code, "a core"))
+    run = gpu_check_command(device="cpu", out=tmp_path, steps=("checks",))
+    document = json.loads((tmp_path / "gpu-check.json").read_text())
+    assert run == exit_code and document["steps"][0]["status"] == status
+    assert document["results"]["checks"] == part["result"]
+    assert {"what": "a", "reason": "b"} in document["not_done"]
+    page = (tmp_path / "gpu-check.md").read_text()
+    assert words in page and "1 passed" in page
+    assert document["verdict"] == ("1 failed" if exit_code else "all that could be run passed")
+
+
+def test_an_interrupt_keeps_what_was_done(monkeypatch, tmp_path):
+    done = child(result(), 0)
+
+    def run(arguments, *rest, **options):
+        if "inference" in arguments:
+            raise KeyboardInterrupt
+        return done(arguments, *rest, **options)
+
+    monkeypatch.setattr(gpu_check, "run_python", run)
+    assert gpu_check_command(device="cpu", out=tmp_path) == 130
+    document = json.loads((tmp_path / "gpu-check.json").read_text())
+    assert document["verdict"].startswith("interrupted")
+    assert "checks" in document["results"] and "bench" not in document["results"]
+
+
+def test_the_whole_run_ends_in_its_time(monkeypatch, tmp_path):
+    """Steps that take all they are given leave nothing for the last ones, which are told."""
+    now, given = [0.0], []
+
+    def run(arguments, seconds, look, cwd=None):
+        now[0] += seconds
+        given.append(seconds)
+        return None, ""
+
+    monkeypatch.setattr(gpu_check.time, "time", lambda: now[0])
+    monkeypatch.setattr(gpu_check, "run_python", run)
+    monkeypatch.setattr(gpu_check, "gpu_test_files", lambda folder: [Path("test_x.py")])
+    monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpu_check, "versions", lambda: dict.fromkeys(gpu_check.PACKAGES, "1"))
+    assert gpu_check_command(out=tmp_path) == 0
+    assert given[:4] == [step.seconds for step in gpu_check.STEPS[:4]] and len(given) == 5
+    assert 8 * 60 - 5 < now[0] < 8 * 60
+    document = json.loads((tmp_path / "gpu-check.json").read_text())
+    assert [step["status"] for step in document["steps"]] == 5 * ["stopped"] + 3 * ["not done"]
+    assert {step["reason"] for step in document["steps"][5:]} == {"time was up"}
+    now[0], given[:] = 0.0, []
+    assert gpu_check_command(out=tmp_path, minutes=0.2) == 0
+    assert sum(given) == now[0] <= 12
+
+
+def test_peers_have_steps_of_their_own(monkeypatch, tmp_path):
+    """What breaks there takes nothing along, and what is not installed is not begun."""
+    part = new_part() | {"whole": True}
+    part["result"] = {"bench": document_of(("conv", "operator", "default", 1.0), target=None)}
+    runs = []
+
+    def run(arguments, seconds, look, cwd=None):
+        name = arguments[arguments.index("--child") + 1]
+        runs.append(name)
+        if name == "peers-scan":
+            return -11, "a core"
+        if name == "peers-conv":
+            new = (("conv", "operator", "default", 2.0), ("conv", "operator", "theirs", 3.0))
+            part["result"] = {"bench": document_of(*new, target=1.5)}
+        return child(part, 0)(arguments, seconds, look)
+
+    found = {"causal-conv1d": "1", "mamba-ssm": "2"}
+    monkeypatch.setattr(gpu_check, "versions", lambda: found)
+    monkeypatch.setattr(gpu_check, "run_python", run)
+    monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    steps = "bench", "peers-conv", "peers-scan", "peers-raster"
+    assert gpu_check_command(out=tmp_path, steps=steps) == 1
+    assert runs == ["bench", "peers-conv", "peers-scan"]
+    document = json.loads((tmp_path / "gpu-check.json").read_text())
+    assert [step["status"] for step in document["steps"]] == [
+        *("passed", "passed", "failed", "not done")
+    ]
+    times = [(r["variant"], r["ms_p50"]) for r in document["bench"]["records"]]
+    assert times == [("default", 2.0), ("theirs", 3.0)]
+    assert [t["value"] for t in document["bench"]["targets"]] == [1.5]
+    assert "not installed: gsplat, gswarp" in (tmp_path / "gpu-check.md").read_text()
+
+
+def document_of(*records, target):
+    """A benchmark's document with records of an op, a case, a variant and a time."""
+    rest = dict(ms_p20=1.0, ms_p80=1.0, jit_ms=1.0, rel_rms_error=0.0, oracle="x", text="y.")
+    rest |= dict(direction="forward", dtype="float32", status="ok", work={}, peer=None)
+    rest |= dict(peer_ms=None, is_default=False, is_peer=False)
+    names = "op", "case", "variant", "ms_p50"
+    wanted = dict(op="conv", text="t", wanted="1", value=target, reached=None)
+    return {"records": [dict(zip(names, r)) | rest for r in records], "targets": [wanted]}
+
+
+def test_a_process_that_hangs_is_ended_with_its_children(tmp_path):
+    marker = tmp_path / "alive"
+    inner = f"import time, pathlib; time.sleep(2); pathlib.Path({str(marker)!r}).touch()"
+    outer = f"import subprocess, sys; print('began'); sys.stdout.flush(); \
+subprocess.run([sys.executable, '-c', {inner!r}])"
+    started, looks = time.time(), []
+    code, said = gpu_check.run_python(["-c", outer], 1.0, lambda: looks.append(1))
+    assert code is None and said == "began" and len(looks) > 2
+    assert time.time() - started < 2
+    time.sleep(max(0, started + 3.5 - time.time()))
+    assert not marker.exists()
+
+
+def test_a_process_that_crashes():
+    crash = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
+    assert gpu_check.run_python(["-c", crash], 30, lambda: None) == (-11, "nothing was printed")
+    code, said = gpu_check.run_python(["-c", "1 / 0"], 30, lambda: None)
+    assert code == 1 and said == "ZeroDivisionError: division by zero"
+
+
+TESTS = """
+import pytest
+@pytest.mark.gpu
+def test_right(): pass
+@pytest.mark.gpu
+@pytest.mark.parametrize("n", [1, 2])
+def test_wrong(n): assert n == 1, "n is wrong"
+@pytest.mark.gpu
+def test_absent(): pytest.skip("no such thing")
+def test_other(): raise SystemExit
+"""
+
+
+def test_pytests_results_are_read(monkeypatch, tmp_path):
+    tests = tmp_path / "tests"
+    tests.mkdir()
+    (tests / "test_a.py").write_text(TESTS)
+    (tests / "test_b.py").write_text("import no_such_package\n@pytest.mark.gpu\ndef test_b(): pass")
+    (tests / "test_c.py").write_text("def test_c(): raise SystemExit")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = gpu: x")
+    assert [path.stem for path in gpu_check.gpu_test_files(tests)] == ["test_a", "test_b"]
+    monkeypatch.setattr(gpu_check, "CHECKOUT", tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
+    assert gpu_check_command(out=tmp_path / "out", steps=("tests",)) == 1
+    document = json.loads((tmp_path / "out" / "gpu-check.json").read_text())
+    assert document["results"]["tests"]["counts"] == {"passed": 2, "failed": 1, "skipped": 1}
+    (failure,) = document["failures"]
+    assert "test_wrong[2]" in failure and "n is wrong" in failure
+    reasons = [row["reason"] for row in document["not_done"]]
+    assert "no such thing" in reasons
+    assert any("no_such_package" in reason for reason in reasons)
+
+
+def test_the_repositorys_gpu_tests_are_found():
+    found = {path.name for path in gpu_check.gpu_test_files(ROOT / "tests")}
+    assert {"test_rasterize_cuda.py", "test_selective_scan_cuda.py"} <= found

@@ -1,0 +1,351 @@
+import io
+from types import SimpleNamespace
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from helpers.gaussians import some
+from helpers.images import bad_files
+from PIL import Image
+
+from gamba_warp import cli
+from gamba_warp.batch import unique_names
+from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
+from gamba_warp.commands import reconstruct as module
+from gamba_warp.data.preprocess import composite, prepare
+from gamba_warp.errors import UserError
+from gamba_warp.formats.meshes import load_mesh
+from gamba_warp.formats.ply import load_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import find_pictures, save_image
+from gamba_warp.model.checkpoint import load_model, save_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.predict import reconstruct
+from gamba_warp.pages.turntable import save_turntable, turntable_frames
+from gamba_warp.render import render
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    torch.manual_seed(0)
+    config = GambaConfig(
+        image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
+    )
+    path = tmp_path_factory.mktemp("model") / "model.safetensors"
+    save_model(path, Gamba(config))
+    return path
+
+
+@pytest.fixture
+def picture(tmp_path):
+    return draw(tmp_path / "thing.png")
+
+
+def draw(path, colour=(0.8, 0.3, 0.1)):
+    """A cut-out square."""
+    rgba = np.zeros((20, 30, 4))
+    rgba[4:16, 8:24] = (*colour, 1)
+    save_image(path, rgba)
+    return path
+
+
+def run(*arguments):
+    return cli.run("reconstruct", [str(a) for a in arguments])
+
+
+def quick(checkpoint, out):
+    return ["--checkpoint", checkpoint, "--out", out, "--turntable", "none", "--no-page"]
+
+
+class Recorder(torch.nn.Module):
+    """Stands in for a model: keeps what it is given."""
+
+    def __init__(self, background):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        color = 1.0 if background == "white" else 0.0
+        self.config = SimpleNamespace(image_size=24, distance=2.0, fov=40, background_color=color)
+
+    def forward(self, images, cameras):
+        self.images, self.cameras = images, cameras
+        return some(9).map(lambda value: value[None])
+
+
+@pytest.mark.parametrize("background", ["white", "black"])
+def test_the_model_sees_the_object_from_the_reference_camera(picture, background):
+    model, rgba = Recorder(background), prepare(picture)
+    gaussians = reconstruct(model, rgba)
+    assert gaussians.num == 9 and gaussians.means.shape == (9, 3)
+    want = composite(rgba, 24, 1.0 if background == "white" else 0.0)
+    torch.testing.assert_close(model.images, want[None])
+    cameras = model.cameras
+    torch.testing.assert_close(cameras.viewmats, reference_viewmat(2.0)[None])
+    torch.testing.assert_close(cameras.Ks, intrinsics(24, 24, 40)[None])
+    assert (cameras.width, cameras.height) == (24, 24)
+
+
+def test_turntable_begins_at_the_reference_view_and_turns():
+    gaussians = some(40)
+    frames = turntable_frames(gaussians, size=33, frames=5)
+    assert frames.shape == (5, 33, 33, 3) and frames.dtype == np.uint8
+    viewmats = orbit(torch.arange(5) * 72.0)
+    cameras = Cameras(viewmats, intrinsics(33, 33).expand(5, 3, 3), 33, 33)
+    want = render(gaussians, cameras, background=torch.ones(3)).rgb.numpy()
+    # rounding to 8 bits
+    np.testing.assert_allclose(frames / 255, want, atol=0.51 / 255)
+    assert (frames[0, 0, 0] == 255).all() and frames.min() < 200
+    assert np.abs(frames[0].astype(int) - frames[2]).max() > 20
+
+
+def test_turntable_chunks_make_no_difference(monkeypatch):
+    gaussians = some(40)
+    whole = turntable_frames(gaussians, size=20, frames=7, elevation=20.0)
+    monkeypatch.setattr("gamba_warp.pages.turntable._CHUNK_PIXELS", 2 * 20 * 20)
+    np.testing.assert_array_equal(
+        turntable_frames(gaussians, size=20, frames=7, elevation=20.0), whole
+    )
+
+
+def moving(size=(18, 21), count=6):
+    """A few smooth colours; bright in another place in each frame."""
+    y, x = np.mgrid[: size[0], : size[1]] / size[1]
+    return np.stack(
+        [np.stack([x, y, np.full_like(x, i / count)], -1) * 255 for i in range(count)]
+    ).astype(np.uint8)
+
+
+def test_gif(tmp_path):
+    frames = moving()
+    save_turntable(tmp_path / "a.gif", frames, seconds=3)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 6 and image.info["loop"] == 0 and image.info["duration"] == 500
+        for index, want in enumerate(frames):
+            image.seek(index)
+            got = np.asarray(image.convert("RGB")).astype(int)
+            # 255 colours for 6 x 378; dithering spreads the rest
+            assert np.abs(got - want).mean() < 12
+
+
+@pytest.mark.parametrize("object_there", [True, False])
+def test_gif_keeps_its_background_white(tmp_path, object_there):
+    frames = np.full((3, 30, 30, 3), 255, np.uint8)
+    if object_there:
+        frames[:, 9:21, 9:21] = np.linspace(245, 254, 12 * 12 * 3).reshape(12, 12, 3)  # a soft edge
+        frames[:, 10:20, 10:20] = np.random.default_rng(0).integers(0, 256, (3, 10, 10, 3))
+    save_turntable(tmp_path / "a.gif", frames)
+    with Image.open(tmp_path / "a.gif") as image:
+        for index in range(image.n_frames):
+            image.seek(index)
+            got = np.asarray(image.convert("RGB"))
+            assert (got[:9] == 255).all() and (got[10:20, 10:20] == 255).all() != object_there
+
+
+def test_mp4_of_odd_size(tmp_path):
+    frames = moving(size=(35, 45), count=12)
+    save_turntable(tmp_path / "a.mp4", frames, seconds=1)
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"))
+    meta = next(reader)
+    assert meta["size"] == (46, 36) and meta["fps"] == 12 and meta["codec"] == "h264"
+    got = [np.frombuffer(data, np.uint8).reshape(36, 46, 3) for data in reader]
+    assert len(got) == 12
+    # lossy, and colour at half resolution
+    assert np.abs(got[5][:35, :45].astype(int) - frames[5]).mean() < 8
+
+
+def test_turntables_that_cannot_be_written(tmp_path):
+    with pytest.raises(UserError, match=r"a\.avi: a turntable is a \.gif or an \.mp4"):
+        save_turntable(tmp_path / "a.avi", moving())
+    for suffix in ("gif", "mp4"):
+        with pytest.raises(UserError, match=f"cannot write /dev/null/a.{suffix}"):
+            save_turntable(f"/dev/null/a.{suffix}", moving())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
+    out = tmp_path / "deep" / "out"
+    arguments = [picture, "--checkpoint", checkpoint, "--out", out, "--size", 32, "--frames", 4]
+    assert run(*arguments, "--formats", "ply", "splat", "glb") == 0
+    files = {path.name: path.stat().st_size for path in out.iterdir()}
+    names = ["thing.gif", "thing.glb", "thing.html", "thing.ply", "thing.splat"]
+    assert sorted(files) == names and all(files.values())
+    gaussians = load_ply(out / "thing.ply")
+    with torch.inference_mode():
+        want = reconstruct(load_model(checkpoint), prepare(picture))
+    assert gaussians.num == 64 and files["thing.splat"] == 64 * 32
+    # float32 through a logarithm or a logit
+    torch.testing.assert_close(gaussians.means, want.means)
+    torch.testing.assert_close(gaussians.scales, want.scales, rtol=1e-5, atol=0)
+    torch.testing.assert_close(gaussians.opacities, want.opacities, rtol=1e-5, atol=0)
+    source = (out / "thing.html").read_text()
+    assert "<h1>thing</h1>" in source and "model.safetensors" in source and ">64<" in source
+    assert "1 pictures, 0 failures" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("frame", ["opencv", "opengl"])
+def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeypatch, frame):
+    ends = torch.tensor([0.35, -0.1, 0.0])
+    stick = Gaussians(
+        means=(torch.arange(64.0)[:, None] / 63) * ends,
+        quats=None,
+        scales=torch.full((64, 3), 0.04),
+        opacities=torch.full((64,), 0.9),
+        colors=torch.tensor([0.9, 0.1, 0.1]).expand(64, 3),
+    )
+    monkeypatch.setattr("gamba_warp.commands.reconstruct.reconstruct", lambda *_: stick)
+    options = [*quick(checkpoint, tmp_path), "--mesh", "ply", "--ply-frame", frame]
+    assert run(picture, *options) == 0
+    mesh = load_mesh(tmp_path / "thing-mesh.ply")
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    want = [0.175, -0.05 if frame == "opencv" else 0.05, 0.0]
+    assert np.abs(middle - want).max() < 0.02  # half a Gaussian
+    assert run(picture, *options, "--min-opacity", 0.95) == 1  # nothing is left
+
+
+def test_options_reach_the_files(tmp_path, picture, checkpoint):
+    arguments = [picture, "--checkpoint", checkpoint, "--out", tmp_path, "--no-page"]
+    assert run(*arguments, "--turntable", "mp4", "--size", 16, "--frames", 2) == 0
+    assert (tmp_path / "thing.mp4").stat().st_size > 0 and not (tmp_path / "thing.html").exists()
+    plain = load_ply(tmp_path / "thing.ply")
+    limit = plain.opacities.median().item()
+    assert run(*quick(checkpoint, tmp_path), picture, "--min-opacity", limit) == 0
+    assert 0 < load_ply(tmp_path / "thing.ply").num < 64
+    assert run(*quick(checkpoint, tmp_path), picture, "--ply-frame", "opengl") == 0
+    assert b"comment frame opengl" in (tmp_path / "thing.ply").read_bytes()
+    torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
+
+
+def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    cases = [(path, reason) for name, path, reason in bad_files(folder) if name != "folder"]
+    save_image(folder / "clear.png", np.zeros((9, 9, 4)))
+    save_image(folder / "noise.bmp", np.random.default_rng(0).random((9, 9, 3)))
+    first, last = draw(folder / "aa.png"), draw(folder / "zz.png")
+    cases += [(folder / "clear.png", "no object"), (folder / "noise.bmp", "cannot tell object")]
+    code = run(*quick(checkpoint, out), first, *(path for path, _ in cases), last)
+    assert code == 1
+    assert sorted(path.name for path in out.iterdir()) == ["aa.ply", "zz.ply"]
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gamba: ")]
+    assert len(errors) == len(cases)
+    for line, (path, reason) in zip(errors, cases):
+        assert line.startswith(f"gamba: failed: {path}: ") and reason in line
+        assert line.count(str(path)) == 1
+
+
+def test_folders_are_searched(tmp_path, checkpoint, capsys):
+    folder, empty = tmp_path / "in", tmp_path / "empty"
+    folder.mkdir(), empty.mkdir()
+    draw(folder / "b.png"), draw(folder / "a.PNG")
+    (folder / "notes.txt").write_text("no picture")
+    assert find_pictures([folder, folder / "b.png"]) == ([folder / "a.PNG", folder / "b.png"], [])
+    assert run(*quick(checkpoint, tmp_path / "out"), folder, empty) == 1
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.ply", "b.ply"]
+    assert f"{empty}: the folder holds no pictures" in capsys.readouterr().err
+
+
+def test_equal_stems_get_names_of_their_own(tmp_path):
+    paths = [tmp_path / p for p in ("a.png", "a.jpg", "x/a.png", "a-2.png")]
+    names = unique_names(paths)
+    assert list(names) == ["a", "a-2", "a-3", "a-2-2"] and list(names.values()) == paths
+
+
+def refused(arguments, *reasons):
+    """Runs, and expects exit code 2 and one line that holds the reasons."""
+
+    def check(capsys):
+        capsys.readouterr()
+        assert run(*arguments) == 2
+        captured = capsys.readouterr()
+        lines = [line for line in captured.err.splitlines() if not line.startswith("Warp")]
+        assert len(lines) == 1 and lines[0].startswith("gamba: "), captured.err
+        assert all(str(reason) in lines[0] for reason in reasons), lines[0]
+
+    return check
+
+
+def test_what_cannot_start_is_refused(tmp_path, picture, checkpoint, capsys):
+    other, file = draw(tmp_path / "other.png"), tmp_path / "file"
+    file.touch()
+    (tmp_path / "empty").mkdir()
+    ready = quick(checkpoint, tmp_path / "out")
+    missing = tmp_path / "none.safetensors"
+    for check in (
+        refused([picture, *quick(missing, tmp_path / "out")], missing, "gamba train"),
+        refused([picture, *quick(file, tmp_path / "out")], file, "safetensors"),
+        refused([picture, *quick(checkpoint, file)], "cannot write into", file),
+        refused([picture, *quick(checkpoint, "/dev/null/x")], "cannot write into /dev/null/x"),
+        refused(ready, "give at least one picture or folder"),
+        refused([tmp_path / "empty", *ready], "empty: the folder holds no pictures"),
+        refused([picture, other, *ready, "--mask", picture], "--mask goes with one picture"),
+        refused([picture, *ready, "--size", 8], "--size"),
+        refused([picture, *ready, "--frames", 1], "--frames"),
+        refused([picture, *ready, "--sam", missing], "--sam", missing),
+    ):
+        check(capsys)
+    if not torch.cuda.is_available():
+        refused([picture, *ready, "--device", "cuda"], "no CUDA device")(capsys)
+    assert not (tmp_path / "out" / "thing.ply").exists()
+
+
+def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeypatch, capsys):
+    monkeypatch.setattr(module, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
+    arguments = [picture, "--out", tmp_path / "out", "--turntable", "none", "--no-page"]
+    refused(arguments, "tiny.safetensors", "--checkpoint FILE")(capsys)
+    (tmp_path / "tiny.safetensors").write_bytes(checkpoint.read_bytes())
+    assert run(*arguments) == 0
+
+
+def test_a_mask_cuts_a_busy_picture(tmp_path, checkpoint):
+    noise = np.random.default_rng(0).random((20, 30, 3))
+    save_image(tmp_path / "noise.png", noise)
+    mask = np.zeros((20, 30))
+    mask[5:15, 5:25] = 1
+    save_image(tmp_path / "mask.png", mask)
+    ready = [tmp_path / "noise.png", *quick(checkpoint, tmp_path / "out")]
+    assert run(*ready) == 1
+    assert run(*ready, "--mask", tmp_path / "mask.png") == 0
+
+
+def test_outputs_that_cannot_be_written_are_failures(tmp_path, picture, checkpoint, capsys):
+    (tmp_path / "out" / "thing.ply").mkdir(parents=True)
+    assert run(picture, *quick(checkpoint, tmp_path / "out")) == 1
+    assert f"cannot write {tmp_path}/out/thing.ply" in capsys.readouterr().err
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["thing.ply"]
+
+
+def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):
+    gaussians = some(9)
+    gaussians.means[3] = float("nan")
+    monkeypatch.setattr(module, "reconstruct", lambda model, rgba: gaussians)
+    assert run(picture, *quick(checkpoint, tmp_path / "out")) == 1
+    assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err
+
+
+def test_the_help_names_every_option(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("--help")
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    for option in ("--checkpoint", "--formats", "--turntable", "--mask", "--sam", "--no-page"):
+        assert option in out
+
+
+def test_pictures_of_many_kinds_go_through(tmp_path, checkpoint):
+    rgba = np.zeros((40, 30, 4), np.uint8)
+    rgba[8:30, 5:25] = (200, 60, 20, 255)
+    cut = Image.fromarray(rgba)
+    flat = Image.new("RGB", cut.size, "white")
+    flat.paste(cut, mask=cut)
+    flat.save(tmp_path / "rgb.jpg", quality=90)
+    flat.convert("L").save(tmp_path / "grey.png")
+    flat.quantize(16).save(tmp_path / "palette.png")
+    flat.convert("CMYK").save(tmp_path / "cmyk.tiff")
+    Image.fromarray(np.asarray(flat.convert("L")).astype(np.uint16) * 257).save(tmp_path / "16.png")
+    cut.save(tmp_path / "cut.webp")
+    content = io.BytesIO()
+    cut.quantize(8).save(content, "GIF")
+    (tmp_path / "still.gif").write_bytes(content.getvalue())
+    assert run(tmp_path, *quick(checkpoint, tmp_path / "out")) == 0
+    assert len(list((tmp_path / "out").glob("*.ply"))) == 7

@@ -1,0 +1,122 @@
+import io
+import json
+import tarfile
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gamba_warp.data.dataset import open_dataset, split_of
+from gamba_warp.errors import UserError
+from gamba_warp.train.data import furniture
+from gamba_warp.train.data.furniture import furniture_command, read_properties
+from gamba_warp.train.data.render import find_meshes, render_command
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+PROPERTIES = r"""# a comment = not a value
+id=Some#Library
+name=Blend Swap CC-BY
+id#1=A
+name#1=Caf\u00e9 chair 01
+category#1=Kitchen
+icon#1=/b/cafe.png
+model#1=/b/cafe/chair.obj
+creator#1=Jay
+id#2=B
+name#2=Caf\u00e9 chair 02
+icon#2=/b/other.png
+model#2=/b/other/chair.obj
+creator#2=Kay
+modelRotation#2=1 0 0 0 \
+  0 -1 0 1 0
+"""
+
+
+def write_library(path, properties=PROPERTIES):
+    icon = io.BytesIO()
+    Image.fromarray(np.zeros((8, 8, 4), np.uint8)).save(icon, "PNG")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("PluginFurnitureCatalog.properties", properties.encode("latin-1"))
+        archive.writestr("PluginFurnitureCatalog_fr.properties", "name#1=Chaise")
+        archive.writestr("LICENSE.TXT", "free")
+        for name in ("cafe", "other"):
+            archive.writestr(f"b/{name}.png", icon.getvalue())
+            archive.writestr(f"b/{name}/chair.obj", TRIANGLE)
+    return path
+
+
+def write_deb(path, files):
+    """An ar archive as dpkg makes it; the odd-sized first member is padded."""
+    inner = io.BytesIO()
+    with tarfile.open(fileobj=inner, mode="w:xz") as tar:
+        for name, data in files.items():
+            info = tarfile.TarInfo(f"./usr/share/sweethome3d/furniture/{name}")
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+    with path.open("wb") as file:
+        file.write(b"!<arch>\n")
+        for name, data in (("debian-binary", b"2.0"), ("data.tar.xz", inner.getvalue())):
+            file.write(f"{name:<16}{0:<12}{0:<6}{0:<6}{'100644':<8}{len(data):<10}`\n".encode())
+            file.write(data + b"\n" * (len(data) % 2))
+    return path
+
+
+def test_properties():
+    values = read_properties(PROPERTIES.encode("latin-1"))
+    assert values["name#1"] == "Café chair 01"
+    assert values["modelRotation#2"].split() == "1 0 0 0 0 -1 0 1 0".split()
+    assert not any("comment" in key for key in values)
+
+
+def test_package_to_views(tmp_path):
+    library = write_library(tmp_path / "BlendSwap-CC-BY.sh3f")
+    deb = write_deb(tmp_path / "p.deb", {library.name: library.read_bytes(), "x": b"no"})
+    out = tmp_path / "models"
+    assert furniture_command(out, deb=deb) == 0
+    assert {p.name for p in out.iterdir()} == {"BlendSwap-CC-BY", "icons", "catalogue.json"}
+    assert (out / "BlendSwap-CC-BY" / "LICENSE.TXT").exists()
+    entries = json.loads((out / "catalogue.json").read_text())["objects"]
+    assert [e["uid"] for e in entries] == ["blendswap-cc-by-cafe", "blendswap-cc-by-other"]
+    assert entries[0]["attribution"]["creator"] == "Jay"
+    assert entries[0]["attribution"]["licence"] == "CC BY 3.0"
+    for entry in entries:
+        assert (out / entry["model"]).exists()
+        assert Image.open(out / "icons" / f"{entry['uid']}.png").size == (8, 8)
+    meshes = find_meshes(out)
+    assert [m.name for m in meshes] == ["Café chair 01", "Café chair 02"]
+    assert len({m.group for m in meshes}) == 1  # numbered variants stay together
+    assert meshes[0].rotation is None and meshes[1].rotation == [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+
+    assert render_command(out, tmp_path / "data", views=1, size=16, workers=1) == 0
+    assert len(open_dataset(tmp_path / "data", split_of(meshes[0].group))) == 2
+    assert furniture_command(out, tree=tmp_path) == 0  # again, from the other kind of source
+    assert json.loads((out / "catalogue.json").read_text())["objects"] == entries
+
+
+def test_bad_sources(tmp_path, monkeypatch):
+    out = tmp_path / "models"
+    with pytest.raises(UserError, match="nowhere.deb: no such file"):
+        furniture_command(out, deb=tmp_path / "nowhere.deb")
+    (tmp_path / "text.deb").write_text("not a package")
+    with pytest.raises(UserError, match="not a Debian package"):
+        furniture_command(out, deb=tmp_path / "text.deb")
+    good = write_deb(tmp_path / "p.deb", {"a.sh3f": b"0" * 5000}).read_bytes()
+    (tmp_path / "cut.deb").write_bytes(good[:-60])
+    with pytest.raises(UserError, match="cannot be unpacked"):
+        furniture_command(out, deb=tmp_path / "cut.deb")
+    with pytest.raises(UserError, match="a.sh3f: not a furniture library"):
+        furniture_command(out, deb=tmp_path / "p.deb")
+    with pytest.raises(UserError, match="holds no .sh3f"):
+        furniture_command(out, deb=write_deb(tmp_path / "e.deb", {}))
+    with pytest.raises(UserError, match="no such folder"):
+        furniture_command(out, tree=tmp_path / "nowhere")
+    write_library(tmp_path / "b.sh3f", "name=x\nmodel#1=/b/gone/chair.obj\n")
+    with pytest.raises(UserError, match="b.sh3f: not a furniture library"):
+        furniture_command(out, tree=tmp_path)
+    monkeypatch.setattr(furniture, "INSTALLED", tmp_path / "not installed")
+    monkeypatch.setattr(furniture.shutil, "which", lambda name: None)
+    with pytest.raises(UserError, match="no apt-get here.*--deb"):
+        furniture_command(out)
+    assert not (out / "catalogue.json").exists()
+    assert not list(out.glob(".download-*"))

@@ -1,0 +1,312 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from helpers.meshes import MTL, QUAD, write_quad
+from PIL import Image
+
+from gamba_warp.cameras import from_opengl, intrinsics
+from gamba_warp.cli import run
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.formats.meshes import load_mesh, to_linear
+from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses
+from gamba_warp.train.data.raycast import Lights, RayCaster
+from gamba_warp.train.data.render import find_meshes, render_command
+
+FOV = 49.1
+# even light from everywhere: what is drawn is the surface's own colour
+FLAT = Lights(np.full(3, 1.0), np.zeros((1, 3)), np.zeros((1, 3)), head=0.0)
+
+
+def write_box(path, extents=(1.0, 0.6, 0.8), face_colors=None):
+    box = trimesh.creation.box(extents=extents)
+    if face_colors is not None:
+        box.visual.face_colors = face_colors
+    path.parent.mkdir(parents=True, exist_ok=True)
+    box.export(path)
+    return path
+
+
+def caster(path, up="z", lights=FLAT):
+    return RayCaster(load_mesh(path).normalized(up)[0], lights)
+
+
+def test_poses_look_at_the_origin_from_where_they_say():
+    for azimuth, elevation, place in (
+        (0, 0, [0, -2, 0]),
+        (90, 0, [2, 0, 0]),
+        (0, 30, [0, -np.sqrt(3), 1]),
+    ):
+        pose = look_at_origin(azimuth, elevation, 2.0)
+        np.testing.assert_allclose(pose[:3, 3], place, atol=1e-12)
+        viewmat = from_opengl(torch.from_numpy(pose))
+        torch.testing.assert_close(viewmat[:3, 3], torch.tensor([0, 0, 2.0]).double())
+        assert viewmat[1, 2] < 0  # the world's z is up: minus the camera's y
+        assert torch.linalg.det(viewmat).item() == pytest.approx(1)
+
+
+def test_nothing_is_cropped_and_all_fits_the_models_cube():
+    rng = np.random.default_rng(0)
+    for shape in ((1, 1, 1), (1, 0.02, 0.5), (0.1, 0.1, 1)):
+        points = (rng.integers(0, 2, (20, 3)) - 0.5) * shape
+        poses = sample_poses(points, 12, FOV, rng)
+        viewmats = from_opengl(torch.from_numpy(poses)).numpy()
+        K = intrinsics(100, 100, FOV).double().numpy()
+        for viewmat in viewmats:
+            local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+            pixels = local @ K.T
+            pixels = pixels[:, :2] / pixels[:, 2:]
+            assert pixels.min() > 1 and pixels.max() < 99
+            scaled = 1.5 / viewmat[2, 3] * points @ viewmat[:3, :3].T
+            assert np.abs(scaled).max() <= 0.5 + 1e-9
+    tall = np.array([[0, 0, -0.5], [0, 0, 0.5]])
+    assert nearest_distance(tall, look_at_origin(0, 0, 1.0), FOV) == pytest.approx(1.5)
+
+
+def test_view_zero_is_from_the_front():
+    for seed in range(20):
+        pose = sample_poses(np.ones((1, 3)), 1, FOV, np.random.default_rng(seed))[0]
+        x, y, z = pose[:3, 3] / np.linalg.norm(pose[:3, 3])
+        assert y < -0.7 and 0 <= z <= np.sin(np.radians(20)) + 1e-9
+
+
+def test_pixels_colours_and_depth_agree_with_the_cameras(tmp_path):
+    colors = np.zeros((12, 4), np.uint8)
+    colors[:, 3] = 255
+    folder = tmp_path / "meshes"
+    plain = load_mesh(write_box(folder / "box.ply")).normalized()[0]
+    normals = np.cross(
+        plain.vertices[plain.faces[:, 1]] - plain.vertices[plain.faces[:, 0]],
+        plain.vertices[plain.faces[:, 2]] - plain.vertices[plain.faces[:, 0]],
+    )
+    axis = np.abs(normals).argmax(1)
+    colors[np.arange(12), axis] = 255  # faces across x red, y green, z blue
+    write_box(folder / "box.ply", face_colors=colors)
+    render_command(folder, tmp_path / "data", views=5, size=33, depth=True, workers=1)
+    data = open_dataset(tmp_path / "data")
+    assert data.uids == ["box"]
+    got = data.load(0)
+    half = torch.tensor([0.5, 0.3, 0.4])
+    y, x = torch.meshgrid(torch.arange(33) + 0.5, torch.arange(33) + 0.5, indexing="ij")
+    seen = set()
+    for image, depth, viewmat, K in zip(
+        got.images, got.depths, got.cameras.viewmats, got.cameras.Ks
+    ):
+        hit = (depth > 0) & (image[..., 3] == 1)
+        assert hit.sum() > 100
+        assert ((depth > 0) == (image[..., 3] >= 0.5))[image[..., 3].sub(0.5).abs() > 0.4].all()
+        local = torch.stack([x, y, torch.ones_like(x)], -1) @ torch.linalg.inv(K).T
+        local = local * depth[..., None]
+        world = (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+        across = world.abs() / half
+        # on the surface, to half a step of the depth file at a grazing angle
+        torch.testing.assert_close(
+            across.max(-1).values[hit], torch.ones(int(hit.sum())), atol=1e-3, rtol=0
+        )
+        # away from edges, where a pixel's nine rays may meet two faces
+        inner = hit & (across.sort(-1).values[..., 1] < 0.9)
+        assert (image[..., :3].argmax(-1) == across.argmax(-1))[inner].all()
+        seen |= set(across.argmax(-1)[inner].tolist())
+    assert seen == {0, 1, 2}
+
+
+def test_texture_is_upright_and_not_mirrored(tmp_path):
+    picture, _ = caster(write_quad(tmp_path), "y").render(look_at_origin(0, 0, 1.5), 32, FOV)
+    rows, columns = np.nonzero(picture[..., 3] == 1)
+    top, bottom, left, right = rows.min() + 2, rows.max() - 2, columns.min() + 2, columns.max() - 2
+    # as in the texture's file: red, green / blue, yellow
+    for row, column, want in (
+        (top, left, [1, 0, 0]),
+        (top, right, [0, 1, 0]),
+        (bottom, left, [0, 0, 1]),
+        (bottom, right, [1, 1, 0]),
+    ):
+        np.testing.assert_array_equal(picture[row, column, :3] > 0.5, want)
+
+
+def test_cut_out_and_glass_let_rays_pass(tmp_path):
+    back = "v -1 0 -1\nv 1 0 -1\nv 1 2 -1\nv -1 2 -1\nusemtl red\nf 5 6 7 8\n"
+    red = "newmtl red\nKd 1 0 0\n"
+    write_quad(tmp_path, obj=QUAD + back, mtl=MTL + red)
+    holes = np.full((16, 16, 4), [0, 255, 0, 0], np.uint8)
+    holes[:, :8, 3] = 255  # left half opaque green, right half a hole
+    Image.fromarray(holes).save(tmp_path / "paint.png")
+    pose = look_at_origin(0, 0, 2.0)
+    picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
+    np.testing.assert_array_equal(picture[16, 12, :3] > 0.5, [0, 1, 0])
+    np.testing.assert_array_equal(picture[16, 20, :3] > 0.5, [1, 0, 0])
+    # the square's front is at y = -0.25 of the cube, the red one half a unit behind
+    assert depth[16, 12] == pytest.approx(1.75) and depth[16, 20] == pytest.approx(2.25)
+
+    write_quad(tmp_path, mtl="newmtl paint\nKd 1 1 1\nd 0.25\n")
+    picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
+    assert picture[16, 16, 3] == pytest.approx(0.25, abs=1e-6) and depth[16, 16] == 0
+    glass = "newmtl paint\nKd 1 1 1\nd 0.25\nnewmtl red\nKd 1 0 0\nd 0.5\n"
+    write_quad(tmp_path, obj=QUAD + back, mtl=glass)
+    picture, depth = caster(tmp_path / "quad.obj", "y").render(pose, 32, FOV)
+    assert picture[16, 16, 3] == pytest.approx(1 - 0.75 * 0.5, abs=1e-6)
+    # red gets 1/4 of white and 3/8 of red, green only the white; mixed in linear light
+    mixed = to_linear(picture[16, 16, :2])
+    assert mixed[1] / mixed[0] == pytest.approx(0.25 / (0.25 + 0.375), abs=0.02)
+    assert depth[16, 16] == pytest.approx(2.25)  # where half the light is blocked
+
+
+def test_edges_are_smooth_and_keep_their_colour(tmp_path):
+    path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.8 0.4 0.2\n")
+    picture, _ = caster(path, "y").render(look_at_origin(20, 10, 1.6), 40, FOV)
+    alpha = picture[..., 3]
+    edge = (alpha > 0) & (alpha < 1)
+    assert edge.sum() > 40
+    spread = picture[alpha > 0][:, :3]
+    np.testing.assert_allclose(spread, np.broadcast_to(spread.mean(0), spread.shape), atol=1e-3)
+    assert (picture[alpha == 0] == 0).all()
+
+
+def test_light_is_two_sided(tmp_path):
+    lights = Lights(np.zeros(3), np.array([[0, -1.0, 0]]), np.ones((1, 3)), head=0.0)
+    path = write_quad(tmp_path, mtl="newmtl paint\nKd 1 1 1\n")
+    turned = write_quad(tmp_path / ".", obj=QUAD.replace("1/1 2/2 3/3 4/4", "4/4 3/3 2/2 1/1"))
+    (tmp_path / "quad.mtl").write_text("newmtl paint\nKd 1 1 1\n")
+    pose = look_at_origin(0, 0, 1.5)
+    front, _ = caster(path, "y", lights).render(pose, 16, FOV)
+    back, _ = caster(turned, "y", lights).render(pose, 16, FOV)
+    assert front[8, 8, 0] > 0.9
+    np.testing.assert_allclose(front, back)
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    folder = tmp_path / "meshes"
+    for i, name in enumerate(["a", "b", "sub/c"]):
+        write_box(folder / f"{name}.ply", extents=(1, 0.3 + 0.2 * i, 0.5))
+    return folder
+
+
+def contents(folder):
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+
+
+def test_same_seed_same_files_and_shards_add_up(meshes, tmp_path):
+    options = dict(views=2, size=16, workers=1)
+    assert render_command(meshes, tmp_path / "one", **options) == 0
+    for i in range(2):
+        assert render_command(meshes, tmp_path / "two", shard=f"{i}/2", **options) == 0
+    one = contents(tmp_path / "one")
+    assert one == contents(tmp_path / "two")
+    assert {n.split("/")[0] for n in one} == {"a", "b", "sub-c", "split.json"}
+    render_command(meshes, tmp_path / "other", seed=1, **options)
+    assert contents(tmp_path / "other")["a/000.webp"] != one["a/000.webp"]
+
+
+def test_two_workers_write_the_same_files(meshes, tmp_path):
+    options = dict(views=1, size=16)
+    render_command(meshes, tmp_path / "one", workers=1, **options)
+    render_command(meshes, tmp_path / "two", workers=2, **options)
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
+    out = tmp_path / "data"
+    options = dict(views=2, size=16, workers=1)
+    render_command(meshes, out, **options)
+    before = contents(out)
+    times = {name: (out / name / "000.webp").stat().st_mtime_ns for name in ("a", "sub-c")}
+    shutil.rmtree(out / "b")
+    (out / ".b.part").mkdir()  # as a killed run leaves it
+    (out / ".b.part" / "000.webp").write_bytes(b"half")
+    assert len(open_dataset(out)) == 2
+    assert render_command(meshes, out, **options) == 0
+    assert "2 of 3 objects are already" in capsys.readouterr().out
+    assert contents(out) == before
+    for name, time in times.items():
+        assert (out / name / "000.webp").stat().st_mtime_ns == time
+    with pytest.raises(UserError, match="rendered with other settings"):
+        render_command(meshes, out, views=3, size=16, workers=1)
+
+
+def test_failures_are_listed_and_do_not_stop_the_rest(meshes, tmp_path, capsys):
+    (meshes / "bad.obj").write_text("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (meshes / "points.obj").write_text("v 0 0 0\n")
+    write_quad(meshes, mtl=None)
+    out = tmp_path / "data"
+    options = ["--out", str(out), "--views", "1", "--size", "16", "--workers", "1"]
+    assert run("data render", [str(meshes), *options]) == 1
+    captured = capsys.readouterr()
+    assert "4 objects" in captured.out and "2 failed" in captured.out
+    assert "warning: quad: quad.mtl: not found" in captured.out
+    assert "failed: bad: " in captured.err and "not finite" in captured.err
+    assert "failed: points: " in captured.err and "no faces" in captured.err
+    assert open_dataset(out).uids == ["a", "b", "quad", "sub-c"]
+    stored = json.loads((out / "quad" / "transforms.json").read_text())
+    assert any("not found" in line for line in stored["warnings"])
+
+
+def test_catalogue_names_and_groups(meshes, tmp_path):
+    entry = {
+        "uid": "box-1",
+        "name": "A box",
+        "group": "boxes",
+        "model": "a.ply",
+        "attribution": {"creator": "me"},
+        "rotation": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
+    }
+    twin = {**entry, "uid": "box-2", "model": "b.ply"}
+    (meshes / "catalogue.json").write_text(json.dumps({"objects": [entry, twin]}))
+    out = tmp_path / "data"
+    render_command(meshes, out, views=1, size=16, workers=1, format="png")
+    views = open_dataset(out).load("box-1")
+    assert (views.name, views.attribution) == ("A box", {"creator": "me"})
+    stored = json.loads((out / "box-1" / "transforms.json").read_text())
+    np.testing.assert_allclose(np.array(stored["applied_transform"])[:, :3], entry["rotation"])
+    parts = json.loads((out / "split.json").read_text())
+    assert sum({"box-1", "box-2"} <= set(parts[name]) for name in ("train", "val", "test")) == 1
+
+
+def test_uids_of_paths(tmp_path):
+    for name in ("chair/chair.ply", "chair.stl", "old chair (2).ply", ".hidden/x.ply"):
+        write_box(tmp_path / name)
+    assert [mesh.uid for mesh in find_meshes(tmp_path)] == ["chair", "chair-stl", "old_chair_2_"]
+    entries = [{"uid": "same", "model": name} for name in ("chair/chair.ply", "chair.stl")]
+    (tmp_path / "catalogue.json").write_text(json.dumps({"objects": entries}))
+    with pytest.raises(UserError, match="would both be 'same'"):
+        find_meshes(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"shard": "2/2"}, "--shard 2/2"),
+        ({"shard": "x"}, "--shard x"),
+        ({"views": 0}, "--views 0"),
+        ({"size": 4}, "--size 4"),
+        ({"fov": 180.0}, "--fov 180"),
+        ({"limit": 0}, "--limit 0"),
+    ],
+)
+def test_bad_options(meshes, tmp_path, options, message):
+    with pytest.raises(UserError, match=message):
+        render_command(meshes, tmp_path / "data", **options)
+
+
+def test_bad_folders(meshes, tmp_path):
+    with pytest.raises(UserError, match="no such folder"):
+        render_command(tmp_path / "nowhere", tmp_path / "data")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="no mesh files"):
+        render_command(tmp_path / "empty", tmp_path / "data")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write into"):
+        render_command(meshes, tmp_path / "file")
+    (meshes / "catalogue.json").write_text('{"objects": [{}]}')
+    with pytest.raises(UserError, match="catalogue.json"):
+        render_command(meshes, tmp_path / "data")
+
+
+def test_limit(meshes, tmp_path):
+    assert render_command(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
+    assert len(open_dataset(tmp_path / "data")) == 2

@@ -1,0 +1,275 @@
+import json
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from helpers.micro import to_opengl
+from PIL import Image
+
+from gamba_warp.cameras import orbit
+from gamba_warp.data.dataset import SPLITS, open_dataset, split_of, write_split
+from gamba_warp.errors import UserError
+
+FOV = math.radians(49.1)
+FOCAL = 0.5 / math.tan(FOV / 2)
+
+
+def viewmats(count):
+    return orbit(torch.arange(count) * 40.0, 15.0, 1.7)
+
+
+def write_picture(path, width=14, height=10, mark=0):
+    """Left half opaque in the colour (mark, 100, 50); right half transparent red."""
+    pixels = np.zeros((height, width, 4), np.uint8)
+    pixels[:, : width // 2] = (mark, 100, 50, 255)
+    pixels[:, width // 2 :] = (255, 0, 0, 0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, lossless=True, exact=True)
+
+
+def write_transforms(folder, count=3, suffix=".png", width=14, height=10, depth=False):
+    poses = to_opengl(viewmats(count).double()).tolist()
+    frames = []
+    for i in range(count):
+        name = f"images/{i:03d}{suffix}"
+        write_picture(folder / name, width, height, mark=i)
+        frames.append({"file_path": name, "transform_matrix": poses[i]})
+        if depth:
+            frames[-1]["depth_file_path"] = f"depth/{i}.png"
+            (folder / "depth").mkdir(exist_ok=True)
+            Image.fromarray(np.full((height, width), 1000 + i, np.uint16)).save(
+                folder / f"depth/{i}.png"
+            )
+    values = {
+        "w": width,
+        "h": height,
+        "fl_x": FOCAL * height,
+        "fl_y": FOCAL * height,
+        "cx": width / 2,
+        "cy": height / 2,
+        "name": "Red half",
+        "attribution": {"creator": "somebody"},
+        "depth_unit": 1e-3,
+        "frames": frames,
+    }
+    (folder / "transforms.json").write_text(json.dumps(values))
+    return folder / "transforms.json"
+
+
+def edit(path, **changes):
+    values = json.loads(path.read_text())
+    values.update(changes)
+    path.write_text(json.dumps(values))
+
+
+def test_transforms_layout(tmp_path):
+    write_transforms(tmp_path / "thing", depth=True)
+    data = open_dataset(tmp_path)
+    assert (data.uids, len(data), data.num_views(0), data.layout) == (["thing"], 1, 3, "transforms")
+    got = data.load("thing", views=[2, 0])
+    assert (got.uid, got.name) == ("thing", "Red half")
+    assert got.attribution == {"creator": "somebody"}
+    assert got.images.shape == (2, 10, 14, 4) and got.images.dtype == torch.float32
+    assert got.images[0, 0, 0].mul(255).round().tolist() == [2, 100, 50, 255]
+    assert (got.cameras.width, got.cameras.height) == (14, 10)
+    # float32 poses of a 1.7 unit orbit, inverted twice
+    torch.testing.assert_close(got.cameras.viewmats, viewmats(3)[[2, 0]], atol=1e-6, rtol=0)
+    want = [[FOCAL * 10, 0, 7], [0, FOCAL * 10, 5], [0, 0, 1]]
+    torch.testing.assert_close(got.cameras.Ks[1], torch.tensor(want))
+    assert got.depths.shape == (2, 10, 14)
+    assert got.depths[:, 3, 3].tolist() == pytest.approx([1.002, 1.0])
+
+
+def test_three_layouts_agree(tmp_path):
+    write_transforms(tmp_path / "a" / "thing", width=12, height=12)
+    for i, viewmat in enumerate(viewmats(3).double()):
+        c2w = torch.linalg.inv(viewmat).numpy()  # OpenCV axes
+        view = tmp_path / "b" / "0" / "10010" / "campos_512_v4" / f"{i:05d}"
+        write_picture(view / f"{i:05d}.png", 12, 12, mark=i)
+        axes = {k: c2w[:3, n].tolist() for n, k in enumerate(["x", "y", "z", "origin"])}
+        axes |= {"x_fov": FOV, "y_fov": FOV}
+        (view / f"{i:05d}.json").write_text(json.dumps(axes))
+        write_picture(tmp_path / "c" / "uid" / "rgba" / f"{i:03d}.png", 12, 12, mark=i)
+        c2w = to_opengl(viewmat).numpy()[:3].copy()
+        c2w[:, 3] *= 2  # its cube has side 2
+        (tmp_path / "c" / "uid" / "pose").mkdir(exist_ok=True)
+        np.save(tmp_path / "c" / "uid" / "pose" / f"{i:03d}.npy", c2w)
+    intrinsics = [[FOCAL * 12, FOCAL * 12], [6, 6], [12, 12]]
+    np.save(tmp_path / "c" / "uid" / "intrinsics.npy", np.array(intrinsics))
+
+    views = {}
+    for root, layout in (("a", "transforms"), ("b", "gobjaverse"), ("c", "openlrm")):
+        data = open_dataset(tmp_path / root)
+        assert data.layout == layout
+        views[layout] = data.load(0)
+    assert open_dataset(tmp_path / "b").uids == ["0/10010"]
+    for layout, got in views.items():
+        want = views["transforms"]
+        assert torch.equal(got.images, want.images), layout
+        # float32 poses
+        torch.testing.assert_close(got.cameras.viewmats, want.cameras.viewmats, atol=1e-5, rtol=0)
+        torch.testing.assert_close(got.cameras.Ks, want.cameras.Ks, msg=layout)
+
+
+def test_gobjaverse_without_a_stated_angle(tmp_path):
+    view = tmp_path / "campos_512_v4" / "00000"
+    write_picture(view / "00000.png", 16, 16)
+    c2w = torch.linalg.inv(viewmats(1)[0]).tolist()
+    axes = {k: [row[n] for row in c2w[:3]] for n, k in enumerate(["x", "y", "z", "origin"])}
+    (view / "00000.json").write_text(json.dumps(axes))
+    cameras = open_dataset(tmp_path).load(0).cameras
+    assert cameras.Ks[0, 0, 0].item() == pytest.approx(1422.222 / 1024 * 16)
+
+
+def test_one_object_folder_is_a_dataset(tmp_path):
+    write_transforms(tmp_path / "lamp")
+    data = open_dataset(tmp_path / "lamp")
+    assert data.uids == ["lamp"]
+    assert data.load(0).images.shape[0] == 3
+
+
+def test_blender_file(tmp_path):
+    path = write_transforms(tmp_path, count=1, width=8, height=8)
+    frame = json.loads(path.read_text())["frames"][0]
+    frame["file_path"] = "./images/000"
+    path.write_text(json.dumps({"camera_angle_x": FOV, "frames": [frame]}))
+    cameras = open_dataset(tmp_path).load(0, size=4).cameras
+    want = torch.tensor([[FOCAL * 4, 0, 2], [0, FOCAL * 4, 2], [0, 0, 1]])
+    torch.testing.assert_close(cameras.Ks[0], want)
+
+
+def test_resize_is_an_area_mean_without_bleeding(tmp_path):
+    write_transforms(tmp_path, count=1, suffix=".webp", width=14, height=10)
+    got = open_dataset(tmp_path).load(0, size=5)
+    assert got.images.shape == (1, 5, 7, 4)
+    # column 3 covers one opaque and one transparent column of the file
+    assert got.images[0, 2, 3, 3].item() == pytest.approx(0.5, abs=1 / 255)
+    # two 8-bit roundings at alpha 1/2
+    assert got.images[0, 2, 3, :3].mul(255).tolist() == pytest.approx([0, 100, 50], abs=2)
+    assert got.cameras.Ks[0, 0].tolist() == pytest.approx([FOCAL * 5, 0, 3.5])
+
+
+def test_only_asked_views_are_read_and_cache_is_equal(tmp_path):
+    write_transforms(tmp_path)
+    (tmp_path / "images" / "001.png").write_bytes(b"broken")
+    data = open_dataset(tmp_path, cache=True)
+    first = data.load(0, views=[2], size=5)
+    (tmp_path / "images" / "002.png").unlink()
+    again = data.load(0, views=[2], size=5)
+    assert torch.equal(first.images, again.images)
+    assert torch.equal(first.cameras.Ks, again.cameras.Ks)
+    with pytest.raises(UserError, match="002.png"):
+        data.load(0, views=[2])  # another size is not in the cache
+    assert pickle.loads(pickle.dumps(data)).uids == data.uids
+
+
+def test_split(tmp_path):
+    uids = [f"object{i:04d}" for i in range(400)]
+    counts = {name: sum(split_of(uid) == name for uid in uids) for name in SPLITS}
+    # binomial: three standard deviations of 400 draws at 0.8 and 0.1
+    assert abs(counts["train"] - 320) < 24 and abs(counts["test"] - 40) < 18
+    for uid in uids[:12]:
+        write_transforms(tmp_path / uid, count=1)
+    by_hash = {name: [u for u in uids[:12] if split_of(u) == name] for name in SPLITS}
+    assert open_dataset(tmp_path, "train").uids == by_hash["train"]
+    write_split(tmp_path, dict.fromkeys(uids[:12], "one group"))
+    group = split_of("one group")
+    assert len(open_dataset(tmp_path, group)) == 12
+    for other in set(SPLITS) - {group}:
+        with pytest.raises(UserError, match=f"12 objects is in the {other}"):
+            open_dataset(tmp_path, other)
+    assert len(open_dataset(tmp_path)) == 12
+
+
+def test_bad_split_file(tmp_path):
+    write_transforms(tmp_path / "a")
+    (tmp_path / "split.json").write_text('{"version": 7}')
+    with pytest.raises(UserError, match="split.json: version 7"):
+        open_dataset(tmp_path, "train")
+    (tmp_path / "split.json").write_text('{"version": 1, "train": ["a"], "test": ["a"]}')
+    with pytest.raises(UserError, match="in both train and test"):
+        open_dataset(tmp_path, "train")
+
+
+def nan_pose(path):
+    values = json.loads(path.read_text())
+    values["frames"][1]["transform_matrix"][0][3] = math.nan
+    path.write_text(json.dumps(values))
+
+
+def bad_pose(path):
+    values = json.loads(path.read_text())
+    values["frames"][1]["transform_matrix"] = [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    path.write_text(json.dumps(values))
+
+
+@pytest.mark.parametrize(
+    "spoil, message",
+    [
+        (lambda p: p.write_text("{"), "transforms.json: not valid JSON"),
+        (lambda p: p.write_bytes(b"\xff\xfe{"), "transforms.json: not valid JSON"),
+        (lambda p: p.write_text("[]"), "transforms.json: expected a JSON object"),
+        (lambda p: edit(p, frames=[]), "transforms.json: no frames"),
+        (lambda p: edit(p, fl_x=None), "frame 0: fl_x is None"),
+        (lambda p: edit(p, fl_x=-3), "must be positive"),
+        (lambda p: edit(p, frames=[{"file_path": "a.png"}]), "frame 0: no transform_matrix"),
+        (lambda p: edit(p, k1=0.1), "lens distortion"),
+        (lambda p: edit(p, w=15), "000.png: is 14x10, but its cameras are for 15x10"),
+        (nan_pose, "frame 1: the pose is not finite"),
+        (bad_pose, "frame 1: the pose's 3x3 part is not a rotation"),
+        (lambda p: (p.parent / "images/002.png").unlink(), "002.png: no such file"),
+        (lambda p: (p.parent / "images/002.png").write_bytes(b""), "002.png: the file is empty"),
+        (lambda p: write_picture(p.parent / "images/002.png", 8, 8), "002.png: is 8x8"),
+        (lambda p: (p.parent / "depth/1.png").unlink(), "1.png: no such file"),
+    ],
+)
+def test_bad_objects_name_the_file(tmp_path, spoil, message):
+    path = write_transforms(tmp_path / "thing", depth=True)
+    spoil(path)
+    with pytest.raises(UserError) as caught:
+        open_dataset(tmp_path).load(0)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_check_lists_every_bad_object(tmp_path):
+    for name in "abc":
+        write_transforms(tmp_path / name)
+    (tmp_path / "a" / "transforms.json").write_text("nonsense")
+    (tmp_path / "b" / "images" / "001.png").unlink()
+    bad = open_dataset(tmp_path).check()
+    assert set(bad) == {"a", "b"}
+    assert "001.png: no such file" in bad["b"]
+
+
+def test_bad_requests(tmp_path):
+    with pytest.raises(UserError, match="no such folder"):
+        open_dataset(tmp_path / "nowhere")
+    with pytest.raises(UserError, match="no objects found"):
+        open_dataset(tmp_path)
+    write_transforms(tmp_path / "a")
+    (tmp_path / ".a.tmp").mkdir()
+    (tmp_path / ".a.tmp" / "transforms.json").write_text("half written")
+    data = open_dataset(tmp_path)
+    assert data.uids == ["a"]
+    with pytest.raises(UserError, match="no object 'z'"):
+        data.load("z")
+    with pytest.raises(UserError, match="view 3 asked for, it has 3"):
+        data.load(0, views=[3])
+    with pytest.raises(UserError, match="no views"):
+        data.load(0, views=[])
+    with pytest.raises(UserError, match="size 0"):
+        data.load(0, size=0)
+    with pytest.raises(UserError, match="split 'tset'"):
+        open_dataset(tmp_path, "tset")
+    with pytest.raises(UserError, match="layout 'x'"):
+        open_dataset(tmp_path, layout="x")
+
+
+def test_openlrm_with_a_missing_pose(tmp_path):
+    write_picture(tmp_path / "u" / "rgba" / "000.png")
+    np.save(tmp_path / "u" / "intrinsics.npy", np.ones((3, 2)))
+    with pytest.raises(UserError, match="000.npy: cannot be read"):
+        open_dataset(tmp_path).load(0)

@@ -1,0 +1,387 @@
+import json
+
+import pytest
+import torch
+from helpers.micro import to_opengl
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
+from gamba_warp.cli import run
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.eval.views import baselines
+from gamba_warp.eval.views.baselines import Retrieval, background, billboard, input_copy
+from gamba_warp.eval.views.ceiling import Ceiling, open_ceiling
+from gamba_warp.eval.views.compare import Truth, ViewsProtocol, compare, load_truth, summary
+from gamba_warp.eval.views.contact_sheet import Row, choose_ranks, contact_sheet
+from gamba_warp.eval.views.table import differences_of, markdown, table_of
+from gamba_warp.fitting.config import FitConfig
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import load_rgba, save_image
+from gamba_warp.render import render
+
+WIDTH, HEIGHT = 45, 33
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Pictures this small take longer on several threads than on one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def truth_at(azimuths, elevation=0.0, distance=1.5, image=None):
+    """A truth whose input picture is ``image``, seen again from the other cameras."""
+    viewmats = torch.cat(
+        [orbit(torch.zeros(1)), orbit(torch.tensor(azimuths), elevation, distance)]
+    )
+    count = len(viewmats)
+    if image is None:
+        image = torch.rand(HEIGHT, WIDTH, 4)
+    cameras = Cameras(viewmats, intrinsics(WIDTH, HEIGHT, 40.0).expand(count, 3, 3), WIDTH, HEIGHT)
+    images = torch.cat([image[None], torch.rand(count - 1, HEIGHT, WIDTH, 4)])
+    return Truth("a", images, cameras, list(range(count)))
+
+
+def test_billboard_reproduces_the_input():
+    """Also with an axis off the centre, and a camera that looks past the object."""
+    truth = truth_at([30.0])
+    truth.cameras.Ks = truth.cameras.Ks.clone()
+    truth.cameras.Ks[:, 0, 2] += 3.3
+    truth.cameras.viewmats[0, :2, 3] = torch.tensor([0.1, -0.07])
+    rgb, mask = billboard(truth)
+    # float32 poses and pictures
+    assert (rgb[0] - truth.rgb[0]).abs().max() < 2e-5
+    assert (mask[0] == truth.mask[0]).all()
+
+
+def test_billboard_is_what_a_camera_sees_of_the_plane():
+    """Each picture against rays cut with the plane one by one, and a picture that is a formula."""
+    x = (torch.arange(WIDTH) + 0.5)[None, :].expand(HEIGHT, WIDTH)
+    y = (torch.arange(HEIGHT) + 0.5)[:, None].expand(HEIGHT, WIDTH)
+    image = torch.stack([x / WIDTH, y / HEIGHT, 0 * x, torch.ones_like(x)], -1)
+    # the last camera is so near that some of its rays run away from the plane
+    truth = truth_at([50.0, 200.0, 80.0], 20.0, torch.tensor([1.2, 1.2, 0.2]), image)
+    rgb, mask = billboard(truth)
+    focal, checked, away = truth.cameras.Ks[0, 0, 0].item(), 0, 0
+    for view in (1, 2, 3):
+        pose = torch.linalg.inv(truth.cameras.viewmats[view].double())
+        for row, column in ((16, 22), (12, 18), (20, 25), (9, 27), (2, 1), (16, 3), (16, 41)):
+            ray = torch.tensor([column + 0.5 - WIDTH / 2, row + 0.5 - HEIGHT / 2, focal])
+            ray = pose[:3, :3] @ ray.double()
+            depth = -pose[2, 3] / ray[2]
+            point = pose[:3, 3] + depth * ray
+            u = focal * point[0] / 1.5 + WIDTH / 2
+            v = focal * point[1] / 1.5 + HEIGHT / 2
+            if depth < 0:
+                away += 1
+                assert not mask[view, row, column]
+            elif 1 < u < WIDTH - 1 and 1 < v < HEIGHT - 1:
+                got, checked = rgb[view, row, column], checked + 1
+                assert abs(got[0] * WIDTH - u) < 1e-3 and abs(got[1] * HEIGHT - v) < 1e-3
+                assert mask[view, row, column]
+            elif not (-1 < u < WIDTH + 1 and -1 < v < HEIGHT + 1):
+                assert not mask[view, row, column] and (rgb[view, row, column] == 1).all()
+    assert checked >= 9 and away >= 1
+
+
+def test_billboard_from_behind_is_mirrored_and_edge_on_gone():
+    rgb, mask = billboard(truth := truth_at([180.0, 90.0]))
+    assert (rgb[1] - truth.rgb[0].flip(1)).abs().max() < 1e-4
+    assert (mask[1] == truth.mask[0].flip(1)).all()
+    assert not mask[2].any() and (rgb[2] == 1).all()
+
+
+def test_background_and_copy():
+    truth = truth_at([10.0, 20.0])
+    assert (background(truth)[0] == 1).all() and not background(truth)[1].any()
+    assert torch.equal(input_copy(truth)[0], truth.rgb[:1].expand(3, -1, -1, -1))
+
+
+SIZE = 32
+
+
+def blob(seed, squash=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    means = 0.25 * (2 * torch.rand(40, 3, generator=generator) - 1)
+    return Gaussians(
+        means=means * torch.tensor([1.0, squash, 1.0]),
+        quats=None,
+        scales=torch.full((40, 3), 0.05),
+        opacities=torch.full((40,), 0.95),
+        colors=torch.rand(3, generator=generator).expand(40, 3).clone(),
+    )
+
+
+def write_object(folder, gaussians, turn=0.0, count=6):
+    azimuths = torch.arange(count) * 60.0 + turn
+    cameras = Cameras(
+        orbit(azimuths, 15.0, 1.8), intrinsics(SIZE, SIZE, 45.0).expand(count, 3, 3), SIZE, SIZE
+    )
+    with torch.no_grad():
+        out = render(gaussians, cameras)
+    rgba = torch.cat([out.rgb / out.alpha.clamp(min=1e-6), out.alpha], -1)
+    folder.mkdir(parents=True)
+    frames = []
+    for v, pose in enumerate(to_opengl(cameras.viewmats)):
+        save_image(folder / f"{v}.png", rgba[v].numpy())
+        frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
+    focal = float(cameras.Ks[0, 0, 0])
+    top = {"w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(top))
+    _, scale = relative_to_reference(cameras.viewmats, cameras.viewmats[0])
+    moved = gaussians.transformed(cameras.viewmats[0, :3, :3], torch.zeros(3), scale.item())
+    moved.colors = 0.8 * moved.colors  # so that the prediction is good, not perfect
+    path = folder.parent.parent / "pred" / f"{folder.name}.ply"
+    path.parent.mkdir(exist_ok=True)
+    save_ply(path, moved)
+
+
+PROTOCOL = ViewsProtocol("test", 0, None, None, None, "not asked for", 1.5)
+
+
+@pytest.fixture
+def data(tmp_path):
+    """``twin`` is ``seen`` itself, its files beginning 120 degrees on."""
+    root = tmp_path / "data"
+    write_object(root / "seen", blob(0), 120.0)
+    write_object(root / "twin", blob(0))
+    write_object(root / "flat", blob(1, 0.3))
+    write_object(root / "other", blob(2))
+    split = {"version": 1, "train": ["flat", "other", "seen"], "val": [], "test": ["twin"]}
+    (root / "split.json").write_text(json.dumps(split))
+    return root
+
+
+def test_retrieval_finds_the_twin_and_its_views(data):
+    """The twin's view 0 is view 4 of ``seen``; from there on, the others follow by camera."""
+    retrieval = Retrieval(open_dataset(data, "train"))
+    truth = load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu")
+    uid, view, distance = retrieval.nearest(truth.images[0], "twin")
+    # the thumbnails are kept in 8 bits
+    assert (uid, view) == ("seen", 4) and distance < 0.01
+    rgb, mask = retrieval(truth)
+    assert (rgb - truth.rgb).abs().max() < 0.02 and (mask == truth.mask).all()
+
+
+def test_retrieval_leaves_out_the_object_itself(data):
+    dataset = open_dataset(data, "train")
+    retrieval = Retrieval(dataset)
+    picture = dataset.load("seen", [2]).images[0]
+    assert retrieval.nearest(picture, "twin")[:2] == ("seen", 2)
+    assert retrieval.nearest(picture, "seen")[0] in ("flat", "other")
+
+
+def test_retrieval_minds_both_shape_and_color(data):
+    retrieval = Retrieval(open_dataset(data, "train"))
+    picture = open_dataset(data).load("seen", [0]).images[0]
+    _, _, same = retrieval.nearest(picture, "")
+    painted = torch.cat([(picture[..., :3] + 0.3).clamp(0, 1), picture[..., 3:]], -1)
+    _, _, recolored = retrieval.nearest(painted, "")
+    _, _, moved = retrieval.nearest(picture.roll(4, 1), "")
+    assert same < 0.01 and 0.05 < recolored <= 0.31 and moved > 0.05
+
+
+def test_retrieval_is_by_both_terms_not_by_shape_alone(data, monkeypatch):
+    """Exhaustive comparison, against the search that stops early."""
+    monkeypatch.setattr(baselines, "_CHUNK", 1)
+    dyed = blob(0)
+    dyed.colors = 1 - dyed.colors
+    write_object(data / "dyed", dyed, 125.0)  # nearly the twin's shape, not its colour
+    split = {"version": 1, "train": ["dyed", "other", "seen"], "val": ["flat"], "test": ["twin"]}
+    (data / "split.json").write_text(json.dumps(split))
+    retrieval = Retrieval(open_dataset(data, "train"))
+    pictures = torch.cat([retrieval.training.load(uid).images for uid in retrieval.training.uids])
+    found = set()
+    for image in load_truth(open_dataset(data, "test"), "twin", PROTOCOL, "cpu").images:
+        for query in (image, torch.cat([1 - image[..., :3], image[..., 3:]], -1)):
+            uid, _, best = retrieval.nearest(query, "")
+            found.add(uid)
+            distances = []
+            for picture in pictures:
+                low = torch.minimum(picture[..., 3], query[..., 3])
+                high = torch.maximum(picture[..., 3], query[..., 3])
+                apart = (picture[..., :3] - query[..., :3]).abs().mean(-1)
+                distances.append(1 - low.sum() / high.sum() + (low * apart).sum() / low.sum())
+            assert best == pytest.approx(min(distances).item(), abs=0.01)  # 8-bit thumbnails
+    assert found == {"seen", "dyed"}
+
+
+def evaluate(data, out, *options):
+    places = ["--checkpoint", str(data.parent / "pred"), "--data", str(data), "--out", str(out)]
+    fixed = ["--no-lpips", "--device", "cpu", "--strips", "0", "--sheet", "1"]
+    code = run("eval-views", [*places, *fixed, *options])
+    path = out / "report.json"
+    return code, json.loads(path.read_text()) if path.exists() else None
+
+
+def test_a_whole_report(data, tmp_path, capsys):
+    code, report = evaluate(data, tmp_path / "out", "--ceiling", str(tmp_path / "pred"))
+    assert code == 0 and report["interrupted"] is False
+    names = ["background", "input_copy", "billboard", "retrieval", "ceiling"]
+    assert list(report["baselines"]) == list(report["protocol"]["baselines"]) == names
+    assert report["baselines"]["retrieval"]["psnr"] > 40 > report["baselines"]["billboard"]["psnr"]
+    # the predictions are the ceiling's own files, moved from a world to the same
+    assert abs(report["baselines"]["ceiling"]["psnr"] - report["mean"]["psnr"]) < 1e-3
+    assert report["protocol"]["uids"] == ["twin"] and report["protocol"]["split_version"] == 1
+    shown = (tmp_path / "out" / "table.md").read_text()
+    assert shown in capsys.readouterr().out
+    assert shown.count("| novel |") == 6 + 5 and shown.count("| input |") == 6 + 5
+    header, row = (tmp_path / "out" / "objects.csv").read_text().splitlines()
+    assert "baselines.billboard.input.psnr" in header and row.startswith("twin,ok,")
+    sheet = load_rgba(tmp_path / "out" / "contact_sheet.png")
+    assert sheet.shape[0] > 128 and sheet.shape[1] > 9 * 128
+
+
+def test_what_cannot_be_had_is_listed(data, tmp_path, capsys):
+    """A bad training picture: the retrieval goes on. No training split: it is left out."""
+    (data / "flat" / "3.png").write_bytes(b"nothing")
+    code, report = evaluate(data, tmp_path / "out")
+    assert code == 1 and report["num_failed"] == 0
+    assert [item["name"] for item in report["failures"]] == ["flat (retrieval)"]
+    assert "retrieval" in report["baselines"] and "flat (retrieval)" in capsys.readouterr().err
+    split = {"version": 1, "train": [], "val": ["flat"], "test": ["twin", "seen", "other"]}
+    (data / "split.json").write_text(json.dumps(split))
+    code, report = evaluate(data, tmp_path / "out", "--limit", "2")
+    assert code == 0 and "retrieval" not in report["baselines"]
+    assert "train split" in report["left_out_baselines"]["retrieval"]
+    assert report["num_ok"] == 2
+
+
+def test_no_output_folder(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    places = ["--checkpoint", "pred", "--data", "data", "--no-lpips", "--device", "cpu"]
+    capsys.readouterr()
+    assert run("eval-views", [*places, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["num_ok"] == 1
+    assert run("eval-views", [*places, "--csv"]) == 0
+    assert capsys.readouterr().out.startswith("name,status,psnr")
+    assert sorted(tmp_path.iterdir()) == before
+    for refused in (["--save-gaussians"], ["--json", "--csv"]):
+        assert run("eval-views", [*places, *refused]) == 2
+
+
+def test_single_view_objects_have_no_novel_views(data, tmp_path):
+    code, report = evaluate(data, tmp_path / "out", "--views", "1")
+    assert code == 0 and report["mean"]["psnr"] is None and report["mean"]["input"]["psnr"] > 15
+    assert {row["views"] for row in report["table"]} == {"input"}
+    assert (tmp_path / "out" / "contact_sheet.png").exists()
+
+
+def test_interrupted(data, tmp_path, monkeypatch, capsys):
+    from gamba_warp.eval.views import evaluate as views
+
+    original, seen = views.evaluate_object, []
+
+    def second_time(job, uid, *rest):
+        seen.append(uid)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return original(job, uid, *rest)
+
+    monkeypatch.setattr(views, "evaluate_object", second_time)
+    code, report = evaluate(data, tmp_path / "out", "--split", "all")
+    assert code == 130 and report["interrupted"] is True
+    assert report["num_ok"] == 1 and len(report["protocol"]["uids"]) == 4
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
+    from gamba_warp.eval.views import ceiling as module
+
+    fitted, calls = module.fit, []
+
+    def counted(*args):
+        calls.append(1)
+        return fitted(*args)
+
+    monkeypatch.setattr(module, "fit", counted)
+    dataset = open_dataset(data)
+
+    def make(steps=25, protocol=PROTOCOL):
+        config = FitConfig(steps=steps, gaussians=150)
+        return Ceiling(dataset, protocol, "cpu", tmp_path / "ceiling", ["flat"], config)
+
+    truth = load_truth(dataset, "flat", PROTOCOL, "cpu")
+    first = make()(truth)
+    # 25 steps are enough to be better than an empty picture by far
+    better = summary(compare({"": first}, truth)[""])["psnr"]
+    assert better > 3 + summary(compare({"": background(truth)}, truth)[""])["psnr"]
+    assert torch.allclose(make()(truth)[0], first[0], atol=1e-5) and len(calls) == 1  # .ply logits
+    make(26)(truth)
+    assert len(calls) == 2  # other settings
+    path = tmp_path / "ceiling" / "flat.ply"
+    assert load_ply(path).num > 0
+    assert make(26)(load_truth(dataset, "other", PROTOCOL, "cpu")) is None
+    path.with_suffix(".json").write_text("{")
+    make(26)(truth)
+    assert len(calls) == 3  # a file that nothing vouches for
+    # another input view and distance: the same Gaussians, in another world
+    moved = ViewsProtocol("test", 2, None, None, None, None, 2.5)
+    again = make(26, moved)(load_truth(dataset, "flat", moved, "cpu"))
+    same = make(26)(truth)
+    assert (again[0][0] - same[0][2]).abs().max() < 1e-3 and len(calls) == 3
+
+
+def test_ceiling_of_so_many_objects(data, tmp_path):
+    dataset = open_dataset(data)
+    ceiling = open_ceiling("2", dataset, dataset.uids, PROTOCOL, "cpu", tmp_path, 7)
+    assert ceiling.uids == ["flat", "seen"] and ceiling.config.steps == 7  # of 4, evenly spaced
+    assert ceiling.folder == tmp_path / "ceiling"
+
+
+@pytest.mark.parametrize("wanted", ["0", "absent", "-3"])
+def test_ceiling_of_nothing(data, wanted, tmp_path):
+    (tmp_path / "empty").mkdir()
+    dataset = open_dataset(data)
+    for value in (wanted, str(tmp_path / "empty")):
+        with pytest.raises(UserError, match="--ceiling"):
+            open_ceiling(value, dataset, dataset.uids, PROTOCOL, "cpu", None, 5)
+
+
+def record(psnr, novel=True, lpips=None):
+    values = {"psnr": psnr, "ssim": 0.5, "lpips": lpips, "mask_iou": 0.25}
+    none = dict.fromkeys(values)
+    return {**(values if novel else none), "input": {**values, "psnr": psnr + 1}}
+
+
+def test_table_and_differences():
+    model = {"a": record(20.0), "b": record(24.0), "c": record(31.0, novel=False)}
+    other = {"b": record(21.0), "a": record(19.0)}
+    rows = table_of({"model": model, "other": other})
+    assert [(r["views"], r["name"], r["objects"]) for r in rows] == [
+        ("novel", "model", 2),
+        ("novel", "other", 2),
+        ("input", "model", 3),
+        ("input", "other", 2),
+    ]
+    assert rows[0]["psnr"]["mean"] == 22 and rows[0]["psnr"]["interval"] == [20, 24]
+    difference, _ = differences_of(model, {"other": other})
+    assert difference["psnr"] == {"mean": 2.0, "interval": [1.0, 3.0]}  # paired: 1 and 3
+    assert difference["lpips"] == {"mean": None, "interval": None}
+    text = markdown([difference], signed=True).splitlines()
+    assert len({len(line) for line in text}) == 1
+    assert "+2.00 [1.00, 3.00]" in text[2] and "absent" in text[2]
+
+
+def test_contact_sheet(tmp_path):
+    assert list(choose_ranks(111, 2).items()) == [
+        *((0, "best"), (1, "best"), (54, "median")),
+        *((55, "median"), (109, "worst"), (110, "worst")),
+    ]
+    assert list(choose_ranks(3, 2)) == [0, 1, 2] and choose_ranks(1, 2) == {0: "best"}
+    assert choose_ranks(0, 2) == {}
+    red, blue = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, 1.0])
+    flat = torch.ones(20, 40, 3)
+    rows = [
+        Row(["one"], flat * red, flat[None] * blue, flat[None] * red),
+        Row(["two"], flat * red, flat.expand(2, -1, -1, -1), flat.expand(2, -1, -1, -1)),
+    ]
+    contact_sheet(tmp_path / "sheet.png", rows)
+    sheet = load_rgba(tmp_path / "sheet.png")[..., :3]
+    columns = [int(x) for x in (sheet[22 + 64] == [0, 0, 1]).all(-1).nonzero()[0][[0, -1]]]
+    assert 120 < columns[1] - columns[0] < 128  # one tile of blue, 128 wide less its outline
+    assert (sheet[22 + 64, columns[0] - 64] == [1, 0, 0]).all()  # the input, to its left

@@ -1,0 +1,355 @@
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from gamba_warp.cli import run
+from gamba_warp.errors import UserError
+from gamba_warp.eval.shapes.alignment import icp, match_moments
+from gamba_warp.eval.shapes.compare import compare, syncdreamer_points
+from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
+from gamba_warp.eval.shapes.occupancy import (
+    VOTERS,
+    fibonacci_sphere,
+    grid_around,
+    parity,
+    solid,
+    syncdreamer_grid,
+)
+from gamba_warp.eval.shapes.protocol import PRESETS
+from gamba_warp.eval.shapes.sample import sample
+from gamba_warp.eval.shapes.shape import Mesh, Similarity
+from gamba_warp.formats.ply import save_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.surfaces.cleaning import cleaned_mesh
+from gamba_warp.surfaces.density import opacity_volume
+from gamba_warp.surfaces.extract import SurfaceOptions
+
+
+def as_mesh(source, move=(0.0, 0, 0)):
+    return Mesh(np.array(source.vertices) + move, np.array(source.faces))
+
+
+def cube(move=(0.0, 0, 0), side=1.0):
+    return as_mesh(trimesh.creation.box((side,) * 3), move)
+
+
+def ball(radius, move=(0.0, 0, 0)):
+    return as_mesh(trimesh.creation.icosphere(4, radius), move)
+
+
+def join(*meshes):
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
+def protocol(**options):
+    name = options.pop("name", "default")
+    return replace(PRESETS[name], num_points=20000, **options)
+
+
+def shell(radius, count=4000, sigma=0.012):
+    means = radius * torch.from_numpy(fibonacci_sphere(count)).float()
+    return Gaussians(
+        means=means,
+        quats=None,
+        scales=torch.full((count, 3), sigma),
+        opacities=torch.full((count,), 0.9),
+        colors=torch.rand(count, 3),
+    )
+
+
+@pytest.mark.parametrize("name", ["default", "syncdreamer"])
+def test_a_shape_and_itself(name):
+    got = compare(ball(0.5), ball(0.5), protocol(name=name))
+    assert got["iou"] == 1
+    # two draws of points differ by the noise floor; the cameras' points do not differ at all
+    assert abs(got["chamfer"] - got["noise_floor"]) <= 0.05 * got["noise_floor"]
+    assert got["fscore"]["0.02"] > 0.999
+
+
+@pytest.mark.parametrize("voxels", [8, 32])
+def test_cubes_shifted(voxels):
+    """A shift by a quarter: intersection 3/4, union 5/4."""
+    a, b = cube(), cube((0.25, 0, 0))
+    grid = grid_around(a, b, resolution=voxels)
+    inside = [solid(mesh, grid) for mesh in (a, b)]
+    assert np.sum(inside[0] & inside[1]) / np.sum(inside[0] | inside[1]) == 0.6
+    assert np.sum(inside[0]) == voxels**3
+
+
+def test_spheres():
+    got = compare(ball(0.45), ball(0.5), protocol())
+    assert abs(got["iou"] - 0.9**3) < 0.01  # voxels of 1/64
+    assert abs(got["chamfer"] - 0.05) < 0.002  # distances of samples are a little longer
+    assert abs(got["chamfer_squared"] - 0.05**2) < 2e-4
+    assert got["normal_consistency"] > 0.99
+
+
+def test_solid_fills_cavities_and_unites_parts():
+    hollow = join(cube(), cube(side=0.5))
+    grid = grid_around(hollow, resolution=16)
+    assert solid(hollow, grid).sum() == 16**3
+    overlapping = join(cube(), cube((0.5, 0, 0)))
+    grid = grid_around(overlapping, resolution=16)
+    assert solid(overlapping, grid).sum() == 1.5 * 16**3
+    assert parity(overlapping, grid).sum() == 16**3  # which is why parity alone will not do
+
+
+def test_solid_of_open_meshes():
+    full = cube()
+    middles = full.vertices[full.faces].mean(1)[:, 1]
+    grid = grid_around(full, resolution=16)
+    for keep, least in ((middles < 0.4, 0.95), (np.abs(middles) < 0.4, 0.85)):
+        opened = Mesh(full.vertices, full.faces[keep])  # without lid; without lid and bottom
+        assert not opened.is_closed() and full.is_closed()
+        share = solid(opened, grid).sum() / 16**3
+        assert least < share <= 1  # only the mouth is lost
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3, 0.9, 1.57])
+def test_solid_of_a_sheet(tilt):
+    side, rise = math.cos(tilt), math.sin(tilt)
+    corners = [[-0.4, 0, 0], [0.4, 0, 0], [0.4, side, rise], [-0.4, side, rise]]
+    sheet = Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+    assert not solid(sheet, grid_around(sheet, resolution=32)).any()
+    half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
+    assert (half[:, 2] > 0).all()  # so no direction is also among the opposites
+
+
+def test_syncdreamer_sees_from_above():
+    points = syncdreamer_points(cube()).positions
+    low, high = points.min(0), points.max(0)
+    assert np.allclose(high, 0.5, atol=1e-3) and low[0] < -0.499 and low[1] < -0.499
+    assert np.mean(points[:, 2] > 0.499) > 0.15  # the top, one of five sides seen
+    inside = np.abs(points[:, :2]).max(1) < 0.49
+    assert points[inside, 2].min() > 0.49  # the bottom is not seen
+    spacing = len(points) / 5
+    assert 0.8e4 < spacing < 2.5e4  # a mean point a voxel of 0.01: about 1e4 a side
+
+
+def test_unmerged_corners_are_still_closed():
+    corners = cube().vertices[cube().faces].reshape(-1, 3)
+    assert Mesh(corners, np.arange(36).reshape(12, 3)).is_closed()
+
+
+def test_syncdreamer_lattice():
+    grid = syncdreamer_grid()
+    points = grid.points()
+    assert points.shape == (64, 64, 64, 3)
+    assert points[0, 0, 0].tolist() == [-1, -1, -1] and points[1, 0, 0, 0] == -1 + 1 / 32
+    volume = parity(ball(0.5), grid).sum() / 32**3
+    assert abs(volume - math.pi / 6) < 0.01
+
+
+def test_density_of_one_gaussian():
+    turn = torch.tensor([[math.cos(0.4), 0, 0, math.sin(0.4)]])
+    one = Gaussians(
+        means=torch.tensor([[0.1, -0.2, 0.3]]),
+        quats=turn,
+        scales=torch.tensor([[0.2, 0.05, 0.1]]),
+        opacities=torch.tensor([0.7]),
+        colors=torch.zeros(1, 3),
+    )
+    volume, origin = opacity_volume(one, 32)
+    axes = [origin[k] + np.arange(volume.shape[k]) / 32 for k in range(3)]
+    at = np.stack(np.meshgrid(*axes, indexing="ij"), -1) - one.means.numpy()
+    c, s = math.cos(0.8), math.sin(0.8)
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    squared = ((at @ rotation / one.scales.numpy()) ** 2).sum(-1)
+    want = 0.7 * np.exp(-squared / 2)
+    assert np.abs(volume - want).max() < 0.0051  # what is under 0.005 is cut
+
+
+def test_density_of_many_is_the_union():
+    """Boxes of every size are visited once."""
+    generator = torch.Generator().manual_seed(0)
+    count = 40
+    many = Gaussians(
+        means=torch.rand(count, 3, generator=generator) - 0.5,
+        quats=None,
+        scales=0.005 + 0.1 * torch.rand(count, 3, generator=generator) ** 2,
+        opacities=0.05 + 0.9 * torch.rand(count, generator=generator),
+        colors=torch.zeros(count, 3),
+    )
+    volume, origin = opacity_volume(many, 16)
+    axes = [torch.from_numpy(origin[k] + np.arange(volume.shape[k]) / 16) for k in range(3)]
+    at = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    clear = torch.ones(at.shape[:3], dtype=torch.float64)
+    for k in range(count):
+        squared = ((at - many.means[k]) / many.scales[k]).square().sum(-1)
+        alpha = many.opacities[k] * torch.exp(-0.5 * squared)
+        clear *= 1 - torch.where(alpha < 0.005, 0.0, alpha)
+    error = np.abs(volume - (1 - clear.numpy()))
+    assert error.max() < 0.05 and error.mean() < 2e-3  # tails under 0.005 differ
+
+
+def test_density_of_a_shell():
+    """One closed surface, filled, outside the centres by about the Gaussians' width."""
+    sigma = 0.012
+    mesh = to_surface(shell(0.4, sigma=sigma), SurfaceOptions(method="density", voxels=64), 0, 0)
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert mesh.is_closed()
+    assert radii.min() > 0.4  # no inner wall
+    assert abs(radii.mean() - 0.4) < 2.5 * sigma
+    grid = grid_around(mesh, resolution=32)
+    assert abs(solid(mesh, grid).sum() / 32**3 - 4 / 3 * math.pi * radii.mean() ** 3) < 0.01
+
+
+def test_tsdf_of_a_shell():
+    rasterize = pytest.importorskip("gamba_warp.kernels.rasterize")
+    if not hasattr(rasterize, "rasterization"):
+        pytest.skip("the rasterizer is not there")
+    options = SurfaceOptions(voxels=64, views=24, pixels=96)
+    mesh = to_surface(shell(0.4), options, 0, 0)
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert abs(np.median(radii) - 0.4) < 1 / 64  # within a voxel
+    assert np.mean(np.abs(radii - 0.4) < 2 / 64) > 0.98
+    grid = grid_around(mesh, resolution=32)
+    assert abs(solid(mesh, grid).sum() / 32**3 - 4 / 3 * math.pi * 0.4**3) < 0.03
+
+
+def test_centers_are_drawn_by_opacity():
+    one = shell(0.4, count=2)
+    one.opacities = torch.tensor([0.25, 0.75])
+    points = to_surface(one, SurfaceOptions(method="centers"), 0, 4000).positions
+    share = np.mean(np.abs(points - one.means[1].numpy()).max(1) < 1e-6)
+    assert abs(share - 0.75) < 0.03  # four standard deviations of 4000 draws
+
+
+@pytest.mark.parametrize("method", ["density", "centers", "tsdf"])
+def test_nothing_visible(method):
+    faint = shell(0.4, count=50)
+    faint.opacities = torch.zeros(50)
+    with pytest.raises(UserError, match="Gaussian"):
+        to_surface(faint, SurfaceOptions(method=method), 0, 10)
+
+
+def test_cleaning_drops_specks():
+    speck = as_mesh(trimesh.creation.icosphere(0, 0.02), (0.8, 0, 0))
+    whole = join(ball(0.4), speck)
+    kept = Mesh(*cleaned_mesh(whole.vertices, whole.faces, min_component=0.01))
+    assert len(kept.faces) == len(ball(0.4).faces)
+
+
+def test_points_are_repeatable_and_area_uniform():
+    a, b, c = (sample(cube(), 30000, seed) for seed in (3, 3, 4))
+    assert np.array_equal(a.positions, b.positions)
+    assert not np.array_equal(a.positions, c.positions)
+    top = np.mean(a.positions[:, 2] > 0.4999999)
+    assert abs(top - 1 / 6) < 0.009  # four standard deviations
+    assert np.abs(np.abs(a.normals).max(1) - 1).max() < 1e-6
+
+
+def test_similarity_moves_all_kinds_alike():
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    motion = Similarity(turn, np.array([0.1, 0.2, 0.3]), 2.0)
+    one = shell(0.4, count=9)
+    moved = motion.apply(one)
+    want = motion.points(one.means.double().numpy())
+    assert np.abs(moved.means.numpy() - want).max() < 1e-6
+    assert torch.allclose(moved.scales, 2 * one.scales)
+    mesh = motion.apply(cube())
+    assert np.allclose(mesh.vertices, 2 * cube().vertices @ turn.T + [0.1, 0.2, 0.3])
+
+
+def test_alignment():
+    truth = as_mesh(trimesh.creation.box((1.0, 0.6, 0.3)))
+    small = Similarity(np.eye(3), np.array([0.2, -0.1, 0.05]), 0.5).apply(truth)
+    got = compare(small, truth, protocol(align="scale"))
+    assert abs(got["alignment"]["scale"] - 2) < 0.02 and got["iou"] > 0.95
+    angle = 0.15
+    turn = np.array(
+        [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]]
+    )
+    turned = Similarity(turn, np.array([0.05, 0, 0]), 1.1).apply(truth)
+    points = [sample(mesh, 5000, seed) for seed, mesh in enumerate((turned, truth))]
+    motion, residual = icp(*points)
+    assert np.abs(motion.rotation @ turn - np.eye(3)).max() < 0.03
+    assert residual["fitness"] > 0.99 and residual["inlier_rmse"] < 0.03
+    single = sample(truth, 1, 0)
+    with pytest.raises(UserError, match="one"):
+        match_moments(single, points[0])
+
+
+def test_truth_is_normalised_and_turned(tmp_path):
+    trimesh.creation.box((2.0, 4.0, 1.0)).apply_translation([5, 5, 5]).export(tmp_path / "a.obj")
+    truth, motion = load_truth(tmp_path / "a.obj", protocol())  # y-up by its suffix
+    mesh = truth.shape
+    assert np.allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.25, 1.0])
+    again = motion.apply(load_shape(tmp_path / "a.obj"))
+    assert np.allclose(np.unique(again.vertices, axis=0), mesh.vertices)
+
+
+def run_geometry(tmp_path, *options):
+    arguments = [str(tmp_path / "pred"), str(tmp_path / "gt"), "--out", str(tmp_path / "out")]
+    code = run("eval-geometry", [*arguments, "--points", "2000", *options])
+    path = tmp_path / "out" / "report.json"
+    return code, json.loads(path.read_text()) if path.exists() else None
+
+
+def export(path, source):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    source.export(path)
+
+
+def test_batch_lists_every_failure(tmp_path):
+    box = trimesh.creation.box((1.0, 1, 1))
+    for name in ("good.ply", "sub/cloud.ply", "faceless.obj", "nan.ply", "noise.ply", "lone.obj"):
+        export(tmp_path / "gt" / name, box)
+    export(tmp_path / "pred" / "good.stl", box)
+    export(tmp_path / "pred" / "extra.stl", box)
+    export(tmp_path / "pred" / "sub" / "cloud.ply", trimesh.PointCloud(box.sample(500)))
+    (tmp_path / "pred" / "faceless.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    broken = trimesh.PointCloud(np.array([[0.0, 0, 0], [math.nan, 0, 0]]))
+    export(tmp_path / "pred" / "nan.ply", broken)
+    (tmp_path / "pred" / "noise.ply").write_bytes(b"nothing")
+    code, report = run_geometry(tmp_path)
+    assert code == 1
+    reasons = {item["name"]: item["reason"] for item in report["failures"]}
+    assert reasons.keys() == {"extra", "lone", "faceless", "nan", "noise"}
+    assert reasons["lone"] == "no prediction" and reasons["extra"] == "no ground truth"
+    assert "no faces" in reasons["faceless"] and "not finite" in reasons["nan"]
+    done = {record["name"]: record for record in report["objects"] if record["status"] == "ok"}
+    assert done.keys() == {"good", "sub/cloud"}
+    assert done["good"]["iou"] == 1 and done["good"]["kind"] == "mesh"
+    assert done["sub/cloud"]["iou"] is None and done["sub/cloud"]["kind"] == "points"
+    assert report["mean"]["iou"] == 1 and report["num_failed"] == 5
+    assert len((tmp_path / "out" / "objects.csv").read_text().splitlines()) == 8
+
+
+def test_gaussians_against_a_ball(tmp_path):
+    export(tmp_path / "gt" / "a.ply", trimesh.creation.icosphere(4, 0.5))
+    (tmp_path / "pred").mkdir()
+    save_ply(tmp_path / "pred" / "a.ply", shell(0.5, sigma=0.012))
+    code, report = run_geometry(tmp_path, "--surface", "density", "--voxels", "48")
+    assert code == 0
+    assert report["protocol"]["surface"]["method"] == "density"
+    assert report["objects"][0]["kind"] == "gaussians"
+    assert report["mean"]["chamfer"] < 0.04 and report["mean"]["iou"] > 0.85
+
+
+@pytest.mark.parametrize("case", ["missing", "empty", "mixed", "few", "data"])
+def test_what_cannot_start(tmp_path, case, capsys):
+    (tmp_path / "pred").mkdir()
+    export(tmp_path / "gt" / "a.obj", trimesh.creation.box((1.0, 1, 1)))
+    options = []
+    if case == "missing":
+        (tmp_path / "pred").rmdir()
+    if case == "mixed":
+        (tmp_path / "pred").rmdir()
+        export(tmp_path / "pred.obj", trimesh.creation.box((1.0, 1, 1)))
+        (tmp_path / "pred.obj").rename(tmp_path / "pred")
+    if case == "few":
+        options = ["--voxels", "2"]
+    if case == "data":
+        options = ["--frame", "reference"]
+    code, report = run_geometry(tmp_path, *options)
+    assert code == 2 and report is None
+    names = {"few": "--voxels", "data": "--data", "mixed": "two files"}
+    assert names.get(case, str(tmp_path / "pred")) in capsys.readouterr().err

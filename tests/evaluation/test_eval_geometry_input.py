@@ -1,0 +1,382 @@
+"""What ``gamba eval-geometry`` reads, refuses and says about its input."""
+
+import json
+import os
+import struct
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from gamba_warp.cli import run
+from gamba_warp.errors import UserError
+from gamba_warp.eval.shapes.flags import tidied
+from gamba_warp.eval.shapes.load import load_shape
+from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
+from gamba_warp.eval.shapes.shape import Mesh
+from gamba_warp.formats.ply import save_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.open3d import import_open3d
+
+MANY = 10**12
+
+
+def box(side=1.0, move=(0.0, 0, 0)):
+    mesh = trimesh.creation.box((side, side, side))
+    mesh.apply_translation(move)
+    return mesh
+
+
+def as_mesh(source):
+    return Mesh(np.array(source.vertices), np.array(source.faces))
+
+
+def evaluate(capfd, *arguments):
+    """Exit code, and the report printed on stdout, which must hold nothing else."""
+    words = [str(word) for word in arguments]
+    code = run("eval-geometry", [*words, "--points", "1000", "--json"])
+    printed = capfd.readouterr()
+    return code, json.loads(printed.out) if code != 2 else printed.err
+
+
+def ply(elements, body, layout="binary_little_endian"):
+    lines = ["ply", f"format {layout} 1.0", *elements, "end_header", ""]
+    return "\n".join(lines).encode() + body
+
+
+def vertices_of(count):
+    return [f"element vertex {count}", *(f"property float {axis}" for axis in "xyz")]
+
+
+def faces_of(count, kind="uchar"):
+    return [f"element face {count}", f"property list {kind} int vertex_indices"]
+
+
+def glb(accessor, length=None):
+    tree = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126, "type": "VEC3", **accessor}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36}],
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, length or 12 + 8 + len(text) + 8 + 36)
+    first = struct.pack("<I4s", length or len(text), b"JSON") + text
+    return head + first + struct.pack("<I4s", 36, b"BIN\0") + bytes(36)
+
+
+def pcd(count, data, body):
+    lines = ["VERSION 0.7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1"]
+    lines += [f"WIDTH {count}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}"]
+    return "\n".join([*lines, f"DATA {data}", ""]).encode() + body
+
+
+TRIANGLE = np.eye(3, dtype="<f4").tobytes()
+FACE = struct.pack("<B3i", 3, 0, 1, 2)
+BOTH = [*vertices_of(3), *faces_of(1)]
+LIES = {
+    "vertices.ply": ply([*vertices_of(MANY), *faces_of(1)], TRIANGLE + FACE),
+    "points.ply": ply(vertices_of(MANY), TRIANGLE),
+    "fewer.ply": ply(vertices_of(2), TRIANGLE),
+    "faces.ply": ply([*vertices_of(3), *faces_of(MANY)], TRIANGLE + FACE),
+    "few_faces.ply": ply([*vertices_of(3), *faces_of(1)], TRIANGLE + FACE * 2),
+    "list.ply": ply(
+        [*vertices_of(3), *faces_of(1, "uint")], TRIANGLE + struct.pack("<I3i", 2**31, 0, 1, 2)
+    ),
+    "mixed.ply": ply(
+        [*vertices_of(3), *faces_of(2)], TRIANGLE + FACE + struct.pack("<B3i", 4, 0, 1, 2)
+    ),
+    "negative.ply": ply(
+        [*vertices_of(3), *faces_of(2, "char")], TRIANGLE + FACE + struct.pack("<b3i", -3, 0, 1, 2)
+    ),
+    "text.ply": ply([*vertices_of(MANY), *faces_of(1)], b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "ascii"),
+    "digits.ply": ply(vertices_of("9" * 30), TRIANGLE),
+    "endless.ply": b"ply\nformat ascii 1.0\n" + b"comment x\n" * 10,
+    "gaussians.ply": ply([f"element vertex {MANY}", "property float opacity"], TRIANGLE),
+    "count.stl": bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(50),
+    "short.stl": bytes(60),
+    "count.off": f"OFF\n{MANY} {MANY} 0\n0 0 0\n0 1 0\n1 0 0\n3 0 1 2\n".encode(),
+    "index.obj": f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 {MANY}\n".encode(),
+    "long_index.obj": f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 {10**25}\n".encode(),
+    "chunk.glb": glb({"bufferView": 0, "count": 3}, length=2**32 - 1),
+    "count.glb": glb({"bufferView": 0, "count": MANY}),
+    "zeros.glb": glb({"count": MANY}),
+    "raw.pcd": pcd(MANY, "binary", TRIANGLE),
+    "text.pcd": pcd(MANY, "ascii", b"0 0 0\n"),
+    "packed.pcd": pcd(10**8, "binary_compressed", struct.pack("<II", 20, 12 * 10**8) + bytes(20)),
+    "broken.pcd": b"VERSION 0.7\nDATA binary\n",
+    "count.pts": f"{MANY}\n0 0 0\n1 1 1\n".encode(),
+}
+
+
+@pytest.fixture
+def frugal():
+    """A gigabyte more of address space than now: what trusts such a header runs into it."""
+    import resource
+
+    import_open3d()
+    with open("/proc/self/statm") as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_false_counts_cost_nothing(tmp_path, name, frugal):
+    path = tmp_path / name
+    path.write_bytes(LIES[name])
+    with pytest.raises(UserError, match=name):
+        load_shape(path)
+
+
+def test_true_counts_pass(tmp_path):
+    """The same builders with the truth, and quads beside triangles."""
+    quad = struct.pack("<B4i", 4, 0, 1, 2, 0)
+    good = {
+        "a.ply": ply(BOTH, TRIANGLE + FACE),
+        "b.ply": ply([*vertices_of(3), *faces_of(2)], TRIANGLE + quad + FACE),
+        "c.ply": ply(vertices_of(3), TRIANGLE),
+        "d.ply": ply(BOTH, b"1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n", "ascii"),
+        "e.glb": glb({"bufferView": 0, "count": 3}),
+        "f.pcd": pcd(3, "binary", TRIANGLE),
+        "g.pcd": pcd(3, "ascii", b"1 0 0\n0 1 0\n0 0 1\n"),
+        "h.pts": b"3\n1 0 0\n0 1 0\n0 0 1\n",
+    }
+    for name, content in good.items():
+        (tmp_path / name).write_bytes(content)
+        if name != "e.glb":  # its three points are one
+            shape = load_shape(tmp_path / name)
+            got = shape.vertices if isinstance(shape, Mesh) else shape.positions
+            assert sorted(got.tolist()) == sorted(np.eye(3).tolist()), name
+
+
+BAD = {
+    "empty": (b"", "empty"),
+    "blank": (ply(vertices_of(0), b""), "no points"),
+    "nan": (ply(BOTH, np.full((3, 3), np.nan, "<f4").tobytes() + FACE), "not finite"),
+    "inf_cloud": (ply(vertices_of(3), np.full((3, 3), np.inf, "<f4").tobytes()), "not finite"),
+    "huge": (ply(BOTH, (1e30 * np.eye(3, dtype="<f4")).tobytes() + FACE), "1e+30"),
+    "far": (ply(BOTH, (1e9 * np.eye(3, dtype="<f4")).tobytes() + FACE), "longest side"),
+    "flat": (ply(BOTH, np.diag([1, 1, 0]).astype("<f4")[[0, 0, 1]].tobytes() + FACE), "no area"),
+    "lies": (LIES["vertices.ply"], "false header"),
+    "half": (ply(["element vertex 1", "property float scale_0"], bytes(4)), "not Gaussians"),
+    "noise": (b"nothing", "not a .ply"),
+}
+
+
+@pytest.mark.parametrize("side", ["pred", "gt"])
+def test_bad_files_are_named_and_the_others_done(tmp_path, side, capfd):
+    for folder in ("pred", "gt"):
+        (tmp_path / folder).mkdir()
+        for name in [*BAD, "good"]:
+            box().export(tmp_path / folder / f"{name}.ply")
+    for name, (content, _) in BAD.items():
+        (tmp_path / side / f"{name}.ply").write_bytes(content)
+    box().export(tmp_path / side / "lone.obj")
+    code, report = evaluate(capfd, tmp_path / "pred", tmp_path / "gt")
+    reasons = {item["name"]: item["reason"] for item in report["failures"]}
+    expected = {name: reason for name, (_, reason) in BAD.items()}
+    if side == "gt":
+        del expected["far"]  # the truth sets the unit
+    assert code == 1
+    for name, reason in expected.items():
+        assert reason in reasons.pop(name), name
+    assert set(reasons) <= {"lone", "far"} and "lone" in reasons
+    done = [record for record in report["objects"] if record["status"] == "ok"]
+    assert [r["name"] for r in done] == (["far", "good"] if side == "gt" else ["good"])
+    assert done[-1]["iou"] == 1
+    assert report["num_failed"] == len(report["failures"]) == len(BAD) + (side == "pred")
+
+
+def test_gaussians_that_lack_an_attribute(tmp_path, capfd):
+    count = 5
+    path = tmp_path / "a.ply"
+    gaussians = Gaussians(
+        torch.rand(count, 3), None, torch.rand(count, 3), torch.rand(count), torch.rand(count, 3)
+    )
+    save_ply(path, gaussians)
+    box().export(tmp_path / "gt.ply")
+    for gone in (b"f_dc_1", b"opacity", b"scale_2", b"rot_0"):
+        broken = tmp_path / "broken.ply"
+        broken.write_bytes(path.read_bytes().replace(gone, b"other"))
+        code, report = evaluate(capfd, broken, tmp_path / "gt.ply")
+        assert code == 1 and f"no property {gone.decode()}" in report["failures"][0]["reason"]
+    code, report = evaluate(capfd, tmp_path / "gt.ply", path)
+    assert code == 1 and "Gaussians" in report["failures"][0]["reason"]
+
+
+def changed(faces=None, more=None):
+    mesh = as_mesh(box())
+    mesh.faces = mesh.faces if faces is None else faces(mesh.faces)
+    return mesh if more is None else as_mesh(trimesh.util.concatenate([box(), more]))
+
+
+FLAGGED = {
+    "open": changed(lambda f: f[1:]),
+    "inverted": changed(lambda f: f[:, ::-1]),
+    "inconsistent": changed(lambda f: np.concatenate([f[:1, ::-1], f[1:]])),
+    "degenerate": changed(lambda f: np.concatenate([f, [[0, 1, 1]]])),
+    "duplicate": changed(lambda f: np.concatenate([f, f[:3, ::-1]])),
+    "nonmanifold": changed(more=box(0.5, (0.75, 0.75, 0.0))),
+    "selfintersecting": changed(more=box(0.5, (0.4, 0.3, 0.2))),
+}
+FLAGGED["nonmanifold"].vertices[8:, 2] *= 2  # now they share an edge
+
+
+@pytest.mark.parametrize("flag", FLAGGED)
+def test_flags(flag, tmp_path, capfd):
+    mesh, flags = tidied(FLAGGED[flag])
+    assert flags == [flag]
+    assert tidied(mesh)[1] == [f for f in flags if f not in ("degenerate", "duplicate")]
+    source = FLAGGED[flag]
+    trimesh.Trimesh(source.vertices, source.faces, process=False).export(tmp_path / "a.ply")
+    box().export(tmp_path / "gt.ply")
+    code, report = evaluate(capfd, tmp_path / "a.ply", tmp_path / "gt.ply")
+    record = report["objects"][0]
+    assert code == 0 and record["pred_flags"] == [flag] and record["gt_flags"] == []
+    assert record["pred_closed"] == (flag != "open") and report["flags"]["pred"] == {flag: 1}
+    if flag in ("inverted", "inconsistent", "degenerate", "duplicate"):  # the surface is the same
+        assert record["iou"] == 1 and record["normal_consistency"] > 0.9  # edges
+    code, report = evaluate(capfd, tmp_path / "a.ply", tmp_path / "gt.ply", "--strict")
+    assert code == (0 if flag == "open" else 1)
+    if code:
+        assert f"--strict: {flag}" in report["failures"][0]["reason"]
+
+
+def test_sound_meshes_have_no_flags():
+    for mesh in (trimesh.creation.icosphere(3), trimesh.creation.torus(0.4, 0.1), box()):
+        corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+        assert tidied(Mesh(corners, np.arange(len(corners)).reshape(-1, 3)))[1] == []
+
+
+def test_units_are_independent_of_the_format(tmp_path, capfd):
+    """The same shape in each format, y-up where the format is, gives the same numbers."""
+    pred = trimesh.creation.icosphere(2, 0.7)
+    truth = trimesh.creation.box((1.0, 2.0, 3.0))
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z-up to y-up
+    values = []
+    for suffix in (".ply", ".stl", ".off", ".obj", ".glb"):
+        meshes = [mesh.copy() for mesh in (pred, truth)]
+        for name, mesh in zip(("pred", "gt"), meshes):
+            if suffix in (".obj", ".glb"):
+                mesh.apply_transform(turn)
+            mesh.export(tmp_path / (name + suffix))
+        code, report = evaluate(capfd, tmp_path / f"pred{suffix}", tmp_path / f"gt{suffix}")
+        assert code == 0 and report["objects"][0]["gt_normalization"]["scale"] == 1 / 3
+        values.append([report["mean"]["iou"], report["mean"]["chamfer"]])
+    # text formats round to 1e-8; the order of the faces decides which points are drawn
+    assert np.ptp(values, axis=0)[0] < 1e-3 and np.ptp(values, axis=0)[1] < 2e-3
+
+
+def test_point_clouds(tmp_path, capfd):
+    random = np.random.default_rng(0)
+    cloud = random.normal(size=(600, 3))
+    trimesh.PointCloud(cloud).export(tmp_path / "a.ply")
+    trimesh.PointCloud(cloud[:1]).export(tmp_path / "one.ply")
+    np.savetxt(tmp_path / "a.xyz", cloud)
+    code, report = evaluate(capfd, tmp_path / "a.xyz", tmp_path / "a.ply")
+    record = report["objects"][0]
+    assert code == 0 and record["chamfer"] < 1e-6 and record["fscore"]["0.01"] == 1
+    assert record["iou"] is None and "point cloud" in record["iou_reason"]
+    assert record["noise_floor"] > 0.01 and record["normal_consistency"] is None
+    code, report = evaluate(capfd, tmp_path / "one.ply", tmp_path / "a.ply")
+    record = report["objects"][0]
+    assert code == 0 and record["accuracy"] < 1e-6 and record["completeness"] > 0.1
+    assert record["chamfer"] == pytest.approx((record["accuracy"] + record["completeness"]) / 2)
+    assert record["hausdorff"] > record["completeness"]
+    for arguments in (("one.ply", "a.ply", "--align", "icp"), ("a.ply", "one.ply")):
+        files = [tmp_path / word if "." in word else word for word in arguments]
+        code, report = evaluate(capfd, *files)
+        assert code == 1 and "one" in report["failures"][0]["reason"]
+
+
+def test_an_evaluation_is_repeated_from_its_report(tmp_path, capfd):
+    trimesh.creation.icosphere(2, 0.5).export(tmp_path / "a.ply")
+    box().export(tmp_path / "b.ply")
+    files = [tmp_path / "a.ply", tmp_path / "b.ply"]
+    options = ["--align", "scale", "--seed", "3", "--surface", "density", "--voxels", "40"]
+    code, first = evaluate(capfd, *files, *options, "--out", tmp_path)
+    assert code == 0 and json.loads((tmp_path / "report.json").read_text()) == first
+    code, again = evaluate(capfd, *files, "--protocol", tmp_path / "report.json")
+    assert again["protocol"] == first["protocol"] and again["mean"]["iou"] == first["mean"]["iou"]
+    assert again["mean"]["chamfer"] == first["mean"]["chamfer"]
+    assert [len(again["objects"][0][key]) for key in ("pred_sha256", "gt_sha256")] == [64, 64]
+    read = read_protocol(str(tmp_path / "report.json"))
+    assert read.changes() == ["num_points", "seed", "align", "surface.method", "surface.voxels"]
+    run("eval-geometry", [str(f) for f in files] + ["--csv", "--points", "100"])
+    lines = capfd.readouterr().out.splitlines()
+    assert len(lines) == 2 and lines[0].startswith("name,status,chamfer") and "a,ok" in lines[1]
+
+
+def test_protocol_files(tmp_path):
+    path = tmp_path / "p.json"
+    for preset in PRESETS.values():
+        path.write_text(json.dumps(preset.to_json()))
+        assert read_protocol(str(path)) == preset
+    path.write_text('{"name": "syncdreamer", "num_points": 5, "surface": {"voxels": 32}}')
+    read = read_protocol(str(path))
+    assert read.points == "views" and read.num_points == 5 and read.surface.voxels == 32
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        ("{", "not JSON"),
+        ("[]", "object"),
+        ('{"num_point": 5}', "num_point is unknown"),
+        ('{"num_points": "5"}', "num_points is '5', must be of type int"),
+        ('{"num_points": true}', "num_points is True"),
+        ('{"num_points": 0}', "num_points is 0, must be at least 1"),
+        ('{"thresholds": 0.1}', "thresholds is 0.1, must be of type a list"),
+        ('{"thresholds": []}', "thresholds"),
+        ('{"thresholds": ["a"]}', "thresholds is 'a'"),
+        ('{"occupancy": "magic"}', "occupancy is 'magic', must be one of solid"),
+        ('{"surface": {"voxels": 1.5}}', "surface.voxels is 1.5"),
+        ('{"surface": {"speed": 1}}', "surface.speed is unknown"),
+        ('{"surface": 3}', "surface is 3"),
+        ('{"version": 1}', "version 1"),
+        ('{"definitions": {"chamfer": "mine"}}', "definitions"),
+        (None, "neither default, syncdreamer nor a file"),
+    ],
+)
+def test_bad_protocol_files(tmp_path, text, reason, capsys):
+    path = tmp_path / "p.json"
+    if text is not None:
+        path.write_text(text)
+    arguments = [str(tmp_path / "a"), str(tmp_path / "b"), "--protocol", str(path)]
+    assert run("eval-geometry", arguments) == 2
+    error = capsys.readouterr().err
+    assert reason in error and str(path) in error and error.count("\n") == 1
+
+
+def test_json_or_csv(tmp_path, capsys):
+    assert run("eval-geometry", [str(tmp_path), str(tmp_path), "--json", "--csv"]) == 2
+    assert "--json and --csv" in capsys.readouterr().err
+
+
+def test_one_crash_stops_no_other(tmp_path, capfd, monkeypatch):
+    """Nor does what a library prints get into the report on stdout."""
+    from gamba_warp.eval.shapes import command as geometry
+
+    def broken(name, *rest):
+        os.write(1, b"a library talks\n")
+        if name == "bad":
+            raise MemoryError("no room")
+        return evaluate_pair(name, *rest)
+
+    evaluate_pair = geometry.evaluate_pair
+    monkeypatch.setattr(geometry, "evaluate_pair", broken)
+    for folder in ("pred", "gt"):
+        (tmp_path / folder).mkdir()
+        for name in ("bad", "good"):
+            box().export(tmp_path / folder / f"{name}.ply")
+    code, report = evaluate(capfd, tmp_path / "pred", tmp_path / "gt")
+    assert code == 1 and report["failures"] == [{"name": "bad", "reason": "MemoryError: no room"}]
+    assert report["num_ok"] == 1

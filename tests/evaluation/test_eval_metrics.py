@@ -1,0 +1,220 @@
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers import rel_rms
+
+from gamba_warp.errors import UserError
+from gamba_warp.eval.report import (
+    check_finite,
+    failure,
+    intervals_of,
+    mean_of,
+    print_summary,
+    write_report,
+)
+from gamba_warp.eval.shapes.metrics import surface_metrics, volume_iou
+from gamba_warp.eval.shapes.shape import Points
+from gamba_warp.image_metrics import mask_iou, psnr, ssim
+from gamba_warp.open3d import import_open3d
+
+
+@pytest.mark.parametrize("shift", [0.5, 0.1, 0.001])
+def test_psnr_of_a_shift(shift):
+    a = torch.rand(2, 7, 9, 3, dtype=torch.float64) * 0.5
+    want = torch.full((2,), -20 * math.log10(shift), dtype=torch.float64)
+    assert rel_rms(psnr(a, a + shift), want) < 1e-9
+
+
+def test_psnr_of_equal_pictures_is_bounded():
+    a = torch.rand(7, 9, 3)
+    assert psnr(a, a) == 100
+
+
+def test_psnr_equals_scikit_image():
+    from skimage.metrics import peak_signal_noise_ratio
+
+    a, b = torch.rand(33, 21, 3), torch.rand(33, 21, 3)
+    want = peak_signal_noise_ratio(a.numpy(), b.numpy(), data_range=1.0)
+    assert abs(float(psnr(a, b)) - want) < 1e-5  # float32 mean there
+
+
+@pytest.mark.parametrize("size", [(11, 11), (33, 21), (64, 40)])
+def test_ssim_equals_scikit_image(size):
+    from skimage.metrics import structural_similarity
+
+    a = torch.rand(2, *size, 3)
+    b = (a + 0.2 * torch.randn_like(a)).clamp(0, 1)
+    b[:, : size[0] // 2] = 1.0  # flat regions, as a white background is
+    a[:, : size[0] // 3] = 1.0
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    want = [
+        structural_similarity(
+            x.double().numpy(), y.double().numpy(), channel_axis=2, data_range=1.0, **options
+        )
+        for x, y in zip(a, b)
+    ]
+    assert np.allclose(ssim(a, b).numpy(), want, rtol=0, atol=1e-9)
+
+
+def test_ssim_known_values():
+    flat = [torch.full((20, 20, 3), value) for value in (0.25, 0.75)]
+    c1 = 0.01**2
+    want = (2 * 0.25 * 0.75 + c1) / (0.25**2 + 0.75**2 + c1)  # no variance: luminance alone
+    assert abs(float(ssim(*flat)) - want) < 1e-6
+    a = torch.rand(20, 20, 3)
+    assert abs(float(ssim(a, a)) - 1) < 1e-12
+
+
+def test_mask_iou():
+    a, b = torch.zeros(2, 4, 5, dtype=torch.bool), torch.zeros(2, 4, 5, dtype=torch.bool)
+    a[0, :2], b[0, 1:3] = True, True
+    assert mask_iou(a, b).tolist() == [1 / 3, 1]
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim, mask_iou])
+def test_shapes_must_agree(metric):
+    with pytest.raises(ValueError, match="shapes differ"):
+        metric(torch.rand(12, 12, 3), torch.rand(12, 13, 3))
+
+
+def test_small_pictures_have_no_ssim():
+    with pytest.raises(ValueError, match="10x12"):
+        ssim(torch.rand(12, 10, 3), torch.rand(12, 10, 3))
+
+
+def test_surface_metrics_by_hand():
+    one = Points(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 0, 1], [0, 0, 1]]))
+    two = Points(np.array([[0.0, 0, 0.03]]), np.array([[0.0, 0.6, -0.8]]))
+    got = surface_metrics(one, two, (0.02, 0.05))
+    far = math.sqrt(1 + 0.03**2)
+    want = {"accuracy": (0.03 + far) / 2, "completeness": 0.03}
+    want["chamfer"] = (want["accuracy"] + want["completeness"]) / 2
+    want["chamfer_squared"] = ((0.03**2 + far**2) / 2 + 0.03**2) / 2
+    for name, value in want.items():
+        assert abs(got[name] - value) < 1e-6, name  # float32 search
+    assert got["fscore"] == {"0.02": 0.0, "0.05": pytest.approx(2 / 3)}  # precision 1/2, recall 1
+    assert got["normal_consistency"] == pytest.approx(0.8)
+
+
+def test_equal_points_are_at_no_distance():
+    points = Points(np.random.default_rng(0).random((500, 3)))
+    got = surface_metrics(points, points)
+    assert got["chamfer"] == got["chamfer_squared"] == 0
+    assert set(got["fscore"].values()) == {1.0} and got["normal_consistency"] is None
+
+
+def test_a_constant_shift():
+    """Far planes of points, one above the other: every distance is the shift."""
+    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
+    got = surface_metrics(Points(grid), Points(grid + [0, 0, 0.25]))
+    for name, want in (("chamfer", 0.25), ("accuracy", 0.25), ("chamfer_squared", 0.0625)):
+        assert abs(got[name] - want) < 1e-6, name
+
+
+def test_surface_metrics_equal_open3d():
+    o3d = import_open3d()
+    random = np.random.default_rng(1)
+    one, two = random.random((400, 3)), random.random((300, 3))
+    clouds = [o3d.t.geometry.PointCloud(points.astype(np.float32)) for points in (one, two)]
+    radii = (0.05, 0.1)
+    params = o3d.t.geometry.MetricParameters(fscore_radius=radii)
+    metric = o3d.t.geometry.Metric
+    kinds = [metric.ChamferDistance, metric.HausdorffDistance, metric.FScore]
+    values = clouds[0].compute_metrics(clouds[1], kinds, params).numpy().tolist()
+    chamfer, hausdorff, *fscores = values
+    got = surface_metrics(Points(one), Points(two), radii)
+    assert abs(got["chamfer"] - chamfer / 2) < 1e-6  # its Chamfer is the sum, ours the mean
+    assert abs(got["hausdorff"] - hausdorff) < 1e-6
+    assert np.allclose(list(got["fscore"].values()), np.array(fscores) / 100, atol=1e-5)
+
+
+def test_volume_iou():
+    a = np.zeros((3, 3, 3), bool)
+    assert volume_iou(a, a) is None
+    b = a.copy()
+    a[:2], b[1:] = True, True
+    assert volume_iou(a, b) == 1 / 3 and volume_iou(a, a) == 1
+
+
+def test_means_pass_over_what_is_not_there():
+    records = [
+        {"name": "a", "x": 1, "nest": {"y": 2.0, "z": None}, "views": [1, 2], "closed": True},
+        {"name": "b", "x": 3, "nest": {"y": None, "z": None}, "views": [1], "closed": False},
+    ]
+    assert mean_of(records) == {"x": 2.0, "nest": {"y": 2.0, "z": None}}
+
+
+def test_report_counts_failures(tmp_path):
+    objects = [
+        failure("z", ValueError("first line\nsecond line")),
+        {"name": "a", "status": "ok", "x": 2.0, "nest": {"y": 1.0}},
+    ]
+    write_report(tmp_path, {"p": 1}, objects, {"v": "1"}, baselines={})
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["mean"] == {"x": 2.0, "nest": {"y": 1.0}}
+    assert report["failures"] == [{"name": "z", "reason": "first line"}]
+    assert [record["name"] for record in report["objects"]] == ["a", "z"]
+    assert (report["num_ok"], report["num_failed"]) == (1, 1)
+    lines = (tmp_path / "objects.csv").read_text().splitlines()
+    assert lines == ["name,status,x,nest.y,reason", "a,ok,2.0,1.0,", "z,failed,,,first line"]
+
+
+def test_nan_is_named():
+    with pytest.raises(UserError, match="nest.y is nan"):
+        check_finite({"x": 1.0, "nest": {"y": math.nan}})
+
+
+def test_interval_is_that_of_the_normal_law():
+    """Of many objects: the mean, 1.96 standard errors to each side."""
+    values = np.random.default_rng(3).normal(5, 2, 400)
+    low, high = intervals_of([{"x": float(v)} for v in values])["x"]
+    error = values.std() / 20
+    # quantiles of 10,000 resamples have a standard error of 0.02 standard errors here
+    assert abs((values.mean() - low) / error - 1.96) < 0.15
+    assert abs((high - values.mean()) / error - 1.96) < 0.15
+
+
+def test_interval_of_few_objects():
+    records = [{"x": 1.0, "nest": {"y": None, "on": True}}, {"x": 1.0, "nest": {"y": 2.0}}]
+    got = intervals_of(records)
+    assert got == {"x": [1.0, 1.0], "nest": {"y": None}}
+    assert intervals_of(records[:1])["x"] is None and intervals_of([]) == {}
+    two = [{"x": 0.0}, {"x": 1.0}]
+    assert intervals_of(two) == {"x": [0.0, 1.0]}  # a quarter of the draws each
+    assert intervals_of(two, level=0.4) == {"x": [0.5, 0.5]}
+    many = [{"x": float(i)} for i in range(1500)]  # several batches
+    assert intervals_of(many) == intervals_of(many) != intervals_of(many, seed=1)
+
+
+def test_summary_shows_the_interval(tmp_path, capsys):
+    objects = [{"name": n, "status": "ok", "x": v} for n, v in (("a", 1.0), ("b", 3.0))]
+    report = write_report(tmp_path, {}, objects, {})
+    assert report["interval"] == {"x": [1.0, 3.0]}
+    assert print_summary(report, tmp_path) == 0
+    assert "2 [1, 3]" in capsys.readouterr().out
+
+
+def test_equal_to_scikit_image_and_kornia():
+    """Their own settings, in float64: 11x11 windows without padding, all three the same numbers."""
+    from kornia.metrics import psnr as kornia_psnr
+    from kornia.metrics import ssim as kornia_ssim
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+    a = torch.rand(37, 29, 3, dtype=torch.float64)
+    b = (a + 0.1 * torch.randn_like(a)).clamp(0, 1)
+    planes = [x.permute(2, 0, 1)[None] for x in (a, b)]
+    kornia = (
+        kornia_psnr(*planes, max_val=1.0).item(),
+        kornia_ssim(*planes, window_size=11, padding="valid").mean().item(),
+    )
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    pictures = a.numpy(), b.numpy()
+    skimage = (
+        peak_signal_noise_ratio(*pictures, data_range=1.0),
+        structural_similarity(*pictures, channel_axis=2, data_range=1.0, **window),
+    )
+    assert [psnr(a, b).item(), ssim(a, b).item()] == pytest.approx(kornia, abs=1e-6)
+    assert [psnr(a, b).item(), ssim(a, b).item()] == pytest.approx(skimage, abs=1e-6)

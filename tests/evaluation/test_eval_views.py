@@ -1,0 +1,302 @@
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from helpers.micro import to_opengl
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
+from gamba_warp.cli import run
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.eval.shapes.command import out_of_reference
+from gamba_warp.eval.views import evaluate as module
+from gamba_warp.eval.views.evaluate import choose_views
+from gamba_warp.formats.ply import save_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import save_image
+from gamba_warp.model.config import GambaConfig
+
+SIZE = 48
+DISTANCE = 2.25  # of the dataset's cameras: not the model's 1.5
+COLOR = torch.tensor([0.2, 0.6, 1.0])
+
+
+def cameras(count=4):
+    """An orbit in a z-up world."""
+    turn = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    azimuths = torch.arange(count) * 77.0 + 20
+    viewmats = orbit(azimuths, 25.0, DISTANCE) @ turn
+    return Cameras(viewmats, intrinsics(SIZE, SIZE, 40.0).expand(count, 3, 3), SIZE, SIZE)
+
+
+def paint(gaussians, views):
+    """Stands in for the rasterizer: a 9x9 square where the first mean is seen."""
+    rgb = torch.ones(len(views.viewmats), views.height, views.width, 3)
+    mask = torch.zeros(rgb.shape[:3], dtype=torch.bool)
+    for v, (viewmat, K) in enumerate(zip(views.viewmats, views.Ks)):
+        seen = K @ (viewmat[:3, :3] @ gaussians.means[0] + viewmat[:3, 3])
+        x, y = (seen[:2] / seen[2]).floor().long().tolist()
+        rgb[v, max(0, y - 4) : y + 5, max(0, x - 4) : x + 5] = gaussians.colors[0]
+        mask[v, max(0, y - 4) : y + 5, max(0, x - 4) : x + 5] = True
+    return rgb, mask
+
+
+def one(point):
+    return Gaussians(
+        means=torch.tensor([point]),
+        quats=None,
+        scales=torch.full((1, 3), 0.08),
+        opacities=torch.tensor([0.95]),
+        colors=COLOR[None],
+    )
+
+
+def write_object(folder, point, views=None, drawer=paint):
+    views = cameras() if views is None else views
+    rgb, mask = drawer(one(point), views)
+    folder.mkdir(parents=True)
+    frames = []
+    for v, pose in enumerate(to_opengl(views.viewmats)):
+        pixels = torch.cat([rgb[v], mask[v, ..., None].float()], -1)
+        save_image(folder / f"{v}.png", pixels.numpy())
+        frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
+    focal = float(views.Ks[0, 0, 0])
+    top = {"w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(top))
+
+
+def in_reference_world(point, reference=0):
+    viewmats = cameras().viewmats
+    _, scale = relative_to_reference(viewmats, viewmats[reference])
+    return (scale * viewmats[reference, :3, :3] @ torch.tensor(point)).tolist()
+
+
+POINTS = {"a": [0.1, 0.05, -0.1], "group/b": [-0.15, 0.1, 0.2], "c": [0.0, 0.2, 0.1]}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Pictures this small take longer on several threads than on one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def data(tmp_path):
+    for uid, point in POINTS.items():
+        write_object(tmp_path / "data" / uid, point)
+        path = tmp_path / "pred" / f"{uid}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_ply(path, one(in_reference_world(point)))
+    return tmp_path
+
+
+@pytest.fixture
+def painted(monkeypatch):
+    monkeypatch.setattr(module, "render_views", paint)
+
+
+def evaluate(folder, *options, pred="pred"):
+    places = ["--checkpoint", str(folder / pred), "--data", str(folder / "data")]
+    arguments = [*places, "--out", str(folder / "out"), "--split", "all", "--device", "cpu"]
+    code = run("eval-views", [*arguments, *options])
+    path = folder / "out" / "report.json"
+    return code, json.loads(path.read_text()) if path.exists() else None
+
+
+def test_perfect_predictions(data, painted):
+    """The dataset's own world, distance and reference view are undone exactly."""
+    for reference in (0, 2):
+        for uid, point in POINTS.items():
+            save_ply(data / "pred" / f"{uid}.ply", one(in_reference_world(point, reference)))
+        options = ["--no-lpips", "--no-baselines", "--reference", str(reference)]
+        code, report = evaluate(data, *options)
+        assert code == 0
+        # 8-bit rounding of the files only
+        assert report["mean"]["psnr"] > 55 and report["mean"]["mask_iou"] == 1
+        assert report["mean"]["input"]["psnr"] > 55
+        assert report["objects"][0]["views"] == [
+            reference,
+            *(v for v in range(4) if v != reference),
+        ]
+    assert [item["name"] for item in report["objects"]] == sorted(POINTS)
+    assert report["mean"]["lpips"] is None
+    assert report["protocol"]["lpips_reason"] == "not asked for"
+    source = report["protocol"]["source"]
+    assert (source["kind"], source["path"], len(source["sha256"])) == ("ply", "pred", 64)
+
+
+def test_a_wrong_distance_shows(data, painted):
+    _, report = evaluate(data, "--no-lpips", "--distance", "2.5")
+    assert report["mean"]["mask_iou"] < 0.99
+
+
+def test_baselines_have_known_values(data, painted):
+    _, report = evaluate(data, "--no-lpips")
+    empty, copy = report["baselines"]["background"], report["baselines"]["input_copy"]
+    rounded = (COLOR * 255 + 0.5).floor() / 255
+    mse = 81 / SIZE**2 * float((1 - rounded).square().mean())
+    assert empty["psnr"] == pytest.approx(-10 * math.log10(mse), abs=1e-4)
+    assert empty["mask_iou"] == 0
+    assert copy["input"]["psnr"] == 100 and copy["input"]["mask_iou"] == 1
+    assert copy["psnr"] < 30  # a mean with the input in it would be over 35
+    options = ["--no-lpips", "--no-baselines", "--limit", "1"]
+    assert evaluate(data, *options)[1]["baselines"] == {}
+
+
+def test_failures_are_listed(data, painted, monkeypatch):
+    (data / "pred" / "a.ply").unlink()
+    (data / "data" / "group" / "b" / "2.png").write_bytes(b"")
+
+    def nan_where_c(gaussians, views):
+        rgb, mask = paint(gaussians, views)
+        return torch.full_like(rgb, torch.nan), mask
+
+    monkeypatch.setattr(module, "render_views", nan_where_c)
+    code, report = evaluate(data, "--no-lpips")
+    assert code == 1
+    reasons = {item["name"]: item["reason"] for item in report["failures"]}
+    assert "No such file" in reasons["a"] and "2.png" in reasons["group/b"]
+    assert "psnr is nan" in reasons["c"]
+    assert report["mean"] == {} and report["num_ok"] == 0
+
+
+def test_strips_and_views(data, painted):
+    from PIL import Image
+
+    _, report = evaluate(data, "--no-lpips", "--views", "3", "--size", "24", "--strips", "1")
+    assert report["objects"][0]["views"] == [0, 1, 2]
+    files = sorted((data / "out" / "strips").rglob("*.png"))
+    assert [path.name for path in files] == ["a.png"]
+    with Image.open(files[0]) as strip:
+        assert strip.size == (3 * 24, 3 * 24)
+    assert len((data / "out" / "objects.csv").read_text().splitlines()) == 4
+
+
+def test_choose_views():
+    assert choose_views(5, 2, None) == [2, 0, 1, 3, 4]
+    assert choose_views(9, 0, 5) == [0, 1, 3, 5, 7]
+    assert choose_views(3, 0, 1) == [0] and choose_views(3, 1, 9) == [1, 0, 2]
+    with pytest.raises(UserError, match="no view 3"):
+        choose_views(3, 3, None)
+
+
+def test_lpips_without_weights(data, painted, monkeypatch):
+    monkeypatch.setenv("GAMBA_CACHE", str(data / "cache"))
+    code, report = evaluate(data, "--limit", "1")
+    assert code == 0 and report["mean"]["lpips"] is None
+    assert "gamba weights lpips" in report["protocol"]["lpips_reason"]
+
+
+def test_lpips_with_weights(data, painted):
+    from gamba_warp.data.vgg_weights import lpips_available
+
+    if not lpips_available():
+        pytest.skip("the LPIPS weights are not in the cache (gamba weights lpips)")
+    _, report = evaluate(data, "--limit", "1", "--views", "2")
+    assert report["protocol"]["lpips"] == "VGG16, version 0.1"
+    # a prediction that differs by rounding, against an empty picture
+    assert report["mean"]["lpips"] < 1e-3 < report["baselines"]["background"]["lpips"]
+
+
+@pytest.mark.parametrize("case", ["pred", "data", "empty", "limit", "distance", "split"])
+def test_what_cannot_start(data, case, capsys):
+    options, pred, message = [], "pred", "gamba: "
+    if case == "pred":
+        pred, message = "absent", "absent"
+    if case == "data":
+        (data / "data").rename(data / "moved")
+        message = "no such folder"
+    if case == "empty":
+        (data / "empty").mkdir()
+        pred, message = "empty", "neither"
+    if case in ("limit", "distance"):
+        options, message = [f"--{case}", "0"], f"--{case}"
+    if case == "split":
+        (data / "data" / "split.json").write_text(
+            json.dumps({"version": 1, "train": ["a", "c", "group/b"], "val": [], "test": []})
+        )
+        options, message = ["--split", "test"], "test split"
+    code, report = evaluate(data, *options, pred=pred)
+    assert code == 2 and report is None
+    assert message in capsys.readouterr().err
+
+
+def test_out_of_the_reference_world(data):
+    motion = out_of_reference(open_dataset(data / "data"), "c", 1, 1.5)
+    there = np.array([in_reference_world(POINTS["c"], 1)])
+    assert np.abs(motion.points(there) - POINTS["c"]).max() < 1e-6
+
+
+def test_module_entry():
+    call = [sys.executable, "-m", "gamba_warp.eval"]
+    wrong = subprocess.run([*call, "nothing"], capture_output=True, text=True)
+    assert wrong.returncode == 2 and "views,geometry" in wrong.stderr
+    helped = subprocess.run([*call, "views", "--help"], capture_output=True, text=True)
+    assert helped.returncode == 0 and "--reference" in helped.stdout
+
+
+@pytest.fixture
+def rasterizer():
+    rasterize = pytest.importorskip("gamba_warp.kernels.rasterize")
+    if not hasattr(rasterize, "rasterization"):
+        pytest.skip("the rasterizer is not there")
+
+
+def straight(gaussians, views):
+    from gamba_warp.render import render
+
+    out = render(gaussians, views)  # on black: the colour is premultiplied
+    return out.rgb / out.alpha.clamp(min=1e-6), out.alpha[..., 0]
+
+
+def test_gaussians_rendered_and_rendered_again(tmp_path, rasterizer):
+    write_object(tmp_path / "data" / "a", POINTS["a"], drawer=straight)
+    (tmp_path / "pred").mkdir()
+    viewmats = cameras().viewmats
+    _, scale = relative_to_reference(viewmats, viewmats[0])
+    moved = one(POINTS["a"]).transformed(viewmats[0, :3, :3], torch.zeros(3), float(scale))
+    save_ply(tmp_path / "pred" / "a.ply", moved)
+    code, report = evaluate(tmp_path, "--no-lpips")
+    assert code == 0
+    # 8-bit colour and alpha in the files; the mask's edge may fall on either side
+    assert report["mean"]["psnr"] > 48 and report["mean"]["mask_iou"] > 0.95
+    assert report["baselines"]["input_copy"]["psnr"] < 40
+
+
+def test_checkpoint(data, rasterizer):
+    from gamba_warp.model.checkpoint import save_model
+    from gamba_warp.model.gamba import Gamba
+
+    config = GambaConfig(
+        image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
+    )
+    (data / "model").mkdir()
+    save_model(data / "model" / "model.safetensors", Gamba(config))
+    code, report = evaluate(data, "--no-lpips", "--limit", "1", "--views", "2", pred="model")
+    assert code == 0
+    assert report["protocol"]["source"]["kind"] == "checkpoint"
+    assert report["objects"][0]["gaussians"] == config.num_gaussians
+
+
+def test_saved_gaussians_evaluate_to_the_same(data, painted):
+    code, report = evaluate(data, "--no-lpips", "--save-gaussians")
+    assert code == 0
+    (data / "out" / "report.json").unlink()
+    code, again = evaluate(data, "--no-lpips", pred="out/gaussians")
+    assert code == 0 and len(list((data / "out" / "gaussians").rglob("*.ply"))) == len(POINTS)
+    assert again["mean"]["psnr"] == report["mean"]["psnr"] > 30
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_cuda_without_a_device_is_refused(data, capsys):
+    options = ["--checkpoint", str(data / "pred"), "--data", str(data / "data")]
+    options += ["--out", str(data / "out"), "--device", "cuda"]
+    assert run("eval-views", options) == 2
+    assert "no CUDA device" in capsys.readouterr().err and not (data / "out").exists()

@@ -1,0 +1,190 @@
+import numpy as np
+import pytest
+import trimesh
+from helpers.meshes import MTL, QUAD, write_quad
+from PIL import Image
+
+from gamba_warp.errors import UserError
+from gamba_warp.formats.meshes import default_up, load_mesh, to_display, to_linear
+
+
+def test_textured_obj(tmp_path):
+    mesh = load_mesh(write_quad(tmp_path))
+    assert len(mesh.faces) == 2 and mesh.warnings == []
+    material = mesh.materials[mesh.material_ids[0]]
+    assert material.texture.shape == (16, 16, 4)
+    assert material.color.tolist() == [1, 1, 1, 1]  # a texture replaces the plain colour
+    corners = mesh.vertices[mesh.faces]
+    # u grows with x, v with height
+    np.testing.assert_allclose(mesh.uvs[..., 0], (corners[..., 0] + 1) / 2)
+    np.testing.assert_allclose(mesh.uvs[..., 1], corners[..., 1] / 2)
+    np.testing.assert_allclose(np.abs(mesh.normals[..., 2]), 1)
+
+
+def test_normalized(tmp_path):
+    path = write_quad(tmp_path)
+    assert default_up(path) == "y" and default_up("a.ply") == "z"
+    before = load_mesh(path)
+    mesh, transform, scale = before.normalized("y")
+    assert scale == 0.5
+    np.testing.assert_allclose(mesh.vertices.min(0), [-0.5, 0, -0.5])
+    np.testing.assert_allclose(mesh.vertices.max(0), [0.5, 0, 0.5])
+    points = np.hstack([before.vertices, np.ones((4, 1))])
+    np.testing.assert_allclose(scale * points @ transform.T, mesh.vertices, atol=1e-12)
+    np.testing.assert_allclose(np.abs(mesh.normals[..., 1]), 1)
+    kept, _, _ = before.normalized("z")
+    np.testing.assert_allclose(kept.vertices.max(0), [0.5, 0.5, 0])
+    # x to y, y to z, z to x; then y-up to z-up
+    turned, _, _ = before.normalized("y", [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(turned.vertices.max(0), [0, 0.5, 0.5], atol=1e-12)
+    np.testing.assert_allclose(np.abs(turned.normals[..., 0]), 1)
+
+
+@pytest.mark.parametrize(
+    "changes, warning",
+    [
+        ({"mtl": None}, "quad.mtl: not found"),
+        ({"texture": None, "mtl": MTL.replace("Kd 0.1 0.1 0.1", "")}, "paint.png: not found"),
+        ({"obj": QUAD.replace("usemtl paint", "usemtl other")}, "no material: grey"),
+    ],
+)
+def test_missing_parts_are_grey_and_named(tmp_path, changes, warning):
+    mesh = load_mesh(write_quad(tmp_path, **changes))
+    assert any(warning in line for line in mesh.warnings), mesh.warnings
+    material = mesh.materials[0]
+    assert material.texture is None
+    np.testing.assert_allclose(material.color, [*[to_linear(0.6)] * 3, 1])
+
+
+def test_broken_texture_becomes_the_plain_colour(tmp_path):
+    path = write_quad(tmp_path)
+    for content in ((tmp_path / "paint.png").read_bytes()[:60], b"no picture", None):
+        (tmp_path / "paint.png").unlink()
+        if content is not None:
+            (tmp_path / "paint.png").write_bytes(content)
+        mesh = load_mesh(path)
+        assert mesh.materials[0].texture is None
+        assert any("paint.png" in line for line in mesh.warnings), content
+        # 0.1 is rounded to 8 bits on the way
+        np.testing.assert_allclose(mesh.materials[0].color[:3], to_linear(0.1), atol=1e-3)
+
+
+def test_texture_without_uvs_becomes_its_mean(tmp_path):
+    mesh = load_mesh(write_quad(tmp_path, obj=QUAD.replace("1/1 2/2 3/3 4/4", "1 2 3 4")))
+    assert mesh.warnings == ["a textured part has no UV coordinates"]
+    np.testing.assert_array_equal(mesh.materials[0].texture, [[[127, 127, 63, 255]]])
+
+
+@pytest.mark.parametrize(
+    "name", ["PAINT.png", ".\\paint.PNG", "-clamp on -s 1 1 1 paint.png", "C:\\art\\paint.png"]
+)
+def test_texture_names_of_other_systems(tmp_path, name):
+    mesh = load_mesh(write_quad(tmp_path, mtl=MTL.replace("paint.png", name)))
+    assert mesh.materials[0].texture is not None, mesh.warnings
+
+
+def test_negative_indices_count_back_from_their_line(tmp_path):
+    head, face = QUAD.rsplit("f ", 1)
+    far = "v 9 9 9\nv 8 9 9\nv 9 8 9\nvt 0.5 0.5\nf "
+    good = load_mesh(write_quad(tmp_path, obj=f"{head}f {face}{far}5/5 6/5 7/5\n"))
+    negative = f"{head}f -4/-4 -3/-3 -2/-2 -1/-1\n{far}-3/-1 -2/-1 -1/-1\n"
+    relative = load_mesh(write_quad(tmp_path, obj=negative))
+    np.testing.assert_allclose(relative.vertices[relative.faces], good.vertices[good.faces])
+    np.testing.assert_allclose(relative.uvs, good.uvs)
+
+
+def test_polygons_become_triangles(tmp_path):
+    hexagon = "\n".join(f"v {np.cos(a)} {np.sin(a)} 0" for a in np.arange(6) * np.pi / 3)
+    path = tmp_path / "hexagon.obj"
+    path.write_text(f"{hexagon}\nf 1 2 3 4 5 6\nf 1 2 3\n")
+    mesh = load_mesh(path)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    assert len(mesh.faces) == 5 and np.isfinite(area)
+
+
+def test_transparency_of_mtl(tmp_path):
+    path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.5 1 0\nd 0.25\n")
+    np.testing.assert_allclose(load_mesh(path).materials[0].color[3], 0.25)
+    path = write_quad(tmp_path, mtl="newmtl paint\nKd 0.5 1 0\nTr 0.25\n")
+    material = load_mesh(path).materials[0]
+    np.testing.assert_allclose(material.color[3], 0.75)
+    # 0.5 is rounded to 8 bits on the way
+    np.testing.assert_allclose(material.color[:3], to_linear([128 / 255, 1, 0]), atol=0.01)
+    Image.fromarray(np.full((4, 4), 64, np.uint8)).save(tmp_path / "mask.png")
+    path = write_quad(tmp_path, mtl=MTL + "map_d mask.png\n")
+    assert (load_mesh(path).materials[0].texture[..., 3] == 64).all()
+
+
+def test_glb_scene(tmp_path):
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[255, 0, 0, 128], alphaMode="BLEND"
+    )
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    scene = trimesh.Scene()
+    move = trimesh.transformations.translation_matrix([3, 0, 0])
+    scene.add_geometry(box, transform=move)
+    scene.add_geometry(box)
+    scene.export(tmp_path / "two.glb")
+    mesh = load_mesh(tmp_path / "two.glb")
+    assert len(mesh.faces) == 24
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [4, 1, 1])
+    np.testing.assert_allclose(mesh.materials[0].color, [1, 0, 0, 128 / 255], atol=1e-6)
+
+
+def test_other_formats(tmp_path):
+    box = trimesh.creation.box()
+    for suffix in (".ply", ".stl", ".off"):
+        box.export(tmp_path / f"box{suffix}")
+        mesh = load_mesh(tmp_path / f"box{suffix}")
+        assert len(mesh.faces) == 12
+        # a cube is flat-shaded, though its vertices are shared
+        assert np.allclose(np.abs(mesh.normals).max(-1), 1), suffix
+    box.visual.vertex_colors = np.tile([10, 200, 30, 255], (8, 1))
+    box.export(tmp_path / "paint.ply")
+    mesh = load_mesh(tmp_path / "paint.ply")
+    assert (mesh.colors == [10, 200, 30, 255]).all()
+    assert mesh.materials[0].color.tolist() == [1, 1, 1, 1]
+
+
+def test_smooth_normals_are_kept(tmp_path):
+    trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "ball.ply")
+    mesh = load_mesh(tmp_path / "ball.ply")
+    outward = mesh.vertices[mesh.faces]
+    assert ((mesh.normals * outward).sum(-1) > 0.999).all()
+
+
+@pytest.mark.parametrize(
+    "name, content, message",
+    [
+        ("a.obj", b"", "the file is empty"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
+        ("a.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "1 of 3 vertices are not finite"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cannot be read as a mesh"),
+        ("a.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "all vertices are one point"),
+        ("a.obj", b"\x00\x01 binary \xff", "a.obj"),
+        ("a.glb", b"glTF nonsense", "cannot be read as a mesh"),
+        ("a.stl", b"solid nothing\nendsolid", "a.stl"),
+        ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", "a.ply"),
+        ("a.txt", b"v 0 0 0", "not a mesh file"),
+    ],
+)
+def test_bad_files_name_the_file(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        load_mesh(path)
+    assert message in str(caught.value) and name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(UserError, match="no such file"):
+        load_mesh(tmp_path / "a.obj")
+
+
+def test_display_curve_inverts():
+    values = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(to_display(to_linear(values)), values, atol=2e-6)  # float32
+    np.testing.assert_allclose(to_linear(0.5), 0.2140, atol=1e-4)

@@ -1,0 +1,180 @@
+import base64
+import html.parser
+import re
+
+import numpy as np
+import pytest
+from helpers.gaussians import some
+from PIL import Image, features
+
+from gamba_warp.errors import UserError
+from gamba_warp.formats.splat import splat_bytes
+from gamba_warp.pages.page import Section, demo_page, reconstruction_page, svg_chart
+
+
+class Page(html.parser.HTMLParser):
+    """Collects tags, and fails on one that is not closed."""
+
+    VOID = {"meta", "img", "line", "polyline"}
+
+    def __init__(self, path):
+        super().__init__()
+        self.tags, self.text, self.stack = [], "", []
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+        self.close()
+        assert not self.stack, f"not closed: {self.stack}"
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in self.VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def pictures(*shape):
+    return np.random.default_rng(0).random(shape).astype(np.float32)
+
+
+def frames(count=5, size=24):
+    return (pictures(count, size, size, 3) * 255).astype(np.uint8)
+
+
+def decoded(source):
+    kind, _, data = source.partition(";base64,")
+    return kind.removeprefix("data:"), base64.b64decode(data, validate=True)
+
+
+def full(title="A chair", **changes):
+    values = dict(
+        text="Seen once.",
+        picture=pictures(9, 9, 4),
+        turntable=frames(),
+        gaussians=some(11),
+        views={"Predicted": pictures(3, 8, 8, 3), "Truth": pictures(2, 8, 8, 3)},
+        header=("", "PSNR"),
+        table=[("input", 24.3456), ("novel", 19), ("note", "n/a")],
+        curves={"loss": [(0, 1.0), (10, 0.1)]},
+        curves_label="loss",
+    )
+    return Section(title, **{**values, **changes})
+
+
+def test_a_page_holds_everything_and_asks_for_nothing(tmp_path):
+    demo_page(tmp_path / "a.html", [full(), full("Second")], title="Demo", text="All of it.")
+    page = Page(tmp_path / "a.html")
+    addresses = re.findall(r"(?:src|href|url|action)\s*[=(]\s*[\"']?([^\"')\s>]+)", page.source)
+    assert addresses and all(a.startswith("data:") for a in addresses)
+    assert "http" not in re.sub(r'http-equiv="[^"]*"', "", page.source)
+    assert not [a for a in page.all("script") if "src" in a] and not page.all("link")
+    (policy,) = [a["content"] for a in page.all("meta") if "http-equiv" in a]
+    assert policy.startswith("default-src 'none'")
+    for image in page.all("img"):
+        kind, data = decoded(image["src"])
+        assert kind in ("image/png", "image/webp") and len(data) > 50 and image["alt"]
+
+
+def test_the_viewer_gets_the_splat_file_and_the_camera(tmp_path):
+    section = full(distance=2.25, fov=40)
+    for write, auto in ((demo_page, False), (reconstruction_page, True)):
+        write(tmp_path / "a.html", [section] if not auto else section)
+        page = Page(tmp_path / "a.html")
+        (viewer,) = [a for a in page.all("div") if a.get("class") == "viewer"]
+        assert viewer["data-distance"] == "2.25" and viewer["data-fov"] == "40"
+        assert ("data-auto" in viewer) == auto
+        name = viewer["data-splat"]
+        (data,) = re.findall(rf'<script type="text/plain" id="{name}">(.*?)</script>', page.source)
+        assert base64.b64decode(data) == splat_bytes(section.gaussians)
+        # the turntable is there once: beside a running viewer, under a waiting one
+        assert page.source.count("image/webp") == 1
+
+
+def test_pictures_come_back_from_the_page(tmp_path):
+    section = full(gaussians=None)
+    demo_page(tmp_path / "a.html", [section])
+    images = [decoded(a["src"]) for a in Page(tmp_path / "a.html").all("img")]
+    (tmp_path / "input.png").write_bytes(images[0][1])
+    with Image.open(tmp_path / "input.png") as image:
+        np.testing.assert_allclose(np.asarray(image) / 255, section.picture, atol=0.501 / 255)
+    (tmp_path / "turn.webp").write_bytes(images[1][1])
+    with Image.open(tmp_path / "turn.webp") as image:
+        assert image.n_frames == 5 and image.size == (24, 24)
+    assert features.check("webp") and len(images) == 2 + 5
+
+
+def test_text_is_escaped(tmp_path):
+    nasty = '</script><b onload="x">&'
+    section = Section(nasty, text=nasty, table=[(nasty, 1)], header=(nasty, nasty))
+    section.views, section.curves = {nasty: pictures(1, 4, 4, 3)}, {nasty: [(0, 1), (1, 2)]}
+    section.curves_label = nasty
+    demo_page(tmp_path / "a.html", [section], title=nasty, text=nasty)
+    page = Page(tmp_path / "a.html")
+    assert not page.all("b") and "</script><b" not in page.source
+    assert page.text.count(nasty) == 11
+
+
+def test_tables_show_numbers_to_four_digits(tmp_path):
+    rows = [("a", 24.34567, 12345), ("b", 1e-7, 7)]
+    demo_page(tmp_path / "a.html", [Section("t", table=rows, header=("", "x", "n"))])
+    source = Page(tmp_path / "a.html").source
+    for text in ("<td>a</td>", ">24.35<", ">1e-07<", ">12,345<"):
+        assert text in source
+
+
+def test_a_bare_section_and_no_sections(tmp_path):
+    demo_page(tmp_path / "a.html", [Section("only a title")])
+    assert "only a title" in Page(tmp_path / "a.html").text
+    demo_page(tmp_path / "a.html", [])
+    assert Page(tmp_path / "a.html").all("h1")
+
+
+def points(svg):
+    return [
+        [tuple(map(float, pair.split(","))) for pair in line.split()]
+        for line in re.findall(r'points="([^"]*)"', svg)
+    ]
+
+
+def test_charts_place_their_points():
+    svg = svg_chart({"a": [(0, 0), (50, 5), (100, 10)], "b": [(100, 0)]}, "y")
+    first, second = points(svg)
+    left, middle, right = first
+    assert left[0] < middle[0] < right[0] and left[1] > middle[1] > right[1]  # y grows downwards
+    assert left[0] > 0 and right[0] < 640 and left[1] < 240 and right[1] > 16  # inside the viewBox
+    assert middle == pytest.approx(((left[0] + right[0]) / 2, (left[1] + right[1]) / 2), abs=0.1)
+    assert second == [pytest.approx((right[0], left[1]), abs=0.1)]
+    for tick in (">0<", ">100<", ">10<", ">y<"):
+        assert tick in svg
+    assert "logarithmic" not in svg
+
+
+def test_a_wide_range_is_drawn_logarithmically():
+    ((a, b, c),) = points(svg_chart({"a": [(0, 1), (1, 0.1), (2, 0.01)]}))
+    assert b[1] - a[1] == pytest.approx(c[1] - b[1], abs=0.2)
+
+
+@pytest.mark.parametrize("values", [[], [(0, float("nan"))], [(float("inf"), 1)]])
+def test_charts_without_points_are_left_out(values):
+    assert svg_chart({"a": values}) == ""
+
+
+@pytest.mark.parametrize("values", [[(3, 7)], [(0, 5), (9, 5)], [(0, -3), (1, 1e9)], [(2, 0)]])
+def test_degenerate_charts_stay_finite(values):
+    svg = svg_chart({"a": values})
+    assert "nan" not in svg and "inf" not in svg and len(points(svg)[0]) == len(values)
+
+
+def test_a_page_that_cannot_be_written():
+    with pytest.raises(UserError, match=r"cannot write /dev/null/a\.html"):
+        demo_page("/dev/null/a.html", [])

@@ -1,0 +1,217 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.gaussians import some
+
+from gamba_warp.errors import UserError
+from gamba_warp.formats.ply import SH_C0, load_ply, save_ply
+from gamba_warp.open3d import import_open3d
+
+NAMES = ("means", "quats", "scales", "opacities", "colors")
+
+
+def write(path, header, body=b""):
+    path.write_bytes("\n".join(["ply", *header, "end_header", ""]).encode() + body)
+    return path
+
+
+PROPERTIES = [
+    *["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"],
+    *["rot_0", "rot_1", "rot_2", "rot_3"],
+]
+
+
+def header(count, kind="float", properties=PROPERTIES, form="binary_little_endian"):
+    return [
+        f"format {form} 1.0",
+        f"element vertex {count}",
+        *(f"property {kind} {name}" for name in properties),
+    ]
+
+
+@pytest.mark.parametrize("frame", ["opencv", "opengl"])
+@pytest.mark.parametrize("rotated", [True, False])
+def test_what_is_saved_is_loaded(tmp_path, frame, rotated):
+    gaussians = some(rotated=rotated)
+    save_ply(tmp_path / "a.ply", gaussians, frame=frame, comments=["one\ntwo", "é"])
+    loaded = load_ply(tmp_path / "a.ply")
+    quats = torch.eye(4)[:1].expand(37, 4) if gaussians.quats is None else gaussians.quats
+    quats = quats / quats.norm(dim=1, keepdim=True)
+    sign = (loaded.quats * quats).sum(1, keepdim=True).sign()  # q and -q are one rotation
+    # float32 through a logarithm or a logit
+    torch.testing.assert_close(loaded.quats * sign, quats, atol=1e-6, rtol=0)
+    for name in ("means", "scales", "opacities", "colors"):
+        want = getattr(gaussians, name)
+        torch.testing.assert_close(getattr(loaded, name), want, atol=2e-7, rtol=2e-6, msg=name)
+
+
+def test_the_file_is_the_standard_layout_in_another_reader(tmp_path):
+    from plyfile import PlyData
+
+    gaussians = some()
+    save_ply(tmp_path / "a.ply", gaussians, comments=["hello"])
+    data = PlyData.read(tmp_path / "a.ply")
+    assert data.byte_order == "<" and not data.text and "hello" in data.comments
+    vertex = data["vertex"]
+    want = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 "
+    want += "rot_0 rot_1 rot_2 rot_3"
+    assert [p.name for p in vertex.properties] == want.split()
+    assert {p.val_dtype for p in vertex.properties} == {"f4"}
+    np.testing.assert_array_equal(vertex["y"], gaussians.means[:, 1])
+    opacity = 1 / (1 + np.exp(-vertex["opacity"]))
+    np.testing.assert_allclose(opacity, gaussians.opacities, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(vertex["scale_2"]), gaussians.scales[:, 2], rtol=1e-5)
+    np.testing.assert_allclose(
+        vertex["f_dc_1"] * SH_C0 + 0.5, gaussians.colors[:, 1], atol=1e-6, rtol=0
+    )
+    w = gaussians.quats[:, 0] / gaussians.quats.norm(dim=1)
+    np.testing.assert_allclose(vertex["rot_0"], w, atol=1e-6)
+
+
+def test_open3d_sees_the_same_gaussians(tmp_path):
+    """Its reader knows the layout: it gives scales activated, opacities as logits."""
+    open3d = import_open3d()
+    gaussians = some()
+    save_ply(tmp_path / "a.ply", gaussians)
+    cloud = open3d.t.io.read_point_cloud(str(tmp_path / "a.ply"))
+    np.testing.assert_array_equal(cloud.point.positions.numpy(), gaussians.means)
+    np.testing.assert_allclose(cloud.point.scale.numpy(), gaussians.scales, rtol=1e-5)
+    quats = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
+    np.testing.assert_allclose(cloud.point.rot.numpy(), quats, atol=1e-6)
+    logits = cloud.point.opacity.numpy()[:, 0]
+    np.testing.assert_allclose(1 / (1 + np.exp(-logits)), gaussians.opacities, rtol=1e-5)
+
+
+def test_opengl_frame_turns_y_up():
+    from gamba_warp.formats.ply import flip_frame
+
+    gaussians = some()
+    flipped = flip_frame(gaussians)
+    torch.testing.assert_close(flipped.means, gaussians.means * torch.tensor([1.0, -1, -1]))
+    torch.testing.assert_close(flip_frame(flipped).means, gaussians.means)
+
+
+def test_files_of_other_programs_are_read(tmp_path):
+    """Big-endian doubles, another order, f_rest, a colour out of range, a second element."""
+    properties = ["opacity", *PROPERTIES[:3], "f_rest_0", "red", *PROPERTIES[3:6], *PROPERTIES[7:]]
+    values = np.array([[0, 1, 2, 3, 9, 9, 0, 5, -5, *[math.log(0.5)] * 3, 0, 0, 2, 0]], ">f8")
+    lines = [*header(1, "double", properties, "binary_big_endian")]
+    lines += ["element extra 1", "property list uchar int things"]
+    loaded = load_ply(write(tmp_path / "a.ply", lines, values.tobytes() + b"\0"))
+    assert loaded.means.tolist() == [[1, 2, 3]] and loaded.means.dtype == torch.float32
+    assert loaded.opacities.tolist() == [0.5] and loaded.colors.tolist() == [[0.5, 1, 0]]
+    assert loaded.quats.tolist() == [[0, 0, 1, 0]]
+    torch.testing.assert_close(loaded.scales, torch.full((1, 3), 0.5))
+
+
+def test_faint_gaussians_can_be_left_out(tmp_path):
+    gaussians = some()
+    save_ply(tmp_path / "a.ply", gaussians, min_opacity=0.5)
+    keep = gaussians.opacities >= 0.5
+    assert 0 < keep.sum() < 37
+    torch.testing.assert_close(load_ply(tmp_path / "a.ply").means, gaussians.means[keep])
+
+
+def test_extremes_stay_finite(tmp_path):
+    gaussians = some(3)
+    gaussians.opacities = torch.tensor([0.0, 1.0, 0.5])
+    gaussians.scales[0] = 0
+    save_ply(tmp_path / "a.ply", gaussians)
+    loaded = load_ply(tmp_path / "a.ply")
+    torch.testing.assert_close(loaded.opacities, gaussians.opacities, atol=2e-6, rtol=0)
+    assert (loaded.scales > 0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_not_finite_is_not_written(tmp_path, name):
+    gaussians = some()
+    getattr(gaussians, name)[4] = float("nan")
+    with pytest.raises(UserError, match=r"a\.ply: not written, 1 of 37 Gaussians"):
+        save_ply(tmp_path / "a.ply", gaussians)
+    assert not list(tmp_path.iterdir())
+
+
+def test_refusals_when_saving(tmp_path):
+    with pytest.raises(UserError, match="no Gaussian has an opacity of 2"):
+        save_ply(tmp_path / "a.ply", some(), min_opacity=2)
+    with pytest.raises(ValueError, match=r"leading shape \(1,\)"):
+        save_ply(tmp_path / "a.ply", some().map(lambda value: value[None]))
+    with pytest.raises(ValueError, match="'blender'"):
+        save_ply(tmp_path / "a.ply", some(), frame="blender")
+    with pytest.raises(UserError, match=r"/dev/null/a\.ply: Not a directory"):
+        save_ply("/dev/null/a.ply", some())
+
+
+GOOD = np.ones((2, 14), "<f4").tobytes()
+BAD_FILES = {
+    "empty": (b"", "not a .ply"),
+    "picture": (b"\x89PNG\r\n\x1a\n" + bytes(50), "not a .ply"),
+    "no end": (b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n", "has no end"),
+    "endless": (b"ply\n" + b"comment x\n" * 10000 + b"end_header\n", "has no end"),
+    "no format": (["element vertex 2", "property float x"], "format is none"),
+    "ascii": (header(2, form="ascii"), "format is ascii"),
+    "no vertices": (["format binary_little_endian 1.0"], "element vertex COUNT"),
+    "faces first": ([header(2)[0], "element face 2", *header(2)[1:]], "element vertex COUNT"),
+    "negative": (header(-1), "element vertex COUNT"),
+    "huge": (header("9" * 5000), "element vertex COUNT"),
+    "lies": (header(10**15), "truncated or false header, 1000000000000000 vertices take"),
+    "no properties": (header(2, properties=[]), "no properties"),
+    "list": (header(2, "list uchar float"), "not a plain number"),
+    "odd type": (header(2, "half"), "'half x' is not a plain number"),
+    "twice": (header(2, properties=[*PROPERTIES, "x"]), "x is given twice"),
+    "none": (header(0), "no Gaussians"),
+    "cloud": (header(2, properties=PROPERTIES[:3]), "no property f_dc_0, f_dc_1, f_dc_2"),
+    "no opacity": (header(2, properties=PROPERTIES[:6] + PROPERTIES[7:]), "no property opacity"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_files_are_refused_with_the_reason(tmp_path, case):
+    content, reason = BAD_FILES[case]
+    path = tmp_path / "bad.ply"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        size = {"cloud": 24, "no opacity": 104, "none": 0}.get(case, len(GOOD))
+        write(path, content, GOOD[:size])
+    with pytest.raises(UserError) as caught:
+        load_ply(path)
+    assert str(path) in str(caught.value) and reason in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("cut", [1, 4, 37, len(GOOD)])
+def test_truncated_and_padded_files_are_refused(tmp_path, cut):
+    path = write(tmp_path / "a.ply", header(2), GOOD[:-cut])
+    with pytest.raises(UserError, match="truncated"):
+        load_ply(path)
+    with pytest.raises(UserError, match="false header"):
+        load_ply(write(path, header(2), GOOD + bytes(cut)))
+
+
+@pytest.mark.parametrize(
+    "column, value, reason",
+    [(1, np.nan, "means"), (6, np.inf, "opacities"), (8, 200, "scales"), (3, -np.inf, "colors")],
+)
+def test_values_that_are_not_finite_are_refused(tmp_path, column, value, reason):
+    values = np.ones((3, 14), "<f4")
+    values[1, column] = value
+    path = write(tmp_path / "a.ply", header(3), values.tobytes())
+    with pytest.raises(UserError, match=f"1 of 3 Gaussians have {reason} that are not finite"):
+        load_ply(path)
+
+
+def test_rotations_of_length_zero_are_refused(tmp_path):
+    values = np.ones((3, 14), "<f4")
+    values[2, 10:] = 0
+    with pytest.raises(UserError, match="1 rotations have length zero"):
+        load_ply(write(tmp_path / "a.ply", header(3), values.tobytes()))
+
+
+def test_missing_file_and_folder(tmp_path):
+    with pytest.raises(UserError, match="No such file"):
+        load_ply(tmp_path / "none.ply")
+    with pytest.raises(UserError, match="Is a directory"):
+        load_ply(tmp_path)

@@ -1,0 +1,12 @@
+"""Shared by the tests: from test_causal_conv1d."""
+
+import torch
+
+
+def make(batch, length, channels, width, dtype=torch.float32):
+    return {
+        "x": torch.randn(batch, length, channels).to(dtype),
+        "weight": torch.randn(channels, width),
+        "bias": torch.randn(channels),
+        "initial_state": torch.randn(batch, width - 1, channels).to(dtype),
+    }

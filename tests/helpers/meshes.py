@@ -1,0 +1,34 @@
+"""Shared by the tests: from test_meshes."""
+
+import numpy as np
+from PIL import Image
+
+QUAD = """mtllib quad.mtl
+v -1 0 0
+v 1 0 0
+v 1 2 0
+v -1 2 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+usemtl paint
+f 1/1 2/2 3/3 4/4
+"""
+
+
+MTL = "newmtl paint\nKd 0.1 0.1 0.1\nmap_Kd paint.png\n"
+
+
+QUARTERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
+
+
+def write_quad(folder, obj=QUAD, mtl=MTL, texture="paint.png"):
+    """A 2x2 upright square that faces +z, textured with four colours."""
+    if mtl:
+        (folder / "quad.mtl").write_text(mtl)
+    if texture:
+        Image.fromarray(QUARTERS.repeat(8, 0).repeat(8, 1)).save(folder / texture)
+    path = folder / "quad.obj"
+    path.write_text(obj)
+    return path

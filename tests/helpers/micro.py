@@ -1,0 +1,97 @@
+"""A micro dataset and options that train in milliseconds: clouds drawn by our rasterizer."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import save_image
+from gamba_warp.render import render
+from gamba_warp.train.config import TrainConfig
+
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+SIZE = 16
+VIEWS = 6
+# 64 Gaussians of one narrow block.
+MODEL = (
+    f"image_size={SIZE}",
+    "patch_size=4",
+    "width=16",
+    "depth=1",
+    "state_size=4",
+    "scale_init=0.06",
+)
+
+
+def to_opengl(viewmats: torch.Tensor) -> torch.Tensor:
+    """Camera-to-world OpenGL matrices from world-to-camera OpenCV ones, both ``[.., 4, 4]``."""
+    return torch.linalg.inv(_FLIP @ viewmats.double()).to(viewmats.dtype)
+
+
+def cloud(seed: int, num: int = 40) -> Gaussians:
+    """Gaussians of one hue in an off-centre ball."""
+    rng = torch.Generator().manual_seed(seed)
+    centre = 0.1 * torch.randn(3, generator=rng)
+    hue = torch.rand(3, generator=rng)
+    return Gaussians(
+        means=centre + 0.1 * torch.randn(num, 3, generator=rng),
+        quats=None,
+        scales=torch.full((num, 3), 0.06),
+        opacities=torch.full((num,), 0.9),
+        colors=(hue + 0.1 * torch.randn(num, 3, generator=rng)).clamp(0, 1),
+    )
+
+
+def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None:
+    """One object in the transforms.json layout."""
+    azimuths = torch.arange(views) * (360.0 / views)
+    viewmats = orbit(azimuths, elevation=15.0, distance=1.8)
+    cameras = Cameras(viewmats, intrinsics(SIZE, SIZE).expand(views, 3, 3), SIZE, SIZE)
+    pictures = render(gaussians, cameras)
+    # Rendered on black, so colour is premultiplied; files hold straight alpha.
+    rgba = torch.cat([pictures.rgb / pictures.alpha.clamp_min(1e-3), pictures.alpha], -1)
+    folder.mkdir(parents=True)
+    K = cameras.Ks[0]
+    frames = []
+    for v in range(views):
+        save_image(folder / f"{v:03d}.png", rgba[v].numpy())
+        pose = to_opengl(viewmats[v]).tolist()
+        frames.append({"file_path": f"{v:03d}.png", "transform_matrix": pose})
+    sizes = {"w": SIZE, "h": SIZE, "cx": SIZE / 2, "cy": SIZE / 2}
+    focal = {"fl_x": K[0, 0].item(), "fl_y": K[1, 1].item()}
+    (folder / "transforms.json").write_text(json.dumps({**sizes, **focal, "frames": frames}))
+
+
+def write_dataset(root: Path, objects: int = 3) -> Path:
+    """``objects`` clouds; the last is held out."""
+    uids = [f"cloud{chr(ord('a') + i)}" for i in range(objects)]
+    for i, uid in enumerate(uids):
+        write_object(root / uid, cloud(i))
+    split = {"version": 1, "train": uids[:-1], "val": uids[-1:], "test": []}
+    (root / "split.json").write_text(json.dumps(split))
+    return root
+
+
+def options(data: Path, out: Path, **groups: dict) -> TrainConfig:
+    """Quick options; ``groups`` are changes, e.g. ``optim={"lr": 1.0}``."""
+    config = TrainConfig(data=data, preset="tiny", set=MODEL)
+    quick = {
+        "length": {"steps": 6},
+        "views": {"batch_size": 2, "size": SIZE, "views_first": 1, "views_last": 3},
+        "loss": {"lpips": "off"},
+        "optim": {"warmup_steps": 1},
+        "run": {
+            "out": out,
+            "device": "cpu",
+            "val_every": 0,
+            "log_every": 1,
+            "tensorboard": False,
+        },
+    }
+    for name in quick:
+        changes = {**quick[name], **groups.get(name, {})}
+        config = replace(config, **{name: replace(getattr(config, name), **changes)})
+    return config

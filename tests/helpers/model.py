@@ -1,0 +1,26 @@
+"""Shared by the tests: from test_model."""
+
+import torch
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.model.config import GambaConfig
+
+
+def micro(**changes) -> GambaConfig:
+    """36 Gaussians, 4 image tokens."""
+    small = {
+        "image_size": 12,
+        "patch_size": 4,
+        "width": 16,
+        "depth": 2,
+        "state_size": 4,
+        "encoder": "gamba_test_vit",
+        "encoder_size": 16,
+    }
+    return GambaConfig(**(small | changes))
+
+
+def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
+    viewmats = orbit(torch.linspace(-30, 200, batch), 11.0)
+    cameras = Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
+    return torch.rand(batch, size, size, 3), cameras

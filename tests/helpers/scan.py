@@ -1,0 +1,62 @@
+"""Shared by the tests: from test_selective_scan."""
+
+import torch
+
+from gamba_warp.kernels.selective_scan import selective_scan
+from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+from helpers import assert_rel_rms
+
+FORWARD = 1e-6  # float32 rounding of a few hundred dependent steps; measured 1e-7 to 5e-7
+
+
+GRADIENT = 1e-5  # the same, for sums over up to 2 * 577 tokens; measured below 1e-6
+
+
+def make(batch, length, channels, states, groups=1, dtype=torch.float32):
+    """All nine tensors, with steps and decays like an initialised model's and some far larger."""
+    r = torch.randn
+    shape = (batch, length, channels)
+    matrix = (batch, length, groups, states)
+    return {
+        "u": r(shape).to(dtype),
+        "delta": (2 * r(shape) - 3).to(dtype),
+        "A": -16 * torch.rand(channels, states) ** 2,
+        "B": r(matrix).to(dtype),
+        "C": r(matrix).to(dtype),
+        "D": r(channels),
+        "z": r(shape).to(dtype),
+        "delta_bias": 0.5 * r(channels),
+        "initial_state": r(batch, channels, states),
+    }
+
+
+def leaves(inputs, dtype=None):
+    return {k: v.detach().clone().to(dtype or v.dtype).requires_grad_() for k, v in inputs.items()}
+
+
+def oracle(*args, **kwargs):
+    """The reference on one thread: its operations are too small for more."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return selective_scan_reference(*args, **kwargs)
+    finally:
+        torch.set_num_threads(before)
+
+
+def compare(inputs, forward=FORWARD, gradient=GRADIENT, **options):
+    """Runs both sides with random cotangents for the output and the last state."""
+    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
+    out, last = selective_scan(**mine, return_last_state=True, **options)
+    want, want_last = oracle(**theirs, **options)
+    assert_rel_rms(out, want, forward, "out")
+    assert_rel_rms(last, want_last, max(forward, 2e-6), "last state")
+    v_out, v_last = torch.randn_like(out), torch.randn_like(last)
+    grads = torch.autograd.grad((out * v_out).sum() + (last * v_last).sum(), [*mine.values()])
+    wants = torch.autograd.grad(
+        (want * v_out.double()).sum() + (want_last * v_last.double()).sum(), [*theirs.values()]
+    )
+    for name, got, expected in zip(mine, grads, wants):
+        assert got.dtype == inputs[name].dtype, name
+        limit = max(gradient, 1e-5) if got.dtype != torch.float32 else GRADIENT
+        assert_rel_rms(got, expected, limit, f"gradient of {name}")

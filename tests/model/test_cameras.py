@@ -1,0 +1,131 @@
+import math
+
+import pytest
+import torch
+from helpers.micro import to_opengl
+from torch.testing import assert_close
+
+from gamba_warp import cameras as C
+from gamba_warp.gaussians import quat_multiply
+
+
+def random_viewmats(*shape):
+    quats = torch.nn.functional.normalize(torch.randn(*shape, 4, dtype=torch.float64), dim=-1)
+    columns = []
+    for axis in torch.eye(4, dtype=torch.float64)[1:]:
+        conjugate = quats * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
+        columns.append(quat_multiply(quat_multiply(quats, axis.expand_as(quats)), conjugate))
+    out = torch.zeros(*shape, 4, 4, dtype=torch.float64)
+    out[..., :3, :3] = torch.stack([c[..., 1:] for c in columns], -1)
+    out[..., :3, 3] = torch.randn(*shape, 3, dtype=torch.float64) + torch.tensor([0, 0, 3.0])
+    out[..., 3, 3] = 1
+    return out
+
+
+def test_intrinsics_put_the_field_of_view_at_the_edges():
+    K = C.intrinsics(100, 64, fov=60)
+    top = torch.tensor([0.0, -math.tan(math.radians(30)), 1.0])
+    assert_close(K @ top, torch.tensor([50.0, 0.0, 1.0]), atol=1e-5, rtol=0)
+    assert_close(K @ torch.tensor([0.0, 0, 2.0]) / 2, torch.tensor([50.0, 32.0, 1.0]))
+    assert K[0, 0] == K[1, 1]
+
+
+def test_resized_cameras_see_the_same():
+    cameras = C.Cameras(torch.eye(4)[None], C.intrinsics(64, 48)[None], 64, 48)
+    small = cameras.resized(32, 96)
+    point = torch.tensor([0.3, -0.2, 2.0])
+    before, after = cameras.Ks[0] @ point / 2, small.Ks[0] @ point / 2
+    assert_close(after, before * torch.tensor([0.5, 2.0, 1.0]))
+    assert (small.width, small.height) == (32, 96) and cameras.width == 64
+
+
+def test_indexing_and_moving():
+    cameras = C.Cameras(random_viewmats(2, 3), C.intrinsics(8, 8).expand(2, 3, 3, 3), 8, 8)
+    one = cameras[1, :2].to(torch.float32)
+    assert one.viewmats.shape == (2, 4, 4) and one.Ks.shape == (2, 3, 3)
+    assert one.viewmats.dtype == torch.float32
+    assert_close(one.viewmats, cameras.viewmats[1, :2].float())
+
+
+def test_opengl_bridge():
+    viewmats = random_viewmats(5, 2)
+    poses = to_opengl(viewmats)
+    assert_close(C.from_opengl(poses), viewmats)
+    # The pose's axes in the world: x right, y up, z backward; its last column is the position.
+    rotation = viewmats[..., :3, :3]
+    assert_close(poses[..., :3, 0], rotation[..., 0, :])
+    assert_close(poses[..., :3, 1], -rotation[..., 1, :])
+    assert_close(poses[..., :3, 2], -rotation[..., 2, :])
+    centre = torch.cat([poses[..., :3, 3], torch.ones(5, 2, 1)], -1)[..., None].double()
+    origin = torch.tensor([0.0, 0, 0, 1]).expand(5, 2, 4).double()
+    assert_close((viewmats @ centre)[..., 0], origin)
+
+
+def test_blender_camera_known_answer():
+    """Identity in Blender's convention looks along -z with y up."""
+    viewmat = C.from_opengl(torch.eye(4))
+    ahead, above = torch.tensor([0.0, 0, -2, 1]), torch.tensor([0.0, 1, 0, 1])
+    assert (viewmat @ ahead).tolist() == [0, 0, 2, 1]
+    assert (viewmat @ above).tolist() == [0, -1, 0, 1]
+
+
+def test_orbit_begins_at_the_reference_camera():
+    assert_close(C.orbit(torch.tensor([0.0]))[0], C.reference_viewmat())
+    assert C.reference_viewmat(2.0)[2, 3] == 2
+
+
+def test_orbit_looks_at_the_origin_from_where_it_says():
+    azimuths = torch.tensor([0.0, 33, 90, 180, 270, -45])
+    elevations = torch.tensor([0.0, 20, -10, 45, 89, 0])
+    viewmats = C.orbit(azimuths, elevations, 2.5).double()
+    rotation, translation = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    identity = torch.eye(3).double().expand(6, 3, 3)
+    assert_close(rotation @ rotation.mT, identity, atol=1e-6, rtol=0)
+    assert_close(torch.linalg.det(rotation), torch.ones(6).double())
+    assert_close(translation, torch.tensor([0, 0, 2.5]).double().expand(6, 3))
+    centres = -(rotation.mT @ translation[..., None])[..., 0]
+    a, e = azimuths.double().deg2rad(), elevations.double().deg2rad()
+    # y is down, so above is negative; azimuth 90 is on the reference camera's right.
+    want = 2.5 * torch.stack([a.sin() * e.cos(), -e.sin(), -a.cos() * e.cos()], -1)
+    assert_close(centres, want, atol=1e-6, rtol=0)
+    assert rotation[:, 0, 1].abs().max() < 1e-6  # right stays horizontal
+    assert (rotation[:, 1, 1] > 0).all()  # the picture's down is the world's
+
+
+def test_relative_to_reference():
+    viewmats, reference = random_viewmats(2, 3), random_viewmats(2)
+    # A reference camera that looks at the origin, as the data's do.
+    reference[:, :3, 3] = torch.tensor([[0, 0, 2.0], [0, 0, 3.0]])
+    out, scale = C.relative_to_reference(viewmats, reference, 1.5)
+    assert_close(scale, torch.tensor([0.75, 0.5]).double())
+    same, _ = C.relative_to_reference(reference[:, None], reference, 1.5)
+    assert_close(same[:, 0], C.reference_viewmat(1.5).double().expand(2, 4, 4))
+    # A point of the world lands at the same place of each camera, scale aside.
+    point = torch.randn(2, 1, 3, 1).double()
+    moved = scale[:, None, None, None] * (reference[:, None, :3, :3] @ point)
+    before = viewmats[..., :3, :3] @ point + viewmats[..., :3, 3:]
+    after = out[..., :3, :3] @ moved + out[..., :3, 3:]
+    assert_close(after, scale[:, None, None, None] * before)
+
+
+@pytest.mark.parametrize("lead", [(), (2,), (2, 3)])
+def test_plucker_rays_pass_through_the_pixels(lead):
+    viewmats = random_viewmats(*lead)
+    K = C.intrinsics(7, 5, 40).double()
+    K[0, 2] += 0.4
+    rays = C.plucker_rays(viewmats, K.expand(*lead, 3, 3), 7, 5)
+    assert rays.shape == (*lead, 5, 7, 6)
+    moment, direction = rays[..., :3], rays[..., 3:]
+    assert_close(direction.norm(dim=-1), torch.ones(*lead, 5, 7).double())
+    assert (moment * direction).sum(-1).abs().max() < 1e-12
+    # The point two units along a ray from the centre projects to that pixel's centre.
+    rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    centre = -(rotation.mT @ translation[..., None])[..., 0]
+    point = centre[..., None, :] + 2 * direction[..., 4, :, :]
+    assert_close(torch.linalg.cross(point, direction[..., 4, :, :]), moment[..., 4, :, :])
+    seen = point @ rotation.mT + translation[..., None, :]
+    pixels = seen @ K.mT
+    pixels = pixels[..., :2] / pixels[..., 2:]
+    want = torch.stack([torch.arange(7) + 0.5, torch.full((7,), 4.5)], -1).double()
+    assert_close(pixels, want.expand(*lead, 7, 2))
+    assert (seen[..., 2] > 0).all()

@@ -1,0 +1,112 @@
+import math
+
+import pytest
+import torch
+from helpers.gaussians import some
+from torch.testing import assert_close
+
+from gamba_warp.gaussians import Gaussians, matrix_to_quat, quat_multiply
+
+
+def to_matrix(quat):
+    w, x, y, z = (quat / quat.norm()).tolist()
+    return torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=quat.dtype,
+    )
+
+
+def covariances(gaussians):
+    halves = [to_matrix(q) * s for q, s in zip(gaussians.quats, gaussians.scales)]
+    return torch.stack([h @ h.T for h in halves])
+
+
+def batch(*lead, n=5, rotated=True):
+    def rand(*size):
+        return torch.rand(*lead, n, *size)
+
+    return Gaussians(
+        rand(3), torch.randn(*lead, n, 4) if rotated else None, rand(3), rand(), rand(3)
+    )
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "colors"])
+def test_shapes_that_do_not_fit_are_named(name):
+    values = vars(batch(2)).copy()
+    values[name] = values[name][:, :-1]
+    with pytest.raises(ValueError, match=rf"{name} has shape \(2, 4, .\), expected \(2, 5, .\)"):
+        Gaussians(**values)
+
+
+def test_containers_index_select_and_convert_alike():
+    for rotated in (True, False):
+        gaussians = batch(2, 3, rotated=rotated)
+        one = gaussians[1, 2]
+        assert gaussians.num == one.num == 5 and one.opacities.shape == (5,)
+        assert_close(one.colors, gaussians.colors[1, 2])
+        keep = torch.tensor([True, False, True, False, True])
+        assert_close(one.select(keep).means, one.means[keep])
+        assert one.to(torch.float64).scales.dtype == torch.float64
+        assert (one.quats is None) == (not rotated)
+        doubled = gaussians.map(lambda value: 2 * value)
+        assert_close(doubled.opacities, 2 * gaussians.opacities)
+
+
+def test_detach_cuts_the_graph():
+    gaussians = batch().map(lambda value: value.requires_grad_())
+    assert gaussians.means.requires_grad and not gaussians.detach().means.requires_grad
+
+
+def test_quaternion_product_is_the_matrix_product():
+    p, q = torch.randn(2, 4, dtype=torch.float64)
+    got = to_matrix(quat_multiply(p, q))
+    assert_close(got, to_matrix(p) @ to_matrix(q))
+
+
+ANGLES = [0, 1e-4, 1, math.pi / 2, math.pi - 1e-4, math.pi]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 0.5), (-1, -1, -1)])
+def test_quaternion_of_a_matrix(axis, angle):
+    axis = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
+    quat = torch.cat([torch.tensor([math.cos(angle / 2)]).double(), math.sin(angle / 2) * axis])
+    matrix = to_matrix(quat)
+    got = matrix_to_quat(matrix)
+    assert got[0] >= 0
+    assert_close(got.norm(), torch.tensor(1.0).double())
+    assert_close(to_matrix(got), matrix, atol=1e-9, rtol=0)
+    # float32 entries: their rounding and no more
+    assert_close(to_matrix(matrix_to_quat(matrix.float())), matrix.float(), atol=3e-7, rtol=0)
+
+
+@pytest.mark.parametrize("rotated", [True, False])
+def test_rigid_motion_moves_means_and_covariances(rotated):
+    gaussians = some(6, rotated).to(torch.float64)
+    rotation = to_matrix(torch.randn(4, dtype=torch.float64))
+    shift = torch.randn(3, dtype=torch.float64)
+    moved = gaussians.transformed(rotation, shift, 1.7)
+    assert_close(moved.means, torch.stack([1.7 * rotation @ m + shift for m in gaussians.means]))
+    before = gaussians
+    if not rotated:
+        quats = torch.eye(4, dtype=torch.float64)[:1].expand(6, 4)
+        before = Gaussians(**{**vars(gaussians), "quats": quats})
+    want = 1.7**2 * rotation @ covariances(before) @ rotation.T
+    assert_close(covariances(moved), want)
+    assert_close(moved.opacities, gaussians.opacities)
+    assert_close(moved.colors, gaussians.colors)
+
+
+def test_rigid_motion_of_a_batch_with_gradients():
+    gaussians = batch(2, 3)
+    gaussians.means.requires_grad_()
+    rotation = to_matrix(torch.randn(4))
+    moved = gaussians.transformed(rotation, torch.zeros(3))
+    cotangent = torch.randn(2, 3, 5, 3)
+    (gradient,) = torch.autograd.grad((moved.means * cotangent).sum(), gaussians.means)
+    assert_close(gradient, cotangent @ rotation)
+    assert moved.quats.shape == (2, 3, 5, 4)

@@ -1,0 +1,251 @@
+"""The whole network: shapes, gradients, ablations, sizes of the presets."""
+
+import pytest
+import timm
+import torch
+from helpers import assert_rel_rms
+from helpers.model import inputs, micro
+from timm.models.vision_transformer import _create_vision_transformer
+
+from gamba_warp.cameras import Cameras, orbit
+from gamba_warp.errors import UserError
+from gamba_warp.model.config import PRESETS, GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.vgg import VGG16Features, VGG16Trunk
+
+
+@timm.models.register_model
+def gamba_test_vit(pretrained=False, **kwargs):
+    tiny = {"patch_size": 8, "embed_dim": 16, "depth": 1, "num_heads": 2}
+    name = "vit_base_patch16_224"  # for its pretrained_cfg alone
+    return _create_vision_transformer(name, pretrained=pretrained, **(tiny | kwargs))
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_shapes(batch):
+    gaussians = Gamba(micro(), "random")(*inputs(batch))
+    assert gaussians.means.shape == (batch, 36, 3)
+    assert gaussians.means.dtype == torch.float32 and gaussians.quats is None
+    assert all(torch.isfinite(v).all() for v in (gaussians.means, gaussians.scales))
+
+
+def test_pictures_of_a_batch_do_not_mix():
+    model = Gamba(micro(), "random")
+    images, cameras = inputs(3)
+    together = model(images, cameras)
+    alone = model(images[1:2], cameras[1:2])
+    # Matrix products of another size sum in another order.
+    assert torch.allclose(together.means[1], alone.means[0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"encoder": "none"},
+        {"additive_image_tokens": False},
+        {"prepend": False},
+        {"camera_token": False},
+        {"predict_rotation": True, "norm": "rms"},
+        {"encoder_frozen": False},
+        {"discretization": "zoh"},
+        {"discretization": "bilinear"},
+        {"dt_rank": 3, "expand": 3, "conv_size": 2, "decoder_width": 20},
+    ],
+    ids=str,
+)
+def test_ablations_run_and_reach_every_parameter(changes):
+    model = Gamba(micro(**changes), "random")
+    gaussians = model(*inputs(2))
+    parts = [gaussians.means, gaussians.scales, gaussians.opacities, gaussians.colors]
+    parts += [gaussians.quats] if model.config.predict_rotation else []
+    sum((part * torch.randn_like(part)).sum() for part in parts).backward()
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            assert parameter.grad is not None, name
+            assert torch.isfinite(parameter.grad).all() and parameter.grad.abs().max() > 0, name
+        else:
+            assert name.startswith("encoder.") and model.config.encoder_frozen
+
+
+def test_picture_and_camera_reach_the_output_by_the_prefix_alone():
+    model = Gamba(micro(additive_image_tokens=False), "random")
+    images, cameras = inputs(1)
+    base = model(images, cameras).means
+    assert (model(1 - images, cameras).means - base).abs().max() > 1e-6
+    other = Cameras(orbit(torch.tensor([90.0]), 40.0), cameras.Ks, 12, 12)
+    assert (model(images, other).means - base).abs().max() > 1e-6
+
+
+def test_without_prefix_and_image_tokens_the_picture_is_ignored():
+    model = Gamba(micro(additive_image_tokens=False, prepend=False))
+    images, cameras = inputs(1)
+    assert torch.equal(model(images, cameras).means, model(1 - images, cameras).means)
+
+
+@pytest.mark.parametrize("changes", [{}, {"prepend": False}], ids=str)
+def test_condition_can_be_kept(changes):
+    model = Gamba(micro(**changes), None if changes else "random").eval()
+    images, cameras = inputs(2)
+    with torch.no_grad():
+        condition = model.condition(images, cameras)
+        assert len(condition) == 2 and (condition[0] is None) == bool(changes)
+        want = model(images, cameras)
+        for _ in range(2):  # a use changes nothing
+            assert torch.equal(model(images, cameras, condition).means, want.means)
+        if not changes:
+            with torch.autocast("cpu", torch.bfloat16):  # the condition is float32
+                rounded = model(images, cameras, condition).means
+            assert_rel_rms(rounded, want.means, 0.1, "bfloat16")  # 8 bits, through two blocks
+            other = model.condition(1 - images, cameras)
+            assert not torch.equal(model(images, cameras, other).means, want.means)
+
+
+def test_segments_change_nothing(monkeypatch):
+    model = Gamba(micro(encoder="none"))
+    images, cameras = inputs(2)
+    want = model(images, cameras)  # with a gradient: in one piece
+    calls = []
+    hook = model.blocks[0].register_forward_hook(
+        lambda _, args, out: calls.append(args[0].shape[1])
+    )
+    monkeypatch.setattr("gamba_warp.model.gamba.SEGMENT", 16)
+    with torch.no_grad():
+        got = model(images, cameras)
+    hook.remove()
+    assert calls == [16, 16, 4]
+    # Matrix products of another size sum in another order.
+    assert_rel_rms(got.means, want.means, 1e-6, "means")
+
+
+def test_recomputation_changes_memory_alone():
+    model = Gamba(micro(image_size=32, width=32, depth=6), "random")
+    images, cameras = inputs(2, 32)
+    cotangent = torch.randn(2, 256, 3)
+
+    def step(recompute: bool) -> tuple[int, dict[str, torch.Tensor]]:
+        model.recompute, kept = recompute, {}
+
+        def pack(tensor):
+            kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        model.zero_grad()
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            loss = (model(images, cameras).means * cotangent).sum()
+        saved = sum(kept.values())
+        loss.backward()
+        return saved, {n: p.grad for n, p in model.named_parameters() if p.grad is not None}
+
+    plain, want = step(False)
+    lean, got = step(True)
+    assert lean < 0.35 * plain, (lean, plain)
+    assert got.keys() == want.keys()
+    for name, grad in want.items():
+        assert torch.equal(got[name], grad), name
+
+
+def test_flags_against_weight_decay():
+    model = Gamba(micro(), "random")
+    kept = {n for n, p in model.named_parameters() if not getattr(p, "_no_weight_decay", False)}
+    kept = {name for name in kept if not name.startswith("encoder.")}
+    matrices = ("_proj.weight", "conv_weight", "project_camera.weight", "project_image.weight")
+    rest = ("patchify.weight", "mlp.0.weight", "mlp.2.weight")
+    heads = tuple(f"decoder.{head}.weight" for head in ("position", "opacity", "scale", "color"))
+    assert kept and all(name.endswith(matrices + rest + heads) for name in kept), kept
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("images", torch.rand(2, 12, 11, 3)),
+        ("images", torch.rand(2, 3, 12, 12)),
+        ("images", torch.rand(3, 12, 12, 3)),
+        ("viewmats", torch.rand(2, 3, 4)),
+        ("Ks", torch.rand(1, 3, 3)),
+        ("width", 24),
+    ],
+)
+def test_wrong_shapes_are_named(name, value):
+    images, cameras = inputs(2)
+    if name == "images":
+        images = value
+    else:
+        setattr(cameras, name, value)
+    with pytest.raises(ValueError, match=r"(images|cameras).* is \(.*expected"):
+        Gamba(micro(), "random")(images, cameras)
+
+
+def test_positions_start_spread_inside_the_object():
+    config = micro(image_size=32, width=96, depth=4, encoder="none")
+    images, cameras = inputs(2, 32)
+    for picture in (images, torch.ones_like(images)):
+        means = Gamba(config)(picture, cameras).means
+        spread = means.std(dim=1)
+        assert (spread > 0.04).all() and (spread < 0.2).all(), spread
+        assert means.abs().max() < 0.49
+
+
+# Without a frozen encoder. The paper's own figure is "about 10 %" of 500 M parameters of an LRM.
+PARAMETERS = {"tiny": 1_403_334, "small": 9_827_142, "paper": 44_614_726}
+LENGTHS = {"tiny": (4096, 0), "small": (9216, 144), "paper": (16384, 576)}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_preset_sizes(preset, monkeypatch):
+    trunk = VGG16Trunk
+    monkeypatch.setattr(
+        "gamba_warp.model.vgg.vgg16_features", lambda path: VGG16Features(trunk().state_dict())
+    )
+    config = PRESETS[preset]
+    with torch.device("meta"):
+        model = Gamba(config, None if config.encoder == "vgg16" else "random")
+        images = torch.rand(1, config.encoder_size, config.encoder_size, 3)
+        image_tokens = model.encoder(images).shape[1] if model.encoder else 0
+    assert (config.num_gaussians, image_tokens) == LENGTHS[preset]
+    assert model.tokens.orders.shape == (config.num_gaussians,)
+    count = sum(p.numel() for p in model.stored_state().values())
+    assert count == PARAMETERS[preset]
+    if preset == "paper":
+        assert 40e6 < count < 55e6
+        assert config.step_rank == 32 and model.encoder.channels == 768
+
+
+def test_config_json_round_trip():
+    for config in (*PRESETS.values(), micro(predict_rotation=True, position_range=0.4)):
+        assert GambaConfig.from_json(config.to_json()) == config
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ('"width": 16, "surprise": 1', "file.x: .*unknown surprise"),
+        ("", "file.x: .*missing width"),
+        ('"width": "16"', "file.x: .*width is '16'"),
+        ('"width": 0', "file.x: .*width is 0"),
+        ('"width": true', "file.x: .*width is True"),
+        ('"width": 16,', "file.x: .*not JSON"),
+    ],
+)
+def test_config_json_errors(change, words):
+    text = micro().to_json().replace('"width": 16', change or '"depth": 2')
+    with pytest.raises(UserError, match=words):
+        GambaConfig.from_json(text, "file.x")
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"image_size": 13}, "image_size 13 is not a multiple of patch_size 4"),
+        ({"norm": "batch"}, "norm is 'batch', not one of layer, rms"),
+        ({"state_size": 257}, "state_size is 257"),
+        ({"conv_size": 5}, "conv_size is 5"),
+        ({"opacity_init": 1.0}, "opacity_init is 1.0"),
+        ({"encoder": "none", "camera_token": False}, "prepend needs"),
+        ({"encoder": "vgg16", "encoder_frozen": False}, "vgg16"),
+        ({"scale_init": float("nan")}, "scale_init is nan"),
+    ],
+)
+def test_config_refuses(changes, words):
+    with pytest.raises(UserError, match=words):
+        micro(**changes)

@@ -1,0 +1,94 @@
+"""Camera numbers, scan orders and 3DGS tokens against hand-made answers."""
+
+import math
+
+import torch
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit, plucker_rays
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.tokens import SplatTokens, camera_numbers, normalize_imagenet, scan_orders
+
+
+def _config(**changes) -> GambaConfig:
+    small = {"image_size": 12, "patch_size": 4, "width": 8, "depth": 1, "encoder": "none"}
+    return GambaConfig(**(small | changes))
+
+
+def _cameras(batch: int, size: int) -> Cameras:
+    viewmats = orbit(torch.linspace(0, 200, batch), 17.0)
+    return Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
+
+
+def test_scan_orders_known_answer():
+    # The map  0 1 2
+    #          3 4 5
+    assert scan_orders(2, 3).tolist() == [
+        [0, 1, 2, 3, 4, 5],
+        [0, 3, 1, 4, 2, 5],
+        [5, 4, 3, 2, 1, 0],
+        [5, 2, 4, 1, 3, 0],
+    ]
+
+
+def test_scan_orders_are_permutations_with_inverses():
+    orders = scan_orders(5, 7)
+    values = torch.randn(35)
+    for order in orders:
+        assert torch.equal(order.sort().values, torch.arange(35))
+        assert torch.equal(values[order][order.argsort()], values)
+    assert len({tuple(order.tolist()) for order in orders}) == 4
+
+
+def test_camera_numbers_known_answer_and_size_independent():
+    viewmat = torch.arange(16.0).reshape(1, 4, 4)
+    K = torch.tensor([[[20.0, 0, 5], [0, 30, 6], [0, 0, 1]]])
+    cameras = Cameras(viewmat, K, width=10, height=12)
+    want = torch.tensor([[*range(12), 2.0, 2.5, 0.5, 0.5]])
+    assert torch.equal(camera_numbers(cameras), want)
+    # Rescaling multiplies and divides in float32.
+    assert torch.allclose(camera_numbers(cameras.resized(30, 6)), want, rtol=1e-6)
+
+
+def test_splat_tokens_equal_patch_by_patch_sum():
+    config = _config()
+    module = SplatTokens(config)
+    images, cameras = torch.rand(3, 12, 12, 3), _cameras(3, 12)
+    got = module(images, cameras)
+    rays = plucker_rays(cameras.viewmats, cameras.Ks, 12, 12)
+    pixels = torch.cat([normalize_imagenet(images), rays], -1)
+    weight, bias = module.patchify.weight, module.patchify.bias
+    order = scan_orders(3, 3).flatten()
+    for position in (0, 4, 10, 20, 35):
+        row, column = divmod(int(order[position]), 3)
+        patch = pixels[:, 4 * row : 4 * row + 4, 4 * column : 4 * column + 4]
+        want = torch.einsum("bhwc,ochw->bo", patch, weight) + bias + module.embedding[position]
+        # Sums of 144 float32 products in another order.
+        assert torch.allclose(got[:, position], want, atol=1e-5), position
+
+
+def test_rays_stay_exact_under_autocast():
+    module = SplatTokens(_config())
+    torch.nn.init.zeros_(module.embedding)
+    images, cameras = torch.full((1, 12, 12, 3), 0.5), _cameras(1, 12)
+    seen = []
+    module.patchify.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    with torch.autocast("cpu", torch.bfloat16):
+        module(images, cameras)
+    module(images, cameras)
+    assert seen[0].dtype == torch.float32
+    assert torch.equal(seen[0], seen[1])
+
+
+def test_without_image_tokens_only_the_embedding_is_left():
+    module = SplatTokens(_config(additive_image_tokens=False))
+    tokens = module(torch.rand(2, 12, 12, 3), _cameras(2, 12))
+    assert torch.equal(tokens, module.embedding.expand(2, 36, 8))
+    assert [name for name, _ in module.named_parameters()] == ["embedding"]
+
+
+def test_tokens_differ_on_a_plain_background():
+    # Otherwise the decoder would put the Gaussians of all background patches at one place.
+    tokens = SplatTokens(_config(width=64))(torch.ones(1, 12, 12, 3), _cameras(1, 12))[0]
+    centred = tokens - tokens.mean(0)
+    share = (centred.square().mean() / tokens.square().mean()).sqrt().item()
+    assert 0.3 < share < 1 and math.isfinite(share)

@@ -1,0 +1,563 @@
+"""gamba bench: what is recorded, what is refused, and what is drawn."""
+
+import json
+import math
+import re
+import xml.etree.ElementTree as ET
+from functools import partial
+
+import pytest
+import torch
+from helpers import rel_rms
+
+from gamba_warp import cli
+from gamba_warp.commands import bench
+from gamba_warp.errors import UserError
+from gamba_warp.kernels.bench import (
+    Case,
+    Error,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    compare,
+    measure,
+    peers,
+)
+from gamba_warp.kernels.bench.cases import conv as conv_suite
+from gamba_warp.kernels.bench.cases import raster as raster_suite
+from gamba_warp.kernels.bench.cases import scan as scan_suite
+from gamba_warp.kernels.bench.cases.raster_variants import make_scene
+from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs
+from gamba_warp.kernels.bench.cases.scan_variants import make_variant
+from gamba_warp.kernels.bench.core.case import LEVELS, Level, NotInstalled
+from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart, pareto
+from gamba_warp.kernels.bench.core.measure import peak_bytes, saved_bytes
+from gamba_warp.kernels.bench.core.page import charts_of, page
+from gamba_warp.kernels.bench.core.report import judge, markdown, ratio_table, ratios
+from gamba_warp.kernels.bench.peers import scan_loop
+from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+
+QUICK = Settings(torch.device("cpu"), "quick", threads=1)
+# DESIGN's schema, and what it leaves to us.
+SCHEMA = set(
+    "op case variant device dtype direction ms_p20 ms_p50 ms_p80 jit_ms rel_rms_error max_error "
+    "peer peer_ms work".split()
+)
+TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """Three rounds of everything; torch's threads as before."""
+    monkeypatch.setitem(LEVELS, "quick", Level(0.0, 3, 3))
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+def variant(name="ours", run=lambda: None, error=1e-8, **options):
+    return Variant(name, run, lambda: Error(error, error, "out"), oracle="a loop", **options)
+
+
+def case(*variants, name="one", axis=None, op="scan"):
+    return Case(op, name, "A test.", lambda: list(variants), axis)
+
+
+def run(*cases):
+    return measure(cases, QUICK)
+
+
+def stub(monkeypatch, *cases, targets=()):
+    """Makes ``gamba bench scan`` run these cases."""
+    module = type("M", (), {"cases": lambda _: list(cases), "targets": lambda _: list(targets)})
+    monkeypatch.setattr(bench, "load_suite", lambda op: module)
+
+
+def test_records_have_the_schema_and_are_json():
+    calls = []
+    document = run(
+        case(
+            variant(run=lambda: calls.append("ours"), work=lambda: {"pairs": 7}, default=True),
+            variant("slow", run=lambda: calls.append("slow"), peer=True, rounds=1),
+        )
+    )
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    ours, slow = document["records"]
+    assert SCHEMA <= ours.keys() and SCHEMA <= slow.keys()
+    assert ours["status"] == "ok" and ours["work"] == {"pairs": 7} and ours["rounds"] == 3
+    assert 0 <= ours["ms_p20"] <= ours["ms_p50"] <= ours["ms_p80"]
+    assert ours["rel_rms_error"] == ours["max_error"] == 1e-8
+    assert (ours["peer"], ours["peer_ms"]) == ("slow", slow["ms_p50"])
+    assert slow["peer"] is None and slow["rounds"] == 1
+    assert calls[:4] == ["ours", "slow", "ours", "slow"]  # first calls, then in turn
+
+
+def test_the_machine_has_no_names_and_no_paths():
+    import platform
+
+    text = json.dumps(run()["machine"])
+    assert "/" not in text.replace("2026/", "") and "torch" in text
+    assert not platform.node() or platform.node() not in text
+
+
+@pytest.mark.parametrize("error", [2e-5, math.inf, math.nan])
+def test_a_failed_check_prints_no_time(error):
+    document = run(case(variant("wrong", error=error), variant("right")))
+    wrong, right = document["records"]
+    assert wrong["status"].startswith("check failed: out") and right["status"] == "ok"
+    assert all(wrong[name] is None for name in TIMES) and wrong["rounds"] == 0
+    assert all(right[name] is not None for name in TIMES)
+    json.dumps(document, allow_nan=False)
+    for text in (markdown([document]), page([document])):
+        row = next(line for line in re.split(r"\n|</tr>", text) if "wrong" in line)
+        assert "check failed" in row
+
+
+def test_a_wrong_kernel_is_caught(monkeypatch):
+    """A thousandth too much in one channel of the scan's output."""
+    from gamba_warp.kernels.bench.cases import scan_problem
+
+    real = scan_problem.selective_scan
+
+    def wrong(*arguments, **options):
+        out = real(*arguments, **options)
+        return out * torch.where(torch.arange(out.shape[-1]) == 1, 1.001, 1.0)
+
+    inputs = make_inputs(1, 40, 4)
+    for function, status in ((real, "ok"), (wrong, "check failed")):
+        monkeypatch.setattr(scan_problem, "selective_scan", function)
+        problem = ScanProblem(inputs, torch.device("cpu"), 40)
+        made = [make_variant(problem, "x", d) for d in ("forward", "forward+backward")]
+        records = run(case(*made))["records"]
+        assert all(r["status"].startswith(status) for r in records)
+
+
+def raises(error):
+    def function():
+        raise error
+
+    return function
+
+
+def test_what_raises_is_recorded_and_the_rest_goes_on():
+    document = run(
+        case(
+            variant("missing", raises(NotInstalled("mambapy")), peer=True),
+            variant("broken", raises(RuntimeError("no such\nkernel"))),
+            variant("fine"),
+        ),
+        Case("scan", "two", "", raises(MemoryError("too big"))),
+        case(variant("last"), name="three"),
+    )
+    status = {r["variant"]: r["status"] for r in document["records"]}
+    assert status == {
+        "missing": "not installed: mambapy",
+        "broken": "failed: RuntimeError: no such",
+        "fine": "ok",
+        "all": "failed: MemoryError: too big",
+        "last": "ok",
+    }
+
+
+def test_interrupt_keeps_what_was_measured(monkeypatch, tmp_path, capsys):
+    count = [0]
+
+    def stop():
+        count[0] += 1
+        if count[0] == 4:  # first call, two rounds, then
+            raise KeyboardInterrupt
+
+    cases = (
+        case(variant("a")),
+        case(variant("b", stop), variant("c"), name="two"),
+        case(variant("d")),
+    )
+    stub(monkeypatch, *cases)
+    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 130
+    assert "interrupted" in capsys.readouterr().out
+    document = json.loads((tmp_path / "bench.json").read_text())
+    assert document["interrupted"] and "interrupted" in (tmp_path / "bench.md").read_text()
+    rounds = {r["variant"]: r["rounds"] for r in document["records"]}
+    assert rounds == {"a": 3, "b": 2, "c": 2}
+
+
+def test_interrupt_before_any_round(monkeypatch):
+    document = run(case(variant("a"), variant("b", raises(KeyboardInterrupt()))))
+    assert document["interrupted"] and document["records"] == []
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "broken.json").write_text('{"format":')
+    (tmp_path / "other.json").write_text('{"format": "x"}')
+    good = run(case(variant()))
+    (tmp_path / "good.json").write_text(json.dumps(good))
+    del good["records"][0]["ms_p50"]
+    (tmp_path / "half.json").write_text(json.dumps(good))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "arguments, reason",
+    [
+        (["nonsense"], "unknown case 'nonsense'; there are scan, conv, raster"),
+        (["scan", "--quick", "--full"], "choose one"),
+        (["scan", "--threads", "0"], "--threads is 0"),
+        (["scan", "--out", "{}/file"], "cannot write into {}/file"),
+        (["scan", "--out", "{}/file/deep"], "cannot write into {}/file/deep"),
+        (["scan", "--compare", "{}/none.json"], "{}/none.json: No such file"),
+        (["scan", "--compare", "{}/broken.json"], "{}/broken.json: not JSON"),
+        (["scan", "--compare", "{}/other.json"], "{}/other.json: not a result of"),
+        (["scan", "--compare", "{}/half.json"], "{}/half.json: damaged"),
+        (["--render", "{}/half.json"], "{}/half.json: damaged"),
+        (["--render", "{}/good.json", "--out", "{}/no/x.md"], "cannot write {}/no/x.md"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(monkeypatch, files, capsys, arguments, reason):
+    stub(monkeypatch, case(variant("must not run", raises(AssertionError()))))
+    code = cli.run("bench", [a.format(files) for a in arguments])
+    captured = capsys.readouterr()
+    assert code == 2 and captured.err.count("\n") == 1 and "Traceback" not in captured.err
+    assert reason.format(files) in captured.err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_cuda_without_a_gpu(tmp_path, capsys):
+    assert cli.run("bench", ["scan", "--device", "cuda", "--out", str(tmp_path / "x")]) == 2
+    assert capsys.readouterr().err == "gamba: --device cuda: no CUDA device is available\n"
+    assert not (tmp_path / "x").exists()
+
+
+def test_compare_prints_ratios(monkeypatch, tmp_path, capsys):
+    old = run(case(variant("a"), variant("gone")))
+    stub(monkeypatch, case(variant("a"), variant("new")))
+    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 0
+    new = bench.read_document(tmp_path / "bench.json")
+    old["records"][0]["ms_p50"] = 2 * new["records"][0]["ms_p50"]
+    (record, before, after), *more = ratios(old, new)
+    assert record["variant"] == "a" and before == 2 * after and not more
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    capsys.readouterr()
+    bench.bench_command(("scan",), quick=True, out=tmp_path, compare=tmp_path / "old.json")
+    assert re.search(r"[\d.]+ x .* ms  scan · one · a · forward · float32", capsys.readouterr().out)
+    assert "0.50 x" in ratio_table(old, new)
+    old["machine"]["torch"] = "1.0"
+    assert "torch was 1.0" in ratio_table(old, new)
+
+
+def test_failures_give_code_1(monkeypatch, tmp_path, capsys):
+    stub(monkeypatch, case(variant("bad", error=1.0)))
+    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 1
+    assert "bad, forward: check failed" in capsys.readouterr().out
+    stub(monkeypatch, case(variant("absent", raises(NotInstalled("gsplat")), peer=True)))
+    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 0
+
+
+def test_targets_are_judged():
+    records = run(case(variant("a", work=lambda: {"pairs": 4}), variant("b")))["records"]
+    records[0]["ms_p50"], records[1]["ms_p50"] = 6.0, 2.0
+    a, b = (Key("scan", "one", name) for name in "ab")
+    pairs = Key("scan", "one", "a", field="pairs")
+    made = [
+        Target("ratio", (a,), (b,), at_most=2.5),
+        Target("ratio", (a,), (b,), at_least=2.5),
+        Target("counts", (a,), (b, pairs), scale=10, at_most=8),
+        Target("no such variant", (Key("scan", "one", "c"),), at_most=1),
+        Target("no such case", (Key("scan", "two", "a"),), at_most=1),
+    ]
+    rows = judge(made, records)
+    assert [(r["value"], r["reached"]) for r in rows] == [
+        (3.0, False),
+        (3.0, True),
+        (7.5, True),
+        (None, None),
+    ]
+    assert rows[0]["wanted"] == "≤ 2.5" and rows[1]["wanted"] == "≥ 2.5"
+
+
+def test_every_target_names_what_its_suite_measures(monkeypatch):
+    """Names only: nothing is run."""
+    for suite in (scan_suite, conv_suite, raster_suite):
+        full = Settings(torch.device("cpu"), "full", threads=2)
+        names = {c.name for c in suite.cases(full)}
+        for target in suite.targets(full):
+            assert {k.case for k in (*target.times, *target.over)} <= names, target.text
+        assert suite.targets(QUICK) == []
+
+
+def test_pareto_front():
+    a, b, c, d, e = (Point(*p) for p in [(1, 9), (2, 5), (3, 5), (4, 1), (2, 7)])
+    assert pareto([e, d, c, b, a]) == [a, b, d]
+    assert pareto([]) == [] and pareto([a, a]) == [a]
+
+
+@pytest.mark.parametrize("count", [1, 2, 30])
+def test_charts_are_whole_svg(count):
+    points = [Point(10.0**i % 97 + 1, 1e-7 * (i + 1), f"<{i}>", "default") for i in range(count)]
+    svg = chart([Series("a&b", points), Series("front", pareto(points), "steps")], *2 * [Axis("x")])
+    root = ET.fromstring(svg)
+    numbers = re.findall(r' (?:x|y|cx|cy|x1|x2|y1|y2)="([^"]+)"', svg)
+    assert all(math.isfinite(float(n)) for n in numbers)
+    assert len(root.findall(".//g")) == count and "&lt;0&gt;" in svg
+
+
+def test_charts_leave_out_what_they_cannot_place():
+    points = [Point(math.nan, 1), Point(1, 0), Point(-1, 1)]
+    assert chart([Series("", points)], Axis("x"), Axis("y")) == ""
+    assert chart([Series("", [*points, Point(1, 1, "ok")])], Axis("x"), Axis("y")).count("<g>") == 1
+
+
+@pytest.mark.parametrize(
+    "axis, count",
+    [("error", 2), ("L", 1), ("skipped", 1), ("memory", 1), ("error,memory,L", 4), (None, 0)],
+)
+def test_a_case_has_the_charts_of_its_axis(axis, count):
+    made = [
+        variant(
+            str(length),
+            direction=direction,
+            default=length == 8,
+            parameters={"L": length},
+            work=lambda: {"skipped": 0.5, "saved_bytes": 2**20},
+        )
+        for length in (8, 16)
+        for direction in ("forward", "forward+backward")
+    ]
+    document = run(case(*made, axis=axis))
+    svgs = charts_of("one", document["records"])
+    assert len(svgs) == count
+    for svg in svgs:
+        ET.fromstring(svg)
+    assert ("Pareto" in "".join(svgs)) == (axis not in ("L", "skipped", None))
+
+
+def test_render_makes_the_same_files_again(monkeypatch, tmp_path, capsys):
+    stub(monkeypatch, case(variant("a", default=True), axis="error"))
+    bench.bench_command(("scan",), quick=True, out=tmp_path)
+    again = tmp_path / "again"
+    source = (tmp_path / "bench.json",)
+    assert bench.bench_command(render=source, out=again) == 0
+    for name in ("bench.md", "bench.html"):
+        assert (again / name).read_text() == (tmp_path / name).read_text()
+    assert bench.bench_command(render=source, out=tmp_path / "doc.md") == 0
+    assert (tmp_path / "doc.md").read_text() == (tmp_path / "bench.md").read_text()
+    assert "http" not in (tmp_path / "bench.html").read_text()
+
+
+def test_compare_of_tensors():
+    want = {"a": torch.tensor([3.0, 4.0]), "b": torch.zeros(2)}
+    got = {"a": torch.tensor([3.0, 4.5]), "b": torch.tensor([0.0, 1e-3])}
+    error = compare(got, want)
+    assert error.worst == "a" and error.maximum == pytest.approx(0.125)
+    assert error.rel_rms == pytest.approx(rel_rms(got["a"], want["a"]))
+    assert compare(got | {"b": torch.tensor([0.0, math.nan])}, want).rel_rms == math.inf
+    assert compare(got | {"b": torch.zeros(3)}, want).worst == "b"
+    assert compare({"a": torch.zeros(0)}, {"a": torch.zeros(0)}).rel_rms == 0
+
+
+def test_saved_bytes_leaves_the_inputs_out():
+    x = torch.rand(100, requires_grad=True)
+    assert saved_bytes(lambda: x * x, [x]) == 0
+    assert saved_bytes(lambda: x.exp() * x, [x]) == 400
+
+
+def test_peak_bytes():
+    """A result of 67 MB, and again when that much was freed just before; then 17 small ones."""
+    for run in (
+        *[lambda: torch.ones(16 * 2**20)] * 2,
+        *[lambda: [torch.ones(2**20) for _ in range(17)]] * 2,
+    ):
+        peak = peak_bytes(run, torch.device("cpu"))
+        assert peak is None or 60e6 < peak < 80e6
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_the_scans_corner_is_the_truth_of_the_whole(groups):
+    """The oracle on some tokens and channels finds no error in the reference run on all."""
+    inputs = make_inputs(2, 30, 12, states=3, groups=groups)
+    state = torch.randn(2, 12, 3)
+    problem = ScanProblem(inputs, torch.device("cpu"), 20, 4, initial_state=state)
+
+    def reference(self, inputs, **options):
+        inputs = {k: x.double() for k, x in inputs.items()}
+        start = self.initial_state.double()
+        return selective_scan_reference(**inputs, delta_softplus=True, initial_state=start)[0]
+
+    problem.call = partial(reference, problem)
+    assert problem.check_forward().rel_rms < 1e-15
+    assert problem.check_backward().rel_rms < 1e-7  # gradients come back in float32
+    assert "4 of 12 channels, first 20 of 30 tokens" in problem.oracle
+
+
+def test_the_torch_loop_is_the_formula():
+    inputs = {k: x.double() for k, x in make_inputs(2, 20, 8, states=3).items()}
+    want, _ = selective_scan_reference(**inputs, delta_softplus=True)
+    first = {k: inputs[k].mT for k in ("u", "delta", "B", "C", "z")}
+    assert rel_rms(scan_loop(**(inputs | first)).mT, want) < 1e-14
+
+
+def test_quick_scan_and_conv_from_the_command_line(tmp_path, capsys):
+    code = cli.run("bench", ["scan", "conv", "--quick", "--threads", "2", "--out", str(tmp_path)])
+    document = bench.read_document(tmp_path / "bench.json")
+    records = document["records"]
+    assert code == 0, [r["status"] for r in records if r["status"] != "ok"]
+    assert {r["op"] for r in records} == {"scan", "conv"}
+    assert all(r["rel_rms_error"] < 5e-2 for r in records)
+    probe = [r for r in records if r["variant"].startswith("probe")]
+    assert len(probe) == 2 and all(r["rel_rms_error"] < 1e-5 for r in probe)
+    loop = next(r for r in records if r["variant"] == "torch loop")
+    ours = next(r for r in records if r["case"] == loop["case"] and r["variant"] == "default")
+    assert ours["peer"] == "torch loop" and ours["peer_ms"] > ours["ms_p50"]
+    assert {"bench.json", "bench.md", "bench.html"} == {p.name for p in tmp_path.iterdir()}
+
+
+def test_the_scene_and_its_crop():
+    """The rasterizer is right on the oracle's crop; a wrong colour is seen."""
+    scene = make_scene(QUICK, 2, count=300, size=64)
+    assert scene.check(True).rel_rms < 1e-4
+    wrong = scene.changed(exact={"alpha_min": 0.2})
+    assert wrong.check(False).rel_rms > 1e-2
+    counts = scene.work(True)
+    assert counts["pairs"] > 100 and counts["tiles"] == 16 and counts["gaussians"] == 300
+
+
+@pytest.mark.parametrize("name", ["one call", "skipping", "batch", "exponential"])
+def test_raster_cases_run(name):
+    chosen = [c for c in raster_suite.cases(QUICK) if c.name == name]
+    records = measure(chosen, QUICK)["records"]
+    assert records and all(r["status"] == "ok" for r in records), records
+    if name == "skipping":
+        shares = {r["variant"]: r["work"].get("skipped") for r in records}
+        assert 0.3 < shares["upstream gradient on half of the picture"] < 0.7
+    if name == "exponential":  # the variant reaches check, clock and counts
+        error = {r["variant"]: r["rel_rms_error"] for r in records}
+        assert error["degree 3"] > 10 * error["degree 5"]
+
+
+@pytest.mark.parametrize("op", ["block", "train-step"])
+def test_model_cases_run(op):
+    module = bench.load_suite(op)
+    cases = [c for c in module.cases(QUICK) if c.op == op][:1]
+    records = measure(cases, QUICK)["records"]
+    assert all(r["status"] == "ok" for r in records), records
+    if op == "block":
+        error = {r["variant"]: r["rel_rms_error"] for r in records}
+        assert 0 < error["default"] < 1e-5
+        products = next(r for r in records if r["variant"] == "matrix products alone")
+        assert products["work"]["products"] >= 7 and products["ms_p50"] > 0
+
+
+def test_products_are_all_of_a_runs():
+    from gamba_warp.measure.blocks import Products
+
+    a, b = torch.rand(3, 4), torch.rand(5, 4)
+    layer = torch.nn.Linear(4, 5)
+    products = Products(lambda: (layer(a), a @ b.T, a[None] @ b.T[None]), torch.device("cpu"))
+    assert products.count == 3 and products.flops == 3 * 2 * 3 * 4 * 5
+    products.run()
+
+
+def test_unwritable_result_is_one_line(monkeypatch, tmp_path):
+    stub(monkeypatch, case(variant()))
+    (tmp_path / "bench.md").mkdir()
+    with pytest.raises(UserError, match="bench.md"):
+        bench.bench_command(("scan",), quick=True, out=tmp_path)
+    assert (tmp_path / "bench.json").is_file()
+
+
+def test_kept_states_are_counted_on_their_own_kernels():
+    (case,) = [c for c in scan_suite.cases(QUICK) if c.name == "boundary spacing"]
+    wide, narrow = measure([case], QUICK)["records"][::-1]
+    assert narrow["status"] == wide["status"] == "ok" and wide["is_default"]
+    assert narrow["work"]["saved_bytes"] == 2 * wide["work"]["saved_bytes"]
+
+
+def test_dropped_background_is_measured_against_the_full_model():
+    (case,) = [c for c in bench.load_suite("model").cases(QUICK) if c.name == "background tokens"]
+    full, none = measure([case], QUICK)["records"]
+    assert full["rel_rms_error"] == 0 and full["work"]["skipped"] == 0
+    assert 0 < none["rel_rms_error"] < 0.3 and 0.3 < none["work"]["skipped"] < 1
+
+
+def test_gsplats_parts_agree_with_ours():
+    pytest.importorskip("gsplat")
+    settings = Settings(torch.device("cpu"), "quick", peers=True, threads=1)
+    (case,) = [c for c in raster_suite.cases(settings) if c.name == "gsplat's parts"]
+    records = measure([case], settings)["records"]
+    assert [r["status"] for r in records] == ["ok"] * 6, records
+    assert sum(r["rel_rms_error"] is not None for r in records) == 2
+
+
+def test_gswarp_is_reported_where_it_is_not():
+    scene = make_scene(QUICK, count=8, size=16)
+    with pytest.raises(NotInstalled, match="gswarp"):
+        scene.forward(peers.gswarp_rasterization)
+    with pytest.raises(ValueError, match="alpha_min"):
+        scene.changed(options={"alpha_min": 0.1}).forward(peers.gswarp_rasterization)
+
+
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        (lambda d: d["records"][0].update(ms_p50=math.nan), "NaN is no number"),
+        (lambda d: d["records"][0].update(ms_p50=math.inf), "Infinity is no number"),
+        (lambda d: d["records"][0].update(ms_p50="fast"), r"records\[0\].ms_p50 is 'fast'"),
+        (lambda d: d["records"][0].update(ms_p20=None), "no times, but its status is ok"),
+        (lambda d: d["records"][0].update(work={"pairs": "many"}), "what is no number"),
+        (lambda d: d["records"][0].pop("text"), r"records\[0\] has no text"),
+        (lambda d: d["records"].append(7), r"records\[1\] is missing or is no object"),
+        (lambda d: d.update(records={}), "records is missing or is no list"),
+        (lambda d: d.pop("machine"), "machine is missing"),
+        (lambda d: d["machine"].pop("warp"), "machine has no warp"),
+        (lambda d: d.pop("interrupted"), "interrupted is missing"),
+        (lambda d: d.update(targets=[{"op": "scan"}]), r"targets\[0\] has no text"),
+        (lambda d: d.update(format="gamba_warp.bench.0"), "not a result of"),
+    ],
+)
+def test_damaged_results_are_refused(tmp_path, change, reason):
+    document = run(case(variant()))
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps(document))
+    assert bench.read_document(path) == document
+    change(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError, match=reason):
+        bench.read_document(path)
+    for data in (b"\xff\xfe", b"[" * 10**5, b"", b"null"):
+        path.write_bytes(data)
+        with pytest.raises(UserError, match="not JSON|not a result"):
+            bench.read_document(path)
+
+
+@pytest.mark.parametrize("axis, saved", [("skipped", 75), ("switched off", -300)])
+def test_saved_time_is_told_by_direction(axis, saved):
+    """A variant takes a quarter of its own direction's default."""
+    made = [
+        variant(name, direction=d, default=name == "all", work=lambda: {"skipped": 0.5})
+        for d in ("forward", "forward+backward")
+        for name in ("all", "less")
+    ]
+    records = run(case(*made, axis=axis))["records"]
+    for record, ms in zip(records, (8.0, 2.0, 80.0, 20.0)):
+        record["ms_p50"] = ms
+    (svg,) = charts_of("one", records)
+    assert svg.count(f"less: 50, {saved}") == 2
+
+
+@pytest.mark.parametrize("low, high", [(75.8, 81.7), (5.1, 5.2), (0.097, 0.099), (88, 150)])
+def test_narrow_axes_have_ticks_and_room(low, high):
+    axis = Axis("ms")
+    svg = chart([Series("", [Point(low, low), Point(high, high)])], axis, axis)
+    assert svg.count('text-anchor="middle"') >= 3 and svg.count('text-anchor="end"') >= 3
+    left, right = (float(x) for x in re.findall(r'cx="([^"]+)"', svg))
+    assert (right - left) / 522 == pytest.approx(math.log10(high / low) / 0.4, rel=0.2)
+
+
+def test_an_error_of_zero_is_drawn_at_the_bottom():
+    document = run(case(variant("all", error=0.0, default=True), variant("part"), axis="error"))
+    (svg,) = charts_of("one", document["records"])
+    assert "all (error 0): " in svg and svg.count("<g>") == 2
+    all_zero = run(case(variant("all", error=0.0), axis="error"))
+    assert charts_of("one", all_zero["records"]) == [""]

@@ -1,0 +1,232 @@
+"""What the CUDA kernels take of a GPU: every kernel found, read from its binary, and in bounds."""
+
+import ast
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+import warp as wp
+from helpers.kernels import plain_kernel
+
+from gamba_warp.commands.bench import bench_command
+from gamba_warp.kernels.bench.static import report as static
+from gamba_warp.kernels.bench.static.cubin import read_cubin
+from gamba_warp.kernels.bench.static.dry_run import Launch, dry_run
+from gamba_warp.kernels.bench.static.report import MACHINES, occupancy
+from gamba_warp.kernels.runtime.views import view
+
+ROOT = Path(__file__).resolve().parents[3]
+DOCS = ROOT / "docs" / "benchmarks"
+
+# op, kernel, case: registers of a thread, bytes of stack, bytes of shared memory of a block, warps
+# that fit on a multiprocessor; about a tenth from what the compiler used when this was written.
+# The stack of the scan's gradient holds its marks: 16 x 8 floats, twice, so none of them spills.
+# The compositor's holds a few values that its loops do not use, the forward's on sm_80 only.
+BOUNDS = {
+    ("scan", "scan_forward", "bfloat16"): (168, 0, 56000, 12),
+    ("scan", "scan_forward", "float32"): (168, 0, 56000, 12),
+    ("scan", "scan_forward", "bfloat16, in pieces"): (112, 0, 21000, 16),
+    ("scan", "scan_forward", "bfloat16, last state alone"): (120, 0, 21000, 16),
+    ("scan", "scan_backward", "bfloat16"): (255, 1200, 36000, 8),
+    ("scan", "scan_backward", "bfloat16, last state alone"): (168, 1200, 21000, 12),
+    ("scan", "summarise_backward", "bfloat16, in pieces"): (140, 0, 21000, 12),
+    ("scan", "carry", "bfloat16, in pieces"): (48, 0, 2000, 36),
+    ("conv", "conv_forward", "bfloat16"): (64, 0, 2000, 32),
+    ("conv", "conv_forward", "float32"): (64, 0, 2000, 32),
+    ("conv", "conv_backward", "bfloat16"): (80, 0, 2000, 24),
+    ("conv", "conv_backward", "float32"): (80, 0, 2000, 24),
+    ("raster", "project", "32 views"): (80, 0, 2000, 24),
+    ("raster", "project_vjp", "32 views"): (128, 0, 2000, 16),
+    ("raster", "count", "32 views"): (64, 0, 2000, 32),
+    ("raster", "emit", "32 views"): (64, 0, 2000, 32),
+    ("raster", "reduce", "32 views"): (64, 0, 2000, 32),
+    ("raster", "quantile", "depth of a transmittance"): (64, 0, 2000, 32),
+    ("raster", "composite", "32 views"): (80, 40, 3200, 24),
+    ("raster", "composite", "1 view, a tile in quarters"): (80, 0, 3200, 24),
+    ("raster", "composite", "32 views with depth"): (96, 8, 3200, 20),
+    ("raster", "composite_vjp", "32 views"): (96, 0, 7600, 20),
+    ("raster", "composite_vjp", "1 view, a tile in quarters"): (96, 0, 7600, 20),
+    ("raster", "composite_vjp", "32 views with depth"): (128, 0, 7600, 16),
+    ("raster", "composite_vjp", "32 views, gradients of colours alone"): (96, 8, 7600, 20),
+}
+
+
+@pytest.fixture(scope="module")
+def entries():
+    return static.find_kernels()
+
+
+@pytest.mark.parametrize("key", BOUNDS, ids=" ".join)
+def test_a_kernel_is_in_its_bounds(entries, key):
+    found = [e for e in entries if (e.op, e.name, e.case) == key]
+    assert found, "no such kernel is launched"
+    registers, stack, most_shared, warps = BOUNDS[key]
+    for entry in found:
+        for arch, (used, dynamic) in static.compile_kernel(entry.launch).items():
+            shared = used.shared + dynamic
+            fit = occupancy(MACHINES[arch], entry.launch.block, used.registers, shared)
+            assert 16 <= used.registers <= registers, (arch, used)
+            assert used.frame <= (0 if key[1] == "composite" and arch == 90 else stack), (
+                arch,
+                used,
+            )
+            assert most_shared / 4 <= shared <= most_shared, (arch, shared)
+            assert fit.warps >= warps, (arch, fit)
+
+
+def kernels_of_the_sources():
+    """Names of the functions under ``@wp.kernel`` in what a GPU runs."""
+    names = set()
+    for path in (ROOT / "kernels").rglob("*.py"):
+        if {"cpu", "bench"} & set(path.parts) or path.stem == "team":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                decorators = " ".join(map(ast.unparse, node.decorator_list))
+                if "wp.kernel" in decorators:
+                    names.add(node.name.lstrip("_"))
+    return names
+
+
+def test_a_dry_run_leaves_nothing_behind():
+    """A description of memory that is not there would be taken for that of a like CPU tensor."""
+    shape = (2, 77, 33)
+    with dry_run():
+        view(torch.empty(shape, device="cuda"))
+    found = view(torch.ones(shape))
+    assert tuple(found.shape)[:3] == shape and tuple(found.strides)[:3] == (77 * 33 * 4, 33 * 4, 4)
+
+
+def test_no_kernel_is_forgotten(entries):
+    assert {entry.name for entry in entries} == kernels_of_the_sources()
+    launches = [entry.launch for entry in entries]
+    assert len(set(launches)) == len(launches)
+
+
+def test_the_choice_of_kernels_is_the_operators(entries):
+    """Few sequences are cut into pieces, few views into parts of tiles: other kernels."""
+    names = {(entry.case, entry.name) for entry in entries}
+    assert ("bfloat16, in pieces", "summarise_backward") in names
+    assert ("bfloat16", "summarise_backward") not in names
+    composites = [e for e in entries if e.name == "composite"]
+    assert len({e.launch.kernel for e in composites}) == len(composites) == 5
+    assert {e.launch.block for e in composites} == {32}
+    directions = {e.name: e.direction for e in entries if e.op != "scan"}
+    assert {n for n, d in directions.items() if d == "gradient"} == {
+        *("conv_backward", "composite_vjp", "reduce", "project_vjp")
+    }
+
+
+def test_the_committed_report_is_of_these_kernels(entries):
+    """Made again by ``gamba bench --static --out docs/benchmarks``."""
+    document = json.loads((DOCS / "static.json").read_text())
+    rows = [(r["op"], r["kernel"], r["case"], r["direction"]) for r in document["kernels"]]
+    assert rows == [(e.op, e.name, e.case, e.direction) for e in entries for _ in MACHINES]
+    assert (DOCS / "static.md").read_text() == static.static_markdown(document)
+
+
+# Known from NVIDIA's occupancy calculator.
+@pytest.mark.parametrize(
+    "arch, block, registers, shared, blocks, share, limit",
+    [
+        (80, 256, 32, 0, 8, 1.0, "registers"),
+        (80, 256, 33, 0, 6, 0.75, "registers"),  # 40 are handed out
+        (80, 256, 64, 0, 4, 0.5, "registers"),
+        (90, 128, 168, 0, 3, 0.1875, "registers"),
+        (90, 96, 168, 0, 4, 0.1875, "registers"),  # 3 warps in each quarter
+        (80, 1024, 255, 0, 0, 0.0, "registers"),
+        (80, 32, 16, 0, 32, 0.5, "blocks"),
+        (80, 1024, 16, 0, 2, 1.0, "warps"),
+        (80, 128, 32, 48 << 10, 3, 0.1875, "shared memory"),  # 49 KB of 164
+        (90, 128, 32, 48 << 10, 4, 0.25, "shared memory"),  # of 228
+        (90, 128, 32, 113 << 10, 2, 0.125, "shared memory"),
+        (90, 128, 32, (113 << 10) + 1, 1, 0.0625, "shared memory"),
+    ],
+)
+def test_occupancy(arch, block, registers, shared, blocks, share, limit):
+    fit = occupancy(MACHINES[arch], block, registers, shared)
+    assert (fit.blocks, fit.share, fit.limit) == (blocks, share, limit)
+    assert fit.warps == fit.blocks * -(-block // 32)
+
+
+Forty = wp.types.vector(40, wp.float32)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def table_kernel(index_in: wp.array[int], x_in: wp.array[float], x_out: wp.array[float]):
+    """A table indexed at run time: it cannot be in registers."""
+    i = wp.tid()
+    table = Forty()
+    for k in range(40):
+        table[k] = x_in[i + k]
+    x_out[i] = table[index_in[i]]
+
+
+def test_local_memory_is_seen():
+    table, plain = (static.compile_kernel(Launch(k, 64)) for k in (table_kernel, plain_kernel))
+    for arch in MACHINES:
+        used, dynamic = table[arch]
+        assert used.frame >= 160 and used.local_stores >= 10 and used.local_loads >= 1
+        assert used.reloads == 0 and dynamic == 0
+        used, _ = plain[arch]
+        assert used.frame == used.local_loads == used.local_stores == used.reloads == 0
+        assert 4 <= used.registers <= 32 and used.instructions > 10
+
+
+def test_a_disassembler_counts_the_same(entries):
+    """Where there is one: NVIDIA's own, or the one that Triton carries."""
+    tool = shutil.which("nvdisasm")
+    if tool is None:
+        triton = pytest.importorskip("triton", reason="no nvdisasm")
+        tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
+    if not Path(tool).exists():
+        pytest.skip("no nvdisasm")
+    entry = next(e for e in entries if e.name == "scan_backward")
+    used, _ = static.compile_kernel(entry.launch)[90]
+    module = entry.launch.kernel.module
+    module.options["block_dim"] = entry.launch.block
+    (path,) = wp.compile_aot_module(module, arch=90, use_ptx=False)
+    text = subprocess.run([tool, "-c", path], capture_output=True, text=True, check=True).stdout
+    lines = [line for line in text.splitlines() if re.match(r"\s+/\*[0-9a-f]{4,}\*/", line)]
+    loads = [line for line in lines if re.search(r"\bLDL\b", line)]
+    assert len(lines) == used.instructions
+    assert len(loads) == used.local_loads > 0
+    assert sum(bool(re.search(r"\bSTL\b", line)) for line in lines) == used.local_stores > 0
+    assert sum("[R1" in line and "[R1." not in line for line in loads) == used.reloads
+
+
+@pytest.mark.parametrize("data", [b"", b"text", b"\x7fELF\x02" + bytes(100), b"\x7fELF\x02\x01"])
+def test_no_cubin_is_an_error(data):
+    with pytest.raises(ValueError, match="cubin"):
+        read_cubin(data)
+
+
+def test_the_command_writes_both_files(monkeypatch, tmp_path, capsys):
+    cases = {("conv", "bfloat16"): static.CASES["conv", "bfloat16"]}
+    monkeypatch.setattr(static, "CASES", cases)
+    assert bench_command(static=True, out=tmp_path / "new") == 0
+    document = json.loads((tmp_path / "new" / "static.json").read_text())
+    assert document["format"] == static.FORMAT and document["versions"]["warp"] == wp.__version__
+    rows = {(r["kernel"], r["direction"], r["arch"]): r for r in document["kernels"]}
+    assert set(rows) == {
+        (*kernel, arch)
+        for kernel in (("conv_forward", "forward"), ("conv_backward", "gradient"))
+        for arch in ("sm_80", "sm_90")
+    }
+    text = (tmp_path / "new" / "static.md").read_text()
+    row = rows["conv_forward", "forward", "sm_90"]
+    (line,) = [line for line in text.splitlines() if line.startswith("| `conv_forward` |")]
+    assert f"{row['registers']} |" in line and f"{row['share']:.0%}" in line
+    assert "4 rows" in capsys.readouterr().out
+
+
+def test_without_a_compiler(monkeypatch, tmp_path):
+    from gamba_warp.errors import UserError
+
+    monkeypatch.setattr(wp, "get_cuda_toolkit_version", lambda: None)
+    with pytest.raises(UserError, match="--static: this build of warp-lang"):
+        bench_command(static=True, out=tmp_path)

@@ -1,0 +1,143 @@
+"""The causal convolution against its float64 oracle: outputs, gradients by name, states."""
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers.conv import make
+
+from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
+from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
+
+FORWARD = 2e-7  # float32 rounding of four products and a SiLU
+GRADIENT = 2e-6  # float32 sums over up to 2 * 577 tokens
+
+
+def leaves(inputs, dtype=None):
+    return {k: v.detach().clone().to(dtype or v.dtype).requires_grad_() for k, v in inputs.items()}
+
+
+def compare(inputs, activation, forward=FORWARD, gradient=GRADIENT):
+    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
+    out, final = causal_conv1d(**mine, activation=activation, return_final_state=True)
+    want, want_final = causal_conv1d_reference(**theirs, activation=activation)
+    assert_rel_rms(out, want, forward, "out")
+    assert torch.equal(final.double(), want_final)
+    v_out, v_final = torch.randn_like(out), torch.randn_like(final)
+    grads = torch.autograd.grad((out * v_out).sum() + (final * v_final).sum(), [*mine.values()])
+    total = (want * v_out.double()).sum() + (want_final * v_final.double()).sum()
+    for name, got, expected in zip(mine, grads, torch.autograd.grad(total, [*theirs.values()])):
+        assert got.dtype == inputs[name].dtype, name
+        limit = gradient if got.dtype != torch.float32 else GRADIENT
+        assert_rel_rms(got, expected, limit, f"gradient of {name}")
+
+
+@pytest.mark.parametrize("activation", [None, "silu"])
+@pytest.mark.parametrize(
+    "batch, length, channels, width",
+    [(1, 1, 1, 4), (2, 2, 17, 3), (1, 65, 16, 2), (2, 256, 5, 4), (1, 258, 40, 4), (2, 577, 33, 4)],
+)
+def test_matches_oracle(batch, length, channels, width, activation):
+    compare(make(batch, length, channels, width), activation)
+
+
+@pytest.mark.parametrize("dtype, limit", [(torch.bfloat16, 4e-3), (torch.float16, 5e-4)])
+def test_half_precision(dtype, limit):
+    """Limits: the rounding of the dtype itself, 2^-9 and 2^-12 at most, on output only."""
+    compare(make(2, 65, 37, 4, dtype), "silu", limit, limit)
+
+
+def test_without_bias_and_state():
+    inputs = make(2, 20, 18, 4)
+    compare({k: inputs[k] for k in ("x", "weight")}, "silu")
+
+
+@pytest.mark.parametrize("cut", [1, 2, 300])
+def test_split_consistency(cut):
+    inputs = make(2, 310, 19, 4)
+    whole = causal_conv1d(**inputs, activation="silu")
+    parts, state = [], inputs.pop("initial_state")
+    x = inputs.pop("x")
+    for piece in (x[:, :cut], x[:, cut:]):
+        out, state = causal_conv1d(
+            piece, **inputs, initial_state=state, activation="silu", return_final_state=True
+        )
+        parts.append(out)
+    assert torch.equal(torch.cat(parts, 1), whole)
+
+
+@pytest.mark.parametrize("name", ["x", "weight", "bias", "initial_state"])
+def test_one_gradient_alone(name):
+    inputs = make(2, 30, 20, 4)
+    everything = leaves(inputs)
+    out = causal_conv1d(**everything, activation="silu")
+    want = torch.autograd.grad(out.square().sum(), everything[name])[0]
+    inputs[name].requires_grad_()
+    out = causal_conv1d(**inputs, activation="silu")
+    assert torch.equal(torch.autograd.grad(out.square().sum(), inputs[name])[0], want)
+
+
+@pytest.mark.parametrize("batch, length", [(0, 5), (2, 0)])
+def test_empty(batch, length):
+    inputs = leaves(make(batch, length, 6, 4))
+    out, final = causal_conv1d(**inputs, activation="silu", return_final_state=True)
+    assert out.shape == (batch, length, 6) and final.shape == (batch, 3, 6)
+    grads = torch.autograd.grad(out.sum() + final.sum(), [*inputs.values()], allow_unused=True)
+    assert all(grad is None or torch.isfinite(grad).all() for grad in grads)
+
+
+def test_strided_input():
+    inputs = make(2, 40, 20, 4)
+    dense = causal_conv1d(**inputs)
+    inputs["x"] = torch.cat([inputs["x"], inputs["x"]], -1)[..., :20]
+    assert torch.equal(causal_conv1d(**inputs), dense)
+
+
+def test_causal_conv1d_signature():
+    inputs = make(2, 21, 18, 4)
+    out, final = causal_conv1d_fn(
+        inputs["x"].transpose(1, 2),
+        inputs["weight"],
+        inputs["bias"],
+        initial_states=inputs["initial_state"].transpose(1, 2),
+        return_final_states=True,
+        activation="swish",
+    )
+    want, want_final = causal_conv1d(**inputs, activation="silu", return_final_state=True)
+    assert torch.equal(out.transpose(1, 2), want) and torch.equal(final.transpose(1, 2), want_final)
+    assert torch.equal(
+        causal_conv1d_fn(inputs["x"].transpose(1, 2), inputs["weight"]),
+        causal_conv1d(inputs["x"], inputs["weight"]).transpose(1, 2),
+    )
+
+
+@pytest.mark.parametrize(
+    "name, change, error",
+    [
+        ("x", lambda x: x[0], ValueError),
+        ("x", lambda x: x.double(), TypeError),
+        ("weight", lambda x: x[:, :1], ValueError),
+        ("weight", lambda x: x[:-1], ValueError),
+        ("bias", lambda x: x[:-1], ValueError),
+        ("initial_state", lambda x: x[:, :-1], ValueError),
+        ("initial_state", lambda x: x.half(), TypeError),
+    ],
+)
+def test_bad_input_names_the_argument(name, change, error):
+    inputs = make(2, 5, 6, 4)
+    inputs[name] = change(inputs[name])
+    with pytest.raises(error, match=rf"^{name} "):
+        causal_conv1d(**inputs)
+
+
+def test_bad_options():
+    inputs = make(2, 5, 6, 4)
+    with pytest.raises(ValueError, match="activation is 'relu'"):
+        causal_conv1d(**inputs, activation="relu")
+    with pytest.raises(ValueError, match="seq_idx"):
+        causal_conv1d_fn(inputs["x"].transpose(1, 2), inputs["weight"], seq_idx=torch.zeros(2, 5))
+
+
+def test_operator_contract():
+    """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
+    arguments = (*leaves(make(2, 7, 5, 3)).values(), True)
+    torch.library.opcheck(torch.ops.gamba_warp.causal_conv1d.default, arguments)

@@ -1,0 +1,170 @@
+"""The rasterizer against its float64 oracle."""
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers.raster import GRADIENT, NAMES, PICTURE, leaves, make, mapped
+
+from gamba_warp.kernels.rasterize import rasterization
+from gamba_warp.kernels.rasterize.harmonics import colors_from_harmonics
+from gamba_warp.kernels.rasterize.reference import rasterization_reference
+
+
+def near_a_cut(scene, options):
+    """Pixels whose float64 alpha changes when alpha_min does a little: there rounding decides."""
+    alpha_min = options.get("alpha_min", 1 / 255)
+    options = {k: v for k, v in options.items() if k != "alpha_min"}
+    scene = mapped(scene, torch.Tensor.double)
+    low, high = (
+        rasterization_reference(**scene, **options, alpha_min=alpha_min * (1 + s))[2]
+        for s in (-1e-5, 1e-5)
+    )
+    return (low != high)[..., 0]
+
+
+def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
+    """Pictures and gradients under a random cotangent, against the oracle in float64."""
+    flip = near_a_cut(scene, {**options, "antialiased": antialiased})
+    assert flip.float().mean() < 0.05
+    got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
+    kind = "antialiased" if antialiased else "classic"
+    renders, alphas, meta = rasterization(**got, render_mode=mode, rasterize_mode=kind, **options)
+    color, depth, alpha = rasterization_reference(**want, antialiased=antialiased, **options)
+    if mode.endswith("ED"):
+        depth = depth / alpha.clamp_min(1e-10)
+    parts = {"RGB": [color], "D": [depth], "ED": [depth]}.get(mode, [color, depth])
+    expected = torch.cat(parts, -1)
+    assert alpha.mean() > 0.1 and renders.std() > 0.01, "the picture is empty"
+    keep = ~flip[..., None]
+    assert ((renders - expected) * keep).abs().max() <= PICTURE * max(1.0, expected.max().item())
+    assert ((alphas - alpha) * keep).abs().max() <= PICTURE
+    v_renders = torch.randn_like(renders) * keep
+    v_alphas = torch.randn_like(alphas) * keep
+    ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
+    ((expected * v_renders).sum() + (alpha * v_alphas).sum()).backward()
+    for name in NAMES:
+        if isinstance(got[name], torch.Tensor) and want[name].grad is not None:
+            if got[name].grad is None:  # depth alone does not see colours
+                assert name in ("colors", "backgrounds") and (want[name].grad == 0).all()
+            else:
+                assert_rel_rms(got[name].grad, want[name].grad, gradient, name)
+    return meta
+
+
+@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+def test_modes(mode):
+    compare(make(), mode)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
+def test_antialiased(mode):
+    # small Gaussians, so that the factor matters
+    compare(make(1, 2, size=0.025, num=300, width=53), mode, antialiased=True)
+
+
+@pytest.mark.parametrize("channels, views, batch", [(1, 1, 1), (2, 1, 3), (5, 2, 1), (17, 1, 1)])
+def test_channels_and_batches(channels, views, batch):
+    compare(make(batch, views, channels=channels, width=21, height=18))
+
+
+def test_large_gaussians_stop_early():
+    scene = make(num=150, size=0.3)
+    scene["opacities"] = 0.9 + 0.0999 * torch.rand(2, 150)
+    # alpha is clamped often, and 1e-4 is all that is left for the last ones
+    meta = compare(scene)
+    assert meta["pairs_walked"] < 0.7 * meta["pairs"]
+
+
+def test_colors_per_view():
+    scene = make()
+    scene["colors"] = torch.rand(2, 3, 60, 3)
+    compare(scene)
+
+
+def test_wide_view_clamps_the_jacobian():
+    scene = make(num=200)
+    scene["means"] = scene["means"] * 4  # many beside the picture, and some behind
+    scene["Ks"][..., 0, 0] *= 0.3
+    scene["Ks"][..., 1, 1] *= 0.5
+    scene["scales"] = scene["scales"] * 3
+    meta = compare(scene)
+    assert meta["culled"]["near"] > 0
+
+
+@pytest.mark.parametrize("option", [{"eps2d": 0.1}, {"alpha_min": 0.02}, {"alpha_max": 0.7}])
+def test_options(option):
+    compare(make(), **option)
+
+
+def test_planes():
+    compare(make(num=200, size=0.1), near_plane=1.5, far_plane=1.9)
+
+
+def test_needles():
+    """The conic as a sum of squares: no cancellation, where a c - b² would lose all digits."""
+    scene = make(num=40, size=0.01, width=96, height=80)
+    scene["scales"][..., 0] = 2.0
+    compare(scene, gradient=1e-3)  # a derivative of a needle's angle carries its length in pixels
+
+
+def test_without_rotation():
+    scene = make()
+    identity = dict(scene, quats=torch.tensor([1.0, 0, 0, 0]).expand(2, 60, 4).contiguous())
+    none = dict(scene, quats=None)
+    compare(none)
+    pictures = [rasterization(**s)[0] for s in (identity, none)]
+    assert torch.equal(*pictures)
+
+
+def test_zero_quaternion_is_no_rotation():
+    scene = make(batch=1)
+    scene["quats"][:, :7] = 0.0
+    compare(scene)
+    scene = leaves(scene, torch.float32)
+    rasterization(**scene)[0].square().sum().backward()
+    assert (scene["quats"].grad[:, :7] == 0).all()
+
+
+def test_quaternion_length_does_not_matter():
+    scene = make()
+    want = rasterization(**scene)[0]
+    for factor in (1e-25, 1e25):
+        got = rasterization(**dict(scene, quats=scene["quats"] * factor))[0]
+        assert (got - want).abs().max() < PICTURE
+
+
+def test_zero_scales_are_points():
+    scene = make(1, 2, num=200)
+    scene["scales"][:, ::2] = 0.0
+    compare(scene)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics(degree):
+    scene = make(num=50)
+    coefficients = 0.4 * torch.randn(2, 50, 16, 3)
+    scene["colors"] = coefficients
+    got = leaves(scene, torch.float32)
+    renders, _, _ = rasterization(**got, sh_degree=degree)
+    want = leaves(scene, torch.float64)
+    flat = colors_from_harmonics(degree, want["colors"], want["means"], want["viewmats"])
+    expected, _, _ = rasterization_reference(**dict(want, colors=flat))
+    keep = ~near_a_cut(dict(scene, colors=flat.detach().float()), {})[..., None]
+    assert ((renders - expected) * keep).abs().max() <= PICTURE * expected.max()
+    v = torch.randn_like(renders) * keep
+    (renders * v).sum().backward()
+    (expected * v).sum().backward()
+    for name in NAMES[:-1]:
+        assert_rel_rms(got[name].grad, want[name].grad, GRADIENT, name)
+    used = (degree + 1) ** 2
+    assert (got["colors"].grad[:, :, used:] == 0).all()
+
+
+def test_harmonics_are_orthonormal():
+    """∫ Y_j Y_k = δ_jk by a Monte Carlo sum: a wrong constant or sign of a term shows."""
+    from gamba_warp.kernels.rasterize.harmonics import _basis
+
+    directions = torch.nn.functional.normalize(torch.randn(400_000, 3, dtype=torch.float64), dim=-1)
+    basis = _basis(3, directions)
+    gram = 4 * torch.pi * basis.T @ basis / len(directions)
+    assert (gram - torch.eye(16)).abs().max() < 0.03  # 1 / sqrt(400000), times 4 sigma and Y² - 1

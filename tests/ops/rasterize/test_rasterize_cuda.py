@@ -1,0 +1,245 @@
+"""The CUDA kernels without a GPU: small shapes on CPU blocks."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+import warp as wp
+from helpers import assert_rel_rms
+from helpers.raster import leaves, make
+
+from gamba_warp.kernels.rasterize import Skip, ops, rasterization
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
+from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
+from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
+from gamba_warp.kernels.rasterize.cuda.warp import touching
+
+SAME = 2e-6  # the two sum in another order
+
+
+def run(scene, v_renders, v_alphas, mode, needs=None, **options):
+    """Pictures and gradients by name, and counts; only ``needs`` get gradients, or all."""
+    tensors = leaves(scene, torch.float32)
+    for name, value in tensors.items():
+        if needs is not None and isinstance(value, torch.Tensor) and name not in needs:
+            value.requires_grad_(False)
+    renders, alphas, meta = rasterization(**tensors, render_mode=mode, **options)
+    ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
+    grads = {k: v.grad for k, v in tensors.items() if getattr(v, "grad", None) is not None}
+    counts = {k: meta[k] for k in ("pairs_walked", "blocks_walked", "blocks_used", "tiles_skipped")}
+    return {"renders": renders, "alphas": alphas, **grads}, counts
+
+
+@pytest.fixture
+def on_blocks(monkeypatch):
+    """The CUDA compositor in place of the CPU's, with real blocks and memory full of NaN."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+
+    def switch(parts=1):
+        monkeypatch.setattr(ops, "_compositor", lambda device: composite_cuda)
+        monkeypatch.setattr(composite_cuda, "parts_of_tile", lambda tiles, device: parts)
+        new_empty = torch.Tensor.new_empty
+
+        def poisoned(tensor, *shape, **options):
+            x = new_empty(tensor, *shape, **options)
+            return x.fill_(torch.nan if x.is_floating_point() else 77)
+
+        monkeypatch.setattr(torch.Tensor, "new_empty", poisoned)
+
+    return switch
+
+
+def test_skips_change_nothing(on_blocks):
+    scene = crowded(3)
+    v_renders, v_alphas = torch.randn(1, 2, 21, 37, 3), torch.randn(1, 2, 21, 37, 1)
+    v_renders[:, :, :16, :16] = v_alphas[:, :, :16, :16] = 0
+    on_blocks(2)
+    want, counts = run(scene, v_renders, v_alphas, "RGB")
+    off = dict.fromkeys([field.name for field in fields(Skip)], False)
+    got, all_counts = run(scene, v_renders, v_alphas, "RGB", skip=Skip(**off))
+    for name, value in want.items():
+        assert_rel_rms(got[name], value, SAME, name)
+    assert all_counts["pairs_walked"] > counts["pairs_walked"]
+    assert all_counts["tiles_skipped"] < counts["tiles_skipped"]
+    assert all_counts["blocks_walked"] > counts["blocks_walked"] > 0
+
+
+def crowded(channels):
+    """Some pixels stop early, some alphas are clamped; lists of up to three batches."""
+    scene = make(1, 2, num=90, width=37, height=21, channels=channels, size=0.15)
+    scene["opacities"][:, ::2] = 0.9999
+    return scene
+
+
+@pytest.mark.parametrize(
+    "channels, mode, parts",
+    [(3, "RGB", 1), (3, "RGB+ED", 2), (6, "RGB", 1), (5, "RGB", 4), (2, "RGB", 2), (1, "ED", 4)],
+)
+def test_block_kernels_equal_lane_kernels(on_blocks, channels, mode, parts):
+    scene = crowded(channels)
+    size = channels + ("+" in mode) if mode != "ED" else 1
+    v_renders, v_alphas = torch.randn(1, 2, 21, 37, size), torch.randn(1, 2, 21, 37, 1)
+    v_renders[:, :, :16, :16] = v_alphas[:, :, :16, :16] = 0  # a tile without gradient
+    v_renders[:, :, :4, 16:24] = v_alphas[:, :, :4, 16:24] = 0  # and a sub-tile
+    lanes, lane_counts = run(scene, v_renders, v_alphas, mode)
+    on_blocks(parts)
+    blocks, block_counts = run(scene, v_renders, v_alphas, mode)
+    assert lanes["alphas"].mean() > 0.3 and lanes.keys() == blocks.keys()
+    for name, value in lanes.items():
+        assert_rel_rms(blocks[name], value, SAME, name)
+    # the CPU counts blocks of which only pixels outside the picture are covered
+    used, lanes_used = block_counts.pop("blocks_used"), lane_counts.pop("blocks_used")
+    assert 0.99 * lanes_used <= used <= lanes_used
+    # a sub-tile is two blocks
+    assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
+    assert block_counts == lane_counts and lane_counts["tiles_skipped"] >= 2
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_colours_alone(on_blocks, parts):
+    """Another kernel, without moments."""
+    scene = crowded(3)
+    v_renders, v_alphas = torch.randn(1, 2, 21, 37, 3), torch.randn(1, 2, 21, 37, 1)
+    lanes, _ = run(scene, v_renders, v_alphas, "RGB", needs=["colors"])
+    on_blocks(parts)
+    blocks, _ = run(scene, v_renders, v_alphas, "RGB", needs=["colors"])
+    assert set(blocks) == {"renders", "alphas", "colors"}
+    for name, value in lanes.items():
+        assert_rel_rms(blocks[name], value, SAME, name)
+
+
+def test_a_first_gaussian_may_stop_a_pixel(on_blocks):
+    """Then its transmittance is still 1, as that of no pixel outside the picture may be."""
+    scene = make(1, 1, num=40, width=21, height=19, channels=3, size=60.0)
+    scene["opacities"][:] = 0.999999
+    options = dict(alpha_max=0.999999)
+    v_renders, v_alphas = torch.randn(1, 1, 19, 21, 3), torch.randn(1, 1, 19, 21, 1)
+    lanes, lane_counts = run(scene, v_renders, v_alphas, "RGB", **options)
+    on_blocks()
+    blocks, block_counts = run(scene, v_renders, v_alphas, "RGB", **options)
+    # a sub-tile is two blocks
+    assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
+    assert (lanes["alphas"] == 0).any() and block_counts == lane_counts
+    for name, value in lanes.items():
+        assert_rel_rms(blocks[name], value, SAME, name)
+
+
+def test_a_gradient_of_nan_is_not_zero(on_blocks):
+    scene = crowded(3)
+    v_renders, v_alphas = torch.zeros(1, 2, 21, 37, 3), torch.zeros(1, 2, 21, 37, 1)
+    v_renders[:, :, 5, 5, 1] = torch.nan
+    on_blocks()
+    result, _ = run(scene, v_renders, v_alphas, "RGB")
+    assert result["colors"][..., 1].isnan().any()
+
+
+@pytest.mark.parametrize("num, views", [(0, 2), (5, 0)])
+def test_empty(on_blocks, num, views):
+    scene = make(1, views, num=num, width=21, height=19)
+    on_blocks(2)
+    v_renders, v_alphas = torch.randn(1, views, 19, 21, 3), torch.randn(1, views, 19, 21, 1)
+    result, _ = run(scene, v_renders, v_alphas, "RGB")
+    assert result["alphas"].shape == v_alphas.shape and not result["alphas"].any()
+    assert result["means"].shape == (1, num, 3) and not result["means"].any()
+
+
+def test_two_runs_and_any_parts(on_blocks):
+    """The same bits twice; pictures do not depend on the parts, gradients by rounding only."""
+    scene = crowded(3)
+    v_renders, v_alphas = torch.randn(1, 2, 21, 37, 3), torch.randn(1, 2, 21, 37, 1)
+    results = []
+    for parts in (1, 1, 4):
+        on_blocks(parts)
+        results.append(run(scene, v_renders, v_alphas, "RGB"))
+    (first, counts), (second, _), (cut, cut_counts) = results
+    assert counts == cut_counts
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+        assert_rel_rms(cut[name], value, 0 if name in ("renders", "alphas") else 1e-6, name)
+    assert any(not torch.equal(first[name], cut[name]) for name in first)
+
+
+def test_many_tiles_are_not_cut(monkeypatch):
+    monkeypatch.setattr(composite_cuda, "_multiprocessors", lambda index: 132)
+    device = torch.device("cuda", 0)
+    views = [1, 2, 3, 32]
+    assert [composite_cuda.parts_of_tile(1024 * n, device) for n in views] == [4, 2, 1, 1]
+    assert composite_cuda.parts_of_tile(4, torch.device("cpu")) == 1
+
+
+_touched = touching(1)
+
+
+@wp.kernel(enable_backward=False)
+def _test_sub_tiles(
+    means2d_in: wp.array[wp.vec2],
+    conics_in: wp.array[wp.vec3],
+    opacities_in: wp.array[float],
+    alpha_min: float,
+    bits_out: wp.array[int],
+):
+    i = wp.tid()
+    corner = wp.vec2(0.5, 0.5)
+    bits_out[i] = _touched(corner, means2d_in[i], conics_in[i], opacities_in[i], alpha_min)
+
+
+@pytest.mark.parametrize("longest", [3.0, 2000.0])
+def test_no_sub_tile_is_missed(longest):
+    """Ellipses from round to needles, in and around the tile, against every pixel in float64."""
+    count = 4000
+    means = torch.rand(count, 2) * 48 - 16
+    angle = torch.rand(count) * torch.pi
+    radii = 0.55 * (torch.rand(count, 2) * torch.log(torch.tensor(longest))).exp()
+    c, s = angle.double().cos(), angle.double().sin()
+    xx, yy = (radii.double() ** 2).unbind(1)
+    cov = xx * c * c + yy * s * s, (xx - yy) * c * s, xx * s * s + yy * c * c
+    conics = torch.stack([cov[2] / (xx * yy), -cov[1] / cov[2], 1 / cov[2]], 1).float()
+    opacities = 0.01 + 0.98 * torch.rand(count)
+    bits = torch.zeros(count, dtype=torch.int32)
+    inputs = [
+        wp.from_torch(means, dtype=wp.vec2),
+        wp.from_torch(conics, dtype=wp.vec3),
+        wp.from_torch(opacities),
+    ]
+    wp.launch(_test_sub_tiles, count, [*inputs, ALPHA_MIN, wp.from_torch(bits)], device="cpu")
+    centre = torch.arange(16).double() + 0.5
+    a, k, e = conics.double()[:, :, None, None].unbind(1)
+    dy = centre[:, None] - means.double()[:, 1, None, None]
+    u = centre - means.double()[:, 0, None, None] + k * dy
+    inside = (
+        opacities.double()[:, None, None] * (-0.5 * (a * u * u + e * dy * dy)).exp() >= ALPHA_MIN
+    )
+    needed = inside.view(count, 4, 4, 2, 8).any(4).any(2).view(count, 8)
+    got = (bits[:, None] >> torch.arange(8) & 1).bool()
+    assert not (needed & ~got).any()
+    assert 0.05 < needed.float().mean() < 0.8
+    # no pixel centre need lie in an ellipse that touches a sub-tile, so some are kept in vain
+    assert (got & ~needed).sum() < 0.2 * needed.sum()
+
+
+def test_a_cpu_needs_blocks(monkeypatch):
+    """Lanes one after the other would read what others have not written yet."""
+    assert not wp.config.enable_cpu_blocks
+    monkeypatch.setattr(ops, "_compositor", lambda device: composite_cuda)
+    with pytest.raises(ValueError, match="enable_cpu_blocks"):
+        rasterization(**make(1, 1, num=30, width=16, height=16))
+
+
+def test_devices_have_their_compositor():
+    assert ops._compositor(torch.device("cpu")) is composite_cpu
+    assert ops._compositor(torch.device("cuda")) is composite_cuda
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("parts", [1, 2, 4])
+def test_on_a_gpu(monkeypatch, parts):
+    monkeypatch.setattr(composite_cuda, "parts_of_tile", lambda tiles, device: parts)
+    scene = make(2, 3, num=300, width=75, height=53)
+    v_renders, v_alphas = torch.randn(2, 3, 53, 75, 4), torch.randn(2, 3, 53, 75, 1)
+    want, _ = run(scene, v_renders, v_alphas, "RGB+D")
+    scene = {k: v.cuda() if isinstance(v, torch.Tensor) else v for k, v in scene.items()}
+    results = [run(scene, v_renders.cuda(), v_alphas.cuda(), "RGB+D")[0] for _ in range(2)]
+    for name, value in want.items():
+        # the exponential is an approximation there; a few pixels cross the cut at alpha_min
+        assert_rel_rms(results[0][name].cpu(), value, 1e-3, name)
+        assert torch.equal(results[0][name], results[1][name]), name

@@ -1,0 +1,336 @@
+"""What the rasterizer promises beyond the oracle: known answers, culling, repeatability, errors."""
+
+import math
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers.raster import NAMES, PICTURE, leaves, make, mapped
+
+from gamba_warp.kernels.rasterize import ops, rasterization
+
+
+def one(mean=(0.0, 0.0, 2.0), scale=0.1, opacity=0.8, size=(33, 31), focal=40.0):
+    """One round Gaussian before a camera at the origin."""
+    width, height = size
+    return dict(
+        means=torch.tensor([mean]),
+        quats=None,
+        scales=torch.full((1, 3), scale),
+        opacities=torch.tensor([opacity]),
+        colors=torch.tensor([[0.2, 0.5, 1.0]]),
+        viewmats=torch.eye(4)[None],
+        Ks=torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]]),
+        width=width,
+        height=height,
+    )
+
+
+def test_one_gaussian():
+    """On the axis the footprint is exp(-d² / 2σ²) with σ² = (f s / z)² + 0.3."""
+    renders, alphas, meta = rasterization(**one())
+    y, x = torch.meshgrid(torch.arange(31) - 15.0, torch.arange(33) - 16.0, indexing="ij")
+    alpha = 0.8 * torch.exp(-0.5 * (x * x + y * y) / (2.0**2 + 0.3))
+    alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+    assert (alphas[0, ..., 0] - alpha).abs().max() < 1e-6
+    assert (renders[0] - alpha[..., None] * torch.tensor([0.2, 0.5, 1.0])).abs().max() < 1e-6
+    assert meta["pairs"] == 4 and meta["tiles"] == 6 and meta["tiles_empty"] == 2
+    assert meta["means2d"].tolist() == [[[16.5, 15.5]]]
+
+
+def test_order_and_transmittance():
+    """Two opaque-ish Gaussians at one pixel: the nearer hides the farther, whatever the order."""
+    scene = one()
+    scene["means"] = torch.tensor([[0, 0, 3.0], [0, 0, 2.0]])
+    scene["scales"], scene["opacities"] = torch.full((2, 3), 5.0), torch.tensor([0.5, 0.75])
+    scene["colors"] = torch.eye(3)[:2]
+    renders, alphas, _ = rasterization(**scene)
+    want = torch.tensor([0.25 * 0.5, 0.75, 0.0])
+    assert (renders[0, 15, 16] - want).abs().max() < 1e-6
+    assert abs(alphas[0, 15, 16, 0] - 0.875) < 1e-6
+
+
+def test_equal_depths_go_by_index():
+    scene = one()
+    scene["means"] = scene["means"].repeat(2, 1)
+    scene["scales"], scene["opacities"] = torch.full((2, 3), 5.0), torch.tensor([0.5, 0.5])
+    scene["colors"] = torch.eye(3)[:2]
+    renders, _, _ = rasterization(**scene)
+    assert (renders[0, 15, 16] - torch.tensor([0.5, 0.25, 0.0])).abs().max() < 1e-6
+
+
+def test_clamped_alpha_has_no_gradient():
+    scene = leaves(one(opacity=0.999), torch.float32)
+    renders, _, _ = rasterization(**scene)
+    renders[0, 15, 16].sum().backward()  # the centre, alpha would be 0.999
+    assert renders[0, 15, 16, 2].item() == pytest.approx(0.99)
+    assert scene["opacities"].grad.item() == 0.0 and (scene["scales"].grad == 0).all()
+
+
+def test_stops_before_falling_to_the_limit():
+    """Three layers of 0.99 leave 1e-2, then would leave 1e-4: only the first is drawn."""
+    scene = one()
+    scene["means"] = torch.tensor([[0, 0, 2.0], [0, 0, 2.1], [0, 0, 2.2]])
+    scene["scales"], scene["opacities"] = torch.full((3, 3), 50.0), torch.ones(3)
+    scene["colors"] = torch.eye(3)
+    renders, alphas, _ = rasterization(**scene, alpha_max=0.992)
+    assert renders[0, 15, 16].tolist() == pytest.approx([0.992, 0.0, 0.0])
+    assert alphas[0, 15, 16, 0] == pytest.approx(0.992)
+
+
+BAD = {
+    "nan mean": ("means", math.nan, "not_finite"),
+    "inf mean": ("means", math.inf, "not_finite"),
+    "nan scale": ("scales", math.nan, "not_finite"),
+    "inf scale": ("scales", math.inf, "not_finite"),
+    "huge scale": ("scales", 1e30, "not_finite"),
+    "nan quat": ("quats", math.nan, "not_finite"),
+    "nan opacity": ("opacities", math.nan, "not_finite"),
+    "negative opacity": ("opacities", -1.0, "transparent"),
+    "faint": ("opacities", 1e-3, "transparent"),
+    "nan color": ("colors", math.nan, "not_finite"),
+    "inf color": ("colors", -math.inf, "not_finite"),
+    "far away": ("means", 1e20, None),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_gaussians_are_culled_and_counted(case):
+    name, value, reason = BAD[case]
+    clean = make(batch=1, views=2)
+    num = clean["means"].shape[1]
+    dirty = mapped(clean, torch.Tensor.clone)
+    place = torch.arange(0, num, 5)
+    dirty[name][:, place] = value
+    keep = torch.ones(num, dtype=torch.bool)
+    keep[place] = False
+    rest = {k: v[:, keep] if k in NAMES[:5] else v for k, v in clean.items()}
+    want, want_alpha, _ = rasterization(**rest)
+    dirty = leaves(dirty, torch.float32)
+    got, alpha, meta = rasterization(**dirty)
+    assert torch.equal(got, want) and torch.equal(alpha, want_alpha) and want_alpha.mean() > 0.1
+    if reason:
+        assert meta["culled"][reason] == 2 * len(place)
+    got.square().sum().backward()
+    for key in NAMES:
+        gradient = dirty[key].grad
+        assert torch.isfinite(gradient).all(), key
+        if key in NAMES[:5]:
+            assert (gradient[:, place] == 0).all() and (gradient[:, keep] != 0).any(), key
+
+
+@pytest.mark.parametrize("z", [-1.0, 0.0, 1e-30, 0.0099])
+def test_behind_and_at_the_camera(z):
+    scene = leaves(one(mean=(0.01, 0.0, z)), torch.float32)
+    renders, _, meta = rasterization(**scene)
+    assert (renders == 0).all() and meta["culled"]["near"] == 1
+    renders.sum().backward()
+    assert (scene["means"].grad == 0).all() and (scene["viewmats"].grad == 0).all()
+
+
+def test_at_the_near_plane_is_seen():
+    _, alphas, meta = rasterization(**one(mean=(0.0, 0.0, 0.5)), near_plane=0.5)
+    assert alphas.max() > 0.7 and meta["culled"]["near"] == 0
+
+
+def test_other_culls():
+    assert rasterization(**one(), far_plane=1.9)[2]["culled"]["far"] == 1
+    assert rasterization(**one(mean=(9.0, 0.0, 2.0)))[2]["culled"]["outside"] == 1
+    assert rasterization(**one(), radius_clip=30.0)[2]["culled"]["small"] == 1
+    assert rasterization(**one(), radius_clip=5.0)[2]["culled"]["small"] == 0
+
+
+def test_huge_gaussian_covers_everything():
+    renders, alphas, _ = rasterization(**one(scale=1e6, opacity=0.5))
+    assert (alphas - 0.5).abs().max() < 1e-5 and torch.isfinite(renders).all()
+
+
+@pytest.mark.parametrize("batch, views, num", [(2, 3, 0), (2, 0, 5), (0, 2, 5), (1, 1, 1)])
+def test_empty(batch, views, num):
+    scene = leaves(make(batch, views, num), torch.float32)
+    for mode, channels in (("RGB", 3), ("RGB+ED", 4), ("D", 1)):
+        renders, alphas, meta = rasterization(**scene, render_mode=mode)
+        assert renders.shape == (batch, views, 53, 37, channels)
+        assert alphas.shape == (batch, views, 53, 37, 1)
+        assert sum(meta["culled"].values()) <= batch * views * num
+        (renders.sum() + alphas.sum()).backward()
+    assert torch.isfinite(scene["means"].grad).all()
+    if num == 0:
+        background = scene["backgrounds"][:, :, None, None].expand(-1, -1, 53, 37, -1)
+        assert torch.equal(rasterization(**scene)[0], background)
+
+
+@pytest.mark.parametrize("lead", [(), (3,), (1, 2)])
+def test_leading_dimensions(lead):
+    flat = make(batch=max(1, math.prod(lead)))
+    scene = mapped(flat, lambda v: v.view(*lead, *v.shape[1:]))
+    want, want_alpha, _ = rasterization(**flat)
+    got, alpha, meta = rasterization(**scene)
+    assert torch.equal(got, want.view(*lead, *want.shape[1:]))
+    assert torch.equal(alpha, want_alpha.view(*lead, *want_alpha.shape[1:]))
+    assert meta["radii"].shape == (*lead, 3, 60, 2)
+
+
+@pytest.mark.parametrize("lead", [(2,), (), (1, 2)])
+def test_gradients_of_projected_means(lead):
+    """Densification reads them from meta, as with gsplat."""
+    scene = mapped(make(batch=max(1, math.prod(lead))), lambda v: v.view(*lead, *v.shape[1:]))
+    scene["means"].requires_grad_()
+    renders, _, meta = rasterization(**scene)
+    meta["means2d"].retain_grad()
+    renders.square().sum().backward()
+    assert meta["means2d"].grad.abs().max() > 0
+
+
+def test_permutation_changes_nothing():
+    scene = make()
+    order = torch.randperm(60)
+    other = {k: v[:, order] if k in NAMES[:5] else v for k, v in scene.items()}
+    a, b = leaves(scene, torch.float32), leaves(other, torch.float32)
+    pictures = [rasterization(**s)[0] for s in (a, b)]
+    assert torch.equal(*pictures)
+    v = torch.randn_like(pictures[0])
+    for picture in pictures:
+        (picture * v).sum().backward()
+    for name in NAMES[:5]:
+        assert torch.equal(a[name].grad[:, order], b[name].grad), name
+
+
+def test_linear_in_colour():
+    scene = make()
+    del scene["backgrounds"]
+    x, y = torch.randn(2, *scene["colors"].shape)
+    rx, ry, rxy = (rasterization(**dict(scene, colors=c))[0] for c in (x, y, 2 * x - 3 * y))
+    assert rx.abs().mean() > 0.05
+    assert (2 * rx - 3 * ry - rxy).abs().max() < 10 * PICTURE
+
+
+def test_background_shows_through():
+    scene = make()
+    backgrounds = scene.pop("backgrounds")
+    black, alphas, _ = rasterization(**scene)
+    got, _, _ = rasterization(**scene, backgrounds=backgrounds, render_mode="RGB+D")
+    want = black + (1 - alphas) * backgrounds[:, :, None, None]
+    assert (got[..., :3] - want).abs().max() < 1e-6
+    assert (got[..., 3:] - rasterization(**scene, render_mode="D")[0]).abs().max() == 0
+
+
+def test_repeatable_with_any_number_of_threads():
+    scene = make(num=400, width=80, height=90)
+    results = []
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 2, 2):
+            torch.set_num_threads(count)
+            torch.manual_seed(1)
+            tensors = leaves(scene, torch.float32)
+            renders, alphas, _ = rasterization(**tensors, render_mode="RGB+ED")
+            (renders * torch.randn_like(renders)).sum().backward()
+            results.append([renders, alphas, *(tensors[k].grad for k in NAMES[:5])])
+    finally:
+        torch.set_num_threads(threads)
+    for again in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], again))
+
+
+def test_only_what_is_asked_for():
+    scene = make()
+    full = leaves(scene, torch.float32)
+    v = torch.randn(2, 3, 53, 37, 3)
+    (rasterization(**full)[0] * v).sum().backward()
+    for name in NAMES:
+        some = mapped(scene, torch.Tensor.clone)
+        some[name].requires_grad_()
+        (rasterization(**some)[0] * v).sum().backward()
+        assert torch.equal(some[name].grad, full[name].grad), name
+
+
+def test_tiles_without_upstream_gradient_are_skipped():
+    scene = leaves(make(batch=1, views=1, num=300, width=64, height=64), torch.float32)
+    v = torch.zeros(1, 1, 64, 64, 3)
+    v[:, :, 20:30, 20:30] = torch.randn(10, 10, 3)
+    renders, _, meta = rasterization(**scene)
+    assert meta["tiles_empty"] == 0
+    (renders * v).sum().backward()
+    assert meta["tiles_skipped"] == 15
+    masked = {k: s.grad.clone() for k, s in scene.items() if k in NAMES}
+    scene = leaves(scene, torch.float32)
+    renders, _, meta = rasterization(**scene)
+    (renders * (v + 1e-30)).sum().backward()
+    assert meta["tiles_skipped"] == 0
+    for name in NAMES:
+        assert_rel_rms(masked[name], scene[name].grad, 1e-6, name)
+
+
+def test_half_precision_inputs():
+    scene = make()
+    for dtype in (torch.bfloat16, torch.float16):
+        half = {k: v.to(dtype) if k in NAMES[:5] and k != "means" else v for k, v in scene.items()}
+        exact = {k: v.float() if k in NAMES[:5] else v for k, v in half.items()}
+        half = {k: v.requires_grad_() if k == "colors" else v for k, v in half.items()}
+        renders, _, _ = rasterization(**half)
+        assert renders.dtype == torch.float32
+        assert torch.equal(renders, rasterization(**exact)[0])
+        renders.sum().backward()
+        assert half["colors"].grad.dtype == dtype
+
+
+def test_meta_counts():
+    _, _, meta = rasterization(**make(num=300, size=0.1, width=100, height=70))
+    assert 0 < meta["pairs_walked"] <= meta["pairs"] < meta["pairs_box"]
+    assert meta["tiles"] == 2 * 3 * 7 * 5 and meta["tiles_skipped"] is None
+    assert 0 < meta["blocks_used"] <= 16 * meta["pairs_walked"]
+    assert meta["width"] == 100 and meta["tile_size"] == 16
+    with pytest.raises(KeyError):
+        meta["nothing"]
+
+
+@pytest.mark.parametrize(
+    "change, error, words",
+    [
+        ({"means": torch.zeros(2, 60, 2)}, ValueError, "means"),
+        ({"means": torch.zeros(2, 60, 3, dtype=torch.float64)}, TypeError, "means"),
+        ({"quats": torch.zeros(2, 59, 4)}, ValueError, r"quats .*\[2, 60, 4\]"),
+        ({"scales": torch.zeros(2, 60)}, ValueError, "scales"),
+        ({"opacities": torch.zeros(2, 60, 1)}, ValueError, "opacities"),
+        ({"colors": torch.zeros(2, 60, 0)}, ValueError, "colors"),
+        ({"colors": torch.zeros(2, 4, 60, 3)}, ValueError, "colors"),
+        ({"colors": torch.zeros(2, 60, 3), "sh_degree": 1}, ValueError, "colors"),
+        ({"colors": torch.zeros(2, 60, 3), "sh_degree": 4}, ValueError, "sh_degree"),
+        ({"viewmats": torch.zeros(2, 3, 3, 4)}, ValueError, "viewmats"),
+        ({"viewmats": torch.zeros(3, 3, 4, 4)}, ValueError, "viewmats"),
+        ({"Ks": torch.zeros(2, 2, 3, 3)}, ValueError, "Ks"),
+        ({"Ks": None}, TypeError, "Ks"),
+        ({"backgrounds": torch.zeros(2, 3, 4)}, ValueError, "backgrounds"),
+        ({"width": 0}, ValueError, "width"),
+        ({"height": 3.5}, ValueError, "height"),
+        ({"near_plane": 0.0}, ValueError, "near_plane"),
+        ({"alpha_max": 1.0}, ValueError, "alpha_max"),
+        ({"alpha_min": math.nan}, ValueError, "alpha_min"),
+        ({"eps2d": -1.0}, ValueError, "eps2d"),
+        ({"render_mode": "rgb"}, ValueError, "render_mode"),
+        ({"rasterize_mode": "mip"}, ValueError, "rasterize_mode"),
+    ],
+)
+def test_bad_input(change, error, words):
+    with pytest.raises(error, match=words):
+        rasterization(**{**make(), **change})
+
+
+def test_too_many_pairs(monkeypatch):
+    monkeypatch.setattr(ops, "MAX_PAIRS", 5000)
+    with pytest.raises(ValueError, match="pairs of tiles and Gaussians"):
+        rasterization(**make(num=400, size=1.0))
+
+
+def test_options_of_gsplat():
+    scene = make()
+    want, _, _ = rasterization(**scene)
+    same = dict(packed=False, tile_size=8, absgrad=False, camera_model="pinhole", covars=None)
+    got, _, _ = rasterization(**scene, **same, channel_chunk=4, rolling_shutter="GLOBAL")
+    assert torch.equal(got, want)
+    for name, value in dict(absgrad=True, camera_model="ortho", covars=torch.eye(3)).items():
+        with pytest.raises(ValueError, match=name):
+            rasterization(**scene, **{name: value})
+    with pytest.raises(TypeError, match="unexpected keyword argument 'tilesize'"):
+        rasterization(**scene, tilesize=8)

@@ -1,0 +1,90 @@
+"""Every skip of the rasterizer, on and off: the same picture, the same gradients, its own count."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from gamba_warp.kernels.bench.cases.raster_scene import LEAVES, orbit_cameras, shell
+from gamba_warp.kernels.rasterize import Skip, rasterization
+
+WIDTH, HEIGHT, VIEWS = 150, 139, 2
+NAMES = [field.name for field in fields(Skip)]
+
+
+def render(skip=None, wanted=LEAVES, mode="classic"):
+    """An opaque shell, much of it hidden, empty tiles around it, no gradient on the right half."""
+    torch.manual_seed(0)
+    gaussians = {k: x.clone() for k, x in shell(6000, 3).items()}
+    gaussians["opacities"][::5] = 0.004  # touches almost nothing
+    gaussians["opacities"].clamp_(max=0.98)
+    viewmats, Ks = orbit_cameras(VIEWS, 128)
+    inputs = {k: x.requires_grad_(k in wanted) for k, x in gaussians.items()}
+    options = {} if skip is None else {"skip": skip}
+    renders, alphas, meta = rasterization(
+        **inputs,
+        viewmats=viewmats,
+        Ks=Ks,
+        width=WIDTH,
+        height=HEIGHT,
+        rasterize_mode=mode,
+        **options,
+    )
+    v, w = torch.randn_like(renders), torch.randn_like(alphas)
+    v[:, :, 64:] = w[:, :, 64:] = 0
+    gradients = torch.autograd.grad([renders, alphas], [inputs[k] for k in wanted], [v, w])
+    return dict(zip(("picture", "alpha", *wanted), (renders, alphas, *gradients))), meta
+
+
+def close(got, want):
+    """Equal to rounding: 1e-6 of the largest value."""
+    assert got.keys() == want.keys()
+    return {
+        k: float((got[k] - want[k]).detach().abs().max() / want[k].detach().abs().max())
+        for k in want
+    }
+
+
+def test_default_is_every_skip():
+    assert all(getattr(Skip(), name) for name in NAMES)
+    assert rasterization.__kwdefaults__["skip"] == Skip()
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("name", [*NAMES, "all of them"])
+def test_same_with_and_without(name, mode):
+    want, counts = render(mode=mode)
+    assert want["picture"].mean() > 0.1 and counts["tiles_empty"] > 5
+    off = {name: False} if name in NAMES else dict.fromkeys(NAMES, False)
+    got, _ = render(replace(Skip(), **off), mode=mode)
+    errors = close(got, want)
+    assert max(errors.values()) < 1e-6, errors
+
+
+def test_counts_tell_what_each_leaves_out():
+    _, on = render()
+    tiles = on["tiles"] - on["tiles_empty"]
+    metas = {name: render(replace(Skip(), **{name: False}))[1] for name in NAMES}
+    assert metas["tile_test"]["pairs"] == on["pairs_box"] > on["pairs"]
+    assert metas["block_test"]["blocks_walked"] > 1.5 * on["blocks_walked"]
+    assert metas["stopped"]["pairs_walked"] == on["pairs"] > on["pairs_walked"]
+    assert metas["zero_upstream"]["tiles_skipped"] == on["tiles_empty"]
+    assert on["tiles_empty"] + tiles / 5 < on["tiles_skipped"] < on["tiles"]
+    assert on["blocks_walked"] > on["blocks_used"] > on["pairs_used"] > on["gaussians_used"] > 0
+    assert on["gaussians_used"] < VIEWS * 6000
+    for name in NAMES:  # what had an effect does not depend on what was looked at
+        assert metas[name]["blocks_used"] == on["blocks_used"]
+
+
+def test_a_hidden_gaussian_has_no_gradient():
+    got, _ = render()
+    assert (got["means"].abs().sum(1) == 0).sum() > 50
+
+
+@pytest.mark.parametrize("wanted", [("colors",), ("means", "scales"), ("opacities",)])
+def test_unasked_gradients(wanted):
+    want, _ = render()
+    for skip in (Skip(), Skip(unasked=False)):
+        got, _ = render(skip, wanted)
+        errors = close(got, {k: want[k] for k in got})
+        assert max(errors.values()) < 1e-6, errors

@@ -1,0 +1,164 @@
+"""Choices inside the kernels: each gives the default's result but for what it trades."""
+
+import dataclasses
+
+import pytest
+import torch
+from helpers import rel_rms
+
+from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
+from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
+from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
+from gamba_warp.kernels.rasterize import rasterization
+from gamba_warp.kernels.rasterize.cpu import tuning as raster_variant
+from gamba_warp.kernels.rasterize.reference import rasterization_reference
+from gamba_warp.kernels.selective_scan import selective_scan
+from gamba_warp.kernels.selective_scan.cpu import tuning as scan_variant
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+
+
+def scan(**choice):
+    """Output and gradients of 173 tokens, 24 channels, 5 states, and the bytes kept for them."""
+    leaves = {k: x.requires_grad_() for k, x in make_inputs(2, 173, 24, states=5).items()}
+    kept = []
+    with scan_variant.use_variant(scan_variant.Variant(**choice)):
+        with torch.autograd.graph.saved_tensors_hooks(lambda x: kept.append(x) or x, lambda x: x):
+            out = selective_scan(**leaves, delta_softplus=True)
+        grads = torch.autograd.grad(out.square().sum(), list(leaves.values()))
+    return [out.detach(), *grads], kept[-1].numel()
+
+
+@pytest.mark.parametrize("chunk, strip", [(16, 8), (64, 32), (128, 128)])
+def test_chunks_of_the_scan(chunk, strip):
+    (want, kept), (got, other) = scan(), scan(chunk=chunk, strip=strip)
+    assert all(rel_rms(a, b) < 1e-6 for a, b in zip(got, want))  # sums in another order
+    assert other / kept == pytest.approx(-(-173 // chunk) / 3)
+
+
+@pytest.mark.parametrize("degree, low, high", [(2, 1e-5, 1e-2), (3, 1e-7, 1e-3), (6, 0, 1e-6)])
+def test_degree_of_the_decays(degree, low, high):
+    (want, _), (got, _) = scan(), scan(degree=degree)
+    assert low < rel_rms(got[0], want[0]) < high
+    assert max(rel_rms(a, b) for a, b in zip(got, want)) < 30 * high  # dA and dδ lose more
+
+
+def scene(**options):
+    made = Scene(shell(400, 3), *orbit_cameras(2, 75), 75, torch.device("cpu"), options)
+    made.viewmats[:, 0, 3] += 0.03
+    return made
+
+
+def results(of):
+    renders, alphas, meta = of.forward()
+    return [renders, alphas, *of.backward()], meta
+
+
+@pytest.mark.parametrize("tile, width, height", [(16, 8, 4), (16, 16, 16), (8, 4, 4), (8, 8, 4)])
+def test_tiles_and_sub_tiles(tile, width, height):
+    want, default = results(scene())
+    with raster_variant.use_variant(raster_variant.Variant(tile, width, height)):
+        got, meta = results(scene())
+        counts = {k: meta[k] for k in ("blocks_used", "tiles", "pairs", "blocks_walked")}
+    assert torch.equal(got[0], want[0]) and torch.equal(got[1], want[1])
+    assert all(rel_rms(a, b) < 1e-6 for a, b in zip(got, want))  # sums by tile
+    assert counts["blocks_used"] == default["blocks_used"]
+    assert meta["tile_size"] == tile and counts["tiles"] == 2 * (-(-75 // tile)) ** 2
+    assert (counts["pairs"] > default["pairs"]) == (tile == 8)
+    assert (counts["blocks_walked"] > default["blocks_walked"]) == (width > 4)
+
+
+@pytest.mark.parametrize("degree, low, high", [(2, 1e-4, 5e-3), (3, 1e-6, 5e-4), (4, 1e-8, 2e-5)])
+def test_degree_of_exp(degree, low, high):
+    want, _ = results(scene())
+    with raster_variant.use_variant(raster_variant.Variant(degree=degree)):
+        got, _ = results(scene())
+    assert low < rel_rms(got[0], want[0]) < high
+
+
+@pytest.mark.parametrize("t_min", [0.3, 1e-2, 1e-30])
+def test_the_limit_of_transmittance(t_min):
+    """Against the oracle with the same limit; the default's picture is another one."""
+    made = scene(t_min=t_min)
+    got, _ = results(made)
+    x = {k: v.double() for k, v in made.gaussians.items()}
+    cameras = (made.viewmats.double(), made.Ks.double(), 75, 75)
+    want, _, alphas = rasterization_reference(*x.values(), *cameras, t_min=t_min)
+    # a pixel at a threshold may fall on its other side
+    assert ((got[0] - want).abs() < 1e-4).float().mean() > 0.999
+    assert ((got[1] - alphas).abs() < 1e-4).float().mean() > 0.999
+    assert rel_rms(got[0], results(scene())[0][0]) > 1e-6
+    assert all(g.isfinite().all() for g in got)
+
+
+@pytest.mark.parametrize("t_min", [0.0, 1.0, -1e-4, float("nan")])
+def test_limits_that_are_refused(t_min):
+    with pytest.raises(ValueError, match="t_min is"):
+        rasterization(**scene(t_min=t_min).arguments())
+
+
+@pytest.mark.parametrize(
+    "module, choice, reason",
+    [
+        (scan_variant, {"chunk": 12}, "chunk is 12"),
+        (scan_variant, {"chunk": 64, "strip": 48}, "multiple of 8 and of strip"),
+        (scan_variant, {"degree": 7}, "degree is 7"),
+        (raster_variant, {"tile": 32}, "tile is 32"),
+        (raster_variant, {"tile": 8, "width": 16}, "width is 16"),
+        (raster_variant, {"degree": 6}, "degree is 6"),
+    ],
+)
+def test_choices_that_are_refused(module, choice, reason):
+    with pytest.raises(ValueError, match=reason):
+        module.Variant(**choice)
+
+
+@pytest.mark.parametrize("module", [scan_variant, raster_variant])
+def test_a_choice_ends_with_its_block(module):
+    other = dataclasses.replace(module.Variant(), degree=3)
+    with pytest.raises(RuntimeError), module.use_variant(other):
+        assert module.current() == other
+        raise RuntimeError
+    assert module.current() == module.Variant()
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    config = GambaConfig(
+        image_size=32, patch_size=4, width=16, depth=2, state_size=4, encoder="none",
+        encoder_size=32,
+    )  # fmt: skip
+    return Gamba(config).eval()
+
+
+def pictures(*squares):
+    """White pictures with a grey pixel each, at row and column."""
+    images = torch.ones(len(squares), 32, 32, 3)
+    for image, (y, x) in zip(images, squares):
+        image[y, x] = 0.9
+    viewmats = reference_viewmat(1.9).repeat(len(squares), 1, 1)
+    K = intrinsics(32, 32).repeat(len(squares), 1, 1)
+    return images, Cameras(viewmats, K, 32, 32)
+
+
+@torch.no_grad()
+def test_background_tokens_are_dropped(model):
+    full = model(*pictures((5, 9)))
+    assert full.means.shape == (1, 4 * 64, 3)
+    for margin, patches in ((0, 1), (1, 9), (2, 4 * 5), (100, 64)):  # row 1, column 2 of 8 x 8
+        made = model(*pictures((5, 9)), background_margin=margin)
+        assert made.means.shape == (1, 4 * patches, 3)
+    assert torch.equal(made.means, full.means) and torch.equal(made.scales, full.scales)
+    kept = model.tokens.foreground(pictures((5, 9))[0], 1.0, 0)
+    first = 1 * 8 + 2, 64 + 2 * 8 + 1  # by rows, then by columns; then each backward
+    assert kept.tolist() == [first[0], first[1], 191 - first[0], 255 - (first[1] - 64)]
+
+
+@torch.no_grad()
+def test_a_token_is_kept_if_any_picture_of_the_batch_needs_it(model):
+    images, cameras = pictures((5, 9), (30, 30))
+    assert model(images, cameras, background_margin=0).means.shape == (2, 8, 3)
+    assert model(torch.ones_like(images), cameras, background_margin=3).means.shape == (2, 0, 3)
+    with pytest.raises(ValueError, match="background_margin is -1"):
+        model(images, cameras, background_margin=-1)

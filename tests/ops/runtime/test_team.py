@@ -1,0 +1,91 @@
+"""CPU launches: on torch's threads, on Python's, and in a forked child, the same result."""
+
+import multiprocessing
+
+import pytest
+import torch
+import warp as wp
+
+from gamba_warp.kernels.runtime import team
+from gamba_warp.kernels.runtime.launch import parallel_launch
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Factors:
+    one: wp.float32
+    two: wp.int32
+
+
+@wp.kernel
+def _mix(
+    offset: wp.int32,
+    factors: Factors,
+    a_in: wp.array[wp.float32],
+    b_in: wp.array[wp.float32],
+    c_out: wp.array2d[wp.float32],
+):
+    i, j = wp.tid()
+    i += offset
+    value = factors.one * a_in[i] + float(factors.two * j)
+    if b_in:
+        value += b_in[i]
+    c_out[i, j] = value
+
+
+def mix(a, b, pieces=None):
+    factors = Factors()
+    factors.one, factors.two = 0.5, 3
+    out = torch.full((a.numel(), 3), torch.nan)
+    parallel_launch(_mix, out.shape, [factors, a, b], [out], pieces=pieces)
+    want = 0.5 * a[:, None] + 3.0 * torch.arange(3) + (0 if b is None else b[:, None])
+    return out, want
+
+
+@pytest.mark.parametrize("with_team", [True, False])
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_every_place_once(monkeypatch, with_team, threads):
+    if with_team and not team.has_team():
+        pytest.skip("torch has no OpenMP runtime with GNU's interface here")
+    if not with_team:
+        monkeypatch.setattr(team, "_parallel", 0)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        for size, pieces in ((1, None), (2, 7), (1001, 13)):
+            a, b = torch.randn(2, size)
+            for second in (b, None):  # an array that is missing after one that was there
+                got, want = mix(a, second, pieces)
+                assert torch.equal(got, want)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_team_is_found_on_linux():
+    # torch's Linux wheels bring GNU's runtime; losing it unnoticed would cost speed, not results
+    if "GNU" not in torch.__config__.parallel_info() and "OpenMP" not in torch.__config__.show():
+        pytest.skip("torch without OpenMP")
+    import sys
+
+    assert team.has_team() or sys.platform != "linux"
+
+
+def _child(queue):
+    queue.put(team.has_team())
+    got, want = mix(torch.ones(50), None)
+    queue.put(torch.equal(got, want))
+
+
+def test_forked_child():
+    if "fork" not in multiprocessing.get_all_start_methods():
+        pytest.skip("no fork here")
+    assert torch.equal(*mix(torch.ones(50), None))  # the parent's threads exist
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    child = context.Process(target=_child, args=(queue,))
+    child.start()
+    assert queue.get(timeout=60) is False
+    assert queue.get(timeout=60)
+    child.join(60)
+    assert child.exitcode == 0

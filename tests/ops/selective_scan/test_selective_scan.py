@@ -1,0 +1,296 @@
+"""The scan against its float64 oracle: outputs, every gradient by name, states, bad input."""
+
+import pytest
+import torch
+from helpers import assert_rel_rms, rel_rms
+from helpers.scan import FORWARD, compare, leaves, make, oracle
+
+from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_fn
+from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+
+
+@pytest.fixture(autouse=True)
+def _two_threads():
+    """Enough for the kernels' splitting; more only make the oracle's small loops wait."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    "batch, length, channels, states, groups",
+    [
+        (1, 1, 1, 1, 1),
+        (2, 2, 17, 3, 1),
+        (3, 17, 33, 16, 1),
+        (2, 63, 80, 3, 2),
+        (1, 65, 37, 64, 1),
+        (1, 577, 35, 16, 1),
+        (1, 40, 12, 2, 12),
+    ],
+)
+def test_matches_oracle(batch, length, channels, states, groups):
+    compare(make(batch, length, channels, states, groups), delta_softplus=True)
+
+
+@pytest.mark.parametrize("discretization", ["bilinear", "zoh"])
+def test_other_discretizations(discretization):
+    inputs = make(2, 130, 21, 5)
+    inputs["A"][:, 0] = -1e-3  # x near 0, where (e^x - 1) / x needs its series
+    compare(inputs, delta_softplus=True, discretization=discretization)
+
+
+def test_without_options():
+    """No D, z, bias, softplus or initial state; B and C without a group dimension."""
+    inputs = make(2, 33, 19, 4)
+    inputs = {k: inputs[k] for k in ("u", "delta", "A", "B", "C")}
+    inputs["delta"] = inputs["delta"].exp()
+    inputs["B"], inputs["C"] = inputs["B"][:, :, 0], inputs["C"][:, :, 0]
+    compare(inputs)
+
+
+@pytest.mark.parametrize("dtype, limit", [(torch.bfloat16, 4e-3), (torch.float16, 5e-4)])
+def test_half_precision(dtype, limit):
+    """Limits: the rounding of the dtype itself, 2^-9 and 2^-12 at most, on output only."""
+    compare(make(2, 65, 37, 3, dtype=dtype), limit, limit, delta_softplus=True)
+
+
+def test_delta_may_have_its_own_dtype():
+    inputs = make(1, 20, 18, 3, dtype=torch.bfloat16)
+    inputs["delta"] = inputs["delta"].float()
+    compare(inputs, 4e-3, 4e-3, delta_softplus=True)
+
+
+@pytest.mark.parametrize("name", ["u", "delta", "A", "B", "C", "D", "z", "delta_bias"])
+def test_one_gradient_alone(name):
+    """A gradient does not depend on which others are asked for."""
+    inputs = make(2, 70, 20, 3)
+    everything = leaves(inputs)
+    out = selective_scan(**everything, delta_softplus=True)
+    v_out = torch.randn_like(out)
+    want = torch.autograd.grad((out * v_out).sum(), everything[name])[0]
+    inputs[name].requires_grad_()
+    out = selective_scan(**inputs, delta_softplus=True)
+    assert torch.equal(torch.autograd.grad((out * v_out).sum(), inputs[name])[0], want)
+
+
+def test_unneeded_gradients_are_not_computed():
+    from gamba_warp.kernels.selective_scan.cpu import launch as cpu
+
+    inputs = make(1, 10, 5, 2)
+    names = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
+    tensors = [inputs[k] for k in names]
+    out, _, saved = cpu.forward(*tensors, None, True, "mamba", True)
+    needs = [name == "C" for name in names] + [False]
+    grads = cpu.backward(torch.ones_like(out), None, *tensors, saved, True, "mamba", needs)
+    assert [g is not None for g in grads] == needs
+
+
+def test_oracle_gradients_by_finite_differences():
+    inputs = leaves(make(1, 4, 3, 2), torch.float64)
+    for discretization in ("mamba", "bilinear", "zoh"):
+
+        def run(*values, discretization=discretization):
+            named = dict(zip(inputs, values))
+            return selective_scan_reference(
+                **named, delta_softplus=True, discretization=discretization
+            )
+
+        assert torch.autograd.gradcheck(run, tuple(inputs.values()), fast_mode=True)
+
+
+def test_one_step_by_hand():
+    """δ = 0.5, A = -2, B = 3, u = 4, h = 1: h' = e^-1 + 6; with C = 2, D = 1: y = 2h' + 4."""
+    one = torch.ones(1, 1, 1)
+    out, last = selective_scan(
+        4 * one, 0.5 * one, torch.tensor([[-2.0]]), 3 * one, 2 * one, torch.ones(1),
+        initial_state=one, return_last_state=True,
+    )  # fmt: skip
+    state = torch.tensor(-1.0).exp() + 6
+    torch.testing.assert_close(last.flatten()[0], state)
+    torch.testing.assert_close(out.flatten()[0], 2 * state + 4)
+
+
+@pytest.mark.parametrize("cut", [1, 64, 100])
+def test_split_consistency(cut):
+    """scan(x, y) = scan(x), then scan(y) from its last state."""
+    inputs = make(2, 150, 20, 3)
+    tokens = ("u", "delta", "B", "C", "z")
+    whole, last = selective_scan(**inputs, delta_softplus=True, return_last_state=True)
+    parts, state = [], inputs["initial_state"]
+    for piece in (slice(0, cut), slice(cut, None)):
+        part = {k: v[:, piece] if k in tokens else v for k, v in inputs.items()}
+        part["initial_state"] = state
+        out, state = selective_scan(**part, delta_softplus=True, return_last_state=True)
+        parts.append(out)
+    # equal to rounding only: cuts move tokens to other chunks, not to other operations
+    assert rel_rms(torch.cat(parts, 1), whole) < 1e-7
+    assert rel_rms(state, last) < 1e-7
+
+
+def test_repeatable_and_independent_of_threads():
+    inputs = make(2, 200, 150, 5)
+
+    def run(threads):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            mine = leaves(inputs)
+            out = selective_scan(**mine, delta_softplus=True)
+            return [out, *torch.autograd.grad(out.square().sum(), [*mine.values()])]
+        finally:
+            torch.set_num_threads(before)
+
+    first = run(1)
+    for again in (run(1), run(2)):
+        assert all(torch.equal(a, b) for a, b in zip(first, again))
+
+
+def test_strided_inputs_are_not_copied():
+    """Halves of one projection are views with a longer row; results equal those of dense copies."""
+    inputs = make(2, 40, 20, 3)
+    both = torch.cat([inputs["u"], inputs["z"]], -1)
+    dense = selective_scan(**inputs, delta_softplus=True)
+    inputs["u"], inputs["z"] = both.chunk(2, -1)
+    assert not inputs["u"].is_contiguous()
+    assert torch.equal(selective_scan(**inputs, delta_softplus=True), dense)
+    inputs["u"] = inputs["u"].transpose(1, 2).contiguous().transpose(1, 2)
+    assert torch.equal(selective_scan(**inputs, delta_softplus=True), dense)
+
+
+def test_extreme_steps():
+    """Softplus at -100, 20 and 100, decays of 0 and e^-10000: finite, and equal to the oracle."""
+    inputs = make(1, 60, 18, 4)
+    inputs["delta"][:, ::3] = torch.tensor([-100.0, 19.999, 20.001, 100.0, 0, -20]).repeat(3)
+    inputs["A"][:, 0], inputs["A"][:, 1] = 0.0, -1e4
+    del inputs["delta_bias"]
+    compare(inputs, delta_softplus=True)
+
+
+def test_small_steps_keep_relative_accuracy():
+    """A step of 1e-8 over long memory: only log1p, not log(1 + x), gives it."""
+    inputs = make(1, 20, 16, 2)
+    inputs["delta"] = torch.full((1, 20, 16), -18.0)
+    inputs = {k: inputs[k] for k in ("u", "delta", "A", "B", "C")}
+    compare(inputs, delta_softplus=True)
+
+
+def test_slow_decay_has_no_drift():
+    """A constant decay of 1 - 1e-3 for 4000 steps: a biased exp would show a thousandfold."""
+    one = torch.ones(1, 4000, 16)
+    inputs = {"u": one, "delta": one * 1e-3, "A": -torch.ones(16, 1)}
+    matrices = {"B": one[..., :1], "C": one[..., :1]}
+    out = selective_scan(**inputs, **matrices)
+    want, _ = oracle(**{k: v.double() for k, v in {**inputs, **matrices}.items()})
+    # the float32 decay itself is off by up to 2^-25, which 1 / (1 - decay) magnifies by 1000
+    assert rel_rms(out, want) < 3e-5
+
+
+def test_growing_states_and_nan_are_passed_on():
+    inputs = make(1, 20, 17, 2)
+    inputs["A"] = inputs["A"].abs() * 0.01
+    compare(inputs, delta_softplus=True)
+    inputs["u"][0, 5, 3] = torch.nan
+    out = selective_scan(**inputs, delta_softplus=True)
+    bad = torch.isnan(out[0])
+    assert bad[5:, 3].all()
+    assert not bad[:5].any() and not bad[:, :3].any() and not bad[:, 4:].any()
+
+
+@pytest.mark.parametrize("batch, length", [(0, 5), (2, 0), (0, 0)])
+def test_empty(batch, length):
+    inputs = leaves(make(batch, length, 6, 3))
+    out, last = selective_scan(**inputs, delta_softplus=True, return_last_state=True)
+    assert out.shape == (batch, length, 6) and last.shape == (batch, 6, 3)
+    assert torch.equal(last, inputs["initial_state"])
+    grads = torch.autograd.grad(out.sum() + (2 * last).sum(), [*inputs.values()])
+    for (name, x), grad in zip(inputs.items(), grads):
+        assert grad.shape == x.shape, name
+        assert (grad == (2 if name == "initial_state" else 0)).all(), name
+
+
+@pytest.mark.parametrize(
+    "name, change, error",
+    [
+        ("u", lambda x: x[0], ValueError),
+        ("u", lambda x: x.double(), TypeError),
+        ("u", lambda x: x.numpy(), TypeError),
+        ("delta", lambda x: x[:, :-1], ValueError),
+        ("A", lambda x: x.bfloat16(), TypeError),
+        ("A", lambda x: x[:, :0], ValueError),
+        ("A", lambda x: x[0], ValueError),
+        ("B", lambda x: x[..., :-1], ValueError),
+        ("B", lambda x: x.expand(-1, -1, 4, -1), ValueError),
+        ("C", lambda x: x.expand(-1, -1, 3, -1), ValueError),
+        ("D", lambda x: x[:-1], ValueError),
+        ("z", lambda x: x.half(), TypeError),
+        ("delta_bias", lambda x: x[None], ValueError),
+        ("initial_state", lambda x: x.transpose(1, 2), ValueError),
+        ("initial_state", lambda x: x.double(), TypeError),
+        ("B", lambda x: x.to("meta"), ValueError),
+    ],
+)
+def test_bad_input_names_the_argument(name, change, error):
+    inputs = make(2, 5, 6, 3)
+    inputs[name] = change(inputs[name])
+    with pytest.raises(error, match=rf"^{name} "):
+        selective_scan(**inputs)
+
+
+def test_bad_options():
+    inputs = make(2, 5, 6, 3)
+    with pytest.raises(ValueError, match="discretization is 'euler'"):
+        selective_scan(**inputs, discretization="euler")
+    inputs = {k: v for k, v in make(1, 2, 3, 257).items() if k in ("u", "delta", "A", "B", "C")}
+    with pytest.raises(ValueError, match="N from 1 to 256"):
+        selective_scan(**inputs)
+
+
+def test_no_second_derivative():
+    inputs = leaves(make(1, 5, 4, 2))
+    out = selective_scan(**inputs, delta_softplus=True)
+    (grad,) = torch.autograd.grad(out.sum(), inputs["u"], create_graph=True)
+    with pytest.raises(RuntimeError, match="second derivatives"):
+        grad.sum().backward()
+
+
+def test_operator_contract():
+    """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
+    inputs = leaves(make(2, 7, 5, 2))
+    arguments = (*inputs.values(), True, "mamba", True)
+    torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, arguments)
+
+
+@pytest.mark.parametrize("constant", ["", "B", "C"])
+def test_mamba_ssm_signature(constant):
+    inputs = make(2, 33, 20, 5, groups=4)
+    del inputs["initial_state"]
+    if constant:
+        inputs[constant] = torch.randn(20, 5)
+    their = dict(inputs)
+    for name in ("u", "delta", "z"):
+        their[name] = inputs[name].transpose(1, 2).contiguous()
+    for name in {"B", "C"} - {constant}:
+        their[name] = inputs[name].permute(0, 2, 3, 1).contiguous()
+    order = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
+    out, last = selective_scan_fn(*(their[k] for k in order), True, True)
+    exact = {k: v.double() for k, v in inputs.items()}
+    if constant:
+        exact[constant] = exact[constant].expand(2, 33, 20, 5)
+    want, want_last = oracle(**exact, delta_softplus=True)
+    assert_rel_rms(out, want.transpose(1, 2), FORWARD, "out")
+    assert_rel_rms(last, want_last, 2 * FORWARD, "last state")
+
+
+def test_mamba_ssm_three_dimensional_matrices():
+    inputs = make(2, 9, 6, 3)
+    their = [inputs[k].transpose(1, 2) for k in ("u", "delta")]
+    matrices = [inputs[k][:, :, 0].transpose(1, 2) for k in ("B", "C")]
+    out = selective_scan_fn(*their, inputs["A"], *matrices, delta_softplus=True)
+    want = selective_scan(
+        **{k: inputs[k] for k in ("u", "delta", "A", "B", "C")}, delta_softplus=True
+    )
+    assert torch.equal(out.transpose(1, 2), want)
+    with pytest.raises(TypeError, match="complex"):
+        selective_scan_fn(*their, inputs["A"].to(torch.complex64), *matrices)

@@ -1,0 +1,143 @@
+"""The scan at full length, on ordinary and on hostile inputs, against float64."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from helpers import assert_rel_rms, rel_rms
+from helpers.scan import leaves, make
+
+from gamba_warp.kernels.selective_scan import selective_scan
+from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+
+PIECE = 256
+TINY = 1e-30  # below, decays held at 2^-126 and numbers flushed to 0 are all that is seen
+
+
+def oracle(u, delta, A, B, C, D, z, delta_bias, initial_state, round_decays=False):
+    """The scan in float64, pieces of tokens side by side: each from 0, then from its first state.
+
+    ``round_decays`` rounds each decay to float32: what no float32 scan of this form can avoid.
+    """
+    step = F.softplus(delta + delta_bias, threshold=1e9)
+    x = step[..., None] * A
+    f = x.exp().float().double() if round_decays else x.exp()
+    w = (step * u)[..., None] * B
+    pad = -u.shape[1] % PIECE
+    cut = (1, -1, PIECE, *f.shape[2:])
+    f = F.pad(f, (0, 0, 0, 0, 0, pad), value=1.0).reshape(cut)
+    w = F.pad(w, (0, 0, 0, 0, 0, pad)).reshape(cut)
+    local, decay, h, p = [], [], torch.zeros_like(f[:, :, 0]), torch.ones_like(f[:, :, 0])
+    for t in range(PIECE):
+        h, p = f[:, :, t] * h + w[:, :, t], f[:, :, t] * p
+        local.append(h)
+        decay.append(p)
+    starts, last = [], initial_state
+    for piece in range(f.shape[1]):
+        starts.append(last)
+        last = decay[-1][:, piece] * last + local[-1][:, piece]
+    start = torch.stack(starts, 1)[:, :, None]
+    states = torch.stack(local, 2) + torch.stack(decay, 2) * start
+    states = states.reshape(1, -1, *states.shape[3:])[:, : u.shape[1]]
+    y = (states * C).sum(-1) + D * u
+    return y * F.silu(z), last
+
+
+def problem(kind, length, channels=16, states=2):
+    torch.manual_seed(0)
+    inputs = make(1, length, channels, states)
+    bias = torch.empty(channels).uniform_(-6.9, -2.3).exp()
+    inputs["delta_bias"] = bias + torch.log(-torch.expm1(-bias))
+    inputs["delta"] = 0.5 * torch.randn(1, length, channels)
+    inputs["A"] = -torch.arange(1.0, states + 1).repeat(channels, 1)
+    if kind == "steps off":
+        inputs["delta"] -= 100
+    elif kind == "steps at 20":
+        inputs["delta"] = 20 - inputs["delta_bias"] + 1e-3 * inputs["delta"]
+    elif kind == "steps on":
+        inputs["delta"] += 100
+    elif kind == "slow":
+        inputs["A"] = torch.full_like(inputs["A"], -1e-6)
+    elif kind == "fast":
+        inputs["A"] = torch.full_like(inputs["A"], -1e4)
+    elif kind == "denormal":
+        inputs["u"] *= 1e-39
+        inputs["initial_state"] *= 0
+    elif kind == "constant":
+        inputs["u"] = torch.ones_like(inputs["u"])
+        inputs["B"] = torch.ones_like(inputs["B"])
+    elif kind == "alternating":
+        inputs["u"] = torch.ones_like(inputs["u"])
+        inputs["u"][:, 1::2] = -1
+        inputs["B"] = torch.ones_like(inputs["B"])
+    return inputs
+
+
+def check(kind, length):
+    inputs = problem(kind, length)
+    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
+    out, last = selective_scan(**mine, delta_softplus=True, return_last_state=True)
+    want, want_last = oracle(**theirs)
+    forward, state, gradient = 1e-6, 1e-6, 1e-5
+    if kind == "slow":  # 1 - f is a fraction of float32's last bit: its rounding is the error
+        rounded, rounded_last = oracle(
+            **{k: v.detach() for k, v in theirs.items()}, round_decays=True
+        )
+        forward = 1.5 * rel_rms(rounded, want)
+        state = 1.5 * rel_rms(rounded_last, want_last)
+        gradient = 10 * forward
+    assert_rel_rms(out, want, forward, "out")
+    assert_rel_rms(last, want_last, state, "last state")
+    v, v_last = torch.randn_like(out), torch.randn_like(last)
+    grads = torch.autograd.grad((out * v).sum() + (last * v_last).sum(), [*mine.values()])
+    total = (want * v.double()).sum() + (want_last * v_last.double()).sum()
+    wants = torch.autograd.grad(total, [*theirs.values()])
+    for name, got, expected in zip(mine, grads, wants):
+        if expected.abs().max() < TINY:
+            assert got.abs().max() < TINY, name
+        else:
+            assert_rel_rms(got, expected, gradient, f"gradient of {name}")
+
+
+def test_oracle_is_the_reference():
+    inputs = {k: v.double() for k, v in make(1, 600, 5, 3).items()}
+    got, last = oracle(**inputs)
+    want, want_last = selective_scan_reference(**inputs, delta_softplus=True)
+    assert_rel_rms(got, want, 1e-13, "out")
+    assert_rel_rms(last, want_last, 1e-13, "last state")
+
+
+KINDS = (
+    "random",
+    "steps off",
+    "steps at 20",
+    "steps on",
+    "slow",
+    "fast",
+    "constant",
+    "alternating",
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_at_the_papers_length(kind):
+    check(kind, 16961)
+
+
+@pytest.mark.parametrize("kind", ["random", "slow"])
+def test_at_65536_tokens(kind):
+    check(kind, 65536)
+
+
+def test_zero_input_gives_zero():
+    inputs = problem("random", 1000)
+    inputs["u"].zero_()
+    inputs["initial_state"].zero_()
+    assert not selective_scan(**inputs, delta_softplus=True).any()
+
+
+def test_denormal_input_stays_finite():
+    mine = leaves(problem("denormal", 1000))
+    out = selective_scan(**mine, delta_softplus=True)
+    assert torch.isfinite(out).all() and out.abs().max() < 1e-36
+    for name, grad in zip(mine, torch.autograd.grad(out.sum(), [*mine.values()])):
+        assert torch.isfinite(grad).all(), name

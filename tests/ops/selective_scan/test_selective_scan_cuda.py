@@ -1,0 +1,298 @@
+"""The CUDA kernels without a GPU: small shapes on CPU blocks."""
+
+import contextlib
+
+import pytest
+import torch
+import warp as wp
+from helpers import assert_rel_rms
+from helpers.conv import make as make_conv
+from helpers.scan import leaves, make
+
+from gamba_warp.kernels.causal_conv1d import causal_conv1d, kernels, ops
+from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
+from gamba_warp.kernels.selective_scan import selective_scan
+from gamba_warp.kernels.selective_scan.cpu import launch as cpu
+from gamba_warp.kernels.selective_scan.cuda import launch as cuda
+from gamba_warp.kernels.selective_scan.cuda.tuning import Variant, choose, use_variant
+from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+
+ORDER = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
+NAMES = (*ORDER, "initial_state")
+STATE = ("u", "delta", "A", "B", "delta_bias", "initial_state")
+LIMIT = 2e-6  # float32 sums of a few hundred terms; measured below 6e-7
+
+
+@pytest.fixture
+def cpu_blocks(monkeypatch):
+    """CPU launches with real blocks, into memory full of NaN: what is not written shows."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    for name in ("empty", "empty_like"):
+        make_empty = getattr(torch, name)
+
+        def poisoned(*args, _make_empty=make_empty, **kwargs):
+            x = _make_empty(*args, **kwargs)
+            return x.fill_(torch.nan) if x.is_floating_point() else x
+
+        monkeypatch.setattr(torch, name, poisoned)
+
+
+def run(module, inputs, discretization, v_out, v_last, softplus=True, needs=None):
+    """Outputs, last state and the gradients that are needed (of all inputs), by name."""
+    tensors = [inputs.get(k) for k in ORDER]
+    state = inputs.get("initial_state")
+    out, last, saved = module.forward(*tensors, state, softplus, discretization, True)
+    needs = [k in (needs or inputs) for k in NAMES]
+    grads = module.backward(v_out, v_last, *tensors, saved, softplus, discretization, needs)
+    return {"out": out, "last": last} | {
+        name: grad for name, grad in zip(NAMES, grads) if grad is not None
+    }
+
+
+def exact(inputs, discretization, v_out, v_last, softplus=True):
+    """The same from the float64 oracle; ``v_out`` None for the gradients of the last state."""
+    inputs = leaves(inputs, torch.float64)
+    out, last = selective_scan_reference(
+        **inputs, delta_softplus=softplus, discretization=discretization
+    )
+    total = (last * v_last.double()).sum()
+    if v_out is not None:
+        total = total + (out * v_out.double()).sum()
+    grads = torch.autograd.grad(total, [*inputs.values()], allow_unused=True)
+    return {"out": out, "last": last, **dict(zip(inputs, grads))}
+
+
+def cotangents(inputs):
+    return torch.randn_like(inputs["u"]), torch.randn(inputs["u"].shape[0], *inputs["A"].shape)
+
+
+def assert_all(got, want, limit=LIMIT):
+    for name in got:
+        assert_rel_rms(got[name], want[name], limit, name)
+
+
+PIECES = Variant(pieces=3, back_pieces=2)
+
+
+@pytest.mark.parametrize(
+    "shape, discretization, variant",
+    [
+        ((2, 139, 37, 3, 1), "mamba", Variant()),
+        ((1, 70, 80, 3, 2), "mamba", PIECES),
+        ((1, 67, 35, 16, 1), "mamba", Variant()),
+        ((2, 139, 37, 16, 1), "mamba", PIECES),
+        ((1, 139, 20, 3, 1), "bilinear", PIECES),
+        ((1, 139, 20, 3, 1), "zoh", PIECES),
+    ],
+)
+def test_block_kernels_equal_lane_kernels_and_oracle(cpu_blocks, shape, discretization, variant):
+    inputs = make(*shape)
+    v_out, v_last = cotangents(inputs)
+    with use_variant(variant):
+        blocks = run(cuda, inputs, discretization, v_out, v_last)
+    assert_all(blocks, exact(inputs, discretization, v_out, v_last))
+    assert_all(blocks, run(cpu, inputs, discretization, v_out, v_last))
+
+
+@pytest.mark.parametrize("length", [1, 4, 5, 63, 64, 65, 128])
+def test_lengths_around_a_chunk(cpu_blocks, length):
+    inputs = make(1, length, 5, 3)
+    v_out, v_last = cotangents(inputs)
+    assert_all(run(cuda, inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
+
+
+@pytest.mark.parametrize("states, length", [(1, 66), (17, 66), (40, 66), (256, 9)])
+def test_any_number_of_states(cpu_blocks, states, length):
+    inputs = make(1, length, 3, states)
+    v_out, v_last = cotangents(inputs)
+    assert_all(run(cuda, inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
+
+
+@pytest.mark.parametrize("dtype, limit", [(torch.bfloat16, 4e-3), (torch.float16, 5e-4)])
+def test_half_precision(cpu_blocks, dtype, limit):
+    """Limits: one rounding of the dtype, 2^-9 and 2^-12."""
+    inputs = make(1, 20, 34, 3, dtype=dtype)
+    v_out, v_last = cotangents(inputs)
+    want = exact(inputs, "mamba", v_out, v_last)
+    got = run(cuda, inputs, "mamba", v_out, v_last)
+    for name, value in got.items():
+        assert value.dtype == (inputs[name] if name in inputs else v_last).dtype or name == "out"
+        assert_rel_rms(value, want[name], LIMIT if value.dtype == torch.float32 else limit, name)
+
+
+def test_without_options_and_with_strides(cpu_blocks):
+    """B and C are slices of one matrix, u and dout rows of wider ones, as projections give them."""
+    inputs = {k: v for k, v in make(2, 70, 21, 3).items() if k in ORDER[:5]}
+    inputs["delta"] = inputs["delta"].exp()
+    both = torch.cat([inputs["B"], inputs["C"]], -1)
+    inputs["B"], inputs["C"] = both[..., :3], both[..., 3:]
+    inputs["u"] = torch.randn(2, 70, 50)[..., 7:28]
+    v_last = torch.randn(2, 21, 3)
+    v_out = torch.randn(2, 70, 22)[..., :21]
+    assert_all(
+        run(cuda, inputs, "mamba", v_out, v_last, softplus=False),
+        exact(inputs, "mamba", v_out, v_last, softplus=False),
+    )
+
+
+VARIANTS = [
+    Variant(),
+    Variant(pieces=2, back_pieces=3),
+    Variant(pieces=7, channels=1, states=16, back_channels=1, back_states=8),
+    Variant(channels=4, states=4, back_pieces=4, back_channels=4, back_states=4),
+    Variant(channels=1, states=4, back_channels=2, back_states=8, block=64),
+]
+
+
+def test_variants_differ_by_rounding_only(cpu_blocks):
+    """What the gradient starts from is the forward's, whatever variant either of them is."""
+    inputs = make(1, 200, 70, 16)
+    v_out, v_last = cotangents(inputs)
+    results = []
+    for variant in VARIANTS:
+        with use_variant(variant):
+            results.append(run(cuda, inputs, "mamba", v_out, v_last))
+    for result in results[1:]:
+        assert_all(result, results[0], 1e-6)  # rounding of sums in another order
+        assert any(not torch.equal(result[k], results[0][k]) for k in result)  # it was another
+
+
+def test_two_runs_same_bits(cpu_blocks):
+    inputs = make(2, 139, 37, 3)
+    v_out, v_last = cotangents(inputs)
+    first, second = (run(cuda, inputs, "mamba", v_out, v_last) for _ in range(2))
+    for name in first:
+        assert torch.equal(first[name], second[name]), name
+
+
+@pytest.mark.parametrize("name", ["C", "z", "A", "D"])
+def test_one_gradient_alone(cpu_blocks, name):
+    """What is not asked for is left out of the kernel, and changes nothing."""
+    inputs = make(1, 70, 20, 3)
+    v_out, v_last = cotangents(inputs)
+    alone = run(cuda, inputs, "mamba", v_out, v_last, needs=[name])
+    assert set(alone) == {"out", "last", name}
+    every = run(cuda, inputs, "mamba", v_out, v_last)
+    assert torch.equal(alone[name], every[name])
+
+
+@pytest.mark.parametrize("variant", [Variant(), PIECES])
+@pytest.mark.parametrize("states", [3, 16])
+def test_final_state(cpu_blocks, variant, states):
+    inputs = make(2, 139, 21, states)
+    _, v_last = cotangents(inputs)
+    wants = exact(inputs, "mamba", None, v_last)
+    tensors = [inputs[k] for k in STATE]
+    needs = [True] * 6
+    with use_variant(variant):
+        last, saved = cuda.final_state(*tensors, True, "mamba", True)
+        grads = cuda.final_state_backward(v_last, *tensors[:5], saved, True, "mamba", needs)
+    assert_rel_rms(last, wants["last"], LIMIT, "last")
+    for name, grad in zip(STATE, grads):
+        assert_rel_rms(grad, wants[name], LIMIT, name)
+    needs[0] = needs[3] = False
+    grads = cuda.final_state_backward(v_last, *tensors[:5], saved, True, "mamba", needs)
+    assert [grad is None for grad in grads] == [not need for need in needs]
+
+
+@pytest.mark.parametrize("batch, length", [(0, 5), (2, 0)])
+def test_empty(batch, length):
+    inputs = make(batch, length, 6, 3)
+    v_out, v_last = cotangents(inputs)
+    got = run(cuda, inputs, "mamba", v_out, v_last)
+    assert torch.equal(got["last"], inputs["initial_state"])
+    assert torch.equal(got["initial_state"], v_last)
+    for name in ORDER:
+        assert got[name].shape == inputs[name].shape
+        assert not got[name].any(), name
+    last, _ = cuda.final_state(*[inputs[k] for k in STATE], True, "mamba", False)
+    assert torch.equal(last, inputs["initial_state"])
+
+
+def test_sums_need_blocks():
+    """Without CPU blocks dB is wrong, so the tests above do see the reduction."""
+    inputs = make(1, 5, 20, 3)
+    v_out, v_last = cotangents(inputs)
+    assert not wp.config.enable_cpu_blocks
+    blocks = run(cuda, inputs, "mamba", v_out, v_last)
+    by_lanes = run(cpu, inputs, "mamba", v_out, v_last)
+    assert not torch.allclose(blocks["B"], by_lanes["B"], rtol=0.1)
+
+
+def test_choice_follows_the_shape():
+    def pieces(batch, length):
+        variant = choose(batch, length, 1024, 16, 1, multiprocessors=132)
+        return variant.pieces, variant.back_pieces
+
+    assert pieces(16, 16961) == (1, 1)
+    few, back_few = pieces(1, 16961)
+    assert 8 <= few <= 64 and 8 <= back_few <= 64  # 16 blocks of channels, 132 multiprocessors
+    assert pieces(1, 64) == (1, 1)
+    assert pieces(1, 128)[0] <= 2
+    assert choose(0, 5, 8, 4, 1, 132) == Variant()
+    counts = [pieces(batch, 16961)[0] for batch in (1, 2, 4, 8, 16, 32)]
+    assert counts == sorted(counts, reverse=True)
+
+
+@pytest.mark.parametrize("use_silu", [0, 1])
+def test_convolution_kernels(monkeypatch, use_silu):
+    """The scalar form of the shared kernel body, launched on the CPU."""
+    inputs = make_conv(2, 300, 19, 4)
+    exact = leaves(inputs, torch.float64)
+    activation = "silu" if use_silu else None
+    out, _ = causal_conv1d_reference(**exact, activation=activation)
+    v_out = torch.randn_like(inputs["x"])
+    wants = torch.autograd.grad((out * v_out.double()).sum(), [*exact.values()])
+    as_cuda = kernels._values
+    monkeypatch.setattr(kernels, "_values", lambda _, io: as_cuda("cuda", io))
+    monkeypatch.setattr(ops, "cpu_values", ops.cuda_values)
+    caches = (kernels.forward_kernel, kernels.backward_kernel)
+    for cached in caches:
+        cached.cache_clear()
+    try:
+        mine = leaves(inputs)
+        got = causal_conv1d(**mine, activation=activation)
+        grads = torch.autograd.grad((got * v_out).sum(), [*mine.values()])
+    finally:
+        for cached in caches:
+            cached.cache_clear()
+    assert_rel_rms(got, out, 2e-7, "out")
+    for name, grad, want in zip(mine, grads, wants):
+        assert_rel_rms(grad, want, 2e-6, f"gradient of {name}")
+
+
+def gpu_gradients(inputs, v_out, v_last):
+    mine = {k: v.cuda().requires_grad_() for k, v in inputs.items()}
+    out, last = selective_scan(**mine, delta_softplus=True, return_last_state=True)
+    total = (out * v_out.cuda()).sum() + (last * v_last.cuda()).sum()
+    grads = torch.autograd.grad(total, [*mine.values()])
+    return {"out": out.cpu(), "last": last.cpu()} | {k: g.cpu() for k, g in zip(mine, grads)}
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dtype, limit", [(torch.float32, 1e-5), (torch.bfloat16, 4e-3)])
+@pytest.mark.parametrize("variant", [None, *VARIANTS])
+@pytest.mark.parametrize("shape", [(2, 577, 70, 16, 1), (1, 65, 40, 3, 2), (1, 100, 20, 40, 1)])
+def test_on_a_gpu(shape, variant, dtype, limit):
+    inputs = make(*shape, dtype=dtype)
+    v_out, v_last = cotangents(inputs)
+    want = exact(inputs, "mamba", v_out, v_last)
+    with use_variant(variant) if variant else contextlib.nullcontext():
+        first, second = (gpu_gradients(inputs, v_out, v_last) for _ in range(2))
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+        # the exponential of the GPU errs by up to 2^-22 a step
+        assert_rel_rms(value, want[name], 1e-5 if value.dtype == torch.float32 else limit, name)
+
+
+@pytest.mark.gpu
+def test_in_a_cuda_graph():
+    inputs = {k: v.cuda() for k, v in make(1, 577, 70, 16).items()}
+    want = selective_scan(**inputs, delta_softplus=True)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        out = selective_scan(**inputs, delta_softplus=True)
+    out.fill_(torch.nan)
+    graph.replay()
+    assert torch.equal(out, want)

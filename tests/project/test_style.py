@@ -1,0 +1,63 @@
+"""The house rules that a machine can check."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = [
+    path
+    for folder in ("kernels", "gamba_warp", "train", "eval")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+]
+MAX_FILE, MAX_FUNCTION, MAX_KERNEL = 400, 60, 120
+
+
+def _is_kernel(node) -> bool:
+    return any("wp.kernel" in ast.unparse(d) for d in node.decorator_list)
+
+
+def _is_device(node) -> bool:
+    return any("wp." in ast.unparse(d) for d in node.decorator_list)
+
+
+def _functions(path: Path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef):
+            yield node
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_sizes(path):
+    lines = path.read_text().count("\n")
+    assert lines <= MAX_FILE, f"{lines} lines"
+    for node in _functions(path):
+        limit = MAX_KERNEL if _is_device(node) else MAX_FUNCTION
+        length = node.end_lineno - node.lineno + 1
+        docstring = ast.get_docstring(node, clean=False)
+        if docstring:
+            length -= docstring.count("\n") + 1
+        for nested in ast.walk(node):  # a factory is not as long as the kernels it makes
+            if isinstance(nested, ast.FunctionDef) and nested is not node and _is_device(nested):
+                length -= nested.end_lineno - nested.lineno + 1
+        assert length <= limit, f"{node.name}: {length} lines"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_public_functions_have_docstrings(path):
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            if isinstance(node, ast.FunctionDef) and _is_device(node):
+                continue
+            assert ast.get_docstring(node), f"{node.name} has no docstring"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_kernel_arrays_say_their_direction(path):
+    """Arrays end in _in or _out, inputs before outputs."""
+    for node in filter(_is_kernel, _functions(path)):
+        names = [a.arg for a in node.args.args if "array" in ast.unparse(a.annotation)]
+        assert all(n.endswith(("_in", "_out")) for n in names), f"{node.name}: {names}"
+        directions = [name.endswith("_out") for name in names]
+        assert directions == sorted(directions), f"{node.name}: outputs come last"
