@@ -1,14 +1,18 @@
 # Every target sets up .venv by itself; only Python >= 3.10, git and make are needed.
 PYTHON ?= python3
+# LOCKED=1 installs the very versions that the suite last passed with (constraints.txt).
+LOCKED ?=
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.ready
+LOCK := $(if $(LOCKED),constraints.txt)
+STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
+WHEEL := build/wheel-check
 
-.PHONY: setup demo test bench lint format clean
+.PHONY: setup demo test bench lint format architecture constraints clean
 
 setup: $(STAMP)
 
-$(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py
+$(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py $(LOCK)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 		{ echo "Python >= 3.10 is needed; set PYTHON=..." >&2; exit 1; }
 	@# Some systems ship Python without ensurepip: virtualenv, from pip, then serves.
@@ -16,7 +20,8 @@ $(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py
 		{ rm -rf $(VENV); $(PYTHON) -m pip install --quiet --user virtualenv && \
 		  $(PYTHON) -m virtualenv --quiet $(VENV); }
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[test]'
+	$(BIN)/python -m pip install --quiet $(addprefix --constraint ,$(LOCK)) --editable '.[test]'
+	@rm -f $(VENV)/.ready*
 	@touch $@
 
 demo: $(STAMP)
@@ -28,13 +33,32 @@ test: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench
 
+# pyright reads what users get: the wheel, unpacked. (build/ goes first: setuptools would take
+# files from it that are gone from the checkout.)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	@rm -rf build
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build .
+	$(BIN)/python -m zipfile --extract build/*.whl $(WHEEL)
+	$(BIN)/pyright
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# docs/architecture.svg and the table of docs/architecture.md, from today's imports.
+architecture: $(STAMP)
+	PYTHONPATH=docs $(BIN)/python -m architecture
+
+# After a green `make test`: constraints.txt from what is installed. Versions without the local
+# part that some wheels carry (torch's +cu130), which no index has; nothing installed from a folder.
+constraints: $(STAMP)
+	@{ echo "# The environment that the suite last passed in: make setup LOCKED=1 installs it."; \
+	   echo "# Made by make constraints on $$($(BIN)/python -VV | cut -d' ' -f1,2), $$(uname -sm)."; \
+	   $(BIN)/python -m pip freeze --exclude-editable | sed -n 's/^\([^ @]*==[^+]*\).*/\1/p'; } \
+		> constraints.txt.new
+	@mv constraints.txt.new constraints.txt
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info

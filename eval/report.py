@@ -1,43 +1,33 @@
-"""The report of a batch: one JSON, one CSV, means over objects, failures listed by name."""
+"""The report of many objects: means with intervals, failures by name, as JSON and as CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import math
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gamba_warp import __version__
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, write_json
 
 OK, FAILED = "ok", "failed"
-LEVEL = 0.95  # of the intervals
+LEVEL = 0.95  # share of the resampled means within an interval
 RESAMPLES = 10_000
 
 
-def versions(*packages: str) -> dict[str, str]:
-    """Installed versions of gamba_warp and of the packages named, where they are installed."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    found = {"gamba_warp": __version__}
-    for package in packages:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
-
-
 def mean_of(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means of the numbers of like records, nested ones too.
+    """Averages the numbers of records with the same keys, nested ones too.
 
-    A number that is None in some records is averaged over the others; None where none has it.
-    Texts, lists and booleans are left out.
+    A number that is None in some records is averaged over the others; the mean is None where no
+    record has the number. Texts, lists and booleans are left out.
     """
     return _over_objects(records, lambda values: sum(values) / len(values))
 
@@ -48,17 +38,17 @@ def intervals_of(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Bootstrap intervals of the means of ``mean_of``: percentiles over objects drawn anew.
+    """Computes bootstrap intervals of the means of ``mean_of``: percentiles over resamples.
 
     Objects are drawn with repetition, as many as there are, and averaged (Efron 1979). The interval
-    tells how far the mean depends on the choice of objects, nothing else; of a handful of objects
-    it is too narrow.
+    tells how far the mean depends on the choice of objects and nothing else; with a handful of
+    objects it is too narrow.
 
     Args:
-        records: like records, one an object.
+        records: records with the same keys, one for each object.
         level: share of the resampled means within the interval.
-        resamples: how often objects are drawn.
-        seed: of the draws; the same for every number.
+        resamples: number of draws.
+        seed: of the draws; every number has the same draws.
 
     Returns:
         The keys of ``mean_of``, each ``[low, high]``; None with fewer than 2 objects.
@@ -68,7 +58,7 @@ def intervals_of(
         if len(values) < 2:
             return None
         random, x = np.random.default_rng(seed), np.asarray(values, np.float64)
-        batch = max(1, 1_000_000 // len(x))  # draws at once: bounds the memory
+        batch = max(1, 1_000_000 // len(x))  # number of draws at once, which bounds the memory
         means = [
             x[random.integers(0, len(x), (min(batch, resamples - start), len(x)))].mean(1)
             for start in range(0, resamples, batch)
@@ -80,7 +70,7 @@ def intervals_of(
 
 
 def _over_objects(records: list[dict[str, Any]], summary: Callable) -> dict[str, Any]:
-    """``summary`` of the values that each number has in the records, or None where it has none."""
+    """Applies ``summary`` to the values that each number has in the records; None without any."""
     result: dict[str, Any] = {}
     for key in dict.fromkeys(key for record in records for key in record):
         values = [record.get(key) for record in records]
@@ -93,7 +83,7 @@ def _over_objects(records: list[dict[str, Any]], summary: Callable) -> dict[str,
 
 
 def flat(record: dict[str, Any], prefix: str = "", lists: bool = False) -> dict[str, Any]:
-    """Nested dicts to one level, keys joined by a dot; lists are left out unless asked for."""
+    """Nested dicts in one level, with keys joined by a dot; lists only where asked for."""
     result: dict[str, Any] = {}
     for key, value in record.items():
         if isinstance(value, dict):
@@ -116,7 +106,7 @@ def check_finite(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def failure(name: str, error: Exception | str) -> dict[str, str]:
-    """The record of an object that could not be evaluated; the reason is one line."""
+    """The record of an object that could not be evaluated; its reason is one line."""
     lines = str(error).strip().splitlines()
     reason = lines[0] if lines else type(error).__name__
     return {"name": name, "status": FAILED, "reason": reason}
@@ -129,12 +119,13 @@ def make_report(
     left_out: tuple[str, ...] = (),
     **more: Any,
 ) -> dict[str, Any]:
-    """The report of a batch.
+    """Makes the report of a batch.
 
     Args:
         protocol: everything that decides what the numbers mean.
-        objects: one record an object, with ``name`` and ``status``; failed ones have ``reason``.
-        used: versions of packages.
+        objects: one record for each object, with ``name`` and ``status``, and ``reason`` where it
+            failed.
+        used: versions of packages by name.
         left_out: keys of the records that have no meaningful mean.
         more: further top-level entries.
 
@@ -164,8 +155,13 @@ def make_report(
     }
 
 
+def json_of(report: dict[str, Any]) -> str:
+    """The text of ``report.json``."""
+    return json.dumps(report, indent=2, allow_nan=False) + "\n"
+
+
 def csv_of(report: dict[str, Any]) -> str:
-    """One line an object, failed ones too; nested numbers as ``outer.inner``, words by a blank."""
+    """A line of CSV for each object; keys are ``outer.inner``, lists of words become one text."""
     rows = [
         flat({key: " ".join(value) if _is_words(value) else value for key, value in record.items()})
         for record in report["objects"]
@@ -188,15 +184,8 @@ def save_report(report: dict[str, Any], folder: Path) -> None:
         temporary.write_bytes(csv_of(report).encode())
 
 
-def write_report(folder: Path, *args: Any, **kwargs: Any) -> dict[str, Any]:
-    """``make_report`` of the other arguments, written into an existing folder; returns it."""
-    report = make_report(*args, **kwargs)
-    save_report(report, folder)
-    return report
-
-
 def summary_lines(report: dict[str, Any]) -> list[str]:
-    """Means with their intervals, ``name  mean [low, high]``, and failures."""
+    """One line ``name  mean [low, high]`` for each number, and one for each failure."""
     lines, intervals = [], flat(report["interval"], lists=True)
     for name, value in flat(report["mean"]).items():
         shown, ends = "n/a" if value is None else f"{value:.5g}", intervals.get(name)
@@ -206,9 +195,27 @@ def summary_lines(report: dict[str, Any]) -> list[str]:
     return lines + [f"failed: {item['name']}: {item['reason']}" for item in report["failures"]]
 
 
+def count_line(report: dict[str, Any], folder: Path | None) -> str:
+    """How many objects were evaluated and how many failed, and where the report is."""
+    file = f"; {folder / 'report.json'}" if folder else ""
+    return f"{report['num_ok']} evaluated, {report['num_failed']} failed{file}"
+
+
 def print_summary(report: dict[str, Any], folder: Path | None = None) -> int:
-    """Prints ``summary_lines`` and counts; returns the exit code: 1 where any object failed."""
-    print("\n".join(summary_lines(report)))
-    where = f"; {folder / 'report.json'}" if folder else ""
-    print(f"{report['num_ok']} evaluated, {report['num_failed']} failed{where}")
+    """Prints ``summary_lines`` and ``count_line``; returns the exit code: 1 for any failure."""
+    print("\n".join([*summary_lines(report), count_line(report, folder)]))
     return 1 if report["failures"] else 0
+
+
+@contextmanager
+def stdout_to_stderr() -> Iterator[None]:
+    """Sends what is printed meanwhile, by libraries too, to stderr: stdout is for the report."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        os.dup2(2, 1)
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)

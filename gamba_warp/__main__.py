@@ -1,3 +1,6 @@
+"""``python -m gamba_warp``, which is the console script ``gamba``."""
+
 from .cli import main
 
-main()
+if __name__ == "__main__":
+    main()

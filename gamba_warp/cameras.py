@@ -1,4 +1,4 @@
-"""Cameras and their conventions, stated once.
+"""Cameras, and the conventions that hold for them everywhere.
 
 ``viewmats [.., V, 4, 4]`` map world to camera in the OpenCV frame (x right, y down, z forward).
 ``Ks [.., V, 3, 3]`` are in pixels, with pixel centres at +0.5. Dataset files hold camera-to-world
@@ -26,8 +26,8 @@ class Cameras:
     Attributes:
         viewmats: ``[.., V, 4, 4]`` world to camera, OpenCV frame.
         Ks: ``[.., V, 3, 3]`` intrinsics in pixels.
-        width: pixels.
-        height: pixels.
+        width: width of the pictures, pixels.
+        height: height of the pictures, pixels.
     """
 
     viewmats: Tensor
@@ -40,31 +40,31 @@ class Cameras:
         return replace(self, viewmats=self.viewmats[index], Ks=self.Ks[index])
 
     def to(self, *args, **kwargs) -> Cameras:
-        """As ``torch.Tensor.to``."""
+        """Moves or converts both tensors, with the arguments of ``torch.Tensor.to``."""
         return replace(
             self, viewmats=self.viewmats.to(*args, **kwargs), Ks=self.Ks.to(*args, **kwargs)
         )
 
     def resized(self, width: int, height: int) -> Cameras:
-        """The same cameras for another picture size (the field of view stays)."""
+        """Returns the same cameras for another picture size; the field of view stays."""
         factor = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
         return Cameras(self.viewmats, self.Ks * factor[:, None], width, height)
 
 
 def intrinsics(width: int, height: int, fov: float = DEFAULT_FOV) -> Tensor:
-    """``[3, 3]`` float32 for square pixels, a centred axis, a vertical field of view in degrees."""
+    """Returns K ``[3, 3]`` float32 of square pixels, a centred axis and a vertical fov, degrees."""
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
 
 def from_opengl(camera_to_world: Tensor) -> Tensor:
-    """World-to-camera OpenCV matrices from camera-to-world OpenGL ones, both ``[.., 4, 4]``."""
+    """Converts camera-to-world OpenGL matrices to world-to-camera OpenCV ones, ``[.., 4, 4]``."""
     inverse = torch.linalg.inv(camera_to_world.double())
     return (_FLIP @ inverse).to(camera_to_world.dtype)
 
 
 def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
-    """``[4, 4]`` float32: the reference camera in its own frame, looking at the origin along +z."""
+    """Returns ``[4, 4]`` float32 of the reference camera, which looks at the origin along +z."""
     viewmat = torch.eye(4)
     viewmat[2, 3] = distance
     return viewmat
@@ -73,10 +73,10 @@ def reference_viewmat(distance: float = DEFAULT_DISTANCE) -> Tensor:
 def orbit(
     azimuths: Tensor, elevation: float | Tensor = 0.0, distance: float | Tensor = DEFAULT_DISTANCE
 ) -> Tensor:
-    """World-to-camera matrices ``[V, 4, 4]`` on an orbit about the origin, in the reference frame.
+    """Returns world-to-camera matrices ``[V, 4, 4]`` float32 on an orbit about the origin.
 
-    Azimuth and elevation 0 is the reference camera itself. The world is the reference camera's
-    frame, so "up" is -y; a positive elevation looks down from above.
+    The world is the reference camera's frame, so "up" is -y. The reference camera itself has
+    azimuth and elevation 0, and a camera of positive elevation looks down from above.
 
     Args:
         azimuths: ``[V]``, degrees.
@@ -87,7 +87,8 @@ def orbit(
     e = torch.deg2rad(torch.as_tensor(elevation, dtype=torch.float64)).expand_as(a)
     d = torch.as_tensor(distance, dtype=torch.float64).expand_as(a)
     zero, one = torch.zeros_like(a), torch.ones_like(a)
-    # z forward points from the camera to the origin; x right stays horizontal; y down = z × x.
+    # z (forward) points from the camera to the origin, x (right) stays horizontal, and y (down) is
+    # z × x.
     forward = torch.stack([-a.sin() * e.cos(), e.sin(), a.cos() * e.cos()], -1)
     right = torch.stack([a.cos(), zero, a.sin()], -1)
     down = torch.linalg.cross(forward, right)
@@ -99,7 +100,7 @@ def orbit(
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """``[count, 3]`` float64 unit vectors spread evenly, none along an axis."""
+    """Returns ``[count, 3]`` float64 unit vectors, evenly spread and none along an axis."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     angle = np.pi * (1 + 5**0.5) * k
@@ -112,18 +113,18 @@ def relative_to_reference(
 ) -> tuple[Tensor, Tensor]:
     """Expresses poses in the reference camera's frame, at a normalised distance.
 
-    The new world has its origin where the object's is, its axes along the reference camera's, and
-    its unit such that the reference camera is at ``distance``: ``reference_viewmat`` if it looks at
-    the origin, else that with the remaining offset.
+    The new world has the object's origin, the axes of the reference camera, and a unit in which the
+    reference camera is at ``distance``. If the reference camera looks at the origin, its new matrix
+    is ``reference_viewmat``; else the offset of its axis from the origin remains.
 
     Args:
         viewmats: ``[.., V, 4, 4]`` world to camera.
-        reference: ``[.., 4, 4]`` world to camera, the reference view.
-        distance: the reference camera's distance from the origin in the new world.
+        reference: ``[.., 4, 4]`` world to camera of the reference view.
+        distance: distance of the reference camera from the origin in the new world.
 
     Returns:
-        New ``viewmats [.., V, 4, 4]`` and ``scale [..]``: new length = scale · old length. A point
-        moves by ``x_new = scale · R_reference · x_old``.
+        New ``viewmats [.., V, 4, 4]``, and ``scale [..]``, the new length of an old unit. A point
+        becomes ``x_new = scale · R_reference · x_old``.
     """
     rotation = reference[..., :3, :3]
     scale = distance / reference[..., :3, 3].norm(dim=-1)
@@ -134,7 +135,7 @@ def relative_to_reference(
 
 
 def _inverse(matrices: Tensor) -> Tensor:
-    """Of ``[.., 3, 3]`` by cofactors: torch's own waits for the GPU to see whether it failed."""
+    """Inverts ``[.., 3, 3]`` by cofactors; torch's own would wait for the GPU to see failures."""
     a, b, c = matrices.unbind(-2)
     pairs = ((b, c), (c, a), (a, b))
     columns = torch.stack([torch.linalg.cross(x, y) for x, y in pairs], -1)
@@ -142,7 +143,7 @@ def _inverse(matrices: Tensor) -> Tensor:
 
 
 def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
-    """Plücker coordinates (o × d, d) of the ray through every pixel centre, world frame.
+    """Computes Plücker coordinates (o × d, d) of the rays through all pixel centres, world frame.
 
     Args:
         viewmats: ``[.., 4, 4]``.
@@ -158,7 +159,7 @@ def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tenso
     y = torch.arange(height, device=Ks.device, dtype=Ks.dtype) + 0.5
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     pixels = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], -1)
-    # d_world = Rᵀ K⁻¹ p, row vectors
+    # This is d_world = Rᵀ K⁻¹ p, written for row vectors.
     to_world = _inverse(Ks).mT @ rotation
     directions = pixels.reshape(-1, 3) @ to_world
     directions = directions / directions.norm(dim=-1, keepdim=True)

@@ -5,64 +5,47 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections.abc import Callable
 
 from .errors import UserError
 from .versions import __version__
 
-# command (one or two words) -> ("module:function", one line of help). Modules load when called.
-COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": (
-        "gamba_warp.commands.demo:demo_command",
-        "Train, reconstruct and evaluate on the starter set.",
-    ),
-    "reconstruct": (
-        "gamba_warp.commands.reconstruct:reconstruct_command",
-        "Pictures to 3D Gaussians.",
-    ),
-    "train": ("gamba_warp.train.command:train_command", "Train a model on posed views."),
-    "fit": ("gamba_warp.commands.fit:fit_command", "Posed views of an object to 3D Gaussians."),
-    "data furniture": ("gamba_warp.train.data.furniture:furniture_command", "Get 820 models."),
-    "data render": ("gamba_warp.train.data.render:render_command", "Meshes to posed views."),
-    "eval-views": (
-        "gamba_warp.eval.views.command:eval_views_command",
-        "PSNR, SSIM, LPIPS of views.",
-    ),
-    "eval-geometry": (
-        "gamba_warp.eval.shapes.command:eval_geometry_command",
-        "Chamfer, IoU, F-score.",
-    ),
-    "export": (
-        "gamba_warp.commands.export:export_command",
-        "Gaussians to meshes, splats and pages.",
-    ),
-    "view": ("gamba_warp.commands.view:view_command", "Gaussians in the browser."),
-    "bench": (
-        "gamba_warp.commands.bench:bench_command",
-        "Run time against error, on this machine.",
-    ),
-    "stress": (
-        "gamba_warp.commands.stress:stress_command",
-        "Random hostile cases against float64.",
-    ),
-    "gpu-check": (
-        "gamba_warp.gpu_check.check:gpu_check_command",
-        "Test and measure on a CUDA machine.",
-    ),
-    "weights lpips": (
-        "gamba_warp.commands.weights:weights_command",
-        "Fetch the LPIPS-VGG weights.",
-    ),
-    "doctor": ("gamba_warp.commands.doctor:doctor_command", "Say what this machine can run."),
+# A command has one or two words. That of the words "a b-c" is the function ``a_b_c_command`` of
+# the module ``gamba_warp.commands.a_b_c``, if MODULES names no other; it is imported when called.
+COMMANDS = {
+    "demo": "Train, reconstruct and evaluate on the starter set.",
+    "reconstruct": "Pictures to 3D Gaussians.",
+    "train": "Train a model on posed views.",
+    "fit": "Posed views of an object to 3D Gaussians.",
+    "data furniture": "Get 820 models.",
+    "data render": "Meshes to posed views.",
+    "eval-views": "PSNR, SSIM, LPIPS of views.",
+    "eval-geometry": "Chamfer, IoU, F-score.",
+    "export": "Gaussians to meshes, splats and pages.",
+    "view": "Gaussians in the browser.",
+    "bench": "Run time against error, on this machine.",
+    "stress": "Random hostile cases against float64.",
+    "gpu-check": "Test and measure on a CUDA machine.",
+    "weights lpips": "Fetch the LPIPS-VGG weights.",
+    "doctor": "Say what this machine can run.",
+}
+MODULES = {
+    "train": "gamba_warp.train.command",
+    "data furniture": "gamba_warp.train.data.furniture_command",
+    "data render": "gamba_warp.train.data.render_command",
+    "eval-views": "gamba_warp.eval.views.command",
+    "eval-geometry": "gamba_warp.eval.shapes.command",
 }
 
 
 def _usage() -> str:
     lines = [f"gamba {__version__}: one image to 3D Gaussians", "", "Commands:"]
-    lines += [f"  gamba {name:<14} {text}" for name, (_, text) in COMMANDS.items()]
+    lines += [f"  gamba {name:<14} {text}" for name, text in COMMANDS.items()]
     return "\n".join([*lines, "", "gamba COMMAND --help shows the options of one."])
 
 
 def _find(arguments: list[str]) -> tuple[str, list[str]]:
+    """The command's name, and its own arguments."""
     for words in (2, 1):
         name = " ".join(arguments[:words])
         if name in COMMANDS:
@@ -73,14 +56,27 @@ def _find(arguments: list[str]) -> tuple[str, list[str]]:
     raise UserError(f"unknown command '{arguments[0]}'; gamba --help lists them")
 
 
-def run(name: str, arguments: list[str]) -> int:
-    """Runs one command and returns its exit code: 0 done, 1 some inputs failed, 2 bad input."""
-    import tyro
+def load_command(name: str) -> Callable[..., int | None]:
+    """Imports the function of one of ``COMMANDS``."""
+    plain = name.replace(" ", "_").replace("-", "_")
+    module = importlib.import_module(MODULES.get(name, f"gamba_warp.commands.{plain}"))
+    return getattr(module, f"{plain}_command")
 
-    module, function = COMMANDS[name][0].split(":")
+
+def run(name: str, arguments: list[str]) -> int:
+    """Runs one command.
+
+    Args:
+        name: one of ``COMMANDS``.
+        arguments: its options.
+
+    Returns:
+        The exit code: 0 all was done, 1 some inputs failed, 2 the input is bad, 130 Ctrl-C.
+    """
     try:
-        command = getattr(importlib.import_module(module), function)
-        return tyro.cli(command, args=arguments, prog=f"gamba {name}") or 0
+        import tyro
+
+        return tyro.cli(load_command(name), args=arguments, prog=f"gamba {name}") or 0
     except UserError as error:
         print(f"gamba: {error}", file=sys.stderr)
         return 2

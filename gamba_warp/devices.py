@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
-
+from .conventions import DeviceChoice
 from .errors import UserError
 
 if TYPE_CHECKING:
-    pass
+    import torch
 
 
-def pick_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is a device, else the CPU.
+def pick_device(name: DeviceChoice) -> torch.device:
+    """The device of the option ``--device``.
+
+    Args:
+        name: ``auto`` is CUDA where there is a device, else the CPU.
 
     Raises:
         UserError: CUDA is asked for and is not there.
     """
+    import torch
+
     if name == "cuda" and not torch.cuda.is_available():
         raise UserError("--device cuda: no CUDA device is available")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")

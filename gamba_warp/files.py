@@ -12,6 +12,7 @@ from .errors import UserError
 
 # The folder of a checkout: of this package, tests/ and starter/. An installed package has neither.
 CHECKOUT = Path(__file__).resolve().parent.parent
+_PART = 1 << 20  # bytes read at once of a file that may be larger than the memory
 
 
 @contextmanager
@@ -73,13 +74,14 @@ def sha256(path: str | Path) -> str:
     Raises:
         UserError: the file cannot be read.
     """
+    digest = hashlib.sha256()
     try:
         with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except AttributeError:  # Python 3.10 has no file_digest
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+            while part := file.read(_PART):
+                digest.update(part)
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from error
+    return digest.hexdigest()
 
 
 def check_sha256(path: str | Path, want: str) -> None:

@@ -1,9 +1,10 @@
-"""The container that every part passes on: activated Gaussian parameters, by name."""
+"""The container of activated Gaussian parameters that every part of the package passes on."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,32 +38,33 @@ class Gaussians:
 
     @property
     def num(self) -> int:
-        """N, the number of Gaussians of one object."""
+        """The number N of Gaussians of one object."""
         return self.opacities.shape[-1]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """The same container with ``function`` applied to every tensor that is there."""
+        """Returns a container with ``function`` applied to every tensor that is not None."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Gaussians(**{k: None if v is None else function(v) for k, v in values.items()})
+        made: dict[str, Any] = {k: v if v is None else function(v) for k, v in values.items()}
+        return Gaussians(**made)
 
     def __getitem__(self, index) -> Gaussians:
         """Indexes the leading batch dimensions, the same way in every tensor."""
         return self.map(lambda value: value[index])
 
     def select(self, keep: Tensor) -> Gaussians:
-        """The Gaussians of one object (no batch dimension) where ``keep [N]`` says so."""
+        """Returns the Gaussians of one object (no batch dimension) that ``keep [N]`` selects."""
         return self.map(lambda value: value[keep])
 
     def to(self, *args, **kwargs) -> Gaussians:
-        """As ``torch.Tensor.to``."""
+        """Moves or converts every tensor, with the arguments of ``torch.Tensor.to``."""
         return self.map(lambda value: value.to(*args, **kwargs))
 
     def detach(self) -> Gaussians:
-        """The same values, cut from the graph."""
+        """Returns the same values, detached from the graph."""
         return self.map(torch.Tensor.detach)
 
     def transformed(self, rotation: Tensor, translation: Tensor, scale: float = 1.0) -> Gaussians:
-        """Moved by ``x -> scale · rotation · x + translation`` (one rigid motion for all).
+        """Moves all Gaussians by the same motion, ``x -> scale · rotation · x + translation``.
 
         Args:
             rotation: ``[3, 3]``, a proper rotation.
@@ -84,7 +86,7 @@ class Gaussians:
 
 
 def quat_multiply(p: Tensor, q: Tensor) -> Tensor:
-    """Hamilton product of wxyz quaternions ``[.., 4]``: the rotation q, then p."""
+    """Computes the Hamilton product of wxyz quaternions ``[.., 4]``: first rotation q, then p."""
     pw, px, py, pz = p.unbind(-1)
     qw, qx, qy, qz = q.unbind(-1)
     return torch.stack(
@@ -99,9 +101,10 @@ def quat_multiply(p: Tensor, q: Tensor) -> Tensor:
 
 
 def matrix_to_quat(rotation: Tensor) -> Tensor:
-    """The wxyz quaternion ``[4]``, w >= 0, of a rotation matrix ``[3, 3]``.
+    """Computes the wxyz quaternion ``[4]``, w >= 0, of a rotation matrix ``[3, 3]``.
 
-    The eigenvector of Bar-Itzhack's symmetric matrix: exact near every angle, 180° included.
+    It is an eigenvector of Bar-Itzhack's symmetric matrix, which is exact near every angle, also
+    near 180°.
     """
     m = rotation.double()
     k = torch.stack(

@@ -1,17 +1,17 @@
-"""How far two pictures are apart: PSNR, SSIM, and IoU of masks."""
+"""Measures of how far two pictures are apart: PSNR, SSIM, and the IoU of masks."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-MAX_PSNR = 100.0  # of equal pictures, whose PSNR has no bound
-SSIM_WINDOW = 11
-SSIM_SIGMA = 1.5  # fixed in kornia
+MAX_PSNR = 100.0  # dB; given for equal pictures, whose PSNR has no bound
+SSIM_WINDOW = 11  # pixels
+SSIM_SIGMA = 1.5  # pixels; kornia has it fixed
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio over the whole picture, in dB, at most ``MAX_PSNR``.
+    """Computes the peak signal-to-noise ratio of the whole picture, in dB, at most ``MAX_PSNR``.
 
     Args:
         a: ``[.., H, W, C]`` in [0, 1].
@@ -26,10 +26,10 @@ def psnr(a: Tensor, b: Tensor) -> Tensor:
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Structural similarity (Wang et al. 2004), mean over channels and whole windows.
+    """Computes the structural similarity (Wang et al. 2004), mean over channels and whole windows.
 
-    Gaussian window 11x11, sigma 1.5, range 1, no padding; equals scikit-image's with
-    ``gaussian_weights=True, use_sample_covariance=False``.
+    The window is Gaussian, 11x11, with sigma 1.5; the range is 1 and nothing is padded. The result
+    equals scikit-image's with ``gaussian_weights=True, use_sample_covariance=False``.
 
     Args:
         a: ``[.., H, W, C]`` in [0, 1], H and W at least 11.
@@ -37,20 +37,23 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
     Returns:
         ``[..]`` float64, 1 for equal pictures.
+
+    Raises:
+        ValueError: the shapes differ, or the pictures are smaller than the window.
     """
     from kornia.metrics import ssim as ssim_map
 
     _same_shape(a, b)
     if min(a.shape[-3:-1]) < SSIM_WINDOW:
         raise ValueError(f"pictures of {a.shape[-2]}x{a.shape[-3]}; SSIM needs 11x11 or more")
-    # float64: the variances are differences of near-equal numbers in flat regions
+    # This needs float64: in flat regions the variances are differences of nearly equal numbers.
     x, y = (v.double().reshape(-1, *v.shape[-3:]).permute(0, 3, 1, 2) for v in (a, b))
     values = ssim_map(x, y, SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
     return values.mean((1, 2, 3)).reshape(a.shape[:-3])
 
 
 def mask_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Intersection over union of two masks.
+    """Computes the intersection over union of two masks.
 
     Args:
         a: ``[.., H, W]`` bool.
@@ -60,7 +63,7 @@ def mask_iou(a: Tensor, b: Tensor) -> Tensor:
         ``[..]`` float64; 1 where both are empty.
     """
     _same_shape(a, b)
-    both, either = ((a & b).sum((-2, -1)), (a | b).sum((-2, -1)))
+    both, either = (a & b).sum((-2, -1)), (a | b).sum((-2, -1))
     return torch.where(either > 0, both.double() / either.clamp(min=1), 1.0)
 
 

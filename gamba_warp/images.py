@@ -1,8 +1,7 @@
-"""Reading and writing pictures: any common file to float RGBA, with errors that name the file."""
+"""Reading and writing pictures; any common file becomes float RGBA, and errors name the file."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -10,22 +9,21 @@ from PIL import Image, UnidentifiedImageError
 from .errors import UserError
 from .files import atomic_path
 
-if TYPE_CHECKING:
-    pass
-
 MAX_PIXELS = 64 * 1024 * 1024
+PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
 
 
 def load_rgba(path: str | Path) -> np.ndarray:
     """Reads one still picture.
 
-    8-bit and 16-bit, grey, palette, RGB and RGBA files are converted; EXIF rotation is applied.
+    Grey, palette, RGB and RGBA files of 8 and 16 bits are converted, and EXIF rotation is applied.
 
     Returns:
         ``[H, W, 4]`` float32 in [0, 1], colour not premultiplied; alpha 1 where the file has none.
 
     Raises:
-        UserError: missing, empty, not a picture, truncated, animated or over 64 megapixels.
+        UserError: the file is missing, empty, not a picture, truncated, animated or over 64
+            megapixels.
     """
     path = Path(path)
     if path.is_dir():
@@ -36,7 +34,7 @@ def load_rgba(path: str | Path) -> np.ndarray:
         if path.stat().st_size == 0:
             raise UserError(f"{path}: the file is empty")
         with Image.open(path) as image:
-            # An MPO is a phone's JPEG with a preview or a depth map behind it.
+            # An MPO is a phone's JPEG, followed by a preview or a depth map.
             frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
             if frames > 1:
                 raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
@@ -47,7 +45,7 @@ def load_rgba(path: str | Path) -> np.ndarray:
         raise
     except UnidentifiedImageError as error:
         raise UserError(f"{path}: not a picture that can be read") from error
-    except Exception as error:  # on damaged files decoders raise nearly any type
+    except Exception as error:  # decoders raise errors of nearly any type on damaged files
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise UserError(f"{path}: cannot be decoded ({reason})") from error
 
@@ -67,7 +65,7 @@ def _to_rgba(image: Image.Image) -> np.ndarray:
 
 
 def over_background(rgba, background):
-    """Straight-alpha RGBA over a colour; for arrays and tensors alike.
+    """Composites straight-alpha RGBA, an array or a tensor, over a colour.
 
     Args:
         rgba: ``[.., H, W, 4]`` in [0, 1], colour not premultiplied.
@@ -86,7 +84,11 @@ def to_uint8(picture: np.ndarray) -> np.ndarray:
 
 
 def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
-    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], in the suffix's format."""
+    """Writes ``[H, W]`` or ``[H, W, 1|3|4]`` floats in [0, 1], in the format of the suffix.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
     pixels = to_uint8(np.asarray(picture))
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
@@ -94,18 +96,15 @@ def save_image(path: str | Path, picture: np.ndarray, **options) -> None:
         Image.fromarray(pixels).save(temporary, **options)
 
 
-PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
-
-
 def find_pictures(images: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Resolves files and folders to picture files.
 
     Args:
-        images: files are taken as they are; of a folder, the files in it that have a picture's
-            suffix, sorted, without sub-folders.
+        images: files, which are taken as they are, and folders, whose files with a picture's
+            suffix are taken in sorted order, without sub-folders.
 
     Returns:
-        The files, each once, and the folders that hold none with the reason.
+        The files, each once; and the folders that give no file, with the reason.
     """
     pictures: dict[Path, None] = {}
     failures = []

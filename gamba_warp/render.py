@@ -1,4 +1,4 @@
-"""Gaussians and cameras to pictures, by the rasterizer kernels."""
+"""Rendering: from Gaussians and cameras to pictures, by the rasterizer kernels."""
 
 from dataclasses import dataclass
 
@@ -7,6 +7,7 @@ from torch import Tensor
 from .cameras import Cameras
 from .gaussians import Gaussians
 from .kernels.rasterize import rasterization
+from .kernels.rasterize.meta import Meta
 
 
 @dataclass
@@ -16,14 +17,14 @@ class Rendering:
     Attributes:
         rgb: ``[.., V, H, W, 3]``, composited on the background.
         alpha: ``[.., V, H, W, 1]`` in [0, 1].
-        depth: ``[.., V, H, W, 1]`` expected depth in object units, or None.
-        meta: work counts of the rasterizer.
+        depth: ``[.., V, H, W, 1]`` expected depth in object units, or None if not asked for.
+        meta: the rasterizer's counts of its work.
     """
 
     rgb: Tensor
     alpha: Tensor
     depth: Tensor | None
-    meta: dict
+    meta: Meta
 
 
 def render(
@@ -36,14 +37,11 @@ def render(
     """Renders every object in each of its views, all in one launch.
 
     Args:
-        gaussians: leading dimensions ``..``.
-        cameras: the same leading dimensions, then V.
+        gaussians: Gaussians with leading dimensions ``..``.
+        cameras: cameras with the same leading dimensions, then V.
         background: RGB in [0, 1], ``[3]`` or ``[.., V, 3]``; None means black.
-        depth: also return the expected depth.
-        options: passed on to ``rasterization``.
-
-    Returns:
-        A ``Rendering``.
+        depth: whether the expected depth is rendered too.
+        options: further arguments of ``rasterization``.
     """
     if background is not None:
         background = background.expand(*cameras.viewmats.shape[:-2], 3)

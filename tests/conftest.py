@@ -1,5 +1,10 @@
+"""What holds for all tests: rewritten asserts in helpers, the marker ``gpu``, a fixed seed."""
+
 import pytest
 import torch
+
+# This must come before the first import of helpers, so that a failing assert in them shows values.
+pytest.register_assert_rewrite("helpers")
 
 
 def pytest_collection_modifyitems(items):

@@ -2,7 +2,7 @@
 
 import sys
 
-from gamba_warp.cli import run
+from gamba_warp.cli import main
 
 if __name__ == "__main__":
-    sys.exit(run("train", sys.argv[1:]))
+    main(["train", *sys.argv[1:]])

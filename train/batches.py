@@ -1,6 +1,7 @@
-"""Batches of views. What a batch holds is a function of (seed, step, place in it) alone.
+"""What a run trains on: its objects, and batches of their views.
 
-So the order of the data needs no saved state: a resumed run goes on with the very same batches.
+A sample is a function of the seed and of its number in the run alone. So the order of the data
+needs no saved state, and a resumed run goes on with the very same batches.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gamba_warp.cameras import Cameras, relative_to_reference
+from gamba_warp.cameras import Cameras
 from gamba_warp.data.dataset import ViewDataset, open_dataset
-from gamba_warp.data.vgg_weights import lpips_available
 from gamba_warp.errors import UserError
-from gamba_warp.images import over_background
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.lpips import LPIPS, load_lpips
+from gamba_warp.model.posing import posed_input, relative_cameras
 
 from .config import TrainConfig
 
-_TRIES = 8  # objects tried in place of one that cannot be read
+_TRIES = 8  # objects tried one after the other until one can be read
+# With --overfit all views share the network's one pass, and rendering them is cheap beside it.
+_OVERFIT_VIEWS = 9
 
 
 @dataclass
@@ -32,12 +33,12 @@ class Batch:
     """B objects, each with one input picture and V+1 pictures to match, the input view first.
 
     Attributes:
-        uids: B names.
+        uids: names of the objects, B.
         inputs: ``[B, h, w, 3]`` RGB in [0, 1] on the model's background.
         input_cameras: ``[B]``, in the model's world.
         targets: ``[B, V+1, H, W, 4]`` RGBA in [0, 1], straight alpha.
         cameras: ``[B, V+1]``.
-        background: ``[B, 1, 3]`` RGB to render and composite on.
+        background: ``[B, 1, 3]`` RGB that pictures are rendered and composited on.
     """
 
     uids: list[str]
@@ -48,21 +49,16 @@ class Batch:
     background: Tensor
 
     def to(self, device: torch.device) -> Batch:
-        """The same batch on a device."""
+        """Returns the same batch on a device."""
         if device.type == "cpu":
             return self
         return Batch(
-            self.uids,
-            *(
-                value.to(device, non_blocking=True)
-                for value in (
-                    self.inputs,
-                    self.input_cameras,
-                    self.targets,
-                    self.cameras,
-                    self.background,
-                )
-            ),
+            uids=self.uids,
+            inputs=self.inputs.to(device, non_blocking=True),
+            input_cameras=self.input_cameras.to(device, non_blocking=True),
+            targets=self.targets.to(device, non_blocking=True),
+            cameras=self.cameras.to(device, non_blocking=True),
+            background=self.background.to(device, non_blocking=True),
         )
 
 
@@ -74,16 +70,16 @@ def load_sample(
     config: GambaConfig,
     background: Tensor,
 ) -> Batch:
-    """One object as a batch of one; ``views[0]`` is the input view.
+    """Loads one object as a batch of one; ``views[0]`` is the input view.
 
-    Poses are relative to the input view, at the model's distance (``relative_to_reference``).
+    Poses are relative to the input view, at the model's distance (``model.posing``).
 
     Args:
-        dataset: where from.
-        index: of the object.
+        dataset: the dataset.
+        index: number of the object.
         views: the input view, then the novel ones.
         size: side of the pictures to match, pixels.
-        config: the model's.
+        config: the model's configuration.
         background: RGB ``[3]``.
 
     Raises:
@@ -95,27 +91,21 @@ def load_sample(
         source = dataset.load(index, views[:1], config.image_size)
     for cameras in (target.cameras, source.cameras):
         if cameras.width != cameras.height:
-            size = f"{cameras.width}x{cameras.height}"
-            raise UserError(f"{target.uid}: pictures are {size}, training needs square ones")
-    viewmats, _ = relative_to_reference(
-        target.cameras.viewmats, target.cameras.viewmats[0], config.distance
-    )
+            sides = f"{cameras.width}x{cameras.height}"
+            raise UserError(f"{target.uid}: pictures are {sides}, training needs square ones")
+    inputs, input_cameras = posed_input(source, config)
     return Batch(
         uids=[target.uid],
-        inputs=over_background(source.images[:1], config.background_color),
-        input_cameras=Cameras(
-            viewmats[:1], source.cameras.Ks[:1], source.cameras.width, source.cameras.height
-        ),
+        inputs=inputs,
+        input_cameras=input_cameras,
         targets=target.images[None],
-        cameras=Cameras(
-            viewmats[None], target.cameras.Ks[None], target.cameras.width, target.cameras.height
-        ),
+        cameras=relative_cameras(target.cameras, config.distance)[None],
         background=background.reshape(1, 1, 3),
     )
 
 
 def join(samples: list[Batch]) -> Batch:
-    """One batch of all; every sample must have as many views."""
+    """Joins samples to one batch; all must have the same number of views."""
     return Batch(
         uids=[uid for s in samples for uid in s.uids],
         inputs=torch.cat([s.inputs for s in samples]),
@@ -138,11 +128,11 @@ def _join_cameras(cameras: list[Cameras]) -> Cameras:
 def choose_views(
     count: int, novel: int, reference: int | None, rng: np.random.Generator
 ) -> list[int]:
-    """An input view and ``novel`` others, without repeats while there are enough.
+    """Chooses an input view and ``novel`` others, which repeat only if there are too few.
 
     Args:
-        count: views of the object.
-        novel: V.
+        count: number of the object's views.
+        novel: number of novel views, V.
         reference: the input view, or None for any.
         rng: source of chance.
     """
@@ -153,7 +143,7 @@ def choose_views(
 
 
 class BatchSource:
-    """Draws batches by number; see the module's docstring."""
+    """Draws batches by their number (see the module's docstring)."""
 
     def __init__(
         self,
@@ -167,25 +157,25 @@ class BatchSource:
         background: str,
         seed: int,
     ) -> None:
-        """``batch_size`` counts all processes; ``objects`` may repeat an index."""
+        """``batch_size`` is that of all processes together; ``objects`` may repeat an index."""
         self.dataset, self.config = dataset, config
         self.objects, self.batch_size, self.size = objects, batch_size, size
         self.reference, self.background, self.seed = reference, background, seed
         self.failures: dict[str, str] = {}
 
     def _object(self, number: int) -> int:
-        """The object of the ``number``-th sample: a new permutation in each epoch."""
-        epoch, place = divmod(number, len(self.objects))
+        """Returns the object of the ``number``-th sample; each epoch has its own permutation."""
+        epoch, position = divmod(number, len(self.objects))
         order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.objects))
-        return self.objects[order[place]]
+        return self.objects[order[position]]
 
     def sample(self, number: int, novel: int) -> Batch:
-        """The ``number``-th sample with ``novel`` novel views.
+        """Loads the ``number``-th sample with ``novel`` novel views.
 
-        An object that cannot be read is noted in ``failures`` and another takes its place.
+        An object that cannot be read is recorded in ``failures``, and the next one is taken.
 
         Raises:
-            UserError: several objects on end cannot be read.
+            UserError: several objects in a row cannot be read.
         """
         rng = np.random.default_rng([self.seed, 2, number])
         background = torch.ones(3) if self.background == "white" else torch.zeros(3)
@@ -199,10 +189,10 @@ class BatchSource:
                 return load_sample(self.dataset, index, views, self.size, self.config, background)
             except UserError as error:
                 self.failures[self.dataset.uids[index]] = reason = str(error)
-        raise UserError(f"{_TRIES} objects on end cannot be read; the last: {reason}")
+        raise UserError(f"{_TRIES} objects in a row cannot be read; the last: {reason}")
 
     def batch(self, number: int, novel: int, rank: int = 0, size: int = 1) -> Batch:
-        """This process's part of the ``number``-th batch."""
+        """Loads the part of the ``number``-th batch that process ``rank`` of ``size`` works on."""
         share = self.batch_size // size
         first = number * self.batch_size + rank * share
         return join([self.sample(first + i, novel) for i in range(share)])
@@ -216,16 +206,16 @@ class Prefetcher:
         self._waiting: dict[object, Future] = {}
 
     def submit(self, key: object, function, *arguments) -> None:
-        """Starts ``function(*arguments)``, unless that key is under way."""
+        """Starts ``function(*arguments)``, unless it was started with this key before."""
         if key not in self._waiting:
             self._waiting[key] = self._pool.submit(function, *arguments)
 
     def take(self, key: object) -> Batch:
-        """Waits for a submitted result. Raises what the function raised."""
+        """Waits for the result of a key; an error of its function is raised here."""
         return self._waiting.pop(key).result()
 
     def close(self) -> None:
-        """Drops what has not begun, waits for the rest."""
+        """Drops what has not begun and waits for the rest."""
         self._pool.shutdown(cancel_futures=True)
 
 
@@ -236,7 +226,9 @@ def fixed_batches(
     novel: int | None,
     size: int,
 ) -> Iterator[Batch]:
-    """For validation: view 0 as the input and ``novel`` evenly spaced others (None: all), on white.
+    """Yields the batches of a validation, one object each, always the same views, on white.
+
+    View 0 is the input; ``novel`` others follow, evenly spaced in the list (None: all).
 
     Raises:
         UserError: an object cannot be read.
@@ -249,23 +241,19 @@ def fixed_batches(
         yield load_sample(dataset, index, [0, *others], size, config, torch.ones(3))
 
 
-# For one object the network's pass is shared by all views, and drawing them is cheap beside it.
-_OVERFIT_VIEWS = 9
-
-
 @dataclass(frozen=True)
 class TrainingData:
-    """What to train and to validate on.
+    """What a run trains and validates on.
 
     Attributes:
-        train: objects to train on.
+        train: dataset with the objects to train on.
         objects: indices into ``train``; one pass over the list is an epoch.
         reference: the input view, or None for any.
         batch_size: objects per batch and process.
-        novel: novel views of each at every step; None means as many as the schedule says.
-        validation: objects to validate on.
+        novel: novel views per object at every step; None means as many as the schedule says.
+        validation: dataset with the objects to validate on.
         held_out: indices into ``validation``; may be empty.
-        val_views: novel views of each; None means all.
+        val_views: novel views per object in a validation; None means all.
         notes: lines for the user.
     """
 
@@ -281,7 +269,7 @@ class TrainingData:
 
     @property
     def fingerprint(self) -> str:
-        """Of the names of the objects in their order: another list would be another run."""
+        """A hash of the objects' names in their order; a run with another list is another run."""
         names = "\n".join(self.train.uids[i] for i in self.objects)
         return hashlib.sha256(names.encode()).hexdigest()[:16]
 
@@ -290,10 +278,11 @@ def open_data(config: TrainConfig) -> TrainingData:
     """Opens the dataset as the options say.
 
     Raises:
-        UserError: no such folder, no objects, no such object, or none of them can be read.
+        UserError: the folder or the object of ``--overfit`` does not exist, or no object can be
+            read.
     """
     if config.views.overfit is not None:
-        return _open_one(config)
+        return _open_one(config, config.views.overfit)
     views, run, notes = config.views, config.run, []
     train = open_dataset(config.data, "train", cache=views.cache)
     bad = train.check()
@@ -323,10 +312,10 @@ def open_data(config: TrainConfig) -> TrainingData:
     )
 
 
-def _open_one(config: TrainConfig) -> TrainingData:
+def _open_one(config: TrainConfig, name: str) -> TrainingData:
+    """Opens the one object that ``--overfit`` names; an epoch is a pass over its views."""
     views = config.views
     dataset = open_dataset(config.data, "all", cache=True)
-    name = views.overfit
     if name in dataset.uids:
         index = dataset.uids.index(name)
     elif name.isdigit() and int(name) < len(dataset):
@@ -344,17 +333,3 @@ def _open_one(config: TrainConfig) -> TrainingData:
         val_views=None,
         notes=[],
     )
-
-
-def open_lpips(config: TrainConfig) -> tuple[LPIPS | None, str | None]:
-    """LPIPS as ``--lpips`` says, and a line for the user where it is missing.
-
-    Raises:
-        UserError: "on", and its weights are not there.
-    """
-    loss = config.loss
-    if loss.lpips == "off" or loss.lpips_weight == 0:
-        return None, None
-    if loss.lpips == "auto" and not lpips_available():
-        return None, "no LPIPS weights: training without (gamba weights lpips fetches them)"
-    return load_lpips(), None

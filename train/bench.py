@@ -1,8 +1,9 @@
-"""Benchmark case of the training: one optimizer step, and what of it is forward."""
+"""Benchmark cases of the training: one optimizer step, and the forward part of it."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -15,28 +16,34 @@ from gamba_warp.model.gamba import Gamba
 from .batches import Batch
 from .config import LossConfig, OptimConfig
 from .optim import build_optimizer
-from .step import forward
+from .step import compute_gradients, forward
 
 _BATCH, _NOVEL, _SIZE = 2, 2, 128
 _BATCHES = {"quick": (1,), "normal": (1, 2, 4), "full": (1, 2, 4, 8)}
 
 
 def cases(settings: Settings) -> list[Case]:
-    """The cases of a training step."""
+    """Returns the cases of a training step."""
     text = (
         f"One step of preset tiny on {_BATCH} objects in {_NOVEL + 1} views of {_SIZE}²: model, "
-        "rendering, loss without LPIPS, gradients, clipping and AdamW; no reading of files. It is "
-        "checked to be finite, no more."
+        "rendering, loss without LPIPS, gradients, clipping and AdamW, without reading files. The "
+        "only check is that the result is finite."
     )
     batches = "Cost of that step against the number of objects."
     return [
-        Case("train-step", "tiny", text, partial(_steps, settings)),
-        Case("train-step", "batch", batches, partial(_batches, settings), "B"),
+        Case(op="train-step", name="tiny", text=text, build=partial(_steps, settings)),
+        Case(
+            op="train-step",
+            name="batch",
+            text=batches,
+            build=partial(_batches, settings),
+            axis="B",
+        ),
     ]
 
 
 def targets(settings: Settings) -> list[Target]:
-    """None are set."""
+    """Returns the targets, of which there are none."""
     return []
 
 
@@ -51,7 +58,7 @@ class _Step:
         self.clip = options.clip
         self.optimizer = build_optimizer(self.model, options.weight_decay, options.beta2)
         for group in self.optimizer.param_groups:
-            group["lr"] = 1e-5  # small: every round does the same work
+            group["lr"] = 1e-5  # the weights hardly move, so every round does the same work
         self.weights = {"rgb": 1.0, "mask": losses.mask_weight, "rdist": losses.rdist_weight}
         size = config.image_size
         first = reference_viewmat(config.distance)
@@ -72,26 +79,26 @@ class _Step:
 
     @torch.no_grad()
     def forward(self) -> torch.Tensor:
-        """Timed: the loss alone."""
+        """Computes the loss alone; this is what is timed."""
         return forward(self.model, self.batch, self.weights).loss
 
     def step(self) -> torch.Tensor:
-        """Timed: all of it. Returns the gradient's norm."""
-        self.optimizer.zero_grad(set_to_none=True)
-        forward(self.model, self.batch, self.weights).loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.clip)
+        """Makes the whole step and returns the gradient's norm; this is what is timed."""
+        made = compute_gradients(
+            self.model, self.optimizer, [self.batch], self.weights, clip=self.clip
+        )
         self.optimizer.step()
-        return norm
+        return made.norm
 
-    def check(self, run) -> None:
-        """There is no oracle; the figure must be finite, and not 0."""
+    def check(self, run: Callable[[], torch.Tensor]) -> None:
+        """Checks that the loss or gradient is finite and not 0; there is no oracle."""
         value = run().item()
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"loss or gradient is {value}")
 
 
 def _disc(size: int) -> torch.Tensor:
-    """The silhouette of a ball in the middle, ``[size, size, 1]``."""
+    """Draws the silhouette of a ball in the middle, ``[size, size, 1]``."""
     x = torch.linspace(-1, 1, size)
     return ((x[:, None] ** 2 + x**2) < 0.25).float()[..., None]
 
@@ -101,17 +108,17 @@ def _steps(settings: Settings) -> list[Variant]:
     parameters = {"B": _BATCH, "views": _NOVEL + 1, "side": _SIZE}
     return [
         Variant(
-            "step",
-            step.step,
-            partial(step.check, step.step),
+            name="step",
+            run=step.step,
+            check=partial(step.check, step.step),
             direction="forward+backward",
             default=True,
             parameters=parameters,
         ),
         Variant(
-            "loss alone",
-            step.forward,
-            partial(step.check, step.forward),
+            name="loss alone",
+            run=step.forward,
+            check=partial(step.check, step.forward),
             parameters=parameters,
         ),
     ]
@@ -123,9 +130,9 @@ def _batches(settings: Settings) -> list[Variant]:
         step = _Step(settings, batch)
         made.append(
             Variant(
-                f"{batch} object{'s' * (batch > 1)}",
-                step.step,
-                partial(step.check, step.step),
+                name=f"{batch} object{'s' * (batch > 1)}",
+                run=step.step,
+                check=partial(step.check, step.step),
                 direction="forward+backward",
                 rounds=10,
                 parameters={"B": batch, "views": _NOVEL + 1, "side": _SIZE},

@@ -1,7 +1,7 @@
-"""Checkpoints: a folder that is whole or not there, ``RUN/checkpoints/step_000123/``.
+"""Checkpoints: folders ``RUN/checkpoints/step_000123/``, each of which is whole or does not exist.
 
-It holds ``model.safetensors`` and ``ema.safetensors`` (models that every command can load) and
-``state.pt`` (what else a bit-identical continuation needs: tensors and plain values only).
+A checkpoint holds ``model.safetensors`` and ``ema.safetensors``, models that every command can
+load, and ``state.pt``, the tensors and plain values that a bit-identical continuation needs too.
 """
 
 from __future__ import annotations
@@ -29,21 +29,24 @@ _TEMPORARY = ".partial-"
 
 
 def list_checkpoints(run: Path) -> list[Path]:
-    """The run's checkpoints, oldest first."""
+    """Lists the run's checkpoints, oldest first."""
     folder = run / "checkpoints"
     found = [p for p in folder.iterdir() if _NAME.fullmatch(p.name)] if folder.is_dir() else []
     return sorted(found, key=lambda p: int(p.name.split("_")[1]))
 
 
 def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict, keep: int) -> Path:
-    """Writes ``RUN/checkpoints/step_<step>`` in a temporary folder, renames it, drops old ones.
+    """Writes a checkpoint to a temporary folder, renames it, and removes the oldest checkpoints.
 
     Args:
         run: the run folder.
         step: optimizer steps done.
-        models: file stem to model, each written by ``save_model``.
-        state: goes to ``state.pt``; tensors and plain values, nested.
+        models: models by file stem, which ``save_model`` writes.
+        state: content of ``state.pt``, nested tensors and plain values.
         keep: number of checkpoints left afterwards.
+
+    Returns:
+        The checkpoint's folder, ``RUN/checkpoints/step_<step>``.
 
     Raises:
         UserError: it cannot be written; older checkpoints are untouched.
@@ -80,7 +83,7 @@ def _write_folder(target: Path, write: Callable[[Path], None]) -> None:
             _remove(target)
         temporary.rename(target)
         _sync(target.parent)
-    # torch.save reports a full disk as a RuntimeError of its zip writer
+    # torch.save reports a full disk as a RuntimeError of its zip writer.
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise UserError(f"cannot write {target}: {reason}") from error
@@ -97,7 +100,7 @@ def _sync(path: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Renames first: a half-deleted folder must not look like a checkpoint."""
+    """Renames the folder before it deletes it: half of one must not look like a checkpoint."""
     doomed = folder.with_name(f"{_TEMPORARY}{folder.name}")
     shutil.rmtree(doomed, ignore_errors=True)
     folder.rename(doomed)
@@ -105,7 +108,7 @@ def _remove(folder: Path) -> None:
 
 
 def find_checkpoint(run: Path, resume: str) -> Path | None:
-    """The checkpoint that ``--resume`` means, or None for a fresh start.
+    """Finds the checkpoint that ``--resume`` means, or None for a fresh start.
 
     Args:
         run: the run folder.
@@ -113,7 +116,7 @@ def find_checkpoint(run: Path, resume: str) -> Path | None:
             checkpoint or of another run folder.
 
     Raises:
-        UserError: "never" where the run folder holds checkpoints, or no checkpoint at the path.
+        UserError: the run folder holds checkpoints in spite of "never", or the path holds none.
     """
     if resume in ("auto", "never"):
         found = list_checkpoints(run)
@@ -133,7 +136,7 @@ def read_state(checkpoint: Path) -> dict:
     """Reads ``state.pt`` onto the CPU.
 
     Raises:
-        UserError: missing, truncated or not such a file.
+        UserError: the file is missing, truncated or of another kind.
     """
     path = checkpoint / "state.pt"
     try:
@@ -149,7 +152,8 @@ def load_weights(path: Path, model: Gamba) -> None:
     """Loads a model file into a model of the same configuration.
 
     Raises:
-        UserError: missing, truncated, or of another configuration; names the differing fields.
+        UserError: the file is missing or truncated, or its configuration differs; the message names
+            the differing fields.
     """
     try:
         with safe_open(path, framework="pt") as file:

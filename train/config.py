@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from gamba_warp.conventions import DeviceChoice
 from gamba_warp.errors import UserError
-from gamba_warp.model.config import PRESETS, GambaConfig
+from gamba_warp.model.config import PRESETS, GambaConfig, Preset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,12 +19,13 @@ class LengthConfig:
     """How long to train. The schedules end with the steps or epochs, else with the minutes."""
 
     steps: int | None = None
-    """Optimizer steps."""
+    """Number of optimizer steps."""
     epochs: float | None = None
-    """Passes over the objects; with --overfit, over its views. 400 if there is no limit at all."""
+    """Number of passes over the objects, or with --overfit over its views; 400 if no limit is
+    given at all."""
     minutes: float | None = None
-    """Stop after this much training time, resumed parts included. If it is the only limit, the
-    schedules follow the clock, and two runs are not the same to the bit."""
+    """Training time, resumed parts included. If it is the only limit, the schedules follow the
+    clock, and two runs are not the same to the bit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,7 @@ class DataConfig:
     """What a step sees."""
 
     batch_size: int | None = None
-    """Objects per step and process, before accumulation. Default: 8, but 1 with --overfit."""
+    """Objects per step and process, before accumulation; 8 if not given, or 1 with --overfit."""
     accumulate: int = 1
     """Batches per optimizer step."""
     size: int = 128
@@ -43,10 +45,10 @@ class DataConfig:
     views_per_object: int | None = None
     """A fixed number of novel views, in place of the growing one; 9 with --overfit."""
     background: Literal["white", "black", "random"] = "white"
-    """Colour behind the rendered and the true pictures. "random" draws one for each object and
+    """Colour behind the rendered and the true pictures; "random" draws one for each object and
     step. The input picture always lies on the model's own background."""
     reference: Literal["auto", "random", "first"] = "auto"
-    """Which view is the input: any, or always the first. "auto": first with --overfit, else any."""
+    """The view that is the input: any, or always the first; "auto" is first with --overfit."""
     overfit: str | None = None
     """Train on this one object (uid or number) and validate on its training views: a smoke test."""
     cache: bool = False
@@ -62,7 +64,7 @@ class LossConfig:
     mask_weight: float = 1.0
     """Weight of the alpha channel's squared error."""
     lpips: Literal["auto", "on", "off"] = "auto"
-    """LPIPS-VGG: "auto" uses it if its weights are there, "on" insists."""
+    """Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" demands them."""
     lpips_weight: float = 0.5
     """Weight of LPIPS."""
     lpips_after: int = 0
@@ -70,11 +72,11 @@ class LossConfig:
     radial_mask: bool = True
     """The radial mask constraint on the projected centres (paper Table 2)."""
     rdist_weight: float = 0.1
-    """Its weight at the start."""
+    """Weight of the radial mask constraint at the start."""
     rdist_epochs: float = 10.0
-    """Its weight falls linearly to 0 over this many epochs."""
+    """Epochs over which the weight of the radial mask constraint falls linearly to 0."""
     rdist_steps: int | None = None
-    """The same in steps; wins over --rdist-epochs."""
+    """The same in steps, in place of --rdist-epochs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +88,7 @@ class OptimConfig:
     warmup_steps: int = 100
     """Steps of the linear warm-up, a tenth of the run at most."""
     weight_decay: float = 0.05
-    """On matrices, except those that a module flags."""
+    """Weight decay of matrices, except those that a module flags."""
     beta2: float = 0.95
     """Second-moment decay of AdamW."""
     clip: float = 1.0
@@ -94,7 +96,7 @@ class OptimConfig:
     ema: float = 0.999
     """Decay of the weights' running average, shorter at the start; 0 turns it off."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """bfloat16: autocast in the network; parameters, losses and rendering stay float32."""
+    """Precision in the network, by autocast; parameters, losses and rendering stay float32."""
     max_skipped: int = 20
     """Give up after so many non-finite steps in a row."""
 
@@ -106,7 +108,7 @@ class RunConfig:
     out: Path = Path("runs/gamba")
     """Run folder."""
     resume: str = "auto"
-    """"auto": go on where the run folder stands; "never"; or the path of a checkpoint."""
+    """"auto" goes on where the run folder stands; else "never", or the path of a checkpoint."""
     init: Path | None = None
     """Start from the weights of this model file (same architecture), with a fresh optimizer."""
     encoder_weights: str | None = None
@@ -118,22 +120,22 @@ class RunConfig:
     val_objects: int = 8
     """Held-out objects to validate on."""
     val_views: int = 4
-    """Novel views of each, evenly spaced in the list; --overfit takes all."""
+    """Novel views of each of these, evenly spaced in the list; --overfit takes all."""
     save_every: int = 500
     """Steps between two checkpoints; one is always saved at the end."""
     keep: int = 2
     """Checkpoints kept; the oldest go first."""
     tensorboard: bool = True
     """Write TensorBoard files, if it is installed."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """"auto": the GPU if there is one."""
+    device: DeviceChoice = "auto"
+    """Device that computes; "auto" is the GPU if there is one."""
     threads: int | None = None
-    """CPU threads; default: all cores."""
+    """Number of CPU threads; all cores if not given."""
     recompute: bool = False
     """Keep only the blocks' inputs for the gradient and run each block again there: the same
     result in less memory and more time."""
     seed: int = 0
-    """Of the initial weights and of the order of the data."""
+    """Seed of the initial weights and of the order of the data."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +144,8 @@ class TrainConfig:
 
     data: tyro.conf.Positional[Path]
     """Dataset folder."""
-    preset: Literal[tuple(PRESETS)] = "small"
-    """Size of the model."""
+    preset: Preset = "small"
+    """Preset of the model."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")] = ()
     """Changes to the preset, e.g. prepend=false depth=4; the fields are GambaConfig's."""
     length: LengthConfig = field(default_factory=LengthConfig)
@@ -205,7 +207,7 @@ class TrainConfig:
 
 
 # A run may go on with other values of these: they change where it reads and writes and how far it
-# goes, not what a step computes. All others must stay.
+# goes, and not what a step computes. All others must stay as they were.
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers", "views.cache"}
 _MUST_STAY = {"run.seed"}
 

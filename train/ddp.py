@@ -15,12 +15,12 @@ from gamba_warp.errors import UserError
 
 @dataclass(frozen=True)
 class World:
-    """This process's place among all.
+    """This process among all processes of the run.
 
     Attributes:
-        rank: 0 to ``size`` - 1; rank 0 logs, validates and saves.
+        rank: number of this process, 0 to ``size`` - 1; rank 0 logs, validates and saves.
         size: number of processes.
-        device: where this process computes.
+        device: device of this process.
     """
 
     rank: int
@@ -29,11 +29,11 @@ class World:
 
     @property
     def main(self) -> bool:
-        """Whether this process writes files."""
+        """Whether this is the process that writes files."""
         return self.rank == 0
 
     def total(self, *values: float) -> list[float]:
-        """Sums each value over all processes, on the CPU: no wait for a GPU."""
+        """Sums each value over all processes, on the CPU, so that nobody waits for a GPU."""
         if self.size == 1:
             return list(values)
         tensor = torch.tensor(values, dtype=torch.float64)
@@ -47,13 +47,13 @@ class World:
 
 @contextmanager
 def world(device: str = "auto") -> Iterator[World]:
-    """Joins the processes that torchrun started, or stands alone.
+    """Joins the processes that torchrun started, or makes a world of this process alone.
 
     Args:
         device: "auto", "cpu" or "cuda".
 
     Raises:
-        UserError: "cuda" without a GPU.
+        UserError: "cuda" was asked for, and there is no GPU for this process.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("--device cuda: no CUDA GPU is available")
@@ -61,17 +61,17 @@ def world(device: str = "auto") -> Iterator[World]:
     rank = int(os.environ.get("RANK", "0"))
     kind = device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     local = int(os.environ.get("LOCAL_RANK", "0"))
-    place = torch.device(kind, local) if kind == "cuda" else torch.device("cpu")
+    chosen = torch.device(kind, local) if kind == "cuda" else torch.device("cpu")
     if kind == "cuda":
         if local >= torch.cuda.device_count():
             raise UserError(f"process {rank} has no GPU: {torch.cuda.device_count()} on this host")
-        torch.cuda.set_device(place)
+        torch.cuda.set_device(chosen)
     if size == 1:
-        yield World(0, 1, place)
+        yield World(rank=0, size=1, device=chosen)
         return
-    # Small CPU tensors (stop flags) always go by gloo, gradients on a GPU by NCCL.
+    # Small CPU tensors (stop flags) always go through gloo, gradients on a GPU through NCCL.
     dist.init_process_group("cpu:gloo,cuda:nccl" if kind == "cuda" else "gloo")
     try:
-        yield World(rank, size, place)
+        yield World(rank, size, chosen)
     finally:
         dist.destroy_process_group()

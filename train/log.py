@@ -1,4 +1,4 @@
-"""The run's log: one JSON object per line, TensorBoard if it is there, and sample pictures."""
+"""The run's log: one JSON object per line, TensorBoard if it is installed, and sample pictures."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class RunLog:
     """Appends to ``RUN/log.jsonl``; every line has ``event``, ``step`` and ``time`` (Unix, s)."""
 
     def __init__(self, run: Path, tensorboard: bool) -> None:
-        """Opens the log.
+        """Opens the log in the run folder.
 
         Raises:
-            UserError: it cannot be written.
+            UserError: the file cannot be written.
         """
         try:
             self._file = open(run / "log.jsonl", "a", encoding="utf-8")
@@ -31,7 +31,7 @@ class RunLog:
         self._board = _summary_writer(run / "tensorboard") if tensorboard else None
 
     def write(self, event: str, step: int, **values: object) -> None:
-        """Adds a line; numbers that are not finite become null."""
+        """Writes a line; numbers that are not finite become null."""
         line = {"event": event, "step": step, "time": round(time.time(), 3)}
         line |= {name: _plain(value) for name, value in values.items()}
         self._file.write(json.dumps(line) + "\n")
@@ -42,7 +42,7 @@ class RunLog:
                     self._board.add_scalar(f"{event}/{name}", value, step)
 
     def warn(self, step: int, message: str) -> None:
-        """Prints one line above the progress bar, and logs it."""
+        """Prints one line above the progress bar and logs it."""
         tqdm.write(f"gamba train: {message}")
         self.write("warning", step, message=message)
 

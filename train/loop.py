@@ -18,13 +18,13 @@ from gamba_warp.errors import UserError
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
-from .batches import BatchSource, Prefetcher, TrainingData, fixed_batches
+from .batches import Batch, BatchSource, Prefetcher, TrainingData, fixed_batches
 from .checkpoint import load_weights, read_state, save_checkpoint
 from .config import TrainConfig, config_differences
 from .ddp import World
 from .log import RunLog, save_strip
 from .optim import Ema, build_optimizer, learning_rate, novel_views, radial_weight
-from .step import collapse_reason, forward, health, validate
+from .step import collapse_reason, compute_gradients, health, validate
 
 STATE_VERSION = 1
 
@@ -48,7 +48,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 
 class Trainer:
-    """A model, its optimizer and their state, trained on one dataset."""
+    """Trains a model on one dataset; it holds the model, its optimizer and their state."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Trainer:
         log: RunLog | None,
         lpips: Callable[[Tensor, Tensor], Tensor] | None,
     ) -> None:
-        """``log`` is there on the main process alone; ``model`` is on the world's device."""
+        """Takes a ``model`` on the world's device; only the main process has a ``log``."""
         self.config, self.data, self.world, self.log, self.lpips = config, data, world, log, lpips
         self.model = model
         self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
@@ -73,7 +73,7 @@ class Trainer:
         self.step = self.skipped = self.skipped_in_row = 0
         self.elapsed = 0.0  # seconds of training, resumed parts included
         self._collapsed = False
-        self._saved = self._validated = -1  # the steps at which each was last done
+        self._saved = self._validated = -1  # the step of the last checkpoint and validation
         self._source = BatchSource(
             data.train,
             model.config,
@@ -92,34 +92,39 @@ class Trainer:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Uid -> reason, of the objects that could not be read so far."""
+        """Reasons by uid, for the objects that could not be read so far."""
         return self._source.failures
 
     def progress(self, step: int) -> float:
-        """0 to 1 at a step: its share of all, or the clock's where only minutes are limited."""
+        """Returns the share of the run that is done at a step, 0 to 1.
+
+        It is a share of the steps, or of the minutes where nothing else is limited.
+        """
         if self.total is not None:
             return min(1.0, step / self.total)
-        return min(1.0, self.elapsed / (60 * self.config.length.minutes))
+        minutes = self.config.length.minutes
+        assert minutes is not None  # without steps or epochs, ``__init__`` sets a total
+        return min(1.0, self.elapsed / (60 * minutes))
 
     def learning_rate(self) -> float:
-        """Of the next step."""
+        """Returns the learning rate of the next step."""
         warmup = self.config.optim.warmup_steps
         if self.total is not None:
             warmup = min(warmup, 0.1 * self.total)
             return learning_rate(self.step, self.total, self.config.optim.lr, warmup)
-        # By the clock: as many steps are to come as the speed so far promises.
+        # Only minutes are limited, so the total follows from the speed so far.
         total = self.step / max(self.progress(self.step), 1e-6)
         return learning_rate(self.step, max(total, warmup + 1), self.config.optim.lr, warmup)
 
     def novel_views(self, step: int) -> int:
-        """V of a step."""
+        """Returns V, the number of novel views at a step."""
         views = self.config.views
         if self.data.novel is not None:
             return self.data.novel
         return novel_views(self.progress(step), views.views_first, views.views_last)
 
     def weights(self) -> dict[str, float]:
-        """Of the loss terms at the next step."""
+        """Returns the weights of the loss terms at the next step."""
         loss = self.config.loss
         span = loss.rdist_steps
         span = loss.rdist_epochs * self.steps_per_epoch if span is None else span
@@ -132,57 +137,63 @@ class Trainer:
         }
 
     def train_step(self, batches: Prefetcher) -> dict[str, float]:
-        """One optimizer step; returns the figures of its last batch.
+        """Makes one optimizer step; returns its figures, some of them those of its last batch.
 
         A step whose loss or gradient is not finite leaves the weights alone and is counted.
 
         Raises:
-            UserError: too many such steps in a row, or data that cannot be read.
+            UserError: there are too many such steps in a row, or data cannot be read.
         """
         started = time.perf_counter()
         rate, weights = self.learning_rate(), self.weights()
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        self.optimizer.zero_grad(set_to_none=True)
-        losses, waited, views = [], 0.0, 0
+        waits: list[float] = []
+        made = compute_gradients(
+            self.wrapped,
+            self.optimizer,
+            self._take(batches, waits),
+            weights,
+            clip=self.config.optim.clip,
+            count=self.accumulate,
+            lpips=self.lpips,
+            precision=self.precision,
+        )
+        loss, norm = torch.stack([made.loss, made.norm]).tolist()
+        self._apply(loss, norm)
+        seconds = time.perf_counter() - started
+        views = made.batch.cameras.viewmats[..., 0, 0].numel() * self.accumulate * self.world.size
+        figures = {"loss": loss, "grad_norm": norm, "lr": rate}
+        figures |= {"seconds": seconds, "wait_share": sum(waits) / seconds}
+        figures["views_per_second"] = views / seconds
+        if self.log is not None and self.step % self.config.run.log_every == 0:
+            terms = made.result.terms.items()
+            figures |= {f"loss_{name}": term.mean().item() for name, term in terms}
+            figures |= {
+                name: value.item() for name, value in health(made.result, made.batch).items()
+            }
+        return figures
+
+    def _take(self, batches: Prefetcher, waits: list[float]) -> Iterator[Batch]:
+        """Yields this step's batches on the device, and appends the seconds waited for each."""
         for micro in range(self.accumulate):
             self._submit(batches, self.step, micro)
             before = time.perf_counter()
             batch = batches.take((self.step, micro)).to(self.world.device)
-            waited += time.perf_counter() - before
+            waits.append(time.perf_counter() - before)
             following = divmod(self.step * self.accumulate + micro + 1, self.accumulate)
             self._submit(batches, *following)
-            last = micro == self.accumulate - 1
-            hold = contextlib.nullcontext() if last else self._no_sync()
-            with hold:
-                result = forward(self.wrapped, batch, weights, self.lpips, self.precision)
-                (result.loss / self.accumulate).backward()
-            losses.append(result.loss.detach())
-            views += batch.cameras.viewmats[..., 0, 0].numel()
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.config.optim.clip)
-        loss, norm = torch.stack([torch.stack(losses).mean(), norm]).tolist()
-        self._apply(loss, norm)
-        seconds = time.perf_counter() - started
-        figures = {"loss": loss, "grad_norm": norm, "lr": rate}
-        figures |= {"seconds": seconds, "wait_share": waited / seconds}
-        figures["views_per_second"] = views * self.world.size / seconds
-        if self.log is not None and self.step % self.config.run.log_every == 0:
-            figures |= {f"loss_{name}": term.mean().item() for name, term in result.terms.items()}
-            figures |= {name: value.item() for name, value in health(result, batch).items()}
-        return figures
-
-    def _no_sync(self):
-        return self.wrapped.no_sync() if self.world.size > 1 else contextlib.nullcontext()
+            yield batch
 
     def _submit(self, batches: Prefetcher, step: int, micro: int) -> None:
         if self.total is not None and step >= self.total:
             return
         number = step * self.accumulate + micro
-        key, place = (step, micro), (self.world.rank, self.world.size)
-        batches.submit(key, self._source.batch, number, self.novel_views(step), *place)
+        novel, rank, size = self.novel_views(step), self.world.rank, self.world.size
+        batches.submit((step, micro), self._source.batch, number, novel, rank, size)
 
     def _apply(self, loss: float, norm: float) -> None:
-        """Updates the weights, or skips, on all processes alike; counts the step."""
+        """Updates the weights or skips the step, on all processes alike, and counts the step."""
         bad = not (math.isfinite(loss) and math.isfinite(norm))
         bad = self.world.total(bad)[0] > 0
         self.step += 1
@@ -204,10 +215,10 @@ class Trainer:
             )
 
     def run(self) -> int:
-        """Trains to the end, to the limit of time or to a signal; always leaves a checkpoint.
+        """Trains until the end, the time limit or a signal, and then saves a checkpoint.
 
         Returns:
-            0; or 128 + the number of the signal that stopped it.
+            0, or 128 + the number of the signal that stopped the run.
 
         Raises:
             UserError: as ``train_step``, or the run folder cannot be written.
@@ -240,7 +251,7 @@ class Trainer:
         return 0
 
     def _agree(self, clock: float, received: list[int]) -> tuple[float, float]:
-        """Elapsed seconds and stop signal (0: none), the same on all processes."""
+        """Returns elapsed seconds and stop signal (0: none), the same on all processes."""
         signals = [float(received[0] if received else 0)]
         clock, total, senders = self.world.total(
             clock / self.world.size, *signals, float(bool(received))
@@ -258,7 +269,7 @@ class Trainer:
         bar.update()
         if self.log is not None and self.step % run.log_every == 0:
             shown = {"loss": f"{figures['loss']:.4f}", "psnr": f"{figures['psnr']:.1f}"}
-            if self.total is None:  # by the clock, the bar has no end
+            if self.total is None:  # only minutes are limited, so the bar has no end
                 shown["minutes"] = f"{self.elapsed / 60:.1f} of {self.config.length.minutes:g}"
             bar.set_postfix(shown)
             epoch = self.step / self.steps_per_epoch
@@ -304,7 +315,7 @@ class Trainer:
         self.world.barrier()
 
     def state(self) -> dict:
-        """All that continues the run beside the weights; tensors and plain values."""
+        """Returns all that a continued run needs beside the weights: tensors and plain values."""
         return {
             "version": STATE_VERSION,
             "config": self.config.to_dict(),
@@ -321,11 +332,11 @@ class Trainer:
         }
 
     def restore(self, checkpoint: Path) -> None:
-        """Continues from a checkpoint: bit-identically on one device.
+        """Continues from a checkpoint, bit-identically on one device.
 
         Raises:
-            UserError: damaged, or of a run with another configuration, data or world size; names
-                the differing fields.
+            UserError: the checkpoint is damaged, or belongs to a run with another configuration,
+                data or number of processes; the message names the differing fields.
         """
         state = read_state(checkpoint)
         if state.get("version") != STATE_VERSION:

@@ -1,4 +1,4 @@
-"""AdamW's parameter groups and the running average of the weights."""
+"""AdamW, the running average of the weights, and the schedules of a run."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import copy
 import math
 
 import torch
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from gamba_warp.model.gamba import Gamba
 
 
 def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.optim.AdamW:
-    """AdamW with decay on matrices alone, not on those flagged ``_no_weight_decay``.
+    """Makes AdamW with weight decay on the matrices that are not flagged ``_no_weight_decay``.
 
-    The learning rate is set before each step by the loop.
+    The loop sets the learning rate before each step.
     """
     trained = [p for p in model.parameters() if p.requires_grad]
     decayed = [p for p in trained if p.ndim >= 2 and not getattr(p, "_no_weight_decay", False)]
@@ -26,11 +27,11 @@ def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.op
 
 
 class Ema:
-    """A copy of the model whose trained weights follow by exponential averaging.
+    """A copy of the model whose weights are an exponential average of the trained ones.
 
     Attributes:
         model: the copy, in eval mode; a frozen encoder is shared, not copied.
-        updates: number of updates so far; the decay is short at first (``ema_decay``).
+        updates: number of updates so far, on which the decay depends (``ema_decay``).
     """
 
     def __init__(self, model: Gamba, decay: float) -> None:
@@ -38,27 +39,28 @@ class Ema:
         shared = {id(encoder): encoder} if encoder is not None and encoder.frozen else {}
         self.model = copy.deepcopy(model, shared).eval()
         self.decay, self.updates = decay, 0
-        pairs = [(a, b) for a, b in zip(self.model.parameters(), model.parameters())]
-        self._pairs = [(a, b) for a, b in pairs if b.requires_grad]
+        pairs = zip(self.model.parameters(), model.parameters())
+        self._pairs = [(average, weight) for average, weight in pairs if weight.requires_grad]
         for average, _ in self._pairs:
             average.requires_grad_(False)
 
     @torch.no_grad()
     def update(self) -> None:
-        """Moves the average towards the model's weights."""
-        averages, weights = zip(*self._pairs)
-        torch._foreach_lerp_(averages, weights, 1 - ema_decay(self.updates, self.decay))
+        """Moves the average towards the model's present weights."""
+        averages, weights = map(list, zip(*self._pairs))
+        move = get_ema_multi_avg_fn(ema_decay(self.updates, self.decay))
+        move(averages, weights, None)
         self.updates += 1
 
 
 def learning_rate(step: float, total: float, base: float, warmup: float) -> float:
-    """Linear warm-up from 0, then a half cosine down to 0.
+    """Returns the learning rate: a linear warm-up from 0, then a half cosine down to 0.
 
     Args:
         step: optimizer steps done, 0 to ``total``.
         total: steps of the whole run, > 0.
         base: peak value.
-        warmup: steps of the rise; the first step already moves.
+        warmup: steps of the rise; the first step has a rate above 0.
     """
     if step < warmup:
         return base * (step + 1) / (warmup + 1)
@@ -67,17 +69,23 @@ def learning_rate(step: float, total: float, base: float, warmup: float) -> floa
 
 
 def novel_views(progress: float, first: int, last: int) -> int:
-    """Novel views per object: ``first`` to ``last`` in equal shares of the run (paper: 2 to 6)."""
+    """Returns the novel views per object, which grow evenly over the run (paper: 2 to 6).
+
+    Args:
+        progress: share of the run that is done, 0 to 1.
+        first: number at the start.
+        last: number at the end; if it is below ``first``, it holds for the whole run.
+    """
     if last < first:
         return last
     return min(last, first + int(progress * (last - first + 1)))
 
 
 def radial_weight(step: float, base: float, span: float) -> float:
-    """Weight of the radial mask constraint: ``base``, falling linearly to 0 at ``span`` steps."""
+    """Returns the radial mask constraint's weight, which falls from ``base`` to 0 in ``span``."""
     return base * max(0.0, 1.0 - step / span) if span > 0 else 0.0
 
 
 def ema_decay(updates: int, decay: float) -> float:
-    """Decay of the running average after ``updates`` updates: short at first, then ``decay``."""
+    """Returns the running average's decay after ``updates`` updates; it grows up to ``decay``."""
     return min(decay, (1 + updates) / (10 + updates))

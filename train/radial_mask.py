@@ -1,6 +1,6 @@
 """The radial mask constraint (paper eq. radial_mask): Gaussians stay inside the silhouettes.
 
-A mask becomes U distances from the image centre to its outermost contour, one per ray. A Gaussian
+A mask becomes U distances, one per ray, from the image centre to the outermost contour. A Gaussian
 whose projected centre lies farther out than the contour at its angle is pulled back.
 
 Distances are in units of half the image's height, so the loss is the same at every picture size.
@@ -16,27 +16,27 @@ from torch import Tensor
 from gamba_warp.cameras import Cameras
 
 RAYS = 256
-NEAR = 0.1  # object units; centres nearer to the camera plane have no meaningful projection
+NEAR = 0.1  # object units; a centre nearer to the camera plane has no meaningful projection
 _STEP = 0.5  # pixels between two samples along a ray
 
 
 def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -> Tensor:
-    """Distance from the image centre to the outermost contour along each ray.
+    """Finds the distance from the image centre to the outermost contour along each ray.
 
     Ray k has the angle 2πk/U, from +x (right) towards +y (down). The contour is where the
     bilinearly interpolated mask passes ``threshold``; outside the picture the mask is 0.
 
     Args:
         masks: ``[.., H, W]`` in [0, 1].
-        rays: U.
-        threshold: in (0, 1).
+        rays: number of rays, U.
+        threshold: mask value of the contour, in (0, 1).
 
     Returns:
         ``[.., U]`` float32 in half image heights; 0 where a ray meets no foreground.
     """
     height, width = masks.shape[-2:]
     angles = torch.arange(rays, device=masks.device) * (2 * math.pi / rays)
-    count = math.ceil(math.hypot(width, height) / 2 / _STEP) + 3  # the last ones lie outside
+    count = math.ceil(math.hypot(width, height) / 2 / _STEP) + 3  # the last samples lie outside
     radii = torch.arange(count, device=masks.device) * _STEP
     directions = torch.stack([angles.cos(), angles.sin()], -1)
     size = masks.new_tensor([width, height], dtype=torch.float32)
@@ -54,7 +54,7 @@ def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -
 
 
 def project_means(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Pinhole projection of every centre into every view.
+    """Projects every centre into every view, as a pinhole camera does.
 
     Args:
         means: ``[.., N, 3]``.
@@ -75,17 +75,17 @@ def project_means(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def radial_mask_loss(means: Tensor, cameras: Cameras, contours: Tensor) -> Tensor:
-    """Mean over all N Gaussians of (d_j - contour)² for those outside the contour, else 0.
+    """Averages (d_j - contour)² over all N Gaussians; those inside the contour count 0.
 
-    d_j is the distance of the projected centre from the image centre; the contour distance is
-    interpolated linearly in angle between the two rays around it (paper eq. radial_mask). A centre
-    behind the camera, and every centre in a view with an empty mask, gives 0. The mean is over all
-    Gaussians, so the pull on one does not depend on how many others are outside.
+    d_j is the distance of the projected centre from the image centre. The contour's distance is
+    interpolated linearly in angle between the two nearest rays (paper eq. radial_mask). A centre
+    behind the camera counts 0, and so does every centre in a view with an empty mask. The mean is
+    over all Gaussians, so the pull on one does not depend on how many others are outside.
 
     Args:
-        means: ``[.., N, 3]`` object units.
-        cameras: ``viewmats [.., V, 4, 4]``, of the pictures that the masks belong to.
-        contours: ``[.., V, U]`` from ``contour_distances``.
+        means: ``[.., N, 3]``, object units.
+        cameras: cameras of the masks' pictures, ``viewmats [.., V, 4, 4]``.
+        contours: result of ``contour_distances``, ``[.., V, U]``.
 
     Returns:
         ``[.., V]``, in squared half image heights.
@@ -93,7 +93,7 @@ def radial_mask_loss(means: Tensor, cameras: Cameras, contours: Tensor) -> Tenso
     positions, depths = project_means(means, cameras)
     centre = positions.new_tensor([cameras.width / 2, cameras.height / 2])
     offsets = (positions - centre) / (cameras.height / 2)
-    # The square root and the angle have no gradient at 0, where the loss is 0 anyway.
+    # Square root and angle have no gradient at 0, where the loss is 0 in any case.
     usable = (depths > NEAR) & (offsets.square().sum(-1) > 1e-12)
     offsets = torch.where(usable[..., None], offsets, offsets.new_tensor([1.0, 0.0]))
     x, y = offsets.unbind(-1)

@@ -1,12 +1,14 @@
-"""One forward pass of the training: a batch to its losses, and to figures of the model's health."""
+"""What is computed on batches: losses, gradients, the model's health, and the validation."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import over_background
@@ -14,10 +16,11 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 
 from .batches import Batch
-from .losses import psnr, total_loss, view_losses
+from .losses import rendered_psnr, total_loss, view_losses
 from .radial_mask import NEAR, contour_distances, project_means, radial_mask_loss
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
+STRIP_VIEWS, STRIP_OBJECTS = 6, 4  # views and objects of a validation's sample pictures
 
 
 @dataclass
@@ -26,10 +29,10 @@ class Forward:
 
     Attributes:
         loss: scalar, with its graph.
-        terms: each unweighted term, ``[B, V+1]``.
-        gaussians: ``[B]``.
-        rendering: ``[B, V+1]``.
-        target: ``[B, V+1, H, W, 3]``, the true pictures on the batch's background.
+        terms: unweighted terms by name, each ``[B, V+1]``.
+        gaussians: predicted Gaussians, ``[B]``.
+        rendering: their pictures, ``[B, V+1]``.
+        target: true pictures on the batch's background, ``[B, V+1, H, W, 3]``.
     """
 
     loss: Tensor
@@ -46,15 +49,15 @@ def forward(
     lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
     precision: torch.dtype = torch.float32,
 ) -> Forward:
-    """Predicts, renders all V+1 views and compares (paper eq. loss_train).
+    """Predicts, renders all V+1 views and compares them with the true ones (paper eq. loss_train).
 
     Args:
         model: ``Gamba`` or a wrapper of it.
-        batch: on the model's device.
-        weights: of the terms ``rgb``, ``mask``, ``lpips`` and ``rdist``; a term of weight 0 is not
-            computed.
+        batch: a batch on the model's device.
+        weights: weights of the terms ``rgb``, ``mask``, ``lpips`` and ``rdist``; ``lpips`` and
+            ``rdist`` are not computed at weight 0.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
-        precision: of the network's matrix products; rendering and losses are float32.
+        precision: dtype of the network's matrix products; rendering and losses are float32.
     """
     kind = batch.inputs.device.type
     with torch.autocast(kind, precision, enabled=precision != torch.float32):
@@ -75,13 +78,72 @@ def forward(
     return Forward(total_loss(terms, weights), terms, gaussians, rendering, target)
 
 
+@dataclass
+class Gradients:
+    """What ``compute_gradients`` returns beside the gradients themselves.
+
+    Attributes:
+        loss: scalar, the mean over the batches, without a graph.
+        norm: scalar, the norm of the gradient before it is clipped.
+        batch: the last batch.
+        result: result of ``forward`` on the last batch.
+    """
+
+    loss: Tensor
+    norm: Tensor
+    batch: Batch
+    result: Forward
+
+
+def compute_gradients(
+    model: Callable,
+    optimizer: torch.optim.Optimizer,
+    batches: Iterable[Batch],
+    weights: Mapping[str, float],
+    *,
+    clip: float,
+    count: int = 1,
+    lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
+    precision: torch.dtype = torch.float32,
+) -> Gradients:
+    """Sets the parameters' gradients to those of the mean loss over some batches, and clips them.
+
+    Several processes exchange their gradients once, with the last batch.
+
+    Args:
+        model: ``Gamba`` or a wrapper of it.
+        optimizer: the optimizer whose parameters get gradients; it makes no step here.
+        batches: ``count`` batches on the model's device.
+        weights: as for ``forward``, like ``lpips`` and ``precision``.
+        clip: largest norm of the gradient.
+        count: number of batches, >= 1.
+        lpips: see above.
+        precision: see above.
+    """
+    optimizer.zero_grad(set_to_none=True)
+    losses = []
+    for number, batch in enumerate(batches):
+        hold = contextlib.nullcontext()
+        if number < count - 1 and isinstance(model, DistributedDataParallel):
+            hold = model.no_sync()
+        with hold:
+            result = forward(model, batch, weights, lpips, precision)
+            (result.loss / count).backward()
+        losses.append(result.loss.detach())
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    norm = torch.nn.utils.clip_grad_norm_(parameters, clip)
+    return Gradients(torch.stack(losses).mean(), norm, batch, result)
+
+
 @torch.no_grad()
 def health(result: Forward, batch: Batch) -> dict[str, Tensor]:
-    """Scalars that show a collapse before the loss does.
+    """Computes scalars that show a collapse before the loss does.
 
-    ``psnr`` of the batch in dB; ``mean_alpha`` rendered and ``target_alpha`` true, both in [0, 1];
-    ``visible_share`` of the Gaussians that are not transparent and project into some view;
-    ``spread``, the rms distance of the centres from their mean, object units.
+    Returns:
+        ``psnr`` of the batch in dB; ``mean_alpha`` of the rendered and ``target_alpha`` of the true
+        pictures, both in [0, 1]; ``visible_share``, the share of Gaussians that are not transparent
+        and project into some view; ``spread``, the rms distance of the centres from their mean in
+        object units.
     """
     means = result.gaussians.means
     positions, depths = project_means(means, batch.cameras)
@@ -90,7 +152,7 @@ def health(result: Forward, batch: Batch) -> dict[str, Tensor]:
     visible = seen.any(-2) & (result.gaussians.opacities > VISIBLE_OPACITY)
     centred = means - means.mean(-2, keepdim=True)
     return {
-        "psnr": psnr(result.rendering.rgb, result.target).mean(),
+        "psnr": rendered_psnr(result.rendering.rgb, result.target).mean(),
         "mean_alpha": result.rendering.alpha.mean(),
         "target_alpha": batch.targets[..., 3].mean(),
         "visible_share": visible.float().mean(),
@@ -99,7 +161,7 @@ def health(result: Forward, batch: Batch) -> dict[str, Tensor]:
 
 
 def collapse_reason(figures: Mapping[str, float]) -> str | None:
-    """One line on what has collapsed, from the figures of ``health``; None while all is well."""
+    """Says in one line what has collapsed by the figures of ``health``; None while all is well."""
     if figures["target_alpha"] > 0 and figures["mean_alpha"] < 0.1 * figures["target_alpha"]:
         return f"the pictures are almost empty (mean alpha {figures['mean_alpha']:.2g})"
     if figures["visible_share"] < 0.02:
@@ -107,9 +169,6 @@ def collapse_reason(figures: Mapping[str, float]) -> str | None:
     if figures["spread"] < 0.01:
         return f"the Gaussians sit in one point (spread {figures['spread']:.2g})"
     return None
-
-
-STRIP_VIEWS, STRIP_OBJECTS = 6, 4
 
 
 @torch.no_grad()
@@ -120,19 +179,19 @@ def validate(
     lpips: Callable[[Tensor, Tensor], Tensor] | None,
     device: torch.device,
 ) -> tuple[dict[str, float], list[Tensor]]:
-    """Means over objects, in float32, on white.
+    """Computes the validation's figures, as means over objects in float32.
 
     Args:
-        model: switched to eval mode, and back.
-        batches: one object each, the input view first.
-        weights: of the loss terms.
-        lpips: as ``forward``.
-        device: the model's.
+        model: the model; it is switched to eval mode, and back.
+        batches: batches of one object each, the input view first, from ``fixed_batches``.
+        weights: weights of the loss terms.
+        lpips: as for ``forward``.
+        device: the model's device.
 
     Returns:
-        ``loss``, ``psnr_input`` and ``psnr_novel`` (mean over views, then over objects, whole
-        picture, dB; ``psnr_novel`` is left out where there are no novel views); and rows
-        ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the first objects.
+        ``loss``, ``psnr_input`` and ``psnr_novel`` (whole picture, dB, mean over views, then over
+        objects; ``psnr_novel`` is missing if there are no novel views); and rows ``[V, H, W, 3]``
+        for ``save_strip``, true above predicted for the first objects.
     """
     was_training = model.training
     model.eval()
@@ -141,7 +200,7 @@ def validate(
     for batch in batches:
         batch = batch.to(device)
         result = forward(model, batch, weights, lpips)
-        quality = psnr(result.rendering.rgb, result.target)[0]
+        quality = rendered_psnr(result.rendering.rgb, result.target)[0]
         figures = {"loss": result.loss.item(), "psnr_input": quality[0].item()}
         if len(quality) > 1:
             figures["psnr_novel"] = quality[1:].mean().item()

@@ -1,4 +1,4 @@
-"""Optional alignment of a prediction with the truth, and what it changed."""
+"""The alignments of a prediction with the truth that a protocol may ask for."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from gamba_warp.open3d import import_open3d
 
 from .shape import Points, Similarity
 
-ICP_DISTANCES = (0.2, 0.1, 0.05)  # how far correspondences reach, in turn; longest side is 1
+# How far correspondences reach in each round of ICP; the truth's longest side is 1.
+ICP_DISTANCES = (0.2, 0.1, 0.05)
 
 
 def match_moments(predicted: Points, truth: Points) -> Similarity:
-    """Translation and scale that bring centroid and mean square radius together.
+    """Finds the translation and scale after which centroids and mean square radii are equal.
+
+    Args:
+        predicted: points to be moved.
+        truth: points to be met.
 
     Raises:
         UserError: the prediction is a single point.
@@ -30,10 +35,19 @@ def match_moments(predicted: Points, truth: Points) -> Similarity:
 
 
 def icp(predicted: Points, truth: Points) -> tuple[Similarity, dict[str, float]]:
-    """Rotation, translation and scale by Open3D's point-to-point ICP, from ``match_moments``.
+    """Finds rotation, translation and scale by Open3D's point-to-point ICP.
+
+    It starts from ``match_moments`` and finds small rotations only.
+
+    Args:
+        predicted: points to be moved.
+        truth: points to be met.
 
     Returns:
         The motion, and Open3D's ``fitness`` (share of points with a partner) and ``inlier_rmse``.
+
+    Raises:
+        UserError: the prediction is a single point.
     """
     o3d = import_open3d()
     clouds = [

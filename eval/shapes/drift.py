@@ -1,11 +1,12 @@
-"""How far the rules of occupancy drift on known shapes that are damaged: ``eval/README.md``.
+"""How far the rules of occupancy drift on known shapes that are damaged.
 
-``python -m gamba_warp.eval.shapes.drift`` prints the table there.
+``python -m gamba_warp.eval.shapes.drift`` prints the table that stands in ``eval/README.md``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import tyro
@@ -16,15 +17,18 @@ from .metrics import volume_iou
 from .occupancy import RULES, enclosed, grid_around
 from .shape import Mesh
 
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
 HOLES = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5)  # shares of the area
 
 
 def known_shapes() -> dict[str, Mesh]:
-    """Closed meshes of fine triangles, longest side 1 or a little less."""
+    """Closed meshes of fine triangles by name; the longest side is 1 or a little less."""
     from trimesh import creation, util
 
     def mesh(*sources) -> Mesh:
-        joined = util.concatenate(list(sources))
+        joined = cast("Trimesh", util.concatenate(list(sources)))
         return Mesh(np.array(joined.vertices), np.array(joined.faces))
 
     box = creation.box()
@@ -45,11 +49,9 @@ def known_shapes() -> dict[str, Mesh]:
 
 
 def with_hole(mesh: Mesh, share: float, seed: int) -> Mesh:
-    """Without the faces nearest to a random place on the surface, up to ``share`` of the area."""
-    corners = mesh.vertices[mesh.faces]
-    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(sides, axis=1)
-    middle = corners.mean(1)
+    """Cuts out the faces nearest to a random place of the surface, up to ``share`` of the area."""
+    area = np.linalg.norm(mesh.normals(), axis=1)
+    middle = mesh.corners().mean(1)
     at = np.random.default_rng(seed).choice(len(middle), p=area / area.sum())
     order = np.argsort(((middle - middle[at]) ** 2).sum(1), kind="stable")
     kept = np.cumsum(area[order]) > share * area.sum() * (1 + 1e-9)
@@ -57,7 +59,7 @@ def with_hole(mesh: Mesh, share: float, seed: int) -> Mesh:
 
 
 def with_flips(mesh: Mesh, share: float, seed: int) -> Mesh:
-    """About ``share`` of the faces, drawn at random, turned over."""
+    """Turns over about ``share`` of the faces, drawn at random."""
     faces = mesh.faces.copy()
     chosen = np.random.default_rng(seed).random(len(faces)) < share
     faces[chosen] = faces[chosen][:, ::-1]
@@ -65,7 +67,7 @@ def with_flips(mesh: Mesh, share: float, seed: int) -> Mesh:
 
 
 def doubled(mesh: Mesh) -> Mesh:
-    """Every face given again from its other side, as in files made for renderers that cull."""
+    """Gives every face again from its other side, as files for renderers that cull have it."""
     return Mesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces[:, ::-1]]))
 
 
@@ -85,10 +87,10 @@ def drift(mesh: Mesh, damage: Callable[[Mesh, int], Mesh], voxels: int, seeds: i
     """Mean IoU, over seeds, of the damaged mesh's occupancy with that of the closed original.
 
     Args:
-        mesh: closed; its true occupancy is what it encloses, cavities included.
-        damage: of a mesh and a seed.
-        voxels: a unit.
-        seeds: at least one.
+        mesh: a closed one; its true occupancy is what it encloses, cavities included.
+        damage: a function of the mesh and a seed, which returns the damaged mesh.
+        voxels: number of voxels in a unit of length.
+        seeds: number of damaged meshes, at least one.
 
     Returns:
         ``{rule: iou}`` for all ``RULES``.
@@ -97,9 +99,9 @@ def drift(mesh: Mesh, damage: Callable[[Mesh, int], Mesh], voxels: int, seeds: i
     truth = enclosed(mesh, grid)
     values: dict[str, list[float]] = {name: [] for name in RULES}
     for seed in range(seeds):
-        broken = tidied(damage(mesh, seed))[0]
-        for name, (_, rule) in RULES.items():
-            values[name].append(volume_iou(rule(broken, grid), truth) or 0.0)
+        broken = tidied(damage(mesh, seed)).mesh
+        for name, rule in RULES.items():
+            values[name].append(volume_iou(rule.fill(broken, grid), truth) or 0.0)
     return {name: float(np.mean(some)) for name, some in values.items()}
 
 
@@ -107,8 +109,8 @@ def main(voxels: int = 32, seeds: int = 3) -> None:
     """Prints the table as Markdown.
 
     Args:
-        voxels: a unit.
-        seeds: places of the hole for each row.
+        voxels: Number of voxels in a unit of length.
+        seeds: Number of places of the hole for each row.
     """
     print(f"| shape | damage | {' | '.join(RULES)} |\n| --- | --- |{' --- |' * len(RULES)}")
     damages = {f"hole {100 * share:g} %": _hole(share) for share in HOLES}

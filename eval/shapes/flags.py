@@ -1,10 +1,12 @@
-"""What is unusual about a mesh: it is evaluated all the same, and its record says so."""
+"""What is unusual about a mesh: it is evaluated all the same, and its record states it."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from .shape import Mesh, merged
+from .shape import Mesh, directed_edges, merged
 
 FLAGS = {
     "open": "an edge belongs to an odd number of faces",
@@ -15,26 +17,32 @@ FLAGS = {
     "duplicate": "a face is given more than once",
     "selfintersecting": "a face cuts another",
 }
-STRICT = tuple(flag for flag in FLAGS if flag != "open")
+STRICT = tuple(flag for flag in FLAGS if flag != "open")  # the flags that "strict" refuses
 
 
-def tidied(mesh: Mesh) -> tuple[Mesh, list[str]]:
-    """The mesh as it is evaluated, and its flags, in the order of ``FLAGS``.
+class Tidied(NamedTuple):
+    """A mesh as it is evaluated, and the flags of the mesh that it was made from.
 
-    Vertices at one place become one; faces without area and repeated faces go. None of this moves
-    the surface.
+    Attributes:
+        mesh: without repeated vertices and faces and without flat faces; it may have no face left.
+        flags: names from ``FLAGS``, in their order.
+    """
+
+    mesh: Mesh
+    flags: list[str]
+
+
+def tidied(mesh: Mesh) -> Tidied:
+    """Merges vertices at one place, drops faces without area and repeated faces, and sets flags.
+
+    None of this moves the surface.
 
     Args:
-        mesh: any; a mesh without area comes back without faces.
-
-    Returns:
-        The new mesh and the names from ``FLAGS`` that apply.
+        mesh: any mesh; of one without area no face is left.
     """
     vertices, index = merged(mesh.vertices)
     faces = index[mesh.faces]
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat = ~(np.abs(normals).max(1) > 0)
+    flat = ~(np.abs(Mesh(vertices, faces).normals()).max(1) > 0)
     order = np.sort(faces, axis=1)
     _, first = np.unique(_keys(order, len(vertices)), return_index=True)
     repeated = np.ones(len(faces), bool)
@@ -47,7 +55,7 @@ def tidied(mesh: Mesh) -> tuple[Mesh, list[str]]:
         found.add("duplicate")
     if len(kept.faces) and _cuts_itself(kept):
         found.add("selfintersecting")
-    return kept, [flag for flag in FLAGS if flag in found]
+    return Tidied(kept, [flag for flag in FLAGS if flag in found])
 
 
 def _keys(order: np.ndarray, count: int) -> np.ndarray:
@@ -58,7 +66,7 @@ def _keys(order: np.ndarray, count: int) -> np.ndarray:
 
 
 def _edge_flags(mesh: Mesh) -> set[str]:
-    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = directed_edges(mesh.faces)
     forward = edges[:, 0] < edges[:, 1]
     order = np.sort(edges, axis=1)
     _, index, counts = np.unique(
@@ -83,9 +91,12 @@ def _signed_volume(mesh: Mesh) -> float:
 
 
 def _cuts_itself(mesh: Mesh) -> bool:
-    import pymeshlab
+    import pymeshlab  # which has no stubs
 
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices, mesh.faces.astype(np.int32)))
+    meshes = pymeshlab.MeshSet()  # pyright: ignore[reportAttributeAccessIssue]
+    copy = pymeshlab.Mesh(  # pyright: ignore[reportAttributeAccessIssue]
+        mesh.vertices, mesh.faces.astype(np.int32)
+    )
+    meshes.add_mesh(copy)
     meshes.compute_selection_by_self_intersections_per_face()
     return meshes.current_mesh().selected_face_number() > 0

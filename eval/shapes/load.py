@@ -1,4 +1,8 @@
-"""A file to what is evaluated: its header checked, read, moved, Gaussians made a surface."""
+"""The load stage of an evaluation: a file becomes an ``Evaluated``, in the truth's unit frame.
+
+``load_truth`` and ``load_prediction`` read a file (``load_shape``), turn Gaussians into a surface,
+move the shape into the unit frame, and clean and flag its mesh. ``compare`` is the next stage.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.headers import check_counts, ply_elements, ply_header
+from gamba_warp.formats.headers import check_counts
 from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
 from gamba_warp.formats.meshes import Y_TO_Z_UP, default_up, load_mesh
 from gamba_warp.formats.ply import load_ply
+from gamba_warp.formats.ply_header import read_ply_header
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.open3d import import_open3d
-from gamba_warp.surfaces.extract import SurfaceOptions, extract_surface
+from gamba_warp.surfaces.extract import extract_surface
+from gamba_warp.surfaces.options import SurfaceOptions
 
 from .flags import STRICT, tidied
 from .protocol import GeometryProtocol
 from .shape import Mesh, Points, Shape, Similarity
 
+CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
+SUFFIXES = (*MESH_SUFFIXES, *CLOUD_SUFFIXES)
+HUGE = 1e18  # the squares of larger coordinates overflow float32
 FAR = 1e6  # units of the truth's longest side; farther out float32 holds nothing of a shape
 KINDS = {Gaussians: "gaussians", Mesh: "mesh", Points: "points"}
 
@@ -30,40 +39,27 @@ class Evaluated:
 
     Attributes:
         shape: in the truth's unit frame.
-        kind: of the file: "gaussians", "mesh" or "points".
+        kind: what the file holds: "gaussians", "mesh" or "points".
         flags: of the mesh (for Gaussians: of their surface), names from ``flags.FLAGS``.
+        motion: what brought the file's coordinates into the unit frame.
     """
 
     shape: Mesh | Points
     kind: str
     flags: list[str]
+    motion: Similarity
 
-    def closed(self) -> bool | None:
-        """Whether it bounds a volume; None for points."""
+    def is_closed(self) -> bool | None:
+        """Whether the mesh is closed, as ``Mesh.is_closed`` says it; None for points."""
         return "open" not in self.flags if isinstance(self.shape, Mesh) else None
 
 
-def unit_motion(shape: Mesh | Points, up: str) -> Similarity:
-    """To z-up, centred on the bounding box, longest side 1.
+def load_truth(path: Path, protocol: GeometryProtocol) -> Evaluated:
+    """Reads a true mesh or cloud and moves it into its unit frame.
 
     Args:
-        shape: at least two places.
-        up: the axis that points up, "y" or "z".
-
-    Raises:
-        UserError: it has no extent, or is so far from the origin that its numbers cannot hold it.
-    """
-    turn = Y_TO_Z_UP if up == "y" else np.eye(3)
-    points = (shape.vertices if isinstance(shape, Mesh) else shape.positions) @ turn.T
-    low, high = points.min(0), points.max(0)
-    extent = (high - low).max()
-    if extent <= 1e-10 * max(abs(low).max(), abs(high).max()):
-        raise UserError("all its points are one, or too near to each other to tell apart")
-    return Similarity(turn, -(low + high) / 2 / extent, 1 / extent)
-
-
-def load_truth(path: Path, protocol: GeometryProtocol) -> tuple[Evaluated, Similarity]:
-    """A true mesh or cloud in its unit frame, and the motion that brought it there.
+        path: file.
+        protocol: says which axis of the file points up, and which flags are refused.
 
     Raises:
         UserError: it cannot be read, is made of Gaussians, or has no extent.
@@ -73,74 +69,83 @@ def load_truth(path: Path, protocol: GeometryProtocol) -> tuple[Evaluated, Simil
         raise UserError(f"{path}: Gaussians, the truth must be a mesh or a point cloud")
     try:
         motion = unit_motion(shape, default_up(path) if protocol.up == "auto" else protocol.up)
-        return _evaluated(motion.apply(shape), KINDS[type(shape)], protocol), motion
+        return _evaluated(motion.apply(shape), KINDS[type(shape)], motion, protocol)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 
 
 def load_prediction(path: Path, motion: Similarity, protocol: GeometryProtocol) -> Evaluated:
-    """A predicted shape, moved, its Gaussians turned into a surface.
+    """Reads a predicted shape, moves it, and turns Gaussians into a surface.
 
     Args:
         path: file.
-        motion: into the truth's unit frame.
-        protocol: how Gaussians become a surface.
+        motion: from the file's coordinates into the truth's unit frame.
+        protocol: says how Gaussians become a surface, and which flags are refused.
 
     Raises:
         UserError: it cannot be read, has no surface, or lies far away.
     """
     shape = motion.apply(load_shape(path))
     kind = KINDS[type(shape)]
-    reach = _reach(shape)
+    reach = float(np.abs(_positions(shape)).max())
     if not reach <= FAR:
         raise UserError(f"{path}: reaches {reach:.3g} times the truth's longest side")
     try:
         if isinstance(shape, Gaussians):
             shape = to_surface(shape, protocol.surface, protocol.seed, protocol.num_points)
-        return _evaluated(shape, kind, protocol)
+        return _evaluated(shape, kind, motion, protocol)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 
 
-def _reach(shape: Shape) -> float:
+def unit_motion(shape: Mesh | Points, up: str) -> Similarity:
+    """The motion after which a shape is z-up and centred, with a longest side of 1.
+
+    Args:
+        shape: at least two places.
+        up: the axis that points up, "y" or "z".
+
+    Raises:
+        UserError: it has no extent, or is so far from the origin that its numbers cannot hold it.
+    """
+    turn = Y_TO_Z_UP if up == "y" else np.eye(3)
+    points = _positions(shape) @ turn.T
+    low, high = points.min(0), points.max(0)
+    extent = (high - low).max()
+    if extent <= 1e-10 * max(abs(low).max(), abs(high).max()):
+        raise UserError("all its points are one, or too near to each other to tell apart")
+    return Similarity(turn, -(low + high) / 2 / extent, 1 / extent)
+
+
+def _positions(shape: Shape) -> np.ndarray:
+    """``[N, 3]``: the vertices, points, or centres of Gaussians."""
     if isinstance(shape, Gaussians):
-        return float(shape.means.abs().max())
-    return float(np.abs(shape.vertices if isinstance(shape, Mesh) else shape.positions).max())
+        return shape.means.numpy()
+    return shape.vertices if isinstance(shape, Mesh) else shape.positions
 
 
-def _evaluated(shape: Mesh | Points, kind: str, protocol: GeometryProtocol) -> Evaluated:
+def _evaluated(
+    shape: Mesh | Points, kind: str, motion: Similarity, protocol: GeometryProtocol
+) -> Evaluated:
     if isinstance(shape, Points):
-        return Evaluated(shape, kind, [])
-    shape, flags = tidied(shape)
-    if len(shape.faces) == 0:
+        return Evaluated(shape, kind, [], motion)
+    mesh, flags = tidied(shape)
+    if len(mesh.faces) == 0:
         raise UserError("the mesh has no area")
     refused = [flag for flag in flags if flag in STRICT]
     if protocol.strict and kind == "mesh" and refused:
         raise UserError(f"--strict: {', '.join(refused)}")
-    return Evaluated(shape, kind, flags)
-
-
-CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
-HUGE = 1e18  # the squares of larger coordinates overflow float32
-SUFFIXES = (*MESH_SUFFIXES, *CLOUD_SUFFIXES)
-
-
-def _ply_kind(path: Path) -> str:
-    """What a ``.ply`` holds, by its header: "gaussians", "mesh" or "points"."""
-    with open(path, "rb") as file:
-        elements = ply_elements(path, ply_header(path, file)[0])
-    if any(name == "face" and count for name, count, _ in elements):
-        return "mesh"
-    properties = {words[-1] for _, _, rows in elements for words in rows}
-    # one is enough, so that a file that lacks the others is not taken for a point cloud
-    return "gaussians" if {"opacity", "scale_0", "rot_0", "f_dc_0"} & properties else "points"
+    return Evaluated(mesh, kind, flags, motion)
 
 
 def load_shape(path: Path) -> Shape:
     """Reads Gaussians (3DGS ``.ply``), a mesh, or a point cloud, by what the file holds.
 
+    The counts that the file's header states are compared with its size first, so that a false
+    header costs no memory.
+
     Raises:
-        UserError: missing, unreadable, empty, untrue about its counts, or with values that are not
+        UserError: missing, unreadable, empty, with a false header, or with values that are not
             finite or beyond ``HUGE``.
     """
     suffix = path.suffix.lower()
@@ -152,37 +157,55 @@ def load_shape(path: Path) -> Shape:
         raise UserError(f"{path}: the file is empty")
     check_counts(path)
     kind = _ply_kind(path) if suffix == ".ply" else "mesh"
+    shape: Shape
     if kind == "gaussians":
-        shape, positions = (gaussians := load_ply(path)), gaussians.means.numpy()
+        shape = load_ply(path)
     elif kind == "points" or suffix in CLOUD_SUFFIXES:
-        shape, positions = (points := _load_points(path)), points.positions
+        shape = _load_points(path)
     else:
         shape = _load_triangles(path)
-        positions = shape.vertices
-    if np.abs(positions).max() > HUGE:
-        raise UserError(f"{path}: coordinates reach {np.abs(positions).max():.3g}, over {HUGE:g}")
+    reach = np.abs(_positions(shape)).max()
+    if reach > HUGE:
+        raise UserError(f"{path}: coordinates reach {reach:.3g}, over {HUGE:g}")
     return shape
+
+
+def _ply_kind(path: Path) -> str:
+    """What a ``.ply`` holds, by its header: "gaussians", "mesh" or "points"."""
+    with open(path, "rb") as file:
+        elements = read_ply_header(path, file).elements
+    if any(element.name == "face" and element.count for element in elements):
+        return "mesh"
+    properties = {item.name for element in elements for item in element.properties}
+    # One is enough, so that a file that lacks the others is not taken for a point cloud.
+    return "gaussians" if {"opacity", "scale_0", "rot_0", "f_dc_0"} & properties else "points"
 
 
 def _load_triangles(path: Path) -> Mesh:
     try:
         mesh = load_mesh(path)
     except UserError as error:
-        mixed = path.suffix.lower() == ".ply" and "cannot be read" in str(error)
-        if not mixed:  # trimesh reads no binary .ply whose faces differ in their corners
+        if path.suffix.lower() != ".ply" or "cannot be read" not in str(error):
             raise
-        import pymeshlab
-
-        meshes = pymeshlab.MeshSet()
-        try:
-            meshes.load_new_mesh(str(path))
-        except pymeshlab.PyMeshLabException:
-            raise error from None
-        read = meshes.current_mesh()
-        mesh = Mesh(read.vertex_matrix(), read.face_matrix().astype(np.int64))
-        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        # trimesh reads no binary .ply whose faces differ in their number of corners.
+        mesh = _load_with_pymeshlab(path)
+        if mesh is None:
             raise
     return Mesh(mesh.vertices, mesh.faces)
+
+
+def _load_with_pymeshlab(path: Path) -> Mesh | None:
+    """The triangles of a file; None where it cannot be read, has no faces, or is not finite."""
+    import pymeshlab  # which has no stubs
+
+    meshes = pymeshlab.MeshSet()  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        meshes.load_new_mesh(str(path))
+    except pymeshlab.PyMeshLabException:  # pyright: ignore[reportAttributeAccessIssue]
+        return None
+    read = meshes.current_mesh()
+    mesh = Mesh(read.vertex_matrix(), read.face_matrix().astype(np.int64))
+    return mesh if len(mesh.faces) and np.isfinite(mesh.vertices).all() else None
 
 
 def _load_points(path: Path) -> Points:
@@ -204,7 +227,13 @@ def _load_points(path: Path) -> Points:
 def to_surface(
     gaussians: Gaussians, options: SurfaceOptions, seed: int, count: int
 ) -> Mesh | Points:
-    """One object's Gaussians to a ``Mesh``, or to ``count`` ``Points`` for the method centers.
+    """Turns one object's Gaussians into a mesh, or into points for the method "centers".
+
+    Args:
+        gaussians: one object, no batch dimension.
+        options: how they become a surface.
+        seed: of the points, for "centers".
+        count: number of points, for "centers".
 
     Raises:
         UserError: there is no surface.
@@ -216,7 +245,7 @@ def to_surface(
 
 
 def centers(gaussians: Gaussians, count: int, seed: int) -> Points:
-    """Centres drawn with a chance proportional to opacity, ``count`` times, with repetition.
+    """Draws ``count`` centres with repetition, each with a chance proportional to its opacity.
 
     Raises:
         UserError: no Gaussian has any opacity.

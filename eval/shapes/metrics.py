@@ -1,4 +1,4 @@
-"""Metrics of surfaces and volumes as pure functions (numpy)."""
+"""Metrics of surfaces and of volumes, as pure functions of numpy arrays."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gamba_warp.open3d import import_open3d
+
 from .shape import Points
 
 
 def nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest of ``points [M, 3]`` to each of ``queries [N, 3]``.
+    """Finds the nearest of ``points [M, 3]`` to each of ``queries [N, 3]``, in float32.
 
     Returns:
         Distances ``[N]`` float32 and indices ``[N]``.
     """
-    from gamba_warp.open3d import import_open3d
-
     o3d = import_open3d()
     search = o3d.core.nns.NearestNeighborSearch(np.ascontiguousarray(points, np.float32))
     search.knn_index()
@@ -27,12 +27,12 @@ def nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
 def surface_metrics(
     predicted: Points, truth: Points, thresholds: Sequence[float] = (0.01, 0.02, 0.05)
 ) -> dict:
-    """How far two surfaces are apart, by points on them.
+    """Measures how far two surfaces are apart, by points on them.
 
     Args:
         predicted: at least one point.
-        truth: at least one point, same unit.
-        thresholds: for the F-score, same unit.
+        truth: at least one point, in the same frame and unit.
+        thresholds: distances for the F-score, in the same unit.
 
     Returns:
         ``accuracy`` (mean distance from predicted to true points), ``completeness`` (from true to
@@ -67,6 +67,6 @@ def surface_metrics(
 
 
 def volume_iou(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Intersection over union of two occupancies (bool, same shape); None where both are empty."""
+    """Intersection over union of two bool arrays of one shape; None where both are empty."""
     either = np.count_nonzero(a | b)
     return float(np.count_nonzero(a & b) / either) if either else None

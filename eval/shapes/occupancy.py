@@ -1,18 +1,19 @@
-"""Which voxels a mesh fills, for meshes that are not closed as well."""
+"""The voxels that a mesh fills, by several rules, for meshes that are not closed as well."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 
 from gamba_warp.cameras import fibonacci_sphere
 
-from .shape import Mesh, merged
+from .options import OccupancyRule
+from .shape import Mesh, directed_edges, merged
 
-VOTERS = 26
+VOTERS = 26  # rays from a point
 
 
 @dataclass
@@ -20,9 +21,9 @@ class Grid:
     """Points of a regular grid.
 
     Attributes:
-        origin: ``[3]`` the first point.
+        origin: ``[3]``, the first point.
         step: distance of neighbours.
-        shape: points along x, y, z.
+        shape: numbers of points along x, y and z.
     """
 
     origin: np.ndarray
@@ -30,27 +31,28 @@ class Grid:
     shape: tuple[int, int, int]
 
     def points(self) -> np.ndarray:
-        """``[X, Y, Z, 3]`` float32."""
+        """Returns ``[X, Y, Z, 3]`` float32."""
         axes = [self.origin[k] + self.step * np.arange(self.shape[k]) for k in range(3)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), -1).astype(np.float32)
 
 
 def grid_around(*meshes: Mesh, resolution: int) -> Grid:
-    """Voxel centres around several meshes, with one empty voxel on each side.
+    """The voxel centres around several meshes, with one empty voxel on each side.
 
     Voxel faces lie on multiples of their side, so the grid does not depend on the meshes' extents
     as long as they fit into a cube of side 2; around larger ones the voxels grow with them.
 
     Args:
         meshes: at least one.
-        resolution: voxels a unit of length.
+        resolution: number of voxels in a unit of length.
     """
     low = np.min([mesh.vertices.min(0) for mesh in meshes], axis=0)
     high = np.max([mesh.vertices.max(0) for mesh in meshes], axis=0)
     step = max(1.0, (high - low).max() / 2) / resolution
     first = np.floor(low / step).astype(int) - 1
     last = np.ceil(high / step).astype(int) + 1
-    return Grid((first + 0.5) * step, step, tuple(int(n) for n in last - first))
+    x, y, z = (int(n) for n in last - first)
+    return Grid((first + 0.5) * step, step, (x, y, z))
 
 
 def syncdreamer_grid(size: int = 64) -> Grid:
@@ -66,7 +68,8 @@ def solid(mesh: Mesh, grid: Grid) -> np.ndarray:
         inside |= majority(mesh, grid)
     if len(parts) > 1 or (parts and len(parts[0].faces) < len(mesh.faces)):
         points = grid.points()
-        for part in parts:  # nowhere else than in its box can more than half of the rays cross it
+        # only within a part's box can more than half of the rays cross it
+        for part in parts:
             low, high = part.vertices.min(0), part.vertices.max(0)
             first = np.maximum(np.ceil((low - grid.origin) / grid.step).astype(int), 0)
             last = np.floor((high - grid.origin) / grid.step).astype(int) + 1
@@ -88,7 +91,7 @@ def majority(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 
 def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
-    """Occupancy ``[X, Y, Z]`` bool, what mesh2sdf does without its repair. See ``RULES``."""
+    """Occupancy ``[X, Y, Z]`` bool, as mesh2sdf has it without its repair. See ``RULES``."""
     return _crossings(mesh.scene(), grid.points(), np.array([-1.0, 0, 0])) % 2 == 1
 
 
@@ -98,9 +101,7 @@ def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
     The generalised winding number (Jacobson et al. 2013) is the mean, over all directions, of the
     signed crossings of a ray; here over the directions of ``majority``.
     """
-    scene, points = mesh.scene(), grid.points().reshape(-1, 3)
-    corners = mesh.vertices[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    scene, points, normals = mesh.scene(), grid.points().reshape(-1, 3), mesh.normals()
     total = np.zeros(len(points))
     for direction in directions():
         found = scene.list_intersections(_rays(points, direction))
@@ -153,26 +154,25 @@ def enclosed(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 def _is_flat(part: Mesh) -> bool:
     """Whether all faces of a connected part lie in one plane, which bounds nothing."""
-    corners = part.vertices[part.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = part.normals()
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     return bool(np.abs(np.cross(normals, normals[0])).max() < 1e-6)
 
 
 def directions() -> np.ndarray:
-    """``[VOTERS, 3]`` in opposite pairs, so that a flat sheet never gets more than half."""
+    """Unit vectors ``[VOTERS, 3]`` in opposite pairs, so that a sheet never gets more than half."""
     half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
     return np.concatenate([half, -half])
 
 
 def connected_parts(mesh: Mesh) -> list[Mesh]:
-    """The mesh in parts that share no edge, vertices at one place taken as one."""
+    """The parts of a mesh that share no edge, where vertices at one place count as one."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     vertices, index = merged(mesh.vertices)
     faces = index[mesh.faces]
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = np.sort(directed_edges(faces), axis=1)
     edge = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)[1].reshape(-1)
     face, size = np.repeat(np.arange(len(faces)), 3), len(faces) + edge.max() + 1
     links = coo_array((np.ones(len(face), bool), (face, len(faces) + edge)), shape=(size, size))
@@ -191,29 +191,42 @@ ENCLOSED = (
     "centres of face neighbours that do not cross the surface; so closed cavities are filled and "
     "parts may overlap"
 )
-Rule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
-RULES: dict[Rule, tuple[str, Callable[[Mesh, Grid], np.ndarray]]] = {
-    "solid": (
+
+
+class Rule(NamedTuple):
+    """A rule of occupancy.
+
+    Attributes:
+        meaning: in words, for reports.
+        fill: gives the voxels of a grid that a mesh fills, ``[X, Y, Z]`` bool.
+    """
+
+    meaning: str
+    fill: Callable[[Mesh, Grid], np.ndarray]
+
+
+RULES: dict[OccupancyRule, Rule] = {
+    "solid": Rule(
         f"{ENCLOSED}. Where a part (faces joined by edges) is open, a voxel is also inside if more "
         f"than half of {_RAYS} cross an odd number of times the whole mesh, or one open part alone",
         solid,
     ),
-    "joint": (
+    "joint": Rule(
         f"{ENCLOSED}. If the mesh is open, a voxel is also inside if more than half of {_RAYS} "
         "cross it an odd number of times",
         joint,
     ),
-    "enclosed": (ENCLOSED, enclosed),
-    "majority": (
+    "enclosed": Rule(ENCLOSED, enclosed),
+    "majority": Rule(
         f"a point is inside if more than half of {_RAYS} cross the surface an odd number of times",
         majority,
     ),
-    "winding": (
+    "winding": Rule(
         "a point is inside if its generalised winding number, estimated by the signed crossings "
         f"of {_RAYS} is over 1/2 or under -1/2",
         winding,
     ),
-    "parity": (
+    "parity": Rule(
         "a point is inside if a ray along -x crosses the surface an odd number of times",
         parity,
     ),

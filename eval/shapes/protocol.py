@@ -1,4 +1,4 @@
-"""What the numbers of ``eval-geometry`` mean: the protocol, its presets and its JSON."""
+"""What the numbers of ``eval-geometry`` mean: the protocol, its presets and its files."""
 
 from __future__ import annotations
 
@@ -11,17 +11,12 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.errors import UserError
-from gamba_warp.surfaces.extract import SurfaceOptions
+from gamba_warp.surfaces.options import SurfaceOptions
 
-from .occupancy import RULES, Rule
+from .occupancy import RULES
+from .options import Align, Frame, GridRule, OccupancyRule, PointRule, ShapesOptions, Up
 
 VERSION = 2  # goes up whenever the same protocol would give other numbers
-
-Align = Literal["none", "scale", "icp"]
-Frame = Literal["gt", "unit", "reference"]
-Up = Literal["auto", "y", "z"]
-PointRule = Literal["area", "views"]
-GridRule = Literal["around", "lattice"]
 
 POINTS: dict[PointRule, str] = {
     "area": "area-uniform on the whole surface, inner faces included; faces given twice and faces "
@@ -55,21 +50,22 @@ class GeometryProtocol:
     """All that decides a number of ``eval-geometry``. Lengths: the truth's longest side is 1.
 
     Attributes:
-        name: of the preset, or whatever a file says.
+        name: name of the preset, or whatever a file says.
         points: how points are put on surfaces, one of ``POINTS``.
-        num_points: a shape (for "area", and for point clouds).
-        seed: of the random points; predicted and true points have different seeds.
-        thresholds: of the F-score.
+        num_points: number of points of a shape (for "area", and for point clouds).
+        seed: seed of the random points; predicted and true points have different seeds.
+        thresholds: distances of the F-score.
         occupancy: rule of the Volume IoU, one of ``occupancy.RULES``.
-        grid: of the Volume IoU, one of ``GRIDS``.
-        iou_voxels: its voxels a unit, for "around".
-        align: of predictions with the truth; anything but none makes the numbers another protocol.
-        frame: in which frame predictions are (see the command).
-        up: axis of the truth's files.
+        grid: grid of the Volume IoU, one of ``GRIDS``.
+        iou_voxels: number of the grid's voxels in a unit of length, for "around".
+        align: how predictions are aligned with the truth; with anything but "none" the numbers
+            are those of another protocol.
+        frame: the frame that predictions are in (see the command).
+        up: the upward axis of the truth's files.
         reference: index of the input view, for the frame "reference".
-        distance: of the input camera in the model's world, for the frame "reference".
-        strict: shapes that are not manifold, cut themselves, are turned inside out or have
-            degenerate or doubled faces count as failures.
+        distance: distance of the input camera in the model's world, for the frame "reference".
+        strict: whether meshes count as failures that are not manifold, cut themselves, are turned
+            inside out or have degenerate or doubled faces.
         surface: how Gaussians become a surface.
     """
 
@@ -78,7 +74,7 @@ class GeometryProtocol:
     num_points: int = 100_000
     seed: int = 0
     thresholds: tuple[float, ...] = (0.01, 0.02, 0.05)
-    occupancy: Rule = "solid"
+    occupancy: OccupancyRule = "solid"
     grid: GridRule = "around"
     iou_voxels: int = 64
     align: Align = "none"
@@ -90,26 +86,26 @@ class GeometryProtocol:
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
 
     def definitions(self) -> dict[str, str]:
-        """The words for the names: rules chosen, and what each metric is."""
+        """Says what the names mean: the rules chosen, and each metric."""
         return {
             "points": POINTS[self.points],
-            "occupancy": RULES[self.occupancy][0],
+            "occupancy": RULES[self.occupancy].meaning,
             "grid": GRIDS[self.grid],
             **DEFINITIONS,
         }
 
     def to_json(self) -> dict[str, Any]:
-        """For a report; ``read_protocol`` reads it back."""
+        """Returns the protocol for a report; ``read_protocol`` reads it back."""
         values = asdict(self) | {"thresholds": list(self.thresholds)}
         return {"version": VERSION, **values, "definitions": self.definitions()}
 
     def changes(self) -> list[str]:
-        """Names of the fields that differ from the preset of its name (from default without)."""
+        """Names the fields that differ from the preset of this name, else from the default."""
         preset = asdict(PRESETS.get(self.name, PRESETS["default"]))
         mine = asdict(self)
-        changed = [key for key in mine if mine[key] != preset[key] and key not in ("name",)]
+        changed = [k for k in mine if k not in ("name", "surface") and mine[k] != preset[k]]
         nested = [k for k, v in mine["surface"].items() if v != preset["surface"][k]]
-        return [key for key in changed if key != "surface"] + [f"surface.{k}" for k in nested]
+        return changed + [f"surface.{k}" for k in nested]
 
 
 PRESETS = {
@@ -121,11 +117,11 @@ PRESETS = {
 
 
 def checked(protocol: GeometryProtocol, where: str) -> GeometryProtocol:
-    """Returns the protocol.
+    """Returns the protocol as it is, if its numbers are in their ranges.
 
     Args:
-        protocol: any.
-        where: names the file or option in errors.
+        protocol: any protocol.
+        where: the file or the options that it comes from, named in errors.
 
     Raises:
         UserError: a number is out of its range.
@@ -148,8 +144,40 @@ def checked(protocol: GeometryProtocol, where: str) -> GeometryProtocol:
     return protocol
 
 
+def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
+    """The protocol that the options name, with the values that they give themselves.
+
+    Raises:
+        UserError: there is no such protocol, or a number is out of its range.
+    """
+    base = read_protocol(options.protocol)
+    options.check()
+    given = {
+        "num_points": options.points,
+        "seed": options.seed,
+        "align": options.align,
+        "frame": options.frame,
+        "up": options.up,
+        "reference": options.reference,
+        "distance": options.distance,
+        "strict": options.strict or None,
+    }
+    surface = {
+        "method": options.surface,
+        "voxels": options.voxels,
+        "views": options.views,
+        "pixels": options.pixels,
+    }
+    changed = replace(base, surface=replace(base.surface, **_not_none(surface)), **_not_none(given))
+    return checked(changed, "options")
+
+
+def _not_none(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def read_protocol(choice: str) -> GeometryProtocol:
-    """A preset by its name, or a JSON file: a protocol, or a report that holds one.
+    """Finds a preset by its name, or reads a JSON file: a protocol, or a report that holds one.
 
     Fields that a file leaves out are those of the preset that its ``name`` gives, or of default.
 

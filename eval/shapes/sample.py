@@ -1,4 +1,4 @@
-"""Points on shapes: drawn at random, or seen by cameras."""
+"""Points on shapes, drawn at random or seen by cameras."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from .shape import Mesh, Points
 
 
 def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
-    """Points on a shape: area-uniform on a mesh; of a cloud, ``count`` at most, drawn at random.
+    """Draws points on a shape: uniformly by area on a mesh, at most ``count`` from a cloud.
+
+    Args:
+        shape: a mesh or a cloud; a cloud of no more than ``count`` points comes back as it is.
+        count: number of points.
+        seed: of the draw.
 
     Raises:
         UserError: the mesh has no area.
@@ -23,14 +28,12 @@ def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
         normals = None if shape.normals is None else shape.normals[keep]
         return Points(shape.positions[keep], normals)
     o3d = import_open3d()
-    corners = shape.vertices[shape.faces]
-    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    solid = np.linalg.norm(sides, axis=1) > 0
-    if not solid.any():
+    has_area = np.linalg.norm(shape.normals(), axis=1) > 0
+    if not has_area.any():
         raise UserError("the mesh has no area")
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(shape.vertices),
-        o3d.utility.Vector3iVector(shape.faces[solid].astype(np.int32)),
+        o3d.utility.Vector3iVector(shape.faces[has_area].astype(np.int32)),
     )
     o3d.utility.random.seed(seed)
     cloud = mesh.sample_points_uniformly(count, use_triangle_normal=True)
@@ -38,29 +41,35 @@ def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
 
 
 def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:
-    """Two random parts of a cloud without a common point, ``count`` points each at most.
+    """Draws two parts of a cloud that share no point, each of at most ``count`` points.
 
     Args:
-        points: at least two.
+        points: at least two points.
         count: at least one.
         seed: of the draw.
+
+    Returns:
+        Two clouds of one size, without normals.
     """
     order = np.random.default_rng(seed).permutation(len(points.positions))
     size = min(count, len(order) // 2)
-    return tuple(Points(points.positions[part]) for part in (order[:size], order[-size:]))
+    return Points(points.positions[order[:size]]), Points(points.positions[order[-size:]])
 
 
 def visible_points(
     mesh: Mesh, viewmats: np.ndarray, K: np.ndarray, size: int, voxel: float
 ) -> Points:
-    """Back-projected depth maps of a mesh, thinned to one mean point a voxel; without normals.
+    """Back-projects depth maps of a mesh and thins the points to one mean point in each voxel.
 
     Args:
-        mesh: what is seen.
+        mesh: what the cameras see.
         viewmats: ``[V, 4, 4]`` world to camera, OpenCV.
-        K: ``[3, 3]`` pixels.
-        size: side of the square pictures.
-        voxel: its side, object units.
+        K: ``[3, 3]`` intrinsics in pixels, of every camera.
+        size: side of the square depth maps, pixels.
+        voxel: side of a voxel, object units.
+
+    Returns:
+        Points without normals.
 
     Raises:
         UserError: no camera sees the mesh.

@@ -1,7 +1,7 @@
-"""What a single-view model has to beat: views that need no model.
+"""Views that need no model, which a single-view model has to beat.
 
-Each baseline is called with a ``Truth`` and gives what it shows in place of every view of it. It
-sees the input view and the cameras alone, the retrieval also the training split.
+Each baseline is called with a ``Truth`` and returns what it shows in place of every view of it. It
+sees the input view and the cameras alone; the retrieval sees the training split too.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def billboard(truth: Truth) -> Shown:
     """The input picture as a plane through the object's centre, parallel to its image plane.
 
     The centre is the origin and the input camera's axes are those of the world, so the plane is
-    z = 0. Every pixel's ray is cut with it, and the point projected into the input camera: exact,
-    mirrored from behind, and gone where a camera sees the plane edge-on.
+    z = 0. Every pixel's ray is cut with it, and the point projected into the input camera. This is
+    exact; from behind the picture is mirrored, and edge-on the plane is not seen.
     """
     viewmats, Ks = truth.cameras.viewmats.double(), truth.cameras.Ks.double()
     count, height, width = truth.mask.shape
@@ -72,15 +72,15 @@ def billboard(truth: Truth) -> Shown:
     points = centres + depth[..., None] * rays
     seen = (points + viewmats[0, :3, 3]) @ Ks[0].mT  # into the input camera, which is not turned
     size = seen.new_tensor([width, height])
-    where = seen[..., :2] / seen[..., 2:] / size * 2 - 1
-    # a ray within 1e-5 of the plane sees a sliver far below a pixel, if not only rounding
-    hit = (depth > 0) & (rays[..., 2].abs() > 1e-5) & where.isfinite().all(-1) & (seen[..., 2] > 0)
-    where = torch.where(hit[..., None], where, 2.0)  # outside
+    places = seen[..., :2] / seen[..., 2:] / size * 2 - 1
+    # What a ray within 1e-5 of the plane sees is far narrower than a pixel, or only rounding.
+    hit = (depth > 0) & (rays[..., 2].abs() > 1e-5) & places.isfinite().all(-1) & (seen[..., 2] > 0)
+    places = torch.where(hit[..., None], places, 2.0)  # outside of the picture
     rgba = truth.images[0].double()
     premultiplied = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
     sampled = grid_sample(
         premultiplied.permute(2, 0, 1).expand(count, -1, -1, -1),
-        where.view(count, height, width, 2),
+        places.view(count, height, width, 2),
         align_corners=False,
     ).permute(0, 2, 3, 1)
     rgb, alpha = sampled[..., :3], sampled[..., 3:]
@@ -88,7 +88,7 @@ def billboard(truth: Truth) -> Shown:
 
 
 class Retrieval:
-    """The nearest training view, and for novel views its object's views from about there.
+    """The nearest training view, and its object's views from about the same cameras.
 
     Attributes:
         failures: reasons by uid, for training objects that cannot be read.
@@ -119,7 +119,7 @@ class Retrieval:
         self._areas = self._alphas.sum(1)
 
     def nearest(self, image: Tensor, uid: str) -> tuple[str, int, float] | None:
-        """The nearest view of another object than ``uid``.
+        """Finds the nearest view of another object than ``uid``.
 
         Args:
             image: ``[H, W, 4]`` straight RGBA in [0, 1].
@@ -134,7 +134,7 @@ class Retrieval:
         shape = 1 - both / either  # 1 where both are empty: nothing tells them apart
         shape[torch.tensor([place[0] == uid for place in self._places])] = torch.inf
         best, at = torch.inf, -1
-        # by the first term, which the colours only add to: most need never be looked at
+        # The colours only add to the first term, so in its order most views need no second look.
         for part in shape.argsort().split(_CHUNK):
             if shape[part[0]] >= best:
                 break
@@ -144,11 +144,11 @@ class Retrieval:
             color = (common * apart).sum(1) / common.sum(1).clamp(min=1e-6)
             value, place = (shape[part] + color).min(0)
             if value < best:
-                best, at = value.item(), part[place].item()
+                best, at = float(value), int(part[place])
         return None if at < 0 else (*self._places[at], best)
 
     def __call__(self, truth: Truth) -> Shown | None:
-        """The pictures; None without another object. Raises UserError for a bad picture."""
+        """Returns the pictures; None without another object. Raises UserError for a bad picture."""
         found = self.nearest(truth.images[0].cpu(), truth.uid)
         if found is None:
             return None
@@ -169,7 +169,7 @@ class Retrieval:
 
 
 def thumbnails(images: Tensor) -> Tensor:
-    """``[V, THUMBNAIL², 4]`` straight RGBA of ``[V, H, W, 4]``: averages over areas."""
+    """Straight RGBA ``[V, THUMBNAIL², 4]`` of ``[V, H, W, 4]``, averaged over areas."""
     premultiplied = torch.cat([images[..., :3] * images[..., 3:], images[..., 3:]], -1)
     small = adaptive_avg_pool2d(premultiplied.permute(0, 3, 1, 2), THUMBNAIL).flatten(2).mT
     return torch.cat([small[..., :3] / small[..., 3:].clamp(min=1e-6), small[..., 3:]], -1)

@@ -1,4 +1,4 @@
-"""What the Gaussians themselves could show: every object fitted to its own true views."""
+"""What Gaussians could show at best: every object fitted to its own true views."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gamba_warp.data.dataset import ObjectViews, ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
 from gamba_warp.fitting.config import FitConfig
-from gamba_warp.fitting.objects import FitJob, load_views
+from gamba_warp.fitting.objects import FitJob, choose_objects, load_views
 from gamba_warp.fitting.optimize import fit
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.gaussians import Gaussians
@@ -25,7 +25,7 @@ from .compare import Shown, Truth, ViewsProtocol, render_views
 
 
 class Ceiling:
-    """``gamba fit`` on all views of an object, or its results of an earlier day.
+    """The result of ``gamba fit`` on all views of an object, made now or read from its file.
 
     Files are ``<uid>.ply`` in the world of view 0, as ``gamba fit`` writes them.
     """
@@ -34,6 +34,7 @@ class Ceiling:
         self,
         dataset: ViewDataset,
         protocol: ViewsProtocol,
+        *,
         device: str,
         folder: Path | None,
         uids: list[str] | None = None,
@@ -45,16 +46,16 @@ class Ceiling:
             dataset: whose objects are fitted.
             protocol: size of the pictures, input view and distance.
             device: torch device.
-            folder: of the files; None: nothing is kept.
-            uids: to fit where the folder does not have them with these settings; None: none, only
-                the files that are there count.
+            folder: folder of the files; None: nothing is kept.
+            uids: objects to fit where the folder does not have them with these settings; None:
+                nothing is fitted, and only the files that are there count.
             config: of the fit.
         """
         self.dataset, self.protocol, self.device = dataset, protocol, device
         self.folder, self.uids, self.config = folder, uids, config
 
     def __call__(self, truth: Truth) -> Shown | None:
-        """The pictures, or None for an object that is not to be fitted.
+        """Returns the pictures, or None for an object that is not to be fitted.
 
         Raises:
             UserError: its views cannot be used, or a file is bad.
@@ -63,8 +64,8 @@ class Ceiling:
         """
         uid = truth.uid
         if self.uids is None:
-            path = self.folder / f"{uid}.ply"
-            found = load_ply(path).to(self.device) if path.exists() else None
+            path = self.folder / f"{uid}.ply" if self.folder else None
+            found = load_ply(path).to(self.device) if path and path.exists() else None
         else:
             found = self._fitted(uid) if uid in self.uids else None
         return None if found is None else render_views(self._moved(found, uid), truth.cameras)
@@ -81,17 +82,26 @@ class Ceiling:
     def _fitted(self, uid: str) -> Gaussians:
         """Fits, or reads what the same settings gave for the same views before."""
         size, device = self.protocol.size, torch.device(self.device)
-        job = FitJob(self.dataset, self.folder or Path(), self.config, 0, size, device)
+        job = FitJob(
+            dataset=self.dataset,
+            folder=self.folder or Path(),
+            config=self.config,
+            held_out=0,
+            size=size,
+            device=device,
+        )
         views = load_views(job, uid, list(range(self.dataset.num_views(uid))))
         key = _key(views, self.config)
         path = self.folder / f"{uid}.ply" if self.folder else None
         if path and path.exists() and _stated(path.with_suffix(".json")) == key:
             return load_ply(path).to(device)
         with tqdm(total=100, desc=f"ceiling {uid}", unit="%", leave=False, disable=None) as bar:
+
+            def show(done: float, _: float) -> None:
+                bar.update(int(100 * done) - bar.n)
+
             images, cameras = views.images.to(device), views.cameras.to(device)
-            result = fit(
-                images, cameras, self.config, lambda d, _: bar.update(int(100 * d) - bar.n)
-            )
+            result = fit(images, cameras, self.config, show)
         first = cameras.viewmats[0]
         _, scale = relative_to_reference(first[None], first)
         moved = result.gaussians.transformed(first[:3, :3], first.new_zeros(3), scale.item())
@@ -123,34 +133,33 @@ def open_ceiling(
     dataset: ViewDataset,
     uids: list[str],
     protocol: ViewsProtocol,
+    *,
     device: str,
     out: Path | None,
     steps: int,
 ) -> Ceiling:
-    """The ceiling that ``--ceiling`` asks for.
+    """Opens the ceiling that ``--ceiling`` asks for.
 
     Args:
         wanted: a number of objects, or a folder of fitted ``.ply`` files.
         dataset: where the views come from.
-        uids: objects under evaluation.
+        uids: the objects under evaluation.
         protocol: as for ``Ceiling``.
         device: torch device.
         out: the report's folder, where fitted objects are kept; or None.
-        steps: of a fit.
+        steps: number of steps of a fit.
 
     Raises:
         UserError: neither a number above 0 nor a folder with a file for any of ``uids``.
     """
     if wanted.isdecimal() and int(wanted) > 0:
-        from gamba_warp.fitting.objects import choose_objects
-
         chosen, config = choose_objects(uids, (), int(wanted)), FitConfig(steps=steps)
         folder = out / "ceiling" if out else None
-        return Ceiling(dataset, protocol, device, folder, chosen, config)
+        return Ceiling(dataset, protocol, device=device, folder=folder, uids=chosen, config=config)
     folder = Path(wanted)
     if not folder.is_dir():
         raise UserError(f"--ceiling {wanted}: neither a number above 0 nor a folder")
     folder = folder / "gaussians" if (folder / "gaussians").is_dir() else folder
     if not any((folder / f"{uid}.ply").exists() for uid in uids):
         raise UserError(f"--ceiling {wanted}: has a .ply file of none of the {len(uids)} objects")
-    return Ceiling(dataset, protocol, device, folder)
+    return Ceiling(dataset, protocol, device=device, folder=folder)

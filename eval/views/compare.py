@@ -1,4 +1,4 @@
-"""True views of an object, predicted views of it, and how far these are from those."""
+"""True views of an object, predicted views of it, and the metrics between the two."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gamba_warp.cameras import Cameras, relative_to_reference
+from gamba_warp.cameras import Cameras
 from gamba_warp.data.dataset import SPLIT_VERSION, ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
 from gamba_warp.images import over_background
 from gamba_warp.model.lpips import LPIPS
+from gamba_warp.model.posing import relative_cameras
+from gamba_warp.render import render
 
 from ..report import mean_of
 
 WHITE = 1.0
-BATCH = 4  # views compared at once: bounds the memory of LPIPS features
+BATCH = 4  # views compared at once, which bounds the memory of LPIPS features
 METRICS = ("psnr", "ssim", "lpips", "mask_iou")
 
 Shown = tuple[Tensor, Tensor]  # rgb [V, H, W, 3] on white in [0, 1], mask [V, H, W] bool
@@ -32,22 +34,22 @@ class ViewsProtocol:
     """What the numbers of ``eval-views`` mean.
 
     Attributes:
-        split: of the dataset.
+        split: split of the dataset.
         reference: index of the input view.
-        views: how many views an object, input included, evenly spaced in file order; None: all.
+        views: number of views of an object, input included, evenly spaced in file order; None: all.
         size: height of the pictures compared; None: the files' own.
-        background: grey value both sides are composited on.
-        region: over what the picture metrics run.
+        lpips: the network, or None.
+        lpips_reason: why there is no LPIPS, or None.
+        distance: of the input camera from the object's centre, object units.
+        background: grey value that both sides are composited on.
+        region: part of the picture that the picture metrics run over.
         rendering: how predicted values are compared.
         max_psnr: dB, given to equal pictures.
         ssim: window and convention.
-        lpips: network, or None.
-        lpips_reason: why there is no LPIPS, or None.
         mask_iou: when a pixel counts as covered.
         averaging: order of the means.
         poses: frame and distance of the cameras.
-        distance: of the input camera from the object's centre, object units.
-        split_version: of the rule or file that made the split.
+        split_version: version of the rule or file that made the split.
     """
 
     split: str
@@ -94,12 +96,12 @@ class Truth:
 
 
 def shown(images: Tensor) -> Shown:
-    """What is compared of straight RGBA ``[V, H, W, 4]``."""
+    """The colours and masks that are compared, of straight RGBA ``[V, H, W, 4]``."""
     return over_background(images, WHITE), images[..., 3] > 0.5
 
 
 def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
-    """The input view first, then ``wanted - 1`` others evenly spaced (all of them for None).
+    """Chooses views: the input first, then ``wanted - 1`` others evenly spaced (None: all).
 
     Raises:
         UserError: there is no view ``reference``.
@@ -114,27 +116,32 @@ def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
 
 
 def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: str) -> Truth:
-    """Loads one object's views and moves the cameras. Raises UserError."""
+    """Loads one object's views, with cameras in the input camera's world.
+
+    Args:
+        dataset: where the views come from.
+        uid: the object.
+        protocol: says which views, their size and the distance.
+        device: torch device of the result.
+
+    Raises:
+        UserError: there is no such view, or a file cannot be read.
+    """
     views = choose_views(dataset.num_views(uid), protocol.reference, protocol.views)
     loaded = dataset.load(uid, views=views, size=protocol.size)
-    viewmats, _ = relative_to_reference(
-        loaded.cameras.viewmats, loaded.cameras.viewmats[0], protocol.distance
-    )
-    cameras = Cameras(viewmats, loaded.cameras.Ks, loaded.cameras.width, loaded.cameras.height)
+    cameras = relative_cameras(loaded.cameras, protocol.distance)
     return Truth(uid, loaded.images.to(device), cameras.to(device), views)
 
 
 def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
-    """RGB ``[V, H, W, 3]`` on white, clipped to [0, 1], and mask ``[V, H, W]`` bool."""
-    from gamba_warp.render import render
-
+    """Renders RGB ``[V, H, W, 3]`` on white, clipped to [0, 1], and masks ``[V, H, W]`` bool."""
     with torch.no_grad():
         out = render(gaussians, cameras, background=cameras.viewmats.new_full((3,), WHITE))
     return out.rgb.clamp(0, 1), out.alpha[..., 0] > 0.5
 
 
 def compare(candidates: dict[str, Shown], truth: Truth) -> dict[str, list[Values]]:
-    """PSNR, SSIM and mask IoU of each view for each candidate; LPIPS is None."""
+    """Computes PSNR, SSIM and mask IoU of each view for each candidate; LPIPS is None yet."""
     result: dict[str, list[Values]] = {}
     for name, (rgb, mask) in candidates.items():
         values = {
@@ -151,10 +158,10 @@ def compare(candidates: dict[str, Shown], truth: Truth) -> dict[str, list[Values
 def add_lpips(
     values: dict[str, list[Values]], candidates: dict[str, Shown], truth: Truth, lpips: LPIPS
 ) -> None:
-    """Puts LPIPS into what ``compare`` returned.
+    """Adds LPIPS to what ``compare`` returned.
 
-    Nearly all the time goes into features. They are computed once for the truth, and once for a
-    candidate that shows every view the same picture (an expanded tensor).
+    Nearly all the time goes into the features. They are computed once for the truth, and once for
+    a candidate that shows the same picture (an expanded tensor) in every view.
     """
     fixed = {
         name: lpips.features(rgb[0]) for name, (rgb, _) in candidates.items() if not rgb.stride(0)
@@ -170,5 +177,5 @@ def add_lpips(
 
 def summary(views: list[Values]) -> dict[str, Any]:
     """Means over the novel views (None without any), and the input view (the first) apart."""
-    novel = mean_of(views[1:]) if len(views) > 1 else dict.fromkeys(METRICS)
+    novel: dict[str, Any] = mean_of(views[1:]) if len(views) > 1 else dict.fromkeys(METRICS)
     return {**novel, "input": views[0]}

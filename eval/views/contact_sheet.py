@@ -24,7 +24,7 @@ class Row:
     Attributes:
         lines: its label.
         shown: the input picture ``[H, W, 3]`` in [0, 1].
-        truth: k true views ``[k, H, W, 3]``.
+        truth: true views ``[k, H, W, 3]`` in [0, 1].
         predicted: the same views as predicted.
     """
 
@@ -35,9 +35,10 @@ class Row:
 
 
 def choose_ranks(count: int, each: int) -> dict[int, str]:
-    """Labels by rank, 0 being the best: ``each`` of the best, about the median, and of the worst.
+    """Chooses ranks, of which 0 is the best: ``each`` of the best, the median and the worst.
 
-    An object that is in two groups is listed once; of few objects all are listed.
+    Returns:
+        Labels by rank. An object that is in two groups is listed once; of few objects all are.
     """
     middle = max(0, (count - each) // 2)
     groups = {
@@ -69,8 +70,8 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
     for number, row in enumerate(rows):
         top = _HEADER + number * step
         for k, line in enumerate(row.lines):
-            bold = (0, 0, 0) if k == 0 else (80, 80, 80)
-            draw.text((6, top + 4 + k * _LINE), line, fill=bold, font=font)
+            grey = (0, 0, 0) if k == 0 else (80, 80, 80)
+            draw.text((6, top + 4 + k * _LINE), line, fill=grey, font=font)
         for start, pictures in zip(starts, (row.shown[None], row.truth, row.predicted)):
             for k, picture in enumerate(pictures):
                 sheet.paste(_tile(picture), (start + k * step, top))

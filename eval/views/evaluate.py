@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,84 +12,47 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gamba_warp.data.dataset import ViewDataset, open_dataset
-from gamba_warp.data.vgg_weights import FETCH, lpips_available
-from gamba_warp.errors import UserError
-from gamba_warp.files import output_folder
+from gamba_warp.files import atomic_path, output_folder
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
-from gamba_warp.model.lpips import LPIPS, load_lpips
+from gamba_warp.versions import __version__, installed
 
-from ..report import OK, check_finite, failure, make_report, mean_of, versions
-from .baselines import MEANING, Baseline, Retrieval, background, billboard, input_copy
-from .compare import (
-    Shown,
-    Truth,
-    ViewsProtocol,
-    add_lpips,
-    choose_views,
-    compare,
-    load_truth,
-    render_views,
-    summary,
-)
-from .contact_sheet import RULE, Row, choose_ranks
-from .predictions import Predictions
-from .table import differences_of, table_of
+from ..report import OK, check_finite, failure, make_report, mean_of, save_report
+from .baselines import MEANING
+from .compare import Truth, add_lpips, choose_views, compare, load_truth, render_views, summary
+from .contact_sheet import RULE, Row, choose_ranks, contact_sheet
+from .job import ERRORS, Job, open_job
+from .options import ViewsOptions
+from .table import differences_of, page, table_of
 
 SHEET_VIEWS = 4  # novel views of an object in the contact sheet
-_ERRORS = (UserError, ValueError, RuntimeError, ArithmeticError)
 
 
-@dataclass
-class Job:
-    """What is the same for every object.
+def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
+    """Evaluates the objects that the options name, and writes the report's files.
 
-    Attributes:
-        predictions: what is under test.
-        dataset: true views.
-        protocol: what the numbers mean.
-        network: of LPIPS, or None.
-        device: torch device.
-        baselines: by name.
-        left_out: reasons by name, of baselines that cannot be had.
-        failures: ``{name, reason}`` of what failed beside objects.
+    Returns:
+        The report: what ``report_of`` returns, and ``interrupted``: whether Ctrl-C ended it.
+
+    Raises:
+        UserError: something cannot be opened or written.
     """
-
-    predictions: Predictions
-    dataset: ViewDataset
-    protocol: ViewsProtocol
-    network: LPIPS | None
-    device: str
-    baselines: dict[str, Baseline] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)
-    failures: list[dict[str, str]] = field(default_factory=list)
-
-    def predict(self, truth: Truth) -> Gaussians:
-        """What is under test. Raises UserError where there is nothing."""
-        return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
-
-    def fail(self, name: str, error: Exception) -> None:
-        """Notes a failure beside those of objects."""
-        self.failures.append({k: v for k, v in failure(name, error).items() if k != "status"})
-
-    def shown(self, truth: Truth) -> dict[str, Shown]:
-        """What each baseline shows; one that fails is noted and does not stop the others."""
-        result = {}
-        for name, baseline in self.baselines.items():
-            try:
-                pictures = baseline(truth)
-            except _ERRORS as error:
-                self.fail(f"{truth.uid} ({name})", error)
-                continue
-            if pictures is not None:
-                result[name] = pictures
-        return result
+    job, folder = open_job(options), options.out
+    if folder:
+        (folder / "contact_sheet.png").unlink(missing_ok=True)  # that of an earlier run
+    objects, interrupted = evaluate(job, options)
+    report = report_of(job, options.data, objects) | {"interrupted": interrupted}
+    if folder:
+        save_report(report, folder)
+        with atomic_path(folder / "table.md") as temporary:
+            temporary.write_text(page(report))
+        if options.sheet and report["num_ok"] and not interrupted:
+            contact_sheet(folder / "contact_sheet.png", sheet_rows(job, objects, options.sheet))
+    return report
 
 
 def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
-    """Rows of input | prediction | truth, ``count`` views evenly spaced, the input first."""
+    """Writes rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
     rows = choose_views(len(rgb), 0, count)
     strips = [torch.cat([truth.rgb[0], rgb[row], truth.rgb[row]], 1) for row in rows]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -99,13 +62,16 @@ def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
 def evaluate_object(
     job: Job, uid: str, strips: Path | None = None, save: Path | None = None
 ) -> dict[str, Any]:
-    """One object's record, with those of its baselines in it.
+    """Evaluates one object and its baselines.
 
     Args:
         job: what to do.
         uid: the object.
-        strips: folder for its comparison picture.
-        save: folder for its Gaussians.
+        strips: folder for its comparison picture, or None.
+        save: folder for its Gaussians, or None.
+
+    Returns:
+        The object's record, with those of its baselines in it.
 
     Raises:
         UserError: a file cannot be read or written, or a number is not finite.
@@ -144,18 +110,28 @@ def evaluate_object(
     }
 
 
-def evaluate(
-    job: Job, uids: list[str], folder: Path | None, strips: int, save: bool
-) -> tuple[list[dict[str, Any]], bool]:
-    """Records of the objects, and whether Ctrl-C ended it after the first and before the last."""
+def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], bool]:
+    """Evaluates the job's objects.
+
+    Args:
+        job: what to do.
+        options: say which files are written for each object.
+
+    Returns:
+        The records, and whether Ctrl-C ended it after the first object and before the last.
+
+    Raises:
+        KeyboardInterrupt: there is no record yet.
+    """
     objects: list[dict[str, Any]] = []
-    kept = output_folder(folder / "gaussians") if folder and save else None
+    folder = options.out
+    saved = output_folder(folder / "gaussians") if folder and options.save_gaussians else None
     try:
-        for number, uid in enumerate(tqdm(uids, unit="object", disable=None)):
-            where = folder / "strips" if folder and number < strips else None
+        for number, uid in enumerate(tqdm(job.uids, unit="object", disable=None)):
+            strips = folder / "strips" if folder and number < options.strips else None
             try:
-                objects.append(evaluate_object(job, uid, where, kept))
-            except _ERRORS as error:
+                objects.append(evaluate_object(job, uid, strips, saved))
+            except ERRORS as error:
                 objects.append(failure(uid, error))
     except KeyboardInterrupt:
         if not objects:
@@ -165,7 +141,13 @@ def evaluate(
 
 
 def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
-    """Rows of the contact sheet; predicts the chosen objects again, so that none is kept."""
+    """Rows of the contact sheet; the chosen objects are predicted again, so that none is kept.
+
+    Args:
+        job: what to do.
+        records: of all objects.
+        each: number of objects in each group (best, median, worst).
+    """
 
     def score(record: dict[str, Any]) -> float:
         return record["input"]["psnr"] if record["psnr"] is None else record["psnr"]
@@ -189,8 +171,18 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
     return rows
 
 
-def report_of(job: Job, data: Path, uids: list[str], objects: list[dict[str, Any]]) -> dict:
-    """The report: of every report, and ``baselines, left_out, table`` and ``differences``."""
+def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, Any]:
+    """The report: what ``make_report`` returns, and entries for the baselines.
+
+    Args:
+        job: what was done.
+        data: the dataset, whose name the report holds.
+        objects: the records.
+
+    Returns:
+        Besides, ``baselines`` (their means), ``left_out_baselines`` (reasons by name), and the
+        rows ``table`` and ``differences`` of ``table.md``.
+    """
     done = [record for record in objects if record["status"] == OK]
     model = {record["name"]: record for record in done}
     others = {
@@ -202,15 +194,15 @@ def report_of(job: Job, data: Path, uids: list[str], objects: list[dict[str, Any
     protocol = asdict(job.protocol) | {
         "source": job.predictions.source,
         "data": data.name,
-        "uids": uids,
-        "uids_sha256": hashlib.sha256("\n".join(uids).encode()).hexdigest(),
+        "uids": job.uids,
+        "uids_sha256": hashlib.sha256("\n".join(job.uids).encode()).hexdigest(),
         "baselines": {name: MEANING[name] for name in job.baselines},
         "contact_sheet": RULE,
     }
     report = make_report(
         protocol,
         objects,
-        versions("torch", "kornia"),
+        {"gamba_warp": __version__} | installed("torch", "kornia"),
         left_out=("baselines",),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},
         left_out_baselines=left_out,
@@ -219,24 +211,3 @@ def report_of(job: Job, data: Path, uids: list[str], objects: list[dict[str, Any
     )
     report["failures"] += job.failures
     return report
-
-
-def lpips_or_reason(wanted: bool, device: str) -> tuple[LPIPS | None, str | None]:
-    """LPIPS on a device, or None and why there is none."""
-    if not wanted:
-        return None, "not asked for"
-    if lpips_available():
-        return load_lpips().to(device), None
-    return None, f"no weights; fetch them with: {FETCH}"
-
-
-def add_baselines(job: Job, data: Path) -> None:
-    """The four that need no fit; the retrieval where there is a training split."""
-    job.baselines |= {"background": background, "input_copy": input_copy, "billboard": billboard}
-    try:
-        job.baselines["retrieval"] = retrieval = Retrieval(open_dataset(data, "train"))
-    except UserError as error:
-        job.left_out["retrieval"] = str(error)
-        return
-    for uid, reason in retrieval.failures.items():
-        job.fail(f"{uid} (retrieval)", UserError(reason))

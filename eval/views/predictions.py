@@ -1,4 +1,4 @@
-"""Where the Gaussians under test come from: a checkpoint, or a folder of ``.ply`` files."""
+"""The Gaussians under test: those of a checkpoint, or of a folder of ``.ply`` files."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
-from gamba_warp.cameras import Cameras, relative_to_reference
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.images import over_background
+from gamba_warp.model.checkpoint import FILE_NAME, load_model
+from gamba_warp.model.posing import posed_input
 
 
 class Predictions(ABC):
@@ -22,8 +22,8 @@ class Predictions(ABC):
 
     Attributes:
         distance: of the reference camera from the origin of that world, object units.
-        source: what is under test, for the report: kind, name and SHA-256 of the file, or of the
-            names and SHA-256s of a folder's files.
+        source: what is under test, for the report: its kind, its name, and the SHA-256 of the file,
+            or of the names and SHA-256s of a folder's files.
     """
 
     distance: float
@@ -31,7 +31,16 @@ class Predictions(ABC):
 
     @abstractmethod
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
-        """One object's Gaussians (no batch dimension). Raises UserError where there are none."""
+        """Returns one object's Gaussians (no batch dimension).
+
+        Args:
+            dataset: that the object belongs to.
+            uid: the object.
+            reference: index of the input view.
+
+        Raises:
+            UserError: there are none, or a file cannot be read.
+        """
 
 
 class PlyPredictions(Predictions):
@@ -53,8 +62,6 @@ class ModelPredictions(Predictions):
     """A checkpoint, shown the reference view alone."""
 
     def __init__(self, path: Path, device: str, encoder_weights: Path | None) -> None:
-        from gamba_warp.model.checkpoint import FILE_NAME, load_model
-
         self.model, self.device = load_model(path, device, encoder_weights), device
         self.distance = self.model.config.distance
         file = path / FILE_NAME if path.is_dir() else path
@@ -65,26 +72,20 @@ class ModelPredictions(Predictions):
         """Runs the model on the reference view, on the model's own background."""
         config = self.model.config
         views = dataset.load(uid, views=[reference], size=config.image_size)
-        images = over_background(views.images, config.background_color)
-        viewmats, _ = relative_to_reference(
-            views.cameras.viewmats, views.cameras.viewmats[0], self.distance
-        )
-        cameras = Cameras(viewmats, views.cameras.Ks, views.cameras.width, views.cameras.height).to(
-            self.device
-        )
-        return self.model(images.to(self.device), cameras)[0]
+        images, cameras = posed_input(views, config)
+        return self.model(images.to(self.device), cameras.to(self.device))[0]
 
 
 def open_predictions(
     path: Path, distance: float, device: str, encoder_weights: Path | None = None
 ) -> Predictions:
-    """A folder with ``.ply`` files, else a checkpoint.
+    """Opens a folder with ``.ply`` files, else a checkpoint.
 
     Args:
-        path: what the user gave.
+        path: the folder or the checkpoint.
         distance: of the reference camera, for ``.ply`` files; a checkpoint states its own.
         device: torch device.
-        encoder_weights: see ``load_model``.
+        encoder_weights: as for ``load_model``.
 
     Raises:
         UserError: there is nothing, or the checkpoint cannot be read.

@@ -14,7 +14,7 @@ _DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "mask_iou": 3}
 
 
 def _row(kind: str, name: str, records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Means and intervals of one candidate; None where no object has such views."""
+    """The means and intervals of one candidate; None where no object has such views."""
     values = [record["input"] if kind == "input" else record for record in records]
     values = [{key: value[key] for key in METRICS} for value in values]
     values = [value for value in values if value["psnr"] is not None]
@@ -26,7 +26,7 @@ def _row(kind: str, name: str, records: list[dict[str, Any]]) -> dict[str, Any] 
 
 
 def table_of(candidates: dict[str, Records]) -> list[dict[str, Any]]:
-    """Rows ``{views, name, objects, psnr: {mean, interval}, …}``: novel views, then the input's."""
+    """Rows ``{views, name, objects, psnr: {mean, interval}, …}``, novel views before the input."""
     rows = [
         _row(kind, name, list(records.values()))
         for kind in KINDS
@@ -36,7 +36,7 @@ def table_of(candidates: dict[str, Records]) -> list[dict[str, Any]]:
 
 
 def differences_of(model: Records, baselines: dict[str, Records]) -> list[dict[str, Any]]:
-    """Rows as of ``table_of``: the model's value minus the baseline's, over objects with both."""
+    """Rows like ``table_of``'s: the model's value minus the baseline's, over objects with both."""
     rows = []
     for kind in KINDS:
         for name, records in baselines.items():
@@ -68,8 +68,8 @@ def markdown(rows: list[dict[str, Any]], signed: bool = False) -> str:
     """The rows as a Markdown table whose columns are aligned in plain text too.
 
     Args:
-        rows: as of ``table_of``.
-        signed: write a plus before positive means.
+        rows: those of ``table_of`` or ``differences_of``.
+        signed: whether positive means get a plus sign.
     """
     sign = "+" if signed else ""
     lines = [["views", "", "objects", *_LABELS.values()]]
@@ -83,7 +83,7 @@ def markdown(rows: list[dict[str, Any]], signed: bool = False) -> str:
 
 
 def page(report: dict[str, Any]) -> str:
-    """The whole of ``table.md``, from a report of ``eval-views``."""
+    """The text of ``table.md``, from a report of ``eval-views``."""
     parts = [markdown(report["table"])]
     if report["differences"]:
         parts += ["Differences, object by object:", markdown(report["differences"], signed=True)]

@@ -2,30 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
-import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Iterable
 
-import imageio_ffmpeg
-import torch
-import warp as wp
-
-from ..cameras import Cameras, intrinsics, orbit
-from ..data.vgg_weights import FETCH, lpips_available
-from ..data.weights import cache_folder
-from ..gaussians import Gaussians
-from ..kernels.selective_scan import selective_scan
-from ..model.checkpoint import DEFAULT_CHECKPOINT
-from ..open3d import import_open3d
-from ..render import render
-from ..versions import __version__
-
-_PACKAGES = (
-    *("torch", "warp-lang", "numpy", "pillow", "safetensors", "timm", "kornia", "scikit-image"),
-    *("trimesh", "pymeshlab", "open3d-cpu", "open3d", "imageio-ffmpeg", "tyro"),
-)
+from ..versions import used_versions
 
 
 def doctor_command(warm_up: bool = False) -> int:
@@ -34,116 +13,26 @@ def doctor_command(warm_up: bool = False) -> int:
     Args:
         warm_up: Also compile the kernels for this machine's devices, and print the time.
     """
-    wp.config.quiet = True
-    faults = 0
-    for title, lines in (("Versions", versions()), ("Devices", devices()), ("Folders", folders())):
-        print(title)
-        for name, value in lines:
-            print(f"  {name:<18} {value}")
-    print("Can run")
-    for name, value, fault in abilities():
-        print(f"  {name:<18} {value}")
-        faults += fault
+    import warp
+
+    from ..measure import health
+
+    warp.config.log_level = warp.LOG_WARNING
+    _print("Versions", used_versions().items())
+    _print("Devices", health.devices())
+    _print("Folders", health.folders())
+    abilities = list(health.abilities())
+    _print("Can run", ((name, value) for name, value, _ in abilities))
     if warm_up:
         print("Kernels")
-        for device in ["cpu", "cuda"][: 1 + torch.cuda.is_available()]:
-            first, again = warm_up_kernels(device)
+        for device, first, again in health.warm_up_kernels():
             print(f"  {device:<18} {first:.1f} s to compile or load, then {1000 * again:.0f} ms")
     else:
         print("Kernels compile on first use; 'gamba doctor --warm-up' does it now")
-    return 1 if faults else 0
+    return 1 if any(fault for _, _, fault in abilities) else 0
 
 
-def versions() -> Iterator[tuple[str, str]]:
-    """Yields name and version of everything that decides what is run."""
-    yield "gamba_warp", __version__
-    yield "python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    for name in _PACKAGES:
-        try:
-            yield name, importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            if not name.startswith("open3d"):  # one of its two packages is enough
-                yield name, "not installed"
-
-
-def devices() -> Iterator[tuple[str, str]]:
-    """Yields the devices that torch can compute on."""
-    yield "cpu", f"{torch.get_num_threads()} threads"
-    for index in range(torch.cuda.device_count()):
-        properties = torch.cuda.get_device_properties(index)
-        memory = properties.total_memory / 2**30
-        architecture = f"sm_{properties.major}{properties.minor}"
-        yield f"cuda:{index}", f"{properties.name}, {memory:.0f} GiB, {architecture}"
-    if not torch.cuda.is_available():
-        yield "cuda", "none"
-
-
-def folders() -> Iterator[tuple[str, str]]:
-    """Yields where compiled kernels and fetched weights are kept, with their size."""
-    wp.init()
-    places = {"compiled kernels": Path(wp.config.kernel_cache_dir), "weights": cache_folder()}
-    for name, path in places.items():
-        size = sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) / 2**20
-        yield name, f"{path} ({size:.0f} MiB)"
-
-
-def abilities() -> Iterator[tuple[str, str, bool]]:
-    """Yields each thing the package does, what is there or missing, and whether that is a fault.
-
-    Weights that have to be fetched or trained are no fault; a library that does not work is one.
-    """
-    working = {"open3d": _open3d, "mp4": imageio_ffmpeg.get_ffmpeg_exe}
-    for name, check in working.items():
-        try:
-            check()
-            yield name, "yes", False
-        except Exception as error:  # a broken installation raises anything: that is what to tell
-            yield name, f"no: {(str(error) or type(error).__name__).splitlines()[0]}", True
-    there = DEFAULT_CHECKPOINT.is_file()
-    missing = "no starter model here; give --checkpoint, or train with 'gamba demo'"
-    yield "reconstruct", "yes" if there else missing, False
-    yield "lpips", "yes" if lpips_available() else f"no weights here; '{FETCH}' fetches them", False
-    yield "sam", "with --sam CHECKPOINT; only busy backgrounds need it", False
-
-
-def _open3d() -> None:
-    import_open3d().geometry.TriangleMesh.create_box()
-
-
-def warm_up_kernels(device: str) -> tuple[float, float]:
-    """Runs scan and rasterizer forward and backward on small inputs, twice.
-
-    Returns:
-        Seconds of the first run, which compiles or loads the kernels, and of the second.
-    """
-    seconds = []
-    for _ in range(2):
-        started = time.perf_counter()
-        _run_scan(device)
-        _run_rasterizer(device)
-        if device != "cpu":
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - started)
-    return seconds[0], seconds[1]
-
-
-def _run_scan(device: str) -> None:
-    u, delta, z = torch.rand(3, 1, 32, 32, device=device).requires_grad_()
-    a = -torch.rand(32, 16, device=device)
-    b, c = torch.rand(2, 1, 32, 16, device=device)
-    skip, bias = torch.rand(2, 32, device=device)
-    selective_scan(u, delta, a, b, c, skip, z, bias, delta_softplus=True).sum().backward()
-
-
-def _run_rasterizer(device: str) -> None:
-    n = 64
-    gaussians = Gaussians(
-        means=torch.rand(n, 3) - 0.5,
-        quats=torch.randn(n, 4),
-        scales=torch.full((n, 3), 0.05),
-        opacities=torch.full((n,), 0.5),
-        colors=torch.rand(n, 3),
-    ).to(device)
-    gaussians.means.requires_grad_()
-    cameras = Cameras(orbit(torch.tensor([0.0])), intrinsics(32, 32)[None], 32, 32).to(device)
-    render(gaussians, cameras).rgb.sum().backward()
+def _print(title: str, lines: Iterable[tuple[str, str]]) -> None:
+    print(title)
+    for name, value in lines:
+        print(f"  {name:<18} {value}")

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import tyro
 
-from ..data.dataset import open_dataset
+from ..batch import report
+from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
 from ..fitting.config import FitConfig, RasterizeMode
-from ..fitting.objects import FitJob, choose_objects, fit_object, write_report
 
 
 def fit_command(
@@ -30,55 +29,44 @@ def fit_command(
     size: int | None = None,
     rasterize_mode: RasterizeMode = "classic",
     seed: int = 0,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: DeviceChoice = "auto",
 ) -> int:
     """Fits Gaussians to the posed views of each object, without any model.
 
     Args:
         folder: One object (transforms.json and RGBA pictures), or a dataset of them.
         out: Folder for report.json, report.md, objects/, gaussians/ and strips/ (truth | fitted).
-        objects: Only these, by name.
-        split: Of the dataset.
-        limit: So many objects only, evenly spaced in the order of names.
-        held_out: Every so many-th view is kept from the fit and measured; 0 for none.
-        steps: Of Adam.
-        minutes: For each object at most; the learning rates then fall with the time.
-        gaussians: In each object.
+        objects: Names of the objects to fit; all if not given.
+        split: Part of the dataset.
+        limit: Number of objects to fit, evenly spaced in the order of names.
+        held_out: One view of so many is kept from the fit and measured; 0 keeps none.
+        steps: Number of Adam steps.
+        minutes: Time limit of each object; the learning rates then fall with the time.
+        gaussians: Number of Gaussians in each object.
         size: Height of the pictures; the files' own by default.
         rasterize_mode: Antialiased fits small pictures better, but files do not hold the mode, and
             most viewers (and eval-views) are classic.
-        seed: Of everything random.
-        device: Where to compute.
+        seed: Seed of all random numbers.
+        device: Device that computes; auto is the GPU if there is one.
     """
+    from ..data.dataset import open_dataset
+    from ..fitting.objects import FitJob, choose_objects, fit_objects
+
     _check(limit, held_out, steps, minutes, gaussians, size, seed)
-    where = pick_device(device)
+    chosen = pick_device(device)
     dataset = open_dataset(folder, split)
     uids = choose_objects(dataset.uids, objects, limit)
-    seconds = None if minutes is None else 60 * minutes
     config = FitConfig(
         gaussians=gaussians,
         steps=steps,
-        seconds=seconds,
+        seconds=None if minutes is None else 60 * minutes,
         rasterize_mode=rasterize_mode,
         seed=seed,
     )
-    job = FitJob(dataset, output_folder(out), config, held_out, size, where)
-    records: list[dict[str, Any]] = []
-    failures: list[dict[str, str]] = []
-    try:
-        for number, uid in enumerate(uids, 1):
-            try:
-                records.append(fit_object(job, uid, f"{number}/{len(uids)} {uid}"))
-            except (UserError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
-                lines = str(error).splitlines() or [type(error).__name__]
-                failures.append({"name": uid, "reason": lines[0].removeprefix(f"{uid}: ")})
-    finally:  # also when interrupted: what is finished counts
-        text = write_report(job, records, failures)
+    job = FitJob(dataset, output_folder(out), config, held_out, size, chosen)
+    text, failures = fit_objects(job, uids)
     print(text)
-    for item in failures:
-        print(f"gamba: failed: {item['name']}: {item['reason']}", file=sys.stderr)
-    print(f"{len(uids)} objects, {len(failures)} failures, results in {out}")
-    return 1 if failures else 0
+    return report(len(uids), "object", failures, out)
 
 
 def _check(limit, held_out, steps, minutes, gaussians, size, seed) -> None:

@@ -4,26 +4,16 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
-import torch
 import tyro
 
-from ..batch import for_each, report
-from ..data.preprocess import SamSegmenter, prepare
+from ..batch import for_each, report, unique_names
+from ..conventions import Axes, DeviceChoice
+from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
-from ..formats.ply import Frame
-from ..surfaces.files import MeshFormat
-
-if TYPE_CHECKING:
-    from ..model.gamba import Gamba
-from ..batch import unique_names
-from ..devices import pick_device
-from ..images import find_pictures
-from ..model.checkpoint import DEFAULT_CHECKPOINT
-from ..model.predict import reconstruct
-from ..pages.outputs import Format, Outputs, write_outputs
+from ..formats.names import GaussianFormat, MeshFormat
 
 
 def reconstruct_command(
@@ -32,7 +22,7 @@ def reconstruct_command(
     checkpoint: Path | None = None,
     encoder_weights: Path | None = None,
     out: Path = Path("out"),
-    formats: tuple[Format, ...] = ("ply",),
+    formats: tuple[GaussianFormat, ...] = ("ply",),
     mesh: tuple[MeshFormat, ...] = (),
     turntable: Literal["gif", "mp4", "none"] = "gif",
     size: int = 256,
@@ -40,9 +30,9 @@ def reconstruct_command(
     page: bool = True,
     mask: Path | None = None,
     sam: Path | None = None,
-    ply_frame: Frame = "opencv",
+    ply_frame: Axes = "opencv",
     min_opacity: float = 0.0,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: DeviceChoice = "auto",
 ) -> int:
     """Turns pictures of single objects into 3D Gaussians, one forward pass each.
 
@@ -61,8 +51,14 @@ def reconstruct_command(
         sam: Segment Anything checkpoint, for pictures with a busy background.
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
-        device: Where to compute.
+        device: Device that computes; auto is the GPU if there is one.
     """
+    from ..data.preprocess import SamSegmenter, prepare
+    from ..images import find_pictures
+    from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
+    from ..model.predict import reconstruct
+    from ..pages.outputs import Outputs, write_outputs
+
     if size < 16 or frames < 2:
         raise UserError("--size must be at least 16 and --frames at least 2")
     if not images:
@@ -72,10 +68,10 @@ def reconstruct_command(
         raise UserError(f"--mask goes with one picture, {len(pictures)} are given")
     if not pictures:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
-    where = pick_device(device)
-    checkpoint = checkpoint or DEFAULT_CHECKPOINT
-    model = _load(checkpoint, encoder_weights, where)
-    segmenter = None if sam is None else SamSegmenter(sam, where)
+    checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
+    _check_there(checkpoint)
+    model = load_model(checkpoint, chosen, encoder_weights)
+    segmenter = None if sam is None else SamSegmenter(sam, chosen)
     outputs = Outputs(
         folder=output_folder(out),
         formats=formats,
@@ -84,7 +80,7 @@ def reconstruct_command(
         size=size,
         frames=frames,
         page=page,
-        ply_frame=ply_frame,
+        axes=ply_frame,
         min_opacity=min_opacity,
         checkpoint=checkpoint,
     )
@@ -94,18 +90,16 @@ def reconstruct_command(
         started = time.perf_counter()
         gaussians = reconstruct(model, rgba).to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
-        write_outputs(name, rgba, gaussians.to(where), outputs, model.config, seconds)
+        write_outputs(name, rgba, gaussians.to(chosen), outputs, model.config, seconds)
 
-    failures += for_each(unique_names(pictures), one, "reconstruct", "picture")
+    for_each(unique_names(pictures), one, "reconstruct", "picture", failures)
     return report(len(pictures), "picture", failures, out)
 
 
-def _load(checkpoint: Path, encoder_weights: Path | None, device: torch.device) -> Gamba:
-    from ..model.checkpoint import load_model
-
+def _check_there(checkpoint: Path) -> None:
+    """Raises UserError, with a remedy, where there is no such file."""
     if not checkpoint.exists():
         raise UserError(
             f"{checkpoint}: no such checkpoint; train one with 'gamba train' or 'gamba demo', "
             "or give --checkpoint FILE"
         )
-    return load_model(checkpoint, device, encoder_weights)

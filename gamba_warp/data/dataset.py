@@ -1,4 +1,4 @@
-"""Posed views on disk: ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
+"""Posed views on disk; ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
 
 Layouts are described in ``layouts.py``. ``split.json`` in the root names the uids of ``train``,
 ``val`` and ``test``; where a uid is in none, ``split_of`` decides by the hash of its name.
@@ -32,10 +32,10 @@ class ObjectViews:
 
     Attributes:
         uid: the object's name within its dataset.
-        name: for people.
+        name: name for people.
         images: ``[V, H, W, 4]`` float32 RGBA in [0, 1], colour not premultiplied.
         cameras: V cameras, float32, in object units (the object's bounding cube has side 1).
-        depths: ``[V, H, W]`` float32 along the optical axis, 0 where nothing; or None.
+        depths: ``[V, H, W]`` float32 along the optical axis, 0 for the background; or None.
         attribution: creator, licence, source; may be empty.
     """
 
@@ -48,7 +48,7 @@ class ObjectViews:
 
 
 def split_of(key: str) -> str:
-    """The split (train 80 %, val 10 %, test 10 %) by the hash of the uid or its group alone."""
+    """Returns the split (train 80 %, val 10 %, test 10 %) by the hash of a uid or of its group."""
     part = int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "big") % 100
     return "train" if part < 80 else "val" if part < 90 else "test"
 
@@ -57,9 +57,9 @@ def write_split(folder: str | Path, groups: Mapping[str, str]) -> None:
     """Writes ``split.json`` into the dataset's root, atomically.
 
     Args:
-        folder: the root.
-        groups: uid -> group. Variants of one thing share a group, so that none is in the test
-            split while its twin is in train; an object on its own has its uid as group.
+        folder: root of the dataset.
+        groups: group by uid. All versions of one thing share a group, so that none is in the test
+            split while its twin is in train. An object on its own has its uid as group.
     """
     parts: dict[str, list[str]] = {name: [] for name in SPLITS}
     for uid in sorted(groups):
@@ -68,7 +68,7 @@ def write_split(folder: str | Path, groups: Mapping[str, str]) -> None:
 
 
 def _read_split(root: Path) -> dict[str, str]:
-    """The split of each uid, as ``split.json`` states it; empty without the file."""
+    """Reads the split of each uid that ``split.json`` states; without the file there is none."""
     path = root / "split.json"
     if not path.exists():
         return {}
@@ -89,16 +89,17 @@ def _read_split(root: Path) -> dict[str, str]:
 def open_dataset(
     folder: str | Path, split: str = "all", layout: str = "auto", cache: bool = False
 ) -> ViewDataset:
-    """Finds the objects under a folder; nothing is decoded yet.
+    """Finds the objects under a folder, without decoding anything yet.
 
     Args:
         folder: a dataset, or the folder of a single object.
         split: "all", "train", "val" or "test".
         layout: "auto", "transforms", "gobjaverse" or "openlrm".
-        cache: keep decoded views in memory, 8 bits a channel.
+        cache: whether decoded views are kept in memory, with 8 bits a channel.
 
     Raises:
-        UserError: no such folder, no objects in it, none in the split, or a bad ``split.json``.
+        UserError: the folder does not exist, holds no objects or none of the split, or its
+            ``split.json`` is bad.
     """
     root = Path(folder)
     if split not in ("all", *SPLITS):
@@ -124,11 +125,11 @@ def open_dataset(
 
 
 class ViewDataset:
-    """Objects with posed views. Make it with ``open_dataset``; safe to send to worker processes.
+    """Objects with posed views, made by ``open_dataset``; it may be sent to worker processes.
 
     Attributes:
-        uids: names of the objects, sorted: their paths under the root.
-        layout: the layout found.
+        uids: names of the objects, which are their paths under the root, sorted.
+        layout: layout of the folders.
     """
 
     def __init__(self, objects: dict[str, Path], layout: str, cache: bool) -> None:
@@ -136,7 +137,9 @@ class ViewDataset:
         self.layout = layout
         self._folders = objects
         self._files: dict[str, ObjectFiles] = {}
-        self._pictures: dict[tuple, np.ndarray] | None = {} if cache else None
+        # A path and a size give the picture, and the (width, height) of the file.
+        self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
+        self._pictures = {} if cache else None
 
     def __len__(self) -> int:
         return len(self.uids)
@@ -149,10 +152,10 @@ class ViewDataset:
         return self.uids[index]
 
     def files(self, index: int | str) -> ObjectFiles:
-        """Paths, poses and intrinsics of one object, read once.
+        """Returns paths, poses and intrinsics of one object, which are read once.
 
         Raises:
-            UserError: the object's camera files are missing or bad; names the file.
+            UserError: the object's camera files are missing or bad; the message names the file.
         """
         uid = self._uid(index)
         if uid not in self._files:
@@ -160,11 +163,11 @@ class ViewDataset:
         return self._files[uid]
 
     def num_views(self, index: int | str) -> int:
-        """V of one object. Raises as ``files``."""
+        """Returns V, the number of views of one object; the errors are those of ``files``."""
         return len(self.files(index).images)
 
     def check(self) -> dict[str, str]:
-        """Reasons by uid, for the objects whose cameras are bad or whose pictures are missing."""
+        """Returns reasons by uid, for objects with bad cameras or missing pictures."""
         bad = {}
         for uid in self.uids:
             try:
@@ -183,10 +186,10 @@ class ViewDataset:
 
         Args:
             index: position in ``uids``, or a uid.
-            views: which, in this order; None means all. Only these files are opened.
-            size: height of the returned pictures (the width follows); None keeps the files' size.
-                Area filter on premultiplied colour, so that no background bleeds in; depth takes
-                the nearest.
+            views: numbers of the views, in this order; None means all. Only their files are opened.
+            size: height of the returned pictures, whose width follows; None keeps the files' size.
+                Colour is premultiplied and area-filtered, so that no background bleeds in; depth
+                takes the nearest sample.
 
         Raises:
             UserError: a file is missing, broken, or not of the size that the cameras state.
@@ -228,7 +231,7 @@ class ViewDataset:
     def _view(
         self, files: ObjectFiles, view: int, size: int | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the size asked for."""
+        """Loads RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the size asked for."""
         path = files.images[view]
         key = (path, size)
         if self._pictures is not None and key in self._pictures:
@@ -253,13 +256,13 @@ def _resize(picture: np.ndarray, size: int | None) -> np.ndarray:
     if size is None or size == height:
         return picture
     new = (max(1, round(width * size / height)), size)
-    # PIL premultiplies RGBA by itself; its box filter is the exact area average.
+    # PIL premultiplies RGBA by itself, and its box filter is the exact area average.
     kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
     return np.asarray(Image.fromarray(picture).resize(new, kind))
 
 
 def _read_depth(path: Path, width: int, height: int) -> np.ndarray:
-    """``[height, width]`` float32, in the file's steps."""
+    """Reads depth ``[height, width]`` float32, in the steps of the file."""
     try:
         with Image.open(path) as image:
             if len(image.getbands()) != 1:

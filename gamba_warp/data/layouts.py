@@ -1,12 +1,13 @@
-"""The folder layouts of posed views that can be read, each to the same ``ObjectFiles``.
+"""The folder layouts of posed views that can be read; all give the same ``ObjectFiles``.
 
 - ``transforms``: ``<uid>/transforms.json`` as nerfstudio and Blender write it: ``w, h, fl_x, fl_y,
-  cx, cy`` (or ``camera_angle_x``), on top or per frame, and ``frames`` of ``file_path`` and
-  ``transform_matrix`` (camera to world, OpenGL). ``gamba data render`` writes this one.
+  cx, cy`` (or ``camera_angle_x``), for all frames or for each, and ``frames`` of ``file_path`` and
+  ``transform_matrix`` (camera to world, OpenGL). ``gamba data render`` writes this layout.
 - ``gobjaverse``: ``<uid>/campos_512_v4/NNNNN/NNNNN.png`` and ``.json``, whose ``x, y, z, origin``
-  are the camera's OpenCV axes and place in the world.
+  are the camera's OpenCV axes and position in the world.
 - ``openlrm``: ``<uid>/rgba/NNN.png``, ``pose/NNN.npy`` (3x4, camera to world, OpenGL) and
-  ``intrinsics.npy`` (3x2: focal lengths, principal point, width and height), world cube side 2.
+  ``intrinsics.npy`` (3x2: focal lengths, principal point, width and height); the world's cube has
+  side 2.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,7 +24,7 @@ import numpy as np
 from ..errors import UserError
 
 GOBJAVERSE = "campos_512_v4"
-GOBJAVERSE_FOCAL = 1422.222 / 1024  # of the picture's height, where the JSON states no x_fov
+GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON states no x_fov
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
@@ -32,20 +33,20 @@ class ObjectFiles:
     """Where the views of one object lie, and their cameras.
 
     Attributes:
-        images: V paths.
+        images: paths of the V pictures.
         camera_to_world: ``[V, 4, 4]`` float64, OpenGL frame, object units.
-        Ks: ``[V, 3, 3]`` float64 in pixels of ``sizes``, in fractions of the size where None.
-        sizes: V times (width, height) as the file states it, or None.
-        depths: V paths, or None.
+        Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
+        sizes: width and height of each of the V pictures as the file states them, or None.
+        depths: paths of the V depth pictures, or None.
         depth_unit: length of one step of the depth pictures, object units.
-        name: for people.
+        name: name for people.
         attribution: creator, licence, source; may be empty.
     """
 
     images: list[Path]
     camera_to_world: np.ndarray
     Ks: np.ndarray
-    sizes: list[tuple[int, int] | None]
+    sizes: Sequence[tuple[int, int] | None]
     depths: list[Path] | None = None
     depth_unit: float = 1.0
     name: str = ""
@@ -56,7 +57,7 @@ def read_json(path: Path) -> dict:
     """Reads a JSON object.
 
     Raises:
-        UserError: missing, not JSON, or not an object.
+        UserError: the file is missing, is not JSON, or holds no object.
     """
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
@@ -70,7 +71,7 @@ def read_json(path: Path) -> dict:
 
 
 def _pose(value: object, source: str) -> np.ndarray:
-    """A checked ``[4, 4]`` camera-to-world matrix from 3x4 or 4x4 nested numbers."""
+    """Makes a ``[4, 4]`` camera-to-world matrix from 3x4 or 4x4 nested numbers, and checks it."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -95,7 +96,7 @@ def _number(values: dict, key: str, source: str) -> float:
 
 
 def _intrinsics(frame: dict, top: dict, source: str) -> tuple[np.ndarray, tuple[int, int] | None]:
-    """K and the stated size of one frame; K is in fractions of the size where none is stated."""
+    """Reads K and the size of one frame; without a stated size K is in fractions of it."""
     values = {**top, **frame}
     for key in ("k1", "k2", "k3", "p1", "p2"):
         if values.get(key):
@@ -120,7 +121,7 @@ def _intrinsics(frame: dict, top: dict, source: str) -> tuple[np.ndarray, tuple[
 
 
 def _picture(folder: Path, name: object, source: str) -> Path:
-    """The frame's file; Blender leaves the suffix out."""
+    """Finds the frame's file, of whose name Blender leaves the suffix out."""
     if not isinstance(name, str) or not name:
         raise UserError(f"{source}: no file_path")
     path = folder / name
@@ -216,7 +217,7 @@ def _read_openlrm(folder: Path) -> ObjectFiles:
     return ObjectFiles(images, np.stack(poses), np.repeat(K[None], len(images), 0), sizes)
 
 
-# layout -> (the mark of an object's folder, reader)
+# Each layout has the name that marks an object's folder, and the folder's reader.
 LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
     "transforms": ("transforms.json", _read_transforms),
     "gobjaverse": (GOBJAVERSE, _read_gobjaverse),
@@ -225,9 +226,10 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], ObjectFiles]]] = {
 
 
 def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
-    """The layout's name and the objects' folders, sorted, at any depth; ``root`` itself may be one.
+    """Finds the layout's name and the objects' folders, sorted, at any depth.
 
-    ``layout`` "auto" means that of the first object met. Folders with a leading dot do not count.
+    ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
+    Folders with a leading dot are passed over.
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
     found = []

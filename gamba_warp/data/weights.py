@@ -18,7 +18,7 @@ from ..errors import UserError
 
 
 def cache_folder() -> Path:
-    """``$GAMBA_CACHE``, else ``~/.cache/gamba_warp``; it may not be there yet."""
+    """The folder ``$GAMBA_CACHE``, else ``~/.cache/gamba_warp``; it may not be there yet."""
     chosen = os.environ.get("GAMBA_CACHE")
     return Path(chosen).expanduser() if chosen else Path.home() / ".cache" / "gamba_warp"
 
@@ -33,10 +33,10 @@ def pip_download(requirement: str, digest: str, source: bool = False) -> Iterato
     Args:
         requirement: name and version, ``name==1.2.3``.
         digest: SHA-256 of the one archive or wheel that is right.
-        source: take the source archive, not a wheel.
+        source: whether the source archive is taken, and not a wheel.
 
     Yields:
-        The archive, in a temporary folder that goes when the context ends.
+        The archive, in a temporary folder that is removed when the context ends.
 
     Raises:
         UserError: pip is missing or fails; the message carries pip's own last line.
@@ -63,7 +63,7 @@ def pip_download(requirement: str, digest: str, source: bool = False) -> Iterato
 
 
 class _NumpyUnpickler(pickle.Unpickler):
-    """Knows dense arrays and nothing else, so a pickle can build no other object."""
+    """An unpickler that knows dense arrays only, so that a pickle can build no other object."""
 
     def find_class(self, module: str, name: str) -> Any:
         if name == "_reconstruct" and module.endswith("multiarray"):

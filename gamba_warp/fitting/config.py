@@ -15,26 +15,26 @@ class FitConfig:
 
     Attributes:
         gaussians: N, fixed throughout.
-        steps: of Adam; 0 returns the start.
-        seconds: where given, stop there if ``steps`` are not done; the learning rates then fall
-            with the time, so the result depends on the machine.
-        views: rendered in each step.
-        lr_means: first learning rate, object units a step.
-        lr_scales: of the logarithms.
-        lr_quats: of the quaternions.
-        lr_opacities: of the logits.
-        lr_colors: of the logits.
+        steps: number of Adam steps; 0 returns the start.
+        seconds: time limit, or None; the learning rates then fall with the time, so the result
+            depends on the machine.
+        views: number of views rendered in each step.
+        lr_means: first learning rate of the means, object units a step.
+        lr_scales: first learning rate of the scales' logarithms.
+        lr_quats: first learning rate of the quaternions.
+        lr_opacities: first learning rate of the opacities' logits.
+        lr_colors: first learning rate of the colours' logits.
         lr_end: the last learning rates as a share of the first; they fall exponentially.
-        weight_alpha: of the squared error of alpha, beside that of colour.
-        weight_l1: of the absolute error of colour.
+        weight_alpha: weight of the squared error of alpha; that of colour has the weight 1.
+        weight_l1: weight of the absolute error of colour.
         relocate_every: steps between relocations; 0 for none.
-        relocate_share: at most so much of the Gaussians at once.
-        relocate_until: none after this share of the steps.
+        relocate_share: largest share of the Gaussians that is relocated at once.
+        relocate_until: share of the steps after which none is relocated.
         min_weight: a Gaussian that has less blending weight than so many pixels in all views
             together is relocated.
-        rasterize_mode: what renders the Gaussians, here and later: files do not hold it, and most
-            viewers are classic; antialiased ones fit small pictures better.
-        seed: of everything random.
+        rasterize_mode: mode that renders the Gaussians. Files do not hold it, and most viewers are
+            classic; antialiased Gaussians fit small pictures better.
+        seed: seed of all random numbers.
     """
 
     gaussians: int = 8000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ..batch import for_each
 from ..cameras import Cameras, relative_to_reference
-from ..commands.doctor import versions
 from ..conventions import DEFAULT_DISTANCE
 from ..data.dataset import ObjectViews, ViewDataset
 from ..errors import UserError
@@ -22,6 +23,7 @@ from ..gaussians import Gaussians
 from ..image_metrics import psnr
 from ..images import over_background, save_image
 from ..render import render
+from ..versions import used_versions
 from .config import FitConfig
 from .optimize import fit
 
@@ -47,12 +49,12 @@ class FitJob:
     """What is the same for every object.
 
     Attributes:
-        dataset: where the views come from.
-        folder: for the results.
-        config: of the fit.
-        held_out: every so many-th view is held out; 0: none.
-        size: height of the pictures; None: the files' own.
-        device: where to compute.
+        dataset: source of the views.
+        folder: folder of the results.
+        config: settings of a fit.
+        held_out: one view of so many is held out, the last; 0 for none.
+        size: height of the pictures, pixels; None for the files' own.
+        device: device that computes.
     """
 
     dataset: ViewDataset
@@ -64,10 +66,15 @@ class FitJob:
 
 
 def choose_objects(uids: list[str], names: tuple[str, ...], limit: int | None) -> list[str]:
-    """The named ones, or all; of these ``limit``, evenly spaced (index ``⌊k · count / limit⌋``).
+    """Chooses the named objects, or all; of these ``limit``, evenly spaced.
+
+    Args:
+        uids: the objects there are.
+        names: those wanted, or none for all.
+        limit: at most so many, of index ``⌊k · count / limit⌋``; None for no limit.
 
     Raises:
-        UserError: a name is not among them.
+        UserError: a name is not among ``uids``.
     """
     unknown = [name for name in names if name not in uids]
     if unknown:
@@ -79,16 +86,25 @@ def choose_objects(uids: list[str], names: tuple[str, ...], limit: int | None) -
 
 
 def split_views(count: int, held_out: int) -> tuple[list[int], list[int]]:
-    """Views for the fit, and the last of every ``held_out`` in file order (5, 11, 17, 23 for 6)."""
+    """Splits views in file order: for the fit, and held out from it.
+
+    Args:
+        count: number of views.
+        held_out: the last of every so many is held out (5, 11, 17, 23 for 6); 0 for none.
+
+    Returns:
+        Indices of the views for the fit, and of those held out.
+    """
     kept = [v for v in range(count) if held_out and v % held_out == held_out - 1]
     return [v for v in range(count) if v not in kept], kept
 
 
 def load_views(job: FitJob, uid: str, fitted: list[int]) -> ObjectViews:
-    """Loads all views of one object.
+    """Loads all views of one object, those for the fit and those held out.
 
     Raises:
-        UserError: a file is bad, or the pictures of the ``fitted`` views are of no use.
+        UserError: a file is bad, or the ``fitted`` views are fewer than two, have no transparent
+            pixel or show nothing.
     """
     if len(fitted) < 2:
         raise UserError(f"{uid}: {len(fitted)} views to fit, at least 2 are needed")
@@ -101,8 +117,36 @@ def load_views(job: FitJob, uid: str, fitted: list[int]) -> ObjectViews:
     return views
 
 
-def fit_object(job: FitJob, uid: str, title: str) -> dict[str, Any]:
-    """Fits one object and writes its files; returns its record.
+def fit_objects(job: FitJob, uids: Sequence[str]) -> tuple[str, list[tuple[str, str]]]:
+    """Fits objects one after the other, and reports on all; one that fails stops no other.
+
+    The report is written also when the loop is interrupted, of what was finished.
+
+    Args:
+        job: what is fitted, and how.
+        uids: the objects' names.
+
+    Returns:
+        The summary as Markdown, and the objects that failed, each with the reason.
+    """
+    records: list[dict[str, Any]] = []
+    failures: list[tuple[str, str]] = []
+
+    def one(uid: str, _: str) -> None:
+        records.append(fit_object(job, uid))
+
+    try:
+        for_each({uid: uid for uid in uids}, one, "fit", "object", failures)
+    finally:
+        text = _write_report(job, records, failures)
+    return text, failures
+
+
+def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
+    """Fits one object and writes its files, with a progress bar.
+
+    Returns:
+        Its record, as ``objects/NAME.json`` holds it without the settings.
 
     Raises:
         UserError: its views cannot be used, or a file cannot be written.
@@ -113,7 +157,7 @@ def fit_object(job: FitJob, uid: str, title: str) -> dict[str, Any]:
     views = load_views(job, uid, fitted)
     images, cameras = views.images.to(job.device), views.cameras.to(job.device)
     wall, cpu = time.perf_counter(), time.process_time()
-    with tqdm(total=100, desc=title, unit="%", disable=None) as bar:
+    with tqdm(total=100, desc=uid, unit="%", leave=False, disable=None) as bar:
 
         def show(done: float, loss: float) -> None:
             bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
@@ -167,7 +211,7 @@ def _write_object(
     }
     for path in paths.values():
         output_folder(path.parent)
-    # where eval-views and eval-geometry expect predictions: in the input camera's world
+    # eval-views and eval-geometry expect predictions in the input camera's world.
     reference = cameras.viewmats[0]
     _, scale = relative_to_reference(cameras.viewmats[:1], reference)
     moved = gaussians.transformed(reference[:3, :3], reference.new_zeros(3), scale.item())
@@ -181,11 +225,13 @@ def _settings(job: FitJob) -> dict[str, Any]:
     return {
         "protocol": {**PROTOCOL, "held_out": job.held_out, "size": job.size},
         "settings": {**asdict(job.config), "device": job.device.type},
-        "versions": dict(versions()),
+        "versions": used_versions(),
     }
 
 
-def write_report(job: FitJob, records: list[dict[str, Any]], failures: list[dict[str, str]]) -> str:
+def _write_report(
+    job: FitJob, records: list[dict[str, Any]], failures: list[tuple[str, str]]
+) -> str:
     """Writes ``report.json`` and ``report.md``; returns the summary as Markdown."""
     summary = {}
     lines = ["| | mean | min | max |", "| --- | --- | --- | --- |"]
@@ -197,14 +243,15 @@ def write_report(job: FitJob, records: list[dict[str, Any]], failures: list[dict
         cells = " | ".join(form.format(value) for value in summary[key].values())
         lines.append(f"| {label} | {cells} |")
     text = "\n".join(lines) if summary else "no object was fitted"
-    report = {**_settings(job), "summary": summary, "objects": records, "failures": failures}
+    reasons = [{"name": name, "reason": reason} for name, reason in failures]
+    report = {**_settings(job), "summary": summary, "objects": records, "failures": reasons}
     write_json(job.folder / "report.json", report)
     table = ["| object | " + " | ".join(label for label, *_ in _TABLE) + " |"]
     table.append("| --- " * (len(_TABLE) + 1) + "|")
     for record in records:
         cells = [form.format(record[k]) if record[k] is not None else "" for _, k, form in _TABLE]
         table.append(f"| {record['name']} | " + " | ".join(cells) + " |")
-    table += ["", *(f"failed: {item['name']}: {item['reason']}" for item in failures)]
+    table += ["", *(f"failed: {name}: {reason}" for name, reason in failures)]
     with atomic_path(job.folder / "report.md") as temporary:
         temporary.write_text(f"{text}\n\n" + "\n".join(table).rstrip() + "\n")
     return text

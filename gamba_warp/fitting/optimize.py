@@ -25,7 +25,7 @@ from .config import MAX_SCALE, MIN_SCALE, FitConfig
 from .relocate import relocate, shares
 from .start import random_start
 
-_BETAS = (0.9, 0.99)  # a second moment that forgets in 100 steps: there are only hundreds
+_BETAS = (0.9, 0.99)  # the second moment forgets in 100 steps, because there are only hundreds
 
 
 @dataclass
@@ -34,8 +34,8 @@ class Fit:
 
     Attributes:
         gaussians: ``[N]``, in the world of the cameras.
-        losses: of each step taken.
-        relocated: how many Gaussians were moved, in all.
+        losses: the loss of each step taken.
+        relocated: number of Gaussians that were moved, in all steps together.
     """
 
     gaussians: Gaussians
@@ -44,7 +44,7 @@ class Fit:
 
 
 def activate(parameters: dict[str, Tensor]) -> Gaussians:
-    """Gaussians from what ``random_start`` returns."""
+    """Makes Gaussians of parameters as ``random_start`` returns them."""
     return Gaussians(
         means=parameters["means"],
         quats=parameters["quats"],
@@ -65,11 +65,12 @@ def fit(
     Args:
         images: ``[V, H, W, 4]`` float32 straight RGBA in [0, 1].
         cameras: V cameras on the same device; the object lies in the unit cube about the origin.
-        config: how.
+        config: settings of the fit.
         progress: called after each step with the share done in [0, 1] and the loss.
 
     Returns:
-        The same bits for the same seed, device and number of threads, unless ``config.seconds``.
+        The Gaussians. They have the same bits for the same seed, device and number of threads,
+        unless ``config.seconds`` limits the time.
 
     Raises:
         ValueError: no silhouette meets the unit cube.
@@ -79,7 +80,7 @@ def fit(
     parameters = random_start(images, cameras, config.gaussians, rng)
     rates = {name: getattr(config, f"lr_{name}") for name in parameters}
     groups = [{"params": [p.requires_grad_()], "name": name} for name, p in parameters.items()]
-    # gradients of single Gaussians are far below Adam's usual eps
+    # The gradients of single Gaussians are far below Adam's usual eps.
     optimizer = torch.optim.Adam(groups, betas=_BETAS, eps=1e-15)
     result = Fit(activate(parameters).detach(), [], 0)
     began, done, pending = time.perf_counter(), 0.0, []
@@ -117,7 +118,7 @@ def _step(
     rng: torch.Generator,
 ) -> float:
     """One step of Adam; returns the loss before it."""
-    # a background that changes tells a see-through object from one of the background's colour
+    # A background that changes tells a see-through object from one of the background's colour.
     backgrounds = torch.rand(len(images), 3, generator=rng, device=images.device)
     mode = config.rasterize_mode
     picture = render(activate(parameters), cameras, backgrounds, rasterize_mode=mode)

@@ -1,4 +1,4 @@
-"""Gaussians that hardly show are moved to where the pictures still differ."""
+"""Moves Gaussians that hardly show to where the pictures still differ."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def shares(
         gaussians: ``[N]``.
         images: ``[V, H, W, 4]``.
         cameras: V cameras.
-        mode: of ``rasterization``.
+        mode: the ``rasterize_mode`` of ``rasterization``.
 
     Returns:
-        Weight in pixels, and share in the squared error: two ``[N]``, over all views.
+        The weight in pixels and the share in the squared error, each ``[N]``, over all views.
     """
     gaussians = gaussians.detach()
     gaussians.colors.requires_grad_()
@@ -52,20 +52,20 @@ def relocate(
 ) -> int:
     """Moves Gaussians of too little weight onto others, drawn by their share in the error.
 
-    The ones moved become copies, set off by a draw from the Gaussian itself. All copies of one
-    together are about as opaque as it was (Kheradmand et al. 2024, with a fixed shrinking of the
-    scales) and start with empty moments.
+    Those that are moved become copies, set off by a random draw from the Gaussian itself. All
+    copies of one together are about as opaque as it was (Kheradmand et al. 2024, with a fixed
+    shrinking of the scales), and their moments in Adam start at 0.
 
     Args:
-        parameters: changed in place.
-        optimizer: of the parameters; its state is changed in place.
+        parameters: as ``random_start`` returns them; changed in place.
+        optimizer: the parameters' Adam; its state is changed in place.
         weight: ``[N]``, see ``shares``.
         error: ``[N]``, see ``shares``.
-        config: ``min_weight`` and ``relocate_share``.
-        rng: on the parameters' device.
+        config: settings of the fit; ``min_weight`` and ``relocate_share`` count here.
+        rng: generator on the parameters' device.
 
     Returns:
-        How many were moved.
+        The number of Gaussians that were moved.
     """
     order = weight.argsort()
     least = order[: int(config.relocate_share * len(order))]

@@ -1,4 +1,4 @@
-"""Where a fit begins: random points in the visual hull of the pictures."""
+"""The start of a fit: random points in the visual hull of the pictures."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def sample_views(images: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
 def visual_hull(alphas: Tensor, cameras: Cameras, grid: int = HULL_GRID) -> Tensor:
     """The voxels of the unit cube about the origin that project into the object in every view.
 
-    Where no voxel does (one picture is empty, or the poses are a little off), those that do so in
-    the most views.
+    If no voxel does (one picture is empty, or the poses are a little off), the hull has those that
+    do so in the most views.
 
     Args:
         alphas: ``[V, H, W]`` in [0, 1].
@@ -57,7 +57,7 @@ def visual_hull(alphas: Tensor, cameras: Cameras, grid: int = HULL_GRID) -> Tens
     votes = torch.zeros(len(points), device=alphas.device)
     for view in range(len(alphas)):
         part = slice(view, view + 1)
-        # below one half, so that bars of a pixel's width stay
+        # The limit is below one half, so that bars of a pixel's width stay.
         votes += sample_views(alphas[part, ..., None], cameras[part], points)[0, :, 0] > 0.25
     most = votes.max()
     if most == 0:
@@ -68,22 +68,23 @@ def visual_hull(alphas: Tensor, cameras: Cameras, grid: int = HULL_GRID) -> Tens
 def random_start(
     images: Tensor, cameras: Cameras, num: int, rng: torch.Generator
 ) -> dict[str, Tensor]:
-    """Parameters before activation: random points in the hull, half of them in its outer voxels.
+    """Parameters before activation, of random points in the hull.
 
-    Concave parts lie inside the hull, hence the other half. Colours are the views' mean.
+    Half of them are in its outer voxels; the others are anywhere in it, because concave parts of an
+    object lie inside the hull. Colours are the views' mean.
 
     Args:
         images: ``[V, H, W, 4]`` straight RGBA in [0, 1].
         cameras: V cameras.
-        num: N.
-        rng: on the images' device.
+        num: number N of Gaussians.
+        rng: generator on the images' device.
 
     Returns:
         ``means [N, 3]``, ``quats [N, 4]``, ``scales [N, 3]`` (logarithms), ``opacities [N]`` and
         ``colors [N, 3]`` (logits).
 
     Raises:
-        ValueError: see ``visual_hull``.
+        ValueError: no voxel projects into any silhouette.
     """
     device = images.device
     hull = visual_hull(images[..., 3], cameras)
@@ -98,7 +99,8 @@ def random_start(
     rgba = sample_views(images, cameras, means)
     weights = rgba[..., 3:].clamp_min(1e-3)
     colors = (rgba[..., :3] * weights).sum(0) / weights.sum(0)
-    # half the side of the square that each would have to itself, were all spread over the surface
+    # This is half the side of the square that each would have to itself if all were spread over
+    # the surface.
     scale = 0.5 * (len(shell) / num) ** 0.5 / HULL_GRID
     scale = min(max(scale, 2 * MIN_SCALE), 0.5 * MAX_SCALE)
     return {

@@ -63,7 +63,7 @@ def save_glb(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0
         )
         parts.append(part.tobytes())
         offset += part.nbytes
-    # Bounds of the rounded values, which the format asks for on POSITION.
+    # The format asks for bounds of POSITION, of the values as they are rounded.
     means = attributes["POSITION"].astype("<f4")
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
     primitive = {
@@ -87,7 +87,7 @@ def save_glb(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0
 
 
 def _container(document: dict, binary: bytes) -> bytes:
-    """The GLB container: header, JSON chunk padded with spaces, BIN chunk of whole float32."""
+    """The GLB container: a header, a JSON chunk padded with spaces, and a BIN chunk of float32."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text

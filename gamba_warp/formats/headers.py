@@ -13,9 +13,8 @@ from typing import BinaryIO
 import numpy as np
 
 from ..errors import UserError
-from .ply import ORDERS, TYPES
+from .ply_header import ORDERS, PlyElement, read_ply_header
 
-MAX_HEADER = 1 << 16
 SLACK = 2  # bytes after the end: a line end
 GLB_JSON, GLB_START = 0x4E4F534A, 12
 
@@ -50,107 +49,64 @@ def _compare(path: Path, says: str, wanted: int, there: int, exact: bool = True)
         raise UserError(f"{path}: false header, {says} take {wanted} bytes but {there} follow")
 
 
-def ply_elements(path: Path, lines: list[bytes]) -> list[tuple[str, int, list[list[str]]]]:
-    """``(name, count, properties as words)`` of each element of a ``.ply`` header.
-
-    Raises:
-        UserError: a line is not understood.
-    """
-    elements: list[tuple[str, int, list[list[str]]]] = []
-    for line in lines:
-        words = line.decode("ascii", "replace").split()
-        if words[:1] == ["element"]:
-            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 18:
-                raise UserError(f"{path}: the .ply header says '{' '.join(words)}'")
-            elements.append((words[1], int(words[2]), []))
-        elif words[:1] == ["property"]:
-            kinds = words[2:4] if words[1:2] == ["list"] else words[1:2]
-            if not elements or len(words) < 3 or any(kind not in TYPES for kind in kinds):
-                raise UserError(f"{path}: the .ply header says '{' '.join(words)}'")
-            elements[-1][2].append(words)
-    return elements
-
-
-def ply_header(path: Path, file: BinaryIO) -> tuple[list[bytes], int]:
-    """Lines of a ``.ply`` header, and where the data begin.
-
-    Raises:
-        UserError: it is not one, or it does not end.
-    """
-    head = file.read(MAX_HEADER)
-    if not head.startswith(b"ply"):
-        raise UserError(f"{path}: not a .ply file")
-    end = head.find(b"end_header")
-    start = head.find(b"\n", end) + 1
-    if end < 0 or start == 0:
-        raise UserError(f"{path}: the .ply header has no end")
-    return head[:end].splitlines(), start
-
-
 def _check_ply(path: Path, file: BinaryIO, size: int) -> None:
-    lines, start = ply_header(path, file)
-    elements = ply_elements(path, lines)
-    says = ", ".join(f"{count} {name}" for name, count, _ in elements)
-    layout = next((line.split()[1:2] for line in lines if line.startswith(b"format")), [])
-    if layout == [b"ascii"]:
+    layout, _, elements, start = read_ply_header(path, file)
+    says = ", ".join(f"{element.count} {element.name}" for element in elements)
+    if layout == "ascii":
         file.seek(start)
-        wanted = sum(count for _, count, properties in elements if properties)
-        found = sum(1 for line in file if line.strip())
+        wanted = sum(element.count for element in elements if element.properties)
+        found = sum(1 for _ in _lines(file))
         if found != wanted:
             raise UserError(f"{path}: truncated or false header, {says}, but {found} lines follow")
         return
-    if len(layout) != 1 or layout[0].decode() not in ORDERS:
+    if layout not in ORDERS:
         raise UserError(f"{path}: the .ply header states no format")
-    order, at = ORDERS[layout[0].decode()], start
-    least = sum(count * _row(properties) for _, count, properties in elements)
+    least = sum(element.count * element.least_bytes() for element in elements)
     _compare(path, says, least, size - start, exact=False)
     if size == start:
         return
-    data = np.memmap(file, np.uint8, "r")
-    for name, count, properties in elements:
-        at += _element_bytes(path, data[at:], name, count, properties, order)
+    data, at = np.memmap(file, np.uint8, "r"), start
+    for element in elements:
+        at += _element_bytes(path, data[at:], element, ORDERS[layout])
     _compare(path, says, at - start, size - start)
 
 
-def _row(properties: list[list[str]]) -> int:
-    """Bytes of one row, its lists empty."""
-    return sum(
-        np.dtype(TYPES[words[2 if words[1] == "list" else 1]]).itemsize for words in properties
-    )
-
-
-def _element_bytes(
-    path: Path, data: np.ndarray, name: str, count: int, properties: list[list[str]], order: str
-) -> int:
-    """Bytes that ``count`` rows take at the start of ``data [B]`` uint8, lists included."""
-    lists = [i for i, words in enumerate(properties) if words[1] == "list"]
+def _element_bytes(path: Path, data: np.ndarray, element: PlyElement, order: str) -> int:
+    """Bytes that an element takes at the start of ``data [B]`` uint8, its lists included."""
+    count = element.count
+    lists = [i for i, item in enumerate(element.properties) if item.length]
     if not lists or count == 0:
-        return count * _row(properties)
-    says = f"{count} {name} with lists"
+        return count * element.least_bytes()
+    says = f"{count} {element.name} with lists"
     if len(lists) == 1:  # as a rule all lists are of one length
-        before = _row(properties[: lists[0]])
-        counts, item = (np.dtype(order + TYPES[word]) for word in properties[lists[0]][2:4])
-        _compare(path, says, _row(properties), len(data), exact=False)
+        item = element.properties[lists[0]]
+        before = sum(other.least_bytes() for other in element.properties[: lists[0]])
+        counts = np.dtype(order + item.length)
+        _compare(path, says, element.least_bytes(), len(data), exact=False)
         length = int(data[before : before + counts.itemsize].view(counts)[0])
-        stride = _row(properties) + length * item.itemsize
+        stride = element.least_bytes() + length * np.dtype(item.kind).itemsize
         if 0 <= length and count * stride <= len(data):
             rows = data[: count * stride].reshape(count, stride)
             found = np.ascontiguousarray(rows[:, before : before + counts.itemsize]).view(counts)
             if (found == length).all():
                 return count * stride
-    at, text = 0, data.tobytes()
-    for _ in range(count):
-        for words in properties:
-            if words[1] != "list":
-                at += np.dtype(TYPES[words[1]]).itemsize
+    return _walked_bytes(path, data.tobytes(), element, order)
+
+
+def _walked_bytes(path: Path, data: bytes, element: PlyElement, order: str) -> int:
+    """As ``_element_bytes``, row by row and list by list."""
+    at, says = 0, f"{element.count} {element.name} with lists"
+    for _ in range(element.count):
+        for item in element.properties:
+            if not item.length:
+                at += item.least_bytes()
                 continue
-            counts, item = (np.dtype(order + TYPES[word]) for word in words[2:4])
-            _compare(path, says, at + counts.itemsize, len(text), exact=False)
-            length = int(np.frombuffer(text, counts, 1, at)[0])
+            _compare(path, says, at + item.least_bytes(), len(data), exact=False)
+            length = int(np.frombuffer(data, order + item.length, 1, at)[0])
             if length < 0:
-                raise UserError(f"{path}: false header, a list of {length} in {name}")
-            at += counts.itemsize + length * item.itemsize
-            _compare(path, says, at, len(text), exact=False)
+                raise UserError(f"{path}: false header, a list of {length} in {element.name}")
+            at += item.least_bytes() + length * np.dtype(item.kind).itemsize
+            _compare(path, says, at, len(data), exact=False)
     return at
 
 

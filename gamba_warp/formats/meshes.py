@@ -1,8 +1,8 @@
 """Mesh files to flat arrays: one list of triangles with their corners' normals, UVs and materials.
 
 trimesh reads the files; this module flattens its scenes, unifies materials and turns what is wrong
-with a file into one line. The frame of the data is z-up; ``.obj``, ``.glb`` and ``.gltf`` files are
-y-up by convention and are turned by ``normalized`` (front +z becomes front -y, as in Blender).
+with a file into one line. The data are z-up; ``.obj``, ``.glb`` and ``.gltf`` files are y-up by
+convention and are turned by ``normalized`` (front +z becomes front -y, as in Blender).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Material:
 
 @dataclass
 class TexturedMesh:
-    """F triangles of V vertices, of whatever a file held, in one frame.
+    """All F triangles and V vertices of a file, in one frame.
 
     Attributes:
         vertices: ``[V, 3]`` float64.
@@ -66,11 +66,11 @@ class TexturedMesh:
     def normalized(
         self, up: str = "z", rotation: ArrayLike | None = None
     ) -> tuple[TexturedMesh, np.ndarray, float]:
-        """Turned to z-up, centred on the bounding box's centre, longest side 1.
+        """The mesh turned to z-up, with its bounding box centred and its longest side 1.
 
         Args:
             up: the axis that points up in the file, "y" or "z".
-            rotation: ``[3, 3]``, applied first, for files whose object lies on its side.
+            rotation: ``[3, 3]``, applied first, for files whose object lies on its side; or None.
 
         Returns:
             The mesh, ``transform [3, 4]`` and ``scale``: x_new = scale · (transform · [x, 1]).
@@ -89,7 +89,7 @@ class TexturedMesh:
         return mesh, np.hstack([turn, -center[:, None]]), float(scale)
 
 
-def to_linear(display: np.ndarray) -> np.ndarray:
+def to_linear(display: np.ndarray | float) -> np.ndarray:
     """SRGB display values in [0, 1] to linear light (IEC 61966-2-1), any shape, float32."""
     x = np.asarray(display, dtype=np.float32)
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
@@ -142,7 +142,7 @@ def load_mesh(path: str | Path) -> TexturedMesh:
 
 
 def _read_parts(path: Path, warnings: list[str]) -> list[tuple]:
-    """(trimesh mesh, its 4x4 place in the scene) for every part that has faces."""
+    """Every part that has faces: trimesh's mesh and the 4x4 matrix of its pose in the scene."""
     import trimesh
 
     try:
@@ -167,7 +167,7 @@ def _read_parts(path: Path, warnings: list[str]) -> list[tuple]:
 
 
 def _absolute_indices(text: bytes) -> bytes:
-    """OBJ with negative face indices made positive: they count back from the line they are on."""
+    """Makes negative face indices of an OBJ positive; they count back from their own line."""
     if not re.search(rb"(?m)^f .*-\d", text):
         return text
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
@@ -192,7 +192,10 @@ def _absolute_indices(text: bytes) -> bytes:
 
 
 def _resolver(path: Path, warnings: list[str]):
-    """Finds side files whatever their case, slashes or options before the name; notes misses."""
+    """Finds side files whatever their case, slashes or options before the name.
+
+    What is not found goes into ``warnings``.
+    """
     from trimesh.resolvers import FilePathResolver
 
     class Resolver(FilePathResolver):
@@ -204,7 +207,7 @@ def _resolver(path: Path, warnings: list[str]):
             if file.suffix.lower() in Image.registered_extensions():
                 try:
                     Image.open(file).close()
-                except OSError:  # trimesh would go on without a word
+                except OSError:  # trimesh would go on and not say so
                     warnings.append(f"{name}: not a picture")
             return file.read_bytes()
 
@@ -212,7 +215,7 @@ def _resolver(path: Path, warnings: list[str]):
 
 
 def _find_file(folder: Path, name: str) -> Path | None:
-    # MTL options come first: "-s 1 1 1 -clamp on wood.jpg"
+    # Options of MTL stand before the name: "-s 1 1 1 -clamp on wood.jpg".
     bare = re.sub(r"^(-\w+\s+(([-+.\d]+|on|off|[rgbmlz])\s+)+)+", "", name.strip())
     for candidate in (name, bare, Path(bare.replace("\\", "/")).name):
         place = folder
@@ -230,7 +233,7 @@ def _find_file(folder: Path, name: str) -> Path | None:
 
 
 def _flatten(mesh, matrix: np.ndarray, warnings: list[str], path: Path) -> tuple[dict, Material]:
-    """Arrays of one part, moved to the scene's frame, and its material."""
+    """The arrays of one part, moved to the scene's frame, and its material."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(mesh.faces, dtype=np.int64)
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -282,7 +285,7 @@ def _rgba8(colors: np.ndarray) -> np.ndarray:
 def _corner_normals(
     vertices: np.ndarray, faces: np.ndarray, vertex_normals: np.ndarray, matrix: np.ndarray
 ) -> np.ndarray:
-    """``[F, 3, 3]``: the vertex's normal where it agrees with the face, else the face's."""
+    """Normals ``[F, 3, 3]``: the vertex's where it agrees with the face, else the face's."""
     corners = vertices[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(flat, axis=1, keepdims=True)
@@ -296,7 +299,7 @@ def _corner_normals(
 
 
 def _material(source, path: Path, warnings: list[str]) -> Material:
-    """The material of a trimesh one."""
+    """Makes our material of one of trimesh's."""
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     if isinstance(source, PBRMaterial):
@@ -312,7 +315,7 @@ def _material(source, path: Path, warnings: list[str]) -> Material:
             texture[..., 3] = np.where(texture[..., 3] >= 255 * cut, 255, 0)
         return Material(color.astype(np.float32), texture)
     grey = Material(np.array([*[to_linear(GREY)] * 3, 1], np.float32))
-    # trimesh makes up an empty material; one from an MTL file has the file's lines in kwargs
+    # trimesh invents a material where there is none; one from an MTL file has kwargs.
     made_up = path.suffix.lower() == ".obj" and not source.kwargs
     if not isinstance(source, SimpleMaterial) or made_up:
         warnings.append("a part has no material: grey")
@@ -353,7 +356,7 @@ def _texture(image: Image.Image | None, warnings: list[str]) -> np.ndarray | Non
     while max(image.size) > MAX_TEXTURE:
         image = image.reduce(2)
     texture = np.array(image)
-    if texture[..., 3].max() < 8:  # an unused alpha channel, not an invisible object
+    if texture[..., 3].max() < 8:  # the alpha channel is unused, the object is not invisible
         texture[..., 3] = 255
     return texture
 

@@ -24,7 +24,7 @@ RECORD = np.dtype(
 def splat_bytes(
     gaussians: Gaussians, *, min_opacity: float = 0.0, name: str | Path = "splat"
 ) -> bytes:
-    """One object as the content of a ``.splat`` file, in our (OpenCV) frame.
+    """The content of a ``.splat`` file of one object, with OpenCV's axes.
 
     Args:
         gaussians: one object, no batch dimension.

@@ -16,10 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
 from xml.etree import ElementTree
 
 import torch
@@ -28,6 +26,7 @@ from ..errors import UserError
 from ..files import CHECKOUT, atomic_path, output_folder, write_json
 from ..kernels.bench import Settings
 from ..kernels.bench.peers import PACKAGES, versions
+from .plan import MINUTES, STEPS, Step
 from .report import headline, machine_facts, page
 
 FORMAT = "gamba_warp.gpu_check.1"
@@ -35,58 +34,27 @@ _GRACE = 15.0  # seconds that the last item of a step may take
 _LEAST = 5.0  # seconds below which no step begins
 
 
-@dataclass(frozen=True)
-class Step:
-    """A part of the run.
-
-    Attributes:
-        name: see ``gpu_steps.run_step``; "tests" runs pytest.
-        seconds: at most, in a run of 8 minutes.
-        cuda: whether a CPU leaves it out.
-        packages: of which at least one is needed.
-    """
-
-    name: str
-    seconds: float
-    cuda: bool = False
-    packages: tuple[str, ...] = ()
-
-
-# What matters most comes first; together they may want more than 8 minutes.
-STEPS = (
-    Step("compile", 100, cuda=True),
-    Step("checks", 100),
-    Step("inference", 100),
-    Step("tests", 90, cuda=True),
-    Step("bench", 130),
-    Step("peers-conv", 60, True, ("causal-conv1d",)),
-    Step("peers-scan", 90, True, ("mamba-ssm", "mambapy")),
-    Step("peers-raster", 480, True, ("gsplat", "gswarp")),  # gsplat compiles itself on first use
-)
-_STEP_NAMES = Literal[
-    "compile", "checks", "inference", "tests", "bench", "peers-conv", "peers-scan", "peers-raster"
-]
-
-
-def gpu_check_command(
-    *,
-    device: Literal["cuda", "cpu"] = "cuda",
+def run_gpu_check(
+    device: str = "cuda",
     quick: bool = False,
     out: Path = Path("out/gpu-check"),
-    minutes: float = 8.0,
-    steps: tuple[_STEP_NAMES, ...] = (),
+    minutes: float = MINUTES,
+    steps: Sequence[str] = (),
 ) -> int:
     """Runs kernel checks, GPU tests, full-size inference and the benchmark on this machine.
 
-    Writes gpu-check.json and gpu-check.md, after every item, and says what it could not do. Exit
-    code: 0 all that could be run passed, 1 something failed, 2 no CUDA device.
-
     Args:
-        device: "cpu" tries the command itself, with --quick in seconds.
-        quick: Tiny sizes.
-        out: Folder for the results.
-        minutes: The whole run takes no longer.
-        steps: Only these; default: all.
+        device: "cuda"; or "cpu", which tries the command itself.
+        quick: tiny sizes.
+        out: folder for gpu-check.json and gpu-check.md.
+        minutes: time limit of the whole run.
+        steps: names of ``STEPS``, or none for all.
+
+    Returns:
+        The exit code: 0 all that could be run passed, 1 something failed, 130 Ctrl-C.
+
+    Raises:
+        UserError: there is no CUDA device, or an option is out of range.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("no CUDA device here; --device cpu --quick tries the command itself")
@@ -96,7 +64,7 @@ def gpu_check_command(
     try:
         for step in STEPS:
             if not steps or step.name in steps:
-                run.do(step, step.seconds * minutes / 8)
+                run.do(step, step.seconds * minutes / MINUTES)
     except KeyboardInterrupt:
         run.finish("interrupted; what was done is here")
         return 130
@@ -106,7 +74,7 @@ def gpu_check_command(
 
 
 def make_settings(device: str, quick: bool) -> Settings:
-    """Of the benchmark's cases."""
+    """The settings of the benchmark's cases, by the options of the command."""
     level = "quick" if quick else "normal"
     return Settings(torch.device(device), level, False, torch.get_num_threads())
 
@@ -129,10 +97,10 @@ class Run:
         self.parts[name]["not_done"].append({"what": what, "reason": reason})
 
     def document(self) -> dict:
-        """All there is so far, ready for JSON.
+        """Everything that is known so far, ready for JSON.
 
-        ``{format, verdict, machine, settings, steps, results, failures, not_done, bench}``; the
-        last is one document as ``gamba bench`` writes it, inference included.
+        It is ``{format, verdict, machine, settings, steps, results, failures, not_done, bench}``;
+        the last is one document as ``gamba bench`` writes it, inference included.
         """
         parts = list(self.parts.values())
         results = {
@@ -173,7 +141,7 @@ class Run:
         print(f"{verdict}; wrote {self.folder / 'gpu-check.json'} and gpu-check.md")
 
     def do(self, step: Step, seconds: float) -> None:
-        """Runs a step in a process of its own, for so many seconds or the rest of the run."""
+        """Runs a step in a process of its own, for ``seconds`` at most or the rest of the run."""
         started = time.time()
         seconds = min(seconds, self.ends - started - 1)
         row = {"name": step.name, "status": "not done", "reason": "", "seconds": 0.0}
@@ -198,7 +166,7 @@ class Run:
         print(f"{step.name:<10} {row['status']}{reason}, {row['seconds']:.0f} s", flush=True)
 
     def _child(self, row: dict, seconds: float) -> None:
-        """A step of ``gpu_steps``; what it writes is taken over while it runs."""
+        """Runs a step of ``steps``; what it writes is taken over while it runs."""
         name = row["name"]
         until = time.time() + max(seconds - _GRACE, seconds / 2)
         with tempfile.TemporaryDirectory() as folder:
@@ -229,7 +197,7 @@ class Run:
             row["status"] = "failed"
 
     def _tests(self, row: dict, seconds: float) -> None:
-        """The tests that are marked gpu, where pytest and a checkout are there."""
+        """Runs the tests that are marked gpu, where pytest and a checkout are there."""
         part = self.parts["tests"]
         files = gpu_test_files(CHECKOUT / "tests")
         if not files or importlib.util.find_spec("pytest") is None:
@@ -246,7 +214,7 @@ class Run:
 
 
 def join_benches(documents: list[dict]) -> dict:
-    """One document of several; a later one's case, or target that it measured, takes the place."""
+    """Joins documents to one; a case or a measured target of a later one replaces an earlier."""
     records: list[dict] = []
     targets: dict[tuple, dict] = {}
     for document in documents:
@@ -261,7 +229,7 @@ def join_benches(documents: list[dict]) -> dict:
 
 
 def new_part() -> dict:
-    """As ``Part.write``, of a step that has done nothing."""
+    """What ``Part.write`` writes of a step that has done nothing."""
     return {"result": {}, "not_done": [], "failures": [], "whole": False}
 
 
@@ -272,9 +240,9 @@ def run_python(
 
     Args:
         arguments: of Python.
-        seconds: at most.
-        look: called every half a second, and at the end.
-        cwd: where; None: here.
+        seconds: time limit.
+        look: called every tenth of a second, and at the end.
+        cwd: working directory; None for that of this process.
 
     Returns:
         The exit code, None if it was ended, and the last line that it printed.
@@ -304,18 +272,18 @@ def run_python(
 
 
 def gpu_test_files(folder: Path) -> list[Path]:
-    """Files of a folder of tests with a test that is marked gpu."""
+    """The files in a folder of tests that have a test marked gpu."""
     files = sorted(folder.rglob("test_*.py"))
     return [path for path in files if "@pytest.mark.gpu" in path.read_text(encoding="utf-8")]
 
 
-def read_junit(text: str) -> dict:
-    """A part as ``new_part``, from pytest's XML.
+def read_junit(xml: str) -> dict:
+    """A part as ``new_part`` makes it, from pytest's XML.
 
-    A module that cannot be imported for want of a package is not done, not failed.
+    A test that fails because a package is not installed counts as not done.
     """
     part, counts = new_part(), {"passed": 0, "failed": 0, "skipped": 0}
-    for case in ElementTree.fromstring(text).iter("testcase"):
+    for case in ElementTree.fromstring(xml).iter("testcase"):
         name = ".".join(filter(None, (case.get("classname"), case.get("name"))))
         wrong = [case.find(kind) for kind in ("failure", "error")]
         wrong = next((element for element in wrong if element is not None), None)
@@ -325,8 +293,8 @@ def read_junit(text: str) -> dict:
             part["not_done"].append({"what": name, "reason": skipped.get("message", "")})
         elif wrong is None:
             counts["passed"] += 1
-        elif "ModuleNotFoundError" in (wrong.text or ""):
-            line = next(x for x in wrong.text.splitlines() if "ModuleNotFoundError" in x)
+        elif "ModuleNotFoundError" in (text := wrong.text or ""):
+            line = next(x for x in text.splitlines() if "ModuleNotFoundError" in x)
             part["not_done"].append({"what": name, "reason": line.removeprefix("E").strip()})
         else:
             counts["failed"] += 1
@@ -339,31 +307,25 @@ def read_junit(text: str) -> dict:
 def main(arguments: list[str] | None = None) -> int:
     """``python -m gamba_warp.gpu_check``: the command without tyro; with --child, one step."""
     parser = argparse.ArgumentParser(
-        prog="gamba gpu-check", description=gpu_check_command.__doc__.split("\n\n")[0]
+        prog="gamba gpu-check", description=(run_gpu_check.__doc__ or "").split("\n\n")[0]
     )
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--quick", action="store_true", help="tiny sizes")
     parser.add_argument("--out", type=Path, default=Path("out/gpu-check"), help="folder")
-    parser.add_argument("--minutes", type=float, default=8.0, help="the run takes no longer")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="the run takes no longer")
     names = [step.name for step in STEPS]
     parser.add_argument("--steps", nargs="+", choices=names, default=(), help="only these")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     parser.add_argument("--until", type=float, help=argparse.SUPPRESS)
     o = parser.parse_args(arguments)
     if o.child:
-        # here, not above: what a step imports may be what breaks it, and that ends the step alone
+        # Imported here, because an import may be what breaks a step, and must end that step alone.
         from .steps import Part, run_step
 
         run_step(o.child, Part(o.out, o.until), make_settings(o.device, o.quick))
         return 0
     try:
-        return gpu_check_command(
-            device=o.device, quick=o.quick, out=o.out, minutes=o.minutes, steps=tuple(o.steps)
-        )
+        return run_gpu_check(o.device, o.quick, o.out, o.minutes, o.steps)
     except UserError as error:
         print(f"gamba: {error}", file=sys.stderr)
         return 2
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,7 @@
 """Checks of the kernels on a device, for a machine that has torch and warp-lang only.
 
-Each compares with the float64 oracle, or a run with another run; ``gamba gpu-check`` runs them all.
+Each check compares a run with the float64 oracle or with another run. ``gamba gpu-check`` runs them
+all.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,26 +21,26 @@ from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
-from ..kernels.selective_scan.cuda.tuning import Variant, use_variant
+from ..kernels.selective_scan.cuda.tuning import Tuning, use_tuning
 
-# Allowed relative rms errors. A GPU's exponential errs by up to 2^-22 a step; half precision rounds
-# inputs and outputs; of a picture a few pixels may cross the cut at the faintest alpha.
+# Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
+# rounds inputs and outputs, and a few pixels may cross the cut at the faintest alpha.
 LIMIT, HALF_LIMIT, PICTURE_LIMIT = 1e-5, 3e-2, 1e-3
-# batch, tokens, channels, states, groups
+# Each is batch, tokens, channels, states and groups.
 SCANS = [
     (2, 139, 37, 3, 1), (1, 65, 40, 3, 2), (1, 1, 1, 1, 1), (1, 577, 70, 16, 1),
     (2, 128, 64, 16, 1), (1, 67, 35, 17, 1), (1, 100, 20, 40, 1), (3, 64, 96, 16, 3),
     (1, 9, 3, 256, 1), (1, 1031, 129, 16, 1), (1, 66, 5, 64, 1), (2, 200, 33, 8, 1),
 ]  # fmt: skip
-VARIANTS = [
-    Variant(pieces=2, back_pieces=3),
-    Variant(pieces=7, channels=1, states=16, back_channels=1, back_states=8),
-    Variant(channels=4, states=4, back_pieces=4, back_channels=4, back_states=4),
-    Variant(channels=1, states=4, back_channels=2, back_states=8, block=64),
+TUNINGS = [
+    Tuning(segments=2, back_segments=3),
+    Tuning(segments=7, channels=1, states=16, back_channels=1, back_states=8),
+    Tuning(channels=4, states=4, back_segments=4, back_channels=4, back_states=4),
+    Tuning(channels=1, states=4, back_channels=2, back_states=8, block=64),
 ]
-# batch, tokens, channels, taps
+# Each is batch, tokens, channels and taps.
 CONVS = [(2, 300, 19, 4), (1, 1, 1, 2), (1, 33, 130, 3), (3, 257, 64, 4)]
-# Gaussians, side of the picture, views, options; few views are cut into parts of tiles
+# Each is Gaussians, side of the picture, views and options; tiles of few views are cut into parts.
 RASTERS = [
     (300, 75, 3, {}), (1, 33, 1, {}), (2000, 130, 1, {"rasterize_mode": "antialiased"}),
     (700, 61, 40, {}), (500, 48, 2, {"quats": None}), (4000, 257, 12, {}),
@@ -46,7 +48,7 @@ RASTERS = [
 
 
 class LeftOut(Exception):
-    """A check that cannot be done here; ``str(error)`` says why."""
+    """Raised by a check that cannot be done here; ``str(error)`` says why."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +56,9 @@ class Check:
     """Something that must hold on a device.
 
     Attributes:
-        name: what.
-        run: given the device, returns what was found, in words; raises what is wrong.
-        cuda: whether only a GPU can do it.
+        name: title of the check.
+        run: function of the device that returns the finding in words, or raises what is wrong.
+        cuda: whether only a GPU can do the check.
     """
 
     name: str
@@ -65,15 +67,15 @@ class Check:
 
 
 def checks(quick: bool) -> Iterator[Check]:
-    """Yields all checks, or a few in each kind."""
+    """Yields all checks, or a few of each kind if ``quick``."""
     few = 2 if quick else None
     for shape in SCANS[:few]:
         yield Check(f"scan {shape}", partial(_scan, shape, torch.float32))
     for shape in SCANS[: few and 1]:
         yield Check(f"scan {shape}, bfloat16", partial(_scan, shape, torch.bfloat16))
-    for variant in VARIANTS:
-        text = ", ".join(f"{name} {value}" for name, value in vars(variant).items())
-        yield Check(f"scan, {text}", partial(_variant, variant), cuda=True)
+    for tuning in TUNINGS:
+        text = ", ".join(f"{name} {value}" for name, value in vars(tuning).items())
+        yield Check(f"scan, {text}", partial(_tuned, tuning), cuda=True)
     for shape in CONVS[:few]:
         yield Check(f"convolution {shape}", partial(_conv, shape))
     for count, size, views, options in RASTERS[:few]:
@@ -104,13 +106,13 @@ def _problem(shape: tuple, device: torch.device) -> ScanProblem:
 
 
 def _scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> str:
-    """Output and all gradients, from a given first state."""
+    """Checks the output and all gradients, from a given first state."""
     error = _problem(shape, device).check_backward(dtype)
     return _within(error, LIMIT if dtype == torch.float32 else HALF_LIMIT)
 
 
-def _variant(variant: Variant, device: torch.device) -> str:
-    with use_variant(variant):
+def _tuned(tuning: Tuning, device: torch.device) -> str:
+    with use_tuning(tuning):
         return _scan(SCANS[3], torch.float32, device)
 
 
@@ -128,14 +130,14 @@ def _same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
 
 
 def _conv(shape: tuple, device: torch.device) -> str:
-    """Output and all gradients, from given first tokens."""
+    """Checks the output and all gradients, from given first tokens."""
     batch, length, channels, taps = shape
     g = torch.Generator().manual_seed(0)
     sizes = {"x": (batch, length, channels), "weight": (channels, taps), "bias": (channels,)}
     sizes["initial_state"] = (batch, taps - 1, channels)
     inputs = {name: torch.randn(*size, generator=g) for name, size in sizes.items()}
     cotangent = torch.randn(*sizes["x"], generator=g)
-    mine = {name: x.to(device).requires_grad_() for name, x in inputs.items()}
+    mine: dict[str, Any] = {k: x.to(device).requires_grad_() for k, x in inputs.items()}
     exact = {name: x.double().requires_grad_() for name, x in inputs.items()}
     out = causal_conv1d(**mine, activation="silu")
     want, _ = causal_conv1d_reference(**exact, activation="silu")
@@ -146,7 +148,7 @@ def _conv(shape: tuple, device: torch.device) -> str:
 
 
 def _scene(count: int, size: int, views: int, options: dict, device: torch.device) -> Scene:
-    gaussians = shell(count, scale=3.0)
+    gaussians: dict[str, Any] = {**shell(count, scale=3.0)}
     if "quats" in options:
         gaussians["quats"] = None
     rest = {name: value for name, value in options.items() if name != "quats"}
@@ -154,7 +156,7 @@ def _scene(count: int, size: int, views: int, options: dict, device: torch.devic
 
 
 def _raster(count: int, size: int, views: int, options: dict, device: torch.device) -> str:
-    """Picture, alphas and all gradients on a crop of the first view."""
+    """Checks picture, alphas and all gradients on a crop of the first view."""
     scene = _scene(count, size, views, options, device)
     picture, alphas, _ = scene.forward()
     if not (picture.isfinite().all() and alphas.max() <= 1):
@@ -170,7 +172,7 @@ def _raster_twice(device: torch.device) -> str:
 
 
 def _layer(problem: ScanProblem) -> tuple[Callable[..., Tensor], list[Tensor]]:
-    """Convolution, then scan, and their inputs on the device."""
+    """Makes a layer of convolution and scan, and its inputs on the device."""
     inputs = problem.at(torch.float32)
     weight = torch.linspace(-0.5, 0.5, 4 * inputs["u"].shape[2], device=problem.device)
 
@@ -203,7 +205,7 @@ def _side_stream(device: torch.device) -> str:
     torch.cuda.synchronize(device)
     with torch.cuda.stream(stream):
         big = torch.randn(4096, 4096, device=device)
-        for _ in range(8):  # so that what is launched on another stream would come too early
+        for _ in range(8):  # whatever is launched on another stream would come too early
             big = big @ big * 1e-3
         out = layer(*(x + 0 * big[0, 0].nan_to_num(0.0, 0.0, 0.0) for x in inputs))
     stream.synchronize()
@@ -212,7 +214,7 @@ def _side_stream(device: torch.device) -> str:
 
 
 def _graph(device: torch.device) -> str:
-    """A replay gives the bits of a plain run, with inputs changed since the capture too."""
+    """Checks that a replay gives the bits of a plain run, also with inputs changed meanwhile."""
     layer, inputs = _layer(_problem((1, 577, 70, 16, 1), device))
     with torch.no_grad():
         stream = torch.cuda.Stream(device)

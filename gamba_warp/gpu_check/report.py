@@ -1,8 +1,6 @@
-"""The page of ``gamba gpu-check``: one table, what was not done, and the benchmark's tables."""
+"""The page of ``gamba gpu-check``: a table of findings, what was not done, and the benchmark."""
 
 from __future__ import annotations
-
-import importlib.metadata
 
 import torch
 import warp as wp
@@ -11,12 +9,13 @@ from ..kernels.bench import Settings
 from ..kernels.bench.core.measure import machine
 from ..kernels.bench.core.report import groups, oracles, table
 from ..kernels.bench.peers import versions
+from ..versions import installed
 
 _OTHERS = ("timm", "pytest", "triton", "tyro", "safetensors")
 
 
 def machine_facts(settings: Settings) -> dict:
-    """As ``gamba bench``'s machine, with what it says of the GPU, and the other packages found."""
+    """Returns the facts of ``gamba bench``, with more on the GPU and on the other packages."""
     facts = machine(settings)
     if settings.device.type == "cuda":
         gpu = torch.cuda.get_device_properties(settings.device)
@@ -28,19 +27,11 @@ def machine_facts(settings: Settings) -> dict:
             "free_gib": round(free / 2**30, 1),
             "driver": ".".join(map(str, wp.get_cuda_driver_version() or ())),
         }
-    packages = {name: _version(name) for name in _OTHERS} | versions()
-    return facts | {"packages": {name: v for name, v in packages.items() if v}}
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+    return facts | {"packages": installed(*_OTHERS) | versions()}
 
 
 def headline(document: dict) -> list[tuple[str, str]]:
-    """What was found, in rows of a name and a value."""
+    """Returns what was found, in rows of a name and a value."""
     facts = document["machine"] | {"packages": _joined(document["machine"]["packages"])}
     rows = [(name.replace("_", " "), str(value)) for name, value in facts.items() if value]
     for step in document["steps"]:
@@ -94,7 +85,7 @@ def _time(record: dict) -> str:
 
 
 def page(document: dict) -> str:
-    """The document as Markdown."""
+    """Returns the document as a Markdown page."""
     title = document["verdict"]
     lines = ["# gamba gpu-check", "", f"Written by `gamba gpu-check`, not by hand. **{title}**", ""]
     lines += _table(("what", "found"), headline(document))

@@ -1,7 +1,7 @@
 """The steps of ``gamba gpu-check``, each run in a process of its own.
 
-A step writes what it has to a file after every item, so that whatever ends it, a crash of somebody
-else's package or the clock, loses no more than the item under way.
+After every item a step writes its findings to a file. So whatever ends the step, a crash of another
+package or the clock, loses no more than the item under way.
 """
 
 from __future__ import annotations
@@ -19,19 +19,18 @@ from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.cases import conv, raster, scan
 from ..kernels.bench.core.report import judge
 from ..kernels.bench.static.report import find_kernels
-from ..measure import blocks as bench_model
-from ..measure import inference as bench_inference
+from ..measure import blocks, inference
 from .kernels import LeftOut, checks
 
-_SUITES = (raster, scan, conv, bench_model)
-# What is timed first, since time may end before the list does; then all other cases.
+_SUITES = (raster, scan, conv, blocks)
+# These cases are timed first, since the time may end before the list does; all others follow.
 _FIRST = [
     ("scan", "operator"), ("raster", "scene"), ("conv", "operator"), ("block", "one block"),
     ("block", "backbone"), ("raster", "32 views"), ("scan", "training batch"),
     ("model", "one picture"),
 ]  # fmt: skip
-_ON_A_CPU = [("conv", "operator")]  # of a quick run there, which only tries the command
-# The cases with other people's packages: what breaks there must not take ours along.
+_ON_A_CPU = [("conv", "operator")]  # a quick run on a CPU only tries the command
+# These cases run other people's packages, and a crash there must not end the timing of ours.
 _BESIDE = {
     "peers-conv": [("conv", "operator")],
     "peers-scan": [("scan", "reference loop")],
@@ -44,12 +43,12 @@ class Part:
     """What a step has done so far.
 
     Attributes:
-        path: where it is written.
-        until: seconds since the epoch; no item is begun later.
-        parent: the process that asked; when it is gone nothing more is begun.
-        result: for JSON.
-        not_done: ``{what, reason}`` each.
-        failures: what was wrong, in words.
+        path: file of the findings.
+        until: time after which no item is begun, seconds since the epoch.
+        parent: number of the process that asked; no item is begun once it is gone.
+        result: findings, ready for JSON.
+        not_done: ``{what, reason}`` of each item left out.
+        failures: faults, in words.
         whole: whether the step came to its end.
     """
 
@@ -62,16 +61,16 @@ class Part:
     whole: bool = False
 
     def write(self) -> None:
-        """Replaces the file."""
+        """Replaces the file by the present state."""
         names = ("result", "not_done", "failures", "whole")
         write_json(self.path, {name: getattr(self, name) for name in names})
 
     def leave_out(self, what: str, reason: str) -> None:
-        """Notes what is not done."""
+        """Records that something is not done, and why."""
         self.not_done.append({"what": what, "reason": reason})
 
     def time_is_up(self) -> bool:
-        """Whether no further item may begin."""
+        """Tells whether no further item may begin."""
         return time.time() > self.until or os.getppid() != self.parent
 
 
@@ -91,7 +90,7 @@ def run_step(name: str, part: Part, settings: Settings) -> None:
 
 
 def _compile(part: Part, settings: Settings) -> None:
-    """Every kernel of ``gamba bench --static``, for the GPU that is there, into Warp's cache."""
+    """Compiles every kernel of ``gamba bench --static`` for this device, into Warp's cache."""
     device = wp.device_from_torch(settings.device)
     entries = find_kernels()
     part.result = {"kernels": 0, "of": len(entries), "seconds": 0.0}
@@ -124,7 +123,7 @@ def _checks(part: Part, settings: Settings) -> None:
         except LeftOut as reason:
             part.leave_out(check.name, str(reason))
             continue
-        except Exception as error:  # a kernel that does not work raises anything: that is the news
+        except Exception as error:  # a broken kernel may raise anything, and that is a finding
             row |= {"status": "failed", "found": _first_line(error)}
             part.failures.append(f"{check.name}: {row['found']}")
         found.append(row | {"seconds": time.perf_counter() - started})
@@ -138,7 +137,7 @@ def _first_line(error: Exception) -> str:
 
 def _inference(part: Part, settings: Settings) -> None:
     part.result["ceilings"] = _ceilings(settings)
-    _measure(part, settings, bench_inference.cases(settings), bench_inference.targets(settings))
+    _measure(part, settings, inference.cases(settings), inference.targets(settings))
     if settings.device.type != "cuda":
         part.leave_out("inference from a CUDA graph", "needs CUDA")
     else:
@@ -148,7 +147,7 @@ def _inference(part: Part, settings: Settings) -> None:
 
 
 def _ceilings(settings: Settings) -> dict[str, float]:
-    """What the device does at best, to judge times by: a copy and a product of matrices."""
+    """Measures what the device does at best, to judge times by: a copy and a matrix product."""
     count = 1 << (20 if settings.level == "quick" else 30)
     side = 256 if settings.level == "quick" else 8192
     source = torch.ones(count // 4, device=settings.device)
@@ -171,8 +170,13 @@ def _seconds(run, settings: Settings, rounds: int = 5) -> float:
     return best
 
 
-def _bench(part: Part, settings: Settings, first: list[tuple[str, str]], alone=True) -> None:
-    """Cases of ``gamba bench`` by op and name, where there are such; unless alone, then others."""
+def _bench(
+    part: Part, settings: Settings, first: list[tuple[str, str]], *, alone: bool = True
+) -> None:
+    """Measures the cases of ``gamba bench`` named in ``first``; unless ``alone``, then all others.
+
+    A name of ``first`` that has no case at this level is passed over.
+    """
     found: dict[tuple[str, str], Case] = {}
     targets: list[Target] = []
     for suite in _SUITES:
@@ -185,7 +189,7 @@ def _bench(part: Part, settings: Settings, first: list[tuple[str, str]], alone=T
 
 
 def _measure(part: Part, settings: Settings, cases: list[Case], targets: list[Target]) -> None:
-    """Measures case after case; what is wrong with ours is a failure, with a peer a note."""
+    """Measures case after case; a fault of ours is a failure, a fault of a peer only a note."""
     document = part.result["bench"] = measure([], settings)
     for case in cases:
         if part.time_is_up():

@@ -1,10 +1,11 @@
-"""Benchmark cases of the model: one block, the backbone, and a picture to Gaussians."""
+"""Benchmark cases of the blocks, and the list of all cases of blocks and models."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -14,22 +15,21 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ..kernels.bench import Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
-from ..model.block import GambaBlock, prefix_states
+from ..model.block import GambaBlock, prefix_states, run_blocks
 from ..model.config import PRESETS, GambaConfig
-from ..model.gamba import SEGMENT
 from .pictures import background_tokens, batches, pictures
 
 BOTH = "forward+backward"
-LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # of the relative rms error to float64
-_IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # of DINOv2 ViT-B/14 at 336 pixels
-_TOKENS = 128  # that the oracle looks at
+LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # allowed relative rms error to float64
+_IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # those of DINOv2 ViT-B/14 at 336 pixels
+_TOKENS = 128  # number of first tokens that are compared with the oracle
 _PRODUCTS = {
     name: getattr(torch.ops.aten, name).default for name in ("mm", "addmm", "bmm", "baddbmm")
 }
 
 
 def cases(settings: Settings) -> list[Case]:
-    """All cases of block and model at the level's sizes."""
+    """Returns all cases of blocks and models at the level's sizes."""
     builders = [
         ("block", "one block", partial(_blocks, depth=1)),
         ("block", "backbone", partial(_blocks, depth=2 if settings.level == "quick" else 14)),
@@ -51,15 +51,18 @@ def cases(settings: Settings) -> list[Case]:
     axes["background tokens"] = "error,skipped"
     return [
         Case(
-            *(op, name, texts.get(name) or " ".join(build.__doc__.split())),
-            *(partial(build, settings), axes.get(name)),
+            op=op,
+            name=name,
+            text=texts.get(name) or " ".join(build.__doc__.split()),
+            build=partial(build, settings),
+            axis=axes.get(name),
         )
         for op, name, build in builders
     ]
 
 
 class _Recorder(TorchDispatchMode):
-    """Notes the shapes of all matrix products."""
+    """Records the shapes of all matrix products."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,11 +76,11 @@ class _Recorder(TorchDispatchMode):
 
 
 class Products:
-    """The matrix products of a run, to be repeated alone.
+    """The matrix products of a run, recorded so that they can be repeated alone.
 
     Attributes:
-        count: how many.
-        flops: floating-point operations of all, a multiplication and an addition each.
+        count: number of products.
+        flops: floating-point operations of all; a multiplication and an addition count as two.
     """
 
     def __init__(self, run: Callable[[], object], device: torch.device) -> None:
@@ -97,7 +100,7 @@ class Products:
             self._calls.append(partial(getattr(torch, name), *tensors, out=out))
 
     def _buffer(self, shape, stride, dtype, use: int) -> Tensor:
-        """Operands of one shape share their memory, as they come from the same allocator."""
+        """Returns a tensor of this shape; operands of the same shape and position share one."""
         key = (tuple(shape), tuple(stride), dtype, use)
         if key not in self._buffers:
             x = torch.empty_strided(shape, stride, dtype=dtype, device=self._device)
@@ -106,21 +109,21 @@ class Products:
 
     @torch.no_grad()
     def run(self) -> None:
-        """Timed."""
+        """Repeats all products; this is what is timed."""
         for call in self._calls:
             call()
 
 
 class _Backbone:
-    """Blocks of the paper's size with an image's condition."""
+    """Blocks of the paper's size with the condition of one image."""
 
     def __init__(self, settings: Settings, depth: int) -> None:
         quick = settings.level == "quick"
         config = GambaConfig(dt_rank=8, width=128) if quick else PRESETS["paper"]
         torch.manual_seed(0)
         channels = _IMAGE_CHANNELS
-        blocks = [GambaBlock(config, channels, channels) for _ in range(depth)]
-        self.blocks = nn.ModuleList(blocks).to(settings.device)
+        blocks = (GambaBlock(config, channels, channels) for _ in range(depth))
+        self.blocks = [block.to(settings.device) for block in blocks]
         self.depth, self.device = depth, settings.device
         self.length = 1024 if quick else config.num_gaussians
         tokens = torch.randn(1, self.length, config.width)
@@ -129,40 +132,37 @@ class _Backbone:
         self.parameters = {"L": self.length, "D": config.width, "depth": depth}
 
     def run(self, tokens: Tensor) -> Tensor:
-        """As the model does it: states of the prefix, then segments of tokens on a CPU."""
+        """Runs the blocks as ``Gamba.forward`` does: first the prefix states, then the tokens."""
         states = prefix_states(self.blocks, self.camera, self.image)
-        segments = [tokens]
-        if self.device.type == "cpu" and not torch.is_grad_enabled():
-            segments = list(tokens.split(SEGMENT, dim=1))
-        for s, segment in enumerate(segments):
-            for i, block in enumerate(self.blocks):
-                segment, states[i] = block(segment, states[i])
-            segments[s] = segment
-        return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
+        return run_blocks(self.blocks, tokens, states)
 
     @torch.no_grad()
     def forward(self) -> Tensor:
-        """Timed."""
+        """Runs the blocks without gradients; this is what is timed."""
         return self.run(self.tokens)
 
     @torch.no_grad()
     def prepended(self) -> Tensor:
-        """Timed: the paper's eq. 2 as it reads."""
+        """Runs the paper's eq. 2 as it reads, prepending and dropping; this is timed too."""
         tokens = self.tokens
         for block in self.blocks:
+            assert block.project_camera is not None and block.project_image is not None
             prefix = [block.project_camera(self.camera), block.project_image(self.image)]
             hidden, _ = block.mamba(block.norm(torch.cat([*prefix, tokens], dim=1)))
             tokens = tokens + hidden[:, -self.length :]
         return tokens
 
     def backward(self) -> tuple[Tensor, ...]:
-        """Timed: forward and the gradients of tokens and weights; the tokens are the cotangent."""
+        """Runs forward and backward, with the tokens as cotangent; this is timed too.
+
+        The gradients are those of the tokens and of all weights.
+        """
         tokens = self.tokens.detach().requires_grad_()
-        leaves = [tokens, *self.blocks.parameters()]
+        leaves = [tokens, *(p for block in self.blocks for p in block.parameters())]
         return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
 
     def check(self, forward: Callable[[], Tensor]) -> Error:
-        """Error of what is added to the first tokens, which depend on no later one."""
+        """Measures the error of what is added to the first tokens, which depend on no later one."""
         with torch.no_grad():
             got = forward()[:, :_TOKENS].double().cpu()
             first = tokens = self.tokens[:, :_TOKENS].double().cpu()
@@ -171,7 +171,7 @@ class _Backbone:
         return compare({"update": got - first}, {"update": tokens - first})
 
     def check_backward(self) -> Error:
-        """Error of the gradient of the first tokens, where the cotangent is 0 behind them."""
+        """Measures the error of the first tokens' gradient, with a cotangent of 0 behind them."""
         tokens = self.tokens.detach().requires_grad_()
         cotangent = self.tokens.clone()
         cotangent[:, _TOKENS:] = 0
@@ -187,13 +187,16 @@ class _Backbone:
 
 
 def reference_block(block: GambaBlock, tokens: Tensor, camera: Tensor, image: Tensor) -> Tensor:
-    """One Gamba block in float64 torch on the CPU, prepending and dropping (paper eq. 2).
+    """Runs one Gamba block in float64 torch on the CPU, prepending and dropping (paper eq. 2).
 
     Args:
-        block: its weights are used.
+        block: the block whose weights are used.
         tokens: ``[B, L, width]`` float64.
         camera: ``[B, 1, channels]``.
         image: ``[B, K, channels]``.
+
+    Returns:
+        ``[B, L, width]`` float64.
     """
     weights = {name: p.detach().double().cpu() for name, p in block.named_parameters()}
 
@@ -233,55 +236,56 @@ def _blocks(settings: Settings, depth: int) -> list[Variant]:
     backbone = _Backbone(settings, depth)
     products = Products(backbone.forward, settings.device)
     oracle = f"float64 with the condition prepended, first {_TOKENS} of {backbone.length} tokens"
-    rounds = 3 if depth > 1 and settings.level == "normal" else None  # seconds each
-    common = dict(oracle=oracle, parameters=backbone.parameters, rounds=rounds)
+    rounds = 3 if depth > 1 and settings.level == "normal" else None  # one takes seconds
+    common: dict[str, Any] = dict(parameters=backbone.parameters, rounds=rounds)
+    checked: dict[str, Any] = dict(oracle=oracle, limit=LIMIT)
     made = [
         Variant(
-            "default",
-            backbone.forward,
-            partial(backbone.check, backbone.forward),
-            LIMIT,
+            name="default",
+            run=backbone.forward,
+            check=partial(backbone.check, backbone.forward),
             default=True,
+            **checked,
             **common,
         ),
         Variant(
-            "prefix states off",
-            backbone.prepended,
-            partial(backbone.check, backbone.prepended),
-            LIMIT,
+            name="prefix states off",
+            run=backbone.prepended,
+            check=partial(backbone.check, backbone.prepended),
+            **checked,
             **common,
         ),
         Variant(
-            "matrix products alone",
-            products.run,
-            None,
+            name="matrix products alone",
+            run=products.run,
+            check=None,
             work=lambda: {"products": products.count, "flops": products.flops},
-            parameters=backbone.parameters,
-            rounds=rounds,
+            **common,
         ),
     ]
     if depth == 1:
         made.append(
             Variant(
-                "default",
-                backbone.backward,
-                backbone.check_backward,
-                BACKWARD_LIMIT,
+                name="default",
+                run=backbone.backward,
+                check=backbone.check_backward,
+                limit=BACKWARD_LIMIT,
+                oracle=f"{oracle}, gradient of these tokens",
                 direction=BOTH,
                 default=True,
-                **common | {"oracle": oracle + ", gradient of these tokens"},
+                **common,
             )
         )
     return made
 
 
 class _Graph:
-    """A function's launches, recorded once and played again."""
+    """A function's CUDA launches, captured once; a call replays them."""
 
     def __init__(self, function: Callable[[], Tensor]) -> None:
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):  # kernels are compiled and buffers made before
+        with torch.cuda.stream(stream):  # the capture must find kernels compiled and buffers made
             for _ in range(3):
                 function()
         torch.cuda.current_stream().wait_stream(stream)
@@ -295,10 +299,11 @@ class _Graph:
 
 
 class _Lazy:
-    """Makes a function at its first call, so that what fails there fails alone."""
+    """Makes a function at its first call, so that a failure there spoils no other variant."""
 
     def __init__(self, make: Callable[[], Callable[[], Tensor]]) -> None:
-        self._make, self._function = make, None
+        self._make = make
+        self._function: Callable[[], Tensor] | None = None
 
     def __call__(self) -> Tensor:
         if self._function is None:
@@ -308,8 +313,9 @@ class _Lazy:
 
 def compiled(settings: Settings) -> list[Variant]:
     """A block of the paper's size as it is, through torch.compile, and on CUDA as a CUDA graph. The
-    first call has the compilation; what it can join are a few elementwise operations between the
-    products and our kernels, and no gain is to be seen: blocks are not compiled by default.
+    first call includes the compilation. All that it can fuse are a few elementwise operations
+    between the products and our kernels, and no gain is seen, so blocks are not compiled by
+    default.
     """
     backbone = _Backbone(settings, 1)
     (block,) = backbone.blocks
@@ -334,7 +340,11 @@ def compiled(settings: Settings) -> list[Variant]:
     oracle = f"float64 with the condition prepended, first {_TOKENS} of {backbone.length} tokens"
     return [
         Variant(
-            *(name, run, partial(backbone.check, run), LIMIT, oracle),
+            name=name,
+            run=run,
+            check=partial(backbone.check, run),
+            limit=LIMIT,
+            oracle=oracle,
             default=run is plain,
             parameters=backbone.parameters,
         )
@@ -343,14 +353,14 @@ def compiled(settings: Settings) -> list[Variant]:
 
 
 def targets(settings: Settings) -> list[Target]:
-    """What should be reached; nothing at a quick run's sizes."""
+    """Returns the targets; there are none at a quick run's sizes."""
     if settings.level == "quick":
         return []
     return [
         Target(
-            f"{case}, time over that of its matrix products alone",
-            (Key("block", case, "default"),),
-            (Key("block", case, "matrix products alone"),),
+            text=f"{case}, time over that of its matrix products alone",
+            times=(Key("block", case, "default"),),
+            over=(Key("block", case, "matrix products alone"),),
             at_most=1.3,
         )
         for case in ("one block", "backbone")

@@ -1,10 +1,11 @@
-"""Benchmark case of inference at full size: a picture to Gaussians in a CUDA graph, and a view."""
+"""Benchmark case of inference at full size: a picture to Gaussians by a CUDA graph, and a view."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,15 +23,17 @@ from ..render import render
 OP, CASE = "inference", "one picture"
 HEADLINE = "CUDA graph, bfloat16"
 WANTED_MS = 10.0  # on an H200; the paper states 50 ms on an A100
-_GIVEN_TOKENS, _GIVEN_CHANNELS = 576, 768  # of DINOv2 ViT-B/14 at 336 pixels
-# Allowed relative rms error. A graph runs the same kernels, but torch may choose other ones for a
-# product under capture: then the results differ by roundings of the dtype.
+_GIVEN_TOKENS, _GIVEN_CHANNELS = 576, 768  # those of DINOv2 ViT-B/14 at 336 pixels
+# Allowed relative rms error of a second run. A graph runs the same kernels, but under capture torch
+# may choose other kernels for a product, and then the results differ by roundings of the dtype.
 REPEAT_LIMITS = {torch.float32: 1e-4, torch.bfloat16: 1e-2}
-HALF_LIMIT = 0.03  # of bfloat16 to float32, of the worst attribute; on a CPU 0.007
+HALF_LIMIT = 0.03  # allowed error of bfloat16 to float32 in the worst attribute; a CPU has 0.007
 
 
 class _GivenTokens(nn.Module):
-    """Stands where the encoder would: the same tokens for every picture, at no cost."""
+    """Takes the encoder's part and gives the same tokens for every picture, at no cost."""
+
+    tokens: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -43,9 +46,9 @@ class _GivenTokens(nn.Module):
 
 
 def build_model(settings: Settings) -> tuple[Gamba, str]:
-    """The paper's model with untrained weights, and in words what its encoder is.
+    """Builds the paper's model with untrained weights; the second value names its encoder in words.
 
-    A quick run has a small one, of 256 Gaussians.
+    A quick run has a small model, of 256 Gaussians.
     """
     torch.manual_seed(0)
     config = PRESETS["paper"]
@@ -68,11 +71,11 @@ def _on(model: Gamba, settings: Settings) -> Gamba:
 
 
 class Inference:
-    """A model with one posed picture on its device, run as it is or from a CUDA graph.
+    """A model with one posed picture on its device, run as it is or by a CUDA graph.
 
     Attributes:
-        device: where everything runs.
-        encoder: in words, what makes the image tokens.
+        device: device of the model and of the picture.
+        encoder: name of the encoder, in words.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -82,24 +85,23 @@ class Inference:
         size = self.config.image_size
         g = torch.Generator().manual_seed(1)
         self.image = torch.rand(1, size, size, 3, generator=g).to(self.device)
-        cameras = reference_cameras(1, size, self.config.fov, self.config.distance)
-        self.cameras = cameras.to(self.device)
+        self.cameras = reference_cameras(self.config, 1).to(self.device)
         self._graphs: dict[torch.dtype, tuple] = {}
         self._graph_bytes: dict[torch.dtype, int] = {}
         self._truths: dict[torch.dtype, Gaussians] = {}
 
     @torch.no_grad()
     def eager(self, dtype: torch.dtype) -> Gaussians:
-        """The model's forward; bfloat16 by autocast."""
+        """Runs the model's forward; bfloat16 means autocast."""
         mixed = dtype != torch.float32
         with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed, cache_enabled=False):
             return self.model(self.image, self.cameras)
 
     def graph(self, dtype: torch.dtype) -> Gaussians:
-        """The same from a CUDA graph, captured by the first call.
+        """Runs the same by a CUDA graph, which the first call captures.
 
         Raises:
-            RuntimeError: the device has none, or something in the model cannot be captured.
+            RuntimeError: the device has no CUDA graphs, or the model cannot be captured.
         """
         if self.device.type != "cuda":
             raise RuntimeError("CUDA graphs need CUDA")
@@ -112,7 +114,7 @@ class Inference:
     def _capture(self, dtype: torch.dtype) -> tuple[torch.cuda.CUDAGraph, Gaussians]:
         stream = torch.cuda.Stream(self.device)
         stream.wait_stream(torch.cuda.current_stream(self.device))
-        with torch.cuda.stream(stream):  # as torch asks for: whatever is set up once is set up here
+        with torch.cuda.stream(stream):  # torch wants everything set up before the capture
             for _ in range(3):
                 self.eager(dtype)
         torch.cuda.current_stream(self.device).wait_stream(stream)
@@ -125,7 +127,7 @@ class Inference:
         return graph, result
 
     def peak(self, function: Callable, dtype: torch.dtype) -> dict[str, int]:
-        """Memory beside weights and input: what eager takes meanwhile, or what a graph keeps."""
+        """Measures memory beside weights and input: the growth of a run, or what a graph keeps."""
         if function == self.graph:
             return {"peak_bytes": self._graph_bytes[dtype]}
         peak = peak_bytes(partial(function, dtype), self.device)
@@ -133,20 +135,20 @@ class Inference:
 
     @torch.no_grad()
     def view(self, gaussians: Gaussians) -> Tensor:
-        """The picture of the reference view; the number of pairs is read back meanwhile."""
+        """Renders the reference view; the rasterizer reads the number of pairs back meanwhile."""
         cameras = replace(
             self.cameras, viewmats=self.cameras.viewmats[:, None], Ks=self.cameras.Ks[:, None]
         )
         return render(gaussians, cameras).rgb
 
     def truth(self, dtype: torch.dtype) -> Gaussians:
-        """What ``eager`` gives; kept, on the CPU."""
+        """Returns what ``eager`` gives, on the CPU; the first call computes it."""
         if dtype not in self._truths:
             self._truths[dtype] = self.eager(dtype).to("cpu")
         return self._truths[dtype]
 
     def check(self, run: Callable[[], Gaussians], truth: torch.dtype) -> Error:
-        """Error of the Gaussians of ``run`` to ``truth``, the worst attribute's."""
+        """Measures the error of the Gaussians of ``run`` to those of ``eager`` in ``truth``."""
         got = run()
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
@@ -158,9 +160,27 @@ def _named(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 def cases(settings: Settings) -> list[Case]:
-    """The one case, with the variants that the device can run."""
+    """Returns the one case, with the variants that the device can run."""
     text = "A posed picture to Gaussians, forward only, untrained weights; then one view of it."
-    return [Case(OP, CASE, text, partial(_variants, settings))]
+    return [Case(op=OP, name=CASE, text=text, build=partial(_variants, settings))]
+
+
+class _Run(NamedTuple):
+    """One way to the Gaussians, and what it is compared with.
+
+    Attributes:
+        function: ``Inference.eager`` or ``Inference.graph``.
+        dtype: dtype of the run.
+        truth: dtype of the ``eager`` run that it is compared with.
+        limit: allowed relative rms error.
+        oracle: name of that run, in words.
+    """
+
+    function: Callable[[torch.dtype], Gaussians]
+    dtype: torch.dtype
+    truth: torch.dtype
+    limit: float
+    oracle: str
 
 
 def _variants(settings: Settings) -> list[Variant]:
@@ -169,32 +189,35 @@ def _variants(settings: Settings) -> list[Variant]:
     parameters |= {"side": size, "encoder": inference.encoder}
     full, half = torch.float32, torch.bfloat16
     runs = {
-        "eager, float32": (inference.eager, full, full, REPEAT_LIMITS[full], "a second run"),
-        "eager, bfloat16": (inference.eager, half, full, HALF_LIMIT, "float32"),
+        "eager, float32": _Run(inference.eager, full, full, REPEAT_LIMITS[full], "a second run"),
+        "eager, bfloat16": _Run(inference.eager, half, full, HALF_LIMIT, "float32"),
     }
     if settings.device.type == "cuda":
         runs |= {
-            "CUDA graph, float32": (inference.graph, full, full, REPEAT_LIMITS[full], "eager"),
-            HEADLINE: (inference.graph, half, half, REPEAT_LIMITS[half], "eager, bfloat16"),
+            "CUDA graph, float32": _Run(inference.graph, full, full, REPEAT_LIMITS[full], "eager"),
+            HEADLINE: _Run(inference.graph, half, half, REPEAT_LIMITS[half], "eager, bfloat16"),
         }
     made = []
-    for name, (function, dtype, truth, limit, oracle) in runs.items():
-        run = partial(function, dtype)
-        check = partial(inference.check, run, truth)
+    for name, way in runs.items():
+        run = partial(way.function, way.dtype)
         made.append(
             Variant(
-                *(name, run, check, limit, f"{oracle} (0: the same bits)"),
-                dtype=str(dtype).removeprefix("torch."),
+                name=name,
+                run=run,
+                check=partial(inference.check, run, way.truth),
+                limit=way.limit,
+                oracle=f"{way.oracle} (0: the same bits)",
+                dtype=str(way.dtype).removeprefix("torch."),
                 default=name == HEADLINE,
                 parameters=parameters,
-                work=partial(inference.peak, function, dtype),
+                work=partial(inference.peak, way.function, way.dtype),
             )
         )
     return [*made, *_pictures(inference, parameters)]
 
 
 def _pictures(inference: Inference, parameters: dict) -> list[Variant]:
-    """Gaussians to a view, and a picture to a view."""
+    """Makes the variants that end in a picture: Gaussians to a view, and a picture to a view."""
     gaussians = inference.eager(torch.float32)
     run = inference.graph if inference.device.type == "cuda" else inference.eager
     size = inference.config.image_size
@@ -207,14 +230,21 @@ def _pictures(inference: Inference, parameters: dict) -> list[Variant]:
         "picture to view, bfloat16": lambda: inference.view(run(torch.bfloat16)),
     }
     return [
-        Variant(name, picture, partial(check, picture), 0.0, "a second run", parameters=parameters)
+        Variant(
+            name=name,
+            run=picture,
+            check=partial(check, picture),
+            limit=0.0,
+            oracle="a second run",
+            parameters=parameters,
+        )
         for name, picture in runs.items()
     ]
 
 
 def targets(settings: Settings) -> list[Target]:
-    """What should be reached on an H200; nothing elsewhere or at a quick run's size."""
+    """Returns the target for an H200; there is none without CUDA or at a quick run's size."""
     if settings.level == "quick" or settings.device.type != "cuda":
         return []
     text = "a picture to 16,384 Gaussians, bfloat16, ms (an H200; the paper: 50 on an A100)"
-    return [Target(text, (Key(OP, CASE, HEADLINE),), at_most=WANTED_MS)]
+    return [Target(text=text, times=(Key(OP, CASE, HEADLINE),), at_most=WANTED_MS)]

@@ -1,8 +1,9 @@
-"""Benchmark cases of whole models: pictures to Gaussians."""
+"""Benchmark cases of whole models, from pictures to Gaussians."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -12,7 +13,7 @@ from ..cameras import Cameras, intrinsics, orbit, reference_viewmat
 from ..gaussians import Gaussians
 from ..kernels.bench import Error, NotInstalled, Settings, Variant, compare
 from ..model.checkpoint import load_model
-from ..model.config import PRESETS, GambaConfig
+from ..model.config import PRESETS, Preset
 from ..model.gamba import Gamba
 from ..model.posing import reference_cameras
 from ..render import render
@@ -20,14 +21,14 @@ from ..render import render
 _REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
 
 
-def _model(preset: str, settings: Settings, count: int) -> tuple[Gamba, Callable[[], Gaussians]]:
-    """A model with fresh weights and no image encoder, and its run on ``count`` pictures."""
+def _model(preset: Preset, settings: Settings, count: int) -> tuple[Gamba, Callable[[], Gaussians]]:
+    """Makes a model with fresh weights and no image encoder, and its run on ``count`` pictures."""
     torch.manual_seed(0)
-    config = GambaConfig(**(vars(PRESETS[preset]) | {"encoder": "none"}))
+    config = replace(PRESETS[preset], encoder="none")
     model = Gamba(config).to(settings.device).eval()
     size = config.image_size
     images = torch.rand(count, size, size, 3).to(settings.device)
-    cameras = reference_cameras(count, size, config.fov, config.distance).to(settings.device)
+    cameras = reference_cameras(config, count).to(settings.device)
     return model, torch.no_grad()(partial(model, images, cameras))
 
 
@@ -37,15 +38,19 @@ def _check_repeats(run: Callable[[], Gaussians]) -> Error:
 
 
 def pictures(settings: Settings) -> list[Variant]:
-    """A posed picture to Gaussians by preset, without the image encoder. Whole models with fresh
-    weights; two runs must give the same bits.
+    """A posed picture to Gaussians by preset, without the image encoder. The models are whole and
+    have fresh weights; two runs must give the same bits.
     """
     made = []
     for name in ("tiny",) if settings.level == "quick" else ("tiny", "small", "paper"):
         model, run = _model(name, settings, 1)
         made.append(
             Variant(
-                *(name, run, partial(_check_repeats, run), 0.0, _REPEATS),
+                name=name,
+                run=run,
+                check=partial(_check_repeats, run),
+                limit=0.0,
+                oracle=_REPEATS,
                 default=True,
                 rounds=10,
                 parameters={"N": model.config.num_gaussians, "side": model.config.image_size},
@@ -61,8 +66,11 @@ def batches(settings: Settings) -> list[Variant]:
         model, run = _model("tiny", settings, count)
         made.append(
             Variant(
-                *(f"{count} picture{'s' * (count > 1)}", run),
-                *(partial(_check_repeats, run), 0.0, _REPEATS),
+                name=f"{count} picture{'s' * (count > 1)}",
+                run=run,
+                check=partial(_check_repeats, run),
+                limit=0.0,
+                oracle=_REPEATS,
                 parameters={"B": count, "N": model.config.num_gaussians},
             )
         )
@@ -73,7 +81,8 @@ class _Pictures:
     """The starter model on some of its icons; errors are of pictures from three sides."""
 
     def __init__(self, settings: Settings) -> None:
-        # here, not above: these need more than torch and warp, the other cases nothing else
+        # These are imported here because they need more packages than torch and warp, which
+        # suffice for all other cases.
         try:
             import safetensors  # noqa: F401
 
@@ -91,8 +100,7 @@ class _Pictures:
         chosen = icons[:: max(1, len(icons) // count)][:count]
         images = [composite(prepare(path), size, config.background_color) for path in chosen]
         self.images = [image[None].to(self.device) for image in images]
-        camera = reference_cameras(1, size, config.fov, config.distance)
-        self.camera = camera.to(self.device)
+        self.camera = reference_cameras(config, 1).to(self.device)
         around = orbit(torch.tensor([90.0, 180.0]), distance=config.distance)
         viewmats = torch.cat([reference_viewmat(config.distance)[None], around])
         K = intrinsics(size, size, config.fov).repeat(3, 1, 1)
@@ -102,18 +110,21 @@ class _Pictures:
 
     @torch.no_grad()
     def run(self, margin: int | None) -> list[Gaussians]:
-        """Timed: one picture after the other."""
+        """Runs the model on one picture after the other; this is what is timed."""
         return [self.model(x, self.camera, background_margin=margin)[0] for x in self.images]
 
     @torch.no_grad()
     def pictures(self, margin: int | None) -> Tensor:
+        """Renders the results of ``run`` from three sides: ``[pictures, 3, H, W, 3]``."""
         made = self.run(margin)
         return torch.stack([render(g, self.views, self.background).rgb for g in made])
 
     def check(self, margin: int | None) -> Error:
+        """Measures the error of the rendered pictures to those of the full model."""
         return compare({"pictures": self.pictures(margin)}, {"pictures": self.full})
 
     def work(self, margin: int | None) -> dict[str, float]:
+        """Counts kept tokens and their share, and the PSNR to the full model's pictures, dB."""
         kept = sum(g.means.shape[-2] for g in self.run(margin))
         total = len(self.images) * self.model.config.num_gaussians
         difference = (self.pictures(margin) - self.full).square().mean().clamp_min(1e-12)
@@ -123,21 +134,21 @@ class _Pictures:
 
 def background_tokens(settings: Settings) -> list[Variant]:
     """Tokens of plain background dropped (``Gamba.forward``'s ``background_margin``), of the
-    starter model on its icons, one after the other; the error is that of pictures from three sides
-    to those of the full model. Margin: patches beside the object that are kept. The model was
-    trained with all tokens, and those of the background draw parts of the object: none is dropped
-    unless asked for.
+    starter model on its icons, one after the other. The error is that of pictures from three sides
+    to those of the full model. The margin counts the patches beside the object that are kept. The
+    model was trained with all tokens, and those of the background draw parts of the object, so none
+    is dropped by default.
     """
     pictures = _Pictures(settings)
     made = []
     for margin in (None, 0) if settings.level == "quick" else (None, 6, 4, 3, 2, 1, 0):
         made.append(
             Variant(
-                "all tokens" if margin is None else f"margin {margin}",
-                partial(pictures.run, margin),
-                partial(pictures.check, margin),
-                1.0,
-                "the full model's pictures (not float64)",
+                name="all tokens" if margin is None else f"margin {margin}",
+                run=partial(pictures.run, margin),
+                check=partial(pictures.check, margin),
+                limit=1.0,
+                oracle="the full model's pictures (not float64)",
                 default=margin is None,
                 work=partial(pictures.work, margin),
                 parameters={"N": pictures.model.config.num_gaussians, "views": 3},

@@ -22,7 +22,7 @@ KINDS = (
     "uniform", "white", "black", "checkerboard", "one pixel", "out of range", "tiny weights",
     "large weights", "long steps", "short steps", "slow decay", "fast decay", "saturated heads",
 )  # fmt: skip
-_BFLOAT16 = 2.0**16  # last bits of float32 in half the last bit of bfloat16
+_BFLOAT16 = 2.0**16  # half the last bit of bfloat16, in last bits of float32
 _IMAGE_CHANNELS = 6
 _PLAIN = {
     "batch": 1, "patches": 1, "patch_size": 1, "width": 1, "depth": 1, "state_size": 1,
@@ -34,7 +34,7 @@ _CHOICES = {"norm": ("layer", "rms"), "discretization": ("mamba", "bilinear", "z
 
 
 def draw(rng: Random, kind: str) -> dict:
-    """Random options."""
+    """Draws random options; each kind takes the same ones."""
     flag = lambda chance=0.5: rng.random() < chance  # noqa: E731
     return valid(dict(
         batch=rng.choice((1, 2, 3)), patches=rng.choice((1, 2, 3, 4)),
@@ -50,7 +50,7 @@ def draw(rng: Random, kind: str) -> dict:
 
 
 def valid(options: dict) -> dict:
-    """Sizes within the configuration's limits."""
+    """Returns the options with all sizes brought within the limits."""
     least = {k: 1 for k in ("patches", "patch_size", "width", "depth", "expand", "dt_rank")}
     least |= {"state_size": 1, "conv_size": 2, "position_bins": 2}
     most = {"state_size": 16, "conv_size": 4, "position_bins": 21, "width": 32, "depth": 4,
@@ -74,13 +74,13 @@ def _config(o: dict) -> GambaConfig:
 
 
 def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], Cameras]:
-    """The model, its inputs that ask for gradients by name, and the cameras."""
+    """Builds the model, its inputs that ask for gradients, by name, and the cameras."""
     o, kind = case.options, case.kind
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(case.seed)
         config = _config(o)
         model = Gamba(config)
-        if o["image_tokens"]:  # as if an encoder had made them
+        if o["image_tokens"]:  # the blocks take image tokens although there is no encoder
             camera = config.width if config.camera_token else 0
             blocks = (GambaBlock(config, camera, _IMAGE_CHANNELS) for _ in range(config.depth))
             model.blocks = torch.nn.ModuleList(blocks)
@@ -100,15 +100,16 @@ def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], C
 
 @torch.no_grad()
 def _change(model: Gamba, kind: str) -> None:
-    """Every parameter away from its start, then what the kind does to some."""
+    """Moves every parameter away from its start, then does what the kind asks for."""
     for parameter in model.parameters():
         parameter += 0.05 * torch.randn_like(parameter)
         if kind in ("tiny weights", "large weights"):
             parameter *= 1e-3 if kind == "tiny weights" else 4.0
     for block in model.blocks:
+        assert isinstance(block, GambaBlock)
         mamba = block.mamba
-        mamba.dt_proj.bias += {"long steps": 8.0, "short steps": -25.0}.get(kind, 0.0)
-        mamba.A_log += {"slow decay": -14.0, "fast decay": 7.0}.get(kind, 0.0)
+        mamba.dt_proj.bias.add_({"long steps": 8.0, "short steps": -25.0}.get(kind, 0.0))
+        mamba.A_log.add_({"slow decay": -14.0, "fast decay": 7.0}.get(kind, 0.0))
     if kind == "saturated heads":
         for head in (model.decoder.position, model.decoder.opacity, model.decoder.scale):
             head.weight *= 300
@@ -136,7 +137,7 @@ class _Oracle:
         self.orders = model.tokens.orders.cpu()
 
     def linear(self, x: Tensor, name: str, ulps: float | None = None) -> Tensor:
-        """``x [S, B, .., in]``; its product's operands and result are rounded."""
+        """Applies a linear layer to ``x [S, B, .., in]`` and rounds operands and result."""
         ulps = self.ulps if ulps is None else ulps
         W, bias = self.weights[f"{name}.weight"], self.weights.get(f"{name}.bias")
         axes = (1,) * (x.dim() - 3)
@@ -147,7 +148,7 @@ class _Oracle:
         return self.r(y + self.r(bias).reshape(len(bias), *axes, 1, -1), ulps, ulps)
 
     def norm(self, x: Tensor, name: str) -> Tensor:
-        """The configuration's norm."""
+        """Applies the configuration's norm."""
         x = self.r(x)
         if self.config.norm == "layer":
             x = self.r(x - x.mean(-1, keepdim=True))
@@ -157,18 +158,18 @@ class _Oracle:
         return self.r(x if bias is None else x + bias[:, None, None])
 
     def silu(self, x: Tensor) -> Tensor:
-        """The activation."""
+        """Applies the activation."""
         return self.r(x * self.r.sigmoid(x, EXP_ULPS), self.ulps)
 
     def tokens(self, images: Tensor, cameras: Cameras) -> Tensor:
-        """The 3DGS tokens."""
+        """Computes the 3DGS tokens."""
         r, embedding = self.r, self.r(self.weights["tokens.embedding"])[:, None]
         if not self.config.additive_image_tokens:
             return embedding.expand(-1, images.shape[1], -1, -1)
         viewmats, Ks = cameras.viewmats.cpu().double(), cameras.Ks.cpu().double()
         rays = plucker_rays(viewmats, Ks, cameras.width, cameras.height)
         rays = rays.expand(SAMPLES, *rays.shape)
-        rays = r.rounded(rays + 2, 4.0) - 2  # differences of products of size 2
+        rays = r.rounded(rays + 2, 4.0) - 2  # they are differences of products of size 2
         pixels = torch.cat([r(normalize_imagenet(images)), rays], -1)
         size, grid = self.config.patch_size, self.config.grid_size
         patches = pixels.unflatten(2, (grid, size)).unflatten(4, (grid, size))
@@ -179,7 +180,7 @@ class _Oracle:
         return r(x[:, :, self.orders] + embedding)
 
     def mamba(self, x: Tensor, name: str) -> Tensor:
-        """One Mamba block over ``[S, B, L, width]``."""
+        """Runs one Mamba block over ``[S, B, L, width]``."""
         r, w = self.r, {k: self.weights[f"{name}.{k}"] for k in (
             "conv_weight", "conv_bias", "A_log", "D", "dt_proj.bias"
         )}  # fmt: skip
@@ -199,7 +200,7 @@ class _Oracle:
         return self.linear(r(y, self.ulps, self.ulps), f"{name}.out_proj")
 
     def run(self, inputs: dict[str, Tensor], cameras: Cameras) -> dict[str, Tensor]:
-        """Attributes of the Gaussians by name."""
+        """Computes the Gaussians' attributes, by name."""
         tokens, prefix = self.tokens(inputs["images"], cameras), []
         if self.config.prepend:
             numbers = torch.cat([
@@ -219,7 +220,7 @@ class _Oracle:
         return self.decode(self.norm(tokens, "norm"))
 
     def decode(self, x: Tensor) -> dict[str, Tensor]:
-        """The heads."""
+        """Applies the decoder to the normalised tokens."""
         r, config = self.r, self.config
         x = self.silu(self.linear(x, "decoder.mlp.0"))
         x = self.silu(self.linear(x, "decoder.mlp.2"))
@@ -227,7 +228,7 @@ class _Oracle:
             "position", "opacity", "scale", "color"
         )}  # fmt: skip
         points = torch.linspace(-config.position_range, config.position_range, config.position_bins)
-        # in steps: the gradient of a saturated softmax is a difference that cancels
+        # The softmax goes in steps: where it saturates, its gradient is a difference that cancels.
         logits = heads["position"].unflatten(-1, (3, -1))
         powers = r.exp(r(logits - logits.detach().amax(-1, keepdim=True)), EXP_ULPS)
         share = r(powers / r(powers.sum(-1, keepdim=True)))
@@ -253,7 +254,7 @@ def _run(model: Gamba, o: dict, inputs: dict, cameras: Cameras) -> dict[str, Ten
 
 
 def evaluate(case: Case, device: torch.device) -> Outcome:
-    """Runs the model; all attributes, the gradients of all parameters and inputs."""
+    """Runs the model and judges all attributes and the gradients of all parameters and inputs."""
     model, inputs, cameras = build(case, device)
     leaves = inputs | dict(model.named_parameters())
     oracle = _Oracle(case, model)

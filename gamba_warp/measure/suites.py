@@ -1,28 +1,77 @@
-"""The suites of ``gamba bench``, and the files of their results."""
+"""A run of ``gamba bench``, and the files of its results."""
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
+import torch
+from tqdm import tqdm
+
 from ..errors import UserError
+from ..files import atomic_path, output_folder, write_json
+from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.core.document import parse_document
-
-# what is measured -> the module with ``cases(settings)`` and ``targets(settings)``, loaded if asked
-SUITES = {
-    "scan": "gamba_warp.kernels.bench.cases.scan",
-    "conv": "gamba_warp.kernels.bench.cases.conv",
-    "raster": "gamba_warp.kernels.bench.cases.raster",
-    "block": "gamba_warp.measure.blocks",
-    "model": "gamba_warp.measure.blocks",
-    "train-step": "gamba_warp.train.bench",
-}
+from ..kernels.bench.core.page import page
+from ..kernels.bench.core.report import judge, markdown, ratio_table
+from ..kernels.bench.peers import versions
+from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 
 
-def load_suite(op: str) -> ModuleType:
-    """The module with the cases and targets of one of ``SUITES``."""
-    return importlib.import_module(SUITES[op])
+def make_settings(
+    device: torch.device, quick: bool, full: bool, peers: bool, threads: int | None
+) -> Settings:
+    """The settings of the cases from the options of the command.
+
+    Raises:
+        UserError: options contradict one another or are out of range.
+    """
+    if quick and full:
+        raise UserError("--quick and --full: choose one")
+    if threads is not None and threads < 1:
+        raise UserError(f"--threads is {threads}, it must be positive")
+    return Settings(
+        device=device,
+        level="quick" if quick else "full" if full else "normal",
+        peers=peers,
+        threads=threads or torch.get_num_threads(),
+    )
+
+
+def run_suites(suites: Mapping[str, ModuleType], settings: Settings) -> dict:
+    """Measures the cases of suites, with a progress bar.
+
+    Args:
+        suites: by operator, the module with its ``cases(settings)`` and ``targets(settings)``.
+        settings: of the cases.
+
+    Returns:
+        The document of the records, targets and peers; Ctrl-C leaves what was measured in it.
+    """
+    cases: list[Case] = []
+    targets: list[Target] = []
+    for op, module in suites.items():
+        cases += [case for case in module.cases(settings) if case.op == op]
+        targets += [t for t in module.targets(settings) if t.times[0].op == op]
+    with tqdm(total=len(cases), unit="case", desc="bench", disable=None) as bar:
+        document = measure(cases, settings, _progress(bar))
+    document["machine"]["peers"] = versions() if settings.peers else {}
+    document["targets"] = judge(targets, document["records"])
+    return document
+
+
+def _progress(bar: tqdm) -> Callable[[str, str], None]:
+    """Shows what is under way; the bar moves on when the case changes."""
+    current: list[str | None] = [None]
+
+    def say(case: str, variant: str) -> None:
+        if current[0] not in (None, case):
+            bar.update()
+        current[0] = case
+        bar.set_postfix_str(f"{case}, {variant}")
+
+    return say
 
 
 def read_document(path: Path) -> dict:
@@ -39,3 +88,80 @@ def read_document(path: Path) -> dict:
         raise UserError(f"{path}: not JSON (not even text)") from error
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def write_document(document: dict, folder: Path) -> None:
+    """Writes bench.json, bench.md and bench.html."""
+    write_json(folder / "bench.json", document)
+    _write_pages([document], folder)
+
+
+def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
+    """Writes the tables and the page of documents.
+
+    Args:
+        documents: as ``read_document`` returns them.
+        out: a .md or .html file, or a folder for bench.md and bench.html.
+
+    Returns:
+        The files.
+    """
+    if out.suffix in (".md", ".html"):
+        _write(out, markdown(documents) if out.suffix == ".md" else page(documents))
+        return [out]
+    return _write_pages(documents, output_folder(out))
+
+
+def _write_pages(documents: Sequence[dict], folder: Path) -> list[Path]:
+    _write(folder / "bench.md", markdown(documents))
+    _write(folder / "bench.html", page(documents))
+    return [folder / "bench.md", folder / "bench.html"]
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_static(folder: Path) -> int:
+    """Compiles the CUDA kernels and writes what they take to static.json and static.md.
+
+    Returns:
+        The number of rows.
+
+    Raises:
+        UserError: this build of Warp has no compiler, or a file cannot be written.
+    """
+    with tqdm(unit="kernel", desc="static", disable=None) as bar:
+
+        def say(kernel: str) -> None:
+            bar.set_postfix_str(kernel)
+            bar.update()
+
+        try:
+            document = static_report(say)
+        except NoCompiler as error:
+            raise UserError(f"--static: {error}") from error
+    write_json(folder / "static.json", document)
+    _write(folder / "static.md", static_markdown(document))
+    return len(document["kernels"])
+
+
+def failed_records(document: dict) -> list[dict]:
+    """The records whose check or run failed."""
+    return [r for r in document["records"] if r["status"].startswith(("failed", "check"))]
+
+
+def summary(document: dict, old: dict | None) -> str:
+    """Lines on targets, failures, and the ratios of the times to those of an older document."""
+    lines = []
+    for t in document["targets"]:
+        word = {True: "reached", False: "missed", None: "not measured"}[t["reached"]]
+        value = "" if t["value"] is None else f"{t['value']:.3g}"
+        lines.append(f"{word:<12} {value:>8}  ({t['wanted']})  {t['op']}: {t['text']}")
+    if old is not None:
+        lines.append(ratio_table(old, document))
+    for r in failed_records(document):
+        lines.append(f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}: {r['status']}")
+    measured = sum(r["status"] == "ok" for r in document["records"])
+    return "\n".join([*lines, f"{measured} measured"])

@@ -1,41 +1,47 @@
 """The Gamba block: prepend the condition, run a Mamba block, drop the condition (paper eq. 2).
 
-A token of a Mamba block depends on those before it through two small states alone. What a block
-puts in front is dropped behind it and made afresh in the next block, so all that it leaves is the
-states after it, and these depend on the condition, not on the tokens: ``prefix_states`` computes
-them for all blocks at once, and each block then runs over the 3DGS tokens only. The result is that
-of prepending and dropping.
+In a Mamba block a token depends on the tokens before it only through two small states. A block
+prepends the condition, drops its outputs, and the next block prepends it anew. All that the
+condition contributes to a block is therefore the pair of states after it, and this pair does not
+depend on the 3DGS tokens. ``prefix_states`` computes the states of all blocks at once, and
+``run_blocks`` then runs the blocks over the 3DGS tokens alone. The result is that of prepending and
+dropping.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from operator import attrgetter
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint
 
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.selective_scan import selective_scan, selective_scan_state
 from .config import GambaConfig
 
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
+# Number of tokens that pass through all blocks together on a CPU that keeps nothing for a gradient.
+# The temporaries of so few are reused at once, instead of being mapped anew each time.
+SEGMENT = 2048
 
 
-def make_norm(config: GambaConfig) -> nn.Module:
+def make_norm(config: GambaConfig) -> nn.LayerNorm | nn.RMSNorm:
     """LayerNorm or RMSNorm over a token's channels, with eps 1e-5."""
     kind = nn.LayerNorm if config.norm == "layer" else nn.RMSNorm
     norm = kind(config.width, eps=1e-5)
     for parameter in norm.parameters():
-        parameter._no_weight_decay = True
+        vars(parameter)["_no_weight_decay"] = True
     return norm
 
 
 class State(NamedTuple):
-    """What a Mamba block keeps of the tokens that it has seen.
+    """What a Mamba block remembers of the tokens that it has seen.
 
     Attributes:
         conv: ``[B, conv_size - 1, inner_width]``, the convolution's last inputs.
@@ -49,8 +55,9 @@ class State(NamedTuple):
 class Mamba(nn.Module):
     """The vanilla Mamba block (Gu & Dao 2023), channels last.
 
-    Parameters have mamba-ssm's names, shapes and row order (``x_proj``: step rank, B, C), so its
-    weights load unchanged, but for the convolution's, which lack its middle axis of length 1.
+    Parameters have mamba-ssm's names, shapes and row order (``x_proj``: step rank, B, C), so
+    weights of mamba-ssm load unchanged. The one exception is the convolution's weight, which lacks
+    mamba-ssm's middle axis of length 1.
     """
 
     def __init__(self, config: GambaConfig) -> None:
@@ -70,7 +77,7 @@ class Mamba(nn.Module):
 
     @torch.no_grad()
     def _init_weights(self, config: GambaConfig) -> None:
-        """As mamba-ssm's defaults (version 2.2)."""
+        """Draws the weights as mamba-ssm does by default (version 2.2)."""
         bound = config.conv_size**-0.5
         nn.init.uniform_(self.conv_weight, -bound, bound)
         nn.init.uniform_(self.conv_bias, -bound, bound)
@@ -81,15 +88,16 @@ class Mamba(nn.Module):
         self.dt_proj.bias.copy_(step + torch.log(-torch.expm1(-step)))  # softplus's inverse
         states = torch.arange(1, config.state_size + 1, dtype=torch.float32)
         self.A_log.copy_(states.log().expand_as(self.A_log))
-        # One residual branch per block: the sum over the depth keeps the variance of one branch.
+        # There is one residual branch per block, and their sum keeps the variance of one branch.
         self.out_proj.weight.div_(math.sqrt(config.depth))
         for parameter in (self.A_log, self.D, self.conv_bias, self.dt_proj.bias):
-            parameter._no_weight_decay = True
+            vars(parameter)["_no_weight_decay"] = True
 
     def forward(self, tokens: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-        """``[B, L, width]`` to ``[B, L, width]``; a token sees itself and those before it.
+        """Maps ``[B, L, width]`` to ``[B, L, width]``; a token sees itself and those before it.
 
-        ``state`` is what earlier tokens left, None for none; that after the last token is returned.
+        ``state`` is what earlier tokens left, or None if there are none. The state after the last
+        token is returned beside the tokens.
         """
         conv_state, scan_state = state or (None, None)
         x, z = self.in_proj(tokens).chunk(2, dim=-1)
@@ -126,12 +134,12 @@ class Mamba(nn.Module):
 class GambaBlock(nn.Module):
     """One Gamba block: G_n = G_{n-1} + Drop(Mamba(Norm(Prepend(P_c T, P_x X, G_{n-1})))).
 
-    The prefix has no residual of its own, since it is dropped and made afresh in each block; it
-    enters as the state that it leaves, from ``prefix_states``.
+    The prefix has no residual branch of its own, since each block drops it and the next one makes
+    it anew. It enters as the state that it leaves behind, which ``prefix_states`` computes.
     """
 
     def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
-        """Zero channels mean that there is no such condition."""
+        """Builds the block; zero channels mean that there is no such condition."""
         super().__init__()
         width = config.width
         self.project_camera = nn.Linear(camera_channels, width) if camera_channels else None
@@ -140,35 +148,70 @@ class GambaBlock(nn.Module):
         self.mamba = Mamba(config)
 
     def forward(self, tokens: Tensor, state: State | None) -> tuple[Tensor, State]:
-        """Refines 3DGS tokens, all or the next ones.
+        """Refines the 3DGS tokens, all of them or the next segment.
 
         Args:
             tokens: ``[B, L, width]``.
-            state: this block's own of ``prefix_states``, or after the tokens before these.
+            state: this block's entry of ``prefix_states``, or its state after the segment before.
 
         Returns:
             ``[B, L, width]``, and the state after the last token.
         """
-        hidden, state = self.mamba(self.norm(tokens), state)
-        return tokens + hidden, state
+        hidden, after = self.mamba(self.norm(tokens), state)
+        return tokens + hidden, after
+
+
+def run_blocks(
+    blocks: Iterable[nn.Module],
+    tokens: Tensor,
+    states: Sequence[State | None],
+    recompute: bool = False,
+) -> Tensor:
+    """Runs all blocks over the 3DGS tokens.
+
+    On a CPU without gradients, one segment of ``SEGMENT`` tokens after the other passes through all
+    blocks, and each block hands its state from one segment to the next.
+
+    Args:
+        blocks: the network's blocks (``GambaBlock``) in their order.
+        tokens: ``[B, L, width]``.
+        states: the result of ``prefix_states``, one entry per block.
+        recompute: with gradients, keep only each block's input and run the block again in the
+            backward pass.
+
+    Returns:
+        ``[B, L, width]``.
+    """
+    states, gradients = list(states), torch.is_grad_enabled()
+    segments = [tokens]
+    if tokens.device.type == "cpu" and not gradients:
+        segments = list(tokens.split(SEGMENT, dim=1))
+    for s, segment in enumerate(segments):
+        for i, block in enumerate(blocks):
+            run = block
+            if recompute and gradients:
+                run = partial(checkpoint, block, use_reentrant=False)
+            segment, states[i] = run(segment, states[i])
+        segments[s] = segment
+    return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
 
 def prefix_states(
-    blocks: Sequence[GambaBlock], camera: Tensor | None, image: Tensor | None
+    blocks: Sequence[GambaBlock] | nn.ModuleList, camera: Tensor | None, image: Tensor | None
 ) -> list[State | None]:
-    """The state in which each block is after its prefix P_c T, P_x X, camera first.
+    """Computes the state of each block after its prefix P_c T, P_x X, camera first.
 
-    All blocks are computed together: a product for each of their matrices, one convolution and one
-    scan in which a block is a group of channels. What only the dropped outputs need is left out:
-    the gate z, C, D and the output projection.
+    All blocks are computed together: one batched product for each kind of matrix, one convolution
+    and one scan in which each block is a group of channels. What only the dropped outputs would
+    need is left out: the gate z, C, D and the output projection.
 
     Args:
-        blocks: of one configuration.
-        camera: ``[B, 1, camera_channels]``, or None where the blocks have no such condition.
-        image: ``[B, K, image_channels]``, likewise.
+        blocks: blocks of one configuration.
+        camera: ``[B, 1, camera_channels]``, or None if the blocks have no such condition.
+        image: ``[B, K, image_channels]``, or None likewise.
 
     Returns:
-        One for each block; None where there is neither condition.
+        One state per block, or None for each if there is neither condition.
     """
     projections = {"project_camera": camera, "project_image": image}
     prefix = [
@@ -178,9 +221,11 @@ def prefix_states(
     ]
     if not prefix:
         return [None] * len(blocks)
-    mamba = blocks[0].mamba
+    first = blocks[0]
+    assert isinstance(first, GambaBlock)
+    mamba = first.mamba
     inner, (rank, states, _) = len(mamba.D), mamba.split
-    tokens = _normalized(blocks, torch.cat(prefix, dim=1))
+    tokens = _normalized(blocks, first.norm, torch.cat(prefix, dim=1))
     x, conv_state = causal_conv1d(
         _product(tokens, _stacked(blocks, "mamba.in_proj.weight", inner)).flatten(2),
         _joined(blocks, "mamba.conv_weight"),
@@ -204,25 +249,26 @@ def prefix_states(
     return [State(*pair) for pair in pairs]
 
 
-def _joined(blocks: Sequence[GambaBlock], name: str) -> Tensor:
-    """A parameter of all blocks, one after the other along the first dimension."""
+def _joined(blocks: Iterable[nn.Module], name: str) -> Tensor:
+    """Joins one parameter of all blocks along its first dimension."""
     return torch.cat([attrgetter(name)(block) for block in blocks])
 
 
-def _stacked(blocks: Sequence[GambaBlock], name: str, rows: int | None = None) -> Tensor:
-    """The first ``rows`` of a matrix of all blocks, ``[depth, rows, columns]``."""
+def _stacked(blocks: Iterable[nn.Module], name: str, rows: int | None = None) -> Tensor:
+    """Stacks the first ``rows`` of one parameter of all blocks: ``[depth, rows, ..]``."""
     return torch.stack([attrgetter(name)(block)[:rows] for block in blocks])
 
 
 def _product(tokens: Tensor, matrices: Tensor) -> Tensor:
-    """``[B, K, depth, in]`` to ``[B, K, depth, out]``: each block's tokens times its matrix."""
+    """Multiplies each block's tokens by its matrix: ``[B, K, depth, in]`` to ``[.., out]``."""
     rows = tokens.flatten(0, 1).transpose(0, 1)
     return torch.bmm(rows, matrices.mT).transpose(0, 1).unflatten(0, tokens.shape[:2])
 
 
-def _normalized(blocks: Sequence[GambaBlock], tokens: Tensor) -> Tensor:
-    """``[B, K, depth·width]`` to ``[B, K, depth, width]``, each block's by its own norm."""
-    norm = blocks[0].norm
+def _normalized(
+    blocks: Sequence[GambaBlock] | nn.ModuleList, norm: nn.LayerNorm | nn.RMSNorm, tokens: Tensor
+) -> Tensor:
+    """Applies each block's own norm: ``[B, K, depth·width]`` to ``[B, K, depth, width]``."""
     tokens = tokens.unflatten(2, (len(blocks), -1)).float()
     if isinstance(norm, nn.RMSNorm):
         return F.rms_norm(tokens, norm.normalized_shape, None, norm.eps) * _stacked(

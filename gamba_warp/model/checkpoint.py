@@ -1,9 +1,8 @@
-"""Models as files: configuration and weights in one safetensors file."""
+"""Models as files: one safetensors file holds the weights and, in its header, the configuration."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,14 +12,11 @@ from ..files import CHECKOUT, atomic_path
 from .config import GambaConfig
 from .gamba import Gamba
 
-if TYPE_CHECKING:
-    from .config import GambaConfig
-    from .gamba import Gamba
-
-
 FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
-# Of checkpoint metadata; extra_metadata may use any other key.
+DEFAULT_CHECKPOINT = CHECKOUT / "starter" / "tiny.safetensors"
+
+# These keys of the header are ours; extra_metadata may use any other key.
 _OWN_KEYS = ("format", "config", "encoder_sha256")
 
 
@@ -30,13 +26,14 @@ def save_model(
     """Writes weights and configuration to one safetensors file, atomically.
 
     Args:
-        path: the file; ``load_model`` reads a folder's ``model.safetensors``.
-        model: a frozen encoder's weights are left out, their SHA-256 is kept.
-        extra_metadata: kept beside ours in the file's header; not "format", "config" or
-            "encoder_sha256".
+        path: the file; if it is named ``model.safetensors``, ``load_model`` finds it by its folder.
+        model: the model; of a frozen encoder only the SHA-256 of its weights is stored.
+        extra_metadata: further entries of the file's header; the keys "format", "config" and
+            "encoder_sha256" are taken.
 
     Raises:
         UserError: the file cannot be written.
+        ValueError: ``extra_metadata`` has a key that is taken.
     """
     from safetensors.torch import save_file
 
@@ -53,22 +50,26 @@ def save_model(
 
 
 def load_model(
-    path: str | Path,
+    path: str | Path | None = None,
     device: str | torch.device = "cpu",
     encoder_weights: str | Path | None = None,
 ) -> Gamba:
-    """Reads ``save_model``'s file; the model comes in eval mode.
+    """Reads a file of ``save_model``.
 
     Args:
-        path: the file, or a folder with a ``model.safetensors``.
-        device: where the model goes.
-        encoder_weights: as ``build_encoder``; needed for a frozen timm encoder.
+        path: the file, or a folder with a ``model.safetensors``; without it the small model in
+            ``starter/``, which a checkout has and an installed package does not.
+        device: the model's device.
+        encoder_weights: as for ``build_encoder``; a frozen timm encoder needs them.
+
+    Returns:
+        The model in eval mode.
 
     Raises:
-        UserError: no such file, not our format, damaged, or an encoder that is not the one the
-            model was trained with.
+        UserError: the file is missing, damaged or not of our format, or the encoder is not the one
+            that the model was trained with.
     """
-    path = Path(path)
+    path = DEFAULT_CHECKPOINT if path is None else Path(path)
     if path.is_dir():
         path = path / FILE_NAME
     metadata, state = _read(path)
@@ -102,6 +103,3 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
             return metadata, {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError) as error:
         raise UserError(f"{path}: not a whole safetensors file ({error})") from error
-
-
-DEFAULT_CHECKPOINT = CHECKOUT / "starter" / "tiny.safetensors"

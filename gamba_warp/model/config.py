@@ -17,7 +17,7 @@ Background = Literal["white", "black"]
 
 @dataclass(frozen=True, kw_only=True)
 class GambaConfig:
-    """Everything that decides what a Gamba network computes, weights aside.
+    """Everything, apart from the weights, that decides what a Gamba network computes.
 
     Attributes:
         image_size: side H = W of the input picture, pixels; a multiple of ``patch_size``.
@@ -33,24 +33,25 @@ class GambaConfig:
         discretization: of the selective scan; "mamba" is what mamba-ssm runs, "zoh" and "bilinear"
             are the exact zero-order hold and the paper's appendix.
         embedding_init: standard deviation of the learned embedding E at the start.
-        additive_image_tokens: False leaves G = E (paper Table 2, "w/o additive 3DGS tokens").
+        additive_image_tokens: False makes G = E (paper Table 2, "w/o additive 3DGS tokens").
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
         camera_token: whether the camera is prepended; the image tokens may be prepended alone.
         encoder: "none", "vgg16" or the name of a timm ViT, e.g. "vit_base_patch14_reg4_dinov2".
         encoder_size: side of the picture that the encoder sees, pixels.
-        encoder_normalize: bring pictures to the mean and deviation a ViT was trained with.
-        encoder_class_token: keep a ViT's class token (register tokens are always dropped).
-        encoder_frozen: the encoder is not trained, and not stored in checkpoints.
+        encoder_normalize: whether pictures are brought to the mean and deviation of the ViT's
+            training.
+        encoder_class_token: whether a ViT's class token is kept (register tokens never are).
+        encoder_frozen: whether the encoder is left untrained, and out of checkpoints.
         decoder_width: channels of the decoder's shared MLP; 0 means ``width``.
         position_bins: points per axis of the position's softmax (paper: 21).
-        position_range: the points lie in ±position_range, object units (paper: 0.5).
+        position_range: the largest coordinate of the points, ±, object units (paper: 0.5).
         position_init: standard deviation of the position logits at the start.
         scale_init: standard deviation of a Gaussian at the start, object units.
         opacity_init: opacity at the start.
         predict_rotation: whether quaternions are predicted; the paper fixes them.
-        distance: of the reference camera from the object's centre, object units.
+        distance: distance of the reference camera from the object's centre, object units.
         fov: vertical field of view of the reference camera, degrees.
-        background: what the input picture is composited on.
+        background: colour that the input picture is composited on.
     """
 
     image_size: int = 512
@@ -136,19 +137,20 @@ class GambaConfig:
         return 1.0 if self.background == "white" else 0.0
 
     def to_json(self) -> str:
-        """One line of JSON with every field; ``from_json`` reads it back."""
+        """Returns one line of JSON with every field; ``from_json`` reads it back."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str, source: str = "config") -> GambaConfig:
-        """Reads ``to_json``'s form.
+        """Reads what ``to_json`` wrote.
 
         Args:
             text: a JSON object with exactly the fields of this class.
-            source: what the text came from, for the error message.
+            source: origin of the text, for the error message.
 
         Raises:
-            UserError: not JSON, an unknown or missing key, a value of the wrong type or range.
+            UserError: the text is not JSON, a key is unknown or missing, or a value has the wrong
+                type or range.
         """
         try:
             values = json.loads(text)
@@ -178,15 +180,16 @@ def _check_kind(name: str, value: object, kind: type) -> None:
         raise UserError(f"config: {name} is {value!r}, it must be of type {kind.__name__}")
 
 
-PRESETS: dict[str, GambaConfig] = {
-    # Trains on two CPU cores: 4,096 Gaussians, no image encoder.
+Preset = Literal["tiny", "small", "paper"]
+PRESETS: dict[Preset, GambaConfig] = {
+    # This one trains on two CPU cores; it has 4,096 Gaussians and no image encoder.
     "tiny": GambaConfig(
         image_size=128, patch_size=4, width=128, depth=6, encoder="none", encoder_size=128
     ),
-    # One small GPU: 9,216 Gaussians.
+    # This one trains on one small GPU; it has 9,216 Gaussians.
     "small": GambaConfig(
         image_size=192, patch_size=4, width=256, depth=10, encoder="vgg16", encoder_size=192
     ),
-    # Paper §4.1: 16,384 Gaussians, 576 image tokens from DINOv2 with registers.
+    # This is paper §4.1: 16,384 Gaussians, 576 image tokens from DINOv2 with registers.
     "paper": GambaConfig(dt_rank=32),
 }

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from ..gaussians import Gaussians
 from .config import GambaConfig
 
-MIN_SCALE = 1e-6  # object units; keeps the logarithm that files store finite
+MIN_SCALE = 1e-6  # object units; keeps finite the logarithm that files store
 
 
 class GaussianDecoder(nn.Module):
@@ -22,9 +22,8 @@ class GaussianDecoder(nn.Module):
         self.config = config
         width = config.decoder_width or config.width
         # The last SiLU keeps the heads from merging with the MLP's second layer.
-        self.mlp = nn.Sequential(
-            nn.Linear(config.width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
-        )
+        first, second = nn.Linear(config.width, width), nn.Linear(width, width)
+        self.mlp = nn.Sequential(first, nn.SiLU(), second, nn.SiLU())
         self.position = nn.Linear(width, 3 * config.position_bins)
         self.opacity = nn.Linear(width, 1)
         self.scale = nn.Linear(width, 3)
@@ -33,23 +32,23 @@ class GaussianDecoder(nn.Module):
         limit = config.position_range
         points = torch.linspace(-limit, limit, config.position_bins)
         self.register_buffer("points", points, persistent=False)
-        self._init_weights()
+        self._init_weights(first, second)
 
-    def _init_weights(self) -> None:
+    def _init_weights(self, first: nn.Linear, second: nn.Linear) -> None:
         config = self.config
-        for layer in (self.mlp[0], self.mlp[2]):
+        for layer in (first, second):
             nn.init.zeros_(layer.bias)
-        # Unit variance before each SiLU, whose mean square on a unit normal is 0.356.
-        nn.init.normal_(self.mlp[0].weight, std=self.mlp[0].in_features ** -0.5)
-        nn.init.normal_(self.mlp[2].weight, std=(0.356 * self.mlp[2].in_features) ** -0.5)
+        # This gives unit variance before each SiLU, whose mean square on a unit normal is 0.356.
+        nn.init.normal_(first.weight, std=first.in_features**-0.5)
+        nn.init.normal_(second.weight, std=(0.356 * second.in_features) ** -0.5)
         for head in (self.opacity, self.scale, self.color, self.rotation):
             if head is not None:
                 nn.init.normal_(head.weight, std=0.02)
                 nn.init.zeros_(head.bias)
         # A softmax over near-zero logits puts every Gaussian at the centre, and a heap of opaque
-        # Gaussians at one point is the collapse that the radial mask loss is there to prevent.
-        # Logits of deviation 1.5 spread the centres by about 0.1 per axis: inside any object,
-        # and far from the saturated softmax, whose gradient would vanish.
+        # Gaussians at one point is the collapse that the radial mask loss shall prevent. Logits of
+        # deviation 1.5 spread the centres by about 0.1 per axis: this is inside any object, and far
+        # from a saturated softmax, whose gradient would vanish.
         fan_in = 0.356 * self.position.in_features
         nn.init.normal_(self.position.weight, std=config.position_init * fan_in**-0.5)
         nn.init.zeros_(self.position.bias)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
@@ -14,11 +15,14 @@ from ..errors import UserError
 from .config import GambaConfig
 from .tokens import IMAGENET_MEAN, IMAGENET_STD
 
+if TYPE_CHECKING:
+    from timm.models.vision_transformer import VisionTransformer
+
 
 class ImageEncoder(nn.Module):
-    """A network from pictures to tokens, at one picture size; get one from ``build_encoder``.
+    """A network from pictures to tokens, at one picture size; ``build_encoder`` makes one.
 
-    While frozen it stays in eval mode and makes no graph.
+    A frozen encoder stays in eval mode and records no graph.
 
     Attributes:
         channels: C, the size of a token.
@@ -35,7 +39,7 @@ class ImageEncoder(nn.Module):
         self.train(self.training)
 
     def forward(self, images: Tensor) -> Tensor:
-        """``[B, K, channels]`` from ``images [B, H, W, 3]`` in [0, 1]; they are resized here."""
+        """Maps ``images [B, H, W, 3]`` in [0, 1] to ``[B, K, channels]``; it resizes them first."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
             if images.shape[1:3] != (self.size, self.size):
                 planes = images.permute(0, 3, 1, 2)
@@ -52,7 +56,7 @@ class ImageEncoder(nn.Module):
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over the network's tensors, names and values as float32, 64 hexadecimal digits.
+        """The SHA-256 of the network's names and float32 values, as 64 hexadecimal digits.
 
         A checkpoint keeps it instead of a frozen network's weights.
         """
@@ -64,13 +68,16 @@ class ImageEncoder(nn.Module):
 
 
 class _ViT(nn.Module):
-    """A timm ViT's last tokens, normalised input to patches; register tokens dropped."""
+    """A timm ViT that normalises its input and returns its last tokens, registers dropped."""
 
-    def __init__(self, vit: nn.Module, config: GambaConfig) -> None:
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, vit: VisionTransformer, config: GambaConfig) -> None:
         super().__init__()
         self.vit = vit
         self.class_token = config.encoder_class_token
-        known = vit.pretrained_cfg
+        known = cast(dict, vit.pretrained_cfg)
         mean = known.get("mean", IMAGENET_MEAN) if config.encoder_normalize else (0.0, 0.0, 0.0)
         std = known.get("std", IMAGENET_STD) if config.encoder_normalize else (1.0, 1.0, 1.0)
         self.register_buffer("mean", torch.tensor(mean), persistent=False)
@@ -84,19 +91,20 @@ class _ViT(nn.Module):
 
 
 def build_encoder(config: GambaConfig, weights: str | Path | None) -> ImageEncoder | None:
-    """The encoder that ``config`` names, with its weights.
+    """Builds the encoder that ``config`` names, with its weights.
 
     Args:
-        config: names the encoder.
+        config: the model's configuration.
         weights: for a timm ViT a file (timm's safetensors or .pth, or Meta's DINOv2 .pth), "hub"
-            to fetch timm's own, or "random" for an untrained one, the same on every call. For
+            to fetch timm's own, or "random" for untrained ones, the same on every call. For
             "vgg16" torchvision's file, or None for the one in the cache.
 
     Returns:
-        None where the encoder is "none".
+        The encoder, or None if ``config.encoder`` is "none".
 
     Raises:
-        UserError: no such network or file, weights that do not fit, or ``weights`` not given.
+        UserError: the network or file does not exist, the weights do not fit, or ``weights`` is
+            needed and not given.
     """
     if config.encoder == "none":
         return None
@@ -122,7 +130,7 @@ def _build_vit(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
             "or 'random' for an untrained one"
         )
     if str(weights) == "random":
-        # No global seed must decide a network that checkpoints do not store.
+        # Checkpoints do not store this network, so no global seed may decide its weights.
         with torch.random.fork_rng():
             torch.manual_seed(0)
             vit = _create_vit(config, pretrained=False)
@@ -133,7 +141,7 @@ def _build_vit(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
     return ImageEncoder(_ViT(vit, config), vit.num_features, config)
 
 
-def _create_vit(config: GambaConfig, pretrained: bool) -> nn.Module:
+def _create_vit(config: GambaConfig, pretrained: bool) -> VisionTransformer:
     import timm
     from timm.models.vision_transformer import VisionTransformer
 
@@ -156,8 +164,8 @@ def _create_vit(config: GambaConfig, pretrained: bool) -> nn.Module:
     return vit
 
 
-def _load_vit(vit: nn.Module, path: Path) -> None:
-    """Loads timm's or Meta's weights; timm resizes the positions to another picture size."""
+def _load_vit(vit: VisionTransformer, path: Path) -> None:
+    """Loads timm's or Meta's weights; timm resizes the positions if the picture size differs."""
     from timm.models.vision_transformer import checkpoint_filter_fn
 
     state = _read_state(path)

@@ -1,33 +1,26 @@
-"""The Gamba network."""
+"""The Gamba network: encoder, tokens, blocks and decoder put together (paper §3.2)."""
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
-import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from ..cameras import Cameras
 from ..gaussians import Gaussians
-from .block import GambaBlock, State, make_norm, prefix_states
+from .block import GambaBlock, State, make_norm, prefix_states, run_blocks
 from .config import GambaConfig
 from .decoder import GaussianDecoder
 from .encoders import ImageEncoder, build_encoder
 from .tokens import CameraToken, SplatTokens
-
-# Tokens that run through the blocks together where a CPU keeps nothing for a gradient: temporaries
-# are small enough to be used again at once, not got anew from the system page by page.
-SEGMENT = 2048
 
 
 class Gamba(nn.Module):
     """One posed picture to Gaussians, in one pass (paper §3.2, GambaFormer and decoder).
 
     Attributes:
-        recompute: keep only each block's input for the gradient and run the block again there;
-            less memory, a third more time.
+        recompute: keep only each block's input for the gradient, and run the block again in the
+            backward pass; this takes less memory and a third more time.
     """
 
     def __init__(
@@ -39,12 +32,12 @@ class Gamba(nn.Module):
         """Builds the network with fresh weights, the encoder's excepted.
 
         Args:
-            config: what to build.
-            encoder_weights: see ``build_encoder``; not used where there is nothing to encode for.
-            encoder: taken instead of the one that ``config`` names.
+            config: the architecture.
+            encoder_weights: see ``build_encoder``; not used without ``config.prepend``.
+            encoder: used in place of the one that ``config`` names.
 
         Raises:
-            UserError: the encoder cannot be built or its weights are not there.
+            UserError: the encoder cannot be built, or its weights are missing.
         """
         super().__init__()
         self.config = config
@@ -65,12 +58,12 @@ class Gamba(nn.Module):
         self.decoder = GaussianDecoder(config)
         for parameter in self.parameters():
             if parameter.ndim == 1:
-                parameter._no_weight_decay = True
+                vars(parameter)["_no_weight_decay"] = True
 
     def condition(self, images: Tensor, cameras: Cameras) -> list[State | None]:
-        """What picture and camera leave in each block's states; all that the prefix does.
+        """Computes the state that picture and camera leave in each block (``prefix_states``).
 
-        Arguments and errors are those of ``forward``.
+        It holds all that the prefix contributes. Arguments and errors are those of ``forward``.
         """
         self._check(images, cameras)
         camera = self.camera_token(cameras) if self.camera_token else None
@@ -90,15 +83,17 @@ class Gamba(nn.Module):
             images: ``[B, H, W, 3]`` RGB in [0, 1] on ``config.background``, H = W =
                 ``config.image_size``.
             cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same picture size.
-            condition: of ``condition`` for the same pictures and cameras, if it is there already.
+            condition: the result of ``condition`` for the same pictures and cameras, if the
+                caller has it already.
             background_margin: drop the 3DGS tokens of patches that are plain background in every
-                picture, but for those within so many patches of one that is not; 0 keeps the
-                object's own. Faster, and another result than the one trained for: ``gamba bench
-                model`` states the error. None drops nothing. On CUDA it reads one number back.
+                picture, except those within this many patches of one that is not; 0 keeps only
+                the object's own patches. This is faster, but the model was not trained for it:
+                ``gamba bench model`` states the error. None drops nothing. On CUDA it reads one
+                number back.
 
         Returns:
-            ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N = ``num_gaussians``, or as
-            many as tokens were kept, in their order.
+            ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or
+            the number of kept tokens, in their order.
 
         Raises:
             ValueError: a shape that does not fit, or a negative margin.
@@ -110,23 +105,8 @@ class Gamba(nn.Module):
         if background_margin is not None:
             background = self.config.background_color
             tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
-        tokens = self._refine(tokens, condition)
+        tokens = run_blocks(self.blocks, tokens, condition, self.recompute)
         return self.decoder(self.norm(tokens))
-
-    def _refine(self, tokens: Tensor, states: list[State | None]) -> Tensor:
-        """Runs the blocks; on a CPU without gradient one segment of tokens after the other."""
-        states = list(states)
-        segments = [tokens]
-        if tokens.device.type == "cpu" and not torch.is_grad_enabled():
-            segments = list(tokens.split(SEGMENT, dim=1))
-        for s, segment in enumerate(segments):
-            for i, block in enumerate(self.blocks):
-                run = block
-                if self.recompute and torch.is_grad_enabled():
-                    run = partial(checkpoint, block, use_reentrant=False)
-                segment, states[i] = run(segment, states[i])
-            segments[s] = segment
-        return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size
@@ -142,17 +122,17 @@ class Gamba(nn.Module):
                 raise ValueError(f"{name} is {tuple(got)}, expected {want}")
 
     def stored_state(self) -> dict[str, Tensor]:
-        """What a checkpoint holds: the state dict without a frozen encoder."""
+        """Returns what a checkpoint holds: the state dict without a frozen encoder."""
         state = self.state_dict()
         if self.encoder and self.encoder.frozen:
             return {name: v for name, v in state.items() if not name.startswith("encoder.")}
         return state
 
     def load_stored_state(self, state: dict[str, Tensor]) -> None:
-        """Loads ``stored_state``'s form.
+        """Loads what ``stored_state`` returned.
 
         Raises:
-            ValueError: missing or unknown tensors, or other shapes.
+            ValueError: a tensor is missing, unknown or of another shape.
         """
         own = self.stored_state()
         missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())

@@ -1,4 +1,4 @@
-"""LPIPS with VGG16: how far two pictures are apart for a person (Zhang et al. 2018)."""
+"""LPIPS with VGG16: how different two pictures look to a person (Zhang et al. 2018)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from torch import Tensor, nn
 from ..data.vgg_weights import WIDTHS, read_cached
 from .vgg import VGG16Trunk
 
-# LPIPS's own normalisation of pictures in [-1, 1] (its "scaling layer").
+# This is LPIPS's own normalisation of pictures in [-1, 1] (its "scaling layer").
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
 
 class LPIPS(nn.Module):
-    """Learned perceptual distance, VGG16, version 0.1; frozen. Get one from ``load_lpips``."""
+    """Learned perceptual distance, VGG16, version 0.1, frozen; ``load_lpips`` makes one."""
+
+    shift: Tensor
+    scale: Tensor
 
     def __init__(self, state: dict[str, Tensor]) -> None:
-        """Args: state: torchvision's ``features.N.*`` and ``lin0`` .. ``lin4``, each ``[C]``."""
+        """Takes torchvision's ``features.N.*`` and ``lin0`` .. ``lin4``, each ``[C]``."""
         super().__init__()
         self.trunk = VGG16Trunk()
         for k, width in enumerate(WIDTHS):
@@ -29,7 +32,7 @@ class LPIPS(nn.Module):
         self.eval()
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Distance of picture pairs; gradients reach whichever input asks for them.
+        """Computes the distance of picture pairs; gradients reach each input that asks for them.
 
         Args:
             a: ``[.., H, W, 3]`` RGB in [0, 1], H and W at least 16.
@@ -39,7 +42,7 @@ class LPIPS(nn.Module):
             ``[..]`` float32, 0 for equal pictures.
 
         Raises:
-            ValueError: shapes differ, are not RGB, or are smaller than 16 pixels.
+            ValueError: the shapes differ, are not RGB, or are smaller than 16 pixels.
         """
         if a.shape != b.shape or a.ndim < 3 or a.shape[-1] != 3:
             raise ValueError(
@@ -48,7 +51,7 @@ class LPIPS(nn.Module):
         return self.distance(self.features(a), self.features(b)).reshape(a.shape[:-3])
 
     def features(self, pictures: Tensor) -> list[Tensor]:
-        """What ``distance`` compares: five maps ``[B, C, h, w]``, each pixel of unit length.
+        """Computes what ``distance`` compares: five maps ``[B, C, h, w]``, unit length per pixel.
 
         Args:
             pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
@@ -57,8 +60,8 @@ class LPIPS(nn.Module):
         return [_unit(y) for y in self.trunk((2 * x - 1 - self.shift) / self.scale)]
 
     def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
-        """``[B]`` from two pictures' ``features``, for those who compare one picture with many."""
-        total = 0.0
+        """Computes ``[B]`` from two ``features``, for comparing one picture with many."""
+        total = a[0].new_zeros(len(a[0]))
         for k, (x, y) in enumerate(zip(a, b, strict=True)):
             weighted = torch.einsum("bchw,c->bhw", (x - y).square(), getattr(self, f"lin{k}"))
             total = total + weighted.mean((1, 2))
@@ -66,15 +69,17 @@ class LPIPS(nn.Module):
 
 
 def _unit(x: Tensor) -> Tensor:
-    # The 1e-20 keeps the gradient of a pixel without any feature finite; elsewhere it is lost.
+    # The 1e-20 keeps the gradient of a pixel without features finite, and is too small to matter
+    # for any other pixel.
     x = x.float()
     return x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()
 
 
 def load_lpips() -> LPIPS:
-    """LPIPS-VGG from the cache, on the CPU.
+    """Makes LPIPS-VGG with the weights in the cache, on the CPU.
 
     Raises:
-        UserError: no weights there, with the command that fetches them; or a damaged file.
+        UserError: the cache holds no weights (the message names the command that fetches them), or
+            the file is damaged.
     """
     return LPIPS(read_cached())

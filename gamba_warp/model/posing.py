@@ -1,18 +1,65 @@
-"""Posed input: pictures, and the cameras that they are seen by, in the world of the model."""
+"""Posed input: pictures and their cameras, in the world that a model sees them in.
+
+That world has its origin at the object's centre and the axes of the reference camera, which is the
+camera of the input picture and stands at the model's distance (``GambaConfig.distance``).
+"""
 
 from __future__ import annotations
 
-from ..cameras import Cameras, intrinsics, reference_viewmat
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from ..cameras import Cameras, intrinsics, reference_viewmat, relative_to_reference
+from .config import GambaConfig
+
+if TYPE_CHECKING:
+    from ..data.dataset import ObjectViews
 
 
-def reference_cameras(count: int, size: int, fov: float, distance: float) -> Cameras:
-    """``count`` times the camera that a model's square picture is seen by.
+def reference_cameras(config: GambaConfig, count: int) -> Cameras:
+    """The reference camera of a model, ``count`` times: that of pictures without a pose.
 
     Args:
-        count: of the cameras, ``[count]``.
-        size: pixels.
-        fov: degrees.
-        distance: object units.
+        config: of the model; gives the size of the square pictures, the field of view and the
+            distance.
+        count: number of pictures, each an input of its own.
+
+    Returns:
+        Cameras ``[count]``, float32 on the CPU.
     """
-    viewmats = reference_viewmat(distance).repeat(count, 1, 1)
-    return Cameras(viewmats, intrinsics(size, size, fov).repeat(count, 1, 1), size, size)
+    size = config.image_size
+    viewmats = reference_viewmat(config.distance).repeat(count, 1, 1)
+    return Cameras(viewmats, intrinsics(size, size, config.fov).repeat(count, 1, 1), size, size)
+
+
+def relative_cameras(cameras: Cameras, distance: float) -> Cameras:
+    """Cameras of a dataset's world, in the world of the first of them.
+
+    Args:
+        cameras: ``[V]`` of one object, V > 0; the first becomes the reference camera.
+        distance: of the reference camera from the object's centre in its world.
+
+    Returns:
+        Cameras ``[V]`` with new poses; see ``relative_to_reference``.
+    """
+    viewmats, _ = relative_to_reference(cameras.viewmats, cameras.viewmats[0], distance)
+    return replace(cameras, viewmats=viewmats)
+
+
+def posed_input(views: ObjectViews, config: GambaConfig) -> tuple[Tensor, Cameras]:
+    """The first view of an object as a model takes it.
+
+    Args:
+        views: of one object; pictures of the model's ``image_size``.
+        config: of the model; gives the background and the distance.
+
+    Returns:
+        Images ``[1, S, S, 3]`` RGB in [0, 1] and the reference camera ``[1]``, on the device of
+        ``views``.
+    """
+    from ..images import over_background  # needs PIL, which a CUDA machine may not have
+
+    images = over_background(views.images[:1], config.background_color)
+    return images, relative_cameras(views.cameras[:1], config.distance)

@@ -1,13 +1,14 @@
-"""A model's answer to one prepared picture."""
+"""A model's answer to one picture."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from ..data.preprocess import composite
+from ..data.preprocess import composite, prepare
 from ..gaussians import Gaussians
 from .posing import reference_cameras
 
@@ -16,19 +17,25 @@ if TYPE_CHECKING:
 
 
 @torch.inference_mode()
-def reconstruct(model: Gamba, rgba: np.ndarray) -> Gaussians:
+def reconstruct(model: Gamba, picture: str | Path | np.ndarray) -> Gaussians:
     """One forward pass on one picture, seen by the reference camera.
 
     Args:
         model: on any device, in evaluation mode.
-        rgba: ``[S, S, 4]`` in [0, 1], object centred, as ``preprocess.prepare`` returns.
+        picture: a file, which ``preprocess.prepare`` cuts out and centres; or what that returns,
+            RGBA ``[S, S, 4]`` in [0, 1] with the object in the middle.
 
     Returns:
         Gaussians ``[N]`` on the model's device, in the reference camera's frame.
+
+    Raises:
+        UserError: the file cannot be read, or its object cannot be told from the background.
+        ValueError: the array has another shape.
     """
+    rgba = picture if isinstance(picture, np.ndarray) else prepare(picture)
+    if rgba.ndim != 3 or rgba.shape[0] != rgba.shape[1] or rgba.shape[2] != 4:
+        raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config
-    size = config.image_size
     device = next(model.parameters()).device
-    images = composite(rgba, size, config.background_color)[None].to(device)
-    cameras = reference_cameras(1, size, config.fov, config.distance)
-    return model(images, cameras.to(device))[0]
+    images = composite(rgba, config.image_size, config.background_color)[None].to(device)
+    return model(images, reference_cameras(config, 1).to(device))[0]

@@ -15,16 +15,17 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def normalize_imagenet(images: Tensor) -> Tensor:
-    """``[.., 3]`` colours in [0, 1] to zero mean and unit deviation over ImageNet."""
-    # a tensor made of numbers would be a copy from the host, which no CUDA graph can hold
+    """Brings ``[.., 3]`` colours in [0, 1] to zero mean and unit deviation over ImageNet."""
+    # A tensor made of the constants would be copied from the host, which a CUDA graph cannot hold.
     planes = zip(images.unbind(-1), IMAGENET_MEAN, IMAGENET_STD)
     return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
 
 
 def scan_orders(height: int, width: int) -> Tensor:
-    """The four orders in which a map is read (VMamba's cross-scan; paper §3.2).
+    """Returns the four orders in which a map is read (VMamba's cross-scan; paper §3.2).
 
-    Row by row from the top left, column by column from the top left, and each of the two backward.
+    These are: row by row from the top left, column by column from the top left, and each of the two
+    backward.
 
     Returns:
         ``[4, height·width]`` int64 positions in the row-major map; each row is a permutation.
@@ -42,12 +43,12 @@ class CameraToken(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(16, channels), nn.SiLU(), nn.Linear(channels, channels))
 
     def forward(self, cameras: Cameras) -> Tensor:
-        """``[B, 1, channels]`` from ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]``."""
+        """Maps ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` to ``[B, 1, channels]``."""
         return self.mlp(camera_numbers(cameras))[:, None]
 
 
 def camera_numbers(cameras: Cameras) -> Tensor:
-    """``[B, 16]``: the world-to-camera matrix's 12 numbers, row by row, then fx, fy, cx, cy.
+    """Returns ``[B, 16]``: the world-to-camera matrix's 12 numbers row by row, then fx, fy, cx, cy.
 
     The intrinsics are divided by the picture's width or height, so they do not depend on its size.
     """
@@ -60,6 +61,8 @@ def camera_numbers(cameras: Cameras) -> Tensor:
 class SplatTokens(nn.Module):
     """The 3DGS tokens G = Scan(Conv(s)) + E (paper eq. 1), or G = E without image tokens."""
 
+    orders: Tensor
+
     def __init__(self, config: GambaConfig) -> None:
         super().__init__()
         grid, self.patch_size = config.grid_size, config.patch_size
@@ -68,17 +71,17 @@ class SplatTokens(nn.Module):
             patch = config.patch_size
             self.patchify = nn.Conv2d(9, config.width, kernel_size=patch, stride=patch)
         self.embedding = nn.Parameter(torch.empty(config.num_gaussians, config.width))
-        # Nearly as large as an image token: where the picture is plain background, E alone
-        # tells the tokens apart, and positions start spread only if the tokens differ.
+        # E is nearly as large as an image token. On plain background E alone tells the tokens
+        # apart, and the positions start spread out only if the tokens differ.
         nn.init.normal_(self.embedding, std=config.embedding_init)
-        self.embedding._no_weight_decay = True
+        vars(self.embedding)["_no_weight_decay"] = True
         self.register_buffer("orders", scan_orders(grid, grid).flatten(), persistent=False)
 
     def forward(self, images: Tensor, cameras: Cameras) -> Tensor:
-        """``[B, L, width]`` from ``images [B, H, W, 3]`` in [0, 1] and one camera per picture."""
+        """Maps ``images [B, H, W, 3]`` in [0, 1] and one camera each to ``[B, L, width]``."""
         if self.patchify is None:
             return self.embedding.expand(len(images), -1, -1)
-        # Autocast would round the matrix products inside to 8 bits: far too coarse for rays.
+        # Autocast would round the matrix products inside to 8 bits, which is too coarse for rays.
         with torch.autocast(images.device.type, enabled=False):
             height, width = images.shape[1:3]
             rays = plucker_rays(cameras.viewmats.float(), cameras.Ks.float(), width, height)
@@ -87,12 +90,13 @@ class SplatTokens(nn.Module):
         return patches[:, self.orders] + self.embedding
 
     def foreground(self, images: Tensor, background: float, margin: int) -> Tensor:
-        """Which tokens belong to patches that are not plain background, or near one that is not.
+        """Finds the tokens whose patch is not plain background, or is near such a patch.
 
         Args:
-            images: ``[B, H, W, 3]``; a patch counts if it does so in any of them.
-            background: grey value; what differs by more than half of 1/255 is no background.
-            margin: how near, patches; 0 or more.
+            images: ``[B, H, W, 3]``; a patch is plain background if it is so in all pictures.
+            background: grey value; a pixel that differs by more than half of 1/255 is not
+                background.
+            margin: patches around the object that are kept too, >= 0.
 
         Returns:
             Positions among the L tokens, int64, ascending.

@@ -6,44 +6,45 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
+import numpy as np
 import torch
 
+from ..conventions import Axes
 from ..errors import UserError
 from ..formats.glb import save_glb
-from ..formats.ply import Frame, load_ply, save_ply
+from ..formats.names import ExportFormat, MeshFormat
+from ..formats.ply import load_ply, save_ply
 from ..formats.splat import save_splat
 from ..gaussians import Gaussians
-from ..surfaces.extract import SurfaceOptions, moved_to_unit, unit_frame
-from ..surfaces.files import MeshFormat, write_meshes
+from ..surfaces.extract import moved_to_unit, unit_frame
+from ..surfaces.files import write_meshes
+from ..surfaces.options import SurfaceOptions
 from .page import Section, reconstruction_page
 from .turntable import save_turntable, turntable_frames
 
-Format = Literal["ply", "splat", "glb", "html", "gif", "mp4"]
-
 
 @dataclass
-class Job:
+class ExportJob:
     """What to write for each input.
 
     Attributes:
-        folder: where.
+        folder: folder of the results.
         mesh: formats of the mesh.
-        formats: of the Gaussians, pages and turntables.
+        formats: formats of the Gaussians, of pages and of turntables.
         surface: how the mesh is made.
-        frame: axes of ``.ply, .obj, .stl``.
+        axes: axes of ``.ply, .obj, .stl``.
         min_opacity: fainter Gaussians are left out.
         size: side of the turntable's frames, pixels.
         frames: views of one turn.
-        device: where to render.
+        device: device that renders.
     """
 
     folder: Path
     mesh: tuple[MeshFormat, ...]
-    formats: tuple[Format, ...]
+    formats: tuple[ExportFormat, ...]
     surface: SurfaceOptions
-    frame: Frame
+    axes: Axes
     min_opacity: float
     size: int
     frames: int
@@ -54,7 +55,10 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
     """Files as they are given, each once; of a folder, the .ply files in it, sorted.
 
     Returns:
-        The files, and the folders that hold none or cannot be read, with the reason.
+        The files, and the inputs that are missing or hold none, with the reason.
+
+    Raises:
+        UserError: there is no input.
     """
     files: dict[Path, None] = {}
     failures = []
@@ -74,8 +78,16 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
     return list(files), failures
 
 
-def export(name: str, path: Path, job: Job) -> str:
-    """Writes everything that was asked for of one file of Gaussians; returns a line about it.
+def export(name: str, path: Path, job: ExportJob) -> str:
+    """Writes everything that was asked for of one file of Gaussians.
+
+    Args:
+        name: stem of the files that are written.
+        path: the Gaussians.
+        job: what to write.
+
+    Returns:
+        A line about what was written.
 
     Raises:
         UserError: the input cannot be read, has no surface, or would be overwritten.
@@ -92,20 +104,20 @@ def export(name: str, path: Path, job: Job) -> str:
     for kind in job.formats:
         target = job.folder / f"{name}.{kind}"
         if kind == "ply":
-            save_ply(target, gaussians, frame=job.frame)
+            save_ply(target, gaussians, axes=job.axes)
         elif kind in ("splat", "glb"):
             {"splat": save_splat, "glb": save_glb}[kind](target, gaussians)
     _write_pictures(name, gaussians, job)
     if not job.mesh:
         return f"{name}: {gaussians.num:,} Gaussians"
     start = time.perf_counter()
-    found = write_meshes(job.folder / name, gaussians, job.mesh, job.surface, job.frame, job.device)
-    closed = "closed" if found.is_closed() else "open"
+    found = write_meshes(job.folder / name, gaussians, job.mesh, job.surface, job.axes, job.device)
+    closed = "closed" if found.is_watertight() else "open"
     counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
     return f"{name}: {counts}, {time.perf_counter() - start:.1f} s"
 
 
-def _write_pictures(name: str, gaussians: Gaussians, job: Job) -> None:
+def _write_pictures(name: str, gaussians: Gaussians, job: ExportJob) -> None:
     """The page and the turntables, of the object at the origin with longest side 1."""
     kinds = [kind for kind in job.formats if kind in ("html", "gif", "mp4")]
     if not kinds:
@@ -114,8 +126,27 @@ def _write_pictures(name: str, gaussians: Gaussians, job: Job) -> None:
     turn = turntable_frames(moved, size=job.size, frames=job.frames)
     for kind in kinds:
         target = job.folder / f"{name}.{kind}"
-        if kind != "html":
+        if kind == "html":
+            write_page(target, name, gaussians, turn)
+        else:
             save_turntable(target, turn)
-            continue
-        table = [("Gaussians", f"{gaussians.num:,}")]
-        reconstruction_page(target, Section(name, turntable=turn, gaussians=moved, table=table))
+
+
+def write_page(
+    path: Path, title: str, gaussians: Gaussians, turntable: np.ndarray | None = None
+) -> None:
+    """Writes a page with a 3D viewer, of an object of any size anywhere.
+
+    Args:
+        path: the .html file.
+        title: heading of the page.
+        gaussians: one object.
+        turntable: frames ``[T, S, S, 3]`` uint8 of one turn, or None.
+
+    Raises:
+        UserError: the object has no extent, or the file cannot be written.
+    """
+    moved = moved_to_unit(gaussians, *unit_frame(gaussians))
+    table = [("Gaussians", f"{gaussians.num:,}")]
+    section = Section(title, turntable=turntable, gaussians=moved, table=table)
+    reconstruction_page(path, section)

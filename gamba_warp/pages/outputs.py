@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from ..conventions import Axes
 from ..formats.glb import save_glb
-from ..formats.ply import Frame, save_ply
+from ..formats.names import GaussianFormat, MeshFormat
+from ..formats.ply import save_ply
 from ..formats.splat import save_splat
 from ..gaussians import Gaussians
-from ..surfaces.extract import SurfaceOptions
-from ..surfaces.files import MeshFormat, write_meshes
+from ..model.config import GambaConfig
+from ..surfaces.files import write_meshes
+from ..surfaces.options import SurfaceOptions
 from .page import Section, reconstruction_page
 from .turntable import save_turntable, turntable_frames
-
-if TYPE_CHECKING:
-    from ..model.config import GambaConfig
-
-
-Format = Literal["ply", "splat", "glb"]
 
 
 @dataclass
@@ -29,26 +25,26 @@ class Outputs:
     """What to write for each picture.
 
     Attributes:
-        folder: where.
-        formats: Gaussian files.
+        folder: folder of the results.
+        formats: formats of the Gaussians.
         mesh: formats of a mesh of the surface.
         turntable: ``gif``, ``mp4`` or ``none``.
         size: side of the turntable's frames, pixels.
         frames: views of one turn.
-        page: also a self-contained HTML page.
-        ply_frame: axes of the ``.ply``.
+        page: whether a self-contained HTML page is written, too.
+        axes: axes of the ``.ply`` and of meshes.
         min_opacity: fainter Gaussians are left out of the files.
-        checkpoint: named on the page.
+        checkpoint: the model's file, named on the page.
     """
 
     folder: Path
-    formats: tuple[Format, ...]
+    formats: tuple[GaussianFormat, ...]
     mesh: tuple[MeshFormat, ...]
     turntable: str
     size: int
     frames: int
     page: bool
-    ply_frame: Frame
+    axes: Axes
     min_opacity: float
     checkpoint: Path
 
@@ -75,43 +71,43 @@ def write_outputs(
         UserError: a file cannot be written, or no Gaussian can be.
     """
     base = outputs.folder / name
-    note = f"from {name} by {outputs.checkpoint.name}"
-    for kind in outputs.formats:
-        path = base.with_name(f"{name}.{kind}")
-        if kind == "ply":
-            options = {"frame": outputs.ply_frame, "comments": [note]}
-            save_ply(path, gaussians, min_opacity=outputs.min_opacity, **options)
-        else:
-            {"splat": save_splat, "glb": save_glb}[kind](
-                path, gaussians, min_opacity=outputs.min_opacity
-            )
+    _write_gaussians(base, gaussians, outputs)
     if outputs.mesh:
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
-        options, where = SurfaceOptions(colors=True), gaussians.means.device
-        write_meshes(base, visible, outputs.mesh, options, outputs.ply_frame, where)
+        options, device = SurfaceOptions(colors=True), gaussians.means.device
+        write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
     if outputs.turntable == "none" and not outputs.page:
         return
-    frames = turntable_frames(
-        gaussians,
-        size=outputs.size,
-        frames=outputs.frames,
-        distance=config.distance,
-        fov=config.fov,
+    distance, fov = config.distance, config.fov
+    turn = turntable_frames(
+        gaussians, size=outputs.size, frames=outputs.frames, distance=distance, fov=fov
     )
     if outputs.turntable != "none":
-        save_turntable(base.with_name(f"{name}.{outputs.turntable}"), frames)
+        save_turntable(base.with_name(f"{name}.{outputs.turntable}"), turn)
     if outputs.page:
+        table = [
+            ("Gaussians", f"{gaussians.num:,}"),
+            ("Model", outputs.checkpoint.name),
+            ("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}"),
+        ]
         section = Section(
-            title=name,
+            name,
             picture=rgba,
-            turntable=frames,
+            turntable=turn,
             gaussians=gaussians,
-            table=[
-                ("Gaussians", f"{gaussians.num:,}"),
-                ("Model", outputs.checkpoint.name),
-                ("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}"),
-            ],
-            distance=config.distance,
-            fov=config.fov,
+            table=table,
+            distance=distance,
+            fov=fov,
         )
         reconstruction_page(base.with_name(f"{name}.html"), section)
+
+
+def _write_gaussians(base: Path, gaussians: Gaussians, outputs: Outputs) -> None:
+    for kind in outputs.formats:
+        path, least = base.with_name(f"{base.name}.{kind}"), outputs.min_opacity
+        if kind == "ply":
+            note = f"from {base.name} by {outputs.checkpoint.name}"
+            save_ply(path, gaussians, axes=outputs.axes, min_opacity=least, comments=[note])
+        else:
+            save = {"splat": save_splat, "glb": save_glb}[kind]
+            save(path, gaussians, min_opacity=least)

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: pictures, a 3D viewer and numbers in one file, no network needed."""
+"""Self-contained HTML pages: pictures, a 3D viewer and numbers in one file that loads nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..gaussians import Gaussians
 from ..images import to_uint8
 from .turntable import SECONDS
 
-# Nothing may be loaded but what is inlined here.
+# A page may load only what is inlined in it.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 _VIEWER_CAPTION = (
     '<span class="when-idle">Press 3D to turn it by hand</span>'
@@ -39,14 +39,14 @@ class Section:
         picture: the input, ``[H, W, 3|4]`` floats in [0, 1].
         turntable: frames ``[F, H, W, 3]`` uint8.
         gaussians: one object ``[N]``, for the 3D viewer.
-        views: label to pictures ``[V, H, W, 3]`` floats in [0, 1]; rows with view beside view, such
-            as "Predicted" above "Truth".
-        table: rows of cells; text to the left, numbers to the right.
-        header: of the table's columns.
-        curves: label to ``(x, y)`` points, drawn as one chart.
-        curves_label: what the chart's vertical axis is.
-        distance: of the viewer's camera from the origin, object units.
-        fov: of the viewer's camera, vertical, degrees.
+        views: pictures ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
+            such as "Predicted" above "Truth".
+        table: rows of cells; text is set to the left, numbers to the right.
+        header: names of the table's columns.
+        curves: ``(x, y)`` points by label, drawn as one chart.
+        curves_label: label of the chart's vertical axis.
+        distance: distance of the viewer's camera from the origin, object units.
+        fov: vertical field of view of the viewer's camera, degrees.
     """
 
     title: str
@@ -64,7 +64,7 @@ class Section:
 
 
 def reconstruction_page(path: str | Path, section: Section) -> None:
-    """Writes the page of one reconstruction, its viewer running, atomically.
+    """Writes the page of one reconstruction atomically; its viewer starts by itself.
 
     Raises:
         UserError: the file cannot be written.
@@ -75,7 +75,7 @@ def reconstruction_page(path: str | Path, section: Section) -> None:
 def demo_page(
     path: str | Path, sections: Sequence[Section], *, title: str = "Gamba demo", text: str = ""
 ) -> None:
-    """Writes a page of many sections, atomically; its viewers start when asked to.
+    """Writes a page of many sections atomically; its viewers start when asked to.
 
     Raises:
         UserError: the file cannot be written.
@@ -118,8 +118,10 @@ def _section(section: Section, name: str, auto: bool) -> str:
     if turning and (auto or section.gaussians is None):
         figures.append(_figure(f'<div class="frame">{turning}</div>', "Turntable"))
         turning = ""
-    if section.gaussians is not None:  # where it waits to be started it shows the turntable
-        figures.append(_figure(_viewer(section, name, auto, turning), _VIEWER_CAPTION))
+    if section.gaussians is not None:  # a viewer that waits to be started shows the turntable
+        figures.append(
+            _figure(_viewer(section, section.gaussians, name, auto, turning), _VIEWER_CAPTION)
+        )
     parts = [f"<h2>{html.escape(section.title)}</h2>" if not auto else ""]
     parts += [
         _paragraph(section.text),
@@ -151,7 +153,7 @@ def _image(picture: np.ndarray, css: str, label: str) -> str:
 
 
 def _animation(frames: np.ndarray) -> str:
-    # WebP: a third of a GIF's size, and no palette.
+    # WebP takes a third of a GIF's size and has no palette.
     content = io.BytesIO()
     first, *rest = (Image.fromarray(frame) for frame in frames)
     duration = round(1000 * SECONDS / len(frames))
@@ -161,8 +163,8 @@ def _animation(frames: np.ndarray) -> str:
     return f'<img alt="turntable" src="{_data(content.getvalue(), "image/webp")}">'
 
 
-def _viewer(section: Section, name: str, auto: bool, poster: str) -> str:
-    splats = base64.b64encode(splat_bytes(section.gaussians, name=section.title)).decode()
+def _viewer(section: Section, gaussians: Gaussians, name: str, auto: bool, poster: str) -> str:
+    splats = base64.b64encode(splat_bytes(gaussians, name=section.title)).decode()
     return (
         f'<div class="viewer" data-splat="{name}" data-distance="{section.distance:g}" '
         f'data-fov="{section.fov:g}"{" data-auto" if auto else ""}>{poster}'
@@ -200,14 +202,14 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str | int | float]]) -
 
 
 def svg_chart(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = "") -> str:
-    """A line chart as inline SVG; the vertical axis is logarithmic where values span over 20 times.
+    """Draws a line chart as inline SVG; the vertical axis is logarithmic if values span over 20x.
 
     Args:
-        curves: name to ``(x, y)`` points; points that are not finite are left out.
-        label: of the vertical axis.
+        curves: ``(x, y)`` points by name; points that are not finite are left out.
+        label: label of the vertical axis.
 
     Returns:
-        The ``<svg>`` element, empty text where there is no finite point.
+        The ``<svg>`` element, or an empty text if there is no finite point.
     """
     series = {
         name: [(x, y) for x, y in points if math.isfinite(x) and math.isfinite(y)]
@@ -222,25 +224,25 @@ def svg_chart(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = 
     low, high = bend(min(ys)), bend(max(ys))
     left, right, top, bottom = 56, 624, 34, 214
 
-    def place_x(x: float) -> float:
+    def to_x(x: float) -> float:
         return left + (right - left) * (x - min(xs)) / ((max(xs) - min(xs)) or 1)
 
-    def place_y(value: float) -> float:
+    def to_y(value: float) -> float:
         return bottom - (bottom - top) * (value - low) / ((high - low) or 1)
 
     parts = []
     for value in _ticks(min(ys), max(ys), logarithmic):
-        y = place_y(bend(value))
+        y = to_y(bend(value))
         parts.append(f'<line class="grid" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{left - 6}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>')
     for value in _ticks(min(xs), max(xs), False):
-        at = f'x="{place_x(value):.1f}" y="{bottom + 20}"'
+        at = f'x="{to_x(value):.1f}" y="{bottom + 20}"'
         parts.append(f'<text {at} text-anchor="middle">{value:,.6g}</text>')
     note = f"{label} (logarithmic)" if logarithmic else label
     parts.append(f'<text x="{left}" y="16">{html.escape(note)}</text>')
     for i, (name, points) in enumerate(series.items()):
         colour = f"var(--s{i % 4})"
-        path = " ".join(f"{place_x(x):.1f},{place_y(bend(y)):.1f}" for x, y in points)
+        path = " ".join(f"{to_x(x):.1f},{to_y(bend(y)):.1f}" for x, y in points)
         parts.append(f'<polyline class="line" style="stroke: {colour}" points="{path}"/>')
         at = right - 110 * (len(series) - 1 - i)
         style = f'text-anchor="end" style="fill: {colour}"'
@@ -249,7 +251,7 @@ def svg_chart(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = 
 
 
 def _ticks(low: float, high: float, logarithmic: bool) -> list[float]:
-    """Round values within the bounds: multiples of 1, 2 or 5, or these times powers of ten."""
+    """Returns round values within the bounds, multiples of 1, 2 or 5 times a power of ten."""
     if high <= low:
         return [low]
     if logarithmic:

@@ -1,4 +1,4 @@
-"""Turntables: a reconstruction seen from all around, as GIF or MP4."""
+"""Turntables, which show a reconstruction from all around, as GIF or MP4."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ..gaussians import Gaussians
 from ..images import to_uint8
 from ..render import render
 
-SECONDS = 3.0  # one turn
-_CHUNK_PIXELS = 1 << 20  # rendered in one launch: keeps a turntable within a few hundred MB
+SECONDS = 3.0  # length of one turn
+_CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch, which takes a few hundred MB
 
 
 @torch.inference_mode()
@@ -30,14 +30,15 @@ def turntable_frames(
     distance: float = DEFAULT_DISTANCE,
     fov: float = DEFAULT_FOV,
 ) -> np.ndarray:
-    """Renders one full turn on white, beginning at the reference view, several views a launch.
+    """Renders one full turn on white, from the reference view on, with several views a launch.
 
     Args:
-        gaussians: one object, no batch dimension, in the reference frame; its device renders.
+        gaussians: one object without batch dimension, in the reference frame, on the device that
+            renders.
         size: side of the square frames, pixels, >= 1.
         frames: number of views, >= 1.
-        elevation: degrees, positive looks down.
-        distance: of the camera from the object's centre, object units.
+        elevation: degrees; a camera of positive elevation looks down.
+        distance: distance of the camera from the object's centre, object units.
         fov: vertical field of view, degrees.
 
     Returns:
@@ -61,11 +62,12 @@ def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECOND
 
     Args:
         path: ends in ``.gif`` or ``.mp4``.
-        frames: ``[F, H, W, 3]`` uint8; for MP4 an odd row or column is repeated, which H.264 needs.
+        frames: ``[F, H, W, 3]`` uint8; for MP4 the last row or column is repeated if their number
+            is odd, since H.264 needs even sizes.
         seconds: length of one turn.
 
     Raises:
-        UserError: another suffix, or the file cannot be written.
+        UserError: the suffix is another one, or the file cannot be written.
     """
     writers = {".gif": _write_gif, ".mp4": _write_mp4}
     suffix = Path(path).suffix.lower()
@@ -80,10 +82,10 @@ def _write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
     pictures = []
     for frame in frames:
         picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
-        # Pillow looks colours up coarsely: white may become a neighbour of white.
+        # Pillow looks colours up so coarsely that white may become a neighbour of white.
         picture.paste(0, mask=Image.fromarray((frame == 255).all(-1)))
         pictures.append(picture)
-    # GIF counts time in units of 10 ms, and viewers slow down anything under 20 ms.
+    # GIF counts time in units of 10 ms, and viewers slow down frames under 20 ms.
     duration = max(20, round(seconds * 100 / len(frames)) * 10)
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, optimize=True
@@ -91,12 +93,12 @@ def _write_gif(path: Path, frames: np.ndarray, seconds: float) -> None:
 
 
 def _palette(frames: np.ndarray) -> Image.Image:
-    """One palette for all frames, so that colours do not flicker: white and 255 others."""
+    """Makes one palette of white and 255 others for all frames, so that colours do not flicker."""
     pixels = frames.reshape(-1, 3)
     pixels = pixels[(pixels < 255).any(1)]
     if len(pixels) == 0:
         pixels = frames.reshape(-1, 3)[:1]
-    colours = Image.fromarray(pixels[None]).quantize(255, kmeans=1).getpalette()
+    colours = Image.fromarray(pixels[None]).quantize(255, kmeans=1).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([255, 255, 255, *colours[: 3 * 255]])
     return palette

@@ -18,13 +18,14 @@ def cleaned_mesh(
     smooth: int = 0,
     max_faces: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Without double and null faces and small parts, and what else is asked for, in this order.
+    """A mesh without double and null faces; what else is asked for is done in this order.
 
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``, outside in front.
-        min_component: parts with a smaller share of all faces go.
-        min_diameter: parts whose bounding box has a shorter diagonal go, in units of the whole's.
+        min_component: parts with a smaller share of all faces are removed.
+        min_diameter: parts whose bounding box has a shorter diagonal are removed, in units of the
+            whole's.
         largest: only the part with the most faces stays.
         close_holes: holes with at most so many edges are closed; 0: none.
         smooth: steps of Taubin smoothing, which hardly shrinks.
@@ -36,10 +37,10 @@ def cleaned_mesh(
     Raises:
         UserError: nothing is left.
     """
-    import pymeshlab
+    from pymeshlab import Mesh, MeshSet  # pyright: ignore[reportAttributeAccessIssue] (no stubs)
 
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(vertices, faces.astype(np.int32)))
+    meshes = MeshSet()
+    meshes.add_mesh(Mesh(vertices, faces.astype(np.int32)))
     meshes.meshing_remove_duplicate_vertices()
     meshes.meshing_remove_duplicate_faces()
     meshes.meshing_remove_null_faces()
@@ -61,7 +62,7 @@ def cleaned_mesh(
 
 
 def _drop_parts(meshes, min_component: float, min_diameter: float, largest: bool) -> None:
-    import pymeshlab
+    from pymeshlab import PureValue  # pyright: ignore[reportAttributeAccessIssue] (no stubs)
 
     least = int(min_component * meshes.current_mesh().face_number())
     if largest:
@@ -73,22 +74,25 @@ def _drop_parts(meshes, min_component: float, min_diameter: float, largest: bool
     if min_diameter > 0:
         shortest = min_diameter * meshes.current_mesh().bounding_box().diagonal()
         meshes.meshing_remove_connected_component_by_diameter(
-            mincomponentdiag=pymeshlab.PureValue(shortest), removeunref=True
+            mincomponentdiag=PureValue(shortest), removeunref=True
         )
 
 
 def _part_sizes(faces: np.ndarray) -> np.ndarray:
-    """Numbers of faces of the parts that hang together by edges."""
+    """The number of faces of each part; faces of one part are joined by edges."""
     import trimesh
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    pairs = trimesh.graph.face_adjacency(faces)
+    pairs = np.asarray(trimesh.graph.face_adjacency(faces))
     links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(faces),) * 2)
     return np.bincount(connected_components(links, directed=False)[1])
 
 
 def _make_manifold(meshes) -> None:
-    """What closing holes needs; faces at an edge of more than two go, the smallest first."""
+    """Makes the mesh manifold, as closing holes needs it.
+
+    Of the faces at an edge of more than two, the smallest are removed first.
+    """
     meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
     meshes.meshing_repair_non_manifold_vertices()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 import torch
@@ -10,22 +11,22 @@ import torch
 from ..errors import UserError
 from ..gaussians import Gaussians
 
-HAZE = 0.05  # opacity that still separates inside from outside, for filling
-EDGE = 1.1  # the grid ends there, closed
+HAZE = 0.05  # opacity that still separates inside from outside, when cavities are filled
+EDGE = 1.1  # the grid ends at this coordinate, and surfaces are closed there
 LEAST = 0.005  # alpha below this is left out
-MOST_POINTS = 1 << 27  # of the grid: half a gigabyte, five times that while it is filled
+MOST_POINTS = 1 << 27  # largest grid: half a gigabyte, five times that while it is filled
 _BATCH = 2_000_000  # points evaluated at once: 100 MB
 
 
 def level_set(gaussians: Gaussians, voxels: int, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Marching cubes on ``opacity_volume``, its closed cavities filled.
+    """A surface by marching cubes on ``opacity_volume``, whose closed cavities are filled.
 
     It fattens thin parts by about the Gaussians' own width.
 
     Args:
         gaussians: one object.
-        voxels: a unit.
-        level: in (0, 1).
+        voxels: number of voxels a unit.
+        level: value of the volume at the surface, in (0, 1).
 
     Returns:
         Vertices ``[V, 3]`` float64 and faces ``[F, 3]`` int64, outside in front.
@@ -45,7 +46,7 @@ def level_set(gaussians: Gaussians, voxels: int, level: float) -> tuple[np.ndarr
 
 
 def _cavities(volume: np.ndarray) -> np.ndarray:
-    """Voxels on the inner side of a shell, bool; the first voxel is outside.
+    """The voxels on the inner side of a shell, bool; the first voxel counts as outside.
 
     A shell of splats leaks at the level of its surface, so what lies inside is found where even a
     faint haze closes it, and grown up to the ridge of the shell.
@@ -53,8 +54,8 @@ def _cavities(volume: np.ndarray) -> np.ndarray:
     from skimage.measure import label
     from skimage.segmentation import watershed
 
-    parts, count = label(volume < HAZE, connectivity=1, return_num=True)
-    if count < 2:
+    parts = cast(np.ndarray, label(volume < HAZE, connectivity=1))
+    if parts.max(initial=0) < 2:
         return np.zeros(volume.shape, bool)
     seeds = np.where(parts == parts[0, 0, 0], 1, np.where(parts > 0, 2, 0))
     return watershed(volume, seeds) == 2
@@ -66,12 +67,12 @@ def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.nd
     Each Gaussian is evaluated at the points it reaches, and nowhere else.
 
     Args:
-        gaussians: one object; those outside [-1, 1]^3 are left out, alpha under 0.005 and
-            what reaches beyond [-1.1, 1.1]^3 too.
-        voxels: grid points a unit.
+        gaussians: one object; Gaussians outside [-1, 1]^3 are left out, and so are alpha under
+            0.005 and what reaches beyond [-1.1, 1.1]^3.
+        voxels: number of grid points a unit.
 
     Returns:
-        ``[X, Y, Z]`` float32 with an empty margin, and the first point ``[3]``.
+        The volume ``[X, Y, Z]`` float32 with an empty margin, and its first point ``[3]``.
 
     Raises:
         UserError: nothing is visible, or the grid would be too large.
@@ -101,7 +102,8 @@ def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.nd
     to_unit = torch.linalg.inv(axes)
     boxes, kinds = half.unique(dim=0, return_inverse=True)
     order = kinds.argsort(stable=True)
-    for box, members in zip(boxes, order.split(kinds.bincount().tolist())):  # of like size together
+    # Gaussians of one size are evaluated together.
+    for box, members in zip(boxes, order.split(kinds.bincount().tolist())):
         spans = [torch.arange(-size, size + 1) for size in box.tolist()]
         points = torch.stack(torch.meshgrid(*spans, indexing="ij"), -1).reshape(-1, 3)
         for part in members.split(max(1, _BATCH // len(points))):
@@ -111,7 +113,7 @@ def opacity_volume(gaussians: Gaussians, voxels: int) -> tuple[np.ndarray, np.nd
 
 
 def _rounded_up(sizes: torch.Tensor) -> torch.Tensor:
-    """To the next of 1, 2, 3, 4, 5, 7, 9, ...: few kinds, none much too large."""
+    """Rounds up to the next of 1, 2, 3, 4, 5, 7, 9, ..., so that there are few sizes."""
     steps = [1]
     while steps[-1] < int(sizes.max()):
         steps.append(max(steps[-1] + 1, steps[-1] * 5 // 4))

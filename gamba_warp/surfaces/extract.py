@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,71 +12,10 @@ from ..errors import UserError
 from ..gaussians import Gaussians
 from .cleaning import cleaned_mesh
 from .density import level_set
+from .options import SurfaceOptions
 from .tsdf import CLEAR, Views, fuse, look_around
 
 VISIBLE = 0.05  # opacity from which a Gaussian counts for the object's extent
-Method = Literal["tsdf", "density", "centers"]
-
-
-@dataclass(frozen=True)
-class SurfaceOptions:
-    """How Gaussians become a surface; lengths in units of the object's longest side.
-
-    Attributes:
-        method: tsdf (depth of many views, fused), density (marching cubes on 1 - prod(1 - alpha)),
-            or centers (opacity-weighted centres; biased inwards, a diagnostic without volume).
-        voxels: voxels a unit, of the TSDF and of the density; 8 to 1024.
-        views: TSDF cameras, on a Fibonacci sphere; also of the colours.
-        pixels: side of a depth map.
-        truncation: of the TSDF, in voxels.
-        transmittance: depth is where a ray's transmittance has fallen to this. Fitted and predicted
-            Gaussians are half transparent, so the median (0.5) lies behind the surface.
-        min_alpha: pixels with less have no depth.
-        clear_alpha: pixels with less say that nothing is there.
-        max_slope: pixels of a steeper surface, depth over width, have no depth.
-        min_support: fused voxels that a smaller share of the views support are dropped.
-        level: of the density.
-        min_component: smaller parts are removed, as a share of all faces.
-        min_diameter: shorter parts are removed, as a share of the whole's diagonal.
-        largest: only the largest part is kept.
-        close_holes: holes with at most so many edges are closed.
-        smooth: steps of Taubin smoothing.
-        faces: at most so many, by decimation; 0: as many as there are.
-        colors: give vertices the colour that the views show.
-    """
-
-    method: Method = "tsdf"
-    voxels: int = 128
-    views: int = 64
-    pixels: int = 256
-    truncation: float = 5.0
-    transmittance: float = 0.92
-    min_alpha: float = 0.3
-    clear_alpha: float = 0.1
-    max_slope: float = 1.5
-    min_support: float = 0.03
-    level: float = 0.5
-    min_component: float = 0.01
-    min_diameter: float = 0.0
-    largest: bool = False
-    close_holes: int = 30
-    smooth: int = 0
-    faces: int = 0
-    colors: bool = False
-
-    def check(self) -> None:
-        """Raises UserError, with the option's name, where a number is out of range."""
-        bounds = {
-            "voxels": (8, 1024),
-            "views": (8, 1000),
-            "pixels": (8, 4096),
-            "close_holes": (0, 10000),
-            "smooth": (0, 1000),
-            "faces": (0, 2**31 - 1),
-        }
-        for name, (low, high) in bounds.items():
-            if not low <= getattr(self, name) <= high:
-                raise UserError(f"--{name.replace('_', '-')}: {low} to {high} are possible")
 
 
 @dataclass
@@ -94,7 +32,7 @@ class Surface:
     faces: np.ndarray
     colors: np.ndarray | None = None
 
-    def is_closed(self) -> bool:
+    def is_watertight(self) -> bool:
         """Whether every edge has two faces."""
         import trimesh
 
@@ -130,6 +68,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
             options.max_slope,
         )
     if options.method == "tsdf":
+        assert views is not None
         support = max(1.0, options.min_support * options.views)
         mesh = fuse(views, options.voxels, options.truncation, support)
     else:
@@ -143,12 +82,15 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
         smooth=options.smooth,
         max_faces=options.faces,
     )
-    colors = vertex_colors(vertices, faces, views, options.voxels) if options.colors else None
+    colors = None
+    if options.colors:
+        assert views is not None
+        colors = vertex_colors(vertices, faces, views, options.voxels)
     return Surface(vertices, faces, colors)
 
 
 def near_and_visible(gaussians: Gaussians) -> Gaussians:
-    """Those with opacity whose centre is within [-1, 1]^3.
+    """The Gaussians whose centre is within [-1, 1]^3.
 
     Raises:
         UserError: a value is not finite, no Gaussian is visible, or all are outside.
@@ -167,9 +109,10 @@ def near_and_visible(gaussians: Gaussians) -> Gaussians:
 
 
 def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
-    """Centre ``[3]`` and longest side of an object anywhere, whatever floats far from it.
+    """The centre ``[3]`` and the longest side of an object anywhere.
 
-    Of the visible Gaussians' centres, half a percent on each side is left out along each axis.
+    Of the visible Gaussians' centres, half a percent at each end of each axis is left out, so that
+    what floats far from the object does not count.
 
     Raises:
         UserError: a value is not finite, no Gaussian is visible, or all are at one point.
@@ -180,7 +123,7 @@ def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
     if len(means) == 0:
         raise UserError(f"no Gaussian has an opacity above {VISIBLE}")
     ends = np.quantile(means.numpy(), [0.005, 0.995], axis=0)
-    # a single Gaussian has an extent as well
+    # A single Gaussian has an extent as well.
     width = float(gaussians.scales.median())
     side = float((ends[1] - ends[0]).max()) + 4 * width
     if not 0 < side < float("inf"):
@@ -190,6 +133,11 @@ def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
 
 def surface_of(gaussians: Gaussians, options: SurfaceOptions, device: torch.device) -> Surface:
     """The surface of an object of any size anywhere, in its own frame.
+
+    Args:
+        gaussians: one object.
+        options: any method but centers.
+        device: device that renders.
 
     Raises:
         UserError: there is no surface.
@@ -201,25 +149,26 @@ def surface_of(gaussians: Gaussians, options: SurfaceOptions, device: torch.devi
 
 
 def moved_to_unit(gaussians: Gaussians, center: Tensor, side: float) -> Gaussians:
-    """``gaussians`` with ``center [3]`` at the origin and ``side`` as the unit."""
+    """The same object with ``center [3]`` at the origin and ``side`` as the unit."""
     means, scales = (gaussians.means - center) / side, gaussians.scales / side
     return replace(gaussians, means=means, scales=scales)
 
 
 def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:
-    """Mean colour of each vertex in the views that see it, those in front counting most.
+    """The mean colour of each vertex in the views that see it; those in front count most.
 
     Args:
         vertices: ``[V, 3]``.
         faces: ``[F, 3]``.
         views: pictures and depth.
-        voxels: a unit; a view sees a vertex if its depth there differs by less than four.
+        voxels: number of voxels a unit; a view sees a vertex if its depth there differs by less
+            than four voxels.
 
     Returns:
         ``[V, 3]`` float32 in [0, 1]; a vertex that no view sees has the nearest one's colour.
     """
     import trimesh
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     points = torch.from_numpy(vertices).float()
@@ -245,5 +194,5 @@ def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels:
     colors = (total / weight.clamp_min(1e-12)).clamp(0, 1).numpy()
     if not known.all():
         known = known.numpy()
-        colors[~known] = colors[known][cKDTree(vertices[known]).query(vertices[~known])[1]]
+        colors[~known] = colors[known][KDTree(vertices[known]).query(vertices[~known])[1]]
     return colors

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import cast
 
 import numpy as np
 import torch
 
+from ..conventions import Axes
 from ..errors import UserError
 from ..files import atomic_path
 from ..formats.meshes import to_linear
-from ..formats.ply import Frame
+from ..formats.names import MESH_FORMATS, MeshFormat
 from ..gaussians import Gaussians
 from ..images import to_uint8
-from .extract import Surface, SurfaceOptions, surface_of
-
-MeshFormat = Literal["obj", "glb", "ply", "stl"]
-MESH_FORMATS = get_args(MeshFormat)
+from .extract import Surface, surface_of
+from .options import SurfaceOptions
 
 
 def save_mesh(path: str | Path, surface: Surface) -> None:
     """Writes a surface, atomically, with vertex colours where the format has them (not .stl).
 
-    The frame is left as it is, but for ``.glb``, which is turned from OpenCV's (y down) to glTF's
-    (y up) as ``save_glb`` does; there colours are linear light, as the format asks.
+    The axes are left as they are, except in ``.glb``: it is turned from OpenCV's (y down) to
+    glTF's (y up), as ``save_glb`` does, and its colours are linear light, as the format asks.
 
     Args:
         path: ends in .obj, .glb, .ply or .stl.
@@ -35,6 +34,7 @@ def save_mesh(path: str | Path, surface: Surface) -> None:
         UserError: another suffix, or the file cannot be written.
     """
     import trimesh
+    from trimesh.visual import ColorVisuals
 
     kind = Path(path).suffix.lower()[1:]
     if kind not in MESH_FORMATS:
@@ -46,10 +46,8 @@ def save_mesh(path: str | Path, surface: Surface) -> None:
     mesh = trimesh.Trimesh(vertices, surface.faces, process=False)
     if colors is not None and kind != "stl":
         opaque = np.ones((len(colors), 1), np.float32)
-        mesh.visual = trimesh.visual.ColorVisuals(
-            mesh, vertex_colors=to_uint8(np.hstack([colors, opaque]))
-        )
-    content = mesh.export(file_type=kind)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(np.hstack([colors, opaque])))
+    content = cast("bytes | str", mesh.export(file_type=kind))  # a dict is of other kinds
     with atomic_path(path) as temporary:
         temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
 
@@ -59,7 +57,7 @@ def write_meshes(
     gaussians: Gaussians,
     formats: Sequence[MeshFormat],
     options: SurfaceOptions,
-    frame: Frame,
+    axes: Axes,
     device: torch.device,
 ) -> Surface:
     """Makes an object's surface and writes it as ``NAME-mesh.FORMAT``.
@@ -67,10 +65,10 @@ def write_meshes(
     Args:
         base: folder and NAME.
         gaussians: an object of any size anywhere.
-        formats: of the files.
+        formats: formats of the files.
         options: how the surface is made.
-        frame: axes of all but .glb, which is y up in any case.
-        device: where to render.
+        axes: axes of all but .glb, which is y up in any case.
+        device: device that renders.
 
     Returns:
         The surface in the Gaussians' own frame.
@@ -81,7 +79,7 @@ def write_meshes(
     found = surface_of(gaussians, options, device)
     for kind in formats:
         turned = found
-        if frame == "opengl" and kind != "glb":
+        if axes == "opengl" and kind != "glb":
             turned = Surface(found.vertices * [1.0, -1.0, -1.0], found.faces, found.colors)
         save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), turned)
     return found

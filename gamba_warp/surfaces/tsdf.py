@@ -1,4 +1,4 @@
-"""Rendered depth of many views, fused in a truncated signed distance field (Open3D)."""
+"""Rendered depth of many views, fused in a truncated signed distance field by Open3D."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..open3d import import_open3d
 from ..render import render
 
 CLEAR = 1e5  # depth of a ray that meets nothing
-_CHUNK_PIXELS = 1 << 20  # rendered in one launch
+_CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch
 
 
 @dataclass
@@ -67,19 +67,20 @@ def look_around(
 
     Args:
         gaussians: one object, about the origin, on the device that renders.
-        count: of the views, on a Fibonacci sphere.
+        count: number of views, on a Fibonacci sphere.
         pixels: side of a picture.
         transmittance: depth is where a ray's transmittance has fallen to this.
         min_alpha: pixels with less have no depth.
         clear_alpha: pixels with less meet nothing.
-        max_slope: pixels of a steeper surface, depth over width, have no depth: seen aslant, the
-            near edge of a Gaussian stands for its centre, and all views together swell the object.
+        max_slope: pixels of a steeper surface, depth over width, have no depth: on a slanted
+            surface the near edge of a Gaussian is taken for its centre, and all views together
+            would make the object larger.
 
     Raises:
         UserError: no pixel of any view is covered.
     """
     reach = gaussians.means.norm(dim=-1) + 2 * gaussians.scales.amax(-1)
-    # a far Gaussian must not make all others small; what lies outside a picture is not seen in it
+    # One far Gaussian must not make all others small in the pictures.
     radius = float(torch.quantile(reach.cpu()[:: 1 + gaussians.num // 2**20], 0.999)) * 1.05
     cameras = sphere_cameras(count, radius, pixels)
     chunk = max(1, _CHUNK_PIXELS // pixels**2)
@@ -100,9 +101,10 @@ def look_around(
 
 
 def _slope(views: Views, k: int) -> Tensor:
-    """``[H, W]``: how steep the plane through a pixel's 5 x 5 neighbours is in view ``k``; 0: none.
+    """The steepness ``[H, W]`` of the plane through a pixel's 5 x 5 neighbours in view ``k``.
 
-    Least squares over the neighbours that hit something, by their moments.
+    The plane has least squares over the neighbours that hit something, from their moments. Pixels
+    without a plane have the steepness 0.
     """
     hit = views.hit()[k].float()
     depth = views.depth[k] * hit
@@ -117,10 +119,10 @@ def _slope(views: Views, k: int) -> Tensor:
     count = count.clamp_min(1)
     sxx, syy, sxy = sxx - sx * sx / count, syy - sy * sy / count, sxy - sx * sy / count
     sxz, syz = sxz - sx * sz / count, syz - sy * sz / count
-    # a single row of pixels has no plane, and no slope then
+    # A single row of pixels has no plane.
     over = torch.where(sxx * syy - sxy * sxy > 1e-3, 1 / (sxx * syy - sxy * sxy), 0.0)
     dx, dy = (syy * sxz - sxy * syz) * over, (sxx * syz - sxy * sxz) * over
-    width = depth / views.cameras.Ks[k, 0, 0]  # of a pixel, where the surface is
+    width = depth / views.cameras.Ks[k, 0, 0]  # width of a pixel at the surface
     return torch.where(hit > 0, torch.hypot(dx, dy) / width.clamp_min(1e-9), 0.0)
 
 
@@ -131,8 +133,8 @@ def fuse(
 
     Args:
         views: what is fused.
-        voxels: a unit.
-        truncation: in voxels; what lies deeper behind a surface knows nothing of it.
+        voxels: number of voxels a unit.
+        truncation: largest distance that counts behind a surface, in voxels.
         support: voxels that fewer views support are left out.
 
     Returns:
@@ -158,7 +160,7 @@ def fuse(
             near = _image(torch.where(hit, depth, 0.0))
             blocks = grid.compute_unique_block_coordinates(near, K, pose, **reach)
             grid.hashmap().activate(blocks)
-    # every view tells of every block: those that see past a surface in front of it clear it
+    # Every view is fused into every block: views that look through a block clear it.
     blocks = grid.hashmap().key_tensor()
     blocks = blocks[grid.hashmap().active_buf_indices().to(o3d.core.int64)]
     for depth, pose in zip(views.depth, poses):

@@ -1,4 +1,4 @@
-"""Run time against error: what is measured, and how. ``gamba bench`` runs it."""
+"""Benchmarks of run time against error: cases, and how they are measured, for ``gamba bench``."""
 
 from .core.case import LEVELS, Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
 from .core.measure import FORMAT, measure

@@ -1,13 +1,14 @@
-"""Other ways to the same result: a plain torch loop written here, and packages if installed."""
+"""Other ways to the same results: plain torch code written here, and packages if installed."""
 
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from gamba_warp.versions import installed
 
 from .core.case import NotInstalled
 
@@ -18,24 +19,16 @@ def load(module: str, package: str):
     """Imports a peer's module.
 
     Raises:
-        NotInstalled: the package is not there; a package that is there but broken raises its own.
+        NotInstalled: the package is not installed. A package that is broken raises its own error.
     """
-    try:
-        importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        raise NotInstalled(package) from None
+    if not installed(package):
+        raise NotInstalled(package)
     return importlib.import_module(module)
 
 
 def versions() -> dict[str, str]:
     """Versions of the peers that are installed."""
-    found = {}
-    for package in PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
+    return installed(*PACKAGES)
 
 
 def scan_loop(
@@ -48,20 +41,20 @@ def scan_loop(
     z: Tensor,
     delta_bias: Tensor,
 ) -> Tensor:
-    """The selective scan as its formula reads, in torch, with δ = softplus(delta + delta_bias).
+    """Runs the selective scan in torch as its formula reads, δ = softplus(delta + delta_bias).
 
-    The way that Mamba's own reference goes: the factors exp(δA) and δBu of all tokens are made
-    first, ``[B, D, L, N]`` each, then a Python loop over the tokens carries the state.
+    Mamba's own reference does it in this way: the factors exp(δA) and δBu of all tokens are
+    computed first, ``[B, D, L, N]`` each, and then a Python loop over the tokens carries the state.
 
     Args:
-        u: ``[B, D, L]``, like delta, z and the result.
-        delta: see above.
+        u: ``[B, D, L]``, as delta, z and the result.
+        delta: ``[B, D, L]``.
         A: ``[D, N]``.
-        B: ``[B, N, L]``, like C.
-        C: see above.
-        D: ``[D]``, like delta_bias.
-        z: the gate.
-        delta_bias: see above.
+        B: ``[B, N, L]``.
+        C: ``[B, N, L]``.
+        D: ``[D]``.
+        z: the gate, ``[B, D, L]``.
+        delta_bias: ``[D]``.
     """
     step = F.softplus(delta + delta_bias[:, None])
     decay = torch.exp(step[..., None] * A[:, None])
@@ -85,10 +78,10 @@ def mambapy_scan(
     z: Tensor,
     delta_bias: Tensor,
 ) -> Tensor:
-    """The parallel scan of mambapy inside the formula; layout ``[B, L, D]``, ``[B, L, N]``.
+    """Runs the formula with mambapy's parallel scan; layout ``[B, L, D]``, ``[B, L, N]``.
 
     Raises:
-        NotInstalled: mambapy is not there.
+        NotInstalled: mambapy is not installed.
     """
     pscan = load("mambapy.pscan", "mambapy").pscan
     step = F.softplus(delta + delta_bias)
@@ -109,10 +102,10 @@ def mamba_ssm_scan(
     z: Tensor,
     delta_bias: Tensor,
 ) -> Tensor:
-    """mamba-ssm's CUDA kernel; layout ``[B, D, L]``, ``[B, N, L]``.
+    """Runs mamba-ssm's CUDA kernel; layout ``[B, D, L]``, ``[B, N, L]``.
 
     Raises:
-        NotInstalled: mamba-ssm is not there.
+        NotInstalled: mamba-ssm is not installed.
     """
     module = load("mamba_ssm.ops.selective_scan_interface", "mamba-ssm")
     return module.selective_scan_fn(
@@ -121,27 +114,27 @@ def mamba_ssm_scan(
 
 
 def torch_conv(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Causal depthwise convolution and SiLU in torch; x ``[B, D, L]``, weight ``[D, W]``."""
+    """Runs causal depthwise convolution and SiLU in torch; x ``[B, D, L]``, weight ``[D, W]``."""
     width = weight.shape[1]
     y = F.conv1d(x, weight[:, None], bias, padding=width - 1, groups=x.shape[1])
     return F.silu(y[..., : x.shape[2]])
 
 
 def causal_conv1d(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """The causal-conv1d package's kernel; x ``[B, D, L]``, weight ``[D, W]``; CUDA only.
+    """Runs the causal-conv1d package's kernel; x ``[B, D, L]``, weight ``[D, W]``; CUDA only.
 
     Raises:
-        NotInstalled: causal-conv1d is not there.
+        NotInstalled: causal-conv1d is not installed.
     """
     function = load("causal_conv1d", "causal-conv1d").causal_conv1d_fn
     return function(x, weight, bias, activation="silu")
 
 
 def gsplat_rasterization(**arguments) -> tuple[Tensor, Tensor, dict]:
-    """The whole operator of gsplat; CUDA only. Arguments as ``rasterization``.
+    """Runs gsplat's whole operator, on CUDA only, with the arguments of ``rasterization``.
 
     Raises:
-        NotInstalled: gsplat is not there.
+        NotInstalled: gsplat is not installed.
     """
     function = load("gsplat", "gsplat").rasterization
     return function(**arguments, packed=False)
@@ -150,13 +143,13 @@ def gsplat_rasterization(**arguments) -> tuple[Tensor, Tensor, dict]:
 def gsplat_projection(
     means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, size: int
 ) -> Tensor:
-    """The projection alone of gsplat's torch code, the one part of it that a CPU runs.
+    """Runs the projection of gsplat's torch code, the only part of gsplat that runs on a CPU.
 
     Returns:
         Centres in the picture, ``[V, N, 2]``.
 
     Raises:
-        NotInstalled: gsplat is not there.
+        NotInstalled: gsplat is not installed.
     """
     torch_code = load("gsplat.cuda._torch_impl", "gsplat")
     covariances, _ = torch_code._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
@@ -176,14 +169,14 @@ def gswarp_rasterization(
     height: int,
     **options,
 ) -> tuple[Tensor, Tensor, dict]:
-    """The whole operator of gswarp, view after view as it takes them; CUDA only.
+    """Runs gswarp's whole operator, one view after the other, on CUDA only.
 
-    Arguments as ``rasterization``, without leading dimensions; the principal point must be the
-    centre. Alphas are those it returns beside the picture.
+    The arguments are those of ``rasterization``, without leading dimensions; the principal point
+    must be the centre. The alphas are those that gswarp returns beside the picture.
 
     Raises:
-        NotInstalled: gswarp is not there.
-        ValueError: an option that it does not have.
+        NotInstalled: gswarp is not installed.
+        ValueError: gswarp does not have an option.
     """
     if options:
         raise ValueError(f"gswarp has no {', '.join(options)}")
@@ -219,7 +212,7 @@ def gswarp_rasterization(
 
 
 def _perspective(tangent_x: float, tangent_y: float, near: float = 0.01, far: float = 100.0):
-    """The projection that diff-gaussian-rasterization's callers make: z forward, w = z."""
+    """Makes the projection matrix of diff-gaussian-rasterization's callers: z forward, w = z."""
     matrix = torch.zeros(4, 4)
     matrix[0, 0], matrix[1, 1] = 1 / tangent_x, 1 / tangent_y
     matrix[2, 2], matrix[2, 3], matrix[3, 2] = far / (far - near), -far * near / (far - near), 1

@@ -1,11 +1,12 @@
-"""A bare scan for a CPU: how fast the sum itself can go, with nothing of an operator around it.
+"""A bare scan for a CPU, which shows how fast the sum itself can go without an operator around it.
 
-One native loop for a block of 16 adjacent channels, their 16 states unrolled, exp2 by a polynomial.
-No gate, skip, softplus or bias, no gradient, one dtype, 16 states; the output is given. What the
-operator costs is told as a ratio to this.
+It is one native loop over a block of 16 adjacent channels, with their 16 states unrolled and exp2
+by a polynomial. It has no gate, skip connection, softplus or bias, no gradient, one dtype and 16
+states, and it writes to a given output. The operator's cost is stated as a ratio to its time.
 """
 
 import functools
+from typing import no_type_check
 
 import warp as wp
 from torch import Tensor
@@ -15,8 +16,8 @@ from ..runtime.launch import parallel_launch
 LANES = STATES = 16
 _LOG2E = 1.4426950408889634
 
-# exp2: 1.5 * 2^23 added and taken off rounds to an integer; a polynomial of degree 5 for the
-# rest (relative error 2e-7), whose exponent then gets the integer.
+# exp2: adding and subtracting 1.5 * 2^23 rounds to an integer. A polynomial of degree 5 takes the
+# rest (relative error 2e-7), and its exponent then gets the integer.
 _SCAN = """
 typedef float F __attribute__((vector_size(64), aligned(4)));
 typedef int I __attribute__((vector_size(64), aligned(4)));
@@ -70,6 +71,7 @@ def _kernel():
     ): ...
 
     @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
     def probe(
         offset: int,
         # in
@@ -90,15 +92,15 @@ def _kernel():
 
 
 def probe_scan(u: Tensor, delta: Tensor, rate: Tensor, B: Tensor, C: Tensor, out: Tensor) -> Tensor:
-    """h_t = exp(δA) h_{t-1} + δ B_t u_t, out_t = Σ_n C_t h_t, on torch's number of threads.
+    """Computes h_t = exp(δA) h_{t-1} + δ B_t u_t, out_t = Σ_n C_t h_t on torch's threads.
 
     Args:
-        u: ``[L, D]`` float32 on the CPU, dense, like all of these; D a multiple of 16.
-        delta: ``[L, D]``, the step itself, > 0.
-        rate: ``[16, D]``, see ``probe_rate``.
+        u: ``[L, D]``, D a multiple of 16; like all arguments float32 on the CPU, dense.
+        delta: ``[L, D]``, the step δ itself, > 0.
+        rate: ``[16, D]`` from ``probe_rate``.
         B: ``[L, 16]``.
         C: ``[L, 16]``.
-        out: ``[L, D]``, written.
+        out: ``[L, D]``, which is overwritten.
 
     Returns:
         ``out``.
@@ -110,5 +112,5 @@ def probe_scan(u: Tensor, delta: Tensor, rate: Tensor, B: Tensor, C: Tensor, out
 
 
 def probe_rate(A: Tensor) -> Tensor:
-    """``[D, 16]`` of negative numbers to what ``probe_scan`` takes: A·log2(e), ``[16, D]``."""
+    """Maps A ``[D, 16]``, negative numbers, to the A·log2(e) ``[16, D]`` of ``probe_scan``."""
     return (A.T * _LOG2E).contiguous()

@@ -5,6 +5,7 @@ floats, one thread each, on CUDA. Equations 1 and 2 of README.md.
 """
 
 import functools
+from typing import no_type_check
 
 import torch
 import warp as wp
@@ -35,6 +36,7 @@ def forward_kernel(device_type: str, io: torch.dtype):
     scalar = WARP_DTYPES[io]
 
     @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
     def conv_forward(
         offset: int,
         # in
@@ -83,6 +85,7 @@ def backward_kernel(device_type: str, io: torch.dtype):
     scalar = WARP_DTYPES[io]
 
     @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
     def conv_backward(
         offset: int,
         # in

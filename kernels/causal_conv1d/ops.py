@@ -93,12 +93,12 @@ def _conv_backward(
         [dx, dstate, view(shaped, m.VALUE)],
     )
     grads = [dx] if need_x else []
-    total = dweight.sum(0)[:, :channels] if need_weight or need_bias else None
+    total = dweight.sum(0)[:, :channels]  # without rows if neither gradient is needed
     if need_weight:
         grads.append(total[TAPS - weight.shape[1] : TAPS].T.to(weight.dtype).contiguous())
-    if need_bias:
+    if need_bias and bias is not None:
         grads.append(total[TAPS].to(bias.dtype).clone())
-    if need_state:
+    if need_state and state is not None:
         grads.append(dstate[:, TAPS - 1 - state.shape[1] :].clone())
     return grads
 

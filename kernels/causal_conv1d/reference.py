@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -20,7 +22,7 @@ def causal_conv1d_reference(
         initial_state = x.new_zeros(x.shape[0], width - 1, x.shape[2])
     padded = torch.cat([initial_state, x], 1)
     length = x.shape[1]
-    out = sum(weight[:, k] * padded[:, k : k + length] for k in range(width))
+    out = reduce(torch.add, (weight[:, k] * padded[:, k : k + length] for k in range(width)))
     if bias is not None:
         out = out + bias
     if activation is not None:

@@ -1,5 +1,7 @@
 """What ``rasterization`` refuses, before any launch."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -9,10 +11,9 @@ _RASTERIZE_MODES = ("classic", "antialiased")
 _MAX_SIDE = 2**15  # pixels
 _MAX_SH_DEGREE = 3
 
-
-# What else gsplat's function takes: its means to be fast, without a meaning here,
+# Options of gsplat's function that make it fast, and mean nothing here.
 _ITS_MEANS = ("packed", "tile_size", "channel_chunk", "segmented")
-# and what this rasterizer does not do: accepted where it asks for nothing.
+# Options of gsplat's function that this rasterizer does not have: only these values are accepted.
 _NOT_HERE = {
     "sparse_grad": False,
     "absgrad": False,
@@ -76,9 +77,7 @@ def _check_options(options: dict) -> None:
         raise ValueError(f"sh_degree is {degree!r}, allowed are None and 0 to {_MAX_SH_DEGREE}")
 
 
-def check_inputs(
-    tensors: dict[str, Tensor | None], options: dict, gsplat_options: dict
-) -> tuple[int, ...]:
+def check_inputs(tensors: dict[str, Any], options: dict, gsplat_options: dict) -> tuple[int, ...]:
     """Checks the arguments of ``rasterization`` by name.
 
     Returns:
@@ -101,7 +100,7 @@ def check_inputs(
             raise TypeError(f"{name} has dtype {value.dtype}, allowed are {names}")
         if value.device != device:
             raise ValueError(f"{name} is on {value.device}, means on {device}: allowed is one")
-    if device.type not in ("cpu", "cuda"):
+    if device is None or device.type not in ("cpu", "cuda"):
         raise ValueError(f"means is on {device}, allowed are cpu and cuda")
 
     means, viewmats, colors = tensors["means"], tensors["viewmats"], tensors["colors"]

@@ -5,5 +5,7 @@ ALPHA_MAX = 0.99  # alpha is clamped here, so 1 / (1 - alpha) <= 100
 T_MIN = 1e-4  # a pixel stops before its transmittance would fall to this: (1 - ALPHA_MAX)^2
 EPS2D = 0.3  # added to the diagonal of the projected covariance, square pixels
 TILE = 16  # pixels, side of a square tile
-FRUSTUM_MARGIN = 0.3  # of tan(fov / 2): how far outside the picture the Jacobian still follows
-COMPENSATION_MIN = 0.005  # floor of the antialiasing factor, keeps its gradient finite
+FRUSTUM_MARGIN = (
+    0.3  # share of tan(fov / 2): how far outside the picture the Jacobian still follows
+)
+COMPENSATION_MIN = 0.005  # floor of the antialiasing factor, which keeps its gradient finite

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .checks import check_inputs
 from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
-from .cpu.tuning import current
+from .cpu.tuning import Tuning, tuning_for
 from .harmonics import colors_from_harmonics
 from .meta import Meta
 from .ops import bin_op, composite, project
+from .project import LensOptions, Projected
 from .skip import Skip
-from .tiles import Bins, Walk
+from .tiles import Bins, Limits, Size, Tiling, Walk
 
 EVERYTHING = Skip()
-_DEPTH_EPS = 1e-10  # alpha below this has no expected depth
+_WEIGHT_EPS = 1e-10  # a sum of weights below this has no expected depth
 
 
 def rasterization(
@@ -71,7 +73,8 @@ def rasterization(
         eps2d: added to the diagonal of the projected covariance, square pixels, > 0.
         sh_degree: None or 0 to 3.
         backgrounds: ``[.., V, C]`` (without the depth channel), or None: black.
-        render_mode: "RGB", "D" (Σ w z), "ED" (D / alpha), "RGB+D" or "RGB+ED": depth comes last.
+        render_mode: "RGB", "D" (Σ w z), "ED" (Σ w z / Σ w), "RGB+D" or "RGB+ED", with the weights
+            w = T α; depth comes last.
         rasterize_mode: "classic", or "antialiased": opacity times sqrt(det Σ / det(Σ + eps2d)).
         alpha_min: fainter contributions are skipped; > 0.
         alpha_max: alpha is clamped here, and has zero gradient then; < 1.
@@ -101,29 +104,29 @@ def rasterization(
         rasterize_mode=rasterize_mode,
     )  # fmt: skip
     lead = check_inputs(tensors, options, gsplat_options)
-    views, size = viewmats.shape[-3], math.prod(lead)
-    flat = [_flat(x, size, len(lead)) for x in tensors.values()]
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat
+    tuning = tuning_for(means.device.type)
+    views, batch = viewmats.shape[-3], math.prod(lead)
+    flat: dict[str, Any] = {k: _flat(x, batch, len(lead)) for k, x in tensors.items()}
+    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat.values()
     if sh_degree is not None:
         colors = colors_from_harmonics(sh_degree, colors, means, viewmats).contiguous()
-    lens = [width, height, near_plane, far_plane, radius_clip, eps2d, alpha_min]
-    lens = [float(x) for x in (*lens, rasterize_mode == "antialiased", skip.unused)]
-    seen = colors.detach()  # for what is culled: no reason to compute the geometry's gradients
-    *projected, status = project(means, quats, scales, opacities, seen, viewmats, Ks, lens)
+    lens = LensOptions(
+        width=width, height=height, near_plane=near_plane, far_plane=far_plane,
+        radius_clip=radius_clip, eps2d=eps2d, alpha_min=alpha_min,
+        antialiased=rasterize_mode == "antialiased", skip_unused=skip.unused,
+    ).numbers()  # fmt: skip
+    # colours only cull here, so their gradient is no reason to compute that of the geometry
+    projected = project(means, quats, scales, opacities, colors.detach(), viewmats, Ks, lens)
     # with the caller's dimensions first: a gradient retained on meta's tensors must be on the way
-    projected = [x.view(*lead, *x.shape[1:]) for x in projected]
-    per_view = [x.reshape(size * views, *x.shape[len(lead) + 1 :]) for x in projected]
-    means2d, conics, depths, view_opacities, _ = per_view
-    bins = bin_op(*(x.detach() for x in per_view), width, height, alpha_min, skip.bits())
-    channels = _channels(render_mode, colors, depths.view(size, views, means.shape[1]))
-    size2d = [width, height, views, int(channels.dim() == 4), skip.bits()]
-    channels = channels.reshape(-1, channels.shape[-1])
-    skipped = None if torch.compiler.is_compiling() else bins[-1].new_full((), -1)
-    splats, limits = (means2d, conics, view_opacities, channels), [alpha_min, alpha_max, t_min]
-    renders, alphas, *walk = composite(*splats, list(bins), size2d, limits, skipped)
+    projected = Projected(*(x.view(*lead, *x.shape[1:]) for x in projected))
+    per_view = Projected(*(x.reshape(batch * views, *x.shape[len(lead) + 1 :]) for x in projected))
+    channels = _channels(render_mode, colors, per_view.depths.view(batch, views, means.shape[1]))
+    colors_per_view, channels = channels.dim() == 4, channels.reshape(-1, channels.shape[-1])
+    size = Size(width, height, views, int(colors_per_view), skip.bits())
+    limits = Limits(alpha_min, alpha_max, t_min)
+    renders, alphas, meta = _draw(per_view, channels, size, limits, tuning)
     renders = _finish(render_mode, renders, alphas, backgrounds)
-    meta = Meta(Bins(*bins), Walk(*walk), status, skipped)
-    _describe(meta, projected, width, height)
+    _describe(meta, projected)
     renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
     return renders, alphas, meta
 
@@ -133,32 +136,62 @@ def _flat(x: Tensor | None, size: int, lead: int) -> Tensor | None:
     return None if x is None else x.reshape(size, *x.shape[lead:]).float().contiguous()
 
 
-def _describe(meta: Meta, projected: list[Tensor], width: int, height: int) -> None:
+def _draw(
+    splats: Projected, channels: Tensor, size: Size, limits: Limits, tuning: Tuning
+) -> tuple[Tensor, Tensor, Meta]:
+    """Makes the lists of I views and blends them: ``[I, H, W, C]``, ``[I, H, W, 1]``, counts."""
+    *parts, status = (x.detach() for x in splats)
+    picture = size.width, size.height, limits.alpha_min, size.skip
+    bins = Bins(*bin_op(*parts, *picture, tuning.numbers()))
+    skipped = None if torch.compiler.is_compiling() else bins.box_pairs.new_full((), -1)
+    renders, alphas, *walk = composite(
+        splats.means2d,
+        splats.conics,
+        splats.view_opacities,
+        channels,
+        list(bins),
+        list(size),
+        list(limits),
+        tuning.numbers(),
+        skipped,
+    )
+    tiling = Tiling(size.width, size.height, tuning.tile)
+    return renders, alphas, Meta(tiling, bins, Walk(*walk), status, skipped)
+
+
+def _describe(meta: Meta, projected: Projected) -> None:
     """What gsplat's ``meta`` has under the same names."""
-    meta.update(zip(("means2d", "conics", "depths", "opacities"), projected))
-    meta.update(radii=projected[4].ceil().int(), width=width, height=height)
-    meta["tile_size"] = current().tile
+    meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
+    meta.update(opacities=projected.view_opacities, radii=projected.extents.ceil().int())
+    meta.update(width=meta.tiling.width, height=meta.tiling.height, tile_size=meta.tiling.tile)
 
 
 def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
-    """What is blended: ``[B, N, C]`` shared by the views, or ``[B, V, N, C]``."""
+    """What is blended: ``[B, N, C]`` shared by the views, or ``[B, V, N, C]``.
+
+    An expected depth needs the sum of the weights too, which is a channel of ones. ``alphas`` is
+    that sum but for rounding: it is made as 1 - T, and where a pixel is faint, it has lost digits.
+    """
     if render_mode == "RGB":
         return colors
-    depth = depths[..., None]
-    if render_mode in ("D", "ED"):
-        return depth
-    if colors.dim() == 3:
-        colors = colors[:, None].expand(-1, depth.shape[1], -1, -1)
-    return torch.cat([colors, depth], -1)
+    parts = [depths[..., None]]
+    if render_mode.endswith("ED"):
+        parts.append(torch.ones_like(parts[0]))
+    if "RGB" in render_mode:
+        if colors.dim() == 3:
+            colors = colors[:, None].expand(-1, depths.shape[1], -1, -1)
+        parts.insert(0, colors)
+    return torch.cat(parts, -1)
 
 
 def _finish(render_mode: str, renders: Tensor, alphas: Tensor, backgrounds: Tensor | None):
     """Expected depth, and the background behind the colour channels."""
     depth = None
-    if render_mode != "RGB":
-        renders, depth = renders[..., :-1], renders[..., -1:]
-        if render_mode.endswith("ED"):
-            depth = depth / alphas.clamp_min(_DEPTH_EPS)
+    if render_mode.endswith("ED"):
+        renders, depth, weight = renders.split([renders.shape[-1] - 2, 1, 1], -1)
+        depth = depth / weight.clamp_min(_WEIGHT_EPS)
+    elif render_mode != "RGB":
+        renders, depth = renders.split([renders.shape[-1] - 1, 1], -1)
     if backgrounds is not None and renders.shape[-1]:
         renders = renders + (1.0 - alphas) * backgrounds.flatten(0, 1)[:, None, None]
     return renders if depth is None else torch.cat([renders, depth], -1)

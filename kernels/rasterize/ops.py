@@ -1,6 +1,7 @@
 """The three registered operators and their gradients: project, bin, composite.
 
-They hold no arithmetic: each calls the launchers of its file. ``function.py`` joins them.
+They hold no arithmetic: each calls the launchers of its file. ``function.py`` joins them. An
+operator takes tensors and plain numbers only, so each named tuple comes as a list of its values.
 """
 
 import torch
@@ -10,31 +11,21 @@ from torch import Tensor
 from ..runtime.views import vectors
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
-from .cpu.tuning import Variant, current
+from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
-from .project import make_lens, project_forward
-from .project_vjp import project_backward
+from .project import LensOptions, Projected, make_lens, project_forward
+from .project_vjp import Cotangents, Gradients, Wanted, project_backward
 from .reduce import reduce_pairs
 from .skip import UNASKED
-from .tiles import (
-    Bins,
-    Walk,
-    make_frame,
-    make_grid,
-    tile_grid,
-)
+from .tiles import Bins, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
 
 _OP = "gamba_warp::rasterize_"
 MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 
 
 def _compositor(device: torch.device):
-    if device.type == "cpu":
-        return composite_cpu
-    if current() != Variant():
-        raise ValueError(f"device is {device}: {current()} is for a CPU")
-    return composite_cuda
+    return composite_cpu if device.type == "cpu" else composite_cuda
 
 
 @torch.library.custom_op(_OP + "project", mutates_args=())
@@ -48,8 +39,10 @@ def project(
     Ks: Tensor,
     lens: list[float],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """``project_forward`` as an operator; ``lens`` holds ``make_lens``'s arguments."""
-    return project_forward(means, quats, scales, opacities, colors, viewmats, Ks, make_lens(*lens))
+    """``project_forward`` as an operator, with the numbers of ``LensOptions``."""
+    gaussians = means, quats, scales, opacities, colors
+    p = project_forward(*gaussians, viewmats, Ks, make_lens(LensOptions(*lens)))
+    return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
 @project.register_fake
@@ -72,38 +65,52 @@ def _project_vjp(
     conics: Tensor,
     status: Tensor,
     cotangents: list[Tensor],
-    needs: list[bool],
+    wanted: list[bool],
 ) -> list[Tensor]:
-    inputs = (means, quats, scales, opacities, viewmats, Ks)
-    grads = project_backward(inputs, make_lens(*lens), conics, status, cotangents, needs)
+    grads = project_backward(
+        means,
+        quats,
+        scales,
+        opacities,
+        viewmats,
+        Ks,
+        make_lens(LensOptions(*lens)),
+        conics,
+        status,
+        Cotangents(*cotangents),
+        Wanted(*wanted),
+    )
     return [g for g in grads if g is not None]
 
 
 @_project_vjp.register_fake
-def _(means, quats, scales, opacities, viewmats, Ks, lens, conics, status, cotangents, needs):
+def _(means, quats, scales, opacities, viewmats, Ks, lens, conics, status, cotangents, wanted):
     inputs = (means, quats, scales, opacities, viewmats)
-    return [torch.empty_like(x) for x, need in zip(inputs, needs) if need]
+    return [torch.empty_like(x) for x, want in zip(inputs, wanted) if want]
 
 
 def _project_setup(ctx, inputs, output):
     means, quats, scales, opacities, _, viewmats, Ks, ctx.lens = inputs
-    _, conics, _, _, extents, status = output
-    ctx.mark_non_differentiable(extents, status)
+    projected = Projected(*output)
+    ctx.mark_non_differentiable(projected.extents, projected.status)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks, conics, status)
+    kept = projected.conics, projected.status
+    ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks, *kept)
 
 
 def _project_backward(ctx, v_means2d, v_conics, v_depths, v_view_opacities, _extents, _status):
     *inputs, conics, status = ctx.saved_tensors
-    needs = [ctx.needs_input_grad[i] for i in (0, 1, 2, 3, 5)]
-    shape = status.shape
+    means, quats, scales, opacities, _, viewmats, _, _ = ctx.needs_input_grad
+    wanted = Wanted(means, quats, scales, opacities, viewmats)
+    cotangents = Cotangents(v_means2d, v_conics, v_depths, v_view_opacities)
+    sizes = ((2,), (3,), (), ())
     cotangents = [
-        conics.new_zeros(*shape, *size) if v is None else v.contiguous()
-        for v, size in zip((v_means2d, v_conics, v_depths, v_view_opacities), ((2,), (3,), (), ()))
+        conics.new_zeros(*status.shape, *size) if v is None else v.contiguous()
+        for v, size in zip(cotangents, sizes)
     ]
-    grads = iter(_project_vjp(*inputs, ctx.lens, conics, status, cotangents, needs))
-    v = [next(grads) if need else None for need in needs]
-    return v[0], v[1], v[2], v[3], None, v[4], None, None
+    grads = iter(_project_vjp(*inputs, ctx.lens, conics, status, cotangents, list(wanted)))
+    v = Gradients(*(next(grads) if want else None for want in wanted))
+    return v.means, v.quats, v.scales, v.opacities, None, v.viewmats, None, None
 
 
 project.register_autograd(_project_backward, setup_context=_project_setup)
@@ -119,6 +126,7 @@ def bin_gaussians(
     height: int,
     alpha_min: float,
     skip: int,
+    tile: int,
 ) -> Bins:
     """Makes the tile lists of all views; reads the number of pairs back (the one synchronisation).
 
@@ -132,16 +140,16 @@ def bin_gaussians(
         height: pixels.
         alpha_min: what is fainter than this is not drawn.
         skip: from ``Skip.bits``.
+        tile: side of a tile, pixels.
 
     Raises:
         ValueError: there are more than 2^31 - 1 pairs, or more tiles.
     """
     images, num = depths.shape
-    tiles_x, tiles_y = tile_grid(width, height)
-    tiles = images * tiles_x * tiles_y
-    if max(tiles, depths.numel()) >= MAX_PAIRS:
-        raise ValueError(f"{images} views of {tiles_x * tiles_y} tiles, {num} Gaussians: over 2^31")
-    grid = make_grid(num, width, height, alpha_min, skip)
+    tiling = Tiling(width, height, tile)
+    if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
+        raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
+    grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
     inputs = [
         vectors(means2d, wp.vec2),
         vectors(conics, wp.vec3),
@@ -149,7 +157,7 @@ def bin_gaussians(
         vectors(extents, wp.vec2),
     ]
     bin_views = (bin_cpu if depths.device.type == "cpu" else bin_cuda).bin_views
-    return Bins(*bin_views(grid, depths, inputs, _refuse_too_many))
+    return bin_views(grid, depths, inputs, _refuse_too_many)
 
 
 def _refuse_too_many(pairs: int) -> None:
@@ -171,23 +179,34 @@ def bin_op(
     height: int,
     alpha_min: float,
     skip: int,
+    tuning: list[int],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """``bin_gaussians`` as an operator; the number of pairs is known only at run time."""
+    """``bin_gaussians`` as an operator, with the numbers of a ``Tuning``, whose tile it takes.
+
+    The number of pairs is known only at run time.
+    """
     per_view = means2d, conics, depths, view_opacities, extents
-    return tuple(bin_gaussians(*per_view, width, height, alpha_min, skip))
+    b = bin_gaussians(*per_view, width, height, alpha_min, skip, Tuning(*tuning).tile)
+    return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs
 
 
 @bin_op.register_fake
-def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min, skip):
+def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min, skip, tuning):
     def ints(*shape):
         return depths.new_empty(shape, dtype=torch.int32)
 
-    tiles_x, tiles_y = tile_grid(width, height)
-    count = depths.numel()
-    pairs = torch.library.get_ctx().new_dynamic_size()
-    starts = ints(depths.shape[0] * tiles_x * tiles_y + 1)
-    box_pairs = depths.new_empty((), dtype=torch.int64)
-    return ints(count), ints(count + 1), ints(pairs), ints(pairs), starts, box_pairs
+    tiling = Tiling(width, height, Tuning(*tuning).tile)
+    count, pairs = depths.numel(), torch.library.get_ctx().new_dynamic_size()
+    return tuple(
+        Bins(
+            order=ints(count),
+            offsets=ints(count + 1),
+            pairs=ints(pairs),
+            rows=ints(pairs),
+            starts=ints(depths.shape[0] * tiling.count + 1),
+            box_pairs=depths.new_empty((), dtype=torch.int64),
+        )
+    )
 
 
 @torch.library.custom_op(_OP + "composite", mutates_args=())
@@ -198,41 +217,49 @@ def composite(
     colors: Tensor,
     bins: list[Tensor],
     size: list[int],
-    alpha_range: list[float],
+    limits: list[float],
+    tuning: list[int],
     skipped: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blends the pairs; ``size``: width, height, V, whether colours are per view, ``Skip.bits``.
+    """Blends the pairs: pictures, alphas and the fields of a ``Walk``.
 
-    ``colors`` is ``[I * N, C]`` or, shared by the views, ``[B * N, C]``; ``bins`` is a ``Bins``.
-    Backward counts the tiles that it skips into ``skipped``, int64 without dimensions.
+    ``colors`` is ``[I * N, C]`` or, shared by the views, ``[B * N, C]``. The lists hold what
+    ``Bins``, ``Size``, ``Limits`` and ``Tuning`` hold, the lists of tiles are made with the same
+    tuning, and backward keeps it. Backward counts the tiles that it skips into ``skipped``, int64
+    without dimensions.
     """
     renders, alphas, walk = _compositor(means2d.device).composite_forward(
-        means2d, conics, view_opacities, colors, Bins(*bins), _frame(means2d, size, alpha_range)
+        means2d,
+        conics,
+        view_opacities,
+        colors,
+        Bins(*bins),
+        _picture(means2d, size, limits, tuning),
+        Tuning(*tuning),
     )
-    return renders, alphas, *walk
+    w = walk.transmittances, walk.stops, walk.blocks, walk.walked, walk.blocks_walked
+    return renders, alphas, *w
 
 
-def _frame(means2d: Tensor, size: list[int], alpha_range: list[float]):
-    width, height, views, per_view, skip = size
-    return make_frame(width, height, views, means2d.shape[1], bool(per_view), *alpha_range, skip)
+def _picture(means2d: Tensor, size: list[int], limits: list[float], tuning: list[int]) -> Picture:
+    num, tile = means2d.shape[1], Tuning(*tuning).tile
+    return make_picture(Size(*size), Limits(*limits), num=num, tile=tile)
 
 
 @composite.register_fake
-def _(means2d, conics, view_opacities, colors, bins, size, alpha_range, skipped):
-    width, height = size[:2]
-    tiles_x, tiles_y = tile_grid(width, height)
-    images, pairs = means2d.shape[0], Bins(*bins).pairs
-    tiles = images * tiles_x * tiles_y
-    blocks = tiles * current().blocks
-    return (
-        colors.new_empty(images, height, width, colors.shape[1]),
-        colors.new_empty(images, height, width, 1),
-        colors.new_empty(blocks, 16),
-        pairs.new_empty(blocks, 16),
-        torch.empty_like(pairs),
-        pairs.new_empty(tiles),
-        pairs.new_empty(tiles, dtype=torch.int64),
+def _(means2d, conics, view_opacities, colors, bins, size, limits, tuning, skipped):
+    width, height = Size(*size).width, Size(*size).height
+    images, pairs, tuning = means2d.shape[0], Bins(*bins).pairs, Tuning(*tuning)
+    tiles = images * Tiling(width, height, tuning.tile).count
+    walk = Walk(
+        transmittances=colors.new_empty(tiles * tuning.blocks, 16),
+        stops=pairs.new_empty(tiles * tuning.blocks, 16),
+        blocks=torch.empty_like(pairs),
+        walked=pairs.new_empty(tiles),
+        blocks_walked=pairs.new_empty(tiles, dtype=torch.int64),
     )
+    renders = colors.new_empty(images, height, width, colors.shape[1])
+    return renders, colors.new_empty(images, height, width, 1), *walk
 
 
 @torch.library.custom_op(_OP + "composite_vjp", mutates_args=())
@@ -243,7 +270,8 @@ def _composite_vjp(
     colors: Tensor,
     bins: list[Tensor],
     size: list[int],
-    alpha_range: list[float],
+    limits: list[float],
+    tuning: list[int],
     walk: list[Tensor],
     v_renders: Tensor,
     v_alphas: Tensor,
@@ -256,7 +284,8 @@ def _composite_vjp(
         view_opacities,
         colors,
         every,
-        _frame(means2d, size, alpha_range),
+        _picture(means2d, size, limits, tuning),
+        Tuning(*tuning),
         Walk(*walk),
         v_renders,
         v_alphas,
@@ -267,16 +296,18 @@ def _composite_vjp(
 
 
 @_composite_vjp.register_fake
-def _(means2d, conics, view_opacities, colors, bins, size, alpha_range, walk, *rest):
+def _(means2d, conics, view_opacities, colors, bins, size, limits, tuning, walk, *rest):
     v_colors = colors.new_empty(*view_opacities.shape, colors.shape[1])
     skipped = torch.empty_like(Walk(*walk).walked)
-    if not rest[-1]:
+    geometry = rest[-1]
+    if not geometry:
         return [skipped, v_colors]
     return [skipped, *map(torch.empty_like, (means2d, conics, view_opacities)), v_colors]
 
 
 def _composite_setup(ctx, inputs, output):
-    means2d, conics, view_opacities, colors, bins, ctx.size, ctx.alpha_range, ctx.skipped = inputs
+    means2d, conics, view_opacities, colors, bins, size, limits, tuning, ctx.skipped = inputs
+    ctx.size, ctx.limits, ctx.tuning = size, limits, tuning
     renders, alphas, *walk = output
     ctx.mark_non_differentiable(*walk)
     ctx.set_materialize_grads(False)
@@ -294,8 +325,8 @@ def _composite_backward(ctx, v_renders, v_alphas, *_):
     bins, walk = rest[: len(Bins._fields)], rest[len(Bins._fields) :]
     v_renders = colors.new_zeros(ctx.shapes[0]) if v_renders is None else v_renders
     v_alphas = colors.new_zeros(ctx.shapes[1]) if v_alphas is None else v_alphas
-    needs = ctx.needs_input_grad
-    geometry = any(needs[:3]) or not ctx.size[-1] & UNASKED
+    needs, size = ctx.needs_input_grad, Size(*ctx.size)
+    geometry = any(needs[:3]) or not size.skip & UNASKED
     skipped, *v_geometry, v_colors = _composite_vjp(
         means2d,
         conics,
@@ -303,7 +334,8 @@ def _composite_backward(ctx, v_renders, v_alphas, *_):
         colors,
         bins,
         ctx.size,
-        ctx.alpha_range,
+        ctx.limits,
+        ctx.tuning,
         walk,
         v_renders.contiguous(),
         v_alphas.contiguous(),
@@ -312,13 +344,12 @@ def _composite_backward(ctx, v_renders, v_alphas, *_):
     v_means2d, v_conics, v_view_opacities = v_geometry if geometry else (None, None, None)
     if ctx.skipped is not None:
         ctx.skipped.copy_(skipped.sum())
-    views, per_view = ctx.size[2:4]
-    if not per_view and views:
+    if not size.colors_per_view and size.views:
         images, num, channels = v_colors.shape
-        v_colors = v_colors.view(images // views, views, num, channels).sum(1)
+        v_colors = v_colors.view(images // size.views, size.views, num, channels).sum(1)
     v_colors = _shaped(v_colors, colors) if needs[3] else None
     grads = (x if need else None for x, need in zip((v_means2d, v_conics, v_view_opacities), needs))
-    return *grads, v_colors, [None] * len(bins), None, None, None
+    return *grads, v_colors, [None] * len(bins), None, None, None, None
 
 
 composite.register_autograd(_composite_backward, setup_context=_composite_setup)

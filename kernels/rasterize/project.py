@@ -3,19 +3,21 @@
 One thread per (view, Gaussian). README.md §1 holds the maths; ``project_vjp.py`` the gradient.
 """
 
+from typing import NamedTuple, no_type_check
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from ..runtime.launch import launch
-from ..runtime.views import vectors
+from ..runtime.views import struct, vectors
 from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 
 wp.set_module_options({"enable_backward": False})
 
 mat23 = wp.types.matrix((2, 3), wp.float32)
 
-# status of a (view, Gaussian)
+# What becomes of a (view, Gaussian).
 VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
 STATUS_NAMES = ("visible", "near", "far", "not_finite", "transparent", "outside", "small")
 
@@ -30,19 +32,69 @@ _OUTSIDE = wp.constant(OUTSIDE)
 _SMALL = wp.constant(SMALL)
 
 
-@wp.struct
-class Lens:
-    """Per launch: picture size and thresholds."""
+class LensOptions(NamedTuple):
+    """What makes a ``Lens``, as numbers that fit in a list of floats.
 
-    width: wp.float32
-    height: wp.float32
-    near_plane: wp.float32
-    far_plane: wp.float32
-    radius_clip: wp.float32
-    eps2d: wp.float32
-    alpha_min: wp.float32
-    antialiased: wp.int32
-    skip_unused: wp.int32
+    Attributes:
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+        near_plane: as ``rasterization``, like the following three.
+        far_plane: as ``rasterization``.
+        radius_clip: as ``rasterization``.
+        eps2d: as ``rasterization``.
+        alpha_min: as ``rasterization``.
+        antialiased: not 0 for ``rasterize_mode="antialiased"``.
+        skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
+    """
+
+    width: float
+    height: float
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    alpha_min: float
+    antialiased: float
+    skip_unused: float
+
+    def numbers(self) -> list[float]:
+        """The attributes in their order; ``LensOptions(*numbers)`` is the way back."""
+        return [float(x) for x in self]
+
+
+class Projected(NamedTuple):
+    """N Gaussians of each of B objects in V views; one that is culled has opacity and extents 0.
+
+    Attributes:
+        means2d: ``[B, V, N, 2]`` centres in pixels.
+        conics: ``[B, V, N, 3]``: a, k, e of README eq. 4.
+        depths: ``[B, V, N]`` along the camera's axis, world units.
+        view_opacities: ``[B, V, N]``, with the factor of antialiasing.
+        extents: ``[B, V, N, 2]`` half sides of the box around alpha >= alpha_min, pixels.
+        status: ``[B, V, N]`` int32, an index of ``STATUS_NAMES``.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    view_opacities: Tensor
+    extents: Tensor
+    status: Tensor
+
+
+@struct
+class Lens:
+    """The scalars of a projection's launch: picture size and thresholds."""
+
+    width: float
+    height: float
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    alpha_min: float
+    antialiased: int
+    skip_unused: int
 
 
 @wp.func
@@ -66,6 +118,7 @@ def translation_of(viewmat: wp.mat44) -> wp.vec3:
 
 
 @wp.func
+@no_type_check
 def quat_size(q: wp.vec4) -> wp.float32:
     # scaled by the largest entry, so that neither tiny nor huge quaternions leave float32's range
     m = wp.max(wp.max(wp.abs(q[0]), wp.abs(q[1])), wp.max(wp.abs(q[2]), wp.abs(q[3])))
@@ -76,6 +129,7 @@ def quat_size(q: wp.vec4) -> wp.float32:
 
 
 @wp.func
+@no_type_check
 def rotation(q: wp.vec4) -> wp.mat33:
     # q is a unit quaternion (w, x, y, z)
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -108,6 +162,7 @@ def slope(p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32
 
 
 @wp.func
+@no_type_check
 def jacobian(t: wp.vec3, K: wp.mat33, lens: Lens) -> mat23:
     sx = slope(t[0] / t[2], K[0, 2], lens.width, K[0, 0])
     sy = slope(t[1] / t[2], K[1, 2], lens.height, K[1, 1])
@@ -122,12 +177,14 @@ def row_of(M: mat23, i: int) -> wp.vec3:
 
 
 @wp.func
+@no_type_check
 def _finite3(v: wp.vec3) -> bool:
     # a sum is finite only if every term is (or the terms overflow, which is as bad)
     return wp.isfinite(wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2]))
 
 
 @wp.kernel
+@no_type_check
 def _project(
     offset: wp.int32,
     views: wp.int32,
@@ -226,24 +283,14 @@ def _project(
     extents_out[i] = extent
 
 
-def make_lens(
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    alpha_min: float,
-    antialiased: bool,
-    skip_unused: bool,
-) -> Lens:
+def make_lens(options: LensOptions) -> Lens:
     """The scalars of a projection as one kernel argument."""
     lens = Lens()
-    lens.width, lens.height = float(width), float(height)
-    lens.near_plane, lens.far_plane = near_plane, far_plane
-    lens.radius_clip, lens.eps2d = radius_clip, eps2d
-    lens.alpha_min, lens.antialiased = alpha_min, int(antialiased)
-    lens.skip_unused = int(skip_unused)
+    lens.width, lens.height = options.width, options.height
+    lens.near_plane, lens.far_plane = options.near_plane, options.far_plane
+    lens.radius_clip, lens.eps2d = options.radius_clip, options.eps2d
+    lens.alpha_min = options.alpha_min
+    lens.antialiased, lens.skip_unused = int(options.antialiased), int(options.skip_unused)
     return lens
 
 
@@ -256,7 +303,7 @@ def project_forward(
     viewmats: Tensor,
     Ks: Tensor,
     lens: Lens,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Projected:
     """Projects B objects of N Gaussians into V views each; float32, contiguous tensors.
 
     Args:
@@ -268,11 +315,6 @@ def project_forward(
         viewmats: ``[B, V, 4, 4]``.
         Ks: ``[B, V, 3, 3]``.
         lens: from ``make_lens``.
-
-    Returns:
-        ``means2d [B, V, N, 2]`` in pixels; ``conics [B, V, N, 3]``: a, k, e of README eq. 4;
-        ``depths [B, V, N]``; ``view_opacities [B, V, N]``; ``extents [B, V, N, 2]``: half sides of
-        the box around alpha >= alpha_min in pixels; ``status [B, V, N]`` int32. Culled: zeros.
     """
     (batch, views), num = viewmats.shape[:2], means.shape[1]
     shape = (batch, views, num)
@@ -306,4 +348,4 @@ def project_forward(
             ],
             means.device,
         )
-    return means2d, conics, depths, view_opacities, extents, status
+    return Projected(means2d, conics, depths, view_opacities, extents, status)

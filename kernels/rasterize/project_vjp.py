@@ -4,6 +4,8 @@ One thread per Gaussian, which loops over its views: sums over views are then in
 README.md §4 holds the maths.
 """
 
+from typing import NamedTuple, no_type_check
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -31,7 +33,37 @@ _VISIBLE = wp.constant(VISIBLE)
 _SHORTEST = wp.constant(1e-30)
 
 
+class Cotangents(NamedTuple):
+    """Upstream gradients of a projection, shaped as in ``Projected``; float32, contiguous."""
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    view_opacities: Tensor
+
+
+class Wanted(NamedTuple):
+    """Of which inputs the gradient is asked for."""
+
+    means: bool
+    quats: bool
+    scales: bool
+    opacities: bool
+    viewmats: bool
+
+
+class Gradients(NamedTuple):
+    """Gradients of a projection's inputs, shaped as these; None where not asked for."""
+
+    means: Tensor | None
+    quats: Tensor | None
+    scales: Tensor | None
+    opacities: Tensor | None
+    viewmats: Tensor | None
+
+
 @wp.func
+@no_type_check
 def _slope_vjp(
     p: wp.float32,
     z: wp.float32,
@@ -40,7 +72,7 @@ def _slope_vjp(
     focal: wp.float32,
     v: wp.float32,
 ) -> wp.vec2:
-    # of j = -focal·slope(x/z)/z with respect to (x, z), p = x/z; a clamped slope is a constant
+    # gradient of j = -focal·slope(x/z)/z to (x, z), p = x/z; a clamped slope is a constant
     s = slope(p, center, size, focal)
     f = v * focal / (z * z)
     if p == s:
@@ -49,8 +81,9 @@ def _slope_vjp(
 
 
 @wp.func
+@no_type_check
 def _rotation_vjp(q: wp.vec4, v: wp.mat33) -> wp.vec4:
-    # of the matrix of a unit quaternion, then of the normalisation but for 1/|q|
+    # through the matrix of a unit quaternion, then through the normalisation, less its 1/|q|
     w, x, y, z = q[0], q[1], q[2], q[3]
     vq = 2.0 * wp.vec4(
         x * (v[2, 1] - v[1, 2]) + y * (v[0, 2] - v[2, 0]) + z * (v[1, 0] - v[0, 1]),
@@ -82,6 +115,7 @@ def _all_zero(v_mean2d: wp.vec2, v_conic: wp.vec3, v_depth: float, v_opacity: fl
 
 
 @wp.kernel
+@no_type_check
 def _project_vjp(
     offset: wp.int32,
     views: wp.int32,
@@ -197,41 +231,46 @@ def _project_vjp(
     if v_quats_out:
         size = quat_size(quats_in[g])
         v_quats_out[g] = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        # of a shorter one the gradient leaves float32's range
+        # the gradient of a shorter one leaves float32's range
         if size > _SHORTEST:
             v_quats_out[g] = _rotation_vjp(q, v_R) / size
 
 
 def project_backward(
-    inputs: tuple[Tensor | None, ...],
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
     lens: Lens,
     conics: Tensor,
     status: Tensor,
-    cotangents: tuple[Tensor, Tensor, Tensor, Tensor],
-    needs: tuple[bool, bool, bool, bool, bool],
-) -> tuple[Tensor | None, ...]:
+    cotangents: Cotangents,
+    wanted: Wanted,
+) -> Gradients:
     """Gradients of ``project_forward``.
 
     Args:
-        inputs: means, quats, scales, opacities, viewmats, Ks as given forward.
+        means: as given forward, like the next five.
+        quats: as given forward.
+        scales: as given forward.
+        opacities: as given forward.
+        viewmats: as given forward.
+        Ks: as given forward.
         lens: as given forward.
         conics: as returned forward.
         status: as returned forward.
-        cotangents: of means2d, conics, depths, view_opacities; float32, contiguous.
-        needs: which of means, quats, scales, opacities, viewmats are asked for.
-
-    Returns:
-        The gradients of those five, None where not asked for.
+        cotangents: of what forward returned.
+        wanted: what is asked for.
     """
-    means, quats, scales, opacities, viewmats, Ks = inputs
     batch, views, num = status.shape
-    v_means, v_quats, v_scales, v_opacities = (
-        torch.zeros_like(x) if need and x is not None else None
-        for x, need in zip((means, quats, scales, opacities), needs)
-    )
-    v_viewmats = means.new_zeros(batch * views, num, 12) if needs[4] else None
+    v_means = torch.zeros_like(means) if wanted.means else None
+    v_quats = torch.zeros_like(quats) if wanted.quats and quats is not None else None
+    v_scales = torch.zeros_like(scales) if wanted.scales else None
+    v_opacities = torch.zeros_like(opacities) if wanted.opacities else None
+    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted.viewmats else None
     if status.numel():
-        v_means2d, v_conics, v_depths, v_view_opacities = cotangents
         launch(
             _project_vjp,
             batch * num,
@@ -247,10 +286,10 @@ def project_backward(
                 vectors(Ks, wp.mat33),
                 vectors(conics, wp.vec3),
                 status.view(-1),
-                vectors(v_means2d, wp.vec2),
-                vectors(v_conics, wp.vec3),
-                v_depths.view(-1),
-                v_view_opacities.view(-1),
+                vectors(cotangents.means2d, wp.vec2),
+                vectors(cotangents.conics, wp.vec3),
+                cotangents.depths.view(-1),
+                cotangents.view_opacities.view(-1),
             ],
             [
                 vectors(v_means, wp.vec3),
@@ -264,4 +303,4 @@ def project_backward(
     if v_viewmats is not None:
         v_viewmats = v_viewmats.sum(1).view(batch, views, 3, 4)
         v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))
-    return v_means, v_quats, v_scales, v_opacities, v_viewmats
+    return Gradients(v_means, v_quats, v_scales, v_opacities, v_viewmats)

@@ -5,28 +5,28 @@ transparent that lies between front and back. A quantile lies on one of the surf
 """
 
 import math
+from typing import no_type_check
 
 import warp as wp
 from torch import Tensor
 
 from ..runtime.launch import launch
 from ..runtime.views import vectors
-from .constants import ALPHA_MAX, ALPHA_MIN, TILE
+from .constants import ALPHA_MAX, ALPHA_MIN
 from .meta import Meta
-from .tiles import tile_grid
 
 wp.set_module_options({"enable_backward": False})
 
-_TILE = wp.constant(TILE)
-
 
 @wp.kernel
+@no_type_check
 def _quantile(
     offset: wp.int32,
     width: wp.int32,
     height: wp.int32,
     tiles_x: wp.int32,
     tiles: wp.int32,
+    shift: wp.int32,
     transmittance: wp.float32,
     limit: wp.float32,
     alpha_min: wp.float32,
@@ -43,7 +43,7 @@ def _quantile(
     image = pixel // (width * height)
     x = pixel % width
     y = pixel // width % height
-    tile = image * tiles + y // _TILE * tiles_x + x // _TILE
+    tile = image * tiles + (y >> shift) * tiles_x + (x >> shift)
     clear = wp.float32(1.0)  # a variable: plain literals would be constants in the loop
     depth = wp.float32(0.0)
     k = starts_in[tile]
@@ -92,17 +92,17 @@ def depth_quantile(
     """
     if not 0 < transmittance < 1:
         raise ValueError(f"transmittance is {transmittance}, allowed is 0 < transmittance < 1")
-    width, height, centers = meta["width"], meta["height"], meta["depths"].detach()
-    tiles_x, tiles_y = tile_grid(width, height)
-    depths = centers.new_empty(*centers.shape[:-1], height, width, 1)
-    limit = 2 * math.log(1 / alpha_min) + 1e-3  # of q: beyond it no opacity reaches alpha_min
-    sizes = [width, height, tiles_x, tiles_x * tiles_y, transmittance, limit, alpha_min, alpha_max]
+    cut, centers = meta.tiling, meta["depths"].detach()
+    depths = centers.new_empty(*centers.shape[:-1], cut.height, cut.width, 1)
+    limit = 2 * math.log(1 / alpha_min) + 1e-3  # where q is larger, no opacity reaches alpha_min
+    sizes = [cut.width, cut.height, cut.tiles_x, cut.count, cut.shift]
+    limits = [transmittance, limit, alpha_min, alpha_max]
     splats = [
         vectors(meta["means2d"].detach().contiguous(), wp.vec2),
         vectors(meta["conics"].detach().contiguous(), wp.vec3),
         meta["opacities"].detach().flatten(),
         centers.flatten(),
     ]
-    inputs = [*sizes, *splats, meta._bins.pairs, meta._bins.starts]
+    inputs = [*sizes, *limits, *splats, meta.bins.pairs, meta.bins.starts]
     launch(_quantile, depths.numel(), inputs, [depths.view(-1)], depths.device)
     return depths

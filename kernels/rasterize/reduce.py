@@ -1,5 +1,7 @@
 """Sums of pair gradients by Gaussian, in emission order: bitwise repeatable, no atomics."""
 
+from typing import NamedTuple, no_type_check
+
 import warp as wp
 from torch import Tensor
 
@@ -11,6 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
+@no_type_check
 def _reduce(
     offset: wp.int32,
     order_in: wp.array[wp.int32],
@@ -61,6 +64,22 @@ def _reduce(
         v_view_opacities_out[i] = v_opacity
 
 
+class PairGradients(NamedTuple):
+    """Gradients of the compositor's inputs by (view, Gaussian).
+
+    Attributes:
+        means2d: ``[I, N, 2]``, or None if colours alone are asked for, like the next two.
+        conics: ``[I, N, 3]`` or None.
+        view_opacities: ``[I, N]`` or None.
+        colors: ``[I, N, C]``.
+    """
+
+    means2d: Tensor | None
+    conics: Tensor | None
+    view_opacities: Tensor | None
+    colors: Tensor
+
+
 def reduce_pairs(
     v_pairs: Tensor,
     written: Tensor | None,
@@ -68,7 +87,7 @@ def reduce_pairs(
     conics: Tensor,
     view_opacities: Tensor,
     geometry: bool,
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor]:
+) -> PairGradients:
     """Sums the rows of ``composite_backward`` by (view, Gaussian).
 
     Args:
@@ -78,10 +97,6 @@ def reduce_pairs(
         conics: ``[I, N, 3]``.
         view_opacities: ``[I, N]``.
         geometry: whether anything but colours is asked for.
-
-    Returns:
-        Gradients of means2d, conics, view_opacities (None without ``geometry``), and of the colours
-        ``[I, N, C]``.
     """
     v_means2d = v_conics = v_opacities = None
     if geometry:
@@ -108,4 +123,4 @@ def reduce_pairs(
         ],
         conics.device,
     )
-    return v_means2d, v_conics, v_opacities, v_colors
+    return PairGradients(v_means2d, v_conics, v_opacities, v_colors)

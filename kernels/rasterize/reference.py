@@ -164,7 +164,8 @@ def rasterization_reference(
         if backgrounds is not None:
             color = color + (1 - alpha) * backgrounds[(*b, v)]
         out.append((color, depth, alpha))
-    return tuple(
+    renders, depths, alphas = (
         torch.stack(parts).view(*lead, views, height, width, parts[0].shape[-1])
         for parts in zip(*out)
     )
+    return renders, depths, alphas

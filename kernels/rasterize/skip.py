@@ -1,5 +1,7 @@
 """What the rasterizer leaves out without changing picture or gradients, each with its switch."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields
 
 
@@ -34,6 +36,11 @@ class Skip:
     def bits(self) -> int:
         """One bit each, in order: ``TILE_TEST`` and so on below."""
         return sum(bool(getattr(self, field.name)) << i for i, field in enumerate(fields(self)))
+
+    @classmethod
+    def from_bits(cls, bits: int) -> Skip:
+        """The way back from ``bits``."""
+        return cls(**{field.name: bool(bits >> i & 1) for i, field in enumerate(fields(cls))})
 
 
 TILE_TEST, BLOCK_TEST, STOPPED, EMPTY_TILES, ZERO_UPSTREAM, UNUSED, UNASKED = (

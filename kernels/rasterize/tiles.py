@@ -1,59 +1,204 @@
-"""Which tiles a Gaussian's ellipse touches: row by row of tiles, by exact intervals of columns.
+"""Tiles: how a picture is cut into them, their lists, and which of them an ellipse touches.
 
-README.md §2 proves the test. Counting and writing call the same functions.
+In this order: ``Tiling``, the cut; ``Bins`` and ``Walk``, what binning and compositing leave to the
+steps after them; ``Grid`` and ``Picture``, the scalars that the launches of these two steps take;
+the test of an ellipse, row by row of tiles, by exact intervals of columns. README.md §2 proves the
+test. Counting and writing call the same functions.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import warp as wp
 from torch import Tensor
 
-from .cpu.tuning import current
+from ..runtime.views import struct
 from .skip import TILE_TEST
 
 wp.set_module_options({"enable_backward": False})
 
 # Rounding of q, relative and absolute; the test may keep too much, never too little.
-SLACK = 1.0 + 1e-4
-SLACK_ABS = 1e-4
-_SLACK = wp.constant(SLACK)
-_SLACK_ABS = wp.constant(SLACK_ABS)
+_SLACK = wp.constant(1.0 + 1e-4)
+_SLACK_ABS = wp.constant(1e-4)
 _TILE_TEST = wp.constant(TILE_TEST)
 
 
-def tile_grid(width: int, height: int) -> tuple[int, int]:
-    """Columns and rows of tiles."""
-    tile = current().tile
-    return -(-width // tile), -(-height // tile)
+class Tiling(NamedTuple):
+    """How a picture is cut into square tiles; it belongs to the lists that were made with it.
+
+    Attributes:
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+        tile: side of a tile in pixels, a power of two.
+    """
+
+    width: int
+    height: int
+    tile: int
+
+    @property
+    def tiles_x(self) -> int:
+        """Tiles in a row; the last one may reach beyond the picture."""
+        return -(-self.width // self.tile)
+
+    @property
+    def tiles_y(self) -> int:
+        """Rows of tiles."""
+        return -(-self.height // self.tile)
+
+    @property
+    def count(self) -> int:
+        """Tiles of one picture."""
+        return self.tiles_x * self.tiles_y
+
+    @property
+    def shift(self) -> int:
+        """A tile has 2^shift pixels in a row."""
+        return self.tile.bit_length() - 1
 
 
-@wp.struct
+class Bins(NamedTuple):
+    """The lists of tiles: P pairs of (tile, Gaussian) in I views; everything is int32.
+
+    Attributes:
+        order: ``[I * N]`` view-major Gaussian indices, front to back within each view.
+        offsets: ``[I * N + 1]`` where the pairs of ``order[j]`` begin, in emission order.
+        pairs: ``[P]`` view-major Gaussian index of each pair, in tile order.
+        rows: ``[P]`` emission number of each pair, in tile order.
+        starts: ``[I * tiles + 1]`` where each tile begins in ``pairs``.
+        box_pairs: ``[]`` int64, number of pairs if tiles were tested against boxes only.
+    """
+
+    order: Tensor
+    offsets: Tensor
+    pairs: Tensor
+    rows: Tensor
+    starts: Tensor
+    box_pairs: Tensor
+
+
+class Walk(NamedTuple):
+    """What the compositor leaves for its gradient, by tiles and by blocks of 4 x 4 pixels.
+
+    Attributes:
+        transmittances: ``[blocks, 16]`` final T; negative where the pixel stopped early.
+        stops: ``[blocks, 16]`` int32, the pair at which the pixel stopped.
+        blocks: ``[P]`` int32, one bit for each block of the tile to which the pair contributed.
+        walked: ``[tiles]`` int32, pairs walked until every pixel had stopped.
+        blocks_walked: ``[tiles]`` int64, blocks evaluated for these pairs.
+    """
+
+    transmittances: Tensor
+    stops: Tensor
+    blocks: Tensor
+    walked: Tensor
+    blocks_walked: Tensor
+
+
+@struct
 class Grid:
-    """Per launch: the picture and its tiles."""
+    """The scalars of a binning launch: the picture and its tiles."""
 
-    num: wp.int32
-    width: wp.int32
-    height: wp.int32
-    tiles_x: wp.int32
-    tiles_y: wp.int32
-    shift: wp.int32  # a tile has 2^shift pixels in a row
-    alpha_min: wp.float32
-    skip: wp.int32
+    num: int
+    width: int
+    height: int
+    tiles_x: int
+    tiles_y: int
+    shift: int  # a tile has 2^shift pixels in a row
+    alpha_min: float
+    skip: int
 
 
-def make_grid(num: int, width: int, height: int, alpha_min: float, skip: int) -> Grid:
-    """The scalars of a binning launch as one kernel argument."""
+def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
+    """The scalars of a binning launch as one kernel argument.
+
+    Args:
+        tiling: the cut of each view's picture.
+        num: Gaussians of a view.
+        alpha_min: what is fainter is not drawn.
+        skip: from ``Skip.bits``.
+    """
     grid = Grid()
-    grid.num, grid.width, grid.height = num, width, height
-    grid.alpha_min, grid.skip = alpha_min, skip
-    grid.tiles_x, grid.tiles_y = tile_grid(width, height)
-    grid.shift = current().tile.bit_length() - 1
+    grid.num, grid.alpha_min, grid.skip = num, alpha_min, skip
+    grid.width, grid.height = tiling.width, tiling.height
+    grid.tiles_x, grid.tiles_y, grid.shift = tiling.tiles_x, tiling.tiles_y, tiling.shift
     return grid
 
 
-@wp.struct
+class Size(NamedTuple):
+    """The integers that a call of the compositor is given.
+
+    Attributes:
+        width: of a picture, pixels.
+        height: of a picture, pixels.
+        views: of an object.
+        colors_per_view: 1 if each view has colours of its own, 0 if an object's views share them.
+        skip: from ``Skip.bits``.
+    """
+
+    width: int
+    height: int
+    views: int
+    colors_per_view: int
+    skip: int
+
+
+class Limits(NamedTuple):
+    """The thresholds that a call of the compositor is given, as ``rasterization`` has them."""
+
+    alpha_min: float
+    alpha_max: float
+    t_min: float
+
+
+@struct
+class Picture:
+    """The scalars of a compositing launch: sizes, thresholds and switches."""
+
+    width: int
+    height: int
+    tiles_x: int
+    tiles_y: int
+    views: int
+    num: int
+    colors_per_view: int
+    alpha_min: float
+    alpha_max: float
+    t_min: float
+    skip: int
+
+
+def make_picture(size: Size, limits: Limits, *, num: int, tile: int) -> Picture:
+    """The scalars of a compositing launch as one kernel argument.
+
+    Args:
+        size: the integers.
+        limits: the thresholds.
+        num: Gaussians of a view.
+        tile: side of a tile, pixels.
+    """
+    tiling = Tiling(size.width, size.height, tile)
+    picture = Picture()
+    picture.width, picture.height = size.width, size.height
+    picture.tiles_x, picture.tiles_y = tiling.tiles_x, tiling.tiles_y
+    picture.views, picture.num = size.views, num
+    picture.colors_per_view, picture.skip = size.colors_per_view, size.skip
+    picture.alpha_min, picture.alpha_max = limits.alpha_min, limits.alpha_max
+    picture.t_min = limits.t_min
+    return picture
+
+
+@wp.func
+def color_row(picture: Picture, g: int) -> int:
+    # the row of view-major Gaussian g; shared colours have one row for each object's Gaussian
+    row = g
+    if picture.colors_per_view == 0:
+        row = g // (picture.views * picture.num) * picture.num + g % picture.num
+    return row
+
+
+@struct
 class Ellipse:
-    """q <= limit around a mean, with what the rows of tiles share."""
+    """The set q <= limit around a mean, with what the rows of tiles share."""
 
     mean: wp.vec2
     k: wp.float32
@@ -65,12 +210,14 @@ class Ellipse:
 
 
 @wp.func
+@no_type_check
 def to_tile(grid: Grid, x: wp.float32, size: wp.int32) -> wp.int32:
     # clamped before the cast: a footprint may be larger than an int32
     return wp.int32(wp.clamp(x, 0.0, float(size - 1))) >> grid.shift
 
 
 @wp.func
+@no_type_check
 def tile_rows(grid: Grid, y: wp.float32, extent: wp.float32) -> wp.vec2i:
     # first and last row with a pixel centre (at +0.5) in reach, with a pixel to spare
     top = to_tile(grid, y - extent - 1.0, grid.height)
@@ -83,6 +230,7 @@ def q_limit(opacity: wp.float32, alpha_min: wp.float32) -> wp.float32:
 
 
 @wp.func
+@no_type_check
 def make_ellipse(mean: wp.vec2, conic: wp.vec3, limit: wp.float32) -> Ellipse:
     a, k, e = conic[0], conic[1], conic[2]
     ellipse = Ellipse()
@@ -98,11 +246,13 @@ def make_ellipse(mean: wp.vec2, conic: wp.vec3, limit: wp.float32) -> Ellipse:
 
 
 @wp.func
+@no_type_check
 def _box_columns(grid: Grid, x: wp.float32, extent: wp.float32) -> wp.vec2i:
     return wp.vec2i(to_tile(grid, x - extent, grid.width), to_tile(grid, x + extent, grid.width))
 
 
 @wp.func
+@no_type_check
 def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) -> wp.vec2i:
     # README eq. 6: columns of row ty that the ellipse touches; first > last: none
     if (grid.skip & _TILE_TEST) == 0:
@@ -128,93 +278,9 @@ def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) ->
 
 
 @wp.func
+@no_type_check
 def box_pairs(grid: Grid, mean: wp.vec2, extent: wp.vec2) -> wp.int64:
     # pairs of a Gaussian if tiles were tested against its box alone
     rows = tile_rows(grid, mean[1], extent[1])
     columns = _box_columns(grid, mean[0], extent[0])
     return wp.int64(rows[1] - rows[0] + 1) * wp.int64(columns[1] - columns[0] + 1)
-
-
-class Bins(NamedTuple):
-    """P pairs of I views; everything int32.
-
-    Attributes:
-        order: ``[I * N]`` view-major Gaussian indices, front to back within each view.
-        offsets: ``[I * N + 1]`` where the pairs of ``order[j]`` begin, in emission order.
-        pairs: ``[P]`` view-major Gaussian index of each pair, in tile order.
-        rows: ``[P]`` emission number of each pair, in tile order.
-        starts: ``[I * tiles + 1]`` where each tile begins in ``pairs``.
-        box_pairs: ``[]`` int64, number of pairs if tiles were tested against boxes only.
-    """
-
-    order: Tensor
-    offsets: Tensor
-    pairs: Tensor
-    rows: Tensor
-    starts: Tensor
-    box_pairs: Tensor
-
-
-@wp.struct
-class Frame:
-    """Per launch: picture and list sizes."""
-
-    width: wp.int32
-    height: wp.int32
-    tiles_x: wp.int32
-    tiles_y: wp.int32
-    views: wp.int32
-    num: wp.int32
-    colors_per_view: wp.int32
-    alpha_min: wp.float32
-    alpha_max: wp.float32
-    t_min: wp.float32
-    skip: wp.int32
-
-
-@wp.func
-def color_row(frame: Frame, g: int) -> int:
-    # of view-major Gaussian g; shared colours have one row per object
-    row = g
-    if frame.colors_per_view == 0:
-        row = g // (frame.views * frame.num) * frame.num + g % frame.num
-    return row
-
-
-class Walk(NamedTuple):
-    """What forward leaves for backward, by tiles and blocks.
-
-    Attributes:
-        transmittances: ``[tiles * 16, 16]`` final T; negative where the pixel stopped early.
-        stops: ``[tiles * 16, 16]`` int32, the pair at which the pixel stopped.
-        blocks: ``[P]`` int32, one bit per 4 x 4 block to which the pair contributed.
-        walked: ``[tiles]`` int32, pairs walked until every pixel had stopped.
-        blocks_walked: ``[tiles]`` int64, blocks evaluated in them.
-    """
-
-    transmittances: Tensor
-    stops: Tensor
-    blocks: Tensor
-    walked: Tensor
-    blocks_walked: Tensor
-
-
-def make_frame(
-    width: int,
-    height: int,
-    views: int,
-    num: int,
-    colors_per_view: bool,
-    alpha_min: float,
-    alpha_max: float,
-    t_min: float,
-    skip: int,
-) -> Frame:
-    """The scalars of a composite launch as one kernel argument."""
-    frame = Frame()
-    frame.width, frame.height = width, height
-    frame.tiles_x, frame.tiles_y = tile_grid(width, height)
-    frame.views, frame.num, frame.colors_per_view = views, num, int(colors_per_view)
-    frame.alpha_min, frame.alpha_max = alpha_min, alpha_max
-    frame.t_min, frame.skip = t_min, skip
-    return frame

@@ -6,12 +6,14 @@ import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from . import team
+from .recording import recorder
 from .start import start_without_gpu
 from .views import view
 
@@ -46,7 +48,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def parallel_launch(
-    kernel: wp.Kernel,
+    kernel: Any,
     dim: int | Sequence[int],
     inputs: Sequence,
     outputs: Sequence = (),
@@ -60,7 +62,7 @@ def parallel_launch(
     to the same places. Returns when all are done.
 
     Args:
-        kernel: not generic.
+        kernel: a ``wp.Kernel``, not generic. (To a type checker, ``@wp.kernel`` gives a function.)
         dim: launch dimensions.
         inputs: arguments after ``offset``; tensors are viewed, other values passed on.
         outputs: more arguments, by convention those that are written.
@@ -79,7 +81,8 @@ def parallel_launch(
     cuts = [dim[0] * i // pieces for i in range(pieces + 1)]
     if threads > 1 and team.has_team():
         dims = [(end - begin, *dim[1:]) for begin, end in zip(cuts[:-1], cuts[1:])]
-        return team.run(kernel, dims, arguments, threads)
+        if team.run(kernel, dims, arguments, threads):
+            return
     kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
     todo = iter(list(zip(cuts[:-1], cuts[1:])))
 
@@ -105,7 +108,7 @@ def parallel_launch(
 
 
 def cuda_launch(
-    kernel: wp.Kernel,
+    kernel: Any,
     dim: int | Sequence[int],
     inputs: Sequence,
     outputs: Sequence = (),
@@ -115,22 +118,27 @@ def cuda_launch(
 ) -> None:
     """Launches on torch's current stream of ``device``; on a CPU device, on the CPU (for tests).
 
+    In a dry run (``recording.py``) the launch is only told to the recorder.
+
     Args:
-        kernel: not generic.
+        kernel: a ``wp.Kernel``, not generic.
         dim: launch dimensions; for a tile kernel the last one is ``block_dim``.
         inputs: all arguments; tensors are viewed, other values passed on.
         outputs: more arguments, by convention those that are written.
-        device: of the tensors.
+        device: of the tensors, cpu or cuda.
         block_dim: threads of a block; on a CPU it needs ``wp.config.enable_cpu_blocks``.
     """
+    if (dry := recorder()) is not None:
+        dry.note(kernel, (dim,) if isinstance(dim, int) else tuple(dim), block_dim)
+        return
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
-    where = {"device": "cpu"}
+    target: dict[str, Any] = {"device": "cpu"}
     if device.type == "cuda":
-        where = {"stream": wp.stream_from_torch(torch.cuda.current_stream(device))}
-    wp.launch(kernel, dim, arguments, block_dim=block_dim, record_tape=False, **where)
+        target = {"stream": wp.stream_from_torch(torch.cuda.current_stream(device))}
+    wp.launch(kernel, dim, arguments, block_dim=block_dim, record_tape=False, **target)
 
 
-def launch(kernel: wp.Kernel, dim: int, inputs, outputs, device: torch.device) -> None:
+def launch(kernel: Any, dim: int, inputs, outputs, device: torch.device) -> None:
     """Launches a plain kernel whose first parameter is ``offset``; ``dim`` 0 is no launch."""
     if dim == 0:
         return

@@ -29,28 +29,35 @@ auto narrow = [](I i) -> I {  // to nearest, ties to even; NaN stays a NaN
     return (is_nan ? (i >> 16) | 0x40 : rounded) & 0xffff;
 };
 """
-# by dtype: element type, lanes from *p, a lane from p[i], *p from lanes v, p[i] from a lane of v
+# By dtype what replaces the names in ``_ROWS``. TYPE is the element's type; READ gives the lanes at
+# p and READ_ONE lane i of them; WRITE stores the lanes v at p and WRITE_ONE lane i of them.
 _CODE = {
-    torch.float32: ("float", "*(const F*)p", "p[i]", "*(F*)p = v", "p[i] = v[i]"),
-    torch.float16: (
-        "_Float16",
-        "__builtin_convertvector(*(const H*)p, F)",
-        "(float)p[i]",
-        "*(H*)p = __builtin_convertvector(v, H)",
-        "p[i] = (_Float16)v[i]",
-    ),
-    torch.bfloat16: (
-        "unsigned short",
-        "(F)(__builtin_convertvector(*(const S*)p, I) << 16)",
-        "widen(p[i])",
-        "*(S*)p = __builtin_convertvector(narrow((I)v), S)",
-        "p[i] = (unsigned short)narrow(I{} + bits(v[i]))[0]",
-    ),
+    torch.float32: {
+        "TYPE": "float",
+        "READ_ONE": "p[i]",
+        "READ": "*(const F*)p",
+        "WRITE_ONE": "p[i] = v[i]",
+        "WRITE": "*(F*)p = v",
+    },
+    torch.float16: {
+        "TYPE": "_Float16",
+        "READ_ONE": "(float)p[i]",
+        "READ": "__builtin_convertvector(*(const H*)p, F)",
+        "WRITE_ONE": "p[i] = (_Float16)v[i]",
+        "WRITE": "*(H*)p = __builtin_convertvector(v, H)",
+    },
+    torch.bfloat16: {
+        "TYPE": "unsigned short",
+        "READ_ONE": "widen(p[i])",
+        "READ": "(F)(__builtin_convertvector(*(const S*)p, I) << 16)",
+        "WRITE_ONE": "p[i] = (unsigned short)narrow(I{} + bits(v[i]))[0]",
+        "WRITE": "*(S*)p = __builtin_convertvector(narrow((I)v), S)",
+    },
 }
 _ROWS = """
-TYPE* const NAME_rows = (TYPE*)((char*)NAME_in.data + (size_t)b * NAME_in.strides[0]
-    + (size_t)t0 * NAME_in.strides[1]) + d;
-const size_t NAME_step = NAME_in.strides[1] / sizeof(TYPE);
+TYPE* const NAME_rows = (TYPE*)((char*)ARRAY.data + (size_t)b * ARRAY.strides[0]
+    + (size_t)t0 * ARRAY.strides[1]) + d;
+const size_t NAME_step = ARRAY.strides[1] / sizeof(TYPE);
 auto read_NAME = [&](int t) -> F {
     const TYPE* p = NAME_rows + t * NAME_step;
     if (width >= 16) return READ;
@@ -67,33 +74,28 @@ auto fetch_NAME = [&](int t, int at) { __builtin_prefetch(NAME_rows + t * NAME_s
 """
 
 
-def rows(name: str, dtype: torch.dtype) -> str:
+def rows(array: str, dtype: torch.dtype) -> str:
     """C++ text: ``read_NAME(t)``, ``write_NAME(t, v)`` and ``fetch_NAME(t, at)``.
 
-    They address the array NAME_in [B, L, D] from batch element ``b``, token ``t0`` and channel
-    ``d`` on, ``width`` channels; all four must be in scope.
+    They address the ``array`` NAME_in or NAME_out [B, L, D] from batch element ``b``, token ``t0``
+    and channel ``d`` on, ``width`` channels; all four must be in scope.
     """
-    parts = zip(("TYPE", "READ_ONE", "READ", "WRITE_ONE", "WRITE"), _ordered(dtype))
-    text = _ROWS.replace("NAME", name)
-    for part, code in parts:
+    name = array.removesuffix("_in").removesuffix("_out")
+    text = _ROWS.replace("ARRAY", array).replace("NAME", name)
+    for part, code in _CODE[dtype].items():
         text = text.replace(part, code)
     return text
 
 
-def _ordered(dtype: torch.dtype) -> tuple[str, ...]:
-    element, read, read_one, write, write_one = _CODE[dtype]
-    return element, read_one, read, write_one, write
-
-
 def _accessors(dtype: torch.dtype):
     scalar = WARP_DTYPES[dtype]
-    prelude = PRELUDE + ELEMENTS + "const int t0 = t;" + rows("x", dtype)
+    head = PRELUDE + ELEMENTS + "const int t0 = t;"
 
-    @wp.func_native(prelude + f"{LANES} r; *(F*)&r = read_x(0); return r;")
+    @wp.func_native(head + rows("x_in", dtype) + f"{LANES} r; *(F*)&r = read_x(0); return r;")
     def load(x_in: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int) -> lanes: ...
 
-    @wp.func_native(prelude + "write_x(0, *(const F*)&v);")
-    def store(x_in: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int, v: lanes): ...
+    @wp.func_native(head + rows("x_out", dtype) + "write_x(0, *(const F*)&v);")
+    def store(x_out: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int, v: lanes): ...
 
     return load, store
 

@@ -95,12 +95,12 @@ def _accessors(dtype: torch.dtype):
     scalar = WARP_DTYPES[dtype]
 
     @wp.func
-    def load(x: wp.array3d(dtype=scalar), b: int, t: int, d: int, count: int) -> float:
-        return float(x[b, t, d])
+    def load(x_in: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int) -> float:
+        return float(x_in[b, t, d])
 
     @wp.func
-    def store(x: wp.array3d(dtype=scalar), b: int, t: int, d: int, count: int, v: float):
-        x[b, t, d] = scalar(v)
+    def store(x_out: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int, v: float):
+        x_out[b, t, d] = scalar(v)
 
     return load, store
 

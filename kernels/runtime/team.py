@@ -3,12 +3,15 @@
 After an operator torch's OpenMP threads wait for the next one by spinning, for milliseconds. Other
 threads would share the cores with them; the same team starts within microseconds. Where torch has
 another runtime than GNU's or one with its interface, and in a forked child, there is no team, and
-``interop.parallel_launch`` takes threads of Python.
+``launch.parallel_launch`` takes threads of Python. It does so too with a Warp whose recorded launch
+has other attributes than those of 1.19, which are not public.
 """
 
 import ctypes
 import os
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
 
@@ -90,20 +93,25 @@ def has_team() -> bool:
 class _Entry:
     """A kernel's compiled function and the C structures that it takes.
 
-    Made by a launch that is recorded only, which checks the arguments; later launches have the same
-    kinds of them.
+    They are attributes of Warp's that are not public.
+
+    Raises:
+        AttributeError: this Warp has no such attributes; also TypeError, where they are others.
     """
 
-    def __init__(self, kernel: wp.Kernel, dim: Sequence[int], arguments: list):
-        command = wp.launch(kernel, dim, arguments, device="cpu", record_cmd=True)
+    def __init__(self, kernel: wp.Kernel, command: Any, dim: Sequence[int], arguments: list):
         self.rank = kernel.adj.kernel_dim
         self.call = command.hooks.forward
         self.address = ctypes.cast(self.call, ctypes.c_void_p).value
+        if not self.address:
+            raise TypeError("a recorded launch has no compiled function")
         self.executable = command.module_exec  # keeps the function loaded
-        self.bounds = type(command.bounds)
+        self.bounds: Any = type(command.bounds)
         self.names = [arg.label for arg in kernel.adj.args]
         fields = [(name, type(x)) for name, x in zip(self.names, command.params[1:])]
-        self.record = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        self.record: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        self.extent(dim)  # raises now what it would raise later
+        self.pack(arguments)
 
     def pack(self, arguments: list) -> ctypes.Structure:
         """The arguments as the compiled function takes them; an array that is None is empty."""
@@ -118,17 +126,37 @@ class _Entry:
         return self.bounds((*dim, *(1,) * (self.rank - len(dim))))
 
 
-_entries: dict[wp.Kernel, _Entry] = {}
+_entries: dict[Any, _Entry] = {}  # by kernel
 
 
-def _entry(kernel: wp.Kernel, dim: Sequence[int], arguments: list) -> _Entry:
+def _entry(kernel: Any, dim: Sequence[int], arguments: list) -> _Entry | None:
+    """The entry of a kernel; None, and no team from now on, where this Warp has no such thing.
+
+    It is made by a launch that is recorded only, which checks the arguments; later launches have
+    the same kinds of them.
+    """
     if kernel not in _entries:
-        _entries[kernel] = _Entry(kernel, dim, arguments)
+        command = wp.launch(kernel, dim, arguments, device="cpu", record_cmd=True)
+        try:
+            _entries[kernel] = _Entry(kernel, command, dim, arguments)
+        except (AttributeError, TypeError) as error:
+            if has_team():
+                warnings.warn(
+                    f"warp-lang {wp.__version__} keeps launches in another form ({error}): those "
+                    "on the CPU take threads of their own, which is slower beside torch's own",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+            _lose()
+            return None
     return _entries[kernel]
 
 
-def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, threads: int) -> None:
+def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, threads: int) -> bool:
     """Runs one launch per entry of ``dims`` on a team of ``threads``; returns when all are done.
+
+    Returns False, having done nothing, where this Warp cannot do it; then there is no team any
+    more.
 
     Args:
         kernel: its first parameter is ``offset: wp.int32``, the sum of the first dimension of the
@@ -138,6 +166,8 @@ def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, thr
         threads: at least 1.
     """
     entry = _entry(kernel, dims[0], [0, *arguments])
+    if entry is None:
+        return False
     bounds, records = (entry.bounds * len(dims))(), (entry.record * len(dims))()
     record, offset = entry.pack([0, *arguments]), 0
     for i, dim in enumerate(dims):
@@ -155,4 +185,7 @@ def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, thr
     )
     inputs = [_parallel, ctypes.addressof(job), threads]
     team = _entry(_team, (1,), inputs)
+    if team is None:
+        return False
     team.call(ctypes.byref(team.extent((1,))), ctypes.byref(team.pack(inputs)))
+    return True

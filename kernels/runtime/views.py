@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeVar, cast, overload
+
 import warp as wp
 from torch import Tensor
 
+from .recording import recorder
+
+_Class = TypeVar("_Class")
 _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
 
 
 def view(tensor: Tensor, dtype=None, name: str = "tensor"):
     """A Warp array descriptor on the tensor's own memory, strides kept; it keeps the tensor alive.
+
+    In a dry run (``recording.py``) it is None: the tensor may have no memory.
 
     Args:
         tensor: float32, float64, bfloat16, float16 or integer, at most 4 dimensions.
@@ -20,12 +27,15 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
         TypeError: the dtype has no Warp counterpart or is not the one asked for.
         ValueError: too many dimensions, a broken vector dimension, or over 2^31 bytes per stride.
     """
+    if recorder() is not None:
+        return None
     key = (tensor.dtype, tensor.shape, tensor.stride(), dtype)
-    if key not in _descriptors:
+    known = _descriptors.get(key)  # looked up once: another thread may clear them at any time
+    if known is None:
+        known = _describe(tensor.detach(), dtype, name)
         if len(_descriptors) >= _MOST_DESCRIPTORS:
             _descriptors.clear()
-        _descriptors[key] = _describe(tensor.detach(), dtype, name)
-    known = _descriptors[key]
+        _descriptors[key] = known
     descriptor = type(known).from_buffer_copy(known)  # a tenth of the time of making it
     descriptor.data = tensor.data_ptr()
     descriptor.owner = tensor
@@ -33,12 +43,10 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
 
 
 _MOST_DESCRIPTORS = 4096
+_descriptors: dict[tuple, Any] = {}  # of the first tensor of each dtype, shape and strides
 
 
-_descriptors: dict[tuple, object] = {}  # of the first tensor of each dtype, shape and strides
-
-
-def _describe(tensor: Tensor, dtype, name: str):
+def _describe(tensor: Tensor, dtype, name: str) -> Any:
     reach = max((s * tensor.element_size() for s in tensor.stride()), default=0)
     if max(reach, *tensor.shape, 0) > _INT32_MAX:
         raise ValueError(
@@ -50,10 +58,22 @@ def _describe(tensor: Tensor, dtype, name: str):
         if tensor.dtype != scalar:
             raise TypeError(f"{name} has dtype {tensor.dtype}, allowed is {scalar}")
     try:
-        made = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
+        made: Any = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
     except RuntimeError as error:
         raise ValueError(f"{name}: {error}") from error
     return type(made).from_buffer_copy(made)  # without the tensor
+
+
+def array(tensor: Tensor, dtype=None) -> Any:
+    """A Warp array of a tensor, for a field of a Warp struct; None in a dry run, as ``view``."""
+    if recorder() is not None:
+        return None
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def struct(cls: type[_Class]) -> type[_Class]:
+    """``wp.struct``, which to a type checker leaves the class what it is."""
+    return cast(type[_Class], wp.struct(cls))
 
 
 def lane_contiguous(tensor: Tensor) -> Tensor:
@@ -68,6 +88,10 @@ def vectors(tensor: Tensor | None, dtype):
     return view(tensor.view(-1, *dtype._shape_), dtype)
 
 
+@overload
+def tokens_first(x: Tensor, name: str) -> Tensor: ...
+@overload
+def tokens_first(x: Tensor | None, name: str) -> Tensor | None: ...
 def tokens_first(x: Tensor | None, name: str) -> Tensor | None:
     """A view ``[B, L, D]`` of mamba-ssm's layout ``[B, D, L]``; what is no tensor stays as it is.
 

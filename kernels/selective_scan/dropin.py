@@ -69,7 +69,7 @@ def selective_scan_fn(
         B = B.float().repeat_interleave(groups // B.shape[2], dim=2)
     if C.shape[2] != groups and groups % C.shape[2] == 0:
         C = C.float().repeat_interleave(groups // C.shape[2], dim=2)
-    result = selective_scan(
+    out, last = selective_scan(
         u,
         tokens_first(delta, "delta"),
         A,
@@ -79,8 +79,7 @@ def selective_scan_fn(
         tokens_first(z, "z"),
         delta_bias,
         delta_softplus,
-        return_last_state=return_last_state,
+        return_last_state=True,
     )
-    if return_last_state:
-        return result[0].transpose(1, 2), result[1]
-    return result.transpose(1, 2)
+    out = out.transpose(1, 2)
+    return (out, last) if return_last_state else out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal, overload
+
 import torch
 from torch import Tensor
 
@@ -70,6 +72,54 @@ def _saves(tensors: tuple[Tensor | None, ...]) -> bool:
     return torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
 
 
+@overload
+def selective_scan(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None = None,
+    z: Tensor | None = None,
+    delta_bias: Tensor | None = None,
+    delta_softplus: bool = False,
+    *,
+    initial_state: Tensor | None = None,
+    return_last_state: Literal[False] = False,
+    discretization: str = "mamba",
+) -> Tensor: ...
+@overload
+def selective_scan(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None = None,
+    z: Tensor | None = None,
+    delta_bias: Tensor | None = None,
+    delta_softplus: bool = False,
+    *,
+    initial_state: Tensor | None = None,
+    return_last_state: Literal[True],
+    discretization: str = "mamba",
+) -> tuple[Tensor, Tensor]: ...
+@overload
+def selective_scan(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None = None,
+    z: Tensor | None = None,
+    delta_bias: Tensor | None = None,
+    delta_softplus: bool = False,
+    *,
+    initial_state: Tensor | None = None,
+    return_last_state: bool,
+    discretization: str = "mamba",
+) -> Tensor | tuple[Tensor, Tensor]: ...
 def selective_scan(
     u: Tensor,
     delta: Tensor,
@@ -122,7 +172,8 @@ def selective_scan(
     if z is not None:
         _check("z", z, tuple(u.shape), (u.dtype,), u.device)
     tensors = (u, delta, A, B, C, D, z, delta_bias, initial_state)
-    out, last, _ = ops.scan(*tensors, delta_softplus, discretization, _saves(tensors))
+    options = delta_softplus, discretization, _saves(tensors), ops.tuning_now(u)
+    out, last, _ = ops.scan(*tensors, *options)
     return (out, last) if return_last_state else out
 
 
@@ -158,5 +209,6 @@ def selective_scan_state(
     """
     states = _check_common(u, delta, A, delta_bias, initial_state, discretization)
     tensors = (u, delta, A, _check_groups("B", B, u, states), delta_bias, initial_state)
-    last, _ = ops.state(*tensors, delta_softplus, discretization, _saves(tensors))
+    options = delta_softplus, discretization, _saves(tensors), ops.tuning_now(u)
+    last, _ = ops.state(*tensors, *options)
     return last

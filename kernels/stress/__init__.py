@@ -1,4 +1,4 @@
-"""Random and hostile cases of the operators, each against float64. ``gamba stress`` runs it."""
+"""Random and hostile cases of the operators, compared with float64, for ``gamba stress``."""
 
 from .core.case import DTYPES, Case, Comparison, Op, Outcome, generator, judge, run_case
 from .core.report import (

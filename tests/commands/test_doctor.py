@@ -4,8 +4,8 @@ import re
 import pytest
 import torch
 
-from gamba_warp import __version__, cli
-from gamba_warp.commands import doctor
+from gamba_warp import __version__, cli, versions
+from gamba_warp.measure import health
 
 
 def run(capsys, *arguments):
@@ -29,7 +29,7 @@ def test_it_says_what_is_there(capsys):
 
 def test_missing_weights_come_with_a_remedy_and_are_no_fault(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "none"))
-    monkeypatch.setattr(doctor, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
+    monkeypatch.setattr(health, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
     code, out = run(capsys)
     assert code == 0
     assert f"{tmp_path}/none (0 MiB)" in out
@@ -43,13 +43,13 @@ def test_a_library_that_does_not_work_is_a_fault(capsys, monkeypatch):
     def broken():
         raise OSError("libusb-1.0.so.0: cannot open shared object file\nmore")
 
-    monkeypatch.setattr(doctor, "import_open3d", broken)
+    monkeypatch.setattr(health, "import_open3d", broken)
     code, out = run(capsys)
     assert code == 1 and re.search(r"open3d +no: libusb-1.0.so.0: cannot open .* file\n", out)
 
 
 def test_a_missing_package_is_named(capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "_PACKAGES", ("torch", "no-such-package"))
+    monkeypatch.setattr(versions, "_USED", ("torch", "no-such-package"))
     assert re.search(r"no-such-package +not installed\n", run(capsys)[1])
 
 

@@ -1,6 +1,7 @@
 import threading
 import urllib.error
 import urllib.request
+import webbrowser
 from http.server import HTTPServer
 
 import numpy as np
@@ -11,12 +12,13 @@ from PIL import Image
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.cli import run
-from gamba_warp.commands import view
 from gamba_warp.formats.meshes import load_mesh, to_linear
+from gamba_warp.formats.names import MESH_FORMATS
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.pages.serve import page_handler
 from gamba_warp.surfaces.extract import Surface
-from gamba_warp.surfaces.files import MESH_FORMATS, save_mesh
+from gamba_warp.surfaces.files import save_mesh
 
 QUICK = ["--voxels", "48", "--views", "16", "--pixels", "64"]
 
@@ -146,11 +148,11 @@ def test_mesh_files_are_read_back(tmp_path, kind):
 
 def test_view_writes_the_page_and_serves_only_it(ball, tmp_path, monkeypatch, capsys):
     opened = []
-    monkeypatch.setattr(view.webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open", opened.append)
     page = tmp_path / "page.html"
     assert run("view", [str(ball), "--out", str(page)]) == 0
     assert opened == [page.as_uri()] and "<script" in page.read_text()
-    server = HTTPServer(("127.0.0.1", 0), view.page_handler(b"hello"))
+    server = HTTPServer(("127.0.0.1", 0), page_handler(b"hello"))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     address = f"http://127.0.0.1:{server.server_port}"
     try:

@@ -13,7 +13,7 @@ from gamba_warp.cli import run
 from gamba_warp.commands.fit import fit_command
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views import compare
-from gamba_warp.eval.views.evaluate import ViewsProtocol, load_truth, render_views
+from gamba_warp.eval.views.compare import ViewsProtocol, load_truth, render_views
 from gamba_warp.eval.views.predictions import PlyPredictions
 from gamba_warp.fitting import objects
 from gamba_warp.fitting.config import FitConfig
@@ -338,12 +338,12 @@ def test_two_views_are_needed(tmp_path, capsys):
 def test_interrupt_keeps_what_is_finished(dataset, tmp_path, monkeypatch):
     real = objects.fit_object
 
-    def interrupted(job, uid, title):
+    def interrupted(job, uid):
         if uid == "blob":
             raise KeyboardInterrupt
-        return real(job, uid, title)
+        return real(job, uid)
 
-    monkeypatch.setattr("gamba_warp.commands.fit.fit_object", interrupted)
+    monkeypatch.setattr(objects, "fit_object", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fit_command(dataset, out=tmp_path / "out", steps=3, gaussians=20, held_out=3)
     report = json.loads((tmp_path / "out" / "report.json").read_text())

@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -17,7 +18,8 @@ from gamba_warp.files import write_json
 from gamba_warp.gpu_check import check as gpu_check
 from gamba_warp.gpu_check import kernels as gpu_kernels
 from gamba_warp.gpu_check import steps as gpu_steps
-from gamba_warp.gpu_check.check import gpu_check_command, main, make_settings, new_part
+from gamba_warp.gpu_check.check import main, make_settings, new_part, run_gpu_check
+from gamba_warp.gpu_check.plan import STEPS, StepName
 from gamba_warp.gpu_check.steps import Part, run_step
 from gamba_warp.kernels.bench.static import dry_run
 from gamba_warp.measure import inference as bench_inference
@@ -199,6 +201,10 @@ def test_a_wrong_kernel_fails_its_check(monkeypatch, tmp_path):
     assert len(part["failures"]) == 2 and "relative rms error" in part["failures"][0]
 
 
+def test_the_options_name_the_steps_of_the_plan():
+    assert get_args(StepName) == tuple(step.name for step in STEPS)
+
+
 def test_no_item_begins_when_time_is_up(tmp_path):
     for name in ("checks", "bench"):
         part = part_of(tmp_path, name, until=time.time() - 1)
@@ -257,7 +263,7 @@ def result(failures=(), whole=True):
 )
 def test_what_a_step_left_is_kept(monkeypatch, tmp_path, part, code, status, exit_code, words):
     monkeypatch.setattr(gpu_check, "run_python", child(part, code, "a core"))
-    run = gpu_check_command(device="cpu", out=tmp_path, steps=("checks",))
+    run = run_gpu_check(device="cpu", out=tmp_path, steps=("checks",))
     document = json.loads((tmp_path / "gpu-check.json").read_text())
     assert run == exit_code and document["steps"][0]["status"] == status
     assert document["results"]["checks"] == part["result"]
@@ -276,7 +282,7 @@ def test_an_interrupt_keeps_what_was_done(monkeypatch, tmp_path):
         return done(arguments, *rest, **options)
 
     monkeypatch.setattr(gpu_check, "run_python", run)
-    assert gpu_check_command(device="cpu", out=tmp_path) == 130
+    assert run_gpu_check(device="cpu", out=tmp_path) == 130
     document = json.loads((tmp_path / "gpu-check.json").read_text())
     assert document["verdict"].startswith("interrupted")
     assert "checks" in document["results"] and "bench" not in document["results"]
@@ -297,14 +303,14 @@ def test_the_whole_run_ends_in_its_time(monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gpu_check, "versions", lambda: dict.fromkeys(gpu_check.PACKAGES, "1"))
-    assert gpu_check_command(out=tmp_path) == 0
+    assert run_gpu_check(out=tmp_path) == 0
     assert given[:4] == [step.seconds for step in gpu_check.STEPS[:4]] and len(given) == 5
     assert 8 * 60 - 5 < now[0] < 8 * 60
     document = json.loads((tmp_path / "gpu-check.json").read_text())
     assert [step["status"] for step in document["steps"]] == 5 * ["stopped"] + 3 * ["not done"]
     assert {step["reason"] for step in document["steps"][5:]} == {"time was up"}
     now[0], given[:] = 0.0, []
-    assert gpu_check_command(out=tmp_path, minutes=0.2) == 0
+    assert run_gpu_check(out=tmp_path, minutes=0.2) == 0
     assert sum(given) == now[0] <= 12
 
 
@@ -330,7 +336,7 @@ def test_peers_have_steps_of_their_own(monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     steps = "bench", "peers-conv", "peers-scan", "peers-raster"
-    assert gpu_check_command(out=tmp_path, steps=steps) == 1
+    assert run_gpu_check(out=tmp_path, steps=steps) == 1
     assert runs == ["bench", "peers-conv", "peers-scan"]
     document = json.loads((tmp_path / "gpu-check.json").read_text())
     assert [step["status"] for step in document["steps"]] == [
@@ -396,7 +402,7 @@ def test_pytests_results_are_read(monkeypatch, tmp_path):
     monkeypatch.setattr(gpu_check, "CHECKOUT", tmp_path)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
-    assert gpu_check_command(out=tmp_path / "out", steps=("tests",)) == 1
+    assert run_gpu_check(out=tmp_path / "out", steps=("tests",)) == 1
     document = json.loads((tmp_path / "out" / "gpu-check.json").read_text())
     assert document["results"]["tests"]["counts"] == {"passed": 2, "failed": 1, "skipped": 1}
     (failure,) = document["failures"]

@@ -12,13 +12,14 @@ from PIL import Image
 from gamba_warp import cli
 from gamba_warp.batch import unique_names
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
-from gamba_warp.commands import reconstruct as module
 from gamba_warp.data.preprocess import composite, prepare
 from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import find_pictures, save_image
+from gamba_warp.model import checkpoint as checkpoints
+from gamba_warp.model import predict
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
@@ -193,7 +194,7 @@ def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeyp
         opacities=torch.full((64,), 0.9),
         colors=torch.tensor([0.9, 0.1, 0.1]).expand(64, 3),
     )
-    monkeypatch.setattr("gamba_warp.commands.reconstruct.reconstruct", lambda *_: stick)
+    monkeypatch.setattr(predict, "reconstruct", lambda *_: stick)
     options = [*quick(checkpoint, tmp_path), "--mesh", "ply", "--ply-frame", frame]
     assert run(picture, *options) == 0
     mesh = load_mesh(tmp_path / "thing-mesh.ply")
@@ -290,7 +291,7 @@ def test_what_cannot_start_is_refused(tmp_path, picture, checkpoint, capsys):
 
 
 def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeypatch, capsys):
-    monkeypatch.setattr(module, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
+    monkeypatch.setattr(checkpoints, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
     arguments = [picture, "--out", tmp_path / "out", "--turntable", "none", "--no-page"]
     refused(arguments, "tiny.safetensors", "--checkpoint FILE")(capsys)
     (tmp_path / "tiny.safetensors").write_bytes(checkpoint.read_bytes())
@@ -318,7 +319,7 @@ def test_outputs_that_cannot_be_written_are_failures(tmp_path, picture, checkpoi
 def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):
     gaussians = some(9)
     gaussians.means[3] = float("nan")
-    monkeypatch.setattr(module, "reconstruct", lambda model, rgba: gaussians)
+    monkeypatch.setattr(predict, "reconstruct", lambda model, rgba: gaussians)
     assert run(picture, *quick(checkpoint, tmp_path / "out")) == 1
     assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err
 

@@ -1,3 +1,5 @@
+"""The furniture package: from its archives to rendered views, and bad sources."""
+
 import io
 import json
 import tarfile
@@ -10,8 +12,10 @@ from PIL import Image
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
 from gamba_warp.train.data import furniture
-from gamba_warp.train.data.furniture import furniture_command, read_properties
-from gamba_warp.train.data.render import find_meshes, render_command
+from gamba_warp.train.data.furniture import read_properties
+from gamba_warp.train.data.furniture_command import data_furniture_command
+from gamba_warp.train.data.render import find_meshes
+from gamba_warp.train.data.render_command import data_render_command
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 PROPERTIES = r"""# a comment = not a value
@@ -73,7 +77,7 @@ def test_package_to_views(tmp_path):
     library = write_library(tmp_path / "BlendSwap-CC-BY.sh3f")
     deb = write_deb(tmp_path / "p.deb", {library.name: library.read_bytes(), "x": b"no"})
     out = tmp_path / "models"
-    assert furniture_command(out, deb=deb) == 0
+    assert data_furniture_command(out, deb=deb) == 0
     assert {p.name for p in out.iterdir()} == {"BlendSwap-CC-BY", "icons", "catalogue.json"}
     assert (out / "BlendSwap-CC-BY" / "LICENSE.TXT").exists()
     entries = json.loads((out / "catalogue.json").read_text())["objects"]
@@ -88,35 +92,35 @@ def test_package_to_views(tmp_path):
     assert len({m.group for m in meshes}) == 1  # numbered variants stay together
     assert meshes[0].rotation is None and meshes[1].rotation == [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
 
-    assert render_command(out, tmp_path / "data", views=1, size=16, workers=1) == 0
+    assert data_render_command(out, tmp_path / "data", views=1, size=16, workers=1) == 0
     assert len(open_dataset(tmp_path / "data", split_of(meshes[0].group))) == 2
-    assert furniture_command(out, tree=tmp_path) == 0  # again, from the other kind of source
+    assert data_furniture_command(out, tree=tmp_path) == 0  # again, from the other kind of source
     assert json.loads((out / "catalogue.json").read_text())["objects"] == entries
 
 
 def test_bad_sources(tmp_path, monkeypatch):
     out = tmp_path / "models"
     with pytest.raises(UserError, match="nowhere.deb: no such file"):
-        furniture_command(out, deb=tmp_path / "nowhere.deb")
+        data_furniture_command(out, deb=tmp_path / "nowhere.deb")
     (tmp_path / "text.deb").write_text("not a package")
     with pytest.raises(UserError, match="not a Debian package"):
-        furniture_command(out, deb=tmp_path / "text.deb")
+        data_furniture_command(out, deb=tmp_path / "text.deb")
     good = write_deb(tmp_path / "p.deb", {"a.sh3f": b"0" * 5000}).read_bytes()
     (tmp_path / "cut.deb").write_bytes(good[:-60])
     with pytest.raises(UserError, match="cannot be unpacked"):
-        furniture_command(out, deb=tmp_path / "cut.deb")
+        data_furniture_command(out, deb=tmp_path / "cut.deb")
     with pytest.raises(UserError, match="a.sh3f: not a furniture library"):
-        furniture_command(out, deb=tmp_path / "p.deb")
+        data_furniture_command(out, deb=tmp_path / "p.deb")
     with pytest.raises(UserError, match="holds no .sh3f"):
-        furniture_command(out, deb=write_deb(tmp_path / "e.deb", {}))
+        data_furniture_command(out, deb=write_deb(tmp_path / "e.deb", {}))
     with pytest.raises(UserError, match="no such folder"):
-        furniture_command(out, tree=tmp_path / "nowhere")
+        data_furniture_command(out, tree=tmp_path / "nowhere")
     write_library(tmp_path / "b.sh3f", "name=x\nmodel#1=/b/gone/chair.obj\n")
     with pytest.raises(UserError, match="b.sh3f: not a furniture library"):
-        furniture_command(out, tree=tmp_path)
+        data_furniture_command(out, tree=tmp_path)
     monkeypatch.setattr(furniture, "INSTALLED", tmp_path / "not installed")
     monkeypatch.setattr(furniture.shutil, "which", lambda name: None)
     with pytest.raises(UserError, match="no apt-get here.*--deb"):
-        furniture_command(out)
+        data_furniture_command(out)
     assert not (out / "catalogue.json").exists()
     assert not list(out.glob(".download-*"))

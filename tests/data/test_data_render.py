@@ -1,3 +1,5 @@
+"""Rendering of meshes to views: poses, pixels, light, resumed and sharded runs, and failures."""
+
 import json
 import shutil
 
@@ -15,7 +17,8 @@ from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh, to_linear
 from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses
 from gamba_warp.train.data.raycast import Lights, RayCaster
-from gamba_warp.train.data.render import find_meshes, render_command
+from gamba_warp.train.data.render import find_meshes
+from gamba_warp.train.data.render_command import data_render_command
 
 FOV = 49.1
 # even light from everywhere: what is drawn is the surface's own colour
@@ -86,7 +89,7 @@ def test_pixels_colours_and_depth_agree_with_the_cameras(tmp_path):
     axis = np.abs(normals).argmax(1)
     colors[np.arange(12), axis] = 255  # faces across x red, y green, z blue
     write_box(folder / "box.ply", face_colors=colors)
-    render_command(folder, tmp_path / "data", views=5, size=33, depth=True, workers=1)
+    data_render_command(folder, tmp_path / "data", views=5, size=33, depth=True, workers=1)
     data = open_dataset(tmp_path / "data")
     assert data.uids == ["box"]
     got = data.load(0)
@@ -193,40 +196,40 @@ def contents(folder):
 
 def test_same_seed_same_files_and_shards_add_up(meshes, tmp_path):
     options = dict(views=2, size=16, workers=1)
-    assert render_command(meshes, tmp_path / "one", **options) == 0
+    assert data_render_command(meshes, tmp_path / "one", **options) == 0
     for i in range(2):
-        assert render_command(meshes, tmp_path / "two", shard=f"{i}/2", **options) == 0
+        assert data_render_command(meshes, tmp_path / "two", shard=f"{i}/2", **options) == 0
     one = contents(tmp_path / "one")
     assert one == contents(tmp_path / "two")
     assert {n.split("/")[0] for n in one} == {"a", "b", "sub-c", "split.json"}
-    render_command(meshes, tmp_path / "other", seed=1, **options)
+    data_render_command(meshes, tmp_path / "other", seed=1, **options)
     assert contents(tmp_path / "other")["a/000.webp"] != one["a/000.webp"]
 
 
 def test_two_workers_write_the_same_files(meshes, tmp_path):
     options = dict(views=1, size=16)
-    render_command(meshes, tmp_path / "one", workers=1, **options)
-    render_command(meshes, tmp_path / "two", workers=2, **options)
+    data_render_command(meshes, tmp_path / "one", workers=1, **options)
+    data_render_command(meshes, tmp_path / "two", workers=2, **options)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
 def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
     out = tmp_path / "data"
     options = dict(views=2, size=16, workers=1)
-    render_command(meshes, out, **options)
+    data_render_command(meshes, out, **options)
     before = contents(out)
     times = {name: (out / name / "000.webp").stat().st_mtime_ns for name in ("a", "sub-c")}
     shutil.rmtree(out / "b")
     (out / ".b.part").mkdir()  # as a killed run leaves it
     (out / ".b.part" / "000.webp").write_bytes(b"half")
     assert len(open_dataset(out)) == 2
-    assert render_command(meshes, out, **options) == 0
+    assert data_render_command(meshes, out, **options) == 0
     assert "2 of 3 objects are already" in capsys.readouterr().out
     assert contents(out) == before
     for name, time in times.items():
         assert (out / name / "000.webp").stat().st_mtime_ns == time
     with pytest.raises(UserError, match="rendered with other settings"):
-        render_command(meshes, out, views=3, size=16, workers=1)
+        data_render_command(meshes, out, views=3, size=16, workers=1)
 
 
 def test_failures_are_listed_and_do_not_stop_the_rest(meshes, tmp_path, capsys):
@@ -258,7 +261,7 @@ def test_catalogue_names_and_groups(meshes, tmp_path):
     twin = {**entry, "uid": "box-2", "model": "b.ply"}
     (meshes / "catalogue.json").write_text(json.dumps({"objects": [entry, twin]}))
     out = tmp_path / "data"
-    render_command(meshes, out, views=1, size=16, workers=1, format="png")
+    data_render_command(meshes, out, views=1, size=16, workers=1, format="png")
     views = open_dataset(out).load("box-1")
     assert (views.name, views.attribution) == ("A box", {"creator": "me"})
     stored = json.loads((out / "box-1" / "transforms.json").read_text())
@@ -290,23 +293,23 @@ def test_uids_of_paths(tmp_path):
 )
 def test_bad_options(meshes, tmp_path, options, message):
     with pytest.raises(UserError, match=message):
-        render_command(meshes, tmp_path / "data", **options)
+        data_render_command(meshes, tmp_path / "data", **options)
 
 
 def test_bad_folders(meshes, tmp_path):
     with pytest.raises(UserError, match="no such folder"):
-        render_command(tmp_path / "nowhere", tmp_path / "data")
+        data_render_command(tmp_path / "nowhere", tmp_path / "data")
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="no mesh files"):
-        render_command(tmp_path / "empty", tmp_path / "data")
+        data_render_command(tmp_path / "empty", tmp_path / "data")
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write into"):
-        render_command(meshes, tmp_path / "file")
+        data_render_command(meshes, tmp_path / "file")
     (meshes / "catalogue.json").write_text('{"objects": [{}]}')
     with pytest.raises(UserError, match="catalogue.json"):
-        render_command(meshes, tmp_path / "data")
+        data_render_command(meshes, tmp_path / "data")
 
 
 def test_limit(meshes, tmp_path):
-    assert render_command(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
+    assert data_render_command(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
     assert len(open_dataset(tmp_path / "data")) == 2

@@ -1,3 +1,5 @@
+"""The starter set: it is whole, small and attributed, and its views fit its meshes."""
+
 from pathlib import Path
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Datasets: three layouts that agree, splits, resizing, and errors that name the file."""
+
 import json
 import math
 import pickle

@@ -1,3 +1,5 @@
+"""Pictures to model input: mattes, masks, recentring, and pictures without an object."""
+
 import importlib.util
 
 import numpy as np

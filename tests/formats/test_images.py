@@ -1,3 +1,5 @@
+"""Pictures in files: all common kinds, damaged ones, and writing that leaves all or nothing."""
+
 import io
 import random
 import struct

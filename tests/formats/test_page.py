@@ -1,3 +1,5 @@
+"""HTML pages: they are well-formed, hold everything that they show, and load nothing."""
+
 import base64
 import html.parser
 import re

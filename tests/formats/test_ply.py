@@ -31,11 +31,11 @@ def header(count, kind="float", properties=PROPERTIES, form="binary_little_endia
     ]
 
 
-@pytest.mark.parametrize("frame", ["opencv", "opengl"])
+@pytest.mark.parametrize("axes", ["opencv", "opengl"])
 @pytest.mark.parametrize("rotated", [True, False])
-def test_what_is_saved_is_loaded(tmp_path, frame, rotated):
+def test_what_is_saved_is_loaded(tmp_path, axes, rotated):
     gaussians = some(rotated=rotated)
-    save_ply(tmp_path / "a.ply", gaussians, frame=frame, comments=["one\ntwo", "é"])
+    save_ply(tmp_path / "a.ply", gaussians, axes=axes, comments=["one\ntwo", "é"])
     loaded = load_ply(tmp_path / "a.ply")
     quats = torch.eye(4)[:1].expand(37, 4) if gaussians.quats is None else gaussians.quats
     quats = quats / quats.norm(dim=1, keepdim=True)
@@ -84,13 +84,13 @@ def test_open3d_sees_the_same_gaussians(tmp_path):
     np.testing.assert_allclose(1 / (1 + np.exp(-logits)), gaussians.opacities, rtol=1e-5)
 
 
-def test_opengl_frame_turns_y_up():
-    from gamba_warp.formats.ply import flip_frame
+def test_opengl_axes_turn_y_up():
+    from gamba_warp.formats.ply import flip_axes
 
     gaussians = some()
-    flipped = flip_frame(gaussians)
+    flipped = flip_axes(gaussians)
     torch.testing.assert_close(flipped.means, gaussians.means * torch.tensor([1.0, -1, -1]))
-    torch.testing.assert_close(flip_frame(flipped).means, gaussians.means)
+    torch.testing.assert_close(flip_axes(flipped).means, gaussians.means)
 
 
 def test_files_of_other_programs_are_read(tmp_path):
@@ -139,7 +139,7 @@ def test_refusals_when_saving(tmp_path):
     with pytest.raises(ValueError, match=r"leading shape \(1,\)"):
         save_ply(tmp_path / "a.ply", some().map(lambda value: value[None]))
     with pytest.raises(ValueError, match="'blender'"):
-        save_ply(tmp_path / "a.ply", some(), frame="blender")
+        save_ply(tmp_path / "a.ply", some(), axes="blender")
     with pytest.raises(UserError, match=r"/dev/null/a\.ply: Not a directory"):
         save_ply("/dev/null/a.ply", some())
 
@@ -161,6 +161,8 @@ BAD_FILES = {
     "list": (header(2, "list uchar float"), "not a plain number"),
     "odd type": (header(2, "half"), "'half x' is not a plain number"),
     "twice": (header(2, properties=[*PROPERTIES, "x"]), "x is given twice"),
+    "odd element": ([*header(2), "element face many"], "expected 'element face COUNT'"),
+    "property first": (["property float x", *header(2)], "a property before any element"),
     "none": (header(0), "no Gaussians"),
     "cloud": (header(2, properties=PROPERTIES[:3]), "no property f_dc_0, f_dc_1, f_dc_2"),
     "no opacity": (header(2, properties=PROPERTIES[:6] + PROPERTIES[7:]), "no property opacity"),

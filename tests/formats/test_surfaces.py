@@ -16,7 +16,8 @@ from gamba_warp.kernels.rasterize import depth_quantile, quantile
 from gamba_warp.render import render
 from gamba_warp.surfaces.cleaning import cleaned_mesh
 from gamba_warp.surfaces.density import MOST_POINTS, opacity_volume
-from gamba_warp.surfaces.extract import SurfaceOptions, extract_surface, unit_frame, vertex_colors
+from gamba_warp.surfaces.extract import extract_surface, unit_frame, vertex_colors
+from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.surfaces.tsdf import CLEAR, Views, fuse, look_around, sphere_cameras
 
 QUICK = dict(voxels=64, views=24, pixels=128)
@@ -58,7 +59,7 @@ def test_a_sphere_within_a_voxel(method):
     mesh = as_trimesh(surface)
     volume = 4 / 3 * math.pi * (0.4 + error.mean() / QUICK["voxels"]) ** 3
     assert abs(mesh.volume - volume) < 0.02 * volume  # positive: the outside is in front
-    assert surface.is_closed() == mesh.is_watertight
+    assert surface.is_watertight() == mesh.is_watertight
 
 
 @pytest.mark.parametrize("method", ["tsdf", "density"])

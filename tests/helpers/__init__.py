@@ -1,17 +1,17 @@
-"""Shared by the tests: comparisons that name what differs."""
+"""What several test files share; here are the comparisons that name what differs."""
 
 import torch
 
 
 def rel_rms(got: torch.Tensor, want: torch.Tensor) -> float:
-    """Root mean square of the difference over that of ``want``, in float64."""
+    """Returns the root mean square of the difference over that of ``want``, in float64."""
     got, want = got.detach().double(), want.detach().double()
     scale = want.square().mean().sqrt().item()
     return (got - want).square().mean().sqrt().item() / max(scale, 1e-300)
 
 
 def assert_rel_rms(got, want, limit: float, name: str) -> None:
-    """Fails with the name and both figures where the relative rms error is over ``limit``."""
+    """Fails with the name and both figures if the relative rms error is over ``limit``."""
     assert got.shape == want.shape, f"{name}: shape {tuple(got.shape)}, want {tuple(want.shape)}"
     assert torch.isfinite(got).all(), f"{name}: not finite"
     error = rel_rms(got, want)

@@ -1,4 +1,4 @@
-"""Shared by the tests: from test_ply."""
+"""Random Gaussians for tests of files and pages."""
 
 import torch
 
@@ -6,6 +6,7 @@ from gamba_warp.gaussians import Gaussians
 
 
 def some(n=37, rotated=True):
+    """Draws ``n`` Gaussians; the quaternions are not normalised, or None if not ``rotated``."""
     quats = torch.randn(n, 4) * 3 if rotated else None
     return Gaussians(
         means=torch.rand(n, 3) - 0.5,

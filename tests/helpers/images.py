@@ -1,4 +1,4 @@
-"""Shared by the tests: from test_images."""
+"""Pictures for tests: random ones, their files in memory, and files that are not pictures."""
 
 import io
 
@@ -7,6 +7,7 @@ from PIL import Image
 
 
 def colours(mode="RGB", size=(7, 5)):
+    """Makes a PIL picture of random colours, the same on each call; ``size`` is (width, height)."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
     image = Image.fromarray(pixels, "RGBA")
@@ -14,12 +15,14 @@ def colours(mode="RGB", size=(7, 5)):
 
 
 def encoded(form):
+    """Returns the bytes of a 40 x 30 picture in a format of PIL."""
     content = io.BytesIO()
     colours(size=(40, 30)).save(content, form)
     return content.getvalue()
 
 
 def bad_files(folder):
+    """Writes files that cannot be read as a picture; yields name, path and the expected reason."""
     first, second = colours("P"), colours("P", (7, 5)).transpose(Image.Transpose.ROTATE_180)
     yield "missing", folder / "none.png", "no such file"
     yield "folder", folder, "is a folder"

@@ -1,4 +1,4 @@
-"""Shared by the tests: from test_meshes."""
+"""A textured square as an .obj file, for tests of meshes and of their rendering."""
 
 import numpy as np
 from PIL import Image
@@ -15,11 +15,7 @@ vt 0 1
 usemtl paint
 f 1/1 2/2 3/3 4/4
 """
-
-
 MTL = "newmtl paint\nKd 0.1 0.1 0.1\nmap_Kd paint.png\n"
-
-
 QUARTERS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""A micro dataset and options that train in milliseconds: clouds drawn by our rasterizer."""
+"""A tiny dataset of clouds, drawn by our rasterizer, and options that train in milliseconds."""
 
 import json
 from dataclasses import replace
@@ -15,7 +15,7 @@ from gamba_warp.train.config import TrainConfig
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 SIZE = 16
 VIEWS = 6
-# 64 Gaussians of one narrow block.
+# One narrow block and 64 Gaussians.
 MODEL = (
     f"image_size={SIZE}",
     "patch_size=4",
@@ -27,12 +27,12 @@ MODEL = (
 
 
 def to_opengl(viewmats: torch.Tensor) -> torch.Tensor:
-    """Camera-to-world OpenGL matrices from world-to-camera OpenCV ones, both ``[.., 4, 4]``."""
+    """Converts world-to-camera OpenCV matrices to camera-to-world OpenGL ones, ``[.., 4, 4]``."""
     return torch.linalg.inv(_FLIP @ viewmats.double()).to(viewmats.dtype)
 
 
 def cloud(seed: int, num: int = 40) -> Gaussians:
-    """Gaussians of one hue in an off-centre ball."""
+    """Makes Gaussians of one hue in an off-centre ball."""
     rng = torch.Generator().manual_seed(seed)
     centre = 0.1 * torch.randn(3, generator=rng)
     hue = torch.rand(3, generator=rng)
@@ -46,12 +46,12 @@ def cloud(seed: int, num: int = 40) -> Gaussians:
 
 
 def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None:
-    """One object in the transforms.json layout."""
+    """Writes one object in the transforms.json layout."""
     azimuths = torch.arange(views) * (360.0 / views)
     viewmats = orbit(azimuths, elevation=15.0, distance=1.8)
     cameras = Cameras(viewmats, intrinsics(SIZE, SIZE).expand(views, 3, 3), SIZE, SIZE)
     pictures = render(gaussians, cameras)
-    # Rendered on black, so colour is premultiplied; files hold straight alpha.
+    # Pictures on black have premultiplied colour, but files hold straight alpha.
     rgba = torch.cat([pictures.rgb / pictures.alpha.clamp_min(1e-3), pictures.alpha], -1)
     folder.mkdir(parents=True)
     K = cameras.Ks[0]
@@ -66,7 +66,7 @@ def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None
 
 
 def write_dataset(root: Path, objects: int = 3) -> Path:
-    """``objects`` clouds; the last is held out."""
+    """Writes a dataset of ``objects`` clouds, of which the last is held out."""
     uids = [f"cloud{chr(ord('a') + i)}" for i in range(objects)]
     for i, uid in enumerate(uids):
         write_object(root / uid, cloud(i))
@@ -76,7 +76,7 @@ def write_dataset(root: Path, objects: int = 3) -> Path:
 
 
 def options(data: Path, out: Path, **groups: dict) -> TrainConfig:
-    """Quick options; ``groups`` are changes, e.g. ``optim={"lr": 1.0}``."""
+    """Makes quick options; ``groups`` changes them, for example ``optim={"lr": 1.0}``."""
     config = TrainConfig(data=data, preset="tiny", set=MODEL)
     quick = {
         "length": {"steps": 6},

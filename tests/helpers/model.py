@@ -1,4 +1,4 @@
-"""Shared by the tests: from test_model."""
+"""A micro configuration of the model, and random input for it."""
 
 import torch
 
@@ -7,7 +7,7 @@ from gamba_warp.model.config import GambaConfig
 
 
 def micro(**changes) -> GambaConfig:
-    """36 Gaussians, 4 image tokens."""
+    """Makes a configuration of 36 Gaussians and 4 image tokens, with changes to its fields."""
     small = {
         "image_size": 12,
         "patch_size": 4,
@@ -21,6 +21,7 @@ def micro(**changes) -> GambaConfig:
 
 
 def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
+    """Draws pictures ``[batch, size, size, 3]`` and makes a camera for each."""
     viewmats = orbit(torch.linspace(-30, 200, batch), 11.0)
     cameras = Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
     return torch.rand(batch, size, size, 3), cameras

@@ -1,15 +1,15 @@
-"""Shared by the tests: from test_rasterize."""
+"""Scenes for the rasterizer's tests: random Gaussians and cameras, and the limits of errors.
+
+A scene is a dict of the arguments of ``rasterization``, so that a test may change one by name.
+"""
 
 import torch
 
 from gamba_warp.cameras import orbit
+from gamba_warp.kernels.rasterize.reference import rasterization_reference
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
-
-
 PICTURE = 1e-5  # float32 sums of some hundred terms in [0, 1]
-
-
 GRADIENT = 1e-4  # as above, with factors up to 1 / (1 - alpha_max)
 
 
@@ -22,6 +22,7 @@ def look(batch, views, width, height):
 
 
 def make(batch=2, views=3, num=60, width=37, height=53, channels=3, size=0.06):
+    """A scene of float32 tensors: standard deviations around ``size``, all opacities."""
     viewmats, Ks = look(batch, views, width, height)
     return dict(
         means=0.3 * torch.randn(batch, num, 3),
@@ -38,10 +39,24 @@ def make(batch=2, views=3, num=60, width=37, height=53, channels=3, size=0.06):
 
 
 def mapped(scene, function):
+    """The scene with ``function`` of each tensor."""
     return {k: function(v) if isinstance(v, torch.Tensor) else v for k, v in scene.items()}
 
 
 def leaves(scene, dtype):
+    """A copy of another dtype, in which every tensor but Ks asks for a gradient."""
     scene = mapped(scene, lambda v: v.detach().to(dtype).clone().requires_grad_())
     scene["Ks"].requires_grad_(False)
     return scene
+
+
+def near_a_cut(scene, options):
+    """Pixels whose float64 alpha changes when alpha_min does a little: there rounding decides."""
+    alpha_min = options.get("alpha_min", 1 / 255)
+    options = {k: v for k, v in options.items() if k != "alpha_min"}
+    scene = mapped(scene, torch.Tensor.double)
+    low, high = (
+        rasterization_reference(**scene, **options, alpha_min=alpha_min * (1 + s))[2]
+        for s in (-1e-5, 1e-5)
+    )
+    return (low != high)[..., 0]

@@ -1,4 +1,8 @@
-"""Shared by the tests: from test_rasterize_accuracy."""
+"""The rasterizer against its oracle pixel by pixel and Gaussian by Gaussian, at realistic sizes.
+
+``Cuts`` makes the dense oracle fast enough and notes how near each pixel comes to a cut (alpha to
+alpha_min, T to its limit), where rounding decides; ``both`` and ``assert_gradients`` compare.
+"""
 
 import pytest
 import torch
@@ -9,14 +13,8 @@ from helpers import assert_rel_rms
 from helpers.raster import GRADIENT, NAMES, PICTURE, leaves
 
 ROW = 1e-3  # of one Gaussian's gradient: a sum over few pixels, some of which cancel
-
-
 ROWS = 0.999  # the share of Gaussians that must keep to it
-
-
 BAND = 5e-5  # relative: rounding of q <= 11.1, of 1e-6 pixels of mean2d over half a pixel of sigma
-
-
 COTANGENTS = 2  # one number per Gaussian may cancel under one of them, hardly under both
 
 
@@ -73,6 +71,7 @@ class Cuts:
         return blended, alpha
 
     def distances(self, like):
+        """How far each pixel is from its nearest cut, shaped as a picture without channels."""
         return torch.stack(self.views).view(like.shape[:-1])
 
 
@@ -87,6 +86,7 @@ def one_thread():
 
 @pytest.fixture
 def cuts(monkeypatch, one_thread):
+    """The oracle blends by blocks and notes the cuts."""
     recorder = Cuts()
     monkeypatch.setattr(reference, "_blend", recorder)
     monkeypatch.setattr(reference, "_CHUNK", 10**9)  # the recorder cuts the picture itself

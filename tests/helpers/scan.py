@@ -1,4 +1,4 @@
-"""Shared by the tests: from test_selective_scan."""
+"""Shared by the tests of the scan: inputs, the oracle, and a comparison that names what differs."""
 
 import torch
 
@@ -7,8 +7,6 @@ from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from helpers import assert_rel_rms
 
 FORWARD = 1e-6  # float32 rounding of a few hundred dependent steps; measured 1e-7 to 5e-7
-
-
 GRADIENT = 1e-5  # the same, for sums over up to 2 * 577 tokens; measured below 1e-6
 
 
@@ -31,6 +29,7 @@ def make(batch, length, channels, states, groups=1, dtype=torch.float32):
 
 
 def leaves(inputs, dtype=None):
+    """Copies that ask for gradients, in another dtype if one is given."""
     return {k: v.detach().clone().to(dtype or v.dtype).requires_grad_() for k, v in inputs.items()}
 
 

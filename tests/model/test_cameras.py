@@ -1,3 +1,5 @@
+"""Cameras: known answers, the bridge to OpenGL, and rays through the pixels."""
+
 import math
 
 import pytest

@@ -1,3 +1,5 @@
+"""The container of Gaussians: its checks, its conversions, and rigid motions."""
+
 import math
 
 import pytest

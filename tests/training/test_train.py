@@ -22,13 +22,12 @@ from torch.utils.checkpoint import checkpoint
 from gamba_warp import cli
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.train import batches as prepare
-from gamba_warp.train import loop, step
+from gamba_warp.train import loop, losses, step
 from gamba_warp.train.batches import choose_views
 from gamba_warp.train.checkpoint import list_checkpoints
-from gamba_warp.train.command import train
 from gamba_warp.train.ddp import World
 from gamba_warp.train.optim import build_optimizer
+from gamba_warp.train.run import train
 
 ALONE = World(0, 1, torch.device("cpu"))
 
@@ -56,7 +55,7 @@ def assert_same_files(a, b):
 
 def stop_after(monkeypatch, count):
     """Sends SIGTERM to this process in the middle of step ``count``."""
-    real, calls = loop.forward, []
+    real, calls = step.forward, []
 
     def counting(*arguments, **options):
         calls.append(1)
@@ -64,7 +63,7 @@ def stop_after(monkeypatch, count):
             os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(loop, "forward", counting)
+    monkeypatch.setattr(step, "forward", counting)
 
 
 def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
@@ -75,7 +74,7 @@ def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
         calls.append(1)
         return checkpoint(*arguments, **options)
 
-    monkeypatch.setattr("gamba_warp.model.gamba.checkpoint", counting)
+    monkeypatch.setattr("gamba_warp.model.block.checkpoint", counting)
     assert run(data, tmp_path / "lean", run={"recompute": True}) == 0
     assert len(calls) == 6  # one block, six steps; none in validation
     assert_same_files(tmp_path / "plain/model.safetensors", tmp_path / "lean/model.safetensors")
@@ -97,11 +96,11 @@ def test_resume_is_bit_identical(data, tmp_path, monkeypatch, accumulate):
         file = f"checkpoints/step_000006/{name}.safetensors"
         assert_same_files(tmp_path / "whole" / file, tmp_path / "parts" / file)
     assert_same_files(*(tmp_path / part / "model.safetensors" for part in ("whole", "parts")))
-    losses = [
+    recorded = [
         [record["loss"] for record in lines(tmp_path / part, "train")]
         for part in ("whole", "parts")
     ]
-    assert losses[0] == losses[1] and len(losses[0]) == 6
+    assert recorded[0] == recorded[1] and len(recorded[0]) == 6
     first = load_file(tmp_path / "parts/checkpoints/step_000003/model.safetensors")
     last = load_file(tmp_path / "parts/checkpoints/step_000006/model.safetensors")
     assert any(not torch.equal(first[name], last[name]) for name in first), "it did train on"
@@ -152,15 +151,14 @@ def test_validation_is_on_held_out_objects(data, tmp_path, monkeypatch):
         seen.append((model.training, tuple(batch.uids)))
         return real(model, batch, *arguments, **options)
 
-    monkeypatch.setattr("gamba_warp.train.step.forward", spy)
-    monkeypatch.setattr("gamba_warp.train.loop.forward", spy)
+    monkeypatch.setattr(step, "forward", spy)
     assert run(data, tmp_path, length={"steps": 2}, run={"val_every": 1}) == 0
     assert {uid for training, uids in seen if training for uid in uids} <= {"clouda", "cloudb"}
     assert [uids for training, uids in seen if not training] == [("cloudc",)] * 2
 
 
 def test_non_finite_step_is_skipped_and_counted(data, tmp_path, monkeypatch, capsys):
-    real, calls = loop.forward, []
+    real, calls = step.forward, []
 
     def poisoned(*arguments, **options):
         result = real(*arguments, **options)
@@ -169,7 +167,7 @@ def test_non_finite_step_is_skipped_and_counted(data, tmp_path, monkeypatch, cap
             result.loss = result.loss * math.nan
         return result
 
-    monkeypatch.setattr(loop, "forward", poisoned)
+    monkeypatch.setattr(step, "forward", poisoned)
     assert run(data, tmp_path, run={"save_every": 1, "keep": 9}) == 0
     weights = [load_file(path / "model.safetensors") for path in list_checkpoints(tmp_path)]
     assert len(weights) == 6
@@ -182,12 +180,14 @@ def test_non_finite_step_is_skipped_and_counted(data, tmp_path, monkeypatch, cap
 
 
 def test_gives_up_after_many_non_finite_steps(data, tmp_path, monkeypatch):
+    real = step.forward
+
     def broken(*arguments, **options):
-        result = step.forward(*arguments, **options)
+        result = real(*arguments, **options)
         result.loss = result.loss * math.inf
         return result
 
-    monkeypatch.setattr(loop, "forward", broken)
+    monkeypatch.setattr(step, "forward", broken)
     with pytest.raises(UserError, match="3 steps in a row were not finite"):
         run(data, tmp_path, optim={"max_skipped": 3})
 
@@ -317,7 +317,7 @@ def test_input_view_is_the_model_s_reference(data):
 
 
 def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(prepare, "lpips_available", lambda: False)
+    monkeypatch.setattr(losses, "lpips_available", lambda: False)
     short = {"length": {"steps": 3}}
     assert run(data, tmp_path / "auto", loss={"lpips": "auto"}, **short) == 0
     warnings = [record["message"] for record in lines(tmp_path / "auto", "warning")]
@@ -328,7 +328,7 @@ def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
         def forward(self, got, want):
             return (got - want).abs().mean((-3, -2, -1)) * 0 + 0.5
 
-    monkeypatch.setattr(prepare, "load_lpips", Half)
+    monkeypatch.setattr(losses, "load_lpips", Half)
     loss = {"lpips": "on", "lpips_weight": 3.0, "lpips_after": 2, "radial_mask": False}
     assert run(data, tmp_path / "on", loss=loss, **short) == 0
     records = lines(tmp_path / "on", "train")
@@ -381,7 +381,7 @@ def test_two_processes(data, tmp_path):
         "import sys, torch\n"
         "from helpers import micro\n"
         "from pathlib import Path\n"
-        "from gamba_warp.train.command import train\n"
+        "from gamba_warp.train.run import train\n"
         "from gamba_warp.train.ddp import world\n"
         "torch.set_num_threads(1)\n"
         "options = micro.options(Path(sys.argv[1]), Path(sys.argv[2]), length={'steps': 3})\n"

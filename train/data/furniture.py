@@ -1,4 +1,4 @@
-"""`gamba data furniture`: 820 textured models that are free to use, ready for `gamba data render`.
+"""820 textured furniture models that are free to use, ready for ``gamba data render``.
 
 They are Sweet Home 3D's furniture libraries as Debian's package ``sweethome3d-furniture`` carries
 them: five ``.sh3f`` zip files of OBJ models, each with a 128x128 RGBA icon, a name and a creator.
@@ -17,10 +17,8 @@ import tempfile
 import zipfile
 from collections import Counter
 from pathlib import Path, PurePosixPath
-from typing import Annotated
 
 import numpy as np
-import tyro
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
@@ -32,7 +30,7 @@ PACKAGE = "sweethome3d-furniture"
 INSTALLED = Path("/usr/share/sweethome3d/furniture")
 _BY = "https://creativecommons.org/licenses/by/3.0/"
 
-# library -> (whom to name, if not each model's creator; licence; its text)
+# By library: whom to name, if not each model's creator; the licence; where its text is.
 LIBRARIES: dict[str, tuple[str, str, str]] = {
     "BlendSwap-CC-0": ("", "CC0 1.0", "https://creativecommons.org/publicdomain/zero/1.0/"),
     "BlendSwap-CC-BY": ("", "CC BY 3.0", _BY),
@@ -46,19 +44,20 @@ LIBRARIES: dict[str, tuple[str, str, str]] = {
 }
 
 
-def furniture_command(
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    deb: Path | None = None,
-    tree: Path | None = None,
-) -> int:
-    """Get 820 free textured models with icons: Sweet Home 3D's libraries, from Debian's package.
-
-    Without --deb or --tree: an installed package is used, else apt-get downloads it (125 MB).
+def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) -> int:
+    """Unpacks the libraries, and writes the catalogue of all models.
 
     Args:
-        out: folder for the models, their icons and catalogue.json; 400 MB.
-        deb: the package file sweethome3d-furniture_*.deb, if you have it.
-        tree: a folder that holds the .sh3f files, if you have them.
+        out: folder for the models, their icons and catalogue.json.
+        deb: the package file, or None.
+        tree: a folder that holds the .sh3f files, or None; without either an installed package is
+            used, or apt-get downloads it.
+
+    Returns:
+        The number of models.
+
+    Raises:
+        UserError: there are no libraries, one is damaged, or two models have one name.
     """
     out = output_folder(out)
     with tempfile.TemporaryDirectory(dir=out, prefix=".download-") as scratch:
@@ -70,8 +69,7 @@ def furniture_command(
     if repeated:
         raise UserError(f"two models are called {repeated[0]}")
     write_json(out / CATALOGUE, {"objects": sorted(objects, key=lambda entry: entry["uid"])})
-    print(f"{len(objects)} models in {out}; next: gamba data render {out} --out DATA")
-    return 0
+    return len(objects)
 
 
 def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:

@@ -1,4 +1,4 @@
-"""Where the cameras of one object stand: around it, all of it in the picture, z up."""
+"""The cameras of one object: they stand around it, and each has all of it in the picture."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import math
 
 import numpy as np
 
-MARGIN = 0.96  # of the picture's half size that the object may reach
-NEAREST = 3.0  # times the object's half size along the camera's axes; see sample_poses
-SPREAD = 0.2  # distances are up to so much farther than the nearest
+MARGIN = 0.96  # share of the picture's half size that the object may reach
+NEAREST = 3.0  # least distance, in half sizes of the object along the camera's axes
+SPREAD = 0.2  # largest share by which a distance exceeds the least one
 
 
 def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndarray:
-    """``[4, 4]`` camera-to-world, OpenGL frame, of a camera that looks at the origin, z up.
+    """Returns ``[4, 4]`` camera-to-world, OpenGL frame, of a camera that looks at the origin, z up.
 
-    Azimuth 0 stands at -y (the front, as in Blender) and grows towards +x.
+    A camera of azimuth 0 stands at -y (the front, as in Blender); azimuth grows towards +x.
 
     Args:
         azimuth: degrees.
-        elevation: degrees, below 90 either way.
+        elevation: degrees, between -90 and 90.
         distance: object units.
     """
     a, e = math.radians(azimuth), math.radians(elevation)
@@ -31,15 +31,15 @@ def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndar
 
 
 def nearest_distance(points: np.ndarray, pose: np.ndarray, fov: float) -> float:
-    """The least distance along the pose's axis at which this camera may stand.
+    """Returns the least distance along the pose's axis at which this camera may stand.
 
-    All points are then in a square picture, with a margin; and if this view becomes the reference,
-    which puts its camera at distance 1.5, the object lies within [-0.5, 0.5] on each camera axis,
+    All points are then in a square picture, with a margin. If this view becomes the reference, its
+    camera is put at distance 1.5, and the object then lies within [-0.5, 0.5] on each camera axis,
     where the model can place Gaussians.
 
     Args:
         points: ``[P, 3]`` in the object's frame.
-        pose: ``[4, 4]`` camera to world; only its rotation counts.
+        pose: ``[4, 4]`` camera to world; only its rotation matters.
         fov: degrees, of the picture's side.
     """
     local = points @ pose[:3, :3]
@@ -51,17 +51,17 @@ def nearest_distance(points: np.ndarray, pose: np.ndarray, fov: float) -> float:
 def sample_poses(
     points: np.ndarray, views: int, fov: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """``[views, 4, 4]`` camera-to-world matrices, OpenGL frame.
+    """Draws ``[views, 4, 4]`` camera-to-world matrices, OpenGL frame.
 
-    View 0 is front-ish: azimuth within 35°, elevation 0 to 20°. The others are spread in azimuth by
-    the golden ratio with a random start; nine in ten have an elevation of -10 to 50°, the rest of
-    -30 to 75°.
+    View 0 sees the object roughly from the front: azimuth within 35°, elevation 0 to 20°. The
+    others are spread in azimuth by the golden ratio with a random start; nine in ten have an
+    elevation of -10 to 50°, the rest one of -30 to 75°.
 
     Args:
         points: ``[P, 3]`` vertices of the object, which is centred at the origin.
-        views: how many.
+        views: number of views.
         fov: degrees, of the picture's side.
-        rng: everything random comes from it.
+        rng: source of chance.
     """
     golden = (math.sqrt(5) - 1) / 2
     start = rng.uniform()

@@ -1,4 +1,4 @@
-"""A small ray caster for textured meshes: Open3D finds the hits, numpy shades them."""
+"""A small ray caster for textured meshes; Open3D finds the hits, and numpy shades them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gamba_warp.formats.meshes import TexturedMesh, to_display, to_linear
 from gamba_warp.open3d import import_open3d
 
 SAMPLES = 3  # rays along each side of a pixel; odd, so that one goes through the pixel's centre
-LAYERS = 8  # surfaces that a ray may pass through
-STEP = 1e-4  # object units behind a surface at which a ray that passes it goes on
-GLOSS = 0.02  # what even a black surface reflects, so that its shape shows
+LAYERS = 8  # number of surfaces that a ray may pass through
+STEP = 1e-4  # object units behind a transparent surface at which its ray goes on
+GLOSS = 0.02  # share that even a black surface reflects, so that its shape shows
 OPAQUE = 0.02  # transmittance below which a ray ends
 
 _TO_LINEAR = to_linear(np.arange(256) / 255.0)
@@ -25,9 +25,9 @@ class Lights:
     """The light of one object, the same for all its views, in its own frame.
 
     Attributes:
-        ambient: ``[3]`` from above (half of it from below).
-        directions: ``[L, 3]`` unit, towards the lights.
-        colors: ``[L, 3]`` linear.
+        ambient: light from above, ``[3]``; half of it comes from below.
+        directions: unit vectors towards the lights, ``[L, 3]``.
+        colors: linear colours of the lights, ``[L, 3]``.
         head: strength of a lamp at the camera.
     """
 
@@ -38,7 +38,7 @@ class Lights:
 
     @classmethod
     def sample(cls, rng: np.random.Generator) -> Lights:
-        """A key and a fill light from above, ambient and headlight, all random."""
+        """Draws a key light and a fill light from above, ambient light and a lamp at the camera."""
         azimuth = rng.uniform(0, 2 * math.pi) + np.array([0, rng.uniform(0.5, 1.5) * math.pi])
         height = np.sin(np.radians([rng.uniform(25, 70), rng.uniform(0, 50)]))
         flat = np.sqrt(1 - height**2)
@@ -51,7 +51,7 @@ class Lights:
         )
 
     def shade(self, normals: np.ndarray, to_camera: np.ndarray) -> np.ndarray:
-        """``[P, 3]`` light that points with unit ``normals [P, 3]`` send on if they are white."""
+        """Returns ``[P, 3]``, the light that white points with unit ``normals [P, 3]`` send on."""
         lambert = np.maximum(normals @ self.directions.T.astype(np.float32), 0)
         light = lambert @ self.colors.astype(np.float32)
         light += (0.75 + 0.25 * normals[:, 2:]) * self.ambient.astype(np.float32)
@@ -60,7 +60,7 @@ class Lights:
 
 
 class _Textures:
-    """All materials' textures, at every halved size, in one flat array of texels."""
+    """The textures of all materials, at every halved size, in one flat array of texels."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
         chains = [_halvings(m.texture) for m in mesh.materials]
@@ -79,7 +79,7 @@ class _Textures:
         self.textured = np.array([m.texture is not None for m in mesh.materials])
 
     def sample(self, material: np.ndarray, uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """``[P, 4]`` linear RGBA, colour premultiplied, of the materials at the UVs."""
+        """Samples ``[P, 4]`` linear RGBA, colour premultiplied, of the materials at the UVs."""
         color = self.colors[material]
         color[:, :3] *= color[:, 3:]
         some = np.flatnonzero(self.textured[material])
@@ -88,7 +88,7 @@ class _Textures:
         return color
 
     def _bilinear(self, material: np.ndarray, uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """``[P, 4]`` linear RGBA, colour premultiplied, of the textures, wrapping around."""
+        """Samples ``[P, 4]`` linear RGBA, colour premultiplied, of textures that wrap around."""
         level = np.clip(level, 0, self.starts.shape[1] - 1)
         start = self.starts[material, level]
         width, height = self.widths[material, level], self.heights[material, level]
@@ -119,7 +119,7 @@ def _halvings(texture: np.ndarray | None) -> list[np.ndarray]:
 
 
 def _blend(corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """``[P, K]``: the corners' values ``[P, 3, K]`` by barycentric ``weights [P, 3]``."""
+    """Blends the corners' values ``[P, 3, K]`` by barycentric ``weights [P, 3]`` to ``[P, K]``."""
     return np.einsum("pck,pc->pk", corners, weights)
 
 
@@ -136,8 +136,8 @@ class RayCaster:
 
     Args:
         mesh: in object units, z-up, centred.
-        lights: in the mesh's frame.
-        threads: for Open3D; 0 means all cores.
+        lights: lights in the mesh's frame.
+        threads: number of Open3D's threads; 0 means all cores.
     """
 
     def __init__(self, mesh: TexturedMesh, lights: Lights, threads: int = 1) -> None:
@@ -159,22 +159,22 @@ class RayCaster:
         uv_area = np.abs(
             uv_edges[:, 0, 0] * uv_edges[:, 1, 1] - uv_edges[:, 0, 1] * uv_edges[:, 1, 0]
         )
-        # texture widths per object unit; times texels gives texels per object unit
+        # Texture widths per object unit; a texture's width times this is its texels per unit.
         self._uv_density = np.sqrt(uv_area / np.maximum(area, 1e-12)).astype(np.float32)
         self._has_colors = bool((mesh.colors != 255).any())
 
     def render(self, pose: np.ndarray, size: int, fov: float) -> tuple[np.ndarray, np.ndarray]:
-        """One view.
+        """Renders one view.
 
         Args:
             pose: ``[4, 4]`` camera to world, OpenGL frame.
-            size: pixels a side.
+            size: side of the picture, pixels.
             fov: degrees, of the picture's side.
 
         Returns:
             ``[size, size, 4]`` float32 display RGBA in [0, 1], colour not premultiplied; and
-            ``[size, size]`` float32 depth along the optical axis at the pixels' centres, where half
-            the light is blocked; 0 where nothing is.
+            ``[size, size]`` float32 depth along the optical axis at the pixels' centres: of the
+            point where half the light is blocked, or 0 if there is none.
         """
         n = size * SAMPLES
         half = math.tan(math.radians(fov) / 2)
@@ -198,7 +198,7 @@ class RayCaster:
         return picture, full_depth[SAMPLES // 2 :: SAMPLES, SAMPLES // 2 :: SAMPLES]
 
     def _window(self, pose: np.ndarray, n: int, half: float) -> tuple[tuple, tuple]:
-        """Ranges of sample rows and columns that the object can cover."""
+        """Finds the ranges of sample rows and columns that the object can cover."""
         local = (self.mesh.vertices - pose[:3, 3]) @ pose[:3, :3]
         if (local[:, 2] > -1e-3).any():  # the camera is beside or inside the object
             return (0, n), (0, n)
@@ -212,7 +212,10 @@ class RayCaster:
     def _trace(
         self, origin: np.ndarray, directions: np.ndarray, spacing: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Premultiplied linear RGBA ``[P, 4]`` and depth ``[P]``; directions have unit depth."""
+        """Traces rays to linear RGBA ``[P, 4]``, colour premultiplied, and depth ``[P]``.
+
+        The directions must have unit depth.
+        """
         count = len(directions)
         color = np.zeros((count, 4), np.float32)
         depth = np.zeros(count, np.float32)
@@ -243,12 +246,12 @@ class RayCaster:
     def _surface(
         self, faces: np.ndarray, bary: np.ndarray, directions: np.ndarray, footprint: np.ndarray
     ) -> np.ndarray:
-        """``[P, 4]`` shaded, premultiplied linear RGBA of the hit points."""
+        """Shades the hit points to ``[P, 4]`` linear RGBA, colour premultiplied."""
         mesh = self.mesh
         weights = np.column_stack([1 - bary[:, 0] - bary[:, 1], bary])
         to_camera = -_unit(directions)
         normals = _unit(_blend(mesh.normals[faces], weights))
-        # two-sided: the side of the face that the camera sees
+        # Faces have two sides, and the normal is that of the side that the camera sees.
         normals *= np.sign(_dot(self._face_normals[faces], to_camera))
         material = mesh.material_ids[faces]
         uv = _blend(mesh.uvs[faces], weights)

@@ -1,4 +1,4 @@
-"""`gamba data render`: mesh files to posed RGBA views, as ``gamba_warp.data.dataset`` reads them.
+"""Mesh files to posed RGBA views, as ``gamba_warp.data.dataset`` reads them.
 
 The world of the views is z-up, the object's bounding box is centred in it, its longest side is 1.
 ``applied_transform`` and ``applied_scale`` in ``transforms.json`` say how the file's points got
@@ -12,25 +12,21 @@ import multiprocessing
 import os
 import re
 import shutil
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-import tyro
 from PIL import Image
 from tqdm import tqdm
 
 from gamba_warp.cameras import intrinsics
-from gamba_warp.conventions import DEFAULT_FOV
 from gamba_warp.data.dataset import write_split
 from gamba_warp.data.layouts import read_json
 from gamba_warp.errors import UserError
-from gamba_warp.files import output_folder, write_json
+from gamba_warp.files import write_json
 from gamba_warp.formats.meshes import SUFFIXES, default_up, load_mesh
 from gamba_warp.images import to_uint8
 
@@ -43,19 +39,38 @@ DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
 
 @dataclass(frozen=True)
 class Mesh:
-    """One object to render: its file, its name in the dataset, and what is known of it."""
+    """One object to render.
+
+    Attributes:
+        path: its file.
+        uid: its folder in the dataset.
+        name: what it is called.
+        group: name of the objects that belong on one side of a split.
+        attribution: who made it, and under which licence.
+        rotation: ``[3, 3]``, turns the file's points upright first, or None.
+    """
 
     path: Path
     uid: str
     name: str
     group: str
     attribution: dict[str, str]
-    rotation: list[list[float]] | None = None  # turns the file's points upright first
+    rotation: list[list[float]] | None = None
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the pixels; kept in every ``transforms.json``."""
+    """What decides the pixels; every ``transforms.json`` keeps it.
+
+    Attributes:
+        views: number of views of an object.
+        size: side of the square pictures, pixels.
+        fov: vertical field of view, degrees.
+        seed: seed of cameras and lights.
+        depth: whether depth pictures are written, too.
+        format: "webp-lossless" or "png".
+        up: the axis that points up in the files, "y" or "z", or "auto" by the suffix.
+    """
 
     views: int
     size: int
@@ -121,7 +136,7 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
         What was missing in the mesh's files and replaced.
 
     Raises:
-        UserError: the mesh cannot be read, or the folder not be written.
+        UserError: the mesh cannot be read, or the folder cannot be written.
     """
     up = default_up(mesh.path) if settings.up == "auto" else settings.up
     model, transform, scale = load_mesh(mesh.path).normalized(up, mesh.rotation)
@@ -130,7 +145,8 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
     caster = RayCaster(model, Lights.sample(rng))
     used = model.vertices[np.unique(model.faces)]
     poses = sample_poses(used, settings.views, settings.fov, rng)
-    part = out / f".{mesh.uid}.part"  # the name of one object's, so that no debris can gather
+    # The name is always the same, so that runs that are killed leave no more than one folder.
+    part = out / f".{mesh.uid}.part"
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
@@ -181,63 +197,48 @@ def _write_view(
     return frame
 
 
-def render_command(
-    folder: tyro.conf.Positional[Path],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    views: int = 24,
-    size: int = 128,
-    fov: float = DEFAULT_FOV,
-    seed: int = 0,
-    depth: bool = False,
-    format: Literal["webp-lossless", "png"] = "webp-lossless",
-    up: Literal["auto", "y", "z"] = "auto",
-    shard: str = "0/1",
-    limit: int | None = None,
-    workers: int = 0,
-) -> int:
-    """Render posed RGBA views of every mesh in a folder (.obj .glb .gltf .ply .stl .off).
+def still_missing(meshes: Sequence[Mesh], out: Path, settings: Settings) -> list[Mesh]:
+    """The objects that are not in the dataset ``out`` yet.
 
-    Objects that are already there are skipped, so a run that was stopped goes on where it was.
+    Raises:
+        UserError: an object in it was rendered with other settings.
+    """
+    return [mesh for mesh in meshes if not _is_done(out / mesh.uid, settings)]
+
+
+def render_meshes(
+    meshes: Sequence[Mesh], out: Path, settings: Settings, workers: int
+) -> tuple[dict[str, list[str]], dict[str, str]]:
+    """Renders objects into a dataset, with a progress bar, and writes its split anew.
 
     Args:
-        folder: meshes, at any depth; a catalogue.json in it may give names and attribution.
-        out: the dataset to make or to go on with.
-        views: per object; view 0 is from the front.
-        size: pixels a side.
-        fov: vertical field of view, degrees.
-        seed: of cameras and lights; each object's also depend on its uid.
-        depth: also write 16-bit depth pictures.
-        format: of the pictures; both are lossless.
-        up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
-        shard: i/n renders every n-th object from the i-th, for n machines.
-        limit: stop after this many objects.
+        meshes: the objects.
+        out: the dataset's folder, which is there.
+        settings: what decides the pixels.
         workers: processes; 0 means one per core.
+
+    Returns:
+        By uid, what was missing in the files of a mesh and replaced; and by uid, why an object
+        could not be rendered.
     """
-    settings = Settings(views, size, fov, seed, depth, format, up)
-    _check(settings, workers, limit)
-    meshes = find_meshes(folder)
-    first, count = _parse_shard(shard)
-    meshes = meshes[first::count][:limit]
-    out = output_folder(out)
-    todo = [mesh for mesh in meshes if not _is_done(out / mesh.uid, settings)]
-    if len(todo) < len(meshes):
-        print(f"{len(meshes) - len(todo)} of {len(meshes)} objects are already in {out}")
-    failures, warnings = {}, {}
-    for mesh, result in tqdm(_run(todo, out, settings, workers), total=len(todo), unit="object"):
+    warnings: dict[str, list[str]] = {}
+    failures: dict[str, str] = {}
+    found = _run(meshes, out, settings, workers)
+    for mesh, result in tqdm(found, total=len(meshes), unit="object"):
         if isinstance(result, str):
             failures[mesh.uid] = result
         elif result:
             warnings[mesh.uid] = result
     write_split(out, _groups(out))
-    for uid, lines in sorted(warnings.items()):
-        print(f"warning: {uid}: {'; '.join(lines)}")
-    print(f"rendered {len(todo) - len(failures)} objects into {out}, {len(failures)} failed")
-    for uid, reason in sorted(failures.items()):
-        print(f"failed: {uid}: {reason}", file=sys.stderr)
-    return 1 if failures else 0
+    return warnings, failures
 
 
-def _check(settings: Settings, workers: int, limit: int | None) -> None:
+def check_options(settings: Settings, workers: int, limit: int | None) -> None:
+    """Checks the options' ranges.
+
+    Raises:
+        UserError: an option is out of its range.
+    """
     for name, value, low, high in (
         ("--views", settings.views, 1, 10_000),
         ("--size", settings.size, 8, 4096),
@@ -249,7 +250,12 @@ def _check(settings: Settings, workers: int, limit: int | None) -> None:
             raise UserError(f"{name} {value}: must be {low} to {high}")
 
 
-def _parse_shard(shard: str) -> tuple[int, int]:
+def parse_shard(shard: str) -> tuple[int, int]:
+    """The numbers i and n of ``i/n``.
+
+    Raises:
+        UserError: it is not of that form, or not 0 <= i < n.
+    """
     match = re.fullmatch(r"(\d+)/(\d+)", shard)
     if not match or not int(match[1]) < int(match[2]):
         raise UserError(f"--shard {shard}: expected i/n with 0 <= i < n, such as 0/4")
@@ -257,7 +263,7 @@ def _parse_shard(shard: str) -> tuple[int, int]:
 
 
 def _is_done(folder: Path, settings: Settings) -> bool:
-    """Whether the object is there; other settings than ours are an error, not a silent mix."""
+    """Whether the object is there. With other settings it is refused, so that none are mixed."""
     path = folder / "transforms.json"
     if not path.exists():
         return False
@@ -270,15 +276,15 @@ def _is_done(folder: Path, settings: Settings) -> bool:
 
 
 def _groups(out: Path) -> dict[str, str]:
-    """Groups by uid, of all the objects that are there."""
+    """The group of each object that is there, by uid."""
     found = sorted(out.glob("[!.]*/transforms.json"))
     return {path.parent.name: read_json(path).get("group", path.parent.name) for path in found}
 
 
 def _run(
-    meshes: list[Mesh], out: Path, settings: Settings, workers: int
+    meshes: Sequence[Mesh], out: Path, settings: Settings, workers: int
 ) -> Iterator[tuple[Mesh, list[str] | str]]:
-    """(mesh, warnings or the reason why it failed), as they are ready."""
+    """Yields each mesh with its warnings, or with the reason why it failed, when it is ready."""
     workers = min(workers or os.cpu_count() or 1, len(meshes))
     if workers <= 1:
         for mesh in meshes:

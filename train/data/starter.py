@@ -3,8 +3,7 @@
 ``gamba data furniture --out FURNITURE``, then
 ``python -m gamba_warp.train.data.starter FURNITURE --out starter``. The same call makes the same
 files again. The split is that of the whole furniture set (by group, see
-``gamba_warp.data.dataset``),
-so nothing that is held out here is trained on there.
+``gamba_warp.data.dataset``), so nothing that is held out here is trained on there.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ blendswap-cc-0-desklamp scopia-bed1 scopia-cat scopia-truck
 blendswap-cc-0-teddybear scopia-chair3 scopia-dog-house scopia-toaster
 """.split()
 
-# single pictures by somebody else's renderer, of objects that no training split holds
+# These are single pictures by another renderer, of objects that are in no training split.
 ICONS = """
 blendswap-cc-0-antiquechair blendswap-cc-0-armchair2 blendswap-cc-0-kitchenaid
 blendswap-cc-0-teddybear blendswap-cc-by-decorativeplant blendswap-cc-by-fordfocus

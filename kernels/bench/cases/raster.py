@@ -41,7 +41,13 @@ def cases(settings: Settings) -> list[Case]:
     else:
         builders.append(("32 views", _many_views, None))
     return [
-        Case("raster", name, " ".join(build.__doc__.split()), partial(build, settings), axis)
+        Case(
+            op="raster",
+            name=name,
+            text=" ".join(build.__doc__.split()),
+            build=partial(build, settings),
+            axis=axis,
+        )
         for name, build, axis in builders
     ]
 
@@ -79,8 +85,12 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
         for direction, run in (("forward", scene.forward), (BOTH, scene.backward)):
             made.append(
                 Variant(
-                    *(f"{package}, {name}", partial(run, function), error, 1e-2),
-                    *("our float32 picture", direction),
+                    name=f"{package}, {name}",
+                    run=partial(run, function),
+                    check=error,
+                    limit=1e-2,
+                    oracle="our float32 picture",
+                    direction=direction,
                     peer=True,
                     parameters=sizes_of(scene),
                 )
@@ -89,7 +99,7 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
 
 
 def _gsplat_parts(settings: Settings) -> list[Variant]:
-    """Those of gsplat's torch functions that run on a CPU beside the same part of ours, at scale 1:
+    """The torch functions of gsplat that run on a CPU, beside the same part of ours, at scale 1:
     projection, tile lists (theirs of boxes, ours of ellipses) and harmonics of degree 3. Its
     compositing needs CUDA.
     """
@@ -99,8 +109,11 @@ def _gsplat_parts(settings: Settings) -> list[Variant]:
         for name, run, peer in (("ours", ours, False), ("gsplat", theirs, True)):
             made.append(
                 Variant(
-                    *(name, run, check if peer else None, 1e-4),
-                    "our float32 result" if peer and check else "",
+                    name=name,
+                    run=run,
+                    check=check if peer else None,
+                    limit=1e-4,
+                    oracle="our float32 result" if peer and check else "",
                     direction=part,
                     peer=peer,
                     default=not peer,
@@ -122,8 +135,8 @@ def _skipping(settings: Settings) -> list[Variant]:
         made[-1].work = partial(_gradients_skipped, scene, 1 - 1 / len(LEAVES))
     half = scene.size // 2
     for name, rows in (("half", scene.size), ("a quarter", half)):
-        part = torch.zeros_like(scene.cotangent)
-        part[:, :rows, :half] = scene.cotangent[:, :rows, :half]
+        part = torch.zeros_like(scene.upstream)
+        part[:, :rows, :half] = scene.upstream[:, :rows, :half]
         part = scene.changed(cotangent=part)
         made.append(make_variant(part, f"upstream gradient on {name} of the picture", BOTH))
         made[-1].work = partial(_tiles_skipped, part)
@@ -136,8 +149,8 @@ def _switches(settings: Settings) -> list[Variant]:
     the difference to the default. Skipped: the share of that switch's own count in the default.
     """
     scene = make_scene(settings, 2)
-    part = torch.zeros_like(scene.cotangent)
-    part[:, :, : scene.size // 2] = scene.cotangent[:, :, : scene.size // 2]
+    part = torch.zeros_like(scene.upstream)
+    part[:, :, : scene.size // 2] = scene.upstream[:, :, : scene.size // 2]
     scene = scene.changed(cotangent=part, wanted=("means",))
     made = make_pair(scene, "all skips", default=True)
     for field in fields(Skip):
@@ -184,8 +197,11 @@ def _one_call(settings: Settings) -> list[Variant]:
     x, viewmats, Ks = together.gaussians, together.viewmats, together.Ks
     single = [
         Scene(
-            *({k: values[b] for k, values in x.items()}, viewmats[b, v : v + 1], Ks[b, v : v + 1]),
-            *(size, settings.device),
+            gaussians={k: values[b] for k, values in x.items()},
+            viewmats=viewmats[b, v : v + 1],
+            Ks=Ks[b, v : v + 1],
+            size=size,
+            device=settings.device,
         )
         for b in range(objects)
         for v in range(views)

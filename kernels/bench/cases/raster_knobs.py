@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 
-from ...rasterize.cpu import tuning as cpu_variant
+from ...rasterize.cpu.tuning import Tuning, use_tuning
 from ..core.case import Settings, Variant, on_kernels
 from .raster_scene import Scene
 from .raster_variants import TRADE_LIMIT, make_pair, make_scene, make_variant
@@ -43,8 +41,8 @@ def trades(settings: Settings) -> list[Variant]:
         made[-1].dtype = made[-2].dtype = name
     if settings.device.type == "cpu":
         made += on_kernels(
-            cpu_variant.use_variant,
-            cpu_variant.Variant(degree=3),
+            use_tuning,
+            Tuning(degree=3),
             make_pair(scene, "exp of degree 3", limit=TRADE_LIMIT),
         )
     return made
@@ -59,11 +57,11 @@ def exponential(settings: Settings) -> list[Variant]:
     same thresholds, so that the polynomial alone is seen: without them ("knobs") their error
     hides it. Degree 5 errs by float32's own rounding at a price that is hardly to be measured.
     """
-    scene, default, made = make_scene(settings, 2), cpu_variant.Variant(), []
+    scene, default, made = make_scene(settings, 2), Tuning(), []
     for degree in (3, 5) if settings.level == "quick" else (2, 3, 4, 5):
-        choice = replace(default, degree=degree)
+        choice = Tuning(degree=degree)
         pair = make_pair(scene, f"degree {degree}", limit=TRADE_LIMIT, default=choice == default)
-        made += on_kernels(cpu_variant.use_variant, choice, pair)
+        made += on_kernels(use_tuning, choice, pair)
     return made
 
 
@@ -72,10 +70,10 @@ def tiles(settings: Settings) -> list[Variant]:
     against in them, of the CPU's kernels, at scale 2. Same picture: a smaller tile makes more
     pairs, a larger sub-tile more evaluations.
     """
-    scene, default, made = make_scene(settings, 2), cpu_variant.Variant(), []
+    scene, default, made = make_scene(settings, 2), Tuning(), []
     sizes = [(16, 4, 4), (16, 8, 4), (16, 8, 8), (16, 16, 16), (8, 4, 4), (8, 8, 8)]
     for tile, width, height in sizes[::4] if settings.level == "quick" else sizes:
-        choice = replace(default, tile=tile, width=width, height=height)
+        choice = Tuning(tile=tile, width=width, height=height)
         pair = make_pair(scene, f"{tile}, {width} x {height}", default=choice == default)
-        made += on_kernels(cpu_variant.use_variant, choice, pair)
+        made += on_kernels(use_tuning, choice, pair)
     return made

@@ -8,13 +8,16 @@ import torch
 from torch import Tensor
 
 from ...rasterize import Skip
+from ...rasterize.constants import ALPHA_MIN, EPS2D, TILE
+from ...rasterize.cpu.tuning import current
 from ...rasterize.harmonics import colors_from_harmonics
 from ...rasterize.ops import bin_op, project
+from ...rasterize.project import LensOptions, Projected
 from .. import peers
 from ..core.case import Error, compare
 from .raster_scene import Scene
 
-_DEGREE, _TILE = 3, 16
+_DEGREE = 3
 
 
 class Parts:
@@ -27,41 +30,55 @@ class Parts:
         g = torch.Generator().manual_seed(5)
         self.coefficients = 0.3 * torch.randn(count, (_DEGREE + 1) ** 2, 3, generator=g)
         self.projected = self.project()
-        _, _, self.depths, _, self.extents, _ = self.projected
 
     @torch.no_grad()
-    def project(self) -> tuple[Tensor, ...]:
-        """Timed: ours."""
-        lens = [float(self.size), float(self.size), 0.01, 1e10, 0.0, 0.3, 1 / 255, 0.0, 1.0]
+    def project(self) -> Projected:
+        """Our projection, which is timed."""
+        lens = LensOptions(
+            width=self.size,
+            height=self.size,
+            near_plane=0.01,
+            far_plane=1e10,
+            radius_clip=0.0,
+            eps2d=EPS2D,
+            alpha_min=ALPHA_MIN,
+            antialiased=False,
+            skip_unused=True,
+        )
         each = [self.x[k][None] for k in ("means", "quats", "scales", "opacities", "colors")]
-        return project(*each, self.viewmats[None], self.Ks[None], lens)
+        return Projected(*project(*each, self.viewmats[None], self.Ks[None], lens.numbers()))
 
     def gsplat_project(self) -> Tensor:
-        """Timed: the centres in the picture, ``[V, N, 2]``."""
-        gaussians = [self.x[k] for k in ("means", "quats", "scales")]
-        return peers.gsplat_projection(*gaussians, self.viewmats, self.Ks, self.size)
+        """The centres that gsplat finds in the picture, ``[V, N, 2]``; this is timed."""
+        means, quats, scales = (self.x[k] for k in ("means", "quats", "scales"))
+        return peers.gsplat_projection(means, quats, scales, self.viewmats, self.Ks, self.size)
 
     def bin(self) -> tuple[Tensor, ...]:
-        """Timed: ours."""
-        per_view = [x.flatten(0, 1) for x in self.projected[:5]]
-        return bin_op(*per_view, self.size, self.size, 1 / 255, Skip().bits())
+        """Our tile lists, which are timed."""
+        x = self.projected
+        parts = x.means2d, x.conics, x.depths, x.view_opacities, x.extents
+        per_view = [part.flatten(0, 1) for part in parts]
+        means2d, conics, depths, opacities, extents = per_view
+        options = self.size, self.size, ALPHA_MIN, Skip().bits(), current().numbers()
+        return bin_op(means2d, conics, depths, opacities, extents, *options)
 
     def gsplat_bin(self) -> object:
-        """Timed: its lists of the same boxes."""
-        tiles = -(-self.size // _TILE)
+        """The lists that gsplat makes of the same boxes; this is timed."""
+        tiles = -(-self.size // TILE)
         code = peers.load("gsplat.cuda._torch_impl", "gsplat")
-        radii = self.extents[0].ceil().int()
-        return code._isect_tiles(self.projected[0][0], radii, self.depths[0], _TILE, tiles, tiles)
+        x = self.projected
+        radii = x.extents[0].ceil().int()
+        return code._isect_tiles(x.means2d[0], radii, x.depths[0], TILE, tiles, tiles)
 
     @torch.no_grad()
     def harmonics(self) -> Tensor:
-        """Timed: ours, ``[1, V, N, 3]``."""
+        """Our colours ``[1, V, N, 3]``, which are timed."""
         means, coefficients = self.x["means"][None], self.coefficients[None]
         return colors_from_harmonics(_DEGREE, coefficients, means, self.viewmats[None])
 
     @torch.no_grad()
     def gsplat_harmonics(self) -> Tensor:
-        """Timed: with the clamp that its operator puts behind them."""
+        """The colours of gsplat, with the clamp that its operator has; this is timed."""
         code = peers.load("gsplat.cuda._torch_impl", "gsplat")
         centre = torch.linalg.inv(self.viewmats)[0, :3, 3]
         colors = code._spherical_harmonics(_DEGREE, self.x["means"] - centre, self.coefficients)
@@ -74,7 +91,7 @@ class Parts:
                 self.project,
                 self.gsplat_project,
                 lambda: compare(
-                    {"centres": self.gsplat_project()}, {"centres": self.project()[0][0]}
+                    {"centres": self.gsplat_project()}, {"centres": self.project().means2d[0]}
                 ),
             ),
             "tile lists": (self.bin, self.gsplat_bin, None),

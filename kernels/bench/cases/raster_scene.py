@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ WORK = (
     "tiles_empty",
 )
 _HALF_FOV = math.radians(49.1) / 2
-_FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # of pictures of 512², width and height
+_FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # width and height, pixels
 
 
 def shell(count: int, scale: float = 1.0, seed: int = 0) -> dict[str, Tensor]:
@@ -65,7 +66,7 @@ class Scene:
         viewmats: ``[.., V, 4, 4]``.
         Ks: ``[.., V, 3, 3]``.
         size: side of the picture, pixels.
-        device: where the operator runs.
+        device: of the operator.
         options: of ``rasterization``.
         wanted: what gradients are asked for.
         exact: options of the oracle where it shall not have ours, as ``alpha_min``.
@@ -94,17 +95,23 @@ class Scene:
             shape = (*self.viewmats.shape[:-2], self.size, self.size, 3)
             self.cotangent = torch.randn(shape, generator=g).to(self.device)
 
+    @property
+    def upstream(self) -> Tensor:
+        """The cotangent of the picture, given or drawn."""
+        assert self.cotangent is not None  # ``__post_init__`` draws one
+        return self.cotangent
+
     def changed(self, **changes) -> Scene:
         """A copy with other attributes."""
         return Scene(**(vars(self) | changes))
 
     def arguments(self) -> dict:
-        """Of the operator."""
+        """What the operator is called with."""
         cameras = dict(viewmats=self.viewmats, Ks=self.Ks, width=self.size, height=self.size)
         return self.gaussians | cameras | self.options
 
     def forward(self, function=rasterization) -> tuple[Tensor, Tensor, dict]:
-        """Timed: no gradient."""
+        """A call without gradient, which is timed."""
         with torch.no_grad():
             return function(**self.arguments())
 
@@ -114,19 +121,21 @@ class Scene:
         return {k: self.gaussians[k].detach().requires_grad_() for k in wanted}
 
     def backward(self, function=rasterization) -> tuple[Tensor, ...]:
-        """Timed: forward, and the gradients asked for."""
+        """A call and the gradients asked for, which is timed."""
         leaves = self.leaves()
-        image, _, _ = function(**(self.arguments() | leaves))
+        given: dict[str, Any] = {**self.arguments(), **leaves}
+        image, _, _ = function(**given)
         return torch.autograd.grad(
-            image, list(leaves.values()), self.cotangent[..., : image.shape[-1]]
+            image, list(leaves.values()), self.upstream[..., : image.shape[-1]]
         )
 
     def work(self, backward: bool = False) -> dict[str, int]:
         """The operator's own counts."""
         leaves = self.leaves()
-        image, _, meta = rasterization(**(self.arguments() | leaves))
+        given: dict[str, Any] = {**self.arguments(), **leaves}
+        image, _, meta = rasterization(**given)
         if backward:
-            cotangent = self.cotangent[..., : image.shape[-1]]
+            cotangent = self.upstream[..., : image.shape[-1]]
             torch.autograd.grad(image, list(leaves.values()), cotangent)
         counts = {}
         for name in (*WORK, "tiles_skipped") if backward else WORK:

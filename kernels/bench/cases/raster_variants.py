@@ -40,12 +40,12 @@ def make_variant(
     """A variant that calls the operator on a scene."""
     backward = direction == BOTH
     return Variant(
-        name,
-        scene.backward if backward else scene.forward,
-        partial(scene.check, backward),
-        limit or (BACKWARD_LIMIT if backward else FORWARD_LIMIT),
-        scene.oracle(backward),
-        direction,
+        name=name,
+        run=scene.backward if backward else scene.forward,
+        check=partial(scene.check, backward),
+        limit=limit or (BACKWARD_LIMIT if backward else FORWARD_LIMIT),
+        oracle=scene.oracle(backward),
+        direction=direction,
         parameters=sizes_of(scene),
         work=partial(scene.work, backward),
         **changes,

@@ -33,7 +33,7 @@ def cases(settings: Settings) -> list[Case]:
         ("knobs", _knobs, "error"),
         *([("exponential", scan_knobs.exponential, "error")] if cpu else []),
         *([("boundary spacing", scan_knobs.spacings, "error,memory,spacing")] if cpu else []),
-        ("chunk size", scan_knobs.chunks if cpu else scan_knobs.cuda_variants, "error"),
+        ("chunk size", scan_knobs.chunks if cpu else scan_knobs.cuda_tunings, "error"),
         ("length", _lengths, "L"),
         ("batch", _batches, "B"),
         ("states", _states, "N"),

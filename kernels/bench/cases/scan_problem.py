@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -105,7 +106,8 @@ class ScanProblem:
         state = self.initial_state
         if state is not None:
             options["initial_state"] = state.to(self.device)
-        return selective_scan(**inputs, delta_softplus=self.softplus, **options)
+        given: dict[str, Any] = {**inputs, **options}
+        return selective_scan(**given, delta_softplus=self.softplus)
 
     def forward(self, dtype: torch.dtype = torch.float32, **options) -> Tensor:
         """Timed: no gradient."""

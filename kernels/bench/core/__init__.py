@@ -1,1 +1,1 @@
-"""What every benchmark stands on: cases, the clock, reports, pages and charts."""
+"""The parts that every benchmark uses: cases, the clock, reports, pages and charts."""

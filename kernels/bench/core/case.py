@@ -1,17 +1,18 @@
-"""What is measured: cases, each a few variants timed in turn, and the targets set on them."""
+"""What is measured: cases, each of a few variants that are timed in turn, and their targets."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
 
 class NotInstalled(Exception):
-    """A peer that is not there; ``str(error)`` names its package."""
+    """Raised for a peer that is not installed; ``str(error)`` names its package."""
 
 
 @dataclass(frozen=True)
@@ -19,9 +20,9 @@ class Level:
     """How long to measure.
 
     Attributes:
-        seconds: spent on a variant, once it has its fewest rounds.
-        fewest: rounds at least.
-        most: rounds at most.
+        seconds: time for a variant; it takes longer only to reach ``fewest``.
+        fewest: least number of rounds.
+        most: greatest number of rounds.
     """
 
     seconds: float
@@ -37,10 +38,10 @@ class Settings:
     """What a run was asked for.
 
     Attributes:
-        device: where everything runs.
+        device: device of all cases.
         level: key of ``LEVELS``; cases also choose their sizes by it.
-        peers: whether other people's packages are measured too, where they are installed.
-        threads: of torch on the CPU; a variant may ask for another number.
+        peers: whether other people's packages are measured too, if they are installed.
+        threads: number of torch's threads on the CPU; a variant may ask for another number.
     """
 
     device: torch.device
@@ -54,8 +55,8 @@ class Error:
     """How far a result is from the oracle.
 
     Attributes:
-        rel_rms: rms of the difference over rms of the truth; of the worst tensor.
-        maximum: largest difference over the largest value of the truth; of the worst tensor.
+        rel_rms: rms of the difference over rms of the truth, of the worst tensor.
+        maximum: largest difference over the largest value of the truth, of the worst tensor.
         worst: name of the tensor with that ``rel_rms``.
     """
 
@@ -65,7 +66,7 @@ class Error:
 
 
 def compare(got: Mapping[str, Tensor], want: Mapping[str, Tensor]) -> Error:
-    """Error of named results, in float64 on the CPU; NaN or a wrong shape makes it infinite."""
+    """Computes the error of named results in float64; NaN or a wrong shape makes it infinite."""
     rel_rms, maximum, worst = 0.0, 0.0, ""
     for name, truth in want.items():
         value, truth = got[name].detach().double().cpu(), truth.detach().double().cpu()
@@ -74,7 +75,7 @@ def compare(got: Mapping[str, Tensor], want: Mapping[str, Tensor]) -> Error:
         if not truth.numel():
             continue
         difference = value - truth
-        # a truth of zeros: the difference itself, as if it were to be 1
+        # If the truth is all zeros, the difference is taken as it is.
         rms = truth.square().mean().sqrt().item() or 1.0
         relative = difference.square().mean().sqrt().item() / rms
         if relative >= rel_rms:
@@ -88,20 +89,20 @@ class Variant:
     """One thing that is timed.
 
     Attributes:
-        name: within its case, unique for a direction.
-        run: what is timed; its first call is timed apart.
-        check: computes the error, before the clock, or raises; without an oracle None, or a check
-            that returns None.
-        limit: of the check's ``rel_rms``; above it no time is printed.
-        oracle: against what, and on which part of the input, in words.
+        name: name within its case, unique for a direction.
+        run: function that is timed; its first call is timed apart.
+        check: function that computes the error before the clock starts, or raises; None, or a
+            function that returns None, if there is no oracle.
+        limit: largest ``rel_rms`` of the check; above it no time is printed.
+        oracle: what the error is measured against, and on which part of the input, in words.
         direction: "forward" or "forward+backward".
-        dtype: of the inputs and outputs.
-        peer: not ours; ours are compared with the fastest of these.
-        default: what a caller gets who asks for nothing.
-        threads: of torch on the CPU in this variant, or None for the run's.
-        rounds: at most so many, for what is slow.
-        parameters: sizes, for the tables and charts.
-        work: counts, taken after the clock has stopped.
+        dtype: dtype of the inputs and outputs.
+        peer: whether it is other people's code; ours is compared with the fastest of these.
+        default: whether it is what a caller gets who asks for nothing.
+        threads: number of torch's threads on the CPU, or None for the run's.
+        rounds: greatest number of rounds, for what is slow.
+        parameters: sizes (numbers or text), for the tables and charts.
+        work: function that counts work after the clock has stopped.
     """
 
     name: str
@@ -115,12 +116,12 @@ class Variant:
     default: bool = False
     threads: int | None = None
     rounds: int | None = None
-    parameters: dict[str, int | float | str] = field(default_factory=dict)
-    work: Callable[[], dict[str, int | float]] | None = None
+    parameters: dict[str, Any] = field(default_factory=dict)
+    work: Callable[[], Mapping[str, int | float]] | None = None
 
 
 def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Variant]:
-    """Has ``made`` run, be checked and counted inside ``use(choice)``, which chooses kernels."""
+    """Makes variants run, check and count inside ``use(choice)``, which chooses kernels."""
 
     def inside(function: Callable) -> Callable:
         def run():
@@ -130,7 +131,9 @@ def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Varia
         return run
 
     for variant in made:
-        variant.run, variant.check = inside(variant.run), inside(variant.check)
+        variant.run = inside(variant.run)
+        if variant.check is not None:
+            variant.check = inside(variant.check)
         if variant.work is not None:
             variant.work = inside(variant.work)
     return made
@@ -144,8 +147,9 @@ class Case:
         op: scan, conv, raster, block, model or train-step.
         name: unique within the op.
         text: one sentence on what is compared.
-        build: makes the inputs and the variants; what they hold is freed after the case.
-        axis: parameter along which cost is drawn; "error" draws time against error; None: no chart.
+        build: function that makes the inputs and the variants; they are freed after the case.
+        axis: parameter along which cost is drawn; "error" draws time against error, and None draws
+            no chart.
     """
 
     op: str
@@ -157,7 +161,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Key:
-    """Finds a figure: op, case, variant, direction and field (``ms_p50`` or a key of ``work``)."""
+    """The key of a figure; ``field`` is ``ms_p50`` or a key of the record's ``work``."""
 
     op: str
     case: str
@@ -171,10 +175,10 @@ class Target:
     """A figure, or a quotient of figures, that should be reached.
 
     Attributes:
-        text: what it is.
+        text: meaning of the figure, in words.
         times: figures to multiply.
         over: figures to divide by.
-        scale: multiplies the quotient.
+        scale: factor of the quotient.
         at_least: the bound, if it is a lower one.
         at_most: the bound, if it is an upper one.
     """

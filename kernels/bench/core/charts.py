@@ -1,4 +1,4 @@
-"""Charts as inline SVG: points with names, lines, logarithmic axes; colours come from the page."""
+"""Charts as inline SVG: named points, lines and logarithmic axes; the page sets the colours."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CHARACTER, _LINE = 6.4, 13.0  # size of a label's character, pixels
 
 @dataclass(frozen=True)
 class Point:
-    """One figure. ``mark`` is "", "default" or "peer"; ``label`` is drawn beside it."""
+    """One figure; ``mark`` is "", "default" or "peer", and ``label`` is drawn beside it."""
 
     x: float
     y: float
@@ -24,7 +24,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one colour. ``line``: "", "straight" between them, or "steps" in their place."""
+    """Points of one colour; ``line`` is "", "straight" between them, or "steps" without them."""
 
     name: str
     points: Sequence[Point]
@@ -33,7 +33,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """What an axis shows, its unit included; ``values`` are its ticks if given."""
+    """What an axis shows, with its unit; ``values`` are its ticks, if they are given."""
 
     label: str
     logarithmic: bool = True
@@ -41,7 +41,7 @@ class Axis:
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Those to which no other is at least as good in x and in y (both: less is better), by x."""
+    """Returns, by x, the points that no other one equals or beats in both x and y (less wins)."""
     front: list[Point] = []
     for point in sorted(points, key=lambda p: (p.x, p.y)):
         if not front or point.y < front[-1].y:
@@ -50,7 +50,7 @@ def pareto(points: Sequence[Point]) -> list[Point]:
 
 
 def chart(series: Sequence[Series], x: Axis, y: Axis) -> str:
-    """The ``<svg>`` element; empty text where there is nothing to show.
+    """Returns the ``<svg>`` element, or an empty text if there is nothing to show.
 
     Points that are not finite, or not positive on a logarithmic axis, are left out.
     """
@@ -81,11 +81,11 @@ def _fits(value: float, axis: Axis) -> bool:
 
 
 def _scale(values: list[float], axis: Axis, start: float, end: float):
-    """The map from figures to pixels, with some room at both ends; ``low, high`` are its bounds."""
+    """Makes the map from figures to pixels, with room at both ends; ``low, high`` bound it."""
     bend = math.log10 if axis.logarithmic else float
     low, high = bend(min(values)), bend(max(values))
     room = 0.08 * (high - low) or (0.3 if axis.logarithmic else abs(high) or 1.0)
-    if axis.logarithmic:  # at least a factor of 2.5: noise shall not look like more
+    if axis.logarithmic:  # show at least a factor of 2.5, so that noise does not look like more
         room = max(room, (0.4 - high + low) / 2)
     low, high = low - room, high + room
 
@@ -140,7 +140,7 @@ def _number(value: float) -> str:
 def _line(placed: list[tuple[float, float]], kind: str, colour: int) -> str:
     if not kind:
         return ""
-    if kind == "steps":  # the least y that is had for at most x
+    if kind == "steps":  # the line shows the least y that can be had for at most x
         corners = [(after[0], at[1]) for at, after in zip(placed, placed[1:])]
         placed = [p for pair in zip(placed, [*corners, placed[-1]]) for p in pair]
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in placed)
@@ -161,18 +161,19 @@ def _mark(at: tuple[float, float], point: Point, colour: int) -> str:
 
 
 def _labels(named: list[tuple[tuple[float, float], str]]) -> list[str]:
-    """Texts beside their points, each at the first place near it where it hides nothing."""
+    """Puts texts beside their points, each at the first position that hides nothing."""
     taken = [(x - 9, y - 9, x + 9, y + 9) for (x, y), _ in named]
     parts = []
     for (x, y), text in named:
         width = _CHARACTER * len(text)
-        places = [
+        positions = [
             (left, y + 4 + lines * _LINE)
             for lines in (0, -1, 1, -2, 2, -3, 3, -4, 4)
             for left in (x + 12, x - 12 - width)
         ]
         left, base = next(
-            ((a, b) for a, b in places if _free((a, b - 11, a + width, b + 3), taken)), places[0]
+            ((a, b) for a, b in positions if _free((a, b - 11, a + width, b + 3), taken)),
+            positions[0],
         )
         taken.append((left, base - 11, left + width, base + 3))
         parts.append(f'<text x="{left:.1f}" y="{base:.1f}">{html.escape(text)}</text>')

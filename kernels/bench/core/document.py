@@ -1,4 +1,4 @@
-"""What a result file must hold before anything is made of it."""
+"""The check of a result file, which comes before any use of it."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
 
 
 def parse_document(text: str) -> dict:
-    """Reads the text of a bench.json and checks that all is there that reports need.
+    """Reads the text of a bench.json and checks that it holds all that reports need.
 
     Raises:
-        ValueError: not JSON, numbers that are not finite, another format, or something missing or
-            of another type; the message says what and where.
+        ValueError: the text is not JSON or of another format, a number is not finite, or something
+            is missing or of another type; the message names it.
     """
     try:
         document = json.loads(text, parse_constant=_refuse)
@@ -65,11 +65,11 @@ def _refuse(name: str) -> None:
     raise ValueError(f"{name} is no number of JSON")
 
 
-def _check(where: str, row: object, fields: dict[str, tuple[type, ...]]) -> None:
+def _check(name: str, row: object, fields: dict[str, tuple[type, ...]]) -> None:
     if not isinstance(row, dict):
-        raise ValueError(f"damaged: {where} is missing or is no object")
-    for name, kinds in fields.items():
-        if name not in row:
-            raise ValueError(f"damaged: {where} has no {name}")
-        if type(row[name]) not in kinds:
-            raise ValueError(f"damaged: {where}.{name} is {str(row[name])[:40]!r}")
+        raise ValueError(f"damaged: {name} is missing or is no object")
+    for key, kinds in fields.items():
+        if key not in row:
+            raise ValueError(f"damaged: {name} has no {key}")
+        if type(row[key]) not in kinds:
+            raise ValueError(f"damaged: {name}.{key} is {str(row[key])[:40]!r}")

@@ -1,7 +1,8 @@
-"""Runs cases: first call, check, clock, counts; what fails its check gets no time."""
+"""Runs cases: first call, check, clock, counts. What fails its check gets no time."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import datetime
 import gc
@@ -9,7 +10,7 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,9 @@ from .case import LEVELS, Case, NotInstalled, Settings, Variant
 
 FORMAT = "gamba_warp.bench.1"
 _TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
+# Options of Linux's prctl, and its further arguments, which must be zeros.
+_SET_THP_DISABLE, _GET_THP_DISABLE = 41, 42
+_NO_MORE = (ctypes.c_ulong(0),) * 4
 
 
 @dataclass
@@ -40,7 +44,7 @@ class _Timed:
 
 
 def synchronize(device: torch.device) -> None:
-    """Waits for the GPU, if it is one."""
+    """Waits until a GPU has done its work; a CPU needs no waiting."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -56,9 +60,9 @@ def measure(
     Ctrl-C ends the run: ``interrupted`` is set and what was measured is kept.
 
     Args:
-        cases: in this order.
-        settings: what was asked for.
-        say: called with the case's and the variant's name before each step.
+        cases: cases in the order of their measuring.
+        settings: settings of the run.
+        say: function that gets the case's and the variant's name before each step.
 
     Returns:
         ``{format, machine, settings, interrupted, records}``, ready for JSON. A record has ``op,
@@ -143,7 +147,7 @@ def _record(case: Case, variant: Variant, settings: Settings) -> dict:
 
 
 def _prepare(t: _Timed, settings: Settings) -> None:
-    """First call and check; sets the status."""
+    """Makes the first call and the check, and sets the status."""
     torch.set_num_threads(t.variant.threads or settings.threads)
     try:
         started = time.perf_counter()
@@ -186,7 +190,7 @@ def _clock(ready: list[_Timed], settings: Settings, say: Callable) -> None:
                     result = t.variant.run()
                     synchronize(settings.device)
                     t.seconds.append(time.perf_counter() - started)
-                    del result  # freeing is not timed, nor is it in the next variant's time
+                    del result  # freeing it is in no variant's time
                 except Exception as error:
                     t.record["status"] = _reason(error)
                     ready.remove(t)
@@ -207,7 +211,7 @@ def _summarize(t: _Timed) -> None:
 
 
 def _set_peers(records: list[dict]) -> None:
-    """The fastest peer of the same direction and sizes."""
+    """Names in each record the fastest peer of the same direction and sizes."""
     for record in records:
         same = [
             r
@@ -228,7 +232,7 @@ def _reason(error: Exception) -> str:
 
 
 def machine(settings: Settings) -> dict:
-    """What decides the figures: processor, threads, versions, day. No names, no paths."""
+    """Returns what decides the figures: processor, threads, versions and day, but no names."""
     gpu = None
     if settings.device.type == "cuda":
         gpu = torch.cuda.get_device_name(settings.device)
@@ -258,10 +262,10 @@ def _cpu_model() -> str:
 
 
 def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
-    """Growth of memory while ``run`` runs, its result included; None where it cannot be seen.
+    """Measures the growth of memory while ``run`` runs, in bytes, its result included.
 
-    On CUDA torch's own count; on Linux the process's resident memory, whose high-water mark the
-    kernel lets us reset.
+    On CUDA this is torch's own count. On Linux it is the process's resident memory, whose
+    high-water mark the kernel lets us reset; on other systems it is None.
     """
     if device.type == "cuda":
         synchronize(device)
@@ -272,15 +276,35 @@ def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
         del result
         return torch.cuda.max_memory_allocated(device) - before
     try:
-        ctypes.CDLL(None).malloc_trim(0)  # else memory that is free, but kept, serves unseen
-        Path("/proc/self/clear_refs").write_text("5")
-        before = _resident("VmRSS")
-        result = run()
-        after = _resident("VmHWM")
+        with _small_pages():
+            ctypes.CDLL(None).malloc_trim(0)  # memory that is free but kept would be reused unseen
+            Path("/proc/self/clear_refs").write_text("5")
+            before = _resident("VmRSS")
+            result = run()
+            after = _resident("VmHWM")
     except (OSError, AttributeError, StopIteration):
         return None
     del result
     return after - before
+
+
+@contextlib.contextmanager
+def _small_pages() -> Iterator[None]:
+    """Keeps Linux from using huge pages for this process.
+
+    numpy asks for huge pages under each array of 4 MiB or more, and the heap keeps this mark after
+    the array is freed. What lies there later would be counted in steps of 2 MiB.
+
+    Raises:
+        AttributeError: the system is not Linux.
+    """
+    prctl = ctypes.CDLL(None).prctl
+    disabled = prctl(_GET_THP_DISABLE, *_NO_MORE)
+    prctl(_SET_THP_DISABLE, ctypes.c_ulong(1), *_NO_MORE[1:])
+    try:
+        yield
+    finally:
+        prctl(_SET_THP_DISABLE, ctypes.c_ulong(max(disabled, 0)), *_NO_MORE[1:])
 
 
 def _resident(name: str) -> int:
@@ -289,7 +313,7 @@ def _resident(name: str) -> int:
 
 
 def saved_bytes(forward: Callable[[], object], inputs: Iterable[torch.Tensor]) -> int:
-    """Bytes that a forward pass keeps for its backward, the inputs themselves not counted."""
+    """Counts the bytes that a forward pass keeps for its backward, without the inputs."""
     own = {x.untyped_storage().data_ptr() for x in inputs}
     seen: dict[int, int] = {}
 

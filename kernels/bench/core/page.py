@@ -1,4 +1,4 @@
-"""The page with charts: one HTML file, nothing loaded."""
+"""The page with charts: one HTML file that loads nothing else."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _AXES = {
 
 
 def charts_of(case: str, records: Sequence[dict]) -> list[str]:
-    """The case's charts, by its axis; none where there is none or nothing was measured."""
-    axis = records[0]["axis"]
+    """Draws the case's charts, by its axis; there are none without an axis or figures."""
+    axis: str | None = records[0]["axis"]
     done = [r for r in records if r["status"] == "ok"]
     if axis is None or not done:
         return []
@@ -49,9 +49,9 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
 
 
 def _error_chart(records: Sequence[dict], direction: str) -> str:
-    """Time against error: less is better in both; the front is what no other variant beats."""
+    """Draws time against error, both better if less; no variant beats those on the front."""
     errors = [r["rel_rms_error"] for r in records if r["rel_rms_error"]]
-    bottom = min(errors, default=0.0) / 3  # where an error of 0 is drawn, and said to be so
+    bottom = min(errors, default=0.0) / 3  # an error of 0 is drawn here, and labelled
     points = []
     for r in records:
         point = _marked(r, r["rel_rms_error"] or 0.0)
@@ -73,7 +73,7 @@ def _marked(record: dict, y: float) -> Point:
 
 
 def _memory_chart(records: Sequence[dict]) -> str:
-    """Time against what is kept for the gradient."""
+    """Draws time against the memory that is kept for the gradient."""
     kept = [r for r in records if "saved_bytes" in r["work"]]
     points = [_marked(r, r["work"]["saved_bytes"] / 2**20) for r in kept]
     front = Series("Pareto front", pareto(points), "steps")
@@ -82,18 +82,18 @@ def _memory_chart(records: Sequence[dict]) -> str:
 
 
 def _skip_chart(records: Sequence[dict], switched_off: bool) -> str:
-    """Work skipped against time saved, as shares of the time of whoever does all the work.
+    """Draws work skipped against time saved, as shares of the time without the skip.
 
-    That is the default of the same direction; or, where variants are without a skip that the
-    default has, the variant.
+    That is the time of the default of the same direction or, if the default skips and the variants
+    do not (``switched_off``), the time of the variant.
     """
     series = []
     for direction in dict.fromkeys(r["direction"] for r in records):
         found = [r for r in records if r["direction"] == direction]
         base = next((r["ms_p50"] for r in found if r["is_default"]), None)
         points = []
-        for r in found if base else []:
-            if "skipped" in r["work"] and not (switched_off and r["is_default"]):
+        for r in found:
+            if base and "skipped" in r["work"] and not (switched_off and r["is_default"]):
                 less, all_of_it = (base, r["ms_p50"]) if switched_off else (r["ms_p50"], base)
                 saved = 100 * (1 - less / all_of_it)
                 name = r["variant"].removeprefix("without ") if switched_off else r["variant"]
@@ -146,7 +146,7 @@ td.number { text-align: right; white-space: nowrap; }
 
 
 def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
-    """A self-contained HTML page: the tables and the charts."""
+    """Returns a self-contained HTML page with the tables and the charts."""
     body = [f"<header><h1>{title}</h1><p>{EXPLANATION}</p>"]
     body.append("<p>Circle: ours; ring: the default; square: a peer.</p></header>")
     for document in documents:

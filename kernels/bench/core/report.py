@@ -1,4 +1,4 @@
-"""What was measured, for people: targets, ratios and Markdown tables."""
+"""What was measured, in a form for people: targets, ratios and Markdown tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .case import Key, Target
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
 
-# counts that the tables show; the JSON has all
+# The tables show these counts under these names; the JSON has all counts.
 _WORK = {
     "pairs_box": "pairs of boxes",
     "pairs": "of ellipses",
@@ -30,7 +30,7 @@ def judge(targets: Iterable[Target], records: Sequence[dict]) -> list[dict]:
 
     Returns:
         ``{op, text, wanted, value, reached}`` for each target whose cases were measured; ``value``
-        and ``reached`` are None where a figure is not there.
+        and ``reached`` are None if a figure is missing.
     """
     cases = {(r["op"], r["case"]) for r in records}
     rows = []
@@ -72,20 +72,20 @@ def _figure(key: Key, records: Sequence[dict]) -> float | None:
 
 
 def identity(record: dict) -> tuple[str, ...]:
-    """What tells records of one document apart."""
+    """Returns the values that tell the records of one document apart."""
     names = ("op", "case", "variant", "direction", "dtype", "device")
     return tuple(str(record[name]) for name in names)
 
 
 def ratios(old: dict, new: dict) -> list[tuple[dict, float, float]]:
-    """Records of the new document that the old one has too, with both median times in ms."""
+    """Pairs the records that both documents have; returns the new one and both medians in ms."""
     before = {identity(r): r["ms_p50"] for r in old["records"]}
     pairs = [(r, before.get(identity(r)), r["ms_p50"]) for r in new["records"]]
     return [(r, a, b) for r, a, b in pairs if a and b]
 
 
 def ratio_table(old: dict, new: dict) -> str:
-    """``ratios`` as text; over 1 is slower than before."""
+    """Returns ``ratios`` as text; a ratio over 1 is slower than before."""
     rows = [
         f"{b / a:8.2f} x  {a:10.4g} -> {b:10.4g} ms  "
         f"{r['op']} · {r['case']} · {r['variant']} · {r['direction']} · {r['dtype']}"
@@ -100,7 +100,7 @@ def ratio_table(old: dict, new: dict) -> str:
 
 
 def machine_line(document: dict) -> str:
-    """The machine and the versions in one line."""
+    """Returns the machine and the versions in one line."""
     m = document["machine"]
     parts = [m["gpu"], f"CUDA {m['cuda']}"] if m["gpu"] else []
     parts += [f"{m['cpu']} ({m['simd']}, {m['cores']} cores)", f"{m['threads']} threads"]
@@ -114,17 +114,15 @@ def _number(value: float | None) -> str:
 
 
 def _row(r: dict) -> list[str]:
-    """Cells under ``_HEADER``, then the peer and the work."""
+    """Returns a record's cells under ``_HEADER``."""
     name = r["variant"] + (" (default)" if r["is_default"] and r["variant"] != "default" else "")
     if r["status"] != "ok":
         reason = textwrap.shorten(r["status"], 90, placeholder=" …")
         return [name, r["direction"], r["dtype"], reason, "", "", _number(r["rel_rms_error"])]
     spread = f"{_number(r['ms_p20'])} to {_number(r['ms_p80'])}"
     error = _number(r["rel_rms_error"]) or "none"
-    return [
-        *(name, r["direction"], r["dtype"], _number(r["ms_p50"]), spread),
-        *(_number(r["jit_ms"]), error),
-    ]
+    times = [_number(r["ms_p50"]), spread, _number(r["jit_ms"])]
+    return [name, r["direction"], r["dtype"], *times, error]
 
 
 def _peer(r: dict) -> str:
@@ -152,9 +150,10 @@ def _work(r: dict) -> str:
 
 
 def table(records: Sequence[dict]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of one case; columns that would be empty are left out."""
+    """Returns header and rows of one case, without the columns that would be empty."""
     peers, work = [_peer(r) for r in records], [_work(r) for r in records]
-    header, rows = list(_HEADER), [_row(r) for r in records]
+    header: list[str] = [*_HEADER]
+    rows = [_row(r) for r in records]
     for name, cells in (("peer's time / ours", peers), ("work", work)):
         if any(cells):
             header.append(name)
@@ -164,7 +163,7 @@ def table(records: Sequence[dict]) -> tuple[list[str], list[list[str]]]:
 
 
 def groups(document: dict) -> dict[str, dict[str, list[dict]]]:
-    """Records by op, then case, in the order measured."""
+    """Groups the records by op, then by case, in the order of their measuring."""
     found: dict[str, dict[str, list[dict]]] = {}
     for r in document["records"]:
         found.setdefault(r["op"], {}).setdefault(r["case"], []).append(r)
@@ -172,13 +171,13 @@ def groups(document: dict) -> dict[str, dict[str, list[dict]]]:
 
 
 def oracles(records: Sequence[dict]) -> str:
-    """What the errors of a case are against, a sentence."""
+    """Says in one sentence what the errors of a case are measured against."""
     names = list(dict.fromkeys(r["oracle"] for r in records if r["oracle"] and not r["is_peer"]))
     return f"Error: relative rms to {' / '.join(names)}." if names else ""
 
 
 def target_rows(document: dict) -> list[list[str]]:
-    """Cells under ``TARGET_HEADER``."""
+    """Returns the targets' cells under ``TARGET_HEADER``."""
     words = {True: "reached", False: "missed", None: "not measured"}
     return [
         [t["op"], t["text"], t["wanted"], _number(t["value"]), words[t["reached"]]]
@@ -196,7 +195,7 @@ EXPLANATION = (
 
 
 def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
-    """All tables; one document is one machine."""
+    """Returns a page of all tables; each document is of one machine."""
     lines = [f"# {title}", "", "Written by `gamba bench`, not by hand.", "", EXPLANATION, ""]
     for document in documents:
         lines += [f"## {machine_line(document)}", ""]

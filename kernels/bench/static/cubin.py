@@ -11,7 +11,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-_CUDA_INFO = 0x70000000  # section type
 _SYMBOLS = 2  # section type
 _REGISTERS, _FRAME = 0x2F, 0x11  # attributes
 _LOAD_LOCAL, _STORE_LOCAL = 0x983, 0x387  # operations LDL and STL

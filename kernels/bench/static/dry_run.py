@@ -7,10 +7,8 @@ is noted instead of made. So the code that chooses kernels is the operators' own
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from types import SimpleNamespace
-from unittest import mock
 
 import torch
 import warp as wp
@@ -19,7 +17,7 @@ from torch._library.custom_ops import OPDEFS
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ...runtime import views as interop
+from ...runtime.recording import Recorder, recording
 
 _READ_BACK = (torch.ops.aten.item.default, torch.ops.aten._local_scalar_dense.default)
 # What an operator reads back from the device, the number of pairs, is taken to be this.
@@ -57,34 +55,10 @@ def dry_run() -> Iterator[list[Launch]]:
     """
     launches: list[Launch] = []
 
-    def note(kernel, dim, inputs=(), outputs=(), *, block_dim=256, **_) -> None:
+    def note(kernel: wp.Kernel, dim: tuple[int, ...], block_dim: int) -> None:
         launches.append(Launch(kernel, block_dim))
 
-    def array(tensor, dtype=None, return_ctype=False, **_):
-        rank = tensor.dim() - len(getattr(dtype, "_shape_", ()))
-        made = wp.array(shape=(0,) * max(rank, 1), dtype=dtype or float, device="cpu")
-        return made.__ctype__() if return_ctype else made
-
-    device = SimpleNamespace(multi_processor_count=MULTIPROCESSORS)
-    replaced = [
-        (wp, "launch", note),
-        (wp, "from_torch", array),
-        (wp, "stream_from_torch", lambda stream: None),
-        (torch.cuda, "current_stream", lambda device=None: None),
-        (torch.cuda, "current_device", lambda: 0),
-        (torch.cuda, "get_device_properties", lambda index=None: device),
-        (torch.Tensor, "data_ptr", lambda tensor: 0),
-        (
-            interop,
-            "_descriptors",
-            {},
-        ),  # those made here describe nothing
-    ]
-    with ExitStack() as stack:
-        for where, name, function in replaced:
-            stack.enter_context(mock.patch.object(where, name, function))
-        stack.enter_context(FakeTensorMode())
-        stack.enter_context(_Inside())
+    with recording(Recorder(note, MULTIPROCESSORS)), FakeTensorMode(), _Inside():
         yield launches
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 import warp as wp
@@ -103,17 +104,17 @@ def _tensor(*shape: int, dtype=torch.float32, gradient: bool = True) -> Tensor:
 def _scan(
     batch: int, dtype, states: int = 16, mode: str = "mamba", last: bool = False
 ) -> list[Tensor]:
-    """The paper's size; few sequences are cut into pieces."""
+    """The paper's size; a single sequence is cut into segments."""
     length, channels = 16384, 1024
     u, delta, z = (_tensor(batch, length, channels, dtype=dtype) for _ in range(3))
     B, C = (_tensor(batch, length, states, dtype=dtype) for _ in range(2))
     A, D, bias = _tensor(channels, states), _tensor(channels), _tensor(channels)
-    options = {"delta_bias": bias, "delta_softplus": True, "discretization": mode}
+    options: dict[str, Any] = {"delta_bias": bias, "delta_softplus": True, "discretization": mode}
     if last:
         return [selective_scan_state(u, delta, A, B, **options)]
     state = _tensor(batch, channels, states)
-    options |= {"D": D, "z": z, "initial_state": state, "return_last_state": True}
-    return list(selective_scan(u, delta, A, B, C, **options))
+    options |= {"D": D, "z": z, "initial_state": state}
+    return list(selective_scan(u, delta, A, B, C, **options, return_last_state=True))
 
 
 def _conv(dtype) -> list[Tensor]:
@@ -163,7 +164,7 @@ _RASTERS = {
 # (op, case) -> a call of the operator; a kernel is listed with the first case that launches it
 CASES: dict[tuple[str, str], Callable[[], list[Tensor]]] = {
     **{("scan", name): partial(_scan, 16, **options) for name, options in _SCANS.items()},
-    **{("scan", f"{name}, in pieces"): partial(_scan, 1, **o) for name, o in _SCANS.items()},
+    **{("scan", f"{name}, in segments"): partial(_scan, 1, **o) for name, o in _SCANS.items()},
     ("conv", "bfloat16"): partial(_conv, torch.bfloat16),
     ("conv", "float32"): partial(_conv, torch.float32),
     **{("raster", name): partial(_raster, **options) for name, options in _RASTERS.items()},

@@ -6,25 +6,26 @@ of each (part, tile); their running sum is where each part writes its pairs of e
 """
 
 from collections.abc import Callable
+from typing import no_type_check
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import parallel_launch
-from ..tiles import Ellipse, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
+from ..tiles import Bins, Ellipse, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
 
 wp.set_module_options({"enable_backward": False})
 
 _BITS = wp.constant(11)
 _DIGITS = wp.constant(2048)
 # A Gaussian's record: number of pairs, first and last row of tiles, columns of the first rows,
-# two numbers of 16 bits each: a picture has at most 2^11 tiles in a row.
+# two numbers of 16 bits each: a picture has at most 2^12 tiles in a row.
 _COUNT, _FIRST_ROW, _LAST_ROW, _SPANS = (wp.constant(i) for i in range(4))
 _ROWS = wp.constant(9)
 _RECORD = 12
-_AHEAD = wp.constant(12)  # Gaussians, for a record to come from memory
-_PARTS_PER_THREAD = 4  # Gaussians differ in size, and so do parts
+_AHEAD = wp.constant(12)  # Gaussians that pass while a record comes from memory
+_PARTS_PER_THREAD = 4  # more than 1, since Gaussians differ in size, and so do parts
 
 
 @wp.func_native("""
@@ -33,11 +34,12 @@ __builtin_prefetch(record);
 __builtin_prefetch(record + records.shape[1] - 1);
 """)
 def _fetch(records: wp.array2d[wp.int32], i: wp.int32):
-    """Brings a record near: records are read in the order of depth, that is, at random."""
+    """Prefetches a record: records are read in the order of depth, which is a random one."""
     ...
 
 
 @wp.func
+@no_type_check
 def _next_place(counts: wp.array3d[wp.int32], image: int, turn: int, key: int) -> int:
     digit = (key >> (turn * _BITS)) & (_DIGITS - 1)
     place = counts[image, turn, digit]
@@ -46,6 +48,7 @@ def _next_place(counts: wp.array3d[wp.int32], image: int, turn: int, key: int) -
 
 
 @wp.func
+@no_type_check
 def _sort_view(
     image: wp.int32,
     depths: wp.array2d[wp.float32],
@@ -54,7 +57,7 @@ def _sort_view(
     counts: wp.array3d[wp.int32],
     order: wp.array2d[wp.int32],
 ):
-    # front to back, equal depths by index; room to work: keys, places and counts of digits
+    # front to back, equal depths by index; keys, places and counts are room to work
     num = depths.shape[1]
     for digit in range(_DIGITS):
         for turn in range(3):
@@ -87,12 +90,14 @@ def _sort_view(
 
 
 @wp.func
+@no_type_check
 def _part(num: wp.int32, part: wp.int32, parts: wp.int32) -> wp.int32:
     # where a part begins; num * part may not fit an int32
     return wp.int32(wp.int64(num) * wp.int64(part) / wp.int64(parts))
 
 
 @wp.func
+@no_type_check
 def _ellipse(
     grid: Grid,
     means2d: wp.array[wp.vec2],
@@ -105,6 +110,7 @@ def _ellipse(
 
 
 @wp.kernel
+@no_type_check
 def _prepare(
     offset: wp.int32,
     grid: Grid,
@@ -149,6 +155,7 @@ def _prepare(
 
 
 @wp.func
+@no_type_check
 def _columns(
     grid: Grid,
     means2d: wp.array[wp.vec2],
@@ -168,6 +175,7 @@ def _columns(
 
 
 @wp.kernel
+@no_type_check
 def _count(
     offset: wp.int32,
     grid: Grid,
@@ -180,7 +188,7 @@ def _count(
     counts_out: wp.array[wp.int32],
     steps_out: wp.array3d[wp.int32],
 ):
-    """Steps: of the number of pairs from tile to tile in a row; their running sum is the number."""
+    """Steps are how the number of pairs changes from tile to tile in a row of tiles."""
     task = offset + wp.tid()
     parts = steps_out.shape[1]
     image = task // parts
@@ -204,6 +212,7 @@ def _count(
 
 
 @wp.kernel
+@no_type_check
 def _emit(
     offset: wp.int32,
     grid: Grid,
@@ -218,7 +227,7 @@ def _emit(
     pairs_out: wp.array[wp.int32],
     rows_out: wp.array[wp.int32],
 ):
-    """Cursors come in as the place of the first pair of each (part, tile)."""
+    """Cursors hold, at first, the place of the first pair of each (part, tile)."""
     task = offset + wp.tid()
     parts = cursors_out.shape[1]
     image = task // parts
@@ -243,10 +252,8 @@ def _emit(
                 p += 1
 
 
-def bin_views(
-    grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None]
-) -> tuple[Tensor, ...]:
-    """The fields of ``Bins``; ``check`` is given the number of pairs before they are made.
+def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None]) -> Bins:
+    """Makes the lists; ``check`` is given the number of pairs before they are made.
 
     Args:
         grid: from ``make_grid``.
@@ -271,12 +278,12 @@ def bin_views(
     in_tiles = steps.cumsum(3, dtype=torch.int32)[..., :-1].reshape(images, parts, tiles)
     ends = in_tiles.transpose(1, 2).reshape(-1).cumsum(0).int()
     begins = torch.nn.functional.pad(ends, (1, 0)).view(-1)
-    starts = begins[::parts].clone()  # not the memory of the cursors
+    starts = begins[::parts].clone()  # the cursors, which are changed, share the memory
     cursors = begins[:-1].view(images, tiles, parts).transpose(1, 2).contiguous()
     pairs, rows = order.new_empty(total), order.new_empty(total)
     if total:
         parallel_launch(_emit, tasks, [*inputs, offsets], [cursors, pairs, rows], pieces=tasks)
-    return order, offsets, pairs, rows, starts, box_counts.sum()
+    return Bins(order, offsets, pairs, rows, starts, box_pairs=box_counts.sum())
 
 
 def _sorted_and_recorded(

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .lanes import TYPES, lanes, lanes_int
-from .tuning import Variant
+from .tuning import Tuning
 
 # alpha of a block's pixels. The exponent is rounded to an integer n by adding 1.5 * 2^23 (+127, the
 # bias), 2^rest is a minimax polynomial p of f. ``a`` and ``e`` of the conic come with -log2(e)/2.
@@ -27,23 +27,30 @@ _ALPHA = """
     };
 """
 
-# By degree, highest power first.
+# The coefficients of p by degree, those of the highest power first.
 _EXP2 = {
     2: (0.23842893540859222, 0.7034479975700378, 1.0004431009292603),
     3: (0.0551716685295105, 0.2426111251115799, 0.6932609677314758, 0.9999280571937561),
     4: (
-        *(9.570102207362652e-3, 5.591785907745361e-2, 0.240247443318367),
-        *(0.6931217908859253, 0.9999992847442627),
+        9.570102207362652e-3,
+        5.591785907745361e-2,
+        0.240247443318367,
+        0.6931217908859253,
+        0.9999992847442627,
     ),
     5: (
-        *(1.32764715e-3, 9.67554133e-3, 5.55071327e-2),
-        *(0.240221197, 0.693146967, 1.00000007),
+        1.32764715e-3,
+        9.67554133e-3,
+        5.55071327e-2,
+        0.240221197,
+        0.693146967,
+        1.00000007,
     ),
 }
 
 
 def _polynomial(degree: int) -> str:
-    """C++ that makes p of f; of degree 5 in pairs, a shorter chain than Horner's."""
+    """C++ that makes p of f; degree 5 goes in pairs, which is a shorter chain than Horner's."""
     c = [f"(F{{}} + {value!r}f)" for value in _EXP2[degree]]
     if degree < 5:
         steps = "".join(f" p = fma_(p, f, {value});" for value in c[1:])
@@ -52,14 +59,14 @@ def _polynomial(degree: int) -> str:
     return f"const F f2 = f * f; const F p = fma_(fma_({high}, f2, {middle}), f2, {low});"
 
 
-def _text(body: str, variant: Variant) -> str:
-    columns = variant.columns
-    body = TYPES + _ALPHA.replace("EXP2", _polynomial(variant.degree)) + body
+def _text(body: str, tuning: Tuning) -> str:
+    columns = tuning.columns
+    body = TYPES + _ALPHA.replace("EXP2", _polynomial(tuning.degree)) + body
     return body.replace("SHIFT", str(columns.bit_length() - 1)).replace("MASK", str(columns - 1))
 
 
 # A pixel that has stopped keeps its transmittance, above t_min, with a minus sign. T itself is not
-# chosen by a mask: that would become a masked store, from which the next load cannot forward.
+# chosen by a mask: that would become a masked store, and the next load would have to wait for it.
 _BLEND = """
     F* const Ts = (F*)transmittances.data + first;
     I* const ends = (I*)stops.data + first;
@@ -78,7 +85,7 @@ _BLEND = """
         const I stays = max_(next, -next) > t_min;
         const F weight = stays ? T * alpha : F{};
         Ts[b] = stays ? next : -T;
-        // no branch on a weight above 0: it would often be foretold wrongly
+        // there is no branch on a weight above 0: the processor would often predict it wrongly
         used |= (unsigned)any_(weight > 0.0f) << b;
         F* const sum = sums + b * channels;
         if (channels == 3)
@@ -145,10 +152,10 @@ _UNBLEND = """
 
 
 @functools.cache
-def blend_leaves(variant: Variant) -> SimpleNamespace:
-    """``blend`` and ``unblend``."""
+def blend_leaves(tuning: Tuning) -> SimpleNamespace:
+    """The leaves ``blend`` and ``unblend`` of a tuning."""
 
-    @wp.func_native(_text(_BLEND, variant))
+    @wp.func_native(_text(_BLEND, tuning))
     def blend(
         bits: wp.int32,
         k: wp.int32,
@@ -176,7 +183,7 @@ def blend_leaves(variant: Variant) -> SimpleNamespace:
         """
         ...
 
-    @wp.func_native(_text(_UNBLEND, variant))
+    @wp.func_native(_text(_UNBLEND, tuning))
     def unblend(
         bits: wp.int32,
         k: wp.int32,

@@ -1,13 +1,13 @@
 """Compositing on the CPU: threads take tile after tile, 16 lanes = the pixels of a 4 x 4 block.
 
-A tile of 16 x 16 pixels is 16 such blocks (cpu_variant.py has other sizes). For each Gaussian of
-the tile its blocks are tested at once (lanes = blocks), and only those that the ellipse touches are
-evaluated (lanes = pixels).
-Backward walks back to front and writes one gradient row per (tile, Gaussian) pair, which are summed
-by Gaussian afterwards: no atomics. README.md §3 and §5 hold the maths.
+A tile of 16 x 16 pixels is 16 such blocks (``tuning.py`` has other sizes). For each Gaussian of the
+tile its blocks are tested at once (lanes = blocks), and only those that the ellipse touches are
+evaluated (lanes = pixels). The gradient walks back to front and writes one row per (tile, Gaussian)
+pair; rows are summed by Gaussian afterwards, without atomics. README.md §3 and §5 hold the maths.
 """
 
 import functools
+from typing import no_type_check
 
 import torch
 import warp as wp
@@ -16,13 +16,13 @@ from torch import Tensor
 from ...runtime.launch import parallel_launch
 from ...runtime.views import vectors, view
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
-from ..tiles import Bins, Frame, Walk, color_row, q_limit
+from ..tiles import Bins, Picture, Walk, color_row, q_limit
 from . import lanes as L
 from .blend import blend_leaves
 from .lanes import block_leaves, lanes, lanes_int
-from .tuning import Variant, current
+from .tuning import Tuning
 
-# Unrolled, the loops over blocks and pixels would take the compiler long for no gain.
+# To unroll the loops over blocks and pixels would take the compiler long, for no gain.
 _OPTIONS = {"enable_backward": False, "max_unroll": 1}
 
 _BLOCK_TEST = wp.constant(BLOCK_TEST)
@@ -30,31 +30,33 @@ _STOPPED = wp.constant(STOPPED)
 _EMPTY_TILES = wp.constant(EMPTY_TILES)
 _ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
 _UNUSED = wp.constant(UNUSED)
-_AHEAD = wp.constant(6)  # pairs, for a Gaussian to come from memory
+_AHEAD = wp.constant(6)  # pairs that pass while a Gaussian comes from memory
 _NEVER = wp.constant(2**31 - 1)
 _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
 
 
 @wp.func
-def _blocks_inside(frame: Frame, columns: int, x: int, y: int) -> int:
+@no_type_check
+def _blocks_inside(picture: Picture, columns: int, x: int, y: int) -> int:
     # bit b is set if block b of the tile at (x, y) has a pixel in the picture
     bits = wp.int32(0)
     for b in range(columns * columns):
-        if x + (b % columns) * 4 < frame.width and y + (b // columns) * 4 < frame.height:
+        if x + (b % columns) * 4 < picture.width and y + (b // columns) * 4 < picture.height:
             bits = bits | (1 << b)
     return bits
 
 
 @functools.cache
-def _forward_kernel(variant: Variant):
-    columns, blocks, side = variant.columns, variant.blocks, variant.tile
-    leaves, blend = block_leaves(variant), blend_leaves(variant).blend
+def _forward_kernel(tuning: Tuning):
+    columns, blocks, side = tuning.columns, tuning.blocks, tuning.tile
+    leaves, blend = block_leaves(tuning), blend_leaves(tuning).blend
     first_x, first_y, touched = leaves.first_x, leaves.first_y, leaves.touched
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
+    @no_type_check
     def composite(
         offset: wp.int32,
-        frame: Frame,
+        picture: Picture,
         tiles: wp.int32,
         means2d_in: wp.array[wp.vec2],
         conics_in: wp.array[wp.vec3],
@@ -72,7 +74,7 @@ def _forward_kernel(variant: Variant):
         renders_out: wp.array4d[wp.float32],
         alphas_out: wp.array4d[wp.float32],
     ):
-        """Room to work: counter, the next tile to take; room, a worker's sums of colours."""
+        """``counter`` is the next tile to take, ``room`` holds a worker's sums of colours."""
         worker = offset + wp.tid()
         channels = colors_in.shape[1]
         tile = L.take(counter_out)
@@ -81,10 +83,10 @@ def _forward_kernel(variant: Variant):
             end = starts_in[tile + 1]
             walked_out[tile] = 0
             blocks_walked_out[tile] = wp.int64(0)
-            if begin < end or (frame.skip & _EMPTY_TILES) == 0:
-                image = tile // (frame.tiles_x * frame.tiles_y)
-                x = tile % frame.tiles_x * side
-                y = tile // frame.tiles_x % frame.tiles_y * side
+            if begin < end or (picture.skip & _EMPTY_TILES) == 0:
+                image = tile // (picture.tiles_x * picture.tiles_y)
+                x = tile % picture.tiles_x * side
+                y = tile // picture.tiles_x % picture.tiles_y * side
                 xs = first_x(float(x) + 0.5)
                 ys = first_y(float(y) + 0.5)
                 first = tile * blocks
@@ -94,7 +96,7 @@ def _forward_kernel(variant: Variant):
                 for i in range(blocks * channels):
                     room_out[worker, i] = lanes(0.0)
 
-                inside = _blocks_inside(frame, columns, x, y)
+                inside = _blocks_inside(picture, columns, x, y)
                 alive = inside
                 evaluated = wp.int64(0)
                 k = begin
@@ -111,9 +113,9 @@ def _forward_kernel(variant: Variant):
                     shear = conic[1]
                     opacity = view_opacities_in[g]
                     bits = alive
-                    if (frame.skip & _BLOCK_TEST) != 0:
+                    if (picture.skip & _BLOCK_TEST) != 0:
                         slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
-                        limit = q_limit(opacity, frame.alpha_min)
+                        limit = q_limit(opacity, picture.alpha_min)
                         bits = alive & touched(
                             xs, ys, mean[0], mean[1], conic[0], shear, conic[2], slope, limit
                         )
@@ -128,11 +130,11 @@ def _forward_kernel(variant: Variant):
                             _EXP2 * conic[0],
                             _EXP2 * conic[2],
                             opacity,
-                            frame.alpha_min,
-                            frame.alpha_max,
-                            frame.t_min,
+                            picture.alpha_min,
+                            picture.alpha_max,
+                            picture.t_min,
                             colors_in,
-                            color_row(frame, g),
+                            color_row(picture, g),
                             first,
                             worker,
                             transmittances_out,
@@ -140,7 +142,7 @@ def _forward_kernel(variant: Variant):
                             room_out,
                         )
                         evaluated += wp.int64(L.count_bits(bits))
-                        if (frame.skip & _STOPPED) != 0:
+                        if (picture.skip & _STOPPED) != 0:
                             alive = alive & ~(used >> 16)
                     blocks_out[k] = used & 0xFFFF
                     k += 1
@@ -165,14 +167,15 @@ def _forward_kernel(variant: Variant):
 
 
 @functools.cache
-def _backward_kernel(variant: Variant):
-    columns, blocks, side = variant.columns, variant.blocks, variant.tile
-    unblend = blend_leaves(variant).unblend
+def _backward_kernel(tuning: Tuning):
+    columns, blocks, side = tuning.columns, tuning.blocks, tuning.tile
+    unblend = blend_leaves(tuning).unblend
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
+    @no_type_check
     def composite_vjp(
         offset: wp.int32,
-        frame: Frame,
+        picture: Picture,
         tiles: wp.int32,
         geometry: wp.int32,
         means2d_in: wp.array[wp.vec2],
@@ -194,20 +197,20 @@ def _backward_kernel(variant: Variant):
         written_out: wp.array[wp.uint8],
         skipped_out: wp.array[wp.int32],
     ):
-        """Room to work: counter, the next tile to take; room as ``unblend`` has it."""
+        """``counter`` is the next tile to take, ``room`` is as ``unblend`` has it."""
         worker = offset + wp.tid()
         channels = colors_in.shape[1]
         upstream = 32 + channels
         tile = L.take(counter_out)
         while tile < tiles:
-            image = tile // (frame.tiles_x * frame.tiles_y)
-            x = tile % frame.tiles_x * side
-            y = tile // frame.tiles_x % frame.tiles_y * side
+            image = tile // (picture.tiles_x * picture.tiles_y)
+            x = tile % picture.tiles_x * side
+            y = tile // picture.tiles_x % picture.tiles_y * side
             first = tile * blocks
             any_v = wp.int32(0)
             inside = wp.int32(0)
             if walked_in[tile] > 0:
-                inside = _blocks_inside(frame, columns, x, y)
+                inside = _blocks_inside(picture, columns, x, y)
             every = inside
             while inside != 0:
                 b = L.lowest_bit(inside)
@@ -222,7 +225,7 @@ def _backward_kernel(variant: Variant):
                     v_c = L.load_block(v_renders_in, image, py, px, c)
                     room_out[worker, place + c] = v_c
                     any_v = any_v | L.any_nonzero(v_c)
-            wanted = any_v != 0 or ((frame.skip & _ZERO_UPSTREAM) == 0 and every != 0)
+            wanted = any_v != 0 or ((picture.skip & _ZERO_UPSTREAM) == 0 and every != 0)
             skipped_out[tile] = wp.where(wanted, 0, 1)
             if wanted:
                 for b in range(blocks):
@@ -231,7 +234,7 @@ def _backward_kernel(variant: Variant):
                 k = starts_in[tile] + walked_in[tile] - 1
                 while k >= starts_in[tile]:
                     bits = blocks_in[k]
-                    if (frame.skip & _UNUSED) == 0:
+                    if (picture.skip & _UNUSED) == 0:
                         bits = every
                     if bits != 0:
                         g = pairs_in[k]
@@ -247,10 +250,10 @@ def _backward_kernel(variant: Variant):
                             _EXP2 * conic[0],
                             _EXP2 * conic[2],
                             view_opacities_in[g],
-                            frame.alpha_min,
-                            frame.alpha_max,
+                            picture.alpha_min,
+                            picture.alpha_max,
                             colors_in,
-                            color_row(frame, g),
+                            color_row(picture, g),
                             first,
                             worker,
                             stops_in,
@@ -271,7 +274,8 @@ def composite_forward(
     view_opacities: Tensor,
     colors: Tensor,
     bins: Bins,
-    frame: Frame,
+    picture: Picture,
+    tuning: Tuning,
 ) -> tuple[Tensor, Tensor, Walk]:
     """Blends I views; float32, contiguous tensors on the CPU.
 
@@ -279,30 +283,31 @@ def composite_forward(
         means2d: ``[I, N, 2]``.
         conics: ``[I, N, 3]``.
         view_opacities: ``[I, N]``.
-        colors: ``[rows, C]``, rows = B * N, or I * N if ``frame.colors_per_view``.
+        colors: ``[rows, C]``, rows = B * N, or I * N if ``picture.colors_per_view``.
         bins: from ``bin_gaussians``.
-        frame: from ``make_frame``.
+        picture: from ``make_picture``, with the tuning's tile.
+        tuning: the choice of kernels; the lists were made with its tile.
 
     Returns:
         ``renders [I, H, W, C]``, ``alphas [I, H, W, 1]`` and a ``Walk``.
     """
     images, channels = means2d.shape[0], colors.shape[1]
-    tiles = images * frame.tiles_x * frame.tiles_y
-    renders = colors.new_zeros(images, frame.height, frame.width, channels)
-    alphas = colors.new_zeros(images, frame.height, frame.width, 1)
-    workers, blocks = torch.get_num_threads(), current().blocks
+    tiles = images * picture.tiles_x * picture.tiles_y
+    renders = colors.new_zeros(images, picture.height, picture.width, channels)
+    alphas = colors.new_zeros(images, picture.height, picture.width, 1)
+    workers, blocks = torch.get_num_threads(), tuning.blocks
     walk = Walk(
-        colors.new_empty(tiles * blocks, 16),
-        bins.pairs.new_empty(tiles * blocks, 16),
-        torch.zeros_like(bins.pairs),
-        bins.pairs.new_empty(tiles),
-        bins.pairs.new_empty(tiles, dtype=torch.int64),
+        transmittances=colors.new_empty(tiles * blocks, 16),
+        stops=bins.pairs.new_empty(tiles * blocks, 16),
+        blocks=torch.zeros_like(bins.pairs),
+        walked=bins.pairs.new_empty(tiles),
+        blocks_walked=bins.pairs.new_empty(tiles, dtype=torch.int64),
     )
     parallel_launch(
-        _forward_kernel(current()),
+        _forward_kernel(tuning),
         workers,
         [
-            frame,
+            picture,
             tiles,
             vectors(means2d, wp.vec2),
             vectors(conics, wp.vec3),
@@ -332,7 +337,8 @@ def composite_backward(
     view_opacities: Tensor,
     colors: Tensor,
     bins: Bins,
-    frame: Frame,
+    picture: Picture,
+    tuning: Tuning,
     walk: Walk,
     v_renders: Tensor,
     v_alphas: Tensor,
@@ -341,12 +347,13 @@ def composite_backward(
     """Gradient sums of each pair, in emission order, for ``reduce_pairs``.
 
     Args:
-        means2d: and the rest as forward.
+        means2d: as forward.
         conics: as forward.
         view_opacities: as forward.
         colors: as forward.
         bins: as forward.
-        frame: as forward.
+        picture: as forward.
+        tuning: as forward.
         walk: as returned forward.
         v_renders: ``[I, H, W, C]``.
         v_alphas: ``[I, H, W, 1]``.
@@ -362,10 +369,10 @@ def composite_backward(
     skipped = torch.empty_like(walk.walked)
     workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)
     parallel_launch(
-        _backward_kernel(current()),
+        _backward_kernel(tuning),
         workers,
         [
-            frame,
+            picture,
             tiles,
             int(geometry),
             vectors(means2d, wp.vec2),

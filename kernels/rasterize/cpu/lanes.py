@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .tuning import Variant
+from .tuning import Tuning
 
 LANES = 16
 lanes = wp.types.vector(LANES, wp.float32)
@@ -45,7 +45,8 @@ def _leaf(body: str, result: str = "F") -> str:
     )
 
 
-# README eq. 6 as in bin.py, for 16 blocks at once; the mask is gathered lane by lane at the end.
+# The least q on the rectangle of a block's pixel centres (README.md §2, the last paragraph), for 16
+# blocks at once; the bits of those where it is within the limit become one mask at the end.
 _TOUCHED = """
     F x0 = *(const F*)&xs, y0 = *(const F*)&ys, zero = F{};
     x0 = x0 - center_x; y0 = y0 - center_y;
@@ -63,17 +64,18 @@ _TOUCHED = """
 
 
 @functools.cache
-def block_leaves(variant: Variant) -> SimpleNamespace:
-    """``first_x, first_y``: first pixels of the blocks' sub-tiles, x or y the tile's; ``touched``.
+def block_leaves(tuning: Tuning) -> SimpleNamespace:
+    """The leaves ``first_x, first_y, touched``, whose lanes are the blocks of a tile.
 
-    Of ``touched`` bit b is set if the sub-tile of block b may hold a pixel with q <= limit;
+    ``first_x`` and ``first_y`` give the first pixel of each block's sub-tile, from the tile's own.
+    ``touched`` sets bit b if the sub-tile of block b may hold a pixel with q <= limit, where
     slope = -a k / (a k² + e). Lanes without a block mean nothing.
     """
     blocks = range(LANES)
-    firsts_x = [4 * (b % variant.columns) // variant.width * variant.width for b in blocks]
-    firsts_y = [4 * (b // variant.columns) // variant.height * variant.height for b in blocks]
-    text = _TOUCHED.replace("WIDTH", str(variant.width - 1))
-    text = text.replace("HEIGHT", str(variant.height - 1))
+    firsts_x = [4 * (b % tuning.columns) // tuning.width * tuning.width for b in blocks]
+    firsts_y = [4 * (b // tuning.columns) // tuning.height * tuning.height for b in blocks]
+    text = _TOUCHED.replace("WIDTH", str(tuning.width - 1))
+    text = text.replace("HEIGHT", str(tuning.height - 1))
 
     @wp.func_native(_leaf(f"const F first = {{{', '.join(map(str, firsts_x))}}}; out = first + x;"))
     def first_x(x: wp.float32) -> lanes: ...
@@ -126,7 +128,7 @@ def fetch(
     view_opacities: wp.array[wp.float32],
     g: wp.int32,
 ):
-    """Brings a Gaussian near that a later pair needs."""
+    """Prefetches a Gaussian that a later pair needs."""
     ...
 
 

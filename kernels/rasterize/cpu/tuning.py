@@ -1,6 +1,7 @@
-"""Sizes and accuracy of the CPU compositor: fixed for callers, overridable to be measured.
+"""Sizes and accuracy of the CPU's kernels: fixed for callers, and to be changed for a measurement.
 
-The tile is that of the lists too. On CUDA there is one choice, see CUDA.md.
+A call of ``rasterization`` looks here once. What it finds goes with its lists to its gradient, so
+nothing below ``function.py`` reads the choice in force. On CUDA there is one choice, see CUDA.md.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ BLOCK = 4  # pixels, side of the block whose pixels are lanes
 
 
 @dataclasses.dataclass(frozen=True)
-class Variant:
-    """A choice of kernels; ``gamba bench raster`` has what each choice costs.
+class Tuning:
+    """A choice of the CPU's kernels; ``gamba bench raster`` has what each choice costs.
 
     Attributes:
         tile: side in pixels of the squares that have a list each, 8 or 16.
@@ -51,19 +52,36 @@ class Variant:
         """Blocks of a tile."""
         return self.columns**2
 
+    def numbers(self) -> list[int]:
+        """The attributes in their order, for an operator; ``Tuning(*numbers)`` is the way back."""
+        return [self.tile, self.width, self.height, self.degree]
 
-_choice = Choice(Variant())
+
+_DEFAULT = Tuning()
+_choice = Choice(_DEFAULT)
 
 
-def current() -> Variant:
-    """What the rasterizer runs on now."""
+def current() -> Tuning:
+    """The choice in force."""
     return _choice.value
 
 
-def use_variant(variant: Variant) -> AbstractContextManager[None]:
-    """Every rasterization on the CPU runs on ``variant`` inside; a gradient must as its forward.
+def tuning_for(device: str) -> Tuning:
+    """The choice in force, for a call on a type of device.
 
-    It holds for all threads of the process: autograd may compute gradients on threads of its own.
-    On CUDA a call raises ``ValueError`` inside, unless it is the default variant.
+    Raises:
+        ValueError: it is not the default, and the device is not a CPU.
     """
-    return _choice.use(variant)
+    tuning = current()
+    if device != "cpu" and tuning.numbers() != _DEFAULT.numbers():
+        raise ValueError(f"device is {device}: {tuning} is for a CPU")
+    return tuning
+
+
+def use_tuning(tuning: Tuning) -> AbstractContextManager[None]:
+    """Every rasterization on the CPU that begins inside runs on ``tuning``, its gradient too.
+
+    It holds for all threads of the process. On CUDA a call raises ``ValueError`` inside, unless it
+    is the default.
+    """
+    return _choice.use(tuning)

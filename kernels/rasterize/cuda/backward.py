@@ -1,11 +1,12 @@
 """The CUDA compositor's gradient kernel: back to front over the pairs of a tile (README §5)."""
 
 import functools
+from typing import no_type_check
 
 import warp as wp
 
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import Frame
+from ..tiles import Picture
 from .warp import (
     HEIGHT,
     PITCH,
@@ -42,15 +43,15 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
     Without ``geometry`` it is for colours alone. Each part has a row of its own for a pair.
     """
     moments = 6 if geometry else 0
-    values = moments + channels  # sums of a pair
-    slots = WARP // values  # pairs whose sums are completed at once, a lane for each
+    values = moments + channels  # how many sums a pair has
+    slots = WARP // values  # pairs whose sums are completed at once, with a lane for each sum
     rows_at = WARP * RECORD
     sums_at = rows_at + WARP
     size = sums_at + slots * values * PITCH
     memory = shared_memory(size)
     arena_type = memory.arena
     place, stage = placing(parts), staging(channels, size)
-    pixels = SUB_TILES // parts  # of a lane
+    pixels = SUB_TILES // parts  # how many a lane has
     part_blocks = (1 << 16 // parts) - 1
     part_stops = (1 << pixels) - 1
     pixels_type = wp.types.vector(pixels, wp.float32)
@@ -60,14 +61,14 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
 
     @wp.func
     def of_part(bits: wp.int32, part: wp.int32, wanted: wp.int32) -> wp.int32:
-        # of a pair's bits, those of a part of the tile, of blocks only the wanted ones
+        # the bits of a pair that belong to a part of the tile; for blocks only the wanted ones
         stops = bits >> (STOP + part * wp.static(pixels)) & wp.static(part_stops)
         blocks = bits >> (part * wp.static(16 // parts)) & wp.static(part_blocks)
         return blocks & wanted | stops << STOP
 
     @wp.func
     def leave(arena: arena_type, lane: wp.int32, slot: wp.int32, row: wp.int32, sums: values_type):
-        # a lane's sums of a pair, to be completed together with those of other pairs
+        # stores a lane's sums of a pair, to be completed together with those of other pairs
         at = wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
         for v in range(wp.static(values)):
             memory.put(arena, at + wp.static(v * PITCH), sums[v])
@@ -81,7 +82,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         count: wp.int32,
         v_pairs: wp.array2d[wp.float32],
     ):
-        # each lane adds up one value of one of the pairs left, over the 32 lanes
+        # each lane adds up one value of one of the stored pairs, over the 32 lanes
         if lane < count * wp.static(values):
             at = wp.static(sums_at) + lane * PITCH
             total = memory.get4(arena, at)
@@ -100,8 +101,9 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
     @wp.kernel(
         enable_backward=False, module="unique", launch_bounds=(WARP, resident), grid_stride=False
     )
+    @no_type_check
     def composite_vjp(
-        frame: Frame,
+        picture: Picture,
         gaussians: Gaussians,
         pairs_in: wp.array[wp.int32],
         rows_in: wp.array[wp.int32],
@@ -117,7 +119,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
-        p = place(frame, index, lane)
+        p = place(picture, index, lane)
         # as forward left it: negative until the walk comes to where the pixel stopped
         T = pixels_type()
         # README eq. 10, less the gradient of alpha, which is the same for all pairs
@@ -130,7 +132,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
             if walked > 0:
                 T[j] = load(transmittances_in, p.place, j * WARP)
             if T[j] != 0.0:
-                step = j // 2 * HEIGHT * frame.width + j % 2 * WIDTH
+                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 largest = wp.float32(0.0)
                 if gaussians.first == 0:
                     R[j] = -load(v_alphas_in, p.pixel, step)
@@ -142,7 +144,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                 # NaN is not taken for zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
-        if (frame.skip & _ZERO_UPSTREAM) == 0:
+        if (picture.skip & _ZERO_UPSTREAM) == 0:
             some = wp.static(part_blocks)
         wanted = memory.any_of(arena, lane, some)
         if wanted == 0:
@@ -157,12 +159,12 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
             bits = wp.int32(0)
             if k >= begin:
                 bits = of_part(load_int(blocks_in, k), p.part, wanted)
-                if (frame.skip & _UNUSED) == 0:
+                if (picture.skip & _UNUSED) == 0:
                     bits |= wanted
                 if bits != 0:
                     g = load_int(pairs_in, k)
                     row = load_int(rows_in, k) * wp.static(parts) + p.part
-                    stage(arena, frame, gaussians, lane, g, bits, row)
+                    stage(arena, picture, gaussians, lane, g, bits, row)
             todo = memory.ballot(arena, lane, bits)
             memory.sync()
             while todo != 0:
@@ -178,8 +180,8 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                         dy = p.y[j // 2] - shape[1]
                         u = sheared(shape[3], p.x[j % 2] - shape[0], dy)
                         alpha = exp2(exponent(shape[2], level[0], level[1], u, dy))
-                        clamped = wp.min(alpha, frame.alpha_max)
-                        if alpha >= frame.alpha_min and T[j] > 0.0:
+                        clamped = wp.min(alpha, picture.alpha_max)
+                        if alpha >= picture.alpha_min and T[j] > 0.0:
                             T[j] = T[j] * reciprocal(1.0 - clamped)
                             weight = T[j] * clamped
                             for c in range(wp.static(channels)):
@@ -189,7 +191,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                                 for c in range(wp.static(channels)):
                                     diff += color[c] * upstream[j, c]
                                 R[j] = R[j] + clamped * diff
-                                if alpha < frame.alpha_max:
+                                if alpha < picture.alpha_max:
                                     h = weight * diff
                                     hu = h * u
                                     hy = h * dy

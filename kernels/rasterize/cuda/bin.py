@@ -1,23 +1,20 @@
 """Tile lists on CUDA: a sort by depth, then counting, writing, and a stable sort by tile."""
 
+from collections.abc import Callable
+from typing import no_type_check
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ..tiles import (
-    Grid,
-    box_pairs,
-    make_ellipse,
-    q_limit,
-    tile_columns,
-    tile_rows,
-)
+from ..tiles import Bins, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
+@no_type_check
 def _count(
     offset: wp.int32,
     grid: Grid,
@@ -47,6 +44,7 @@ def _count(
 
 
 @wp.kernel
+@no_type_check
 def _emit(
     offset: wp.int32,
     grid: Grid,
@@ -76,8 +74,8 @@ def _emit(
                 p += 1
 
 
-def bin_views(grid: Grid, depths: Tensor, inputs: list, check) -> tuple[Tensor, ...]:
-    """The fields of ``Bins``; ``check`` is given the number of pairs before they are made."""
+def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None]) -> Bins:
+    """As ``bin_views`` of the CPU."""
     device, (images, num) = depths.device, depths.shape
     # stable: equal depths stay in the order of the Gaussians
     order = torch.argsort(depths, dim=1, stable=True)
@@ -99,4 +97,5 @@ def bin_views(grid: Grid, depths: Tensor, inputs: list, check) -> tuple[Tensor, 
     # not bincount: on CUDA it reads the largest value back
     firsts = torch.arange(tiles + 1, dtype=torch.int32, device=device)
     starts = torch.searchsorted(sorted_tiles, firsts, out_int32=True)
-    return order, offsets, gaussians[rows], rows.int(), starts, box_counts.sum()
+    pairs, rows = gaussians[rows], rows.int()
+    return Bins(order, offsets, pairs, rows, starts, box_pairs=box_counts.sum())

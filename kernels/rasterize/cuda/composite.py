@@ -5,34 +5,29 @@ add up. Sums are written per pair and reduced by Gaussian afterwards: no atomics
 §5 hold the maths, CUDA.md the design.
 """
 
-import functools
-
 import torch
 import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import cuda_launch
-from ..tiles import Bins, Frame, Walk
+from ...runtime.recording import multiprocessors_of
+from ...runtime.views import array
+from ..tiles import Bins, Picture, Walk
 from .backward import backward_kernel
 from .forward import forward_kernel
 from .warp import CHUNK, WARP, Gaussians
-
-
-@functools.cache
-def _multiprocessors(index: int) -> int:
-    return torch.cuda.get_device_properties(index).multi_processor_count
 
 
 def parts_of_tile(tiles: int, device: torch.device) -> int:
     """Into how many warps' work a tile is cut: 1, or where tiles are few, 2 or 4.
 
     A few views do not fill the machine: the tile with the longest list sets the time, and its parts
-    run side by side. With more views parts only repeat the work that a Gaussian costs once per
-    warp. CUDA.md has the estimate behind the limits; no GPU has timed it.
+    run side by side. With more views, parts would only repeat what a Gaussian costs each warp.
+    CUDA.md has the estimate behind the limits; no GPU has timed it.
     """
     if device.type != "cuda":
         return 1
-    few = 10 * _multiprocessors(device.index or 0)
+    few = 10 * multiprocessors_of(device)
     return 4 if tiles <= few else 2 if tiles <= 2 * few else 1
 
 
@@ -42,10 +37,10 @@ def _gaussians(
     if means2d.device.type == "cpu" and not wp.config.enable_cpu_blocks:
         raise ValueError("device is cpu: these kernels run there with enable_cpu_blocks only")
     gaussians = Gaussians()
-    gaussians.means2d = wp.from_torch(means2d.detach().view(-1, 2), dtype=wp.vec2)
-    gaussians.conics = wp.from_torch(conics.detach().view(-1, 3), dtype=wp.vec3)
-    gaussians.opacities = wp.from_torch(view_opacities.detach().view(-1))
-    gaussians.colors = wp.from_torch(colors.detach())
+    gaussians.means2d = array(means2d.view(-1, 2), wp.vec2)
+    gaussians.conics = array(conics.view(-1, 3), wp.vec3)
+    gaussians.opacities = array(view_opacities.view(-1))
+    gaussians.colors = array(colors)
     gaussians.channels = colors.shape[1]
     return gaussians
 
@@ -56,37 +51,33 @@ def composite_forward(
     view_opacities: Tensor,
     colors: Tensor,
     bins: Bins,
-    frame: Frame,
+    picture: Picture,
+    tuning: object,
 ) -> tuple[Tensor, Tensor, Walk]:
-    """As ``composite_cpu.composite_forward``.
+    """As ``composite_forward`` of the CPU; ``tuning`` is the CPU's default, which is not read.
 
     A ``Walk``'s pixels are in the order of the lanes, its ``stops`` are set where a pixel stopped
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
     """
     images, channels = means2d.shape[0], colors.shape[1]
     gaussians = _gaussians(means2d, conics, view_opacities, colors)
-    tiles = images * frame.tiles_x * frame.tiles_y
-    renders = colors.new_empty(images, frame.height, frame.width, channels)
-    alphas = colors.new_empty(images, frame.height, frame.width, 1)
+    tiles = images * picture.tiles_x * picture.tiles_y
+    renders = colors.new_empty(images, picture.height, picture.width, channels)
+    alphas = colors.new_empty(images, picture.height, picture.width, 1)
     parts = parts_of_tile(tiles, colors.device)
     walk = Walk(
-        colors.new_empty(tiles * 16, 16),
-        bins.pairs.new_empty(tiles * 16, 16),
-        torch.zeros_like(bins.pairs),
-        bins.pairs.new_zeros(tiles),
-        bins.pairs.new_zeros(tiles, dtype=torch.int64),
+        transmittances=colors.new_empty(tiles * 16, 16),
+        stops=bins.pairs.new_empty(tiles * 16, 16),
+        blocks=torch.zeros_like(bins.pairs),
+        walked=bins.pairs.new_zeros(tiles),
+        blocks_walked=bins.pairs.new_zeros(tiles, dtype=torch.int64),
     )
     for first in range(0, channels if tiles else 0, CHUNK):
         gaussians.first = first
         cuda_launch(
             forward_kernel(min(CHUNK, channels - first), parts),
             (tiles * parts, WARP),
-            [
-                frame,
-                gaussians,
-                bins.pairs,
-                bins.starts,
-            ],
+            [picture, gaussians, bins.pairs, bins.starts],
             [
                 walk.transmittances,
                 walk.stops,
@@ -108,13 +99,14 @@ def composite_backward(
     view_opacities: Tensor,
     colors: Tensor,
     bins: Bins,
-    frame: Frame,
+    picture: Picture,
+    tuning: object,
     walk: Walk,
     v_renders: Tensor,
     v_alphas: Tensor,
     geometry: bool,
 ) -> tuple[Tensor, None, Tensor]:
-    """As ``composite_cpu.composite_backward``; all rows are written."""
+    """As ``composite_backward`` of the CPU; all rows are written."""
     tiles, channels = walk.walked.numel(), colors.shape[1]
     gaussians = _gaussians(means2d, conics, view_opacities, colors)
     parts = parts_of_tile(tiles, colors.device)
@@ -126,7 +118,7 @@ def composite_backward(
             backward_kernel(min(CHUNK, channels - first), geometry, parts),
             (tiles * parts, WARP),
             [
-                frame,
+                picture,
                 gaussians,
                 bins.pairs,
                 bins.rows,

@@ -1,11 +1,12 @@
 """The CUDA compositor's forward kernel: front to back over the pairs of a tile (README §3)."""
 
 import functools
+from typing import no_type_check
 
 import warp as wp
 
 from ..skip import BLOCK_TEST, STOPPED
-from ..tiles import Frame
+from ..tiles import Picture
 from .warp import (
     HEIGHT,
     RECORD,
@@ -45,7 +46,7 @@ def forward_kernel(channels: int, parts: int):
     """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4."""
     memory = shared_memory(_SIZE)
     place, touched, stage = placing(parts), touching(parts), staging(channels, _SIZE)
-    pixels = SUB_TILES // parts  # of a lane
+    pixels = SUB_TILES // parts  # how many a lane has
     pixels_type = wp.types.vector(pixels, wp.float32)
     sums_type = wp.types.matrix((pixels, channels), wp.float32)
     resident = 24 if channels < 4 else 20  # warps of a multiprocessor, as registers allow
@@ -53,8 +54,9 @@ def forward_kernel(channels: int, parts: int):
     @wp.kernel(
         enable_backward=False, module="unique", launch_bounds=(WARP, resident), grid_stride=False
     )
+    @no_type_check
     def composite(
-        frame: Frame,
+        picture: Picture,
         gaussians: Gaussians,
         pairs_in: wp.array[wp.int32],
         starts_in: wp.array[wp.int32],
@@ -68,14 +70,14 @@ def forward_kernel(channels: int, parts: int):
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
-        p = place(frame, index, lane)
-        half = lane // 4 % 2  # of a sub-tile: blocks of 4 x 4 pixels
+        p = place(picture, index, lane)
+        half = lane // 4 % 2  # which of a sub-tile's two blocks of 4 x 4 pixels
         # positive: the pixel goes on; negative: it stopped; 0: it is outside the picture
         T = pixels_type()
         sums = sums_type()
         inside = wp.int32(0)
         for j in range(wp.static(pixels)):
-            if p.px + j % 2 * WIDTH < frame.width and p.py + j // 2 * HEIGHT < frame.height:
+            if p.px + j % 2 * WIDTH < picture.width and p.py + j // 2 * HEIGHT < picture.height:
                 T[j] = 1.0
                 inside |= 1 << j
         live = memory.any_of(arena, lane, inside)
@@ -97,11 +99,11 @@ def forward_kernel(channels: int, parts: int):
                     load2(gaussians.means2d, g),
                     load3(gaussians.conics, g),
                     load1(gaussians.opacities, g),
-                    frame.alpha_min,
+                    picture.alpha_min,
                 )
-                if (frame.skip & _BLOCK_TEST) == 0:
+                if (picture.skip & _BLOCK_TEST) == 0:
                     mask = live
-                stage(arena, frame, gaussians, lane, g, mask, 0)
+                stage(arena, picture, gaussians, lane, g, mask, 0)
             todo = memory.ballot(arena, lane, mask)
             memory.sync()
             mine = wp.int32(0)
@@ -120,10 +122,10 @@ def forward_kernel(channels: int, parts: int):
                         dy = p.y[j // 2] - shape[1]
                         u = sheared(shape[3], p.x[j % 2] - shape[0], dy)
                         alpha = exp2(exponent(shape[2], level[0], level[1], u, dy))
-                        weight = T[j] * wp.min(alpha, frame.alpha_max)
+                        weight = T[j] * wp.min(alpha, picture.alpha_max)
                         after = T[j] - weight
-                        if alpha >= frame.alpha_min and T[j] > 0.0:
-                            if after > frame.t_min:
+                        if alpha >= picture.alpha_min and T[j] > 0.0:
+                            if after > picture.t_min:
                                 used[0] += wp.static(1 << first_block(j))
                                 T[j] = after
                                 for c in range(wp.static(channels)):
@@ -143,7 +145,7 @@ def forward_kernel(channels: int, parts: int):
                             if T[j] > 0.0:
                                 going = 1
                             over = memory.ballot(arena, lane, going) == 0
-                            if over and (frame.skip & _STOPPED) != 0:
+                            if over and (picture.skip & _STOPPED) != 0:
                                 live &= wp.static(~(1 << j))
                     if live == 0:
                         walked = k0 + i - begin + 1
@@ -162,12 +164,12 @@ def forward_kernel(channels: int, parts: int):
             wp.atomic_max(walked_out, p.tile, walked)
         if lane == 0 and gaussians.first == 0:
             wp.atomic_add(blocks_walked_out, p.tile, wp.int64(evaluated))
-        p = place(frame, anew(index), lane)
+        p = place(picture, anew(index), lane)
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         for j in range(wp.static(pixels)):
             store(transmittances_out, p.place, j * WARP, T[j])
             if T[j] != 0.0:
-                step = j // 2 * HEIGHT * frame.width + j % 2 * WIDTH
+                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 store(alphas_out, p.pixel, step, 1.0 - wp.abs(T[j]))
                 step *= gaussians.channels
                 for c in range(wp.static(channels)):

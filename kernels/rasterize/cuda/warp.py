@@ -6,24 +6,26 @@ functions are C++ with a CPU form, for tests on CPU blocks. CUDA.md has the desi
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, no_type_check
 
 import warp as wp
 
+from ...runtime.views import struct
 from ..constants import TILE
-from ..tiles import Frame, color_row, q_limit
+from ..tiles import Picture, color_row, q_limit
 
 wp.set_module_options({"enable_backward": False})
 
 WARP = 32
 WIDTH, HEIGHT = 8, 4  # pixels of a sub-tile; two of them side by side
-SUB_TILES = 8  # of a tile
+SUB_TILES = 8  # in a tile
 STOP = 16  # bit STOP + j of a pair: a pixel of sub-tile j stopped at it; below are 4 x 4 blocks
 RECORD = 12  # floats of a Gaussian in shared memory
 PITCH = WARP + 4  # floats of a row of partial sums: aligned, and without bank conflicts
-CHUNK = 4  # channels of a launch, at most
+CHUNK = 4  # a launch has at most so many channels
 
-# An integer that branches change in place; of a plain one Warp keeps a copy for each branch.
+# An integer that branches change in place; Warp would keep a copy of a plain one for each branch.
 word = wp.types.vector(1, wp.int32)
 
 _TILE = wp.constant(TILE)
@@ -61,7 +63,7 @@ def exp2(x: wp.float32) -> wp.float32:
 #endif
 """)
 def reciprocal(x: wp.float32) -> wp.float32:
-    """1/x of a normal number, to 1 unit in the last place; of 1 exactly 1."""
+    """1/x of a normal number, to 1 unit in the last place; 1/1 is exactly 1."""
     ...
 
 
@@ -124,11 +126,11 @@ def store_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32, v: wp.
     return x;
 """)
 def anew(x: wp.int32) -> wp.int32:
-    """The same; what is computed from it is not kept in registers from before."""
+    """Returns x; what was computed from x before is not kept in registers for its sake."""
     ...
 
 
-# fmaf by name: forward and backward must see the same alpha, so no choice is left to the compiler.
+# fmaf is named, since forward and backward must see the same alpha: the compiler has no choice.
 @wp.func_native("return fmaf(k, dy, dx);")
 def sheared(k: wp.float32, dx: wp.float32, dy: wp.float32) -> wp.float32:
     """The u of README §5."""
@@ -226,21 +228,22 @@ _PUT4 = f"""
 class Memory(NamedTuple):
     """A warp's shared memory: ``arena`` is the tile's type, the rest are functions."""
 
-    arena: type
-    sync: wp.Function
-    any_of: wp.Function  # the or of all lanes' integers
-    ballot: wp.Function  # bit l: lane l's integer is not 0
-    put: wp.Function
-    put_int: wp.Function
-    get_int: wp.Function
-    put4: wp.Function  # at a multiple of 4
-    get4: wp.Function
+    arena: object
+    sync: Callable
+    any_of: Callable  # the or of all lanes' integers
+    ballot: Callable  # bit l: lane l's integer is not 0
+    put: Callable
+    put_int: Callable
+    get_int: Callable
+    put4: Callable  # at a multiple of 4
+    get4: Callable
 
 
 @functools.cache
 def shared_memory(size: int) -> Memory:
     """Access to ``size`` floats, which lie behind 32 words for the CPU's votes."""
-    arena_type = wp.tile[float, WARP + size]
+    # Its stub has the function of that name only.
+    arena_type = wp.tile[float, WARP + size]  # pyright: ignore[reportIndexIssue]
 
     @wp.func_native(_SYNC)
     def sync(): ...
@@ -269,12 +272,12 @@ def shared_memory(size: int) -> Memory:
     return Memory(arena_type, sync, any_of, ballot, put, put_int, get_int, put4, get4)
 
 
-@wp.struct
+@struct
 class Place:
     """Where a warp and a lane work."""
 
     tile: wp.int32
-    part: wp.int32  # of the tile
+    part: wp.int32  # which part of the tile
     px: wp.int32  # the lane's pixel in the first sub-tile
     py: wp.int32
     pixel: wp.int64  # its number in all pictures
@@ -290,16 +293,17 @@ def placing(parts: int):
     pixels = SUB_TILES // parts
 
     @wp.func
-    def place(frame: Frame, index: wp.int32, lane: wp.int32) -> Place:
+    @no_type_check
+    def place(picture: Picture, index: wp.int32, lane: wp.int32) -> Place:
         p = Place()
         p.tile = index // wp.static(parts)
         p.part = index % wp.static(parts)
-        image = p.tile // (frame.tiles_x * frame.tiles_y)
-        x = p.tile % frame.tiles_x * _TILE
-        y = p.tile // frame.tiles_x % frame.tiles_y * _TILE + p.part * wp.static(TILE // parts)
+        image = p.tile // (picture.tiles_x * picture.tiles_y)
+        x = p.tile % picture.tiles_x * _TILE
+        y = p.tile // picture.tiles_x % picture.tiles_y * _TILE + p.part * wp.static(TILE // parts)
         p.px = x + lane % WIDTH
         p.py = y + lane // WIDTH
-        p.pixel = wp.int64(image * frame.height + p.py) * wp.int64(frame.width) + wp.int64(p.px)
+        p.pixel = wp.int64(image * picture.height + p.py) * wp.int64(picture.width) + wp.int64(p.px)
         p.place = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
         for i in range(2):
             p.x[i] = float(p.px + i * WIDTH) + 0.5
@@ -316,6 +320,7 @@ def touching(parts: int):
     """The test of a Gaussian against the sub-tiles of a part of a tile (README eq. 6)."""
 
     @wp.func
+    @no_type_check
     def touched(
         corner: wp.vec2, mean: wp.vec2, conic: wp.vec3, opacity: wp.float32, alpha_min: wp.float32
     ) -> wp.int32:
@@ -347,7 +352,7 @@ def touching(parts: int):
     return touched
 
 
-@wp.struct
+@struct
 class Gaussians:
     """What is composited; dense arrays over view-major Gaussians."""
 
@@ -355,8 +360,8 @@ class Gaussians:
     conics: wp.array[wp.vec3]
     opacities: wp.array[wp.float32]
     colors: wp.array2d[wp.float32]
-    channels: wp.int32  # of ``colors``
-    first: wp.int32  # the first one of this launch
+    channels: int  # how many ``colors`` has
+    first: int  # the first channel of this launch
 
 
 @functools.cache
@@ -369,9 +374,10 @@ def staging(channels: int, size: int):
     arena_type = memory.arena
 
     @wp.func
+    @no_type_check
     def stage(
         arena: arena_type,
-        frame: Frame,
+        picture: Picture,
         gaussians: Gaussians,
         lane: wp.int32,
         g: wp.int32,
@@ -386,7 +392,7 @@ def staging(channels: int, size: int):
         memory.put(arena, at + 5, wp.log2(load1(gaussians.opacities, g)))
         memory.put_int(arena, at + 6, bits)
         memory.put_int(arena, at + 7, row)
-        source = wp.int64(color_row(frame, g)) * wp.int64(gaussians.channels)
+        source = wp.int64(color_row(picture, g)) * wp.int64(gaussians.channels)
         for c in range(wp.static(channels)):
             memory.put(arena, at + 8 + c, load(gaussians.colors, source, gaussians.first + c))
 

@@ -6,16 +6,19 @@ h_n lives in registers and N is free. Equations are those of README.md.
 """
 
 import functools
+from typing import no_type_check
 
 import torch
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES, W, flush_denormals, lanes, restore_denormals
+from ...runtime.views import struct
 from . import recurrence, tokens
+from .decays import SCALES
 from .layout import BLOCKS
-from .recurrence import NEED_DB, NEED_DC, SCALES
-from .tokens import GRAD_TOKEN, KEPT, TOKEN
-from .tuning import Variant
+from .recurrence import NEED_DB, NEED_DC
+from .tokens import EXTRA, GRAD_TOKEN, KEPT, TOKEN
+from .tuning import Tuning
 
 SPAN = 32  # lane groups of a task at most: long pieces of rows, and what a core's own cache holds
 
@@ -24,7 +27,7 @@ _W = wp.constant(W)
 _DC, _DB = wp.constant(NEED_DC), wp.constant(NEED_DB)
 
 
-@wp.struct
+@struct
 class Sizes:
     """What the kernels know: shapes, options, and which gradients are wanted."""
 
@@ -42,7 +45,7 @@ class Sizes:
     needs: int
 
 
-@wp.struct
+@struct
 class Place:
     """Where a task works."""
 
@@ -59,6 +62,7 @@ class Place:
 
 
 @wp.func
+@no_type_check
 def _place(sizes: Sizes, task: int) -> Place:
     spans = (sizes.group_blocks + sizes.span - 1) / sizes.span
     first = task % spans * sizes.span
@@ -82,7 +86,7 @@ def _place(sizes: Sizes, task: int) -> Place:
 
 @functools.cache
 def forward_kernel(
-    variant: Variant, io: torch.dtype, delta_io: torch.dtype, discretization: str, output: bool
+    tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, discretization: str, output: bool
 ):
     """From the states before each segment, in ``h_out``, to those after it.
 
@@ -91,13 +95,14 @@ def forward_kernel(
     """
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
     token = tokens.forward_leaves(io, delta_io)
-    state = recurrence.forward_leaves(discretization, variant.degree)
+    state = recurrence.forward_leaves(discretization, tuning)
     prepare, finish = token.prepare, token.finish
     advance, accumulate = state.advance, state.accumulate
-    scale, chunk_size, strip_size = SCALES[discretization], variant.chunk, variant.strip
-    room = TOKEN * strip_size + 1  # one more, for alignment to cache lines
+    scale, chunk_size, strip_size = SCALES[discretization], tuning.chunk, tuning.strip
+    room = TOKEN * strip_size + EXTRA
 
     @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
     def scan_forward(
         offset: int,
         # in
@@ -153,16 +158,17 @@ def forward_kernel(
 
 @functools.cache
 def gradient_states_kernel(
-    variant: Variant, io: torch.dtype, delta_io: torch.dtype, discretization: str
+    tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, discretization: str
 ):
     """What a segment's outputs send back to the state before it, and the products of the decays."""
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
     prepare = tokens.backward_leaves(io, delta_io).prepare
-    gather = recurrence.backward_leaves(discretization, variant).gather
-    scale, chunk_size = SCALES[discretization], variant.chunk
-    room = GRAD_TOKEN * chunk_size + 1
+    gather = recurrence.backward_leaves(discretization, tuning).gather
+    scale, chunk_size = SCALES[discretization], tuning.chunk
+    room = GRAD_TOKEN * chunk_size + EXTRA
 
     @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
     def scan_gradient_states(
         offset: int,
         # in
@@ -202,17 +208,18 @@ def gradient_states_kernel(
 
 
 @functools.cache
-def backward_kernel(variant: Variant, io: torch.dtype, delta_io: torch.dtype, discretization: str):
+def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, discretization: str):
     """From the gradients of the states after each segment, in ``dh_out``, to all others."""
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
     token = tokens.backward_leaves(io, delta_io)
-    state = recurrence.backward_leaves(discretization, variant)
+    state = recurrence.backward_leaves(discretization, tuning)
     prepare, finish = token.prepare, token.finish
     retreat, sum_lanes, scale = state.retreat, state.sum_lanes, SCALES[discretization]
-    chunk_size = variant.chunk
-    room, kept_room = GRAD_TOKEN * chunk_size + 1, KEPT * chunk_size + 1
+    chunk_size = tuning.chunk
+    room, kept_room = GRAD_TOKEN * chunk_size + EXTRA, KEPT * chunk_size + 1
 
     @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
     def scan_backward(
         offset: int,
         # in

@@ -10,39 +10,13 @@ from types import SimpleNamespace
 import warp as wp
 
 from ...runtime.lanes import lanes, prelude
+from .decays import SPREAD, STATE, walks
 from .tokens import TOKENS
-from .tuning import Variant
+from .tuning import Tuning
 
 # gradients that cost work inside the loops, as bits of ``needs``
 NEED_DZ, NEED_DC, NEED_DB, NEED_DH = 1, 2, 4, 8
 
-LOG2E = 1.4426950408889634
-# what δ is multiplied by to give ``rate``: exponentials are powers of two
-SCALES = {"mamba": LOG2E, "bilinear": 1.0, "zoh": LOG2E}
-
-_PHI = """
-    const F xe = x * 0.6931471805599453f;
-    F series = splat(2.505210838544172e-8f), slope = splat(2.505210838544172e-7f);
-    const float series_of[10] = {2.755731922398589e-7f, 2.755731922398589e-6f, 2.48015873015873e-5f,
-        1.984126984126984e-4f, 1.388888888888889e-3f, 8.333333333333333e-3f,
-        4.1666666666666664e-2f, 0.16666666666666666f, 0.5f, 1.0f};
-    for (int i = 0; i < 10; ++i) series = fma_(series, xe, splat(series_of[i]));
-    for (int i = 0; i < 9; ++i) slope = fma_(slope, xe, splat(series_of[i] * (float)(9 - i)));
-    const I small = (xe < 1.0f) & (xe > -1.0f);
-    const F safe = small ? splat(1.0f) : xe;
-    const F g = small ? series : (f - 1.0f) / safe;
-"""
-# Equations 2 to 4: f and g of x = rate A.
-_FACTORS = {
-    "mamba": "const F f = exp2(x); const F g = splat(1.0f);",
-    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x); const F f = fma_(x, g, splat(1.0f));",
-    "zoh": "const F f = exp2(x);" + _PHI,
-}
-# And their slopes, f given.
-_SLOPES = {
-    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x); const F df = g * g, dg = 0.5f * df;",
-    "zoh": _PHI + "const F df = f, dg = small ? slope : (f - g) / safe;",
-}
 _OPEN = (
     TOKENS
     + """
@@ -63,75 +37,72 @@ for (int n = 0; n < states; ++n) {
     const F a = rates[n];
 """
 )
-_WALK = """
-    if (tame) walk(exp2_tame_);
+_CHOOSE = """
+    const bool slow = slow_(*(const F*)&token[count] * a);
+    if (slow) slow_walk(0);
+    else if (tame) walk(exp2_tame_);
     else walk(exp2_);
-}
 """
 
 # Equations 1 and 5.
-_ADVANCE = (
-    _OPEN
-    + """
+_ADVANCE = """
     Token* const token = aligned_((Token*)scratch.data);
     const Column b = column_(b_in, n), c = column_(c_in, n);
-    auto walk = [&](auto exp2) {
-        F h = state_(h_out, n);
+WALKS
+}
+"""
+_ADVANCE_WALK = """
+        STATE h(state_(h_out, n), state_(h_out, states + n));
         for (int t = 0; t < count; ++t) {
             const F x = token[t].rate * a;
             FACTORS
-            h = fma_(f, h, g * (token[t].du * b[t]));
-            token[t].y = fma_(h, splat(c[t]), token[t].y);
+            h.step(m, g * (token[t].du * b[t]));
+            token[t].y = fma_(h.value(), splat(c[t]), token[t].y);
         }
-        state_(h_out, n) = h;
-    };
+        h.keep(state_(h_out, n), state_(h_out, states + n));
 """
-    + _WALK
-)
 
 # Equation 1 alone, and the product of the decays.
-_ACCUMULATE = (
-    _OPEN
-    + """
+_ACCUMULATE = """
     const Token* const token = aligned_((const Token*)scratch.data);
     const Column b = column_(b_in, n);
-    auto walk = [&](auto exp2) {
-        F h = state_(h_out, n), product = state_(product_out, n);
+WALKS
+}
+"""
+_ACCUMULATE_WALK = """
+        STATE h(state_(h_out, n), state_(h_out, states + n));
+        STATE product(state_(product_out, n), state_(product_out, states + n));
         for (int t = 0; t < count; ++t) {
             const F x = token[t].rate * a;
             FACTORS
-            h = fma_(f, h, g * (token[t].du * b[t]));
-            product *= f;
+            h.step(m, g * (token[t].du * b[t]));
+            product.decay(m);
         }
-        state_(h_out, n) = h;
-        state_(product_out, n) = product;
-    };
+        h.keep(state_(h_out, n), state_(h_out, states + n));
+        product.keep(state_(product_out, n), state_(product_out, states + n));
 """
-    + _WALK
-)
 
 # What the outputs send back to the state before the first token, and the product of the decays.
-_GATHER = (
-    _OPEN
-    + """
+_GATHER = """
     const GradToken* const token = aligned_((const GradToken*)scratch.data);
     const Column c = column_(c_in, n);
-    auto walk = [&](auto exp2) {
-        F dh = state_(dh_out, n), product = state_(product_out, n);
+WALKS
+}
+"""
+_GATHER_WALK = """
+        STATE dh(state_(dh_out, n), state_(dh_out, states + n));
+        STATE product(state_(product_out, n), state_(product_out, states + n));
         for (int t = 0; t < count; ++t) {
             const F x = token[t].rate * a;
             FACTORS
-            product *= f;
-            dh = fma_(product, token[t].dy * c[t], dh);
+            product.decay(m);
+            dh.add(product.value(), token[t].dy * c[t]);
         }
-        state_(dh_out, n) = dh;
-        state_(product_out, n) = product;
-    };
+        dh.keep(state_(dh_out, n), state_(dh_out, states + n));
+        product.keep(state_(product_out, n), state_(product_out, states + n));
 """
-    + _WALK
-)
 
-# As _ADVANCE, keeping f and h of every token, and adding dy·h to the sums of dC (equation 8); then
+# As _ADVANCE, keeping m and h of every token, and adding dy·h to the sums of dC (equation 8); then
 # backwards, equations 6, 7 and 9 to 12. Σ rate q is left in da.
 _RETREAT = f"""
     GradToken* const token = aligned_((GradToken*)scratch.data);
@@ -143,62 +114,73 @@ _RETREAT = f"""
         if (needs & {NEED_DB}) db[t] = F{{}};
         if (needs & {NEED_DC}) dc[t] = F{{}};
     }}
-    auto walk = [&](auto exp2) {{
-        F h = state_(starts_in, n);
+WALKS
+    if (!(needs & {NEED_DH})) continue;
+    if (slow) slow_back(0);
+    else back(0);
+}}
+"""
+_RETREAT_WALK = f"""
+        STATE h(state_(starts_in, n), F{{}});
         for (int t = 0; t < count; ++t) {{
             const F x = token[t].rate * a;
             FACTORS
-            kept[t].f = f;
-            kept[t].h = h;
-            h = fma_(f, h, g * (token[t].du * b[t]));
-            if (needs & {NEED_DZ}) token[t].y = fma_(h, splat(c[t]), token[t].y);
-            if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h, dc[t]);
+            kept[t].m = m;
+            kept[t].h = h.value();
+            h.step(m, g * (token[t].du * b[t]));
+            if (needs & {NEED_DZ}) token[t].y = fma_(h.value(), splat(c[t]), token[t].y);
+            if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h.value(), dc[t]);
         }}
-    }};
-    if (tame) walk(exp2_tame_);
-    else walk(exp2_);
-    if (!(needs & {NEED_DH})) continue;
-    F dh = state_(dh_out, n), da = F{{}};
-    for (int t = count - 1; t >= 0; --t) {{
-        GradToken& own = token[t];
-        const F f = kept[t].f;
-        dh = fma_(own.dy, splat(c[t]), dh);
-        GRADIENT
-        own.p = fma_(q, a, own.p);
-        da = fma_(q, own.rate, da);
-    }}
-    state_(dh_out, n) = dh;
-    state_(da_out, n) += da;
-}}
+"""
+_RETREAT_BACK = """
+        STATE dh(state_(dh_out, n), state_(dh_out, states + n));
+        F da = F{};
+        for (int t = count - 1; t >= 0; --t) {
+            GradToken& own = token[t];
+            const F m = kept[t].m;
+            dh.add(own.dy, splat(c[t]));
+            GRADIENT
+            own.p = fma_(q, a, own.p);
+            da = fma_(q, own.rate, da);
+        }
+        dh.keep(state_(dh_out, n), state_(dh_out, states + n));
+        state_(da_out, n) += da;
 """
 _OWN = f"""
-        if (needs & {NEED_DB}) db[t] = fma_(dh, own.du, db[t]);
-        own.s = fma_(dh, splat(b[t]), own.s);
-        dh = f * dh;
-        const F q = dh * kept[t].h;
+            const F v = dh.value();
+            if (needs & {NEED_DB}) db[t] = fma_(v, own.du, db[t]);
+            own.s = fma_(v, splat(b[t]), own.s);
+            dh.decay(m);
+            const F q = dh.value() * kept[t].h;
 """
 _GENERAL = f"""
-        const F x = own.rate * a;
-        SLOPES
-        const F gh = g * dh;
-        if (needs & {NEED_DB}) db[t] = fma_(gh, own.du, db[t]);
-        own.s = fma_(gh, splat(b[t]), own.s);
-        const F q = dh * (kept[t].h * df + own.du * b[t] * dg);
-        dh = f * dh;
+            const F x = own.rate * a;
+            SLOPES
+            const F v = dh.value(), gv = g * v;
+            if (needs & {NEED_DB}) db[t] = fma_(gv, own.du, db[t]);
+            own.s = fma_(gv, splat(b[t]), own.s);
+            const F q = v * (kept[t].h * df + own.du * b[t] * dg);
+            dh.decay(m);
 """
-_GRADIENTS = {
-    "mamba": _OWN,
-    "bilinear": _GENERAL.replace("SLOPES", _SLOPES["bilinear"]),
-    "zoh": _GENERAL.replace("SLOPES", _SLOPES["zoh"]),
-}
+
+
+def _leaf(text: str, walk: str, discretization: str, tuning: Tuning, back: str = "") -> str:
+    """The C++ text of a leaf: for every state its ``text``, with the walks that belong to it."""
+    parts = walks("walk", walk, discretization)
+    if back:
+        gradient = _OWN if discretization == "mamba" else _GENERAL
+        parts += walks("back", back.replace("GRADIENT", gradient), discretization)
+    text = prelude(tuning.degree) + STATE + _OPEN + text.replace("WALKS", parts + _CHOOSE)
+    chunk = tuning.chunk
+    return text.replace("SPREAD", str(max(SPREAD, chunk))).replace("CHUNK", str(chunk))
 
 
 @functools.cache
-def forward_leaves(discretization: str, degree: int) -> SimpleNamespace:
+def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """``advance`` and ``accumulate``: the states of a lane group from before the strip to after."""
-    factors, head = _FACTORS[discretization], prelude(degree)
+    parts = discretization, tuning
 
-    @wp.func_native(head + _ADVANCE.replace("FACTORS", factors))
+    @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts))
     def advance(
         states: int,
         tame: int,
@@ -213,7 +195,7 @@ def forward_leaves(discretization: str, degree: int) -> SimpleNamespace:
         h_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(head + _ACCUMULATE.replace("FACTORS", factors))
+    @wp.func_native(_leaf(_ACCUMULATE, _ACCUMULATE_WALK, *parts))
     def accumulate(
         states: int,
         tame: int,
@@ -232,17 +214,14 @@ def forward_leaves(discretization: str, degree: int) -> SimpleNamespace:
 
 
 @functools.cache
-def backward_leaves(discretization: str, variant: Variant) -> SimpleNamespace:
+def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """``retreat`` and ``gather``: gradients of states from after the chunk to before.
 
     ``first`` says that the sums of dB and dC are empty yet.
     """
-    factors = _FACTORS[discretization]
-    head, chunk = prelude(variant.degree), str(variant.chunk)
-    retreat_text = _OPEN + _RETREAT.replace("GRADIENT", _GRADIENTS[discretization])
-    retreat_text = retreat_text.replace("FACTORS", factors).replace("CHUNK", chunk)
+    parts = discretization, tuning
 
-    @wp.func_native(head + retreat_text)
+    @wp.func_native(_leaf(_RETREAT, _RETREAT_WALK, *parts, _RETREAT_BACK))
     def retreat(
         states: int,
         tame: int,
@@ -264,7 +243,7 @@ def backward_leaves(discretization: str, variant: Variant) -> SimpleNamespace:
         da_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(head + _GATHER.replace("FACTORS", factors))
+    @wp.func_native(_leaf(_GATHER, _GATHER_WALK, *parts))
     def gather(
         states: int,
         tame: int,
@@ -279,13 +258,13 @@ def backward_leaves(discretization: str, variant: Variant) -> SimpleNamespace:
         product_out: wp.array(dtype=lanes),
     ): ...
 
-    return SimpleNamespace(retreat=retreat, gather=gather, sum_lanes=_sum_lanes(variant.chunk))
+    return SimpleNamespace(retreat=retreat, gather=gather, sum_lanes=_sum_lanes(tuning.chunk))
 
 
-# Rows of ``sums`` [states, CHUNK] to their sums over lanes, eight rows at a time.
+# Adds up the lanes of the rows of ``sums_in`` [states, CHUNK], eight rows at a time.
 _SUM_LANES = """
 typedef float E __attribute__((vector_size(32), aligned(4)));
-const E* const rows = (const E*)sums.data;
+const E* const rows = (const E*)sums_in.data;
 auto pair = [](E a, E b) -> E {
     return __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13)
         + __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
@@ -303,7 +282,7 @@ for (int n = 0; n < states; ++n)
         const E high = quad(pair(v[4], v[5]), pair(v[6], v[7]));
         const E all = __builtin_shufflevector(low, high, 0, 1, 2, 3, 8, 9, 10, 11)
             + __builtin_shufflevector(low, high, 4, 5, 6, 7, 12, 13, 14, 15);
-        float* const out = total.data + n * (size_t)length + t0 + t;
+        float* const out = total_out.data + n * (size_t)length + t0 + t;
         if (t + 8 <= count) *(E*)out = all;
         else for (int i = 0; i < count - t; ++i) out[i] = all[i];
     }
@@ -318,8 +297,8 @@ def _sum_lanes(chunk: int):
         length: int,
         t0: int,
         count: int,
-        sums: wp.array(dtype=lanes),
-        total: wp.array(dtype=wp.float32),
+        sums_in: wp.array(dtype=lanes),
+        total_out: wp.array(dtype=wp.float32),
     ): ...
 
     return sum_lanes

@@ -17,10 +17,11 @@ from ...runtime.rows import ELEMENTS, rows
 TOKENS = """
 struct Token { F rate, du, y; };
 struct GradToken { F rate, du, dy, y, s, p; };
-struct Kept { F f, h; };
+struct Kept { F m, h; };
 auto aligned_ = [](auto* p) { return (decltype(p))(((size_t)p + 63) & ~(size_t)63); };
 """
 TOKEN, GRAD_TOKEN, KEPT = 3, 6, 2  # lanes of each
+EXTRA = 2  # lanes beside the tokens: the largest rate, and room for the alignment
 
 _PRELUDE = PRELUDE + ACTIVATIONS + ELEMENTS + TOKENS
 
@@ -43,7 +44,12 @@ for (int t = 0; t < count; ++t) {
     const F rate = step * scale;
     top = wider_(top, rate);
 """
-_CLOSE = "} return tame_(top * *(const F*)&widest_in);"
+# The largest |rate| of each lane is left behind the tokens, for the recurrence.
+_CLOSE = """
+}
+*(F*)&token[count] = top;
+return tame_(top * *(const F*)&widest_in);
+"""
 _PREPARE = (
     "Token* const token = aligned_((Token*)scratch.data);"
     + _OPEN.replace("FETCH", "")
@@ -57,10 +63,10 @@ const Token* const token = aligned_((const Token*)scratch.data);
 if (use_z)
     for (int t = 0; t < count; ++t) {
         const F z = read_z(t);
-        write_out(t, token[t].y * (z * sigmoid_(z)));
+        write_y(t, token[t].y * (z * sigmoid_(z)));
     }
 else
-    for (int t = 0; t < count; ++t) write_out(t, token[t].y);
+    for (int t = 0; t < count; ++t) write_y(t, token[t].y);
 """
 
 # As _PREPARE, and dy = dout silu(z).
@@ -83,8 +89,8 @@ _FINISH_GRAD = """
 const GradToken* const token = aligned_((const GradToken*)scratch.data);
 const F bias = *(const F*)&bias_in, skip = *(const F*)&skip_in;
 F dskip = F{}, dbias = F{};
-const bool need_u = du_in.shape[1] > 0, need_delta = ddelta_in.shape[1] > 0;
-const bool need_z = dz_in.shape[1] > 0;
+const bool need_u = du_out.shape[1] > 0, need_delta = ddelta_out.shape[1] > 0;
+const bool need_z = dz_out.shape[1] > 0;
 for (int t = 0; t < count; ++t) {
     const GradToken& own = token[t];
     const F u = read_u(t);
@@ -106,19 +112,19 @@ for (int t = 0; t < count; ++t) {
 
 
 def _leaf(text: str, **arrays: torch.dtype) -> str:
-    return _PRELUDE + "".join(rows(name, dtype) for name, dtype in arrays.items()) + text
+    return _PRELUDE + "".join(rows(array, dtype) for array, dtype in arrays.items()) + text
 
 
 @functools.cache
 def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
-    """``prepare`` and ``finish`` for u, z, out and delta of these dtypes.
+    """``prepare`` and ``finish`` for u, z and y of dtype ``io`` and delta of ``delta_io``.
 
     ``prepare`` fills rate, δu and D u, returns whether all |rate A| are tame, and fetches this lane
     group's ``share`` of the ``lines`` of the rows that begin ``next`` tokens on.
     """
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
 
-    @wp.func_native(_leaf(_PREPARE, u=io, delta=delta_io, z=io))
+    @wp.func_native(_leaf(_PREPARE, u_in=io, delta_in=delta_io, z_in=io))
     def prepare(
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
@@ -141,7 +147,7 @@ def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         scratch: wp.array(dtype=lanes),
     ) -> int: ...
 
-    @wp.func_native(_leaf(_FINISH, z=io, out=io))
+    @wp.func_native(_leaf(_FINISH, z_in=io, y_out=io))
     def finish(
         z_in: wp.array3d(dtype=scalar),
         b: int,
@@ -151,7 +157,7 @@ def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         width: int,
         use_z: int,
         scratch: wp.array(dtype=lanes),
-        out_in: wp.array3d(dtype=scalar),
+        y_out: wp.array3d(dtype=scalar),
     ): ...
 
     return SimpleNamespace(prepare=prepare, finish=finish)
@@ -159,10 +165,10 @@ def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
 
 @functools.cache
 def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
-    """``prepare`` and ``finish`` of the backward pass."""
+    """``prepare`` and ``finish`` of the gradient, for dtypes as in ``forward_leaves``."""
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
 
-    @wp.func_native(_leaf(_PREPARE_GRAD, u=io, delta=delta_io, z=io, dout=io))
+    @wp.func_native(_leaf(_PREPARE_GRAD, u_in=io, delta_in=delta_io, z_in=io, dout_in=io))
     def prepare(
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
@@ -187,7 +193,16 @@ def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
     ) -> int: ...
 
     @wp.func_native(
-        _leaf(_FINISH_GRAD, u=io, delta=delta_io, z=io, dout=io, du=io, ddelta=delta_io, dz=io)
+        _leaf(
+            _FINISH_GRAD,
+            u_in=io,
+            delta_in=delta_io,
+            z_in=io,
+            dout_in=io,
+            du_out=io,
+            ddelta_out=delta_io,
+            dz_out=io,
+        )
     )
     def finish(
         u_in: wp.array3d(dtype=scalar),
@@ -205,9 +220,9 @@ def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         use_softplus: int,
         scale: float,
         scratch: wp.array(dtype=lanes),
-        du_in: wp.array3d(dtype=scalar),
-        ddelta_in: wp.array3d(dtype=delta_scalar),
-        dz_in: wp.array3d(dtype=scalar),
+        du_out: wp.array3d(dtype=scalar),
+        ddelta_out: wp.array3d(dtype=delta_scalar),
+        dz_out: wp.array3d(dtype=scalar),
         dskip_out: wp.array(dtype=lanes),
         dbias_out: wp.array(dtype=lanes),
     ): ...

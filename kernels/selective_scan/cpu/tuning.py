@@ -9,7 +9,7 @@ from ...runtime.choice import Choice
 
 
 @dataclasses.dataclass(frozen=True)
-class Variant:
+class Tuning:
     """A choice of kernels; ``gamba bench scan`` has what each choice costs.
 
     Attributes:
@@ -33,18 +33,23 @@ class Variant:
         if not 2 <= self.degree <= 6:
             raise ValueError(f"degree is {self.degree}, allowed are 2 to 6")
 
+    def numbers(self) -> list[int]:
+        """The fields in their order, as the operators take them: ``Tuning(*numbers)`` is equal."""
+        return [self.chunk, self.strip, self.degree]
 
-_choice = Choice(Variant())
+
+_choice = Choice(Tuning())
 
 
-def current() -> Variant:
-    """What a scan on the CPU runs on now."""
+def current() -> Tuning:
+    """The tuning that a scan on the CPU gets if it begins now."""
     return _choice.value
 
 
-def use_variant(variant: Variant) -> AbstractContextManager[None]:
-    """Every scan on the CPU runs on ``variant`` inside; a gradient must run inside as its forward.
+def use_tuning(tuning: Tuning) -> AbstractContextManager[None]:
+    """Every scan on the CPU that begins inside runs on ``tuning``, and so does its gradient.
 
-    It holds for all threads of the process: autograd may compute gradients on threads of its own.
+    It holds for all threads of the process. A gradient may run later: it has the tuning of its
+    forward.
     """
-    return _choice.use(variant)
+    return _choice.use(tuning)

@@ -1,13 +1,14 @@
-"""The gradient kernels of the CUDA scan: a piece of the sequence backwards, chunk by chunk.
+"""The gradient kernels of the CUDA scan: a segment of the sequence backwards, chunk by chunk.
 
 A chunk starts from the state that the forward saved. It is walked once to mark the state before
 every few tokens, then in these few tokens at a time, last first: forwards again, holding decays and
 states in registers, and backwards. Sums over states and over the block's channels go through shared
 memory, so that dB and dC leave a block once per token and state. ``summarise_backward`` gives
-what a piece's own outputs send back through it, for all pieces but the first at once.
+what a segment's own outputs send back through it, for all segments but the first at once.
 """
 
 import functools
+from typing import no_type_check
 
 import warp as wp
 
@@ -15,7 +16,7 @@ from ...runtime.lanes import WARP_DTYPES
 from ...runtime.scalars import LOG2E, sigmoid, softplus, softplus_slope
 from .blocks import (
     MARK,
-    Frame,
+    BlockShape,
     Place,
     Sizes,
     arena_io,
@@ -34,7 +35,7 @@ from .tokens import SUB, advancing, decaying, marking
 TILE = 16  # tokens
 
 
-def _retreat_layout(f: Frame, flags: frozenset) -> tuple[dict, int]:
+def _retreat_layout(f: BlockShape, flags: frozenset) -> tuple[dict, int]:
     partial = f.lanes * lane_stride(f)
     products = SUB * token_stride(f)
     parts = {"STEP": SUB * f.span, "DU": SUB * f.span, "B": SUB * f.padded}
@@ -51,7 +52,7 @@ def _retreat_layout(f: Frame, flags: frozenset) -> tuple[dict, int]:
 
 @functools.cache
 def backward_kernel(
-    dtypes: tuple, mode: str, f: Frame, use_softplus: bool, use_z: bool, flags: frozenset
+    dtypes: tuple, mode: str, f: BlockShape, use_softplus: bool, use_z: bool, flags: frozenset
 ):
     """The kernel of one static shape.
 
@@ -86,8 +87,8 @@ def backward_kernel(
 
     @wp.func
     def set_marks(
-        p: Place, arena: arena_type, marks: wp.array(dtype=float), t0: int, end: int, bias: float,
-        a: vec, h: vec,
+        p: Place, arena: arena_type, marks_out: wp.array(dtype=float), t0: int, end: int,
+        bias: float, a: vec, h: vec,
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
         b_in: wp.array4d(dtype=matrix_scalar),
@@ -114,7 +115,7 @@ def backward_kernel(
             u = fetch_tile(u_in, p, first, end)
             delta = fetch_tile_delta(delta_in, p, first, end)
             b = fetch_tile_matrix(b_in, p, first, end)
-            h = mark(arena, base, marks, tile, subs, p.slot, p.q, a, h)
+            h = mark(arena, base, marks_out, tile, subs, p.slot, p.q, a, h)
         sync()
 
     @wp.func
@@ -154,6 +155,7 @@ def backward_kernel(
         return wp.vec2(dskip, dbias)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
+    @no_type_check
     def scan_backward(
         # in
         sizes: Sizes,
@@ -261,7 +263,7 @@ def backward_kernel(
                     du_out, ddelta_out, dz_out,
                 )  # fmt: skip
             sync()
-        if p.piece == 0:
+        if p.segment == 0:
             write_states(first_out, p.b, p, first_half(state))
         write_states(da_out, p.at, p, second_half(state))
         if p.active != 0:
@@ -272,8 +274,10 @@ def backward_kernel(
 
 
 @functools.cache
-def summary_kernel(dtypes: tuple, mode: str, f: Frame, use_softplus: bool, use_z: bool, read: bool):
-    """What each piece's own outputs send to the state it starts from, and its decay.
+def summary_kernel(
+    dtypes: tuple, mode: str, f: BlockShape, use_softplus: bool, use_z: bool, read: bool
+):
+    """What each segment's own outputs send to the state it starts from, and its decay.
 
     Args: as ``backward_kernel``.
     """
@@ -293,6 +297,7 @@ def summary_kernel(dtypes: tuple, mode: str, f: Frame, use_softplus: bool, use_z
     scale = 1.0 if multiply else LOG2E
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
+    @no_type_check
     def summarise_backward(
         # in
         sizes: Sizes,
@@ -315,7 +320,7 @@ def summary_kernel(dtypes: tuple, mode: str, f: Frame, use_softplus: bool, use_z
         bias = bias_in[p.d]
         total = wp.float32(0.0)
         tiles = (p.end - p.begin + wp.static(TILE - 1)) / wp.static(TILE)
-        tiles = wp.where(p.piece == 0, 0, tiles)  # of the first piece nobody asks
+        tiles = wp.where(p.segment == 0, 0, tiles)  # of the first segment nobody asks
         t0 = p.begin + (tiles - 1) * wp.static(TILE)
         end = wp.where(tiles > 0, p.end, 0)
         z = raw()

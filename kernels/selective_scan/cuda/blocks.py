@@ -8,19 +8,21 @@ a thread owns one channel and every ``rows``-th token, so that a warp touches ad
 
 import dataclasses
 import functools
+from typing import no_type_check
 
 import torch
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
 from ...runtime.scalars import WIDE
+from ...runtime.views import struct
 
 STATES = 16  # of a state block, the most that a channel holds in registers
 MARK = 64  # tokens between the states that the forward saves for the gradient
 
 
 @dataclasses.dataclass(frozen=True)
-class Frame:
+class BlockShape:
     """The static shape of a block."""
 
     block: int  # threads
@@ -65,12 +67,12 @@ class Frame:
         return 32 // self.lanes if self.lanes > 1 else 0
 
 
-def frame(block: int, channels: int, states: int, total: int) -> Frame:
-    """The frame of ``total`` states for a variant's block, channels and states of a thread."""
+def block_shape(block: int, channels: int, states: int, total: int) -> BlockShape:
+    """The block shape for ``total`` states; the others are a tuning's, of a block or a thread."""
     width = min(STATES, 1 << (total - 1).bit_length())
     states = min(states, width)
     lanes = width // states
-    return Frame(block, min(channels, lanes), states, lanes, -(-total // width))
+    return BlockShape(block, min(channels, lanes), states, lanes, -(-total // width))
 
 
 # A type, an integer of its bits, and the float that such an integer means.
@@ -99,7 +101,7 @@ def widening(io: torch.dtype):
     return widen
 
 
-@wp.struct
+@struct
 class Sizes:
     """What all kernels know: the shapes, and how block indices map to them."""
 
@@ -108,20 +110,20 @@ class Sizes:
     group_width: int
     groups: int
     parts: int  # blocks of channels in a group
-    pieces: int  # of the sequence, each a block's own
-    piece: int  # tokens of one, a multiple of MARK
+    segments: int  # of the sequence, each a block's own
+    segment: int  # tokens of one, a multiple of MARK
     save: int
 
 
-@wp.struct
+@struct
 class Place:
     """Where a thread works."""
 
     b: int
     group: int
     part: int
-    piece: int
-    at: int  # row of arrays [B * pieces, ...]
+    segment: int
+    at: int  # row of arrays [B * segments, ...]
     begin: int  # tokens
     end: int
     lane: int  # of the block
@@ -150,7 +152,7 @@ def offsets(parts: dict) -> tuple[dict, int]:
 @functools.cache
 def arena_io(size: int):
     """The type of a block's shared memory of ``size`` floats, and access to it."""
-    arena_type = wp.tile[float, size]
+    arena_type = wp.tile[float, size]  # pyright: ignore[reportIndexIssue] (in its stub a function)
 
     @wp.func_native("arena.data.ptr[i] = v;")
     def put(arena: arena_type, i: int, v: float): ...
@@ -166,21 +168,22 @@ def sync(): ...
 
 
 @functools.cache
-def placing(f: Frame):
+def placing(f: BlockShape):
     """The function that finds a thread's place."""
 
     @wp.func
+    @no_type_check
     def place(sizes: Sizes, index: int, lane: int) -> Place:
         p = Place()
         p.part = index % sizes.parts
         rest = index / sizes.parts
         p.group = rest % sizes.groups
         rest = rest / sizes.groups
-        p.piece = rest % sizes.pieces
-        p.b = rest / sizes.pieces
+        p.segment = rest % sizes.segments
+        p.b = rest / sizes.segments
         p.at = rest
-        p.begin = p.piece * sizes.piece
-        p.end = wp.min(p.begin + sizes.piece, sizes.length)
+        p.begin = p.segment * sizes.segment
+        p.end = wp.min(p.begin + sizes.segment, sizes.length)
         p.lane = lane
         p.d0 = p.group * sizes.group_width + p.part * wp.static(f.span)
         p.count = wp.min(wp.static(f.span), sizes.group_width - p.part * wp.static(f.span))
@@ -197,16 +200,16 @@ def placing(f: Frame):
 
 
 @functools.cache
-def states_io(f: Frame):
+def states_io(f: BlockShape):
     """The vector of a thread's states, walk by walk, and its load from and store to ``[*, D, N]``.
 
     States past the last are 0.
     """
     vec = wp.types.vector(f.walks * f.held, wp.float32)
 
-    def loop(body: str) -> str:
+    def loop(array: str, body: str) -> str:
         return f"""
-float* row = x.data + (size_t)i * (x.strides[0] / 4);
+float* row = {array}.data + (size_t)i * ({array}.strides[0] / 4);
 WP_PRAGMA_UNROLL
 for (int k = 0; k < {f.walks * f.held}; ++k) {{
     const int c = slot * {f.channels} + k % {f.held} / {f.states};
@@ -218,16 +221,16 @@ for (int k = 0; k < {f.walks * f.held}; ++k) {{
 
     @wp.func_native(
         f"wp::vec_t<{f.walks * f.held}, float> h;"
-        + loop("h.c[k] = c < count && n < states ? *at : 0.0f;")
+        + loop("x_in", "h.c[k] = c < count && n < states ? *at : 0.0f;")
         + "return h;"
     )
     def load(
-        x: wp.array3d(dtype=float), i: int, d0: int, count: int, states: int, slot: int, q: int
+        x_in: wp.array3d(dtype=float), i: int, d0: int, count: int, states: int, slot: int, q: int
     ) -> vec: ...
 
-    @wp.func_native(loop("if (c < count && n < states) *at = h.c[k];"))
+    @wp.func_native(loop("x_out", "if (c < count && n < states) *at = h.c[k];"))
     def store(
-        x: wp.array3d(dtype=float),
+        x_out: wp.array3d(dtype=float),
         i: int,
         d0: int,
         count: int,
@@ -238,18 +241,18 @@ for (int k = 0; k < {f.walks * f.held}; ++k) {{
     ): ...
 
     @wp.func
-    def read(x: wp.array3d(dtype=float), i: int, p: Place) -> vec:
-        return load(x, i, p.d0, p.count, p.states, p.slot, p.q)
+    def read(x_in: wp.array3d(dtype=float), i: int, p: Place) -> vec:
+        return load(x_in, i, p.d0, p.count, p.states, p.slot, p.q)
 
     @wp.func
-    def write(x: wp.array3d(dtype=float), i: int, p: Place, h: vec):
-        store(x, i, p.d0, p.count, p.states, p.slot, p.q, h)
+    def write(x_out: wp.array3d(dtype=float), i: int, p: Place, h: vec):
+        store(x_out, i, p.d0, p.count, p.states, p.slot, p.q, h)
 
     return vec, read, write
 
 
 @functools.cache
-def halves(f: Frame):
+def halves(f: BlockShape):
     """Two vectors of a thread's states as one, for a native function to return."""
     n = f.walks * f.held
     vec = wp.types.vector(n, wp.float32)
@@ -272,7 +275,7 @@ def halves(f: Frame):
 
 
 @functools.cache
-def channel_io(f: Frame, io: torch.dtype, tokens: int):
+def channel_io(f: BlockShape, io: torch.dtype, tokens: int):
     """Access to a thread's own elements of a tile of ``[B, L, D]``.
 
     ``fetch`` loads their bits: the loads are on their way while the tile before is worked on, and
@@ -282,17 +285,18 @@ def channel_io(f: Frame, io: torch.dtype, tokens: int):
     element, word, _ = _BITS[io]
     count = tokens // f.rows
     raw = wp.types.vector(count, wp.uint32)
-    address = (
-        WIDE
-        + f"""
-char* at = (char*)(({element}*)x.data + d) + wide_(b, x.strides[0]);
-at += wide_(t, x.strides[1]);
+
+    def address(array: str) -> str:
+        return f"""
+{WIDE}
+char* at = (char*)(({element}*){array}.data + d) + wide_(b, {array}.strides[0]);
+at += wide_(t, {array}.strides[1]);
 """
-    )
+
     snippet = f"""
-{address}
+{address("x_in")}
 wp::vec_t<{count}, unsigned> r;
-const long long step = wide_({f.rows}, x.strides[1]);
+const long long step = wide_({f.rows}, x_in.strides[1]);
 WP_PRAGMA_UNROLL
 for (int i = 0; i < {count}; ++i, at += step) {{
     r.c[i] = 0;
@@ -302,21 +306,21 @@ return r;
 """
 
     @wp.func_native(snippet)
-    def fetch_own(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, left: int) -> raw: ...
+    def fetch_own(x_in: wp.array3d(dtype=scalar), b: int, d: int, t: int, left: int) -> raw: ...
 
     @wp.func
-    def fetch(x: wp.array3d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+    def fetch(x_in: wp.array3d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
         left = wp.where(t0 < 0, 0, end - t0 - p.row)  # a tile before the first is not there
-        return fetch_own(x, p.b, p.d, t0 + p.row, left)
+        return fetch_own(x_in, p.b, p.d, t0 + p.row, left)
 
-    @wp.func_native(f"{address} *({element}*)at = ({element})v;")
-    def store(x: wp.array3d(dtype=scalar), b: int, d: int, t: int, v: float): ...
+    @wp.func_native(f"{address('x_out')} *({element}*)at = ({element})v;")
+    def store(x_out: wp.array3d(dtype=scalar), b: int, d: int, t: int, v: float): ...
 
     return count, raw, fetch, store
 
 
 @functools.cache
-def matrix_io(f: Frame, io: torch.dtype, tokens: int, arena_size: int):
+def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
     """As ``channel_io`` for a block's tile of B or C, ``[B, L, G, N]``; ``put_rows`` as floats."""
     scalar = WARP_DTYPES[io]
     size = tokens * f.padded
@@ -326,7 +330,8 @@ def matrix_io(f: Frame, io: torch.dtype, tokens: int, arena_size: int):
     widen = widening(io)
     snippet = f"""
 {WIDE}
-const char* from = (const char*)x.data + wide_(b, x.strides[0]) + wide_(group, x.strides[2]);
+const char* from = (const char*)x_in.data + wide_(b, x_in.strides[0]);
+from += wide_(group, x_in.strides[2]);
 wp::vec_t<{count}, unsigned> r;
 WP_PRAGMA_UNROLL
 for (int i = 0; i < {count}; ++i) {{
@@ -334,20 +339,26 @@ for (int i = 0; i < {count}; ++i) {{
     r.c[i] = 0;
     if (t < left && n < states && e < {size})
         r.c[i] = *(const {_BITS[io][1]}*)(
-            from + wide_(n, x.strides[3]) + wide_(t0 + t, x.strides[1]));
+            from + wide_(n, x_in.strides[3]) + wide_(t0 + t, x_in.strides[1]));
 }}
 return r;
 """
 
     @wp.func_native(snippet)
     def fetch_all(
-        x: wp.array4d(dtype=scalar), b: int, group: int, lane: int, states: int, t0: int, left: int
+        x_in: wp.array4d(dtype=scalar),
+        b: int,
+        group: int,
+        lane: int,
+        states: int,
+        t0: int,
+        left: int,
     ) -> raw: ...
 
     @wp.func
-    def fetch(x: wp.array4d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
+    def fetch(x_in: wp.array4d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
         left = wp.where(t0 < 0, 0, end - t0)
-        return fetch_all(x, p.b, p.group, p.lane, p.states, t0, left)
+        return fetch_all(x_in, p.b, p.group, p.lane, p.states, t0, left)
 
     @wp.func
     def put_rows(arena: arena_type, base: int, p: Place, r: raw):

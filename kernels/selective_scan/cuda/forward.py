@@ -1,12 +1,13 @@
-"""The forward kernels of the CUDA scan: a piece of the sequence from its first state.
+"""The forward kernels of the CUDA scan: a segment of the sequence from its first state.
 
 A tile of tokens at a time is loaded, turned into δ and δu in shared memory, walked by the
 recurrence, and gated and stored, with one barrier a tile: there are two buffers, and the loads of
 the next tile are on their way meanwhile. ``summarise_forward`` is the same from h = 0 without
-outputs, for all pieces but the last at once.
+outputs, for all segments but the last at once.
 """
 
 import functools
+from typing import no_type_check
 
 import warp as wp
 
@@ -14,7 +15,7 @@ from ...runtime.lanes import WARP_DTYPES
 from ...runtime.scalars import LOG2E, sigmoid, softplus
 from .blocks import (
     MARK,
-    Frame,
+    BlockShape,
     Place,
     Sizes,
     arena_io,
@@ -29,12 +30,12 @@ from .blocks import (
 from .tokens import advancing, decaying
 
 
-def tile_tokens(f: Frame) -> int:
+def tile_tokens(f: BlockShape) -> int:
     """Tokens of a tile: fewer where B and C of very many states would fill shared memory."""
     return 16 if f.padded <= 128 else 8
 
 
-def _layout(f: Frame, read: bool) -> tuple[dict, int]:
+def _layout(f: BlockShape, read: bool) -> tuple[dict, int]:
     tokens = tile_tokens(f)
     parts = {"STEP": tokens * f.span, "IN": tokens * f.span, "W": tokens * f.padded}
     if read:
@@ -44,7 +45,13 @@ def _layout(f: Frame, read: bool) -> tuple[dict, int]:
 
 @functools.cache
 def forward_kernel(
-    dtypes: tuple, mode: str, f: Frame, read: bool, summary: bool, use_softplus: bool, use_z: bool
+    dtypes: tuple,
+    mode: str,
+    f: BlockShape,
+    read: bool,
+    summary: bool,
+    use_softplus: bool,
+    use_z: bool,
 ):
     """The kernel of one static shape.
 
@@ -52,7 +59,7 @@ def forward_kernel(
         dtypes: of u, delta, and of B and C.
         mode: the discretization.
         read: with outputs; without, C and what follows it are left out.
-        summary: from h = 0, giving the last state and the decay of the piece.
+        summary: from h = 0, giving the last state and the decay of the segment.
     """
     io, delta_io, matrix = dtypes
     scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
@@ -90,6 +97,7 @@ def forward_kernel(
                 store(y_out, p.b, p.d, t0 + t, y)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
+    @no_type_check
     def scan_forward(
         # in
         sizes: Sizes,
@@ -127,8 +135,8 @@ def forward_kernel(
         u_before = raw()
         z_before = raw()
         tiles = (p.end - p.begin + wp.static(tokens - 1)) / wp.static(tokens)
-        if wp.static(summary):  # of the last piece nobody asks
-            tiles = wp.where(p.piece == sizes.pieces - 1, 0, tiles)
+        if wp.static(summary):  # of the last segment nobody asks
+            tiles = wp.where(p.segment == sizes.segments - 1, 0, tiles)
         for tile in range(tiles):
             t0 = p.begin + tile * wp.static(tokens)
             base = (tile % 2) * wp.static(size)
@@ -175,7 +183,7 @@ def forward_kernel(
                 write_states(decay_out, p.at, p, product)
             elif p.active != 0:
                 decay_out[p.at, p.row, p.d] = total
-        elif p.piece == sizes.pieces - 1:
+        elif p.segment == sizes.segments - 1:
             write_states(last_out, p.b, p, h)
 
     return scan_forward

@@ -1,7 +1,7 @@
-"""The scan on CUDA: launches and sums around the kernels of ``cuda_forward.py`` and
-``cuda_backward.py``. Which of them, ``cuda_variant.py`` says.
+"""The scan on CUDA: launches and sums around the kernels of ``forward.py`` and ``backward.py``.
 
-All runs on torch's current stream, without synchronisation, in memory from torch's allocator.
+``tuning.py`` chooses among them: a ``tuning`` is empty or holds the numbers of a ``Tuning``. All
+runs on torch's current stream, without synchronisation, in memory from torch's allocator.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ from .forward import forward_kernel
 from .operands import Operands
 
 
-def forward(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save):
+def forward(
+    u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save, tuning
+):
     """Runs the scan on CUDA; arguments and results as ``cpu.forward``."""
-    o = Operands(u, delta, A, B, C, D, z, delta_bias, initial_state, back=False)
+    o = Operands(u, delta, A, B, C, D, z, delta_bias, initial_state, tuning, back=False)
     return _forward(o, softplus, discretization, save, True)
 
 
-def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save):
+def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning):
     """The last state ``[B, D, N]`` of ``forward`` alone, and the saved states."""
-    o = Operands(u, delta, A, B, B, None, None, delta_bias, initial_state, back=False)
+    o = Operands(u, delta, A, B, B, None, None, delta_bias, initial_state, tuning, back=False)
     _, last, saved = _forward(o, softplus, discretization, save, False)
     return last, saved
 
@@ -38,30 +40,33 @@ def _forward(o: Operands, softplus: bool, mode: str, save: bool, read: bool):
     inputs = [o.u, o.delta, o.z, o.A[None], o.B, o.C, o.skip, o.bias]
     flat = saved.view(-1, o.channels, o.states)
     first, decay = o.state, o.empty(0, 0, 0)
-    if o.pieces > 1:
+    if o.segments > 1:
         first, decay = o.summary(mode)
-        kernel = forward_kernel(o.dtypes, mode, o.frame, False, True, softplus, False)
+        kernel = forward_kernel(o.dtypes, mode, o.shape, False, True, softplus, False)
         o.launch(kernel, [o.sizes(), *inputs, o.state], [first, decay, flat, out])
         o.carry(mode, False, first, decay)
     last = torch.empty_like(o.state)
-    kernel = forward_kernel(o.dtypes, mode, o.frame, read, False, softplus, o.use_z and read)
+    kernel = forward_kernel(o.dtypes, mode, o.shape, read, False, softplus, o.use_z and read)
     o.launch(kernel, [o.sizes(save), *inputs, first], [last, decay, flat, out])
     return out, last, saved
 
 
 def backward(
-    dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs
-):
+    dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs,
+    tuning,
+):  # fmt: skip
     """Gradients of ``forward``; arguments and results as ``cpu.backward``."""
-    o = Operands(u, delta, A, B, C, D, z, delta_bias, dlast, back=True)
+    o = Operands(u, delta, A, B, C, D, z, delta_bias, dlast, tuning, back=True)
     grads = _backward(o, dout, saved, softplus, discretization, needs)
     dtypes = [None if x is None else x.dtype for x in (u, delta, A, B, C, D, z, delta_bias, A)]
     return _wanted(grads, needs, dtypes)
 
 
-def final_state_backward(dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs):
+def final_state_backward(
+    dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs, tuning
+):
     """Gradients of ``final_state``: six, for u, delta, A, B, delta_bias and the initial state."""
-    o = Operands(u, delta, A, B, B, None, None, delta_bias, dlast, back=True)
+    o = Operands(u, delta, A, B, B, None, None, delta_bias, dlast, tuning, back=True)
     u_, delta_, A_, B_, bias_, state_ = needs
     needs = (u_, delta_, A_, B_, False, False, False, bias_, state_)
     grads = _backward(o, None, saved, softplus, discretization, needs)
@@ -110,15 +115,15 @@ def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str
 
     du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
     db, dc = sums("dB"), sums("dC")
-    rows = o.batch * o.pieces
+    rows = o.batch * o.segments
     dfirst, da = torch.empty_like(o.state), o.empty(rows, o.channels, o.states)
-    dskip, dbias = o.empty(2, rows, o.frame.rows, o.channels)
+    dskip, dbias = o.empty(2, rows, o.shape.rows, o.channels)
     if o.u.numel():
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state
-        if o.pieces > 1:
+        if o.segments > 1:
             last = _carry_back(o, dout, softplus, mode, "read" in flags)
-        kernel = backward_kernel(o.dtypes, mode, o.frame, softplus, o.use_z, flags)
+        kernel = backward_kernel(o.dtypes, mode, o.shape, softplus, o.use_z, flags)
         o.launch(
             kernel,
             [
@@ -143,14 +148,14 @@ def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str
 
 
 def _carry_back(o: Operands, dout: Tensor, softplus: bool, mode: str, read: bool) -> Tensor:
-    """The gradient of the state after each piece."""
+    """The gradient of the state after each segment."""
     last, decay = o.summary(mode)
-    kernel = summary_kernel(o.dtypes, mode, o.frame, softplus, o.use_z, read)
+    kernel = summary_kernel(o.dtypes, mode, o.shape, softplus, o.use_z, read)
     o.launch(kernel, [o.sizes(), o.delta, o.z, o.A[None], o.C, o.bias, dout], [last, decay])
     o.carry(mode, True, last, decay)
     return last
 
 
-def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool) -> tuple[int, ...]:
-    """The shape of the saved states that ``forward`` returns."""
+def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool, tuning) -> tuple[int, ...]:
+    """The shape of the saved states that ``forward`` returns, whatever the tuning."""
     return (u.shape[0], -(-u.shape[1] // MARK) if save else 0, *A.shape)

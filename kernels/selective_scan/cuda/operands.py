@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any, no_type_check
 
 import torch
 import warp as wp
@@ -11,16 +12,17 @@ from torch import Tensor
 from ...runtime.launch import cuda_launch
 from ...runtime.scalars import LOG2E, exp2
 from ...runtime.views import lane_contiguous
-from .blocks import MARK, Frame, Sizes, frame
-from .tuning import scan_variant
+from .blocks import MARK, BlockShape, Sizes, block_shape
+from .tuning import scan_tuning
 
 
 @functools.cache
 def _carry_kernel(exponential: bool, reverse: bool):
     @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
     def carry(
         # in
-        pieces: int,
+        segments: int,
         states: int,
         a_in: wp.array2d(dtype=float),
         decay_in: wp.array3d(dtype=float),
@@ -32,11 +34,11 @@ def _carry_kernel(exponential: bool, reverse: bool):
         h = state_out[b, i]
         d = i / states
         n = i % states
-        for k in range(pieces):
-            piece = k
+        for k in range(segments):
+            segment = k
             if wp.static(reverse):
-                piece = pieces - 1 - k
-            at = b * pieces + piece
+                segment = segments - 1 - k
+            at = b * segments + segment
             own = local_out[at, i]
             local_out[at, i] = h
             decay = wp.float32(0.0)
@@ -55,25 +57,25 @@ def _carry_kernel(exponential: bool, reverse: bool):
 class Operands:
     """The tensors of one scan as the kernels take them, and how it is cut.
 
-    ``state`` is a new, dense ``[B, D, N]``: the first state, or the gradient of the last.
+    ``state`` is a new, dense ``[B, D, N]``: the first state, or the gradient of the last. ``shape``
+    is the block shape. ``tuning`` holds the numbers that ``scan_tuning`` takes, ``back`` says that
+    the gradient runs.
     """
 
-    def __init__(self, u, delta, A, B, C, D, z, delta_bias, state, back: bool):
+    def __init__(self, u, delta, A, B, C, D, z, delta_bias, state, tuning, back: bool):
         self.batch, self.length, self.channels = u.shape
         self.states, self.groups, self.device = A.shape[1], B.shape[2], u.device
-        variant = scan_variant(u.shape, self.states, self.groups, u.device)
-        self.block = variant.block
-        per_thread = (variant.channels, variant.states)
-        pieces = variant.pieces
+        tuning = scan_tuning(u.shape, self.states, self.groups, u.device, tuning)
+        per_thread = (tuning.channels, tuning.states)
+        segments = tuning.segments
         if back:
-            per_thread = (variant.back_channels, variant.back_states)
-            pieces = variant.back_pieces
-        self.frame: Frame = frame(variant.block, *per_thread, self.states)
-        marks = -(-self.length // MARK)
-        self.piece = -(-max(marks, 1) // pieces) * MARK
-        self.pieces = -(-self.length // self.piece)
-        self.marks = marks
-        self.parts = -(-(self.channels // self.groups) // self.frame.span)
+            per_thread = (tuning.back_channels, tuning.back_states)
+            segments = tuning.back_segments
+        self.shape: BlockShape = block_shape(tuning.block, *per_thread, self.states)
+        self.marks = -(-self.length // MARK)
+        self.segment = -(-max(self.marks, 1) // segments) * MARK
+        self.segments = -(-self.length // self.segment)
+        self.parts = -(-(self.channels // self.groups) // self.shape.span)
 
         matrix = B.dtype if B.dtype == C.dtype else torch.float32
         self.dtypes = (u.dtype, delta.dtype, matrix)
@@ -98,33 +100,34 @@ class Operands:
         sizes = Sizes()
         sizes.length, sizes.states, sizes.groups = self.length, self.states, self.groups
         sizes.group_width = self.channels // self.groups
-        sizes.parts, sizes.pieces, sizes.piece = self.parts, self.pieces, self.piece
+        sizes.parts, sizes.segments, sizes.segment = self.parts, self.segments, self.segment
         sizes.save = int(save)
         return sizes
 
     def empty(self, *shape: int) -> Tensor:
         return torch.empty(shape, device=self.device)
 
-    def launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        blocks = self.batch * self.pieces * self.groups * self.parts
-        dim = (blocks, self.block)
-        cuda_launch(kernel, dim, inputs, outputs, device=self.device, block_dim=self.block)
+    def launch(self, kernel: Any, inputs: list, outputs: list) -> None:
+        blocks = self.batch * self.segments * self.groups * self.parts
+        threads = self.shape.block
+        dim = (blocks, threads)
+        cuda_launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
 
     def summary(self, mode: str) -> tuple[Tensor, Tensor]:
-        """For what each piece adds to a state that enters it, and its decay."""
-        rows = self.batch * self.pieces
+        """Empty tensors: what each segment adds to the state that enters it, and its decay."""
+        rows = self.batch * self.segments
         local = self.empty(rows, self.channels, self.states)
         if mode == "bilinear":
             return local, torch.empty_like(local)
-        return local, self.empty(rows, self.frame.rows, self.channels)
+        return local, self.empty(rows, self.shape.rows, self.channels)
 
     def carry(self, mode: str, reverse: bool, local: Tensor, decay: Tensor) -> None:
-        """Turns what each piece adds into the state that enters it."""
+        """Turns what each segment adds into the state that enters it."""
         width = self.channels * self.states
         cuda_launch(
             _carry_kernel(mode != "bilinear", reverse),
             (self.batch, width),
-            [self.pieces, self.states, self.A, decay],
+            [self.segments, self.states, self.A, decay],
             [local.view(-1, width), self.state.view(-1, width)],
             device=self.device,
             block_dim=128,

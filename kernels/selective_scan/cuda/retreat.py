@@ -1,6 +1,6 @@
 """The native inner loop of the CUDA scan's gradient: a few tokens forwards again, then backwards.
 
-Names are those of ``cuda_tokens.py``. The walk forwards holds the decays and states of the tokens
+Names are those of ``tokens.py``. The walk forwards holds the decays and states of the tokens
 in registers for the walk backwards. Sums over states leave the threads as partial sums of the
 lanes, sums over channels are completed over the block and stored.
 """
@@ -9,21 +9,21 @@ import functools
 
 import warp as wp
 
-from .blocks import MARK, Frame, arena_io
-from .tokens import MARKS, SUB, prelude
+from .blocks import MARK, BlockShape, arena_io
+from .tokens import SUB, marks_access, prelude
 
 
-def lane_stride(f: Frame) -> int:
+def lane_stride(f: BlockShape) -> int:
     """Floats between the partial sums of two lanes."""
     return SUB * f.span + f.pad
 
 
-def token_stride(f: Frame) -> int:
+def token_stride(f: BlockShape) -> int:
     """Floats between the products for dB or dC of two tokens: half the banks further."""
     return (f.slots + 1) * f.width
 
 
-def _add(f: Frame, at: int, values: str) -> str:
+def _add(f: BlockShape, at: int, values: str) -> str:
     """Stores one float per channel as a lane's partial sum, over all state blocks."""
     return f"""{{
             float* to = s + {at} + q * {lane_stride(f)} + t * SPAN + channel;
@@ -37,7 +37,7 @@ def _add(f: Frame, at: int, values: str) -> str:
         }}"""
 
 
-def _forwards(f: Frame, mode: str, at: dict, flags: frozenset) -> str:
+def _forwards(f: BlockShape, mode: str, at: dict, flags: frozenset) -> str:
     """Exponentials first: they wait for no state. Loads run a token ahead of the stores."""
     early = "factors_(r[i], an[k], fs[t][k], g);" if mode == "mamba" else ""
     late = "" if mode == "mamba" else "factors_(v.r[i], an[k], fs[t][k], g);"
@@ -72,7 +72,7 @@ def _forwards(f: Frame, mode: str, at: dict, flags: frozenset) -> str:
 """
 
 
-def _backwards(f: Frame, mode: str, at: dict, flags: frozenset) -> str:
+def _backwards(f: BlockShape, mode: str, at: dict, flags: frozenset) -> str:
     slopes = """
             const float f = fs[t][k], w = d;
             dh[k] = f * d;
@@ -107,7 +107,7 @@ def _backwards(f: Frame, mode: str, at: dict, flags: frozenset) -> str:
 """
 
 
-def _totals(f: Frame, at: dict, flags: frozenset) -> str:
+def _totals(f: BlockShape, at: dict, flags: frozenset) -> str:
     """Sums the products for dB and dC over the block's channels: a thread takes one sum."""
     sums = [name for name in ("dB", "dC") if name in flags]
     if not sums:
@@ -130,7 +130,7 @@ def _totals(f: Frame, at: dict, flags: frozenset) -> str:
 
 
 @functools.cache
-def retreating(f: Frame, mode: str, at: tuple, arena_size: int, flags: frozenset):
+def retreating(f: BlockShape, mode: str, at: tuple, arena_size: int, flags: frozenset):
     """Equations 6 to 12 over the ``SUB`` tokens from ``t0`` on, of which ``left`` are there.
 
     ``both`` is dh and the sum of dA, from after the tokens to before them.
@@ -139,25 +139,25 @@ def retreating(f: Frame, mode: str, at: tuple, arena_size: int, flags: frozenset
         at: offsets of ``STEP, DU, DY, B, C``; of partial sums ``Y, S, P``; of products ``DB, DC``.
         flags: of ``read`` (there is dy), ``y``, ``dB``, ``dC`` (wanted), ``through`` (dh is).
     """
-    at = dict.fromkeys(("DY", "C", "Y", "S", "P", "DB", "DC"), 0) | dict(at)
+    offset = dict.fromkeys(("DY", "C", "Y", "S", "P", "DB", "DC"), 0) | dict(at)
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     pair = wp.types.vector(2 * f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     read = f"""
-    load_ch(s + {at["DY"]} + t * SPAN + channel, v.dy);
-    load_st(s + {at["C"]} + t * PADDED + state, v.c);
+    load_ch(s + {offset["DY"]} + t * SPAN + channel, v.dy);
+    load_st(s + {offset["C"]} + t * PADDED + state, v.c);
 """
     snippet = f"""
 {prelude(f, mode)}
-{MARKS}
+{marks_access("marks_in")}
 struct Token {{ float r[CH], x[CH], dy[CH], b[ST], c[ST]; }};
 WP_PRAGMA_NO_UNROLL
 for (int walk = 0; walk < WALKS; ++walk) {{
     const int state = walk * WIDTH + q * ST;
     auto fetch_ = [&](int t, Token& v) {{
-        load_ch(s + {at["STEP"]} + t * SPAN + channel, v.r);
-        load_ch(s + {at["DU"]} + t * SPAN + channel, v.x);
-        load_st(s + {at["B"]} + t * PADDED + state, v.b);
+        load_ch(s + {offset["STEP"]} + t * SPAN + channel, v.r);
+        load_ch(s + {offset["DU"]} + t * SPAN + channel, v.x);
+        load_st(s + {offset["B"]} + t * PADDED + state, v.b);
         {read if "read" in flags else ""}
     }};
     Token next;
@@ -169,15 +169,15 @@ for (int walk = 0; walk < WALKS; ++walk) {{
         dh[k] = both.c[walk * E + k];
         da[k] = both.c[(WALKS + walk) * E + k];
     }}
-    {_forwards(f, mode, at, flags)}
-    {_backwards(f, mode, at, flags) if "through" in flags else ""}
+    {_forwards(f, mode, offset, flags)}
+    {_backwards(f, mode, offset, flags) if "through" in flags else ""}
     WP_PRAGMA_UNROLL
     for (int k = 0; k < E; ++k) {{
         both.c[walk * E + k] = dh[k];
         both.c[(WALKS + walk) * E + k] = da[k];
     }}
     WP_TILE_SYNC();
-    {_totals(f, at, flags)}
+    {_totals(f, offset, flags)}
     if (WALKS > 1) WP_TILE_SYNC();
 }}
 return both;

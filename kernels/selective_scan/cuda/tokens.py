@@ -11,7 +11,7 @@ import math
 import warp as wp
 
 from ...runtime.scalars import EXP2, RECIPROCAL
-from .blocks import MARK, Frame, arena_io
+from .blocks import MARK, BlockShape, arena_io
 
 SUB = 4  # tokens whose states and decays the gradient holds in registers
 UNROLL = 4  # tokens whose sums wait in registers, so that their loads need not wait for stores
@@ -52,8 +52,8 @@ _ALIGNED = """
 """
 
 # The local array that holds the marks, and a thread's states in it as vectors.
-MARKS = """
-float* marks = (float*)(((size_t)marks_in.data + 15) & ~(size_t)15);
+_MARKS = """
+float* marks = (float*)(((size_t)ARRAY.data + 15) & ~(size_t)15);
 constexpr int VE = E % 4 == 0 ? 4 : E % 2 == 0 ? 2 : 1;
 struct ALIGNED(4 * VE) PE { float v[VE]; };
 auto load_e = [](float* at, float* h, bool store) {
@@ -71,6 +71,12 @@ auto load_e = [](float* at, float* h, bool store) {
 };
 """
 
+
+def marks_access(array: str) -> str:
+    """C++ text: ``marks``, aligned, in the local ``array``, and ``load_e`` to load and store."""
+    return _MARKS.replace("ARRAY", array)
+
+
 # The state blocks, one after the other over the same tile.
 _WALK = """
 WP_PRAGMA_NO_UNROLL
@@ -87,7 +93,7 @@ _END_WALK = """
 """
 
 
-def prelude(f: Frame, mode: str) -> str:
+def prelude(f: BlockShape, mode: str) -> str:
     """Constants, vector access to shared memory, and the factors of equations 2 to 4."""
 
     def access(name: str, count: int) -> str:
@@ -133,7 +139,7 @@ const int channel = slot * CH;
 
 
 @functools.cache
-def advancing(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int, read, reverse):
+def advancing(f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int, read, reverse):
     """The recurrence over a tile.
 
     Forward it is equation 1, and with ``read`` the sums of equation 5 as partial sums of the lanes;
@@ -143,7 +149,7 @@ def advancing(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int, read
         at: pairs (name, offset) of ``STEP, IN, W`` (δu and B, or dy and C), with ``read`` of
             ``C, Y``.
     """
-    at = {"C": 0, "Y": 0} | dict(at)
+    offset = {"C": 0, "Y": 0} | dict(at)
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     order = f"{tokens - 1} - (t0 + u)" if reverse else "t0 + u"
@@ -151,12 +157,12 @@ def advancing(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int, read
         update = "hn[k] = f * (hn[k] + x[i] * w[j]);"
     else:
         update = "hn[k] = f * hn[k] + g * (x[i] * w[j]);"
-    load_c = f"load_st(s + {at['C']} + t * PADDED + state, c);" if read else ""
+    load_c = f"load_st(s + {offset['C']} + t * PADDED + state, c);" if read else ""
     sum_y = "y[u * CH + i] += c[j] * hn[k];" if read else ""
     store_y = f"""
     WP_PRAGMA_UNROLL
     for (int u = 0; u < {UNROLL}; ++u) {{
-        float* to = s + {at["Y"]} + q * {tokens * f.span + f.pad} + (t0 + u) * SPAN + channel;
+        float* to = s + {offset["Y"]} + q * {tokens * f.span + f.pad} + (t0 + u) * SPAN + channel;
         if (walk > 0) {{
             float before[CH];
             load_ch(to, before);
@@ -176,9 +182,9 @@ for (int t0 = 0; t0 < {tokens}; t0 += {UNROLL}) {{
     for (int u = 0; u < {UNROLL}; ++u) {{
         const int t = {order};
         float r[CH], x[CH], w[ST], c[ST];
-        load_ch(s + {at["STEP"]} + t * SPAN + channel, r);
-        load_ch(s + {at["IN"]} + t * SPAN + channel, x);
-        load_st(s + {at["W"]} + t * PADDED + state, w);
+        load_ch(s + {offset["STEP"]} + t * SPAN + channel, r);
+        load_ch(s + {offset["IN"]} + t * SPAN + channel, x);
+        load_st(s + {offset["W"]} + t * PADDED + state, w);
         {load_c}
         WP_PRAGMA_UNROLL
         for (int i = 0; i < CH; ++i)
@@ -204,9 +210,9 @@ return h;
 
 
 @functools.cache
-def decaying(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int):
+def decaying(f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int):
     """The product of a tile's decays into ``h``: only where they are no exponentials."""
-    at = dict(at)
+    offset = dict(at)
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     snippet = f"""
@@ -215,7 +221,7 @@ for (int t = 0; t < {tokens}; ++t)
     WP_PRAGMA_UNROLL
     for (int k = 0; k < {f.walks} * E; ++k) {{
         float f, g;
-        factors_(s[{at["STEP"]} + t * SPAN + channel + k % E / ST], a.c[k], f, g);
+        factors_(s[{offset["STEP"]} + t * SPAN + channel + k % E / ST], a.c[k], f, g);
         h.c[k] *= f;
     }}
 return h;
@@ -228,18 +234,18 @@ return h;
 
 
 @functools.cache
-def marking(f: Frame, mode: str, tokens: int, at: tuple, arena_size: int):
+def marking(f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int):
     """The recurrence over a tile once more, keeping the state before every ``SUB`` tokens.
 
     The marks of a chunk are local memory: up to 1 KB per channel, too much for registers, and left
     to the cache where shared memory would limit the number of blocks.
     """
-    at = dict(at)
+    offset = dict(at)
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     snippet = f"""
 {prelude(f, mode)}
-{MARKS}
+{marks_access("marks_out")}
 {_WALK}
 WP_PRAGMA_NO_UNROLL
 for (int t0 = 0; t0 < {tokens}; t0 += {SUB}) {{
@@ -251,9 +257,9 @@ for (int t0 = 0; t0 < {tokens}; t0 += {SUB}) {{
     for (int u = 0; u < {SUB}; ++u) {{
         const int t = t0 + u;
         float r[CH], x[CH], w[ST];
-        load_ch(s + {at["STEP"]} + t * SPAN + channel, r);
-        load_ch(s + {at["DU"]} + t * SPAN + channel, x);
-        load_st(s + {at["B"]} + t * PADDED + state, w);
+        load_ch(s + {offset["STEP"]} + t * SPAN + channel, r);
+        load_ch(s + {offset["DU"]} + t * SPAN + channel, x);
+        load_st(s + {offset["B"]} + t * PADDED + state, w);
         WP_PRAGMA_UNROLL
         for (int i = 0; i < CH; ++i)
             WP_PRAGMA_UNROLL
@@ -273,7 +279,7 @@ return h;
     def mark(
         arena: arena_type,
         base: int,
-        marks_in: wp.array(dtype=float),
+        marks_out: wp.array(dtype=float),
         tile: int,
         count: int,
         slot: int,

@@ -60,15 +60,18 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
             x["x"], x["weight"], x["bias"], activation=activation,
             initial_state=x["initial_state"], return_final_state=o["final"],
         )  # fmt: skip
-        return {"out": result[0], "final": result[1]} if o["final"] else {"out": result}
+        if isinstance(result, tuple):
+            return {"out": result[0], "final": result[1]}
+        return {"out": result}
     state = x["initial_state"]
     result = causal_conv1d_fn(
         x["x"].transpose(1, 2), x["weight"], x["bias"], activation=activation,
         initial_states=None if state is None else state.transpose(1, 2),
         return_final_states=o["final"],
     )  # fmt: skip
-    out, final = result if o["final"] else (result, None)
-    return {"out": out.transpose(1, 2)} | ({"final": final.transpose(1, 2)} if o["final"] else {})
+    if isinstance(result, tuple):
+        return {"out": result[0].transpose(1, 2), "final": result[1].transpose(1, 2)}
+    return {"out": result.transpose(1, 2)}
 
 
 def evaluate(case: Case, device: torch.device) -> Outcome:

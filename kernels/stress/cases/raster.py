@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from random import Random
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from .scan import gradients_of, repeated
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _SIDES = (1, 2, 3, 5, 8, 15, 16, 17, 18, 23, 31, 33, 40, 48)
-_LARGEST = 100_000  # pairs of pixel and Gaussian, times channels
+_LARGEST = 100_000  # most pairs of pixel and Gaussian, times channels
 _PLAIN = {
     "lead": "none", "views": 1, "num": 1, "width": 1, "height": 1, "channels": 1,
     "dtype": "float32", "mode": "RGB", "antialiased": False, "sh_degree": "none",
@@ -72,13 +73,33 @@ def valid(options: dict) -> dict:
 
 
 def _options(o: dict) -> dict:
-    """Of ``rasterization``."""
+    """The options that ``rasterization`` is called with."""
     names = ("alpha_min", "alpha_max", "eps2d", "radius_clip", "width", "height")
-    bits = [bool(o["skip"] >> i & 1) for i in range(7)]
     return {name: o[name] for name in names} | dict(
         render_mode=o["mode"], rasterize_mode="antialiased" if o["antialiased"] else "classic",
-        sh_degree=None if o["sh_degree"] == "none" else int(o["sh_degree"]), skip=Skip(*bits),
+        sh_degree=None if o["sh_degree"] == "none" else int(o["sh_degree"]),
+        skip=Skip.from_bits(o["skip"]),
     )  # fmt: skip
+
+
+class _Pixels(NamedTuple):
+    """A view's pixels, ``[H W, C]``.
+
+    Attributes:
+        renders: ``[SAMPLES, H W, C]``, as ``rasterization`` renders them.
+        alphas: ``[SAMPLES, H W, 1]``.
+        extra: by how much an undecided pixel of the picture may differ besides.
+        extra_alpha: likewise of alpha.
+        undecided: whether a cut or an order is within rounding.
+        loose: or a clamp is, so that no gradient is asked for.
+    """
+
+    renders: Tensor
+    alphas: Tensor
+    extra: Tensor
+    extra_alpha: Tensor
+    undecided: Tensor
+    loose: Tensor
 
 
 class _Truth:
@@ -92,65 +113,68 @@ class _Truth:
             k: t.reshape(len(t), self.batch, *t.shape[1 + len(lead) :])
             for k, t in self.leaves.items()
         }
-        self.Ks = x["Ks"].detach().cpu().double().reshape(self.batch, self.views, 3, 3)
+        Ks = x["Ks"]
+        assert Ks is not None
+        self.Ks = Ks.detach().cpu().double().reshape(self.batch, self.views, 3, 3)
         names = ("width", "height", "alpha_min", "alpha_max", "eps2d", "radius_clip", "antialiased")
         degree = None if self.o["sh_degree"] == "none" else int(self.o["sh_degree"])
         self.lens = Lens(**{k: self.o[k] for k in names}, sh_degree=degree)
         self.round = Rounding(case.seed)
         pairs = [(b, v) for b in range(self.batch) for v in range(self.views)]
-        made = [self._view(b, v) for b, v in pairs]
-        if not made:
-            made = [self._blank()]
-        self.renders, self.alphas, self.extra, self.extra_alpha, self.undecided, self.loose = (
-            self._together([m[i] for m in made], i < 2) for i in range(6)
-        )
+        made = [self._view(b, v) for b, v in pairs] or [self._blank()]
+        self.renders = self._together([view.renders for view in made], sampled=True)
+        self.alphas = self._together([view.alphas for view in made], sampled=True)
+        self.extra = self._together([view.extra for view in made])
+        self.extra_alpha = self._together([view.extra_alpha for view in made])
+        self.undecided = self._together([view.undecided for view in made])
+        self.loose = self._together([view.loose for view in made])
 
-    def _together(self, parts: list[Tensor], sampled: bool) -> Tensor:
-        """Views ``[.., H W, C]`` to ``[.., *lead, V, H, W, C]``."""
+    def _together(self, parts: list[Tensor], sampled: bool = False) -> Tensor:
+        """All views ``[.., H W, C]`` as one tensor ``[.., *lead, V, H, W, C]``."""
         stacked = torch.stack(parts, int(sampled))
         if not self.views:
             stacked = stacked.narrow(int(sampled), 0, 0)
         shape = (*self.lead, self.views, self.o["height"], self.o["width"], stacked.shape[-1])
         return stacked.reshape(*stacked.shape[: int(sampled)], *shape)
 
-    def _blank(self) -> tuple[Tensor, ...]:
-        """As ``_view``, of nothing."""
+    def _blank(self) -> _Pixels:
+        """An empty view, in the form of ``_view``."""
         color = 3 if self.o["sh_degree"] != "none" else self.o["channels"]
         size = {"RGB": color, "D": 1, "ED": 1}.get(self.o["mode"], color + 1)
         pixels = self.o["height"] * self.o["width"]
         picture, one = torch.zeros(SAMPLES, pixels, size), torch.zeros(SAMPLES, pixels, 1)
-        return picture, one, picture[0], one[0], one[0] > 0, one[0] > 0
+        none = one[0] > 0
+        return _Pixels(picture, one, picture[0], one[0], undecided=none, loose=none)
 
-    def _view(self, b: int, v: int) -> tuple[Tensor, ...]:
+    def _view(self, b: int, v: int) -> _Pixels:
         r, x = self.round, {k: t[:, b] for k, t in self.flat.items()}
-        gaussians = {k: x.get(k) for k in GAUSSIAN}
+        gaussians: dict[str, Any] = {k: x.get(k) for k in GAUSSIAN}
         if self.o["colors_per_view"]:
             gaussians["colors"] = gaussians["colors"][:, v]
         W, w = x["viewmats"][:, v, :3, :3], x["viewmats"][:, v, :3, 3]
         view, top = render_view(gaussians, W, w, self.Ks[b, v], self.lens, r)
-        color, depth, alpha = (
-            t for t in view.blended.split([view.blended.shape[-1] - 2, 1, 1], dim=-1)
-        )
+        parts = [view.blended.shape[-1] - 3, 1, 1, 1]
+        color, depth, weight, alpha = view.blended.split(parts, dim=-1)
         slack = view.allowance + FACTOR * UNIT * torch.cat([top, torch.ones(1)])
-        more, more_depth, more_alpha = slack.split([slack.shape[-1] - 2, 1, 1], dim=-1)
+        more, more_depth, more_weight, more_alpha = slack.split(parts, dim=-1)
         if "backgrounds" in x:
             background = x["backgrounds"][:, v][:, None]
             color = r(color + r(r(1 - alpha) * background))
             more = more + more_alpha * background[0].detach().abs()
         if self.o["mode"].endswith("ED"):
-            depth = r(depth / alpha.clamp_min(1e-10))
-            least = (alpha[0].detach() - more_alpha).clamp_min(1e-10)
-            more_depth = (
-                (more_depth + depth[0].detach() * more_alpha) / least * view.undecided[:, None]
-            )
+            depth = r(depth / weight.clamp_min(1e-10))
+            least = (weight[0].detach() - more_weight).clamp_min(1e-10)
+            more_depth = (more_depth + depth[0].detach() * more_weight) / least
+            more_depth = more_depth * view.undecided[:, None]
         if "+" in self.o["mode"]:
             color, more = torch.cat([color, depth], -1), torch.cat([more, more_depth], -1)
         elif self.o["mode"] != "RGB":
             color, more = depth, more_depth
-        return color, alpha, more, more_alpha, view.undecided[:, None], view.loose[:, None]
+        undecided, loose = view.undecided[:, None], view.loose[:, None]
+        return _Pixels(color, alpha, more, more_alpha, undecided=undecided, loose=loose)
 
 
-# which dimensions of a gradient are taken together: the entries of one Gaussian
+# The dimensions of a gradient that are taken together: the entries of one Gaussian.
 _PARTS = {
     "means": (-1,), "quats": (-1,), "scales": (-1,), "opacities": (), "colors": (-1,),
     "viewmats": (-2, -1), "backgrounds": (-1,),
@@ -205,4 +229,12 @@ def _poison_faults(case: Case, x, run, results, grads, cotangents) -> list[str]:
     return faults
 
 
-OP = Op("raster", KINDS, _PLAIN, _CHOICES, draw, valid, evaluate)
+OP = Op(
+    name="raster",
+    kinds=KINDS,
+    plain=_PLAIN,
+    choices=_CHOICES,
+    draw=draw,
+    valid=valid,
+    evaluate=evaluate,
+)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -144,11 +146,12 @@ def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor 
     lead, num, more = len(LEADS[o["lead"]]), o["num"], o["poison"]
     place = torch.randperm(num + more, generator=g)
     fresh, old = place[num:], place[:num].sort().values
-    names = [k for k in GAUSSIAN if x[k] is not None]
-    made = dict(x)
+    known = {k: t for k in GAUSSIAN if (t := x[k]) is not None}
+    names = list(known)
+    made: dict[str, Any] = {**x}
     for name in names:
         axis = lead + (1 if name == "colors" and o["colors_per_view"] else 0)
-        before = x[name].detach().cpu().movedim(axis, 0)
+        before = known[name].detach().cpu().movedim(axis, 0)
         after = torch.full((num + more, *before.shape[1:]), 0.5, dtype=before.dtype)
         after[old] = before
         made[name] = after
@@ -162,5 +165,7 @@ def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor 
         row.fill_((torch.nan, torch.inf, -torch.inf)[torch.randint(3, (), generator=g)])
     for name in names:
         axis = lead + (1 if name == "colors" and o["colors_per_view"] else 0)
-        made[name] = made[name].movedim(0, axis).contiguous().to(x[name].device).requires_grad_()
+        made[name] = (
+            made[name].movedim(0, axis).contiguous().to(known[name].device).requires_grad_()
+        )
     return made, old

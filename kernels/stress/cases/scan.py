@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from random import Random
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -183,25 +184,27 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
 
 def _run(o: dict, x: dict) -> dict[str, Tensor]:
     """The results by name, channels last."""
-    common = dict(delta_softplus=o["softplus"])
+    common: dict[str, Any] = dict(delta_softplus=o["softplus"])
     if o["api"] == "mamba-ssm":
-        flip = lambda t: None if t is None else t.transpose(1, 2)  # noqa: E731
+        u, delta = (x[name].transpose(1, 2) for name in ("u", "delta"))
+        z = None if x["z"] is None else x["z"].transpose(1, 2)
         B, C = (t if t.dim() == 2 else t.permute(0, 2, 3, 1) for t in (x["B"], x["C"]))
         if o["groups"] == 1:
             B, C = (t if t.dim() == 2 else t[:, 0] for t in (B, C))
         result = selective_scan_fn(
-            flip(x["u"]), flip(x["delta"]), x["A"], B, C, x["D"], flip(x["z"]), x["delta_bias"],
+            u, delta, x["A"], B, C, x["D"], z, x["delta_bias"],
             return_last_state=o["last"], **common,
         )  # fmt: skip
-        out, last = result if o["last"] else (result, None)
-        return {"out": out.transpose(1, 2)} | ({"last": last} if o["last"] else {})
+        if isinstance(result, tuple):
+            return {"out": result[0].transpose(1, 2), "last": result[1]}
+        return {"out": result.transpose(1, 2)}
     common["discretization"] = o["discretization"]
     state = x["initial_state"]
     k = o["length"] if o["api"] == "state" else o["split"]
     if o["api"] in ("state", "prefix"):
-        first = (x[name][:, :k] for name in ("u", "delta"))
+        u, delta = (x[name][:, :k] for name in ("u", "delta"))
         steps = dict(delta_bias=x["delta_bias"], initial_state=state, **common)
-        state = selective_scan_state(*first, x["A"], x["B"][:, :k], **steps)
+        state = selective_scan_state(u, delta, x["A"], x["B"][:, :k], **steps)
     if o["api"] == "state":
         return {"last": state}
     u, delta, B, C = (x[name][:, k:] for name in ("u", "delta", "B", "C"))
@@ -210,7 +213,9 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
         u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], initial_state=state,
         return_last_state=o["last"], **common,
     )  # fmt: skip
-    return {"out": result[0], "last": result[1]} if o["last"] else {"out": result}
+    if isinstance(result, tuple):
+        return {"out": result[0], "last": result[1]}
+    return {"out": result}
 
 
 def _oracle(case: Case, x: dict) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -1,1 +1,1 @@
-"""What every stress test stands on: cases, ranges of values, rounding, runs and reports."""
+"""The parts that every stress test uses: cases, ranges of values, rounding, runs and reports."""

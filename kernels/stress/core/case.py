@@ -12,8 +12,9 @@ from torch import Tensor
 
 from .rounding import UNDERFLOW, UNIT
 
-FACTOR = 8.0  # how often an error may be what rounding does to the formula
-_STORED = {  # of a result: relative error of its dtype, absolute error below its normal numbers
+FACTOR = 8.0  # largest error, as a multiple of what rounding does to the formula
+# A result's dtype: its relative error, and its absolute error below its normal numbers.
+_STORED = {
     torch.float32: (0.0, UNDERFLOW),
     torch.bfloat16: (2.0**-8, UNDERFLOW),
     torch.float16: (2.0**-11, 2.0**-25),
@@ -27,9 +28,9 @@ class Case:
 
     Attributes:
         op: name of an ``Op``.
-        kind: one of the op's kinds: what is hostile about the values.
-        seed: of the values.
-        options: JSON values by name: sizes, dtype, switches; the keys of the op's ``plain``.
+        kind: one of the op's kinds, which says what is hostile about the values.
+        seed: seed of the values.
+        options: sizes, dtype and switches as JSON values by name; the keys of the op's ``plain``.
     """
 
     op: str
@@ -40,15 +41,15 @@ class Case:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One result against float64.
+    """One result compared with float64.
 
     Attributes:
-        name: "out", "gradient of u", ...
+        name: name of the result, such as "out" or "gradient of u".
         error: rms of the difference over rms of the truth, of the whole tensor.
-        ratio: of the worst part: its error over its limit; a failure above 1.
-        nonfinite: numbers that are NaN or infinite where the truth fits in the dtype.
-        counts: whether ``error`` is shown: of a float32 result, whose truth is well above what may
-            count as 0 and is not itself what rounding leaves of a sum that cancels.
+        ratio: error of the worst part over its limit; above 1 the result fails.
+        nonfinite: count of numbers that are NaN or infinite although the truth fits in the dtype.
+        counts: whether ``error`` is shown. It is shown for a float32 result whose truth is well
+            above what may count as 0, and is not itself the rounding error of a sum that cancels.
     """
 
     name: str
@@ -59,7 +60,7 @@ class Comparison:
 
     @property
     def is_gradient(self) -> bool:
-        """Whether it counts as a gradient or as the forward result."""
+        """Whether the result is a gradient, and not a forward result."""
         return self.name.startswith("gradient")
 
 
@@ -68,10 +69,10 @@ class Outcome:
     """What a case found.
 
     Attributes:
-        comparisons: one for each result.
-        faults: what is wrong otherwise: an exception, two runs that differ.
-        pixels: that were compared (rasterizer).
-        undecided: of them, those where rounding decides a cut or an order.
+        comparisons: comparisons, one per result.
+        faults: everything else that is wrong, such as an exception or two runs that differ.
+        pixels: number of pixels that were compared (rasterizer).
+        undecided: number of those pixels in which rounding decides a cut or an order.
     """
 
     comparisons: list[Comparison] = field(default_factory=list)
@@ -81,16 +82,19 @@ class Outcome:
 
     @property
     def nonfinite(self) -> int:
-        """How many numbers are not finite that should be."""
+        """The count of numbers that are not finite and should be."""
         return sum(c.nonfinite for c in self.comparisons)
 
     @property
     def worst(self) -> Comparison | None:
-        """The comparison that is nearest to its limit, or farthest beyond."""
+        """The comparison that is nearest to its limit, or farthest beyond it."""
         return max(self.comparisons, key=lambda c: c.ratio, default=None)
 
     def failure(self) -> dict | None:
-        """``what`` ("fault", "not finite" or "limit"), ``name``, ``error``, ``ratio``; or None."""
+        """Returns the failure's ``what``, ``name``, ``error`` and ``ratio``, or None.
+
+        ``what`` is "fault", "not finite" or "limit".
+        """
         if self.faults:
             return {"what": "fault", "name": self.faults[0], "error": None, "ratio": None}
         worst = self.worst
@@ -107,13 +111,13 @@ class Op:
     """Something to be stressed.
 
     Attributes:
-        name: of the op.
-        kinds: of values; the first is the plain one.
-        plain: every option at its simplest; a shrinking case goes there.
-        choices: what an option may be, where that is not any number or switch.
-        draw: random options for a kind.
-        valid: the nearest options that make sense, for options changed one at a time.
-        evaluate: runs a case on a device.
+        name: name of the op.
+        kinds: kinds of values; the first is the plain one.
+        plain: simplest value of every option, at which the shrinking of a case aims.
+        choices: allowed values of those options that are neither a number nor a switch.
+        draw: function that draws random options for a kind.
+        valid: function that returns the nearest options that make sense together.
+        evaluate: function that runs a case on a device.
     """
 
     name: str
@@ -126,7 +130,7 @@ class Op:
 
 
 def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
-    """Runs a case; an exception becomes a fault."""
+    """Runs a case and turns an exception into a fault."""
     try:
         return op.evaluate(case, device)
     except Exception as error:
@@ -135,7 +139,7 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
 
 
 def generator(case: Case, name: str) -> torch.Generator:
-    """Random numbers for one tensor of a case, whatever else the case holds."""
+    """Makes the source of chance for one tensor of a case, independent of its other tensors."""
     return torch.Generator().manual_seed(case.seed * 1009 + sum(name.encode()))
 
 
@@ -147,15 +151,15 @@ def judge(
     extra: Tensor | None = None,
     shown: Tensor | None = None,
 ) -> Comparison:
-    """Compares a result with the samples of its formula; README.md says what the limit means.
+    """Compares a result with the samples of its formula; README.md explains the limit.
 
     Args:
-        name: of the result.
+        name: name of the result.
         got: the result, float dtype.
         samples: ``[SAMPLES, *got.shape]`` float64; sample 0 is the truth.
-        parts: dimensions of ``got`` that are taken together, as one rms; () compares each number.
-        extra: added to the limit, of ``got``'s shape without ``parts``.
-        shown: which numbers make up ``error``; the limit holds for all.
+        parts: dimensions of ``got`` that are taken together as one rms; () compares each number.
+        extra: addition to the limit, of ``got``'s shape without ``parts``.
+        shown: mask of the numbers that make up ``error``; the limit holds for all numbers.
 
     Raises:
         ValueError: the shapes do not fit.

@@ -1,4 +1,4 @@
-"""Values of a tensor by name of their range."""
+"""Values of a tensor by the name of their range."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ RANGES = (
 
 
 def fill(shape: tuple[int, ...], kind: str, g: torch.Generator) -> Tensor:
-    """Float32 numbers of one of ``RANGES``.
+    """Draws float32 numbers of one of ``RANGES``.
 
-    "alternating" changes sign along dimension 1, "tiny" is around 1e-12, "denormal" around 1e-40,
-    "huge" around 1e4, "spread" is log-uniform in 1e-6..1e4 with either sign, "spikes" is 0 but for
-    one in sixteen of 1e3.
+    "alternating" changes sign along dimension 1, "tiny" is around 1e-12, "denormal" around 1e-40
+    and "huge" around 1e4. "spread" is log-uniform in 1e-6..1e4 with either sign. "spikes" is 0,
+    except for one number in sixteen, which is around 1e3.
     """
     normal = torch.randn(shape, generator=g)
     if kind == "uniform":

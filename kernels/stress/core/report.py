@@ -1,4 +1,4 @@
-"""A run's findings as tables, and a failing case as a file's content."""
+"""Reports: a run's findings as tables, and a failing case as the content of a file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _cells(row: Row) -> list[str]:
 
 
 def table(rows: list[Row]) -> str:
-    """A markdown table, its columns aligned for a terminal."""
+    """Returns a Markdown table with its columns aligned for a terminal."""
     cells = [list(_HEAD), *(_cells(row) for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(_HEAD))]
     lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths)) + " |" for line in cells]
@@ -38,7 +38,7 @@ def table(rows: list[Row]) -> str:
 
 
 def plain_number(value: float | None) -> float | None:
-    """JSON has no infinity: None."""
+    """Returns the number, or None for one that is not finite, which JSON cannot hold."""
     return value if value is not None and math.isfinite(value) else None
 
 
@@ -50,14 +50,14 @@ def _record(row: Row) -> dict:
 
 
 def document(tally: Tally, about: dict, failures: list[dict]) -> dict:
-    """The whole run as JSON values."""
+    """Returns the whole run as JSON values."""
     rows = [_record(row) for row in tally.sorted()]
     totals = [_record(row) for row in tally.totals()]
     return {"format": FORMAT, **about, "totals": totals, "rows": rows, "failures": failures}
 
 
 def markdown(tally: Tally, about: dict, failures: list[dict]) -> str:
-    """The whole run as a page."""
+    """Returns the whole run as a Markdown page."""
     run = ", ".join(f"{name} {value}" for name, value in about.items())
     parts = [
         "# Numerical stress test",
@@ -71,17 +71,17 @@ def markdown(tally: Tally, about: dict, failures: list[dict]) -> str:
 
 
 def failure_text(case: Case, failure: dict) -> str:
-    """One line."""
-    place = f"{case.op}, {case.kind}: "
+    """Describes a failure in one line."""
+    title, name = f"{case.op}, {case.kind}", failure["name"]
     if failure["what"] == "limit":
-        return place + f"{failure['name']} is {failure['ratio']:.3g} times its limit off"
+        return f"{title}: {name} is {failure['ratio']:.3g} times its limit off"
     if failure["what"] == "not finite":
-        return place + f"{failure['name']} is not finite"
-    return place + failure["name"]
+        return f"{title}: {name} is not finite"
+    return f"{title}: {name}"
 
 
 def reproducer(case: Case, outcome: Outcome, versions: dict) -> dict:
-    """The content of a file that ``read_reproducer`` reads."""
+    """Returns the content of a file that ``read_reproducer`` reads."""
     failure = outcome.failure()
     if failure is not None:
         failure = {k: plain_number(v) if k in ("error", "ratio") else v for k, v in failure.items()}
@@ -89,10 +89,10 @@ def reproducer(case: Case, outcome: Outcome, versions: dict) -> dict:
 
 
 def read_reproducer(document: object, ops: dict[str, Op]) -> Case:
-    """The case of a ``reproducer``.
+    """Reads the case of a ``reproducer``.
 
     Raises:
-        ValueError: one line that says what is wrong with it.
+        ValueError: the document is not such a file; the message says in one line what is wrong.
     """
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError(f"not a case of 'gamba stress' (format is not {FORMAT})")

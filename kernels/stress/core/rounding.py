@@ -1,14 +1,16 @@
-"""What rounding to float32 does to a formula: the yardstick of every limit (see README.md)."""
+"""What rounding to float32 does to a formula, which every limit is based on (see README.md)."""
 
 from __future__ import annotations
+
+from typing import overload
 
 import torch
 from torch import Tensor
 
-SAMPLES = 8  # evaluations side by side: one exact, six rounded at random, one to float32
+SAMPLES = 8  # evaluations side by side: one exact, six rounded at random, one rounded to float32
 UNIT = 2.0**-24  # half of float32's last bit, relative
-# numbers below 2^-126 may count as 0, and decays are not smaller; products of several factors meet
-# that in any order
+# Numbers below 2^-126 may count as 0, and decays are no smaller. A product of several factors may
+# be taken in any order, and a partial product of it may underflow.
 UNDERFLOW = 2.0**-124
 
 
@@ -59,32 +61,32 @@ class _Decay(torch.autograd.Function):
 class Rounding:
     """Rounds an intermediate result and its gradient, differently in each sample.
 
-    Dimension 0 of every tensor are the ``SAMPLES``: 0 stays as it is; in 1 to 6 each number is off
-    by a random share of its last bit (Monte Carlo arithmetic; Parker 1997), the same share for the
-    same number, so that equal steps err equally, as they do in float32; 7 is rounded to float32.
-    Gradients are rounded on their way back as values are on theirs.
+    Dimension 0 of every tensor holds the ``SAMPLES``. Sample 0 stays exact. In samples 1 to 6 each
+    number is off by a random share of its last bit (Monte Carlo arithmetic; Parker 1997); equal
+    numbers get the same share, since equal steps err equally in float32 too. Sample 7 is rounded to
+    float32. Gradients are rounded on their way back in the same way.
     """
 
     def __init__(self, seed: int) -> None:
         self.generator = torch.Generator().manual_seed(seed)
         self.salt = torch.randint(2**31, (SAMPLES - 2,), generator=self.generator)
-        # an approximation errs to one side all along: in each sample by another share
+        # An approximation always errs to the same side, in each sample by another share.
         self.share = torch.tensor([0.0, *torch.linspace(-1, 1, SAMPLES - 2).tolist(), 0.0])
 
     def __call__(self, x: Tensor, ulps: float = 1.0, back: float = 1.0) -> Tensor:
-        """``x [SAMPLES, ..]`` float64, rounded.
+        """Rounds the result of an operation, and its gradient.
 
         Args:
-            x: the result of an operation.
-            ulps: how coarse it may be, in last bits.
-            back: likewise its gradient.
+            x: ``[SAMPLES, ..]`` float64.
+            ulps: size of the rounding, in last bits.
+            back: size of the gradient's rounding, in last bits.
         """
         return _Round.apply(x, self, ulps, back)
 
     def drift(self, x: Tensor, steps: Tensor) -> Tensor:
-        """``x [S, .., n]`` as if reckoned from the last entry to the first; without a gradient.
+        """Rounds ``x [S, .., n]`` as if computed from the last entry to the first; no gradient.
 
-        ``steps [.., n]`` says which entries are a step: a product and a quotient, each rounded.
+        ``steps [.., n]`` marks the entries that are a step, a rounded product and quotient.
         """
         shape = (SAMPLES - 2, *steps.shape)
         noise = torch.rand(shape, dtype=x.dtype, generator=self.generator) * 4 - 2
@@ -92,36 +94,37 @@ class Rounding:
         out[1:-1] *= 1 + UNIT * (noise * steps).flip(-1).cumsum(-1).flip(-1)
         return out
 
-    def constant(self, value: float) -> Tensor:
-        """A number that is not differentiated, rounded: ``[SAMPLES, 1]``."""
+    def constant(self, value: float | Tensor) -> Tensor:
+        """Rounds a number that is not differentiated, to ``[SAMPLES, 1]``."""
         return self.rounded(torch.full((SAMPLES, 1), float(value), dtype=torch.float64), 1.0)
 
     def stored(self, x: Tensor, dtype: torch.dtype) -> Tensor:
-        """``x`` as it is; its gradient on this path is rounded to ``dtype`` before it is added."""
+        """Returns ``x`` as it is, but rounds its gradient on this path to ``dtype``."""
         return _Round.apply(x, self, 0.0, torch.finfo(dtype).eps / 2 / UNIT)
 
     def exp(self, x: Tensor, ulps: float) -> Tensor:
-        """The exponential of ``x``, with a relative error that grows with |x| by ``ulps``."""
+        """Computes the exponential of ``x``, with a relative error of |x| times ``ulps``."""
         share = self.share.double().view(-1, *[1] * (x.dim() - 1))
         x = x + x.abs() * share * (ulps * UNIT)
         return _Map.apply(self(x), torch.exp, lambda _, y: y, self, 1.0)
 
     def softplus(self, x: Tensor, ulps: float) -> Tensor:
-        """log(1 + e^x), and its slope, the sigmoid, to ``ulps``."""
+        """Computes log(1 + e^x), and its slope, the sigmoid, to ``ulps``."""
         return _Map.apply(x, _softplus, lambda v, _: v.sigmoid(), self, ulps)
 
     def decay(self, f: Tensor, h: Tensor) -> Tensor:
-        """The product of a decay and a state."""
+        """Computes the product of a decay and a state."""
         return _Decay.apply(f, h, self)
 
     def sigmoid(self, x: Tensor, ulps: float) -> Tensor:
-        """1 / (1 + e^-x) to ``ulps``."""
+        """Computes 1 / (1 + e^-x) to ``ulps``."""
         return _Map.apply(x, torch.sigmoid, lambda _, y: y * (1 - y), self, ulps)
 
     def rounded(self, x: Tensor, ulps: float, up: bool = True) -> Tensor:
-        """As the call, without a gradient; ``up``: underflow errs upwards in half of the samples.
+        """Rounds as the call does, without a gradient.
 
-        Upwards as decays do that are held at the smallest normal number.
+        With ``up``, half of the samples err upwards where numbers underflow, as decays do that are
+        held at the smallest normal number.
         """
         out = x.clone()
         part = x[1:-1]
@@ -131,7 +134,7 @@ class Rounding:
         return out
 
     def underflow(self, x: Tensor, up: bool = False) -> Tensor | float:
-        """What may be lost where ``x`` is tiny; ``up`` as in ``rounded``."""
+        """Draws what may be lost where ``x`` is tiny; ``up`` is that of ``rounded``."""
         small = x[1:-1].abs() < 2.0**-100
         if not small.any():
             return 0.0
@@ -143,7 +146,7 @@ class Rounding:
         return lost
 
     def _noise(self, x: Tensor) -> Tensor:
-        """In ±1, a function of sample and number alone: a hash of its float32 bits."""
+        """Hashes each number's float32 bits, with its sample, to a number in ±1."""
         bits = x.float().contiguous().view(torch.int32).long()
         bits ^= self.salt.view(-1, *[1] * (x.dim() - 1))
         for multiplier in (0x2545F4914F6CDD1D, 0x5851F42D4C957F2D):
@@ -152,8 +155,12 @@ class Rounding:
         return (bits & 0xFFFFFF).double().mul_(2.0**-23).sub_(1.0)
 
 
+@overload
+def samples_of(x: Tensor) -> Tensor: ...
+@overload
+def samples_of(x: None) -> None: ...
 def samples_of(x: Tensor | None) -> Tensor | None:
-    """A float64 leaf ``[SAMPLES, ..]`` on the CPU, the same number in each sample."""
+    """Makes a float64 leaf ``[SAMPLES, ..]`` on the CPU, with the same number in each sample."""
     if x is None:
         return None
     x = x.detach().cpu().double()

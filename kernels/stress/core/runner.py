@@ -1,4 +1,4 @@
-"""Draws cases, runs them, keeps count, and makes failing cases small."""
+"""Draws cases, runs and counts them, and makes failing cases small."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .case import Case, Comparison, Op, Outcome, run_case
 
 
 def draw_cases(ops: Sequence[Op], seed: int) -> Iterator[tuple[Op, Case]]:
-    """Cases without end, the same for the same ops and seed; ops and kinds take turns."""
+    """Draws cases endlessly, the same ones for the same ops and seed; ops and kinds take turns."""
     count = 0
     while True:
         op = ops[count % len(ops)]
@@ -30,17 +30,17 @@ class Row:
     """What the cases of one kind found so far.
 
     Attributes:
-        op: name.
-        kind: of values.
-        cases: run.
+        op: name of the op.
+        kind: kind of values.
+        cases: number of cases that were run.
         forward: largest relative rms error of a forward result in float32, and its name.
-        gradient: likewise of a gradient.
+        gradient: largest relative rms error of a gradient, and its name.
         ratio: largest error over its limit; infinite if something was not finite.
-        nonfinite: numbers that are not finite and should be.
-        failures: cases that failed in any way.
-        pixels: compared (rasterizer).
-        undecided: of them, those where rounding decides a cut or an order.
-        seconds: spent.
+        nonfinite: count of numbers that are not finite and should be.
+        failures: number of cases that failed in any way.
+        pixels: number of pixels compared (rasterizer).
+        undecided: number of those pixels in which rounding decides a cut or an order.
+        seconds: time spent.
     """
 
     op: str
@@ -76,7 +76,7 @@ def _entry(c: Comparison) -> tuple[float, str]:
 
 
 class Tally:
-    """Rows by op and kind, in the order of first sight."""
+    """Rows by op and kind, in the order in which they first appeared."""
 
     def __init__(self) -> None:
         self.rows: dict[tuple[str, str], Row] = {}
@@ -87,12 +87,12 @@ class Tally:
         self.rows.setdefault(key, Row(*key)).add(outcome, seconds)
 
     def sorted(self) -> list[Row]:
-        """All rows, those of an op together."""
+        """Returns all rows, with those of an op together."""
         ops = list(dict.fromkeys(op for op, _ in self.rows))
         return sorted(self.rows.values(), key=lambda row: ops.index(row.op))
 
     def totals(self) -> list[Row]:
-        """One row for each op, of kind "all"."""
+        """Returns one row per op, of kind "all"."""
         made: dict[str, Row] = {}
         for row in self.rows.values():
             total = made.setdefault(row.op, Row(row.op, "all"))
@@ -121,7 +121,7 @@ def run_cases(
 
 
 def _simpler(op: Op, case: Case, name: str) -> Iterator[Case]:
-    """Cases with one option (or "kind") nearer to its plain value, the boldest step first."""
+    """Yields cases with one option (or "kind") nearer to its plain value, largest step first."""
     if name == "kind":
         if case.kind != op.kinds[0]:
             yield replace(case, kind=op.kinds[0])
@@ -136,7 +136,7 @@ def _simpler(op: Op, case: Case, name: str) -> Iterator[Case]:
 
 
 def _size(op: Op, case: Case) -> float:
-    """How far the options are from plain; shrinking only ever lowers it."""
+    """Measures how far the options are from plain; shrinking only ever lowers it."""
     far = float(case.kind != op.kinds[0])
     for name, plain in op.plain.items():
         value = case.options[name]
@@ -148,15 +148,17 @@ def _size(op: Op, case: Case) -> float:
 def shrink(
     op: Op, case: Case, device: torch.device, seconds: float = 30.0
 ) -> tuple[Case, Outcome, int]:
-    """A smaller case that fails in the same way, greedily; at most for ``seconds``.
+    """Looks greedily, for at most ``seconds``, for a smaller case that fails in the same way.
 
     Returns:
-        The case, its outcome, and how many were tried.
+        The case, its outcome, and the number of cases tried.
     """
     outcome = run_case(op, case, device)
     failure, tried = outcome.failure(), 0
     end = time.monotonic() + seconds
-    improved = failure is not None
+    if failure is None:
+        return case, outcome, tried
+    improved = True
     while improved:
         improved = False
         for name in ("kind", *op.plain):

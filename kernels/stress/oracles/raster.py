@@ -1,4 +1,4 @@
-"""The rasterizer's formula in float64, dense, rounded sample by sample; and what rounding decides.
+"""The rasterizer in float64, dense, rounded sample by sample; and what rounding decides.
 
 Which pairs of pixel and Gaussian count, and in which order, is decided by sample 0. Where another
 sample comes near a decision, the pixel is undecided: README.md, "Cuts".
@@ -17,7 +17,7 @@ from ..core.case import FACTOR
 from ..core.rounding import UNIT, Rounding
 from .scan import EXP_ULPS
 
-_RANGE = 3.4e38  # of float32
+_RANGE = 3.4e38  # largest float32
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class View:
     """One object in one view.
 
     Attributes:
-        blended: ``[SAMPLES, H W, C + 2]``: colours, depth Σ w z, alpha.
-        allowance: ``[H W, C + 2]``: by how much an undecided pixel may differ besides.
+        blended: ``[SAMPLES, H W, C + 3]``: colours, depth Σ w z, weight Σ w, alpha.
+        allowance: ``[H W, C + 3]``: by how much an undecided pixel may differ besides.
         undecided: ``[H W]``: a cut or an order is within rounding.
         loose: ``[H W]``: or a slope (a clamp) is: no gradient is asked of these pixels.
     """
@@ -105,7 +105,10 @@ def _jacobian(t: Tensor, K: Tensor, lens: Lens, r: Rounding) -> tuple[Tensor, Te
 
 @dataclass
 class _Splats:
-    """Gaussians of a view, front to back; ``[SAMPLES, n]`` but for the last four, ``[n]``."""
+    """Gaussians of a view, front to back; ``[SAMPLES, n, ..]``, the last four ``[n]``.
+
+    Channels are colours, depth and a channel of ones, whose sum is the weight.
+    """
 
     center: Tensor
     conic: tuple[Tensor, Tensor, Tensor]
@@ -154,13 +157,22 @@ def _splats(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -
     scaled = [r(r(K[i, i] * t[..., i]) / t[..., 2]) for i in (0, 1)]
     center = torch.stack([r(scaled[i] + r.constant(K[i, 2])) for i in (0, 1)], -1)
     depth = t[..., 2]
-    channels = torch.cat([channels, depth[..., None]], -1)
-    parts = center, conic, opacity, depth, channels, seen & fits, unsure, loose, index
-    return _Splats(*parts)
+    channels = torch.cat([channels, depth[..., None], torch.ones_like(depth)[..., None]], -1)
+    return _Splats(
+        center=center,
+        conic=conic,
+        opacity=opacity,
+        depth=depth,
+        channels=channels,
+        seen=seen & fits,
+        unsure=unsure,
+        loose=loose,
+        index=index,
+    )
 
 
 def _order_swaps(s: _Splats, weight: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """Of Gaussians whose depths rounding may swap: ``[P, C]`` change, ``[P]`` whether any."""
+    """What a swap of depths by rounding changes: ``[P, C]`` how much, ``[P]`` whether any."""
     depth, band = s.depth[0].detach(), _band(s.depth)
     behind = depth[None] - depth[:, None]
     swaps = (behind > 0) & (behind <= band[None] + band[:, None])
@@ -202,7 +214,7 @@ def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
     channels = s.channels[:, None]
     moved = back[..., None] * (channels - channels.detach())
     blended = r(r(weight[..., None] * channels.detach() + moved).sum(2))
-    # alpha is 1 - T_end and its gradient that of Σ T α: README.md there, equations 7 and 10
+    # alpha is 1 - T_end, and its gradient is that of Σ T α: the rasterizer's README, eq. 7 and 10
     alphas = r(r.stored(weight, torch.float32).sum(-1))
     left = torch.cumprod(torch.where(on & going, r(1 - alpha), 1.0), -1)[..., -1]
     alphas = alphas + (r(1 - left) - alphas).detach()
@@ -227,7 +239,7 @@ def _decisions(s, lens, blended, before, after, value, band, on, stops) -> View:
     swap, swapped = _order_swaps(s, before * value.clamp_max(lens.alpha_max), on & reached)
     allowance[:, :-1] += 2 * swap
     undecided = cut.any(-1) | stop.any(-1) | swapped
-    # whatever comes before a stop, it may stop elsewhere: with this light at most
+    # what is undecided before a stop may move the stop: this light at most is then left
     elsewhere = undecided & (stops | stop.any(-1))
     allowance[elsewhere] += 2 * T_MIN / (1 - lens.alpha_max) * top
     bend = on & ((value - lens.alpha_max).abs() <= band) | (on & s.loose)
@@ -249,7 +261,7 @@ def render_view(
         r: rounds.
 
     Returns:
-        The view, and the largest colours and depth in it, ``[C + 1]``: the scale of its rounding.
+        The view, and the largest of each channel in it, ``[C + 2]``: the scale of its rounding.
     """
     x = {name: None if t is None else r(t) for name, t in x.items()}
     bent = None
@@ -269,7 +281,7 @@ def render_view(
     pixels = torch.stack([columns, rows], -1).reshape(-1, 2).double() + 0.5
     if not len(s.seen):
         channels = x["colors"].shape[-1]
-        blank = x["means"].new_zeros(len(W), len(pixels), channels + 2)
+        blank = x["means"].new_zeros(len(W), len(pixels), channels + 3)
         none = torch.zeros(len(pixels), dtype=torch.bool)
         return View(blank, blank[0], none, none), blank[0, 0, :-1]
     return _blend(s, pixels, lens, r), s.channels[0].detach().abs().amax(0)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import mmap
 import re
 import xml.etree.ElementTree as ET
 from functools import partial
@@ -37,6 +38,7 @@ from gamba_warp.kernels.bench.core.page import charts_of, page
 from gamba_warp.kernels.bench.core.report import judge, markdown, ratio_table, ratios
 from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+from gamba_warp.measure import suites
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 # DESIGN's schema, and what it leaves to us.
@@ -234,7 +236,7 @@ def test_compare_prints_ratios(monkeypatch, tmp_path, capsys):
     old = run(case(variant("a"), variant("gone")))
     stub(monkeypatch, case(variant("a"), variant("new")))
     assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 0
-    new = bench.read_document(tmp_path / "bench.json")
+    new = suites.read_document(tmp_path / "bench.json")
     old["records"][0]["ms_p50"] = 2 * new["records"][0]["ms_p50"]
     (record, before, after), *more = ratios(old, new)
     assert record["variant"] == "a" and before == 2 * after and not more
@@ -373,6 +375,20 @@ def test_peak_bytes():
         assert peak is None or 60e6 < peak < 80e6
 
 
+@pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="needs Linux")
+def test_peak_bytes_counts_no_huge_pages():
+    """One byte in each 2 MiB is one small page, also in memory that numpy marked for huge pages."""
+    block = mmap.mmap(-1, 64 * 2**20, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    block.madvise(mmap.MADV_HUGEPAGE)  # numpy does so under each array of 4 MiB or more
+
+    def touch():
+        for start in range(0, len(block), 2**21):
+            block[start] = 1
+
+    peak = peak_bytes(touch, torch.device("cpu"))
+    assert peak is None or peak < 8e6
+
+
 @pytest.mark.parametrize("groups", [1, 2])
 def test_the_scans_corner_is_the_truth_of_the_whole(groups):
     """The oracle on some tokens and channels finds no error in the reference run on all."""
@@ -400,7 +416,7 @@ def test_the_torch_loop_is_the_formula():
 
 def test_quick_scan_and_conv_from_the_command_line(tmp_path, capsys):
     code = cli.run("bench", ["scan", "conv", "--quick", "--threads", "2", "--out", str(tmp_path)])
-    document = bench.read_document(tmp_path / "bench.json")
+    document = suites.read_document(tmp_path / "bench.json")
     records = document["records"]
     assert code == 0, [r["status"] for r in records if r["status"] != "ok"]
     assert {r["op"] for r in records} == {"scan", "conv"}
@@ -520,15 +536,15 @@ def test_damaged_results_are_refused(tmp_path, change, reason):
     document = run(case(variant()))
     path = tmp_path / "x.json"
     path.write_text(json.dumps(document))
-    assert bench.read_document(path) == document
+    assert suites.read_document(path) == document
     change(document)
     path.write_text(json.dumps(document))
     with pytest.raises(UserError, match=reason):
-        bench.read_document(path)
+        suites.read_document(path)
     for data in (b"\xff\xfe", b"[" * 10**5, b"", b"null"):
         path.write_bytes(data)
         with pytest.raises(UserError, match="not JSON|not a result"):
-            bench.read_document(path)
+            suites.read_document(path)
 
 
 @pytest.mark.parametrize("axis, saved", [("skipped", 75), ("switched off", -300)])

@@ -29,12 +29,12 @@ DOCS = ROOT / "docs" / "benchmarks"
 BOUNDS = {
     ("scan", "scan_forward", "bfloat16"): (168, 0, 56000, 12),
     ("scan", "scan_forward", "float32"): (168, 0, 56000, 12),
-    ("scan", "scan_forward", "bfloat16, in pieces"): (112, 0, 21000, 16),
+    ("scan", "scan_forward", "bfloat16, in segments"): (112, 0, 21000, 16),
     ("scan", "scan_forward", "bfloat16, last state alone"): (120, 0, 21000, 16),
     ("scan", "scan_backward", "bfloat16"): (255, 1200, 36000, 8),
     ("scan", "scan_backward", "bfloat16, last state alone"): (168, 1200, 21000, 12),
-    ("scan", "summarise_backward", "bfloat16, in pieces"): (140, 0, 21000, 12),
-    ("scan", "carry", "bfloat16, in pieces"): (48, 0, 2000, 36),
+    ("scan", "summarise_backward", "bfloat16, in segments"): (140, 0, 21000, 12),
+    ("scan", "carry", "bfloat16, in segments"): (48, 0, 2000, 36),
     ("conv", "conv_forward", "bfloat16"): (64, 0, 2000, 32),
     ("conv", "conv_forward", "float32"): (64, 0, 2000, 32),
     ("conv", "conv_backward", "bfloat16"): (80, 0, 2000, 24),
@@ -108,9 +108,9 @@ def test_no_kernel_is_forgotten(entries):
 
 
 def test_the_choice_of_kernels_is_the_operators(entries):
-    """Few sequences are cut into pieces, few views into parts of tiles: other kernels."""
+    """Few sequences are cut into segments, few views into parts of tiles: other kernels."""
     names = {(entry.case, entry.name) for entry in entries}
-    assert ("bfloat16, in pieces", "summarise_backward") in names
+    assert ("bfloat16, in segments", "summarise_backward") in names
     assert ("bfloat16", "summarise_backward") not in names
     composites = [e for e in entries if e.name == "composite"]
     assert len({e.launch.kernel for e in composites}) == len(composites) == 5

@@ -4,16 +4,13 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.conv import make
+from helpers.scan import leaves
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 
 FORWARD = 2e-7  # float32 rounding of four products and a SiLU
 GRADIENT = 2e-6  # float32 sums over up to 2 * 577 tokens
-
-
-def leaves(inputs, dtype=None):
-    return {k: v.detach().clone().to(dtype or v.dtype).requires_grad_() for k, v in inputs.items()}
 
 
 def compare(inputs, activation, forward=FORWARD, gradient=GRADIENT):

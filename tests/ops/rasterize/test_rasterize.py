@@ -3,23 +3,11 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.raster import GRADIENT, NAMES, PICTURE, leaves, make, mapped
+from helpers.raster import GRADIENT, NAMES, PICTURE, leaves, make, near_a_cut
 
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_from_harmonics
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
-
-
-def near_a_cut(scene, options):
-    """Pixels whose float64 alpha changes when alpha_min does a little: there rounding decides."""
-    alpha_min = options.get("alpha_min", 1 / 255)
-    options = {k: v for k, v in options.items() if k != "alpha_min"}
-    scene = mapped(scene, torch.Tensor.double)
-    low, high = (
-        rasterization_reference(**scene, **options, alpha_min=alpha_min * (1 + s))[2]
-        for s in (-1e-5, 1e-5)
-    )
-    return (low != high)[..., 0]
 
 
 def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):

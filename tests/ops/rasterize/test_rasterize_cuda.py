@@ -160,7 +160,7 @@ def test_two_runs_and_any_parts(on_blocks):
 
 
 def test_many_tiles_are_not_cut(monkeypatch):
-    monkeypatch.setattr(composite_cuda, "_multiprocessors", lambda index: 132)
+    monkeypatch.setattr(composite_cuda, "multiprocessors_of", lambda device: 132)
     device = torch.device("cuda", 0)
     views = [1, 2, 3, 32]
     assert [composite_cuda.parts_of_tile(1024 * n, device) for n in views] == [4, 2, 1, 1]

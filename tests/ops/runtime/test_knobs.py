@@ -10,10 +10,10 @@ from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
 from gamba_warp.kernels.rasterize import rasterization
-from gamba_warp.kernels.rasterize.cpu import tuning as raster_variant
+from gamba_warp.kernels.rasterize.cpu import tuning as raster_tuning
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import selective_scan
-from gamba_warp.kernels.selective_scan.cpu import tuning as scan_variant
+from gamba_warp.kernels.selective_scan.cpu import tuning as scan_tuning
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 
@@ -22,7 +22,7 @@ def scan(**choice):
     """Output and gradients of 173 tokens, 24 channels, 5 states, and the bytes kept for them."""
     leaves = {k: x.requires_grad_() for k, x in make_inputs(2, 173, 24, states=5).items()}
     kept = []
-    with scan_variant.use_variant(scan_variant.Variant(**choice)):
+    with scan_tuning.use_tuning(scan_tuning.Tuning(**choice)):
         with torch.autograd.graph.saved_tensors_hooks(lambda x: kept.append(x) or x, lambda x: x):
             out = selective_scan(**leaves, delta_softplus=True)
         grads = torch.autograd.grad(out.square().sum(), list(leaves.values()))
@@ -57,7 +57,8 @@ def results(of):
 @pytest.mark.parametrize("tile, width, height", [(16, 8, 4), (16, 16, 16), (8, 4, 4), (8, 8, 4)])
 def test_tiles_and_sub_tiles(tile, width, height):
     want, default = results(scene())
-    with raster_variant.use_variant(raster_variant.Variant(tile, width, height)):
+    choice = raster_tuning.Tuning(tile=tile, width=width, height=height)
+    with raster_tuning.use_tuning(choice):
         got, meta = results(scene())
         counts = {k: meta[k] for k in ("blocks_used", "tiles", "pairs", "blocks_walked")}
     assert torch.equal(got[0], want[0]) and torch.equal(got[1], want[1])
@@ -71,7 +72,7 @@ def test_tiles_and_sub_tiles(tile, width, height):
 @pytest.mark.parametrize("degree, low, high", [(2, 1e-4, 5e-3), (3, 1e-6, 5e-4), (4, 1e-8, 2e-5)])
 def test_degree_of_exp(degree, low, high):
     want, _ = results(scene())
-    with raster_variant.use_variant(raster_variant.Variant(degree=degree)):
+    with raster_tuning.use_tuning(raster_tuning.Tuning(degree=degree)):
         got, _ = results(scene())
     assert low < rel_rms(got[0], want[0]) < high
 
@@ -100,26 +101,26 @@ def test_limits_that_are_refused(t_min):
 @pytest.mark.parametrize(
     "module, choice, reason",
     [
-        (scan_variant, {"chunk": 12}, "chunk is 12"),
-        (scan_variant, {"chunk": 64, "strip": 48}, "multiple of 8 and of strip"),
-        (scan_variant, {"degree": 7}, "degree is 7"),
-        (raster_variant, {"tile": 32}, "tile is 32"),
-        (raster_variant, {"tile": 8, "width": 16}, "width is 16"),
-        (raster_variant, {"degree": 6}, "degree is 6"),
+        (scan_tuning, {"chunk": 12}, "chunk is 12"),
+        (scan_tuning, {"chunk": 64, "strip": 48}, "multiple of 8 and of strip"),
+        (scan_tuning, {"degree": 7}, "degree is 7"),
+        (raster_tuning, {"tile": 32}, "tile is 32"),
+        (raster_tuning, {"tile": 8, "width": 16}, "width is 16"),
+        (raster_tuning, {"degree": 6}, "degree is 6"),
     ],
 )
 def test_choices_that_are_refused(module, choice, reason):
     with pytest.raises(ValueError, match=reason):
-        module.Variant(**choice)
+        module.Tuning(**choice)
 
 
-@pytest.mark.parametrize("module", [scan_variant, raster_variant])
+@pytest.mark.parametrize("module", [scan_tuning, raster_tuning])
 def test_a_choice_ends_with_its_block(module):
-    other = dataclasses.replace(module.Variant(), degree=3)
-    with pytest.raises(RuntimeError), module.use_variant(other):
+    other = dataclasses.replace(module.Tuning(), degree=3)
+    with pytest.raises(RuntimeError), module.use_tuning(other):
         assert module.current() == other
         raise RuntimeError
-    assert module.current() == module.Variant()
+    assert module.current() == module.Tuning()
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """CPU launches: on torch's threads, on Python's, and in a forked child, the same result."""
 
 import multiprocessing
+import warnings
 
 import pytest
 import torch
@@ -69,6 +70,36 @@ def test_team_is_found_on_linux():
     import sys
 
     assert team.has_team() or sys.platform != "linux"
+
+
+class _Other:
+    """A recorded launch of another Warp: it lacks an attribute."""
+
+    def __init__(self, command, lacks):
+        self.__dict__ = {k: v for k, v in vars(command).items() if k != lacks}
+
+
+@pytest.mark.parametrize("lacks", ["hooks", "params", "bounds", "module_exec"])
+def test_another_warp_has_no_team_and_says_so_once(monkeypatch, lacks):
+    """The launches go to Python's threads, with the same results."""
+    if not team.has_team():
+        pytest.skip("torch has no OpenMP runtime with GNU's interface here")
+    launch = wp.launch
+
+    def other(*args, record_cmd=False, **kwargs):
+        made = launch(*args, record_cmd=record_cmd, **kwargs)
+        return _Other(made, lacks) if record_cmd else made
+
+    monkeypatch.setattr(wp, "launch", other)
+    monkeypatch.setattr(team, "_entries", {})
+    monkeypatch.setattr(team, "_parallel", team._parallel)  # comes back after the test
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    with pytest.warns(RuntimeWarning, match="keeps launches in another form") as said:
+        got, want = mix(torch.randn(100), None)
+    assert torch.equal(got, want) and len(said) == 1 and not team.has_team()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.equal(*mix(*torch.randn(2, 33)))
 
 
 def _child(queue):

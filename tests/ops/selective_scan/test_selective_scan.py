@@ -81,9 +81,10 @@ def test_unneeded_gradients_are_not_computed():
     inputs = make(1, 10, 5, 2)
     names = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
     tensors = [inputs[k] for k in names]
-    out, _, saved = cpu.forward(*tensors, None, True, "mamba", True)
+    out, _, saved = cpu.forward(*tensors, None, True, "mamba", True, ())
     needs = [name == "C" for name in names] + [False]
-    grads = cpu.backward(torch.ones_like(out), None, *tensors, saved, True, "mamba", needs)
+    back = torch.ones_like(out), None, *tensors, saved, True, "mamba"
+    grads = cpu.backward(*back, needs, ())
     assert [g is not None for g in grads] == needs
 
 
@@ -258,8 +259,11 @@ def test_no_second_derivative():
 def test_operator_contract():
     """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
     inputs = leaves(make(2, 7, 5, 2))
-    arguments = (*inputs.values(), True, "mamba", True)
-    torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, arguments)
+    options = True, "mamba", True, [16, 8, 5]
+    operators = torch.ops.gamba_warp
+    torch.library.opcheck(operators.selective_scan.default, (*inputs.values(), *options))
+    state = [inputs[k] for k in ("u", "delta", "A", "B", "delta_bias", "initial_state")]
+    torch.library.opcheck(operators.selective_scan_state.default, (*state, *options))
 
 
 @pytest.mark.parametrize("constant", ["", "B", "C"])

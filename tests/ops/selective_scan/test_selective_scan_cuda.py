@@ -1,4 +1,4 @@
-"""The CUDA kernels without a GPU: small shapes on CPU blocks."""
+"""The scan's CUDA kernels without a GPU: small shapes on CPU blocks."""
 
 import contextlib
 
@@ -6,15 +6,12 @@ import pytest
 import torch
 import warp as wp
 from helpers import assert_rel_rms
-from helpers.conv import make as make_conv
 from helpers.scan import leaves, make
 
-from gamba_warp.kernels.causal_conv1d import causal_conv1d, kernels, ops
-from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
-from gamba_warp.kernels.selective_scan.cuda.tuning import Variant, choose, use_variant
+from gamba_warp.kernels.selective_scan.cuda.tuning import Tuning, choose, use_tuning
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 
 ORDER = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
@@ -37,13 +34,14 @@ def cpu_blocks(monkeypatch):
         monkeypatch.setattr(torch, name, poisoned)
 
 
-def run(module, inputs, discretization, v_out, v_last, softplus=True, needs=None):
+def run(module, inputs, discretization, v_out, v_last, softplus=True, needs=None, tuning=()):
     """Outputs, last state and the gradients that are needed (of all inputs), by name."""
     tensors = [inputs.get(k) for k in ORDER]
     state = inputs.get("initial_state")
-    out, last, saved = module.forward(*tensors, state, softplus, discretization, True)
+    out, last, saved = module.forward(*tensors, state, softplus, discretization, True, tuning)
     needs = [k in (needs or inputs) for k in NAMES]
-    grads = module.backward(v_out, v_last, *tensors, saved, softplus, discretization, needs)
+    back = v_out, v_last, *tensors, saved, softplus, discretization
+    grads = module.backward(*back, needs, tuning)
     return {"out": out, "last": last} | {
         name: grad for name, grad in zip(NAMES, grads) if grad is not None
     }
@@ -71,25 +69,24 @@ def assert_all(got, want, limit=LIMIT):
         assert_rel_rms(got[name], want[name], limit, name)
 
 
-PIECES = Variant(pieces=3, back_pieces=2)
+SEGMENTS = Tuning(segments=3, back_segments=2)
 
 
 @pytest.mark.parametrize(
-    "shape, discretization, variant",
+    "shape, discretization, tuning",
     [
-        ((2, 139, 37, 3, 1), "mamba", Variant()),
-        ((1, 70, 80, 3, 2), "mamba", PIECES),
-        ((1, 67, 35, 16, 1), "mamba", Variant()),
-        ((2, 139, 37, 16, 1), "mamba", PIECES),
-        ((1, 139, 20, 3, 1), "bilinear", PIECES),
-        ((1, 139, 20, 3, 1), "zoh", PIECES),
+        ((2, 139, 37, 3, 1), "mamba", Tuning()),
+        ((1, 70, 80, 3, 2), "mamba", SEGMENTS),
+        ((1, 67, 35, 16, 1), "mamba", Tuning()),
+        ((2, 139, 37, 16, 1), "mamba", SEGMENTS),
+        ((1, 139, 20, 3, 1), "bilinear", SEGMENTS),
+        ((1, 139, 20, 3, 1), "zoh", SEGMENTS),
     ],
 )
-def test_block_kernels_equal_lane_kernels_and_oracle(cpu_blocks, shape, discretization, variant):
+def test_block_kernels_equal_lane_kernels_and_oracle(cpu_blocks, shape, discretization, tuning):
     inputs = make(*shape)
     v_out, v_last = cotangents(inputs)
-    with use_variant(variant):
-        blocks = run(cuda, inputs, discretization, v_out, v_last)
+    blocks = run(cuda, inputs, discretization, v_out, v_last, tuning=tuning.numbers())
     assert_all(blocks, exact(inputs, discretization, v_out, v_last))
     assert_all(blocks, run(cpu, inputs, discretization, v_out, v_last))
 
@@ -135,23 +132,21 @@ def test_without_options_and_with_strides(cpu_blocks):
     )
 
 
-VARIANTS = [
-    Variant(),
-    Variant(pieces=2, back_pieces=3),
-    Variant(pieces=7, channels=1, states=16, back_channels=1, back_states=8),
-    Variant(channels=4, states=4, back_pieces=4, back_channels=4, back_states=4),
-    Variant(channels=1, states=4, back_channels=2, back_states=8, block=64),
+TUNINGS = [
+    Tuning(),
+    Tuning(segments=2, back_segments=3),
+    Tuning(segments=7, channels=1, states=16, back_channels=1, back_states=8),
+    Tuning(channels=4, states=4, back_segments=4, back_channels=4, back_states=4),
+    Tuning(channels=1, states=4, back_channels=2, back_states=8, block=64),
 ]
 
 
-def test_variants_differ_by_rounding_only(cpu_blocks):
-    """What the gradient starts from is the forward's, whatever variant either of them is."""
+def test_tunings_differ_by_rounding_only(cpu_blocks):
     inputs = make(1, 200, 70, 16)
     v_out, v_last = cotangents(inputs)
     results = []
-    for variant in VARIANTS:
-        with use_variant(variant):
-            results.append(run(cuda, inputs, "mamba", v_out, v_last))
+    for tuning in TUNINGS:
+        results.append(run(cuda, inputs, "mamba", v_out, v_last, tuning=tuning.numbers()))
     for result in results[1:]:
         assert_all(result, results[0], 1e-6)  # rounding of sums in another order
         assert any(not torch.equal(result[k], results[0][k]) for k in result)  # it was another
@@ -176,22 +171,22 @@ def test_one_gradient_alone(cpu_blocks, name):
     assert torch.equal(alone[name], every[name])
 
 
-@pytest.mark.parametrize("variant", [Variant(), PIECES])
+@pytest.mark.parametrize("tuning", [Tuning(), SEGMENTS])
 @pytest.mark.parametrize("states", [3, 16])
-def test_final_state(cpu_blocks, variant, states):
+def test_final_state(cpu_blocks, tuning, states):
     inputs = make(2, 139, 21, states)
     _, v_last = cotangents(inputs)
     wants = exact(inputs, "mamba", None, v_last)
     tensors = [inputs[k] for k in STATE]
-    needs = [True] * 6
-    with use_variant(variant):
-        last, saved = cuda.final_state(*tensors, True, "mamba", True)
-        grads = cuda.final_state_backward(v_last, *tensors[:5], saved, True, "mamba", needs)
+    needs, numbers = [True] * 6, tuning.numbers()
+    last, saved = cuda.final_state(*tensors, True, "mamba", True, numbers)
+    back = v_last, *tensors[:5], saved, True, "mamba"
+    grads = cuda.final_state_backward(*back, needs, numbers)
     assert_rel_rms(last, wants["last"], LIMIT, "last")
     for name, grad in zip(STATE, grads):
         assert_rel_rms(grad, wants[name], LIMIT, name)
     needs[0] = needs[3] = False
-    grads = cuda.final_state_backward(v_last, *tensors[:5], saved, True, "mamba", needs)
+    grads = cuda.final_state_backward(*back, needs, numbers)
     assert [grad is None for grad in grads] == [not need for need in needs]
 
 
@@ -205,7 +200,7 @@ def test_empty(batch, length):
     for name in ORDER:
         assert got[name].shape == inputs[name].shape
         assert not got[name].any(), name
-    last, _ = cuda.final_state(*[inputs[k] for k in STATE], True, "mamba", False)
+    last, _ = cuda.final_state(*[inputs[k] for k in STATE], True, "mamba", False, ())
     assert torch.equal(last, inputs["initial_state"])
 
 
@@ -220,45 +215,18 @@ def test_sums_need_blocks():
 
 
 def test_choice_follows_the_shape():
-    def pieces(batch, length):
-        variant = choose(batch, length, 1024, 16, 1, multiprocessors=132)
-        return variant.pieces, variant.back_pieces
+    def segments(batch, length):
+        tuning = choose(batch, length, 1024, 16, 1, multiprocessors=132)
+        return tuning.segments, tuning.back_segments
 
-    assert pieces(16, 16961) == (1, 1)
-    few, back_few = pieces(1, 16961)
+    assert segments(16, 16961) == (1, 1)
+    few, back_few = segments(1, 16961)
     assert 8 <= few <= 64 and 8 <= back_few <= 64  # 16 blocks of channels, 132 multiprocessors
-    assert pieces(1, 64) == (1, 1)
-    assert pieces(1, 128)[0] <= 2
-    assert choose(0, 5, 8, 4, 1, 132) == Variant()
-    counts = [pieces(batch, 16961)[0] for batch in (1, 2, 4, 8, 16, 32)]
+    assert segments(1, 64) == (1, 1)
+    assert segments(1, 128)[0] <= 2
+    assert choose(0, 5, 8, 4, 1, 132) == Tuning()
+    counts = [segments(batch, 16961)[0] for batch in (1, 2, 4, 8, 16, 32)]
     assert counts == sorted(counts, reverse=True)
-
-
-@pytest.mark.parametrize("use_silu", [0, 1])
-def test_convolution_kernels(monkeypatch, use_silu):
-    """The scalar form of the shared kernel body, launched on the CPU."""
-    inputs = make_conv(2, 300, 19, 4)
-    exact = leaves(inputs, torch.float64)
-    activation = "silu" if use_silu else None
-    out, _ = causal_conv1d_reference(**exact, activation=activation)
-    v_out = torch.randn_like(inputs["x"])
-    wants = torch.autograd.grad((out * v_out.double()).sum(), [*exact.values()])
-    as_cuda = kernels._values
-    monkeypatch.setattr(kernels, "_values", lambda _, io: as_cuda("cuda", io))
-    monkeypatch.setattr(ops, "cpu_values", ops.cuda_values)
-    caches = (kernels.forward_kernel, kernels.backward_kernel)
-    for cached in caches:
-        cached.cache_clear()
-    try:
-        mine = leaves(inputs)
-        got = causal_conv1d(**mine, activation=activation)
-        grads = torch.autograd.grad((got * v_out).sum(), [*mine.values()])
-    finally:
-        for cached in caches:
-            cached.cache_clear()
-    assert_rel_rms(got, out, 2e-7, "out")
-    for name, grad, want in zip(mine, grads, wants):
-        assert_rel_rms(grad, want, 2e-6, f"gradient of {name}")
 
 
 def gpu_gradients(inputs, v_out, v_last):
@@ -271,13 +239,13 @@ def gpu_gradients(inputs, v_out, v_last):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("dtype, limit", [(torch.float32, 1e-5), (torch.bfloat16, 4e-3)])
-@pytest.mark.parametrize("variant", [None, *VARIANTS])
+@pytest.mark.parametrize("tuning", [None, *TUNINGS])
 @pytest.mark.parametrize("shape", [(2, 577, 70, 16, 1), (1, 65, 40, 3, 2), (1, 100, 20, 40, 1)])
-def test_on_a_gpu(shape, variant, dtype, limit):
+def test_on_a_gpu(shape, tuning, dtype, limit):
     inputs = make(*shape, dtype=dtype)
     v_out, v_last = cotangents(inputs)
     want = exact(inputs, "mamba", v_out, v_last)
-    with use_variant(variant) if variant else contextlib.nullcontext():
+    with use_tuning(tuning) if tuning else contextlib.nullcontext():
         first, second = (gpu_gradients(inputs, v_out, v_last) for _ in range(2))
     for name, value in first.items():
         assert torch.equal(value, second[name]), name

@@ -8,19 +8,19 @@ import torch
 from helpers import assert_rel_rms
 
 from gamba_warp import cli
-from gamba_warp.commands import stress
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import selective_scan_fn, selective_scan_state
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
-from gamba_warp.kernels.stress import Case, draw_cases, run_case, shrink
+from gamba_warp.kernels.stress import Case, draw_cases, reproducer, run_case, shrink
 from gamba_warp.kernels.stress.cases import conv, raster, scan
 from gamba_warp.kernels.stress.core.rounding import Rounding, samples_of
 from gamba_warp.kernels.stress.oracles import scan as oracle
 from gamba_warp.measure import stress as stress_model
+from gamba_warp.measure import stress_run
 
 CPU = torch.device("cpu")
-OPS = {op.name: op for op in stress._ops(("all",))}
+OPS = {op.name: op for op in stress_run.choose_ops(("all",))}
 SHORT = {"scan": 18, "conv": 11, "raster": 19, "model": 3}  # cases; but for the model each kind
 
 
@@ -219,7 +219,7 @@ def test_a_small_error_is_caught_written_and_replayed(tmp_path, broken_scan, cap
 
 def test_a_mended_error_passes_its_replay(tmp_path, capsys):
     case = Case("scan", "uniform", 1, scan.OP.plain)
-    content = stress.reproducer(case, run_case(scan.OP, case, CPU), stress.versions())
+    content = reproducer(case, run_case(scan.OP, case, CPU), stress_run.versions())
     path = tmp_path / "case.json"
     path.write_text(json.dumps(content))
     assert exit_code("--replay", path) == 0

@@ -128,7 +128,7 @@ def test_harmonics(degree):
 
 def tile_sets(meta, tiles):
     """Our pairs as a set of numbers tile * Gaussians + Gaussian, from the lists themselves."""
-    bins = meta._bins
+    bins = meta.bins
     tile = torch.repeat_interleave(torch.arange(tiles), bins.starts.diff().long())
     return tile * meta["depths"].numel() + bins.pairs
 

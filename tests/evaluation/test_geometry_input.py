@@ -363,16 +363,16 @@ def test_json_or_csv(tmp_path, capsys):
 
 def test_one_crash_stops_no_other(tmp_path, capfd, monkeypatch):
     """Nor does what a library prints get into the report on stdout."""
-    from gamba_warp.eval.shapes import command as geometry
+    from gamba_warp.eval.shapes import pairs
 
-    def broken(name, *rest):
+    def broken(pair, *rest):
         os.write(1, b"a library talks\n")
-        if name == "bad":
+        if pair.name == "bad":
             raise MemoryError("no room")
-        return evaluate_pair(name, *rest)
+        return evaluate_pair(pair, *rest)
 
-    evaluate_pair = geometry.evaluate_pair
-    monkeypatch.setattr(geometry, "evaluate_pair", broken)
+    evaluate_pair = pairs.evaluate_pair
+    monkeypatch.setattr(pairs, "evaluate_pair", broken)
     for folder in ("pred", "gt"):
         (tmp_path / folder).mkdir()
         for name in ("bad", "good"):

@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 
+from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.cli import run
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.alignment import icp, match_moments
@@ -14,7 +15,6 @@ from gamba_warp.eval.shapes.compare import compare, syncdreamer_points
 from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
 from gamba_warp.eval.shapes.occupancy import (
     VOTERS,
-    fibonacci_sphere,
     grid_around,
     parity,
     solid,
@@ -27,7 +27,7 @@ from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.cleaning import cleaned_mesh
 from gamba_warp.surfaces.density import opacity_volume
-from gamba_warp.surfaces.extract import SurfaceOptions
+from gamba_warp.surfaces.options import SurfaceOptions
 
 
 def as_mesh(source, move=(0.0, 0, 0)):
@@ -279,10 +279,10 @@ def test_alignment():
 
 def test_truth_is_normalised_and_turned(tmp_path):
     trimesh.creation.box((2.0, 4.0, 1.0)).apply_translation([5, 5, 5]).export(tmp_path / "a.obj")
-    truth, motion = load_truth(tmp_path / "a.obj", protocol())  # y-up by its suffix
+    truth = load_truth(tmp_path / "a.obj", protocol())  # y-up by its suffix
     mesh = truth.shape
     assert np.allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.25, 1.0])
-    again = motion.apply(load_shape(tmp_path / "a.obj"))
+    again = truth.motion.apply(load_shape(tmp_path / "a.obj"))
     assert np.allclose(np.unique(again.vertices, axis=0), mesh.vertices)
 
 

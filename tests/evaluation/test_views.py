@@ -12,9 +12,9 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
-from gamba_warp.eval.shapes.command import out_of_reference
+from gamba_warp.eval.shapes.pairs import out_of_reference
 from gamba_warp.eval.views import evaluate as module
-from gamba_warp.eval.views.evaluate import choose_views
+from gamba_warp.eval.views.compare import choose_views
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image

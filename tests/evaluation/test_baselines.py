@@ -303,7 +303,8 @@ def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
 
     def make(steps=25, protocol=PROTOCOL):
         config = FitConfig(steps=steps, gaussians=150)
-        return Ceiling(dataset, protocol, "cpu", tmp_path / "ceiling", ["flat"], config)
+        folder = tmp_path / "ceiling"
+        return Ceiling(dataset, protocol, device="cpu", folder=folder, uids=["flat"], config=config)
 
     truth = load_truth(dataset, "flat", PROTOCOL, "cpu")
     first = make()(truth)
@@ -328,7 +329,8 @@ def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
 
 def test_ceiling_of_so_many_objects(data, tmp_path):
     dataset = open_dataset(data)
-    ceiling = open_ceiling("2", dataset, dataset.uids, PROTOCOL, "cpu", tmp_path, 7)
+    options = {"device": "cpu", "out": tmp_path, "steps": 7}
+    ceiling = open_ceiling("2", dataset, dataset.uids, PROTOCOL, **options)
     assert ceiling.uids == ["flat", "seen"] and ceiling.config.steps == 7  # of 4, evenly spaced
     assert ceiling.folder == tmp_path / "ceiling"
 
@@ -339,7 +341,7 @@ def test_ceiling_of_nothing(data, wanted, tmp_path):
     dataset = open_dataset(data)
     for value in (wanted, str(tmp_path / "empty")):
         with pytest.raises(UserError, match="--ceiling"):
-            open_ceiling(value, dataset, dataset.uids, PROTOCOL, "cpu", None, 5)
+            open_ceiling(value, dataset, dataset.uids, PROTOCOL, device="cpu", out=None, steps=5)
 
 
 def record(psnr, novel=True, lpips=None):

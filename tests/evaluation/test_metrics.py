@@ -11,9 +11,10 @@ from gamba_warp.eval.report import (
     check_finite,
     failure,
     intervals_of,
+    make_report,
     mean_of,
     print_summary,
-    write_report,
+    save_report,
 )
 from gamba_warp.eval.shapes.metrics import surface_metrics, volume_iou
 from gamba_warp.eval.shapes.shape import Points
@@ -152,7 +153,7 @@ def test_report_counts_failures(tmp_path):
         failure("z", ValueError("first line\nsecond line")),
         {"name": "a", "status": "ok", "x": 2.0, "nest": {"y": 1.0}},
     ]
-    write_report(tmp_path, {"p": 1}, objects, {"v": "1"}, baselines={})
+    save_report(make_report({"p": 1}, objects, {"v": "1"}, baselines={}), tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["mean"] == {"x": 2.0, "nest": {"y": 1.0}}
     assert report["failures"] == [{"name": "z", "reason": "first line"}]
@@ -191,7 +192,7 @@ def test_interval_of_few_objects():
 
 def test_summary_shows_the_interval(tmp_path, capsys):
     objects = [{"name": n, "status": "ok", "x": v} for n, v in (("a", 1.0), ("b", 3.0))]
-    report = write_report(tmp_path, {}, objects, {})
+    report = make_report({}, objects, {})
     assert report["interval"] == {"x": [1.0, 3.0]}
     assert print_summary(report, tmp_path) == 0
     assert "2 [1, 3]" in capsys.readouterr().out

@@ -1,0 +1,77 @@
+"""Options of ``gamba eval-geometry``, and the words that they and protocols choose from.
+
+This module imports nothing that is slow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from gamba_warp.errors import UserError
+from gamba_warp.surfaces.options import Method
+
+Align = Literal["none", "scale", "icp"]
+Frame = Literal["gt", "unit", "reference"]
+Up = Literal["auto", "y", "z"]
+PointRule = Literal["area", "views"]
+GridRule = Literal["around", "lattice"]
+OccupancyRule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
+
+
+@dataclass(frozen=True)
+class ShapesOptions:
+    """What to evaluate, and what differs from the protocol; None leaves the protocol's value."""
+
+    pred: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PRED")]
+    """Gaussians (.ply), a mesh or a point cloud; or a folder of them."""
+    gt: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GT")]
+    """A mesh or a point cloud; or a folder, paired with PRED by name."""
+    out: Path | None = None
+    """Folder for report.json and objects.csv."""
+    protocol: str = "default"
+    """default, syncdreamer (points that 16 cameras see, parity on a 64^3 lattice), or a JSON file:
+    a protocol, or the report.json of an evaluation to repeat."""
+    surface: Method | None = None
+    """How Gaussians become a surface; centers is a diagnostic."""
+    align: Align | None = None
+    """How predictions are aligned with the truth before comparing; scale also moves, icp also
+    turns."""
+    frame: Frame | None = None
+    """Frame of the predictions: that of the GT file, its unit frame (z-up, longest side 1,
+    centred), or the reference camera's (needs --data)."""
+    up: Up | None = None
+    """Upward axis of GT files; auto goes by the suffix."""
+    data: Path | None = None
+    """Dataset whose objects have the same names, for --frame reference."""
+    reference: int | None = None
+    """Index of the input view, for --frame reference."""
+    distance: float | None = None
+    """Distance of the input camera in the model's world, for --frame reference."""
+    points: int | None = None
+    """Number of points on each surface."""
+    voxels: int | None = None
+    """Number of voxels in a unit of length, for surfaces of Gaussians."""
+    views: int | None = None
+    """Number of views of the TSDF."""
+    pixels: int | None = None
+    """Side of the TSDF's depth maps."""
+    seed: int | None = None
+    """Seed of the random points."""
+    strict: bool = False
+    """Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …) are
+    failures; else they are evaluated and flagged."""
+
+    def check(self) -> None:
+        """Checks the numbers that are given here.
+
+        Raises:
+            UserError: one is too small; the message names the option.
+        """
+        for name in ("points", "voxels", "views", "pixels"):
+            value = getattr(self, name)
+            if value is not None and value < 8:
+                raise UserError(f"--{name} {value}: must be at least 8")

@@ -1,0 +1,238 @@
+"""Pairs of a predicted and a true file: found, evaluated one after the other, and reported."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from gamba_warp.cameras import relative_to_reference
+from gamba_warp.data.dataset import ViewDataset, open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.files import output_folder, sha256
+from gamba_warp.versions import __version__, installed
+
+from ..report import OK, check_finite, failure, make_report, save_report, stdout_to_stderr
+from .compare import compare
+from .load import SUFFIXES, load_prediction, load_truth
+from .options import ShapesOptions
+from .protocol import GeometryProtocol
+from .shape import Similarity
+
+PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch")
+# entries of the records that have no meaningful mean
+_NO_MEAN = ("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed")
+
+
+class Pair(NamedTuple):
+    """Two files of one object.
+
+    Attributes:
+        name: of the object: the path within the folders, without suffix.
+        pred: the predicted shape.
+        gt: the true shape.
+    """
+
+    name: str
+    pred: Path
+    gt: Path
+
+
+def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[str, Any]:
+    """Evaluates the files that the options name, and writes the report's files.
+
+    Args:
+        options: what to compare, and where the report goes.
+        protocol: how to compare; see ``chosen_protocol``.
+
+    Returns:
+        The report; see ``report_of``.
+
+    Raises:
+        UserError: something cannot be opened or written.
+    """
+    if (protocol.frame == "reference") != (options.data is not None):
+        raise UserError("--frame reference and --data: give both or neither")
+    pairs, failures = find_pairs(options.pred, options.gt)
+    dataset = open_dataset(options.data) if options.data is not None else None
+    folder = output_folder(options.out) if options.out is not None else None
+    with stdout_to_stderr():
+        objects = failures + evaluate_pairs(pairs, protocol, dataset)
+    named = {"pred": options.pred, "gt": options.gt, "data": options.data}
+    inputs = {side: path.name if path else None for side, path in named.items()}
+    report = report_of(protocol, objects, inputs)
+    if folder is not None:
+        save_report(report, folder)
+    return report
+
+
+def find_pairs(pred: Path, gt: Path) -> tuple[list[Pair], list[dict[str, str]]]:
+    """Pairs two files, or the files of two folders by their paths without suffix.
+
+    Returns:
+        The pairs, sorted by name, and a failure record of each name that has no or several
+        partners.
+
+    Raises:
+        UserError: nothing is there, or a file on one side and a folder on the other.
+    """
+    for path in (pred, gt):
+        if not path.exists():
+            raise UserError(f"{path}: no such file or folder")
+    if pred.is_file() and gt.is_file():
+        return [Pair(pred.stem, pred, gt)], []
+    if pred.is_file() or gt.is_file():
+        raise UserError(f"{pred} and {gt}: give two files or two folders")
+    predicted, true = _shapes_in(pred), _shapes_in(gt)
+    pairs, failures = [], []
+    for name in sorted(predicted.keys() | true.keys()):
+        sides = {"prediction": predicted.get(name, []), "ground truth": true.get(name, [])}
+        if all(len(files) == 1 for files in sides.values()):
+            pairs.append(Pair(name, *(files[0] for files in sides.values())))
+            continue
+        missing = [side for side, files in sides.items() if not files]
+        several = [files for files in sides.values() if len(files) > 1]
+        if missing:
+            reason = f"no {missing[0]}"
+        else:
+            reason = f"more than one file: {', '.join(path.name for path in several[0])}"
+        failures.append(failure(name, reason))
+    return pairs, failures
+
+
+def _shapes_in(folder: Path) -> dict[str, list[Path]]:
+    """The shape files in a folder by their paths without suffix. Raises UserError for none."""
+    found: dict[str, list[Path]] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.suffix.lower() in SUFFIXES:
+            name = path.relative_to(folder).with_suffix("").as_posix()
+            found.setdefault(name, []).append(path)
+    if not found:
+        raise UserError(f"{folder}: no files of {', '.join(SUFFIXES)} in it")
+    return found
+
+
+def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: float) -> Similarity:
+    """The motion from the input camera's world, where a model predicts, to the dataset's.
+
+    Args:
+        dataset: that the object belongs to.
+        uid: the object.
+        reference: index of the input view.
+        distance: of the input camera in its world.
+
+    Raises:
+        UserError: the view cannot be read.
+    """
+    viewmat = dataset.load(uid, views=[reference]).cameras.viewmats[0].double()
+    _, scale = relative_to_reference(viewmat[None], viewmat, distance)
+    return Similarity(viewmat[:3, :3].T.numpy(), np.zeros(3), float(1 / scale))
+
+
+def evaluate_pair(
+    pair: Pair, protocol: GeometryProtocol, motion: Similarity | None
+) -> dict[str, Any]:
+    """Loads and compares one pair.
+
+    Args:
+        pair: the files.
+        protocol: what to do.
+        motion: of the prediction into the truth's unit frame; None: the same as the truth's.
+
+    Returns:
+        The object's record.
+
+    Raises:
+        UserError: a file cannot be read or has no surface, or a number is not finite.
+    """
+    start = time.perf_counter()
+    truth = load_truth(pair.gt, protocol)
+    predicted = load_prediction(pair.pred, truth.motion if motion is None else motion, protocol)
+    loaded = time.perf_counter()
+    metrics = check_finite(compare(predicted.shape, truth.shape, protocol))
+    return {
+        "name": pair.name,
+        "status": OK,
+        **metrics,
+        "kind": predicted.kind,
+        "pred_closed": predicted.is_closed(),
+        "gt_closed": truth.is_closed(),
+        "pred_flags": predicted.flags,
+        "gt_flags": truth.flags,
+        "pred_sha256": sha256(pair.pred),
+        "gt_sha256": sha256(pair.gt),
+        "gt_normalization": truth.motion.record(),
+        "seconds": {
+            "load": round(loaded - start, 3),
+            "compare": round(time.perf_counter() - loaded, 3),
+        },
+    }
+
+
+def evaluate_pairs(
+    pairs: list[Pair], protocol: GeometryProtocol, dataset: ViewDataset | None
+) -> list[dict[str, Any]]:
+    """Evaluates every pair; what goes wrong with one is its failure and stops no other.
+
+    Args:
+        pairs: the files.
+        protocol: what to do.
+        dataset: whose objects have the names of the pairs, for the frame "reference".
+
+    Returns:
+        One record for each pair.
+    """
+    objects = []
+    for pair in tqdm(pairs, unit="object", disable=None):
+        try:
+            motion = _into_unit_frame(pair.name, protocol, dataset)
+            objects.append(evaluate_pair(pair, protocol, motion))
+        except UserError as error:
+            objects.append(failure(pair.name, error))
+        except Exception as error:  # whatever a library runs into, the others are still evaluated
+            objects.append(failure(pair.name, f"{type(error).__name__}: {error}"))
+    return objects
+
+
+def _into_unit_frame(
+    name: str, protocol: GeometryProtocol, dataset: ViewDataset | None
+) -> Similarity | None:
+    """The prediction's motion by the protocol's frame; None: the same as the truth's."""
+    if protocol.frame == "unit":
+        return Similarity(np.eye(3), np.zeros(3))
+    if dataset is not None:
+        return out_of_reference(dataset, name, protocol.reference, protocol.distance)
+    return None
+
+
+def report_of(
+    protocol: GeometryProtocol, objects: list[dict[str, Any]], inputs: dict[str, str | None]
+) -> dict[str, Any]:
+    """The report: what ``make_report`` returns, ``inputs`` and ``flags``.
+
+    Args:
+        protocol: what was done.
+        objects: the records.
+        inputs: names of what was compared.
+    """
+    return make_report(
+        protocol.to_json(),
+        objects,
+        {"gamba_warp": __version__} | installed(*PACKAGES),
+        left_out=_NO_MEAN,
+        inputs=inputs,
+        flags=flag_counts(objects),
+    )
+
+
+def flag_counts(objects: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """Counts, for each side, how many of the evaluated shapes have which flag."""
+    done = [record for record in objects if record["status"] == OK]
+    return {
+        side: dict(Counter(flag for record in done for flag in record[f"{side}_flags"]))
+        for side in ("pred", "gt")
+    }

@@ -1,0 +1,136 @@
+"""What an evaluation of views needs for every object, opened as the options say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gamba_warp.data.dataset import ViewDataset, open_dataset
+from gamba_warp.data.vgg_weights import FETCH, lpips_available
+from gamba_warp.devices import pick_device
+from gamba_warp.errors import UserError
+from gamba_warp.files import output_folder
+from gamba_warp.fitting.objects import choose_objects
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.model.lpips import LPIPS, load_lpips
+
+from ..report import failure
+from .baselines import Baseline, Retrieval, background, billboard, input_copy
+from .ceiling import open_ceiling
+from .compare import Shown, Truth, ViewsProtocol
+from .options import ViewsOptions
+from .predictions import Predictions, open_predictions
+
+# errors that are the failure of one object and stop no other
+ERRORS = (UserError, ValueError, RuntimeError, ArithmeticError)
+
+
+@dataclass
+class Job:
+    """What is the same for every object.
+
+    Attributes:
+        predictions: what is under test.
+        dataset: where the true views come from.
+        uids: the objects.
+        protocol: what the numbers mean.
+        network: of LPIPS, or None.
+        device: torch device.
+        baselines: by name.
+        left_out: reasons by name, of baselines that cannot be had.
+        failures: ``{name, reason}`` of what failed beside objects.
+    """
+
+    predictions: Predictions
+    dataset: ViewDataset
+    uids: list[str]
+    protocol: ViewsProtocol
+    network: LPIPS | None
+    device: str
+    baselines: dict[str, Baseline] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    failures: list[dict[str, str]] = field(default_factory=list)
+
+    def predict(self, truth: Truth) -> Gaussians:
+        """Returns the Gaussians under test. Raises UserError where there are none."""
+        return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
+
+    def fail(self, name: str, error: Exception) -> None:
+        """Notes a failure beside those of objects."""
+        self.failures.append({k: v for k, v in failure(name, error).items() if k != "status"})
+
+    def shown(self, truth: Truth) -> dict[str, Shown]:
+        """Returns what each baseline shows; one that fails is noted and stops no other."""
+        result = {}
+        for name, baseline in self.baselines.items():
+            try:
+                pictures = baseline(truth)
+            except ERRORS as error:
+                self.fail(f"{truth.uid} ({name})", error)
+                continue
+            if pictures is not None:
+                result[name] = pictures
+        return result
+
+
+def open_job(options: ViewsOptions) -> Job:
+    """Opens everything that the options name, and makes the folder of the report.
+
+    Raises:
+        UserError: something is not there, cannot be read, or cannot be written.
+    """
+    device = str(pick_device(options.device))
+    dataset = open_dataset(options.data, options.split)
+    uids = choose_objects(dataset.uids, (), options.limit)
+    predictions = open_predictions(
+        options.checkpoint, options.distance, device, options.encoder_weights
+    )
+    network, reason = _lpips_or_reason(options.lpips, device)
+    protocol = ViewsProtocol(
+        split=options.split,
+        reference=options.reference,
+        views=options.views,
+        size=options.size,
+        lpips="VGG16, version 0.1" if network else None,
+        lpips_reason=reason,
+        distance=predictions.distance,
+    )
+    job = Job(predictions, dataset, uids, protocol, network, device)
+    folder = None if options.out is None else output_folder(options.out)
+    ceiling = None
+    if options.ceiling is not None:
+        ceiling = open_ceiling(
+            options.ceiling,
+            dataset,
+            uids,
+            protocol,
+            device=device,
+            out=folder,
+            steps=options.ceiling_steps,
+        )
+    if options.baselines:
+        _add_baselines(job, options.data)
+    if ceiling is not None:
+        job.baselines["ceiling"] = ceiling
+    return job
+
+
+def _lpips_or_reason(wanted: bool, device: str) -> tuple[LPIPS | None, str | None]:
+    """LPIPS on a device, or None and why there is none."""
+    if not wanted:
+        return None, "not asked for"
+    if lpips_available():
+        return load_lpips().to(device), None
+    return None, f"no weights; fetch them with: {FETCH}"
+
+
+def _add_baselines(job: Job, data: Path) -> None:
+    """Adds the four that need no fit; the retrieval only where there is a training split."""
+    job.baselines |= {"background": background, "input_copy": input_copy, "billboard": billboard}
+    try:
+        job.baselines["retrieval"] = retrieval = Retrieval(open_dataset(data, "train"))
+    except UserError as error:
+        job.left_out["retrieval"] = str(error)
+        return
+    for uid, reason in retrieval.failures.items():
+        job.fail(f"{uid} (retrieval)", UserError(reason))

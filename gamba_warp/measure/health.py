@@ -1,0 +1,109 @@
+"""What this machine has and can run; what is missing, and how to get it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio_ffmpeg
+import torch
+import warp as wp
+
+from ..cameras import Cameras, intrinsics, orbit
+from ..data.vgg_weights import FETCH, lpips_available
+from ..data.weights import cache_folder
+from ..gaussians import Gaussians
+from ..kernels.selective_scan import selective_scan
+from ..model.checkpoint import DEFAULT_CHECKPOINT
+from ..open3d import import_open3d
+from ..render import render
+
+
+def devices() -> Iterator[tuple[str, str]]:
+    """Yields the devices that torch can compute on, each with what is known of it."""
+    yield "cpu", f"{torch.get_num_threads()} threads"
+    for index in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(index)
+        memory = properties.total_memory / 2**30
+        architecture = f"sm_{properties.major}{properties.minor}"
+        yield f"cuda:{index}", f"{properties.name}, {memory:.0f} GiB, {architecture}"
+    if not torch.cuda.is_available():
+        yield "cuda", "none"
+
+
+def folders() -> Iterator[tuple[str, str]]:
+    """Yields where compiled kernels and fetched weights are kept, with their size."""
+    wp.init()
+    compiled = wp.config.kernel_cache_dir
+    assert compiled is not None  # ``wp.init`` sets it
+    kept = {"compiled kernels": Path(compiled), "weights": cache_folder()}
+    for name, path in kept.items():
+        size = sum(p.stat().st_size for p in path.rglob("*") if p.is_file()) / 2**20
+        yield name, f"{path} ({size:.0f} MiB)"
+
+
+def abilities() -> Iterator[tuple[str, str, bool]]:
+    """Yields each thing the package does, what is there or missing, and whether that is a fault.
+
+    Weights that have to be fetched or trained are no fault; a library that does not work is one.
+    """
+    working = {"open3d": _open3d, "mp4": imageio_ffmpeg.get_ffmpeg_exe}
+    for name, check in working.items():
+        try:
+            check()
+            yield name, "yes", False
+        except Exception as error:  # a broken installation raises anything: that is what to tell
+            yield name, f"no: {(str(error) or type(error).__name__).splitlines()[0]}", True
+    there = DEFAULT_CHECKPOINT.is_file()
+    missing = "no starter model here; give --checkpoint, or train with 'gamba demo'"
+    yield "reconstruct", "yes" if there else missing, False
+    yield "lpips", "yes" if lpips_available() else f"no weights here; '{FETCH}' fetches them", False
+    yield "sam", "with --sam CHECKPOINT; only busy backgrounds need it", False
+
+
+def _open3d() -> None:
+    import_open3d().geometry.TriangleMesh.create_box()
+
+
+def warm_up_kernels() -> Iterator[tuple[str, float, float]]:
+    """Runs scan and rasterizer forward and backward on small inputs, twice on each device.
+
+    Yields:
+        The device's type, the seconds of the first run, which compiles or loads the kernels, and
+        those of the second.
+    """
+    for device in ["cpu", "cuda"][: 1 + torch.cuda.is_available()]:
+        first, again = (_seconds_of_a_run(device) for _ in range(2))
+        yield device, first, again
+
+
+def _seconds_of_a_run(device: str) -> float:
+    started = time.perf_counter()
+    _run_scan(device)
+    _run_rasterizer(device)
+    if device != "cpu":
+        torch.cuda.synchronize()
+    return time.perf_counter() - started
+
+
+def _run_scan(device: str) -> None:
+    u, delta, z = torch.rand(3, 1, 32, 32, device=device).requires_grad_()
+    a = -torch.rand(32, 16, device=device)
+    b, c = torch.rand(2, 1, 32, 16, device=device)
+    direct, bias = torch.rand(2, 32, device=device)
+    selective_scan(u, delta, a, b, c, direct, z, bias, delta_softplus=True).sum().backward()
+
+
+def _run_rasterizer(device: str) -> None:
+    n = 64
+    gaussians = Gaussians(
+        means=torch.rand(n, 3) - 0.5,
+        quats=torch.randn(n, 4),
+        scales=torch.full((n, 3), 0.05),
+        opacities=torch.full((n,), 0.5),
+        colors=torch.rand(n, 3),
+    ).to(device)
+    gaussians.means.requires_grad_()
+    cameras = Cameras(orbit(torch.tensor([0.0])), intrinsics(32, 32)[None], 32, 32).to(device)
+    render(gaussians, cameras).rgb.sum().backward()

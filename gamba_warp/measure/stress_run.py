@@ -1,0 +1,182 @@
+"""A run of ``gamba stress``: its operators, its cases, and the files that it leaves."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from ..errors import UserError
+from ..files import atomic_path, write_json
+from ..kernels.stress import (
+    Case,
+    Op,
+    Outcome,
+    Tally,
+    document,
+    failure_text,
+    markdown,
+    read_reproducer,
+    reproducer,
+    run_case,
+    run_cases,
+    shrink,
+    table,
+)
+from ..versions import __version__, installed
+
+# What is stressed -> modules with an ``OP``. They are imported when they are asked for.
+SUITES = {
+    "scan": ("gamba_warp.kernels.stress.cases.scan", "gamba_warp.kernels.stress.cases.conv"),
+    "raster": ("gamba_warp.kernels.stress.cases.raster",),
+    "model": ("gamba_warp.measure.stress",),
+}
+_SHRUNK = 5  # failures of a run that are made small; all are written
+
+
+def choose_ops(what: Sequence[str]) -> list[Op]:
+    """The operators of those of ``SUITES`` that are named.
+
+    Args:
+        what: names, or "all".
+
+    Raises:
+        UserError: a name is not known.
+    """
+    unknown = [name for name in what if name not in (*SUITES, "all")]
+    if unknown:
+        raise UserError(f"unknown '{unknown[0]}'; there are {', '.join(SUITES)} and all")
+    wanted = [name for name in SUITES if name in what or "all" in what]
+    return [importlib.import_module(module).OP for name in wanted for module in SUITES[name]]
+
+
+def versions() -> dict[str, str]:
+    """Versions by name of what decides a result."""
+    return {"gamba_warp": __version__} | installed("torch", "warp-lang")
+
+
+class StressRun:
+    """One run: its tally, its failures, and the files that it leaves.
+
+    Attributes:
+        about: what is written of the run itself.
+        tally: the cases so far.
+        failures: the file and a line of text of each failing case.
+
+    Args:
+        ops: what is stressed.
+        device: where the kernels run.
+        folder: for the summary and the failing cases.
+        seed: the same seed gives the same cases in the same order.
+        shrink_seconds: time for making one failing case small.
+    """
+
+    def __init__(
+        self, ops: list[Op], device: torch.device, folder: Path, seed: int, shrink_seconds: float
+    ) -> None:
+        self._ops, self._device, self._folder = ops, device, folder
+        self._shrink_seconds = shrink_seconds
+        self.about = {"seed": seed, "device": str(device), **versions()}
+        self.tally = Tally()
+        self.failures: list[dict[str, str]] = []
+
+    def run(self, count: int | None, seconds: float) -> None:
+        """Runs cases until there are ``count``, the time is up or Ctrl-C, with a progress bar.
+
+        Args:
+            count: of the cases; None for no limit.
+            seconds: may be infinite.
+        """
+        began, interrupted, worst = time.monotonic(), False, 0.0
+        total = count if seconds == math.inf else None
+        seed = self.about["seed"]
+        with tqdm(total=total, unit="case", desc="stress", disable=None) as bar:
+            try:
+                found = run_cases(self._ops, seed, self._device, count=count, seconds=seconds)
+                for op, case, outcome, spent in found:
+                    self.tally.add(case, outcome, spent)
+                    failure = outcome.failure()
+                    if failure is not None:
+                        bar.set_postfix_str(f"{op.name}: a failure, made small")
+                        self._keep_failure(op, case, outcome, failure)
+                    worst = max(worst, outcome.worst.ratio if outcome.worst else 0.0)
+                    failed = f"{len(self.failures)} failures"
+                    bar.set_postfix_str(f"worst {worst:.2f} of its limit, {failed}")
+                    bar.update()
+            except KeyboardInterrupt:
+                interrupted = True
+        minutes = round((time.monotonic() - began) / 60, 2)
+        self.about |= {"minutes": minutes, "interrupted": interrupted}
+
+    def _keep_failure(self, op: Op, case: Case, outcome: Outcome, failure: dict) -> None:
+        name = f"failure-{op.name}-{len(self.failures) + 1}.json"
+        # It is written as it is first, because making it small may be interrupted.
+        self._write_case(name, case, outcome)
+        self.failures.append({"file": name, "text": failure_text(case, failure)})
+        if len(self.failures) <= _SHRUNK:
+            small, found, _ = shrink(op, case, self._device, self._shrink_seconds)
+            still = found.failure()
+            if still is not None:
+                self._write_case(name, small, found)
+                self.failures[-1]["text"] = failure_text(small, still)
+
+    def _write_case(self, name: str, case: Case, outcome: Outcome) -> None:
+        write_json(self._folder / name, reproducer(case, outcome, versions()))
+
+    def write(self) -> None:
+        """Writes stress.json and stress.md."""
+        content = document(self.tally, self.about, self.failures)
+        write_json(self._folder / "stress.json", content)
+        with atomic_path(self._folder / "stress.md") as temporary:
+            text = markdown(self.tally, self.about, self.failures)
+            temporary.write_text(text, encoding="utf-8")
+
+    def summary(self) -> str:
+        """The table of the cases, and a line for each failure."""
+        lines = [table([*self.tally.sorted(), *self.tally.totals()])]
+        lines += [f"{self._folder / row['file']}: {row['text']}" for row in self.failures]
+        cases = sum(row.cases for row in self.tally.totals())
+        return "\n".join([*lines, f"{cases} cases, {len(self.failures)} failed"])
+
+
+def replay(paths: Sequence[Path], device: torch.device) -> Iterator[tuple[bool, str]]:
+    """Runs the cases in files; all files are read before the first case is run.
+
+    Yields:
+        Whether a case passes, and lines about it.
+
+    Raises:
+        UserError: no such file, not JSON, damaged, or from another version.
+    """
+    ops = {op.name: op for op in choose_ops(("all",))}
+    cases = [(path, _read_case(path, ops)) for path in paths]
+    for path, case in cases:
+        outcome = run_case(ops[case.op], case, device)
+        failure, worst = outcome.failure(), outcome.worst
+        if failure is None:
+            ratio = f"{worst.name} {worst.ratio:.2f} of its limit" if worst else "nothing compared"
+            lines = [f"{path}: passes; {case.op}, {case.kind}: {ratio}"]
+        else:
+            lines = [f"{path}: fails; {failure_text(case, failure)}"]
+        for c in outcome.comparisons:
+            lines.append(f"  {c.name:<28} error {c.error:.2e}, {c.ratio:.3g} of its limit")
+        yield failure is None, "\n".join(lines)
+
+
+def _read_case(path: Path, ops: dict[str, Op]) -> Case:
+    try:
+        content = json.loads(path.read_text())
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror or 'cannot be read'}") from error
+    except ValueError as error:
+        raise UserError(f"{path}: not JSON ({error})") from error
+    try:
+        return read_reproducer(content, ops)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error

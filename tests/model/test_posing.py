@@ -1,0 +1,86 @@
+"""The one way from a dataset's view to a model's posed input."""
+
+import pytest
+import torch
+from helpers.micro import write_dataset
+
+from gamba_warp.cameras import intrinsics, reference_viewmat
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+from gamba_warp.eval.views.predictions import ModelPredictions
+from gamba_warp.model.checkpoint import save_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.posing import posed_input, reference_cameras, relative_cameras
+from gamba_warp.train.batches import load_sample
+
+CONFIG = GambaConfig(
+    image_size=16,
+    patch_size=4,
+    width=16,
+    depth=1,
+    encoder="none",
+    encoder_size=16,
+    distance=1.7,
+    fov=40.0,
+    background="black",
+)
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    return open_dataset(write_dataset(tmp_path / "data", objects=1), "all")
+
+
+def test_reference_cameras():
+    cameras = reference_cameras(CONFIG, 3)
+    assert cameras.viewmats.shape == (3, 4, 4) and cameras.Ks.shape == (3, 3, 3)
+    assert (cameras.width, cameras.height) == (16, 16)
+    assert torch.equal(cameras.viewmats[2], reference_viewmat(1.7))
+    assert torch.equal(cameras.Ks[1], intrinsics(16, 16, 40.0))
+
+
+def test_the_first_camera_becomes_the_reference(dataset):
+    views = dataset.load(dataset.uids[0], views=[2, 0, 5])
+    cameras = relative_cameras(views.cameras, 1.7)
+    # the dataset's cameras look at the origin; float32 rotations
+    torch.testing.assert_close(cameras.viewmats[0], reference_viewmat(1.7), atol=1e-5, rtol=0)
+    centres = -(cameras.viewmats[:, :3, :3].mT @ cameras.viewmats[:, :3, 3:])[..., 0]
+    before = views.cameras.viewmats
+    old = -(before[:, :3, :3].mT @ before[:, :3, 3:])[..., 0]
+    scale = 1.7 / before[0, :3, 3].norm()
+    torch.testing.assert_close(centres, scale * old @ before[0, :3, :3].mT, atol=1e-5, rtol=0)
+    assert torch.equal(cameras.Ks, views.cameras.Ks) and cameras.width == views.cameras.width
+
+
+def test_the_input_lies_on_the_model_s_background(dataset):
+    views = dataset.load(dataset.uids[0], views=[1, 3], size=16)
+    images, cameras = posed_input(views, CONFIG)
+    assert images.shape == (1, 16, 16, 3) and cameras.viewmats.shape == (1, 4, 4)
+    empty = views.images[0, ..., 3] == 0
+    assert empty.any() and (images[0][empty] == 0).all()
+
+
+def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypatch):
+    """To the bit, whatever the other views and the size of the pictures to match."""
+    uid = dataset.uids[0]
+    want = posed_input(dataset.load(uid, views=[4], size=16), CONFIG)
+    for size in (16, 24):
+        batch = load_sample(dataset, 0, [4, 1, 2], size, CONFIG, torch.ones(3))
+        assert torch.equal(batch.inputs, want[0])
+        assert torch.equal(batch.input_cameras.viewmats, want[1].viewmats)
+        assert torch.equal(batch.input_cameras.Ks, want[1].Ks)
+
+    (tmp_path / "model").mkdir()
+    save_model(tmp_path / "model" / "model.safetensors", Gamba(CONFIG))
+    predictions = ModelPredictions(tmp_path / "model", "cpu", None)
+    seen = []
+    run = predictions.model.forward
+    monkeypatch.setattr(predictions.model, "forward", lambda *x: seen.append(x) or run(*x))
+    predictions.gaussians(dataset, uid, 4)
+    assert torch.equal(seen[0][0], want[0]) and torch.equal(seen[0][1].Ks, want[1].Ks)
+    assert torch.equal(seen[0][1].viewmats, want[1].viewmats)
+
+    protocol = ViewsProtocol("all", 4, None, None, None, None, predictions.distance)
+    truth = load_truth(dataset, uid, protocol, "cpu")
+    assert torch.equal(truth.cameras.viewmats[:1], want[1].viewmats)

@@ -1,0 +1,54 @@
+"""Views of tensors: their cache of descriptors, several threads, dry runs."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+import warp as wp
+
+from gamba_warp.kernels.runtime import views
+from gamba_warp.kernels.runtime.launch import cuda_launch
+from gamba_warp.kernels.runtime.recording import Recorder, multiprocessors_of, recording
+from gamba_warp.kernels.runtime.views import array, vectors, view
+
+
+class _Cleared(dict):
+    """A cache that another thread clears as soon as something is put into it."""
+
+    def __setitem__(self, key, value):
+        super().__setitem__(key, value)
+        self.clear()
+
+
+def test_a_cache_that_another_thread_clears(monkeypatch):
+    monkeypatch.setattr(views, "_descriptors", _Cleared())
+    x = torch.arange(6.0).view(2, 3)
+    made = view(x)
+    assert made.data == x.data_ptr() and tuple(made.shape)[:2] == (2, 3)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _never(x_out: wp.array[float]):
+    x_out[wp.tid()] = 1.0
+
+
+def test_a_dry_run_tells_and_does_nothing(monkeypatch):
+    """No view, no launch, no look at a device, and only in the thread that asked for it."""
+    monkeypatch.setattr(views, "_descriptors", {})
+    told, device, x = [], torch.device("cuda"), torch.zeros(6)
+    with recording(Recorder(lambda *launch: told.append(launch), 77)):
+        assert multiprocessors_of(device) == multiprocessors_of(torch.device("cuda:3")) == 77
+        assert view(x) is None and array(x) is None and vectors(x, wp.vec3) is None
+        cuda_launch(_never, 6, [], [x], device=device, block_dim=32)
+        cuda_launch(_never, (2, 3), [], [x], device=x.device)
+        with ThreadPoolExecutor(1) as pool:
+            assert pool.submit(view, x).result().data == x.data_ptr()
+    assert told == [(_never, (6,), 32), (_never, (2, 3), 256)]
+    assert not x.any() and len(views._descriptors) == 1
+    assert view(x).data == x.data_ptr()
+
+
+def test_a_dry_run_ends_with_its_block():
+    with pytest.raises(RuntimeError), recording(Recorder(lambda *_: None, 1)):
+        raise RuntimeError
+    assert view(torch.zeros(2)) is not None

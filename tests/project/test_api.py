@@ -1,0 +1,137 @@
+"""The public names: each is what it says, in whatever order modules are imported."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gamba_warp
+from gamba_warp import kernels
+from gamba_warp.cameras import Cameras
+from gamba_warp.formats.ply import load_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import load_rgba, save_image
+from gamba_warp.kernels.causal_conv1d.function import causal_conv1d
+from gamba_warp.kernels.rasterize.function import rasterization
+from gamba_warp.kernels.selective_scan.function import selective_scan
+from gamba_warp.model.checkpoint import load_model
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.predict import reconstruct
+from gamba_warp.render import render
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text()
+# Modules and packages that have the name of a function beside them.
+BESIDE = ("gamba_warp.render", "gamba_warp.kernels.selective_scan.reference",
+          "gamba_warp.kernels.causal_conv1d.ops", "gamba_warp.kernels.rasterize")  # fmt: skip
+
+
+def run(code: str) -> str:
+    """What a fresh Python prints."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def python_block(heading: str) -> str:
+    """The Python of one section of the README."""
+    section = README.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return re.search(r"```python\n(.*?)```", section, re.DOTALL)[1]
+
+
+@pytest.mark.parametrize("package", [gamba_warp, kernels], ids=lambda p: p.__name__)
+def test_every_public_name_is_there_and_listed(package):
+    assert list(package.__all__) == sorted(package.__all__)
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+        assert name in dir(package)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        package.no_such_name  # noqa: B018
+
+
+def test_the_names_are_the_functions_and_classes():
+    assert gamba_warp.Gamba is Gamba and gamba_warp.Cameras is Cameras
+    assert gamba_warp.Gaussians is Gaussians and gamba_warp.render is render
+    assert gamba_warp.load_model is load_model and gamba_warp.reconstruct is reconstruct
+    assert kernels.selective_scan is selective_scan and kernels.causal_conv1d is causal_conv1d
+    assert kernels.rasterization is rasterization
+
+
+def test_importing_the_packages_is_light():
+    code = (
+        "import sys, gamba_warp, gamba_warp.kernels; print([m for m in {!r} if m in sys.modules])"
+    )
+    assert run(code.format(("torch", "warp", "numpy", "tyro"))).strip() == "[]"
+
+
+@pytest.mark.parametrize("module", BESIDE)
+@pytest.mark.parametrize("first", ["module", "name"])
+def test_a_module_does_not_hide_a_function(module, first):
+    names = "from gamba_warp import render\nfrom gamba_warp.kernels import *"
+    modules = f"import {module}\nimport gamba_warp.measure.stress"
+    order = [modules, names, modules] if first == "module" else [names, modules, names]
+    code = """
+import gamba_warp, gamba_warp.kernels as kernels
+for name in ("selective_scan", "causal_conv1d", "rasterization", "render"):
+    assert type(globals()[name]).__name__ == "function", name
+assert render is gamba_warp.render and selective_scan is kernels.selective_scan
+from gamba_warp.render import Rendering
+from gamba_warp.kernels.selective_scan import reference
+from gamba_warp.kernels.causal_conv1d import ops
+assert reference.selective_scan_reference and ops.__name__.endswith("causal_conv1d.ops")
+print("right")
+"""
+    assert run("\n".join([*order, code])).strip() == "right"
+
+
+def test_a_public_name_can_be_replaced(monkeypatch):
+    """As in tests of programs that use it; the import system alone cannot."""
+    with monkeypatch.context() as patch:
+        patch.setattr(gamba_warp, "render", print)
+        assert gamba_warp.render is print
+    assert gamba_warp.render is render
+
+
+def test_the_readme_runs(tmp_path, monkeypatch):
+    rgba = np.zeros((40, 30, 4))
+    rgba[8:32, 5:25] = (0.8, 0.3, 0.1, 1)
+    save_image(tmp_path / "photo.png", rgba)
+    monkeypatch.chdir(tmp_path)
+    exec(python_block("In Python"), {})
+    assert load_ply(tmp_path / "photo.ply").num == 4096
+    picture = load_rgba(tmp_path / "view.png")
+    assert picture.shape == (256, 256, 4) and (picture[..., :3] < 0.9).any()
+    exec(python_block("The kernels alone"), {})
+
+
+def test_a_picture_may_be_a_file_or_an_array(tmp_path):
+    rgba = np.zeros((30, 30, 4), np.float32)
+    rgba[3:27, 3:27] = (0.8, 0.3, 0.1, 1)  # as ``prepare`` leaves it
+    save_image(tmp_path / "a.png", rgba)
+    model = load_model()
+    want = reconstruct(model, load_rgba(tmp_path / "a.png"))
+    for path in (tmp_path / "a.png", str(tmp_path / "a.png")):
+        got = reconstruct(model, path)
+        assert np.array_equal(got.means.numpy(), want.means.numpy())
+    for shape in ((30, 30, 3), (30, 20, 4), (30, 30)):
+        with pytest.raises(ValueError, match=re.escape(f"picture has shape {shape}")):
+            reconstruct(model, np.zeros(shape))
+
+
+def test_types_are_told():
+    assert (ROOT / "gamba_warp" / "py.typed").is_file()
+    assert "py.typed" in (ROOT / "setup.cfg").read_text()
+
+
+@pytest.mark.parametrize("package", [gamba_warp, kernels], ids=lambda p: p.__name__)
+def test_editors_are_told_what_is_loaded(package):
+    body = ast.parse(Path(package.__file__).read_text()).body
+    typing = [n for n in body if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.unparse(n.test)]
+    typed = {name.name: "." + n.module for n in typing[0].body for name in n.names}
+    calls = [n.value for n in body if isinstance(n, ast.Expr) and isinstance(n.value, ast.Call)]
+    (loaded,) = [ast.literal_eval(c.args[1]) for c in calls if "load_when_used" in ast.unparse(c)]
+    assert typed == loaded and set(package.__all__) - {"__version__"} == set(loaded)

@@ -1,0 +1,71 @@
+"""``gamba data render``: mesh files to posed RGBA views."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from gamba_warp.conventions import DEFAULT_FOV
+from gamba_warp.files import output_folder
+
+
+def data_render_command(
+    folder: tyro.conf.Positional[Path],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    views: int = 24,
+    size: int = 128,
+    fov: float = DEFAULT_FOV,
+    seed: int = 0,
+    depth: bool = False,
+    format: Literal["webp-lossless", "png"] = "webp-lossless",
+    up: Literal["auto", "y", "z"] = "auto",
+    shard: str = "0/1",
+    limit: int | None = None,
+    workers: int = 0,
+) -> int:
+    """Render posed RGBA views of every mesh in a folder (.obj .glb .gltf .ply .stl .off).
+
+    Objects that are already there are skipped, so a run that was stopped goes on where it was.
+
+    Args:
+        folder: meshes, at any depth; a catalogue.json in it may give names and attribution.
+        out: the dataset to make or to go on with.
+        views: number of views of an object; view 0 is from the front.
+        size: pixels a side.
+        fov: vertical field of view, degrees.
+        seed: seed of cameras and lights; those of an object also depend on its uid.
+        depth: also write 16-bit depth pictures.
+        format: format of the pictures; both are lossless.
+        up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
+        shard: i/n renders every n-th object from the i-th, for n machines.
+        limit: stop after this many objects.
+        workers: number of processes; 0 means one per core.
+    """
+    from .render import (
+        Settings,
+        check_options,
+        find_meshes,
+        parse_shard,
+        render_meshes,
+        still_missing,
+    )
+
+    settings = Settings(views, size, fov, seed, depth, format, up)
+    check_options(settings, workers, limit)
+    meshes = find_meshes(folder)
+    first, count = parse_shard(shard)
+    meshes = meshes[first::count][:limit]
+    out = output_folder(out)
+    todo = still_missing(meshes, out, settings)
+    if len(todo) < len(meshes):
+        print(f"{len(meshes) - len(todo)} of {len(meshes)} objects are already in {out}")
+    warnings, failures = render_meshes(todo, out, settings, workers)
+    for uid, lines in sorted(warnings.items()):
+        print(f"warning: {uid}: {'; '.join(lines)}")
+    print(f"rendered {len(todo) - len(failures)} objects into {out}, {len(failures)} failed")
+    for uid, reason in sorted(failures.items()):
+        print(f"failed: {uid}: {reason}", file=sys.stderr)
+    return 1 if failures else 0

@@ -1,0 +1,96 @@
+"""One run of ``gamba train``, from the options to the exit code."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import torch
+
+from gamba_warp.files import output_folder, write_json
+from gamba_warp.model.gamba import Gamba
+
+from .batches import open_data
+from .checkpoint import find_checkpoint, load_weights
+from .config import TrainConfig
+from .ddp import World
+from .log import RunLog
+from .loop import Trainer
+from .losses import open_lpips
+
+
+def train(config: TrainConfig, world: World) -> int:
+    """Trains as configured on this process's device.
+
+    Args:
+        config: the options.
+        world: this process among all.
+
+    Returns:
+        0; 1 if some objects could not be read; 128 + n if signal n stopped it (resumable).
+
+    Raises:
+        UserError: bad data, options or run folder.
+    """
+    run = config.run
+    data = open_data(config)
+    checkpoint = find_checkpoint(run.out, run.resume)
+    lpips, warning = open_lpips(config)
+    torch.manual_seed(run.seed)
+    torch.set_float32_matmul_precision("high")  # TF32 where there is a GPU; no effect on a CPU
+    model = Gamba(config.model_config(), run.encoder_weights)
+    model.recompute = run.recompute
+    if run.init is not None and checkpoint is None:
+        load_weights(run.init, model)
+    model.to(world.device)
+    if lpips is not None:
+        lpips.to(world.device)
+    log = None
+    if world.main:
+        output_folder(run.out / "samples")
+        log = RunLog(run.out, run.tensorboard)
+    try:
+        trainer = Trainer(config, model, data, world, log, lpips)
+        if checkpoint is not None:
+            trainer.restore(checkpoint)
+        if log is not None:
+            _announce(trainer, log, checkpoint, warning)
+        code = trainer.run()
+        if log is not None:
+            code = _report(trainer, log, code)
+        return code
+    finally:
+        if log is not None:
+            log.close()
+
+
+def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, warning: str | None) -> None:
+    """Says at the beginning what is trained on what, and what is missing."""
+    config, data = trainer.config, trainer.data
+    write_json(config.run.out / "config.json", config.to_dict())
+    log.write("start", trainer.step, config=config.to_dict(), resumed_from=str(checkpoint or ""))
+    parameters = sum(p.numel() for p in trainer.parameters)
+    length = f"{trainer.total} steps" if trainer.total else f"{config.length.minutes} minutes"
+    print(
+        f"{len(set(data.objects))} objects, {parameters / 1e6:.1f} M parameters, {length}, "
+        f"{trainer.world.device} -> {config.run.out}"
+    )
+    for note in [*data.notes, *([warning] if warning else [])]:
+        log.warn(trainer.step, note)
+    if checkpoint is not None:
+        print(f"resumed {checkpoint} at step {trainer.step}")
+
+
+def _report(trainer: Trainer, log: RunLog, code: int) -> int:
+    """Says at the end what went wrong on the way; returns the exit code."""
+    failures = trainer.failures
+    log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures)
+    if trainer.skipped:
+        print(f"{trainer.skipped} of {trainer.step} steps were skipped: not finite")
+    for uid, reason in failures.items():
+        print(f"could not read {uid}: {reason}", file=sys.stderr)
+    if code > 128:
+        print(f"stopped by a signal at step {trainer.step}; the same command goes on from here")
+    elif code == 0:
+        print(f"wrote {trainer.config.run.out / 'model.safetensors'}")
+    return code or int(bool(failures))
