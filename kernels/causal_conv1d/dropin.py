@@ -19,7 +19,7 @@ def causal_conv1d_fn(
     final_states_out: Tensor | None = None,
     activation: str | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """``causal_conv1d.causal_conv1d_fn``, same arguments and layout.
+    """Does what causal-conv1d's ``causal_conv1d_fn`` does, with the same arguments and layout.
 
     Args:
         x: ``[B, D, L]`` float32, bfloat16 or float16.

@@ -1,4 +1,4 @@
-"""The public convolution: checks at the door, then the operators of ``ops.py``."""
+"""The public convolution: it checks its arguments and calls the operators of ``ops.py``."""
 
 from typing import Literal, overload
 

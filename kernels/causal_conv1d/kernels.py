@@ -15,8 +15,8 @@ from ..runtime import scalars as cuda_values
 from ..runtime.lanes import WARP_DTYPES
 
 TAPS = 4
-STRIP = 16  # tokens of a forward task: few rows at once, for each is of another page
-CHUNK = 64  # of a backward one; the gradient of the weight is summed in these, then over them
+STRIP = 16  # tokens of a forward task; few, because each row may lie in another page
+CHUNK = 64  # tokens of a backward task, each with its own sum for the gradient of the weight
 _S = wp.constant(STRIP)
 _K = wp.constant(CHUNK)
 _HISTORY = wp.constant(TAPS - 1)
@@ -80,7 +80,7 @@ def forward_kernel(device_type: str, io: torch.dtype):
 
 @functools.cache
 def backward_kernel(device_type: str, io: torch.dtype):
-    """Its gradients (README, equation 2); those of the weight in one partial sum a chunk."""
+    """The kernel of the gradients (README, equation 2); those of the weight are one sum a chunk."""
     value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
     scalar = WARP_DTYPES[io]
 

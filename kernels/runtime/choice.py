@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 class Choice(Generic[T]):
-    """What is in force now, for all threads: autograd may compute gradients on its own.
+    """What is in force now, for all threads of the process.
 
     Attributes:
         value: what is in force.
@@ -21,7 +21,7 @@ class Choice(Generic[T]):
 
     @contextlib.contextmanager
     def use(self, value: T) -> Iterator[None]:
-        """``value`` is in force inside."""
+        """Puts ``value`` in force inside, and what was in force before it back at the end."""
         before, self.value = self.value, value
         try:
             yield

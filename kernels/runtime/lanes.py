@@ -44,14 +44,14 @@ _EXP2 = {
 
 
 def _polynomial(degree: int) -> str:
-    """C++ that makes p of f."""
+    """C++ text that computes p, the polynomial of that degree, from f."""
     first, *rest = _EXP2[degree]
     lines = [f"F p = splat({first!r}f);", *(f"p = fma_(p, f, splat({c!r}f));" for c in rest)]
     return "\n    ".join(lines)
 
 
-# exp2: round to an integer by adding 1.5 * 2^23 (+127, the exponent bias), then the polynomial of
-# the rest. NaN stays NaN.
+# exp2 rounds to an integer by adding 1.5 * 2^23 (+127, the exponent bias), and takes the polynomial
+# of the rest. NaN stays NaN.
 _PRELUDE = (
     VECTORS
     + """
@@ -75,12 +75,12 @@ auto exp2_ = [&](F x) -> F {
     x = x < -126.0f ? splat(-126.0f) : x;
     return exp2_clamped_(x > 128.0f ? splat(128.0f) : x);
 };
-// e^-|x|; for NaN it is 2^-126
+// e^-|x|; NaN gives 2^-126
 auto decay_ = [&](F x) -> F {
     x = (F)((I)x | (int)0x80000000) * LOG2E;
     return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
 };
-// the same of another degree for |x| <= 125, NaN excluded: the exponent is added as an integer
+// exp2 of another degree for |x| <= 125 and no NaN: the exponent is added as an integer
 auto exp2_tame_ = [&](F x) -> F {
     const F plain = splat(12582912.0f);
     F r = x + plain;
@@ -93,7 +93,7 @@ auto exp2_tame_ = [&](F x) -> F {
 
 
 def prelude(degree: int) -> str:
-    """Arithmetic on lanes; ``degree`` of the recurrence's exp2 where |x| <= 125."""
+    """C++ text of the arithmetic on lanes; ``degree`` is that of ``exp2_tame_``."""
     return _PRELUDE.replace("TAME", _polynomial(degree))
 
 

@@ -1,4 +1,4 @@
-"""Launches: over torch's own threads on the CPU, on torch's current stream on CUDA."""
+"""Launches of kernels, on torch's own threads on the CPU and on its current stream on CUDA."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .recording import recorder
 from .start import start_without_gpu
 from .views import view
 
-if wp.config.log_level == wp.LOG_INFO:  # the default; a level that somebody chose stays
+if wp.config.log_level == wp.LOG_INFO:  # Warp's default; a level that somebody chose stays
     wp.config.log_level = wp.LOG_WARNING
 
 
@@ -66,8 +66,8 @@ def parallel_launch(
         dim: launch dimensions.
         inputs: arguments after ``offset``; tensors are viewed, other values passed on.
         outputs: more arguments, by convention those that are written.
-        threads: how many at once; None means ``torch.get_num_threads()``.
-        pieces: how many pieces; None means one per thread. More of them even out uneven work.
+        threads: number of threads; None means ``torch.get_num_threads()``.
+        pieces: number of pieces; None means one per thread. More pieces even out uneven work.
 
     Raises:
         Exception: the first one that a piece raised.
@@ -139,7 +139,7 @@ def cuda_launch(
 
 
 def launch(kernel: Any, dim: int, inputs, outputs, device: torch.device) -> None:
-    """Launches a plain kernel whose first parameter is ``offset``; ``dim`` 0 is no launch."""
+    """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing."""
     if dim == 0:
         return
     if device.type == "cpu":

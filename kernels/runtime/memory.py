@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-_HUGE = 4 << 20  # bytes from which huge pages pay
+_HUGE = 4 << 20  # bytes from which huge pages are worth it
 
 
 _libc = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
 def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """As ``torch.empty`` on the CPU; a large tensor asks for huge pages.
+    """Makes a tensor as ``torch.empty`` does on the CPU; a large one asks for huge pages.
 
     The first touch of a page costs more than filling it, and with rows of 4 KiB each row would be a
     page of its own.

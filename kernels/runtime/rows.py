@@ -1,4 +1,4 @@
-"""Rows of a ``[B, L, D]`` tensor as lanes: element types, strides and ragged ends, in C++ text.
+"""Rows of a ``[B, L, D]`` tensor as lanes, in C++ text: element types, strides and ragged ends.
 
 A row is dense in D; tokens and batch elements may be strided. Lanes past ``width`` are read as 0
 and not written.
@@ -11,7 +11,7 @@ from .lanes import LANES, PRELUDE, WARP_DTYPES, W, fma, lanes, sigmoid, times
 
 __all__ = ["ACCESSORS", "ELEMENTS", "VALUE", "WIDTH", "fma", "rows", "sigmoid", "times"]
 
-VALUE, WIDTH = lanes, W  # with the rest, the names that scalars.py shares
+VALUE, WIDTH = lanes, W  # scalars.py has these names too, as kernels for both devices need them
 
 ELEMENTS = """
 typedef _Float16 H __attribute__((vector_size(32), aligned(2)));
@@ -100,5 +100,5 @@ def _accessors(dtype: torch.dtype):
     return load, store
 
 
-# By element type, ``(load, store)``: both address row [b, t] from channel d on.
+# ``(load, store)`` by element type; both address row [b, t] from channel d on.
 ACCESSORS = {dtype: _accessors(dtype) for dtype in WARP_DTYPES}

@@ -1,4 +1,4 @@
-"""The leaves of ``lanes.py`` for one channel per thread: what CUDA kernels use.
+"""The leaves of ``lanes.py`` for one channel per thread, for CUDA kernels.
 
 Each is plain Warp, or a line of C++ that also compiles for a CPU, where the tests run it.
 """
@@ -12,7 +12,8 @@ VALUE = wp.float32
 WIDTH = 1
 LOG2E = 1.4426950408889634
 
-# One instruction each on the special function unit: about 2^-22 of relative error, denormals are 0.
+# Each of the two is one instruction on the special function unit, with a relative error of about
+# 2^-22. Denormals count as 0.
 EXP2 = """
 auto exp2_ = [](float v) -> float {
 #if defined(__CUDA_ARCH__)
@@ -37,7 +38,7 @@ auto reciprocal_ = [](float v) -> float {
 """
 
 
-# The product of two int32 in one instruction, for an address.
+# The product of two int32 in one instruction, as addresses need it.
 WIDE = """
 auto wide_ = [](int a, int b) -> long long {
 #if defined(__CUDA_ARCH__)
@@ -64,7 +65,7 @@ def sigmoid(x: float) -> float:
     return reciprocal(1.0 + exp2(-wp.static(LOG2E) * x))  # 0 where the power is infinite
 
 
-# As in lanes.py: branch-free, and relatively accurate for x << 0.
+# It has no branch and is relatively accurate for x << 0, as the one in lanes.py.
 @wp.func
 def softplus(x: float) -> float:
     e = exp2(-wp.static(LOG2E) * wp.abs(x))
@@ -74,7 +75,7 @@ def softplus(x: float) -> float:
     return wp.max(x, 0.0) + 2.0 * s * (1.0 + w * (0.33333206564805135 + w * p))
 
 
-# The sigmoid, by the exponential that ``softplus`` takes.
+# This is the sigmoid, from the exponential that ``softplus`` uses as well.
 @wp.func
 def softplus_slope(x: float) -> float:
     e = exp2(-wp.static(LOG2E) * wp.abs(x))

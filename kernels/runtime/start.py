@@ -10,10 +10,10 @@ import warp as wp
 
 
 def start_without_gpu() -> None:
-    """Starts Warp, holding back its native note on a missing CUDA driver: a CPU is no fault."""
+    """Starts Warp and holds back its note on a missing CUDA driver, which is no fault on a CPU."""
     try:
         saved = os.dup(2)
-    except OSError:  # stderr is closed: nobody to spare
+    except OSError:  # stderr is closed, so nobody would see the note
         return wp.init()
     with tempfile.TemporaryFile() as held:
         os.dup2(held.fileno(), 2)

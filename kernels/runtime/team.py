@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 class _Job(ctypes.Structure):
-    """The pieces: one after the other in memory, with the number of the next one."""
+    """The pieces, which lie one after the other in memory, and the number of the next one."""
 
     _fields_ = [
         ("entry", ctypes.c_void_p),
@@ -77,7 +77,7 @@ def _find() -> None:
 
 def _lose() -> None:
     global _parallel
-    _parallel = 0  # the threads of the team stayed with the parent
+    _parallel = 0  # after a fork: the threads of the team stayed with the parent
 
 
 _find()
@@ -110,7 +110,7 @@ class _Entry:
         self.names = [arg.label for arg in kernel.adj.args]
         fields = [(name, type(x)) for name, x in zip(self.names, command.params[1:])]
         self.record: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
-        self.extent(dim)  # raises now what it would raise later
+        self.extent(dim)  # so that an error comes now and not in a later launch
         self.pack(arguments)
 
     def pack(self, arguments: list) -> ctypes.Structure:

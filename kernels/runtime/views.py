@@ -14,7 +14,7 @@ _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
 
 
 def view(tensor: Tensor, dtype=None, name: str = "tensor"):
-    """A Warp array descriptor on the tensor's own memory, strides kept; it keeps the tensor alive.
+    """A Warp array descriptor on the memory and strides of a tensor, which it keeps alive.
 
     In a dry run (``recording.py``) it is None: the tensor may have no memory.
 
@@ -43,7 +43,7 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
 
 
 _MOST_DESCRIPTORS = 4096
-_descriptors: dict[tuple, Any] = {}  # of the first tensor of each dtype, shape and strides
+_descriptors: dict[tuple, Any] = {}  # one for each dtype, shape and strides
 
 
 def _describe(tensor: Tensor, dtype, name: str) -> Any:
@@ -61,7 +61,7 @@ def _describe(tensor: Tensor, dtype, name: str) -> Any:
         made: Any = wp.from_torch(tensor, dtype=dtype, requires_grad=False, return_ctype=True)
     except RuntimeError as error:
         raise ValueError(f"{name}: {error}") from error
-    return type(made).from_buffer_copy(made)  # without the tensor
+    return type(made).from_buffer_copy(made)  # a copy that does not keep the tensor alive
 
 
 def array(tensor: Tensor, dtype=None) -> Any:
@@ -93,7 +93,7 @@ def tokens_first(x: Tensor, name: str) -> Tensor: ...
 @overload
 def tokens_first(x: Tensor | None, name: str) -> Tensor | None: ...
 def tokens_first(x: Tensor | None, name: str) -> Tensor | None:
-    """A view ``[B, L, D]`` of mamba-ssm's layout ``[B, D, L]``; what is no tensor stays as it is.
+    """A view ``[B, L, D]`` of mamba-ssm's layout ``[B, D, L]``; what is no tensor is returned.
 
     Raises:
         ValueError: the tensor, called ``name``, has not three dimensions.

@@ -9,13 +9,13 @@ from .function import selective_scan
 
 
 def _input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
-    """(D, N), (B, N, L) or (B, G, N, L) to ``[B, L, G, N]``."""
+    """Brings (D, N), (B, N, L) or (B, G, N, L) to ``[B, L, G, N]``."""
     if not isinstance(x, Tensor):
         raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
     if x.is_complex():
         raise TypeError(f"{name} has dtype {x.dtype}; complex states are not supported")
     if x.dim() == 2:
-        # float32, or the sum of its gradient over all tokens would be in x's own few bits
+        # in float32: the sum of its gradient over all tokens would not fit in x's few bits
         return x.float().expand(u.shape[0], u.shape[2], *x.shape)
     if x.dim() == 3:
         return x.transpose(1, 2)[:, :, None]
@@ -36,7 +36,7 @@ def selective_scan_fn(
     delta_softplus: bool = False,
     return_last_state: bool = False,
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """``mamba_ssm.ops.selective_scan_interface.selective_scan_fn``, same arguments and layout.
+    """Does what mamba-ssm's ``selective_scan_fn`` does, with the same arguments and layout.
 
     Args:
         u: ``[B, D, L]`` float32, bfloat16 or float16; likewise delta and z.
@@ -65,7 +65,7 @@ def selective_scan_fn(
     tokens = u.transpose(1, 2)
     B, C = _input_matrix(B, tokens, "B"), _input_matrix(C, tokens, "C")
     groups = max(B.shape[2], C.shape[2])
-    if B.shape[2] != groups and groups % B.shape[2] == 0:  # float32: gradients are summed again
+    if B.shape[2] != groups and groups % B.shape[2] == 0:  # float32, as gradients are summed again
         B = B.float().repeat_interleave(groups // B.shape[2], dim=2)
     if C.shape[2] != groups and groups % C.shape[2] == 0:
         C = C.float().repeat_interleave(groups // C.shape[2], dim=2)

@@ -1,4 +1,4 @@
-"""The public scan: checks at the door, then the operators of ``ops.py``."""
+"""The public scan: it checks its arguments and calls the operators of ``ops.py``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _check(name: str, x: Tensor, shape: tuple[int, ...], dtypes: tuple, device) 
 
 
 def _check_groups(name: str, x: Tensor, u: Tensor, states: int) -> Tensor:
-    """``[B, L, N]`` or ``[B, L, G, N]`` to ``[B, L, G, N]``."""
+    """Checks B or C and brings ``[B, L, N]`` to ``[B, L, G, N]``."""
     if not isinstance(x, Tensor):
         raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
     batch, length, channels = u.shape
@@ -44,7 +44,7 @@ def _check_groups(name: str, x: Tensor, u: Tensor, states: int) -> Tensor:
 
 
 def _check_common(u, delta, A, delta_bias, initial_state, discretization) -> int:
-    """What both functions take but B and C; returns N."""
+    """Checks what both functions take, except B and C; returns N."""
     if not isinstance(u, Tensor):
         raise TypeError(f"u is {type(u).__name__}, must be a tensor")
     if u.dim() != 3 or u.shape[2] == 0:
@@ -188,7 +188,7 @@ def selective_scan_state(
     initial_state: Tensor | None = None,
     discretization: str = "mamba",
 ) -> Tensor:
-    """The state after the last token, for those who need no output: no C, D or gate is computed.
+    """The state after the last token, where no output is needed: no C, D or gate is computed.
 
     Args:
         u: as ``selective_scan``; likewise the others.

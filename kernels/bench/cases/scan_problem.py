@@ -110,7 +110,7 @@ class ScanProblem:
         return selective_scan(**given, delta_softplus=self.softplus)
 
     def forward(self, dtype: torch.dtype = torch.float32, **options) -> Tensor:
-        """Timed: no gradient."""
+        """What is timed: the output, without a gradient."""
         with torch.no_grad():
             return self.call(self.at(dtype), **options)
 
@@ -119,7 +119,7 @@ class ScanProblem:
         return {k: x.detach().requires_grad_() for k, x in self.at(dtype).items()}
 
     def backward(self, dtype: torch.dtype = torch.float32, **options) -> tuple[Tensor, ...]:
-        """Timed: forward and all gradients; u serves as the cotangent."""
+        """What is timed: forward and all gradients, with u as the cotangent."""
         leaves = self.leaves(dtype)
         out = self.call(leaves, **options)
         return torch.autograd.grad(out, list(leaves.values()), self.at(dtype)["u"])

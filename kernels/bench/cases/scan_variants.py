@@ -10,9 +10,10 @@ from ..core.case import Settings, Variant
 from ..core.measure import peak_bytes, saved_bytes
 from .scan_problem import ScanProblem, make_inputs
 
-# Allowed relative rms error to float64. Half precision: what rounding inputs and output explains.
+# The relative rms errors to float64 that are allowed. Those of half precision are explained by the
+# rounding of inputs and output.
 FORWARD_LIMIT, BACKWARD_LIMIT = 1e-6, 1e-5
-CUDA_LIMIT = 1e-5  # both ways: ex2.approx there is off by 2^-22 at every token
+CUDA_LIMIT = 1e-5  # of both directions: ex2.approx is off by 2^-22 at every token
 HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
 TRADE_LIMIT = 1.0  # where accuracy is the knob
 BOTH = "forward+backward"

@@ -1,7 +1,7 @@
 """Which kernels an operator launches on CUDA, found without a GPU.
 
-The operators run on tensors that have a shape, a dtype and the device cuda, but no memory; a launch
-is noted instead of made. So the code that chooses kernels is the operators' own.
+The operators run on tensors that have a shape, a dtype and the device cuda, but no memory. Their
+launches are recorded (``runtime/recording.py``), so the code that chooses kernels is their own.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ...runtime.recording import Recorder, recording
 
 _READ_BACK = (torch.ops.aten.item.default, torch.ops.aten._local_scalar_dense.default)
-# What an operator reads back from the device, the number of pairs, is taken to be this.
+# The number of pairs, which the rasterizer reads back from the device, is taken to be this.
 COUNT = 1 << 20
-# Multiprocessors of the device that is imagined; an A100 has 108, an H100 or H200 has 132.
+# The multiprocessors of the imagined device: an A100 has 108, an H100 or H200 has 132.
 MULTIPROCESSORS = 132
 
 
@@ -86,7 +86,7 @@ def run_backward(outputs: Sequence[Tensor]) -> None:
 def _gradients(node, gradients: list) -> tuple[list, list]:
     """What follows a node, and the gradient for each."""
     following = list(node.next_functions)
-    if not hasattr(node, "needs_input_grad"):  # of C++
+    if not hasattr(node, "needs_input_grad"):  # a node of C++
         results = node(*gradients)
         return following, list(results) if isinstance(results, tuple) else [results]
     results = zip(node.apply(*gradients), node.needs_input_grad)

@@ -5,7 +5,7 @@ chunk whose decays are all slow take f - 1 instead, which float32 holds to its l
 kept as a sum of two numbers.
 """
 
-# What δ is multiplied by to give ``rate``: exponentials are powers of two.
+# The factor from δ to ``rate``: exponentials are computed as powers of two.
 SCALES = {"mamba": 1.4426950408889634, "bilinear": 1.0, "zoh": 1.4426950408889634}
 
 _PHI = """
@@ -20,25 +20,25 @@ _PHI = """
     const F safe = small ? splat(1.0f) : xe;
     const F g = small ? series : (m - 1.0f) / safe;
 """
-# m = f and g of x = rate A.
+# Of x = rate A: m, which is f here, and g.
 FACTORS = {
     "mamba": "const F m = exp2(x), g = splat(1.0f);",
     "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x), m = fma_(x, g, splat(1.0f));",
     "zoh": "const F m = exp2(x);" + _PHI,
 }
-# Their slopes df and dg, and g again; m is given.
+# From x and m: the slopes df and dg of f and g, and g again.
 SLOPES = {
     "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x), df = g * g, dg = 0.5f * df;",
     "zoh": _PHI + "const F df = m, dg = small ? slope : (m - g) / safe;",
 }
 
-SPREAD = 64  # a decay is slow where |x| <= 1 / SPREAD; the chunk's length, if that is longer
+SPREAD = 64  # a decay is slow where |x| <= 1 / SPREAD; longer chunks take their length instead
 # (2^x - 1) / x for |x| <= 1/64: the series of the exponential, off by 5.3e-8 at most.
 _RISE = """
     const F rise = fma_(fma_(splat(0.05550410866482158f), x, splat(0.2402265069591007f)), x,
         splat(0.6931471805599453f));
 """
-# The same where the decay is slow, with m = f - 1.
+# The same where the decay is slow; m is f - 1 here.
 SLOW_FACTORS = {
     "mamba": _RISE + "const F m = x * rise, g = splat(1.0f);",
     "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x), m = x * g;",
@@ -89,7 +89,7 @@ auto slow_ = [&](F x) -> bool {
 
 
 def walks(name: str, body: str, discretization: str) -> str:
-    """C++ text: lambdas ``name`` (of an exp2) and ``slow_name`` (of anything) with that body.
+    """C++ text of two lambdas with that body: ``name``, of an exp2, and ``slow_name``, of anything.
 
     The body may hold FACTORS and SLOPES, which stand for m, g, df and dg of x, and STATE, which
     stands for the type of a state.

@@ -20,7 +20,7 @@ from .recurrence import NEED_DB, NEED_DC
 from .tokens import EXTRA, GRAD_TOKEN, KEPT, TOKEN
 from .tuning import Tuning
 
-SPAN = 32  # lane groups of a task at most: long pieces of rows, and what a core's own cache holds
+SPAN = 32  # lane groups of a task at most: rows are read in long parts that fit a core's cache
 
 _P = wp.constant(BLOCKS)
 _W = wp.constant(W)
@@ -32,7 +32,7 @@ class Sizes:
     """What the kernels know: shapes, options, and which gradients are wanted."""
 
     length: int
-    segment: int  # tokens of a segment, whole chunks
+    segment: int  # tokens of a segment, a multiple of the chunk
     segments: int
     batch: int
     states: int
@@ -50,7 +50,7 @@ class Place:
     """Where a task works."""
 
     b: int
-    state: int  # row of the state arrays: segments, then batch elements
+    state: int  # row of the state arrays, which are ordered by segment, then batch element
     group: int
     begin: int  # tokens
     end: int
@@ -88,7 +88,10 @@ def _place(sizes: Sizes, task: int) -> Place:
 def forward_kernel(
     tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, discretization: str, output: bool
 ):
-    """From the states before each segment, in ``h_out``, to those after it.
+    """Brings the states in ``h_out`` from before each segment to after it.
+
+    States, gradients of states and products of decays are pairs: N values, then for each what it
+    has rounded away (``decays.py``).
 
     With ``output`` it computes y; else it multiplies the decays into ``product_out``, and z, C and
     skip are not used.
@@ -209,7 +212,7 @@ def gradient_states_kernel(
 
 @functools.cache
 def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, discretization: str):
-    """From the gradients of the states after each segment, in ``dh_out``, to all others."""
+    """Computes all gradients from those of the states after each segment, in ``dh_out``."""
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
     token = tokens.backward_leaves(io, delta_io)
     state = recurrence.backward_leaves(discretization, tuning)

@@ -16,8 +16,8 @@ class Layout:
     """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded.
 
     A task is a segment of one batch element's tokens and a span of blocks of one group. The blocks
-    of a span are walked side by side, so that long pieces of rows are read. Segments are for inputs
-    with fewer channels than feed torch's threads; finding their first states costs a second walk.
+    of a span are walked side by side, so that rows are read in long parts. Segments are for inputs
+    with too few channels for torch's threads; finding their first states costs a second walk.
     """
 
     def __init__(self, u: Tensor, A: Tensor, B: Tensor, most: int, chunk: int, split: bool = True):
@@ -49,7 +49,7 @@ class Layout:
         self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
 
     def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
-        """``[.., D, *]`` to float32 ``[.., blocks, *, W]``, a copy; None becomes zeros."""
+        """Copies ``[.., D, *]`` to float32 ``[.., blocks, *, W]``; None becomes zeros."""
         if x is None:
             return torch.zeros(*lead, self.blocks, W)
         n = len(lead)
@@ -70,7 +70,7 @@ class Layout:
         return x.reshape(*lead, self.channels, *tail).contiguous()
 
     def states_of(self, x: Tensor | None) -> Tensor:
-        """States ``[B, D, N]`` or None for 0 to packed ones, ``[B, blocks, N, W]``."""
+        """Packs states ``[B, D, N]``, or None for 0, to ``[B, blocks, N, W]``."""
         if x is None:
             return torch.zeros(self.batch, self.blocks, self.states, W)
         return self.pack(x, (self.batch,))

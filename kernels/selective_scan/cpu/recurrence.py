@@ -1,4 +1,4 @@
-"""Native inner loops of the CPU scan: state after state, a strip of tokens, sixteen channels.
+"""Native inner loops of the CPU scan: a state, a strip of tokens, sixteen channels.
 
 Equations are those of README.md. Values per token come from ``tokens.py``; B and C
 are read where they are, from token ``t0`` on.
@@ -177,7 +177,7 @@ def _leaf(text: str, walk: str, discretization: str, tuning: Tuning, back: str =
 
 @functools.cache
 def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
-    """``advance`` and ``accumulate``: the states of a lane group from before the strip to after."""
+    """``advance`` and ``accumulate`` bring a lane group's states from before a strip to after."""
     parts = discretization, tuning
 
     @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts))
@@ -215,7 +215,7 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
 
 @functools.cache
 def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
-    """``retreat`` and ``gather``: gradients of states from after the chunk to before.
+    """``retreat`` and ``gather`` bring gradients of states from after a chunk to before it.
 
     ``first`` says that the sums of dB and dC are empty yet.
     """

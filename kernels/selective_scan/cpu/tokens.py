@@ -12,8 +12,8 @@ import warp as wp
 from ...runtime.lanes import ACTIVATIONS, PRELUDE, WARP_DTYPES, lanes
 from ...runtime.rows import ELEMENTS, rows
 
-# What is held of a token; rate is δ times a scale. The values of a token lie together: arrays of
-# 4 KiB would fall on one another in the cache.
+# What is kept of a token; its rate is δ times a scale. The values of a token lie together, because
+# arrays of 4 KiB would evict one another from the cache.
 TOKENS = """
 struct Token { F rate, du, y; };
 struct GradToken { F rate, du, dy, y, s, p; };

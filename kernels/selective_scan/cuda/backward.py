@@ -320,7 +320,7 @@ def summary_kernel(
         bias = bias_in[p.d]
         total = wp.float32(0.0)
         tiles = (p.end - p.begin + wp.static(TILE - 1)) / wp.static(TILE)
-        tiles = wp.where(p.segment == 0, 0, tiles)  # of the first segment nobody asks
+        tiles = wp.where(p.segment == 0, 0, tiles)  # the first segment's is not needed
         t0 = p.begin + (tiles - 1) * wp.static(TILE)
         end = wp.where(tiles > 0, p.end, 0)
         z = raw()

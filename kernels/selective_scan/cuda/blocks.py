@@ -53,7 +53,7 @@ class BlockShape:
 
     @property
     def rows(self) -> int:
-        """Threads that load one channel, each other tokens of it."""
+        """Threads that share the loads of one channel, each for other tokens."""
         return self.block // self.span
 
     @property
@@ -93,7 +93,7 @@ _BITS = {
 
 @functools.cache
 def widening(io: torch.dtype):
-    """The function from the bits of ``io`` to a float."""
+    """Makes the function that turns the bits of an ``io`` into a float."""
 
     @wp.func_native(_BITS[io][2])
     def widen(bits: wp.uint32) -> float: ...
@@ -130,16 +130,16 @@ class Place:
     d0: int  # the block's first channel
     count: int  # its channels inside the group
     d: int  # the thread's own channel; threads past the last share that one and are not active
-    c: int  # the same, within the block
+    c: int  # the same channel, counted from d0
     active: int
     row: int  # the thread's first token of a tile
-    slot: int  # the recurrence: which channels
-    q: int  # and which states
-    states: int  # of all
+    slot: int  # the thread's channels in the recurrence, of ``slots``
+    q: int  # the thread's states in the recurrence, of ``lanes``
+    states: int  # N
 
 
-# Shared memory is one tile of floats, addressed by plain offsets: assigning to elements of a tile
-# has a barrier each.
+# Shared memory is one tile of floats that is addressed by plain offsets, because each assignment to
+# an element of a tile has a barrier.
 def offsets(parts: dict) -> tuple[dict, int]:
     """Where parts of so many floats begin in shared memory, and their sum."""
     at, size = {}, 0
@@ -169,7 +169,7 @@ def sync(): ...
 
 @functools.cache
 def placing(f: BlockShape):
-    """The function that finds a thread's place."""
+    """Makes the function that finds a thread's place."""
 
     @wp.func
     @no_type_check
@@ -310,7 +310,7 @@ return r;
 
     @wp.func
     def fetch(x_in: wp.array3d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
-        left = wp.where(t0 < 0, 0, end - t0 - p.row)  # a tile before the first is not there
+        left = wp.where(t0 < 0, 0, end - t0 - p.row)  # there is no tile before the first
         return fetch_own(x_in, p.b, p.d, t0 + p.row, left)
 
     @wp.func_native(f"{address('x_out')} *({element}*)at = ({element})v;")

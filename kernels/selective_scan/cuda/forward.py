@@ -135,7 +135,7 @@ def forward_kernel(
         u_before = raw()
         z_before = raw()
         tiles = (p.end - p.begin + wp.static(tokens - 1)) / wp.static(tokens)
-        if wp.static(summary):  # of the last segment nobody asks
+        if wp.static(summary):  # the last segment's is not needed
             tiles = wp.where(p.segment == sizes.segments - 1, 0, tiles)
         for tile in range(tiles):
             t0 = p.begin + tile * wp.static(tokens)

@@ -19,7 +19,7 @@ def lane_stride(f: BlockShape) -> int:
 
 
 def token_stride(f: BlockShape) -> int:
-    """Floats between the products for dB or dC of two tokens: half the banks further."""
+    """Floats between the products for dB or dC of two tokens, half the banks apart."""
     return (f.slots + 1) * f.width
 
 
@@ -38,7 +38,7 @@ def _add(f: BlockShape, at: int, values: str) -> str:
 
 
 def _forwards(f: BlockShape, mode: str, at: dict, flags: frozenset) -> str:
-    """Exponentials first: they wait for no state. Loads run a token ahead of the stores."""
+    """The walk forwards: exponentials first, as they wait for no state, and loads a token ahead."""
     early = "factors_(r[i], an[k], fs[t][k], g);" if mode == "mamba" else ""
     late = "" if mode == "mamba" else "factors_(v.r[i], an[k], fs[t][k], g);"
     dc = f"store_st(s + {at['DC']} + t * {token_stride(f)} + slot * WIDTH + q * ST, dc);"

@@ -17,7 +17,9 @@ SUB = 4  # tokens whose states and decays the gradient holds in registers
 UNROLL = 4  # tokens whose sums wait in registers, so that their loads need not wait for stores
 
 # Equations 2 to 4: f and g of x = δA, where ``a`` holds A, times log2(e) for an exponential.
-_COEFFICIENTS = [1.0 / math.factorial(k) for k in range(1, 13)]  # of (e^x - 1) / x, rising
+_COEFFICIENTS = [
+    1.0 / math.factorial(k) for k in range(1, 13)
+]  # of (e^x - 1) / x, lowest power first
 _PHI = """
     const float x = rate * a * 0.6931471805599453f;
     const bool small = x < 1.0f && x > -1.0f;
@@ -42,7 +44,7 @@ _SLOPES = {
 }
 
 
-# Vectors of shared memory; on a CPU a tile lies anywhere.
+# Vectors of shared memory are aligned; on a CPU a tile may lie anywhere.
 _ALIGNED = """
 #if defined(__CUDA_ARCH__)
 #define ALIGNED(bytes) alignas(bytes)
@@ -211,7 +213,7 @@ return h;
 
 @functools.cache
 def decaying(f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int):
-    """The product of a tile's decays into ``h``: only where they are no exponentials."""
+    """Multiplies a tile's decays into ``h``, for the rules whose decays are no exponentials."""
     offset = dict(at)
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
@@ -235,7 +237,7 @@ return h;
 
 @functools.cache
 def marking(f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int):
-    """The recurrence over a tile once more, keeping the state before every ``SUB`` tokens.
+    """Walks the recurrence over a tile and keeps the state before every ``SUB`` tokens.
 
     The marks of a chunk are local memory: up to 1 KB per channel, too much for registers, and left
     to the cache where shared memory would limit the number of blocks.
