@@ -32,9 +32,9 @@ class Recorder:
 _recorder: ContextVar[Recorder | None] = ContextVar("recorder", default=None)
 
 
-def recorder() -> Recorder | None:
-    """The recorder of this thread; None where launches are made."""
-    return _recorder.get()
+# The recorder of this thread; None where launches are made. Each view of a tensor asks it, so it is
+# the variable's own method, without a call of Python's around it.
+recorder: Callable[[], Recorder | None] = _recorder.get
 
 
 @contextmanager
