@@ -4,8 +4,20 @@ from __future__ import annotations
 
 __version__ = "0.1.0"
 _USED = (
-    *("torch", "warp-lang", "numpy", "pillow", "safetensors", "timm", "kornia", "scikit-image"),
-    *("trimesh", "pymeshlab", "open3d-cpu", "open3d", "imageio-ffmpeg", "tyro"),
+    "torch",
+    "warp-lang",
+    "numpy",
+    "pillow",
+    "safetensors",
+    "timm",
+    "kornia",
+    "scikit-image",
+    "trimesh",
+    "pymeshlab",
+    "open3d-cpu",
+    "open3d",
+    "imageio-ffmpeg",
+    "tyro",
 )
 
 
