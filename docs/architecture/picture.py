@@ -63,19 +63,26 @@ BOXES = {
     "kernels.bench": Box(1, 2, "kernels", "bench", ("run time against error", "of the operators")),
     "kernels.stress": Box(2, 2, "kernels", "stress", ("hostile cases", "against float64")),
     "words": Box(3.4, 2, "gamba_warp", "words", ("gaussians, cameras,", "render, images, files")),
-    "data": Box(2.5, 3, "gamba_warp", "data", ("datasets, preprocess,", "weights to fetch")),
-    "formats": Box(4, 3, "gamba_warp", "formats", (".ply .splat .glb,", "meshes, their headers")),
-    "model": Box(1.6, 4, "gamba_warp", "model", ("posing, tokens, blocks,", "decoder")),
-    "surfaces": Box(4, 4, "gamba_warp", "surfaces", ("Gaussians to meshes:", "TSDF, density")),
-    "fitting": Box(2.8, 4, "gamba_warp", "fitting", ("one object", "by optimisation")),
-    "pages": Box(2.2, 5, "gamba_warp", "pages", ("pages, turntables,", "the viewer")),
-    "measure": Box(0.6, 5, "gamba_warp", "measure", ("bench and stress cases", "with the model")),
-    "train": Box(3.6, 5, "train", "train", ("batches, losses, loop;", "data/: rendering")),
-    "eval": Box(4.7, 5, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
-    "gpu_check": Box(1, 6, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
-    "commands": Box(2.2, 7, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
-    "cli": Box(2.8, 8, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
-    "public": Box(0.2, 8, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
+    "untrusted": Box(
+        3.4, 3, "gamba_warp", "untrusted", ("what strangers' files", "go through first")
+    ),
+    "data": Box(2.5, 4, "gamba_warp", "data", ("datasets, preprocess,", "weights to fetch")),
+    "formats": Box(4, 4, "gamba_warp", "formats", (".ply .splat .glb,", "meshes, their headers")),
+    "model": Box(1.6, 5, "gamba_warp", "model", ("posing, tokens, blocks,", "decoder")),
+    "surfaces": Box(4, 5, "gamba_warp", "surfaces", ("Gaussians to meshes:", "TSDF, density")),
+    "fitting": Box(2.8, 5, "gamba_warp", "fitting", ("one object", "by optimisation")),
+    "pages": Box(2.2, 6, "gamba_warp", "pages", ("pages, turntables,", "the viewer")),
+    "measure": Box(0.6, 6, "gamba_warp", "measure", ("bench and stress cases", "with the model")),
+    "train": Box(3.6, 6, "train", "train", ("batches, losses, loop;", "data/: rendering")),
+    "eval": Box(4.7, 6, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
+    "gpu_check": Box(1, 7, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
+    "hostile": Box(3.4, 7, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
+    "endurance": Box(
+        4.7, 7, "gamba_warp", "endurance", ("kills and full disks", "in every command")
+    ),
+    "commands": Box(2.2, 8, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
+    "cli": Box(2.8, 9, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
+    "public": Box(0.2, 9, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
 }
 FLOORS = 1 + max(box.floor for box in BOXES.values())
 

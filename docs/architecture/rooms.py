@@ -36,7 +36,8 @@ _KERNELS = ("versions", "kernels.runtime", *_OPS, "kernels")
 _BENCH = tuple(f"kernels.bench{part}" for part in ("", ".core", ".cases", ".static"))
 _STRESS = tuple(f"kernels.stress{part}" for part in ("", ".core", ".oracles", ".cases"))
 _WORDS = (*_KERNELS, "words")
-_LIBRARY = (*_WORDS, "data", "formats", "model")
+_READERS = (*_WORDS, "untrusted")
+_LIBRARY = (*_READERS, "data", "formats", "model")
 _RESULTS = (*_LIBRARY, "surfaces", "fitting", "pages")
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
 _TRAIN = ("train", "train.data")
@@ -66,20 +67,35 @@ ROOMS = {
     ),
     "kernels.stress": Room("its public names", ("kernels.stress.core",)),
     "words": Room("Gaussians, cameras, images, rendering, files, errors", _KERNELS),
-    "data": Room("datasets, preprocessing, weights to fetch", _WORDS),
-    "formats": Room(".ply, .splat, .glb, meshes, their headers", _WORDS),
-    "model": Room("tokens, blocks, decoder, checkpoints", (*_WORDS, "data", "formats")),
+    "untrusted": Room("what strangers' files go through first", _WORDS),
+    "data": Room("datasets, preprocessing, weights to fetch", _READERS),
+    "formats": Room(".ply, .splat, .glb, meshes, their headers", _READERS),
+    "model": Room("tokens, blocks, decoder, checkpoints", (*_READERS, "data", "formats")),
     "surfaces": Room("Gaussians to meshes", _LIBRARY),
     "fitting": Room("one object by optimisation", _LIBRARY),
     "pages": Room("pages, turntables, the viewer", (*_LIBRARY, "surfaces", "fitting")),
     "measure": Room("benchmark and stress cases that need the model", _MEASURES),
+    "hostile": Room(
+        "hostile files for every reader",
+        (*_RESULTS, "kernels.stress"),
+        ("measure", *_BENCH, *_STRESS, *_TRAIN, *_EVAL),
+    ),
     "train.data": Room("furniture, rendering of meshes, starter set", _LIBRARY),
     "train": Room("batches, losses, loop", (*_LIBRARY, *_BENCH, "train.data")),
-    "eval": Room("the report that both evaluations share", _WORDS),
+    "eval": Room("the report that both evaluations share", _READERS),
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
     "eval.shapes": Room("Chamfer, IoU, F-score", (*_RESULTS, "eval")),
     "gpu_check": Room("the checks on a CUDA machine", (*_MEASURES, "measure")),
-    "commands": Room("a file a command", (*_MEASURES, "measure", "gpu_check"), (*_TRAIN, *_EVAL)),
+    "endurance": Room(
+        "kills and full disks under every command",
+        _RESULTS,
+        ("measure", *_TRAIN, *_EVAL),
+    ),
+    "commands": Room(
+        "a file a command",
+        (*_MEASURES, "measure", "hostile", "endurance", "gpu_check"),
+        (*_TRAIN, *_EVAL),
+    ),
     "cli": Room(
         "finds the command, parses, calls",
         ("versions", "words"),

@@ -1,0 +1,64 @@
+"""``.npy`` files of strangers: small arrays of numbers of a known shape, read without numpy.load.
+
+``numpy.load`` goes by the content: a zip is opened as such, and memory is taken by what a header
+states.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import format as npy
+
+from ..errors import UserError
+from .documents import read_bytes
+
+MAX_BYTES = 1 << 20
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+
+
+def read_array(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """Reads an array of finite numbers.
+
+    Args:
+        path: file, at most ``MAX_BYTES``; any kind of integers or floats, of any byte order.
+        shape: what it must have.
+
+    Returns:
+        float64 array of that shape.
+
+    Raises:
+        UserError: it cannot be read, is no ``.npy`` file, holds other things than numbers, or more
+            or fewer of them, or one that is not finite.
+    """
+    try:
+        array = _parse(read_bytes(path, MAX_BYTES), shape)
+    except UserError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise UserError(f"{path}: cannot be read ({reason})") from error
+    if not np.isfinite(array).all():
+        raise UserError(f"{path}: not all of its numbers are finite")
+    return array
+
+
+def _parse(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    file = io.BytesIO(data)
+    try:
+        header = _HEADERS[npy.read_magic(file)]
+        stated, columns_first, dtype = header(file)
+    except Exception as error:  # numpy asks Python's own parser, which has a dozen kinds
+        raise UserError("its header is not that of an array") from error
+    if dtype.kind not in "fiu" or dtype.shape:
+        raise UserError(f"it holds {dtype.name[:40]}, not numbers")
+    wanted = "x".join(map(str, shape))
+    if tuple(stated) != shape:
+        got = "x".join(map(str, stated))[:40] or "a single number"
+        raise UserError(f"expected {wanted} numbers, it states {got}")
+    values = data[file.tell() :]
+    if len(values) != dtype.itemsize * int(np.prod(shape)):
+        raise UserError(f"expected {wanted} numbers, it holds {len(values)} bytes of them")
+    order = "F" if columns_first else "C"
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.frombuffer(values, dtype).reshape(shape, order=order).astype(np.float64)

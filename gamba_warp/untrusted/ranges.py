@@ -1,0 +1,143 @@
+"""Ranges of numbers: declared once beside a field or option, checked before anything starts.
+
+A range is a ``msgspec.Meta``, so the same declaration also holds for what a JSON file gives.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, is_dataclass
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+from ..errors import UserError
+
+if TYPE_CHECKING:
+    from msgspec import Meta
+else:
+    try:
+        from msgspec import Meta
+    except ImportError:  # gamba gpu-check needs torch, numpy and warp-lang alone
+
+        @dataclass(frozen=True, kw_only=True)
+        class Meta:
+            """What of ``msgspec.Meta`` is used: the bounds of a number, each of which may lack."""
+
+            ge: float | None = None
+            gt: float | None = None
+            le: float | None = None
+            lt: float | None = None
+
+
+Function = TypeVar("Function", bound=Callable)
+
+# What many commands have.
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+Threads = Annotated[int, Meta(ge=1, le=4096)]
+Minutes = Annotated[float, Meta(gt=0, le=1e6)]
+Frames = Annotated[int, Meta(ge=2, le=10_000)]
+Side = Annotated[int, Meta(ge=16, le=4096)]
+Opacity = Annotated[float, Meta(ge=0, le=1)]
+
+
+def wrong(value: float, limits: Meta) -> str | None:
+    """Says what a number must be, or None where it is that; what is not finite never is.
+
+    Args:
+        value: any number.
+        limits: its range; a bound that is not given is none.
+
+    Returns:
+        For example "must be above 0 and at most 10".
+    """
+    fits = (
+        (limits.ge is None or value >= limits.ge)
+        and (limits.gt is None or value > limits.gt)
+        and (limits.le is None or value <= limits.le)
+        and (limits.lt is None or value < limits.lt)
+    )
+    if fits and abs(value) < float("inf"):
+        return None
+    bounds = {"at least": limits.ge, "above": limits.gt, "at most": limits.le, "below": limits.lt}
+    words = [f"{word} {bound:,}" for word, bound in bounds.items() if bound is not None]
+    return f"must be {' and '.join(words) or 'finite'}"
+
+
+def check_range(label: str, value: float, limits: Meta) -> None:
+    """Refuses a number outside its range.
+
+    Args:
+        label: what begins the message, such as "--lr" or "p.json: seed is".
+        value: any number.
+        limits: its range.
+
+    Raises:
+        UserError: one line, such as "--lr inf: must be above 0 and at most 10".
+    """
+    reason = wrong(value, limits)
+    if reason:
+        huge = isinstance(value, int) and abs(value) > 10**30  # one may have a million digits
+        shown, mark = "huge" if huge else value, "," if label.endswith(" is") else ":"
+        raise UserError(f"{label} {shown}{mark} {reason}")
+
+
+def check_values(
+    values: Mapping[str, Any], hints: Mapping[str, Any], label: Callable[[str], str]
+) -> None:
+    """Refuses the first value that is outside the range that its type declares.
+
+    Args:
+        values: by name; a list or tuple is checked item by item, None is let through.
+        hints: types by name, with their ``Annotated`` parts; those without ranges are let through.
+        label: what begins the message, from a value's name.
+
+    Raises:
+        UserError: as for ``check_range``.
+    """
+    for name, value in values.items():
+        for limits in _limits(hints.get(name)):
+            for item in value if isinstance(value, (list, tuple)) else [value]:
+                if isinstance(item, (int, float)) and not isinstance(item, bool):
+                    check_range(label(name), item, limits)
+
+
+def _limits(hint: Any) -> list[Meta]:
+    """Every range in a type: its own, and those of its parts."""
+    found = [part for part in getattr(hint, "__metadata__", ()) if isinstance(part, Meta)]
+    return found + [limits for part in typing.get_args(hint) for limits in _limits(part)]
+
+
+def option(name: str) -> str:
+    """A field's or argument's name as an option: ``warmup_steps`` is ``--warmup-steps``."""
+    return "--" + name.replace("_", "-")
+
+
+def check_options(group: Any) -> None:
+    """Refuses the first field of a dataclass of options that is outside its range.
+
+    Raises:
+        UserError: as for ``check_range``; it names the option.
+    """
+    hints = typing.get_type_hints(type(group), include_extras=True)
+    check_values(vars(group), hints, option)
+
+
+def ranged(command: Function) -> Function:
+    """Makes a command check its arguments against their ranges before it starts.
+
+    Arguments that are dataclasses are checked by their own fields' ranges.
+    """
+
+    @functools.wraps(command)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        hints = typing.get_type_hints(command, include_extras=True)
+        values = inspect.signature(command).bind(*args, **kwargs).arguments
+        check_values(values, hints, option)
+        for value in values.values():
+            if is_dataclass(value) and not isinstance(value, type):
+                check_options(value)
+        return command(*args, **kwargs)
+
+    return typing.cast(Function, checked)

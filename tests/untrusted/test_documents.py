@@ -1,0 +1,106 @@
+"""JSON of strangers, ranges of numbers, torch's files: sound values, or one line."""
+
+import os
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import pytest
+from msgspec import Meta
+
+from gamba_warp.errors import UserError
+from gamba_warp.untrusted.documents import parse_document, read_bytes, read_document
+from gamba_warp.untrusted.ranges import Seed, check_options, ranged, wrong
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        ("", "not valid JSON"),
+        ("{", "not valid JSON"),
+        ('{"a": NaN}', "not valid JSON"),
+        ('{"a": -Infinity}', "not valid JSON"),
+        ('{"a": 1e999}', "out of range"),
+        ('{"a": "\ud800"}'.encode("utf-8", "surrogatepass"), "not valid JSON"),
+        (b"\xff\xfe{", "not valid JSON"),
+        ("[" * 40 + "]" * 40, "nested deeper than 32 levels"),
+        ("[" * 10**6, "nested deeper than 32 levels"),
+        ('{"a":' * 10**5, "nested deeper than 32 levels"),
+        ("[1]", "Expected `object`"),
+        ('{"a": "1"}', "Expected `int`"),
+        ('{"a": -1}', "Expected `int` >= 0"),
+    ],
+)
+def test_documents_that_are_refused(text, reason):
+    with pytest.raises(UserError, match="^some file: ") as caught:
+        parse_document(text, dict[str, Seed], "some file")
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_documents_that_are_read(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_bytes(b'\xef\xbb\xbf{"a": 5}')
+    assert read_document(path, dict[str, Seed]) == {"a": 5}
+    path.write_text("[" * 32 + "]" * 32)
+    assert read_document(path, Any)
+
+
+def test_only_plain_files_of_a_bounded_size_are_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "large").write_bytes(bytes(101))
+    assert read_bytes(tmp_path / "large", 101) == bytes(101)
+    for name, reason in (
+        ("pipe", "not a plain file"),
+        (".", "not a plain file"),
+        ("none", "No such file"),
+        ("a\0b", "null"),
+        ("x" * 5000, "too long"),
+        ("large", "over"),
+    ):
+        with pytest.raises(UserError, match=reason):
+            read_bytes(tmp_path / name, 100)
+
+
+@pytest.mark.parametrize(
+    "value, limits, words",
+    [
+        (5, Meta(ge=5, le=5), None),
+        (4, Meta(ge=5), "must be at least 5"),
+        (0.0, Meta(gt=0, lt=1), "must be above 0 and below 1"),
+        (1e4, Meta(gt=0, le=1000), "must be above 0 and at most 1,000"),
+        (float("nan"), Meta(ge=0), "must be at least 0"),
+        (float("inf"), Meta(ge=0), "must be at least 0"),
+        (float("inf"), Meta(), "must be finite"),
+        (10**400, Meta(le=10), "must be at most 10"),
+    ],
+)
+def test_ranges(value, limits, words):
+    assert wrong(value, limits) == words
+
+
+def test_options_and_arguments_are_checked_by_their_declarations():
+    @dataclass
+    class Options:
+        warm_up: Annotated[int, Meta(ge=1)] | None = None
+        shares: tuple[Annotated[float, Meta(ge=0, le=1)], ...] = ()
+        flag: bool = True
+        free: float = 0.0
+
+    called = []
+
+    @ranged
+    def command(options: Options, /, seed: Seed = 0, *, rest: str = "") -> int:
+        called.append(seed)
+        return seed
+
+    globals()["Options"] = Options  # the declarations are looked up by name
+    check_options(Options(warm_up=None, shares=(0, 1), free=float("nan")))
+    assert command(Options(), 7) == 7 and called == [7]
+    for options, seed, words in (
+        (Options(warm_up=0), 0, "--warm-up 0: must be at least 1"),
+        (Options(shares=(0.5, 2)), 0, "--shares 2: must be at least 0 and at most 1"),
+        (Options(), -1, "--seed -1: must be at least 0 and at most 4,294,967,295"),
+        (Options(), 10**10**4, "--seed huge: must be"),
+    ):
+        with pytest.raises(UserError) as caught:
+            command(options, seed)
+        assert str(caught.value).startswith(words) and called == [7]

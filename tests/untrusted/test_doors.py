@@ -1,0 +1,51 @@
+"""Strangers' files have one door each: what opens them elsewhere would be open to all."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+# Who may call what; ``vgg_weights`` opens a wheel whose digest pip has compared.
+DOORS = {
+    "Image.open": {"gamba_warp/images.py"},
+    "tarfile.open": {"gamba_warp/untrusted/archives.py"},
+    "zipfile.ZipFile": {
+        "gamba_warp/untrusted/archives.py",
+        "gamba_warp/untrusted/torch_files.py",
+        "gamba_warp/data/vgg_weights.py",
+    },
+    "np.load": set(),
+    "pickle.load": set(),
+    "pickle.loads": {"gamba_warp/untrusted/children.py"},
+}
+TESTERS = ("gamba_warp/hostile", "gamba_warp/endurance")  # they make the files that they open
+
+
+def calls(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if isinstance(node.func.value, ast.Name):
+                yield f"{node.func.value.id}.{node.func.attr}", node.lineno
+
+
+@pytest.fixture(scope="module")
+def found():
+    """The lines of each call, by what is called."""
+    lines = {name: set() for name in DOORS}
+    for folder in ("gamba_warp", "train", "eval", "kernels"):
+        for path in (ROOT / folder).rglob("*.py"):
+            place = path.relative_to(ROOT).as_posix()
+            if not place.startswith(TESTERS):
+                for name, line in calls(path):
+                    if name in lines:
+                        lines[name].add((place, line))
+    return lines
+
+
+@pytest.mark.parametrize("name", DOORS)
+def test_a_library_is_called_at_its_door_only(found, name):
+    elsewhere = {(place, line) for place, line in found[name] if place not in DOORS[name]}
+    assert not elsewhere, f"{name}: see docs/security.md"
+    if name == "Image.open":
+        assert found[name], "the search itself must find something"
