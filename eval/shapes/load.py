@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.headers import check_counts
+from gamba_warp.formats.clouds import read_cloud
+from gamba_warp.formats.headers import open_shape
 from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
 from gamba_warp.formats.meshes import Y_TO_Z_UP, default_up, load_mesh
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.formats.ply_header import read_ply_header
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.open3d import import_open3d
 from gamba_warp.surfaces.extract import extract_surface
 from gamba_warp.surfaces.options import SurfaceOptions
 
@@ -142,7 +142,7 @@ def load_shape(path: Path) -> Shape:
     """Reads Gaussians (3DGS ``.ply``), a mesh, or a point cloud, by what the file holds.
 
     The counts that the file's header states are compared with its size first, so that a false
-    header costs no memory.
+    header costs no memory; no native library sees the file's bytes.
 
     Raises:
         UserError: missing, unreadable, empty, with a false header, or with values that are not
@@ -153,9 +153,6 @@ def load_shape(path: Path) -> Shape:
         raise UserError(f"{path}: not one of {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
-    if path.stat().st_size == 0:
-        raise UserError(f"{path}: the file is empty")
-    check_counts(path)
     kind = _ply_kind(path) if suffix == ".ply" else "mesh"
     shape: Shape
     if kind == "gaussians":
@@ -163,7 +160,8 @@ def load_shape(path: Path) -> Shape:
     elif kind == "points" or suffix in CLOUD_SUFFIXES:
         shape = _load_points(path)
     else:
-        shape = _load_triangles(path)
+        mesh = load_mesh(path)
+        shape = Mesh(mesh.vertices, mesh.faces)
     reach = np.abs(_positions(shape)).max()
     if reach > HUGE:
         raise UserError(f"{path}: coordinates reach {reach:.3g}, over {HUGE:g}")
@@ -172,7 +170,7 @@ def load_shape(path: Path) -> Shape:
 
 def _ply_kind(path: Path) -> str:
     """What a ``.ply`` holds, by its header: "gaussians", "mesh" or "points"."""
-    with open(path, "rb") as file:
+    with open_shape(path) as (file, _):
         elements = read_ply_header(path, file).elements
     if any(element.name == "face" and element.count for element in elements):
         return "mesh"
@@ -181,46 +179,13 @@ def _ply_kind(path: Path) -> str:
     return "gaussians" if {"opacity", "scale_0", "rot_0", "f_dc_0"} & properties else "points"
 
 
-def _load_triangles(path: Path) -> Mesh:
-    try:
-        mesh = load_mesh(path)
-    except UserError as error:
-        if path.suffix.lower() != ".ply" or "cannot be read" not in str(error):
-            raise
-        # trimesh reads no binary .ply whose faces differ in their number of corners.
-        mesh = _load_with_pymeshlab(path)
-        if mesh is None:
-            raise
-    return Mesh(mesh.vertices, mesh.faces)
-
-
-def _load_with_pymeshlab(path: Path) -> Mesh | None:
-    """The triangles of a file; None where it cannot be read, has no faces, or is not finite."""
-    import pymeshlab  # which has no stubs
-
-    meshes = pymeshlab.MeshSet()  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        meshes.load_new_mesh(str(path))
-    except pymeshlab.PyMeshLabException:  # pyright: ignore[reportAttributeAccessIssue]
-        return None
-    read = meshes.current_mesh()
-    mesh = Mesh(read.vertex_matrix(), read.face_matrix().astype(np.int64))
-    return mesh if len(mesh.faces) and np.isfinite(mesh.vertices).all() else None
-
-
 def _load_points(path: Path) -> Points:
-    o3d = import_open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(path))
-    positions = np.asarray(cloud.points)
-    if len(positions) == 0:
-        raise UserError(f"{path}: no points in it, or it cannot be read")
-    bad = np.count_nonzero(~np.isfinite(positions).all(1))
-    if bad:
-        raise UserError(f"{path}: {bad} of {len(positions)} points are not finite")
-    normals = np.asarray(cloud.normals)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    usable = len(normals) == len(positions) and np.isfinite(lengths).all() and lengths.all()
+    positions, normals = read_cloud(path)
+    if normals is None:
+        return Points(positions)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    usable = np.isfinite(lengths).all() and lengths.all()
     return Points(positions, normals / lengths if usable else None)
 
 

@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gamba_warp.cameras import fibonacci_sphere
-
 from .options import OccupancyRule
 from .shape import Mesh, directed_edges, merged
 
@@ -161,6 +159,8 @@ def _is_flat(part: Mesh) -> bool:
 
 def directions() -> np.ndarray:
     """Unit vectors ``[VOTERS, 3]`` in opposite pairs, so that a sheet never gets more than half."""
+    from gamba_warp.cameras import fibonacci_sphere  # with torch, which few need
+
     half = fibonacci_sphere(VOTERS)[: VOTERS // 2]
     return np.concatenate([half, -half])
 

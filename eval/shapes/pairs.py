@@ -1,28 +1,40 @@
-"""Pairs of a predicted and a true file: found, evaluated one after the other, and reported."""
+"""Pairs of a predicted and a true file: found, evaluated one after the other, and reported.
+
+Pairs are evaluated in a child process, which one of them may kill. What is slow to import is
+imported by the functions that run there.
+"""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from gamba_warp.cameras import relative_to_reference
-from gamba_warp.data.dataset import ViewDataset, open_dataset
 from gamba_warp.errors import UserError
-from gamba_warp.files import output_folder, sha256
+from gamba_warp.files import output_folder, sha256, visible
+from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
+from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
+from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.versions import __version__, installed
 
 from ..report import OK, check_finite, failure, make_report, save_report, stdout_to_stderr
-from .compare import compare
-from .load import SUFFIXES, load_prediction, load_truth
 from .options import ShapesOptions
 from .protocol import GeometryProtocol
-from .shape import Similarity
 
+if TYPE_CHECKING:
+    from gamba_warp.data.dataset import ViewDataset
+
+    from .shape import Similarity
+
+SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
+PAIR_SECONDS = 3600.0  # a pair takes seconds, the slowest protocol on a huge shape minutes
 PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch")
 # entries of the records that have no meaningful mean
 _NO_MEAN = ("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed")
@@ -58,7 +70,11 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     if (protocol.frame == "reference") != (options.data is not None):
         raise UserError("--frame reference and --data: give both or neither")
     pairs, failures = find_pairs(options.pred, options.gt)
-    dataset = open_dataset(options.data) if options.data is not None else None
+    dataset = None
+    if options.data is not None:
+        from gamba_warp.data.dataset import open_dataset
+
+        dataset = open_dataset(options.data)
     folder = output_folder(options.out) if options.out is not None else None
     with stdout_to_stderr():
         objects = failures + evaluate_pairs(pairs, protocol, dataset)
@@ -107,7 +123,7 @@ def find_pairs(pred: Path, gt: Path) -> tuple[list[Pair], list[dict[str, str]]]:
 def _shapes_in(folder: Path) -> dict[str, list[Path]]:
     """The shape files in a folder by their paths without suffix. Raises UserError for none."""
     found: dict[str, list[Path]] = {}
-    for path in sorted(folder.rglob("*")):
+    for path in sorted(visible(folder, "*")):
         if path.is_file() and path.suffix.lower() in SUFFIXES:
             name = path.relative_to(folder).with_suffix("").as_posix()
             found.setdefault(name, []).append(path)
@@ -128,6 +144,10 @@ def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: f
     Raises:
         UserError: the view cannot be read.
     """
+    from gamba_warp.cameras import relative_to_reference
+
+    from .shape import Similarity
+
     viewmat = dataset.load(uid, views=[reference]).cameras.viewmats[0].double()
     _, scale = relative_to_reference(viewmat[None], viewmat, distance)
     return Similarity(viewmat[:3, :3].T.numpy(), np.zeros(3), float(1 / scale))
@@ -149,6 +169,9 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
+    from .compare import compare
+    from .load import load_prediction, load_truth
+
     start = time.perf_counter()
     truth = load_truth(pair.gt, protocol)
     predicted = load_prediction(pair.pred, truth.motion if motion is None else motion, protocol)
@@ -174,28 +197,56 @@ def evaluate_pair(
 
 
 def evaluate_pairs(
-    pairs: list[Pair], protocol: GeometryProtocol, dataset: ViewDataset | None
+    pairs: list[Pair],
+    protocol: GeometryProtocol,
+    dataset: ViewDataset | None,
+    evaluate: Callable[..., dict[str, Any]] = evaluate_pair,
 ) -> list[dict[str, Any]]:
     """Evaluates every pair; what goes wrong with one is its failure and stops no other.
+
+    That includes what ends a process: the pairs are evaluated in a child, see ``run_each``.
 
     Args:
         pairs: the files.
         protocol: what to do.
         dataset: whose objects have the names of the pairs, for the frame "reference".
+        evaluate: makes the record of one pair, as ``evaluate_pair`` does; a function of a module.
 
     Returns:
         One record for each pair.
     """
+    # Where torch is not loaded yet, both processes would begin with the same number of threads.
+    threads = sys.modules["torch"].get_num_threads() if "torch" in sys.modules else None
+    attempt = partial(
+        _attempt, protocol=protocol, dataset=dataset, evaluate=evaluate, threads=threads
+    )
+    found = run_each(attempt, pairs, seconds=PAIR_SECONDS)
     objects = []
-    for pair in tqdm(pairs, unit="object", disable=None):
-        try:
-            motion = _into_unit_frame(pair.name, protocol, dataset)
-            objects.append(evaluate_pair(pair, protocol, motion))
-        except UserError as error:
-            objects.append(failure(pair.name, error))
-        except Exception as error:  # whatever a library runs into, the others are still evaluated
-            objects.append(failure(pair.name, f"{type(error).__name__}: {error}"))
+    for index, result in tqdm(found, total=len(pairs), unit="object", disable=None):
+        if isinstance(result, Failed):
+            result = failure(pairs[index].name, result.reason)
+        objects.append(result)
     return objects
+
+
+def _attempt(
+    pair: Pair,
+    protocol: GeometryProtocol,
+    dataset: ViewDataset | None,
+    evaluate: Callable[..., dict[str, Any]],
+    threads: int | None,
+) -> dict[str, Any]:
+    """In the child: one pair's record, or the ``failure`` that one of its errors is."""
+    import torch
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    try:
+        return evaluate(pair, protocol, _into_unit_frame(pair.name, protocol, dataset))
+    except UserError as error:
+        return failure(pair.name, error)
+    except Exception as error:  # whatever a library runs into, the others are still evaluated
+        return failure(pair.name, f"{type(error).__name__}: {error}")
 
 
 def _into_unit_frame(
@@ -203,6 +254,8 @@ def _into_unit_frame(
 ) -> Similarity | None:
     """The prediction's motion by the protocol's frame; None: the same as the truth's."""
     if protocol.frame == "unit":
+        from .shape import Similarity
+
         return Similarity(np.eye(3), np.zeros(3))
     if dataset is not None:
         return out_of_reference(dataset, name, protocol.reference, protocol.distance)

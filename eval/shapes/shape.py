@@ -1,15 +1,19 @@
-"""What is evaluated, meshes and points, and the motions that bring it into one frame."""
+"""What is evaluated, meshes and points, and the motions that bring it into one frame.
+
+The process that only hands pairs to a child reads this module, so torch is imported by functions.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import overload
+from typing import TYPE_CHECKING, TypeAlias, overload
 
 import numpy as np
-import torch
 
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.open3d import import_open3d
+
+if TYPE_CHECKING:
+    from gamba_warp.gaussians import Gaussians
 
 
 @dataclass
@@ -65,7 +69,7 @@ class Mesh:
         return bool((counts % 2 == 0).all())
 
 
-Shape = Mesh | Points | Gaussians
+Shape: TypeAlias = "Mesh | Points | Gaussians"
 
 
 def directed_edges(faces: np.ndarray) -> np.ndarray:
@@ -113,6 +117,8 @@ class Similarity:
         if isinstance(shape, Points):
             normals = None if shape.normals is None else shape.normals @ self.rotation.T
             return Points(self.points(shape.positions), normals)
+        import torch
+
         rotation, translation = (
             torch.from_numpy(v).to(shape.means) for v in (self.rotation, self.translation)
         )

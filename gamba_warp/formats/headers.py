@@ -2,45 +2,99 @@
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 from collections.abc import Iterator
-from itertools import islice
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
-import numpy as np
+import msgspec
 
 from ..errors import UserError
-from .ply_header import ORDERS, PlyElement, read_ply_header
+from ..untrusted.documents import parse_document
+from .tables import lines_of
 
+MAX_FILE = 1 << 30  # bytes of a shape
 SLACK = 2  # bytes after the end: a line end
 GLB_JSON, GLB_START = 0x4E4F534A, 12
+MAX_ZEROS = 1 << 24  # bytes of all accessors that no bytes of the file stand behind
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=MAX_FILE)]
 
 
-def check_counts(path: Path) -> None:
-    """Compares what a .ply, .stl, .glb, .gltf, .pcd or .pts file says it holds with its size.
+class _Buffer(msgspec.Struct):
+    byteLength: Count
+    uri: str | None = None
 
-    Nothing is allocated by what the file says, so that a header of 10^12 vertices costs nothing.
-    Files of other kinds state no counts, or are read without trust in them, and pass.
+
+class _View(msgspec.Struct):
+    buffer: Count
+    byteLength: Count
+    byteOffset: Count = 0
+    byteStride: Annotated[int, msgspec.Meta(ge=1, le=252)] | None = None
+
+
+class _Accessor(msgspec.Struct):
+    count: Count
+    componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    bufferView: Count | None = None
+    byteOffset: Count = 0
+    sparse: Any = None
+
+    def row_bytes(self) -> int:
+        """Bytes of one value."""
+        one = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}[self.componentType]
+        parts = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+        return one * parts[self.type]
+
+
+class _Gltf(msgspec.Struct):
+    """The parts of a glTF document that say how many bytes are where."""
+
+    buffers: list[_Buffer] = []
+    bufferViews: list[_View] = []
+    accessors: list[_Accessor] = []
+
+
+@contextmanager
+def open_shape(path: Path, limit: int = MAX_FILE) -> Iterator[tuple[BinaryIO, int]]:
+    """Opens a shape file for reading; gives it and its size in bytes.
 
     Raises:
-        UserError: the file holds less or more than it says, or its header is broken.
+        UserError: it is missing, no plain file, empty or over ``limit`` bytes, cannot be read, or
+            what is read of it does not fit the memory.
     """
-    check = _CHECKS.get(path.suffix.lower())
-    if check is None:
-        return
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise UserError(f"{path}: not a plain file")
         with open(path, "rb") as file:
-            check(path, file, os.fstat(file.fileno()).st_size)
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
-    except (ValueError, struct.error, KeyError, IndexError, TypeError, AttributeError) as error:
-        raise UserError(f"{path}: broken header ({error})") from error
+            size = os.fstat(file.fileno()).st_size
+            if size == 0:
+                raise UserError(f"{path}: the file is empty, not a {path.suffix} file")
+            if size > limit:
+                raise UserError(f"{path}: over {limit >> 20} MB, the limit for a shape")
+            yield file, size
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise UserError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    except MemoryError as error:
+        raise UserError(f"{path}: not enough memory for it") from error
 
 
-def _compare(path: Path, says: str, wanted: int, there: int, exact: bool = True) -> None:
+def compare_sizes(path: Path, says: str, wanted: int, there: int, exact: bool = True) -> None:
+    """Compares the bytes that a header promises with those that follow it.
+
+    Args:
+        path: named in errors.
+        says: what the header states.
+        wanted: bytes of that.
+        there: bytes that follow.
+        exact: whether more than ``SLACK`` bytes beyond ``wanted`` are refused, too.
+
+    Raises:
+        UserError: there are too few bytes, or too many.
+    """
     if there < wanted:
         raise UserError(
             f"{path}: truncated or false header, {says} take {wanted} bytes but {there} follow"
@@ -49,162 +103,127 @@ def _compare(path: Path, says: str, wanted: int, there: int, exact: bool = True)
         raise UserError(f"{path}: false header, {says} take {wanted} bytes but {there} follow")
 
 
-def _check_ply(path: Path, file: BinaryIO, size: int) -> None:
-    layout, _, elements, start = read_ply_header(path, file)
-    says = ", ".join(f"{element.count} {element.name}" for element in elements)
-    if layout == "ascii":
-        file.seek(start)
-        wanted = sum(element.count for element in elements if element.properties)
-        found = sum(1 for _ in _lines(file))
-        if found != wanted:
-            raise UserError(f"{path}: truncated or false header, {says}, but {found} lines follow")
-        return
-    if layout not in ORDERS:
-        raise UserError(f"{path}: the .ply header states no format")
-    least = sum(element.count * element.least_bytes() for element in elements)
-    _compare(path, says, least, size - start, exact=False)
-    if size == start:
-        return
-    data, at = np.memmap(file, np.uint8, "r"), start
-    for element in elements:
-        at += _element_bytes(path, data[at:], element, ORDERS[layout])
-    _compare(path, says, at - start, size - start)
+def check_counts(path: Path) -> None:
+    """Compares what an .stl, .off, .glb or .gltf file says it holds with its size.
 
+    Nothing is allocated by what the file says, so that a header of 10^12 vertices costs nothing.
+    Files of other kinds state no counts, or are read without trust in them, and pass; only that
+    they are plain files of bounded size is checked.
 
-def _element_bytes(path: Path, data: np.ndarray, element: PlyElement, order: str) -> int:
-    """Bytes that an element takes at the start of ``data [B]`` uint8, its lists included."""
-    count = element.count
-    lists = [i for i, item in enumerate(element.properties) if item.length]
-    if not lists or count == 0:
-        return count * element.least_bytes()
-    says = f"{count} {element.name} with lists"
-    if len(lists) == 1:  # as a rule all lists are of one length
-        item = element.properties[lists[0]]
-        before = sum(other.least_bytes() for other in element.properties[: lists[0]])
-        counts = np.dtype(order + item.length)
-        _compare(path, says, element.least_bytes(), len(data), exact=False)
-        length = int(data[before : before + counts.itemsize].view(counts)[0])
-        stride = element.least_bytes() + length * np.dtype(item.kind).itemsize
-        if 0 <= length and count * stride <= len(data):
-            rows = data[: count * stride].reshape(count, stride)
-            found = np.ascontiguousarray(rows[:, before : before + counts.itemsize]).view(counts)
-            if (found == length).all():
-                return count * stride
-    return _walked_bytes(path, data.tobytes(), element, order)
-
-
-def _walked_bytes(path: Path, data: bytes, element: PlyElement, order: str) -> int:
-    """As ``_element_bytes``, row by row and list by list."""
-    at, says = 0, f"{element.count} {element.name} with lists"
-    for _ in range(element.count):
-        for item in element.properties:
-            if not item.length:
-                at += item.least_bytes()
-                continue
-            _compare(path, says, at + item.least_bytes(), len(data), exact=False)
-            length = int(np.frombuffer(data, order + item.length, 1, at)[0])
-            if length < 0:
-                raise UserError(f"{path}: false header, a list of {length} in {element.name}")
-            at += item.least_bytes() + length * np.dtype(item.kind).itemsize
-            _compare(path, says, at, len(data), exact=False)
-    return at
+    Raises:
+        UserError: the file holds less or more than it says, or its header is broken.
+    """
+    with open_shape(path) as (file, size):
+        check = _CHECKS.get(path.suffix.lower())
+        if check is None:
+            return
+        try:
+            check(path, file, size)
+        except (struct.error, IndexError) as error:
+            raise UserError(f"{path}: broken header ({error})") from error
 
 
 def _check_stl(path: Path, file: BinaryIO, size: int) -> None:
     head = file.read(84)
-    if head.lstrip().startswith(b"solid") and b"facet" in head + file.read(1 << 12):
-        return  # text, which states no count
+    head += file.read(1 << 12)
+    if head.lstrip().startswith(b"solid") and b"facet" in head:
+        _check_stl_text(path, head + file.read())
+        return
     if len(head) < 84:
         raise UserError(f"{path}: {size} bytes are too few for an .stl file")
-    count = struct.unpack("<I", head[80:])[0]
-    _compare(path, f"{count} faces", 50 * count, size - 84)
+    count = struct.unpack("<I", head[80:84])[0]
+    compare_sizes(path, f"{count} faces", 50 * count, size - 84)
+
+
+def _check_stl_text(path: Path, text: bytes) -> None:
+    """Every facet is closed and has three vertices, and the solid has an end."""
+    text = text.lower()
+    ends, vertices = text.count(b"endfacet"), text.count(b"vertex")
+    begun = text.count(b"facet") - ends
+    if not begun == ends == vertices / 3 or b"endsolid" not in text:
+        says = f"{begun} facets, {ends} of them with an end, and {vertices} vertices"
+        raise UserError(f"{path}: truncated or false, {says}")
+
+
+def _check_off(path: Path, file: BinaryIO, size: int) -> None:
+    lines = (line.split("#")[0].split() for line in lines_of(file, str(path), comments="#"))
+    words = next(lines, [])
+    counts = words[1:] or next(lines, [])
+    if not words or not words[0].endswith("OFF") or not all(w.isdecimal() for w in counts[:2]):
+        raise UserError(f"{path}: broken header, not OFF and numbers of vertices and faces")
+    rows = [int(word[:18]) for word in counts[:2]]
+    if len(rows) < 2:
+        raise UserError(f"{path}: broken header, not OFF and numbers of vertices and faces")
+    says = f"{rows[0]} vertices and {rows[1]} faces"
+    found = 0
+    for found, words in enumerate(lines, 1):
+        if found <= rows[0]:
+            whole = len(words) >= 3
+        else:
+            whole = words[0].isdecimal() and len(words) > int(words[0][:18])
+        if not whole:
+            raise UserError(f"{path}: row {found} is not whole: {' '.join(words)[:40]}")
+    if found != sum(rows):
+        raise UserError(f"{path}: truncated or false header, {says}, but {found} lines follow")
 
 
 def _check_glb(path: Path, file: BinaryIO, size: int) -> None:
-    magic, _, length = struct.unpack("<4sII", file.read(GLB_START))
+    magic, version, length = struct.unpack("<4sII", file.read(GLB_START))
     if magic != b"glTF":
         raise UserError(f"{path}: not a .glb file")
-    _compare(path, "its header and chunks", length, size)
-    at, tree, binary = GLB_START, None, 0
+    if version != 2:
+        raise UserError(f"{path}: cannot be read as a mesh (version {version} of .glb, not 2)")
+    compare_sizes(path, "its header and chunks", length, size)
+    at, text, binary = GLB_START, None, 0
     while at + 8 <= size:
         file.seek(at)
         chunk, kind = struct.unpack("<II", file.read(8))
-        _compare(path, f"a chunk at byte {at}", chunk, size - at - 8, exact=False)
-        if kind == GLB_JSON and tree is None:
-            tree = json.loads(file.read(chunk))
+        compare_sizes(path, f"a chunk at byte {at}", chunk, size - at - 8, exact=False)
+        if kind == GLB_JSON and text is None:
+            text = file.read(chunk)
         else:
             binary += chunk
         at += 8 + chunk
-    if tree is None:
+    if text is None:
         raise UserError(f"{path}: no JSON chunk")
+    # Padded with blanks; some writers pad with zeros.
+    tree = parse_document(text.rstrip(b"\0 "), _Gltf, str(path))
+    for number, buffer in enumerate(tree.buffers):
+        if buffer.uri is None:
+            compare_sizes(path, f"buffer {number}", buffer.byteLength, binary, exact=False)
     _check_accessors(path, tree)
 
 
 def _check_gltf(path: Path, file: BinaryIO, size: int) -> None:
-    _check_accessors(path, json.load(file))
+    _check_accessors(path, parse_document(file.read(), _Gltf, str(path)))
 
 
-def _check_accessors(path: Path, tree: dict) -> None:
-    """Each accessor against its view; the views' buffers are what trimesh reads for real."""
-    bytes_of = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
-    parts = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-    views = tree.get("bufferViews", [])
-    most = max([int(buffer["byteLength"]) for buffer in tree.get("buffers", [])], default=0)
-    for number, accessor in enumerate(tree.get("accessors", [])):
-        count = int(accessor["count"])
-        there = most  # without a view it is zeros, which nothing bounds; sparse ones are rare
-        size = 1
-        if "bufferView" in accessor:
-            there = int(views[accessor["bufferView"]]["byteLength"])
-            size = bytes_of[accessor["componentType"]] * parts[accessor["type"]]
-        _compare(path, f"{count} values of accessor {number}", count * size, there, exact=False)
+def _check_accessors(path: Path, tree: _Gltf) -> None:
+    """Each view against its buffer, each accessor against its view.
+
+    trimesh compares the buffers' stated lengths with their real ones where a view is taken.
+    """
+    for number, view in enumerate(tree.bufferViews):
+        there = tree.buffers[view.buffer].byteLength - view.byteOffset
+        compare_sizes(path, f"the bytes of view {number}", view.byteLength, there, exact=False)
+    zeros = total = 0
+    for number, accessor in enumerate(tree.accessors):
+        size = accessor.row_bytes()
+        total += accessor.count * size
+        says = f"{accessor.count} values of accessor {number}"
+        if accessor.sparse is not None:
+            raise UserError(f"{path}: accessor {number} is sparse, which is not read")
+        if accessor.bufferView is None:  # zeros, until an extension fills them
+            zeros += accessor.count * size
+            compare_sizes(path, says, zeros, MAX_ZEROS, exact=False)
+            continue
+        view = tree.bufferViews[accessor.bufferView]
+        step = view.byteStride or size
+        wanted = (accessor.count - 1) * step + size if accessor.count else 0
+        there = view.byteLength - accessor.byteOffset
+        compare_sizes(path, says, wanted, there, exact=False)
+    if total > MAX_FILE:
+        raise UserError(f"{path}: its accessors take {total >> 20} MB, over {MAX_FILE >> 20}")
 
 
-def _check_pcd(path: Path, file: BinaryIO, size: int) -> None:
-    lines: dict[str, list[str]] = {}
-    for line in islice(file, 64):
-        words = line.decode("ascii", "replace").split()
-        if words and not words[0].startswith("#"):
-            lines[words[0]] = words[1:]
-        if words[:1] == ["DATA"]:
-            break
-    at = file.tell()
-    sizes = [int(word) for word in lines["SIZE"]]
-    repeats = [int(word) for word in lines.get("COUNT", ["1"] * len(sizes))]
-    count = int(lines["POINTS"][0])
-    says, data = f"{count} points", lines["DATA"][0]
-    if data == "ascii":  # a digit and a blank each
-        _compare(path, says, 2 * count * sum(repeats) - 1, size - at, exact=False)
-        return
-    wanted = count * sum(a * b for a, b in zip(sizes, repeats, strict=True))
-    if data == "binary_compressed":
-        packed, unpacked = struct.unpack("<II", file.read(8))
-        _compare(path, says, packed, size - at - 8, exact=False)
-        _compare(path, says, wanted, unpacked)
-        _compare(path, says, wanted, packed * 264, exact=False)  # LZF's longest repetition
-        return
-    _compare(path, says, wanted, size - at)
-
-
-def _check_pts(path: Path, file: BinaryIO, size: int) -> None:
-    words = next(_lines(file)).split()
-    if len(words) == 1:
-        rows = sum(1 for _ in _lines(file))
-        if rows != int(words[0]):
-            raise UserError(
-                f"{path}: truncated or false header, {int(words[0])} points but {rows} lines follow"
-            )
-
-
-def _lines(file: BinaryIO) -> Iterator[bytes]:
-    return (line for line in file if line.strip())
-
-
-_CHECKS = {
-    ".ply": _check_ply,
-    ".stl": _check_stl,
-    ".glb": _check_glb,
-    ".gltf": _check_gltf,
-    ".pcd": _check_pcd,
-    ".pts": _check_pts,
-}
+_CHECKS = {".stl": _check_stl, ".off": _check_off, ".glb": _check_glb, ".gltf": _check_gltf}

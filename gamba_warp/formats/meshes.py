@@ -13,30 +13,30 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from PIL import Image
 
 from ..errors import UserError
+from .headers import check_counts, open_shape
+from .materials import GREY, Budget, Material, make_material, side_files, to_linear
+from .ply_data import PlyData, PlyList, read_ply, triangles
 
 SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
 Y_UP = (".obj", ".glb", ".gltf")
-GREY = 0.6  # display value of a surface whose colour is not known
-MAX_TEXTURE = 2048  # pixels a side; larger ones are halved until they fit
+MAX_MATERIALS = 2000  # of an .obj file; trimesh's time grows with their square
+MAX_REACH = 1e18  # the squares of larger coordinates overflow float32
+MAX_PARTS = 40_000_000  # vertices and faces; their arrays take 4 GB
 CREASE = np.cos(np.radians(40))  # a vertex normal farther than this from its face's is not used
 
+# Digits, and blanks between numbers, can be read in one way only: the time is linear in the line.
+_EXPONENT = rb"(?:[eE][-+]?\d+)?"
+_FINITE = rb"(?:\d+(?:\.\d*)?|\.\d+)" + _EXPONENT
+_NUMBER = rb"[-+]?(?:" + _FINITE + rb"|[nN][aA][nN]|[iI][nN][fF])(?=[ \t\r]|$)"
+_CORNER = rb"-?0{0,9}[1-9]\d{0,14}(?:/-?\d{0,15}){0,2}(?=[ \t\r]|$)"
+_BAD_OBJ = re.compile(
+    rb"(?m)^(?:v[ \t](?!(?:[ \t]*" + _NUMBER + rb"){3,}[ \t\r]*$)"
+    rb"|f[ \t](?!(?:[ \t]*" + _CORNER + rb"){3,}[ \t\r]*$)).*"
+)
+
 Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-
-
-@dataclass
-class Material:
-    """How a surface looks.
-
-    Attributes:
-        color: ``[4]`` float32 RGBA, linear light, multiplies the texture.
-        texture: ``[h, w, 4]`` uint8 RGBA, display (sRGB) values, not premultiplied; or None.
-    """
-
-    color: np.ndarray
-    texture: np.ndarray | None = None
 
 
 @dataclass
@@ -89,12 +89,6 @@ class TexturedMesh:
         return mesh, np.hstack([turn, -center[:, None]]), float(scale)
 
 
-def to_linear(display: np.ndarray | float) -> np.ndarray:
-    """SRGB display values in [0, 1] to linear light (IEC 61966-2-1), any shape, float32."""
-    x = np.asarray(display, dtype=np.float32)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
 def to_display(linear: np.ndarray) -> np.ndarray:
     """Linear light in [0, 1] to sRGB display values, any shape, float32."""
     x = np.asarray(linear, dtype=np.float32)
@@ -121,12 +115,14 @@ def load_mesh(path: str | Path) -> TexturedMesh:
         raise UserError(f"{path}: not a mesh file ({', '.join(SUFFIXES)})")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
-    if path.stat().st_size == 0:
-        raise UserError(f"{path}: the file is empty")
+    check_counts(path)
     warnings: list[str] = []
-    parts, materials = [], []
+    parts, materials, budget, count = [], [], Budget(), 0
     for mesh, matrix in _read_parts(path, warnings):
-        part, material = _flatten(mesh, matrix, warnings, path)
+        count += len(mesh.faces) + len(mesh.vertices)  # a scene may hold one part many times
+        if count > MAX_PARTS:
+            raise UserError(f"{path}: over {MAX_PARTS} vertices and faces, the limit for a mesh")
+        part, material = _flatten(mesh, matrix, warnings, path, budget)
         part["material_ids"] = np.full(len(part["faces"]), len(materials))
         parts.append(part)
         materials.append(material)
@@ -136,7 +132,13 @@ def load_mesh(path: str | Path) -> TexturedMesh:
     for part, offset in zip(parts, offsets):
         part["faces"] = part["faces"] + offset
     joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    if np.ptp(joined["vertices"], axis=0).max() <= 0:
+    reach = np.abs(joined["vertices"]).max()
+    if reach > MAX_REACH:
+        raise UserError(f"{path}: coordinates reach {reach:.3g}, over {MAX_REACH:g}")
+    extent = np.ptp(joined["vertices"], axis=0).max()
+    if 0 < extent < 1 / MAX_REACH:
+        raise UserError(f"{path}: its longest side is {extent:.3g}, below {1 / MAX_REACH:g}")
+    if extent <= 0:
         raise UserError(f"{path}: all vertices are one point")
     return TexturedMesh(**joined, materials=materials, warnings=list(dict.fromkeys(warnings)))
 
@@ -145,13 +147,20 @@ def _read_parts(path: Path, warnings: list[str]) -> list[tuple]:
     """Every part that has faces: trimesh's mesh and the 4x4 matrix of its pose in the scene."""
     import trimesh
 
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        data = read_ply(path)
+        if _has_mixed_polygons(data):
+            return [(_mixed_mesh(path, data), np.eye(4))]
+    with open_shape(path) as (file, _):
+        text = file.read()
+    if suffix == ".obj":
+        text = _absolute_indices(path, _checked_obj(path, text))
     try:
-        with path.open("rb") as file:
-            text = _absolute_indices(file.read()) if path.suffix.lower() == ".obj" else file.read()
         scene = trimesh.load_scene(
             trimesh.util.wrap_as_stream(text),
-            file_type=path.suffix.lower()[1:],
-            resolver=_resolver(path, warnings),
+            file_type=suffix[1:],
+            resolver=side_files(path, warnings),
             process=False,
         )
         parts = []
@@ -166,7 +175,55 @@ def _read_parts(path: Path, warnings: list[str]) -> list[tuple]:
         raise UserError(f"{path}: cannot be read as a mesh ({reason[0]})") from error
 
 
-def _absolute_indices(text: bytes) -> bytes:
+def _has_mixed_polygons(data: PlyData) -> bool:
+    """Whether it is a binary file whose faces differ in length, which trimesh does not read."""
+    lists = [x for x in data.elements.get("face", {}).values() if isinstance(x, PlyList)]
+    uneven = any(len(x.lengths) and np.ptp(x.lengths) > 0 for x in lists)
+    return uneven and data.header.format != "ascii"
+
+
+def _mixed_mesh(path: Path, data: PlyData):
+    """The mesh of a ``.ply``: triangles, and the vertices' normals and colours."""
+    import trimesh
+
+    vertices = data.numbers("vertex", ("x", "y", "z"))
+    corners = [data.elements["face"].get(name) for name in ("vertex_indices", "vertex_index")]
+    lists = [item for item in corners if isinstance(item, PlyList)]
+    if vertices is None or not lists:
+        raise UserError(f"{path}: its vertices have no x, y and z, or its faces no indices")
+    faces = triangles(path, lists[0], len(vertices))
+    if not len(faces):
+        raise UserError(f"{path}: no faces")
+    colors = [data.elements["vertex"].get(name) for name in ("red", "green", "blue")]
+    known = all(isinstance(item, np.ndarray) and item.dtype == np.uint8 for item in colors)
+    return trimesh.Trimesh(
+        vertices,
+        faces,
+        vertex_normals=data.numbers("vertex", ("nx", "ny", "nz")),
+        vertex_colors=np.stack(colors, 1) if known else None,  # pyright: ignore[reportArgumentType, reportCallIssue]
+        process=False,
+    )
+
+
+def _checked_obj(path: Path, text: bytes) -> bytes:
+    """An OBJ file whose lines of vertices and faces are numbers; trimesh stops at what is none.
+
+    Raises:
+        UserError: one is not.
+    """
+    text = text.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
+    bad = _BAD_OBJ.search(text)
+    if bad:
+        line = " ".join(bad[0][:60].decode("ascii", "replace").split())
+        number = text.count(b"\n", 0, bad.start()) + 1
+        raise UserError(f"{path}: line {number}, '{line}', is no vertex or face")
+    used = set(re.findall(rb"(?m)^[ \t]*usemtl[ \t]+(.*)$", text))
+    if len(used) > MAX_MATERIALS:
+        raise UserError(f"{path}: uses {len(used)} materials, over the limit of {MAX_MATERIALS}")
+    return text
+
+
+def _absolute_indices(path: Path, text: bytes) -> bytes:
     """Makes negative face indices of an OBJ positive; they count back from their own line."""
     if not re.search(rb"(?m)^f .*-\d", text):
         return text
@@ -187,52 +244,15 @@ def _absolute_indices(text: bytes) -> bytes:
                 )
                 for corner in words[1:]
             ]
+            if any(corner.startswith((b"-", b"0")) for corner in corners):
+                raise UserError(f"{path}: a face names a vertex before the first")
             lines[i] = b" ".join([b"f", *corners])
     return b"\n".join(lines)
 
 
-def _resolver(path: Path, warnings: list[str]):
-    """Finds side files whatever their case, slashes or options before the name.
-
-    What is not found goes into ``warnings``.
-    """
-    from trimesh.resolvers import FilePathResolver
-
-    class Resolver(FilePathResolver):
-        def get(self, name: str) -> bytes:
-            file = _find_file(path.parent, name)
-            if file is None:
-                warnings.append(f"{name}: not found")
-                raise OSError(f"{name}: not found")
-            if file.suffix.lower() in Image.registered_extensions():
-                try:
-                    Image.open(file).close()
-                except OSError:  # trimesh would go on and not say so
-                    warnings.append(f"{name}: not a picture")
-            return file.read_bytes()
-
-    return Resolver(str(path))
-
-
-def _find_file(folder: Path, name: str) -> Path | None:
-    # Options of MTL stand before the name: "-s 1 1 1 -clamp on wood.jpg".
-    bare = re.sub(r"^(-\w+\s+(([-+.\d]+|on|off|[rgbmlz])\s+)+)+", "", name.strip())
-    for candidate in (name, bare, Path(bare.replace("\\", "/")).name):
-        place = folder
-        for part in candidate.strip().strip('"').replace("\\", "/").split("/"):
-            if part in ("", "."):
-                continue
-            exact = place / part
-            if not exact.exists() and place.is_dir():
-                same = [p for p in place.iterdir() if p.name.lower() == part.lower()]
-                exact = same[0] if same else exact
-            place = exact
-        if place.is_file():
-            return place
-    return None
-
-
-def _flatten(mesh, matrix: np.ndarray, warnings: list[str], path: Path) -> tuple[dict, Material]:
+def _flatten(
+    mesh, matrix: np.ndarray, warnings: list[str], path: Path, budget: Budget
+) -> tuple[dict, Material]:
     """The arrays of one part, moved to the scene's frame, and its material."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     faces = np.asarray(mesh.faces, dtype=np.int64)
@@ -246,7 +266,7 @@ def _flatten(mesh, matrix: np.ndarray, warnings: list[str], path: Path) -> tuple
     colors = np.full((count, 3, 4), 255, np.uint8)
     visual = mesh.visual
     if visual.kind == "texture":
-        material = _material(visual.material, path, warnings)
+        material = make_material(visual.material, path, warnings, budget)
         if visual.uv is not None and len(visual.uv) == len(vertices):
             uvs = np.nan_to_num(np.asarray(visual.uv, np.float32)[faces])
         elif material.texture is not None:
@@ -296,85 +316,3 @@ def _corner_normals(
     agree = (smooth * flat).sum(2, keepdims=True)
     smooth = smooth * np.sign(agree)
     return np.where(np.abs(agree) > CREASE, smooth, flat).astype(np.float32)
-
-
-def _material(source, path: Path, warnings: list[str]) -> Material:
-    """Makes our material of one of trimesh's."""
-    from trimesh.visual.material import PBRMaterial, SimpleMaterial
-
-    if isinstance(source, PBRMaterial):
-        texture = _texture(source.baseColorTexture, warnings)
-        factor = source.baseColorFactor
-        color = np.ones(4) if factor is None else np.asarray(factor, np.float64) / 255
-        if source.alphaMode in (None, "OPAQUE"):
-            color[3] = 1.0
-            if texture is not None:
-                texture[..., 3] = 255
-        elif source.alphaMode == "MASK" and texture is not None:
-            cut = 0.5 if source.alphaCutoff is None else source.alphaCutoff
-            texture[..., 3] = np.where(texture[..., 3] >= 255 * cut, 255, 0)
-        return Material(color.astype(np.float32), texture)
-    grey = Material(np.array([*[to_linear(GREY)] * 3, 1], np.float32))
-    # trimesh invents a material where there is none; one from an MTL file has kwargs.
-    made_up = path.suffix.lower() == ".obj" and not source.kwargs
-    if not isinstance(source, SimpleMaterial) or made_up:
-        warnings.append("a part has no material: grey")
-        return grey
-    texture = _texture(source.image, warnings)
-    mask = source.kwargs.get("map_d")
-    if texture is not None and mask:
-        texture = _with_mask(texture, path.parent, " ".join(mask), warnings)
-    color = np.ones(4, np.float32)
-    if texture is None:
-        if "kd" in source.kwargs:
-            color[:3] = to_linear(np.asarray(source.diffuse[:3], np.float32) / 255)
-        else:
-            color[:3] = grey.color[:3]
-    color[3] = _opacity(source.kwargs)
-    return Material(color, texture)
-
-
-def _opacity(options: dict) -> float:
-    """MTL's ``d`` (1 is opaque) or ``Tr`` (0 is opaque)."""
-    for key, sign in (("d", 1), ("tr", -1)):
-        try:
-            value = float(options[key][-1])
-        except (KeyError, IndexError, TypeError, ValueError):
-            continue
-        return float(np.clip(value if sign > 0 else 1 - value, 0, 1))
-    return 1.0
-
-
-def _texture(image: Image.Image | None, warnings: list[str]) -> np.ndarray | None:
-    if image is None:
-        return None
-    try:
-        image = image.convert("RGBA")
-    except (OSError, SyntaxError, ValueError) as error:
-        warnings.append(f"{image.info.get('file_path', 'a texture')}: cannot be decoded ({error})")
-        return None
-    while max(image.size) > MAX_TEXTURE:
-        image = image.reduce(2)
-    texture = np.array(image)
-    if texture[..., 3].max() < 8:  # the alpha channel is unused, the object is not invisible
-        texture[..., 3] = 255
-    return texture
-
-
-def _with_mask(texture: np.ndarray, folder: Path, name: str, warnings: list[str]) -> np.ndarray:
-    """The texture with its alpha from MTL's ``map_d``: that picture's alpha, or its grey."""
-    file = _find_file(folder, name)
-    if file is None:
-        warnings.append(f"{name}: not found")
-        return texture
-    try:
-        with Image.open(file) as image:
-            alpha = image.convert("RGBA").getchannel("A")
-            if alpha.getextrema()[0] == 255:
-                alpha = image.convert("L")
-            alpha = alpha.resize((texture.shape[1], texture.shape[0]))
-    except (OSError, SyntaxError, ValueError) as error:
-        warnings.append(f"{name}: cannot be decoded ({error})")
-        return texture
-    texture[..., 3] = np.asarray(alpha)
-    return texture

@@ -18,12 +18,15 @@ from ..errors import UserError
 from ..files import atomic_path
 from ..gaussians import Gaussians
 from ..versions import __version__
+from .headers import open_shape
 from .ply_header import ORDERS, PlyElement, read_ply_header
 
 SH_C0 = 0.28209479177387814  # value of the degree-0 spherical harmonic
 
 _OPENGL_COMMENT = "frame opengl"
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
+MAX_FILE = 4 << 30  # bytes; 17 million Gaussians with all their harmonics
+MAX_REACH = 1e18  # of means and scales: the squares of larger numbers overflow float32
 _MIN_SCALE = 1e-12  # keeps the logarithm finite
 _GROUPS = {
     "means": ("x", "y", "z"),
@@ -142,7 +145,7 @@ def load_ply(path: str | Path) -> Gaussians:
 
     Raises:
         UserError: not a file, not a binary ``.ply``, truncated or longer than it says, an attribute
-            missing, a value not finite, or a rotation of length zero.
+            missing, a value not finite or over ``MAX_REACH``, or a rotation of length zero.
     """
     vertices, comments = _read_vertices(Path(path))
     values: dict[str, torch.Tensor] = {}
@@ -160,12 +163,22 @@ def load_ply(path: str | Path) -> Gaussians:
                 f"{path}: {bad} of {len(vertices)} Gaussians have {name} that are not finite"
             )
         values[name] = torch.from_numpy(stacked)
-    lengths = values["quats"].norm(dim=1, keepdim=True)
-    if (lengths == 0).any():
-        raise UserError(f"{path}: {int((lengths == 0).sum())} rotations have length zero")
+    for name in ("means", "scales"):
+        reach = float(values[name].abs().max())
+        if reach > MAX_REACH:
+            raise UserError(f"{path}: {name} reach {reach:.3g}, over {MAX_REACH:g}")
+    quats = values["quats"]
+    lengths = quats.norm(dim=1, keepdim=True)
+    odd = ((lengths == 0) | ~lengths.isfinite())[:, 0]  # the squares leave float32's range
+    if odd.any():
+        quats[odd] /= quats[odd].abs().amax(1, keepdim=True)
+        lengths = quats.norm(dim=1, keepdim=True)
+        bad = int((~(lengths > 0)).sum())
+        if bad:
+            raise UserError(f"{path}: {bad} rotations have length zero")
     gaussians = Gaussians(
         means=values["means"],
-        quats=values["quats"] / lengths,
+        quats=quats / lengths,
         scales=values["scales"],
         opacities=values["opacities"][:, 0].sigmoid(),
         colors=(values["colors"] * SH_C0 + 0.5).clamp(0, 1),
@@ -175,13 +188,10 @@ def load_ply(path: str | Path) -> Gaussians:
 
 def _read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
     """The vertices as a structured array, and the header's comments."""
-    try:
-        with open(path, "rb") as file:
-            header = read_ply_header(path, file)
-            file.seek(header.start)
-            data = file.read()
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
+    with open_shape(path, MAX_FILE) as (file, _):
+        header = read_ply_header(path, file)
+        file.seek(header.start)
+        data = file.read()
     if header.format not in ORDERS:
         raise UserError(f"{path}: .ply format is {header.format}, only binary is read")
     if not header.elements or header.elements[0].name != "vertex":

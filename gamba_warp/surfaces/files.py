@@ -12,7 +12,7 @@ import torch
 from ..conventions import Axes
 from ..errors import UserError
 from ..files import atomic_path
-from ..formats.meshes import to_linear
+from ..formats.materials import to_linear
 from ..formats.names import MESH_FORMATS, MeshFormat
 from ..gaussians import Gaussians
 from ..images import to_uint8

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from ..errors import UserError
+from msgspec import Meta
+
+from ..untrusted.ranges import check_options
 
 Method = Literal["tsdf", "density", "centers"]
+Voxels = Annotated[int, Meta(ge=8, le=1024)]
+Views = Annotated[int, Meta(ge=8, le=1000)]
+Pixels = Annotated[int, Meta(ge=8, le=4096)]
+Faces = Annotated[int, Meta(ge=0, le=2**31 - 1)]
+Holes = Annotated[int, Meta(ge=0, le=10_000)]
+Smoothing = Annotated[int, Meta(ge=0, le=1000)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+PartShare = Annotated[float, Meta(ge=0, lt=1)]
 
 
 @dataclass(frozen=True)
@@ -38,22 +48,22 @@ class SurfaceOptions:
     """
 
     method: Method = "tsdf"
-    voxels: int = 128
-    views: int = 64
-    pixels: int = 256
-    truncation: float = 5.0
-    transmittance: float = 0.92
-    min_alpha: float = 0.3
-    clear_alpha: float = 0.1
-    max_slope: float = 1.5
-    min_support: float = 0.03
-    level: float = 0.5
-    min_component: float = 0.01
-    min_diameter: float = 0.0
+    voxels: Voxels = 128
+    views: Views = 64
+    pixels: Pixels = 256
+    truncation: Annotated[float, Meta(gt=0, le=1000)] = 5.0
+    transmittance: Annotated[float, Meta(gt=0, lt=1)] = 0.92
+    min_alpha: Share = 0.3
+    clear_alpha: Share = 0.1
+    max_slope: Annotated[float, Meta(gt=0, le=1e6)] = 1.5
+    min_support: Share = 0.03
+    level: Annotated[float, Meta(gt=0, lt=1)] = 0.5
+    min_component: PartShare = 0.01
+    min_diameter: Share = 0.0
     largest: bool = False
-    close_holes: int = 30
-    smooth: int = 0
-    faces: int = 0
+    close_holes: Holes = 30
+    smooth: Smoothing = 0
+    faces: Faces = 0
     colors: bool = False
 
     def check(self) -> None:
@@ -62,14 +72,4 @@ class SurfaceOptions:
         Raises:
             UserError: a number is out of its range; the message names the option.
         """
-        bounds = {
-            "voxels": (8, 1024),
-            "views": (8, 1000),
-            "pixels": (8, 4096),
-            "close_holes": (0, 10000),
-            "smooth": (0, 1000),
-            "faces": (0, 2**31 - 1),
-        }
-        for name, (low, high) in bounds.items():
-            if not low <= getattr(self, name) <= high:
-                raise UserError(f"--{name.replace('_', '-')}: {low} to {high} are possible")
+        check_options(self)

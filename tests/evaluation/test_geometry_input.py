@@ -1,16 +1,18 @@
 """What ``gamba eval-geometry`` reads, refuses and says about its input."""
 
 import json
-import os
 import struct
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.children import murderous_pair, talking_pair
 
 from gamba_warp.cli import run
 from gamba_warp.errors import UserError
+from gamba_warp.eval.shapes import pairs
 from gamba_warp.eval.shapes.flags import tidied
 from gamba_warp.eval.shapes.load import load_shape
 from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
@@ -328,7 +330,7 @@ def test_protocol_files(tmp_path):
 @pytest.mark.parametrize(
     "text, reason",
     [
-        ("{", "not JSON"),
+        ("{", "not valid JSON"),
         ("[]", "object"),
         ('{"num_point": 5}', "num_point is unknown"),
         ('{"num_points": "5"}', "num_points is '5', must be of type int"),
@@ -361,22 +363,29 @@ def test_json_or_csv(tmp_path, capsys):
     assert "--json and --csv" in capsys.readouterr().err
 
 
+def pairs_of(folder, names):
+    for side in ("pred", "gt"):
+        (folder / side).mkdir()
+        for name in names:
+            box().export(folder / side / f"{name}.ply")
+    return folder / "pred", folder / "gt"
+
+
 def test_one_crash_stops_no_other(tmp_path, capfd, monkeypatch):
     """Nor does what a library prints get into the report on stdout."""
-    from gamba_warp.eval.shapes import pairs
-
-    def broken(pair, *rest):
-        os.write(1, b"a library talks\n")
-        if pair.name == "bad":
-            raise MemoryError("no room")
-        return evaluate_pair(pair, *rest)
-
-    evaluate_pair = pairs.evaluate_pair
-    monkeypatch.setattr(pairs, "evaluate_pair", broken)
-    for folder in ("pred", "gt"):
-        (tmp_path / folder).mkdir()
-        for name in ("bad", "good"):
-            box().export(tmp_path / folder / f"{name}.ply")
-    code, report = evaluate(capfd, tmp_path / "pred", tmp_path / "gt")
+    broken = partial(pairs.evaluate_pairs, evaluate=talking_pair)
+    monkeypatch.setattr(pairs, "evaluate_pairs", broken)
+    code, report = evaluate(capfd, *pairs_of(tmp_path, ("bad", "good")))
     assert code == 1 and report["failures"] == [{"name": "bad", "reason": "MemoryError: no room"}]
     assert report["num_ok"] == 1
+
+
+def test_one_that_kills_its_process_stops_no_other(tmp_path, capfd, monkeypatch):
+    broken = partial(pairs.evaluate_pairs, evaluate=murderous_pair)
+    monkeypatch.setattr(pairs, "evaluate_pairs", broken)
+    files = pairs_of(tmp_path, ("a", "bad", "c", "d"))
+    code, report = evaluate(capfd, *files, "--out", tmp_path / "out")
+    reason = "its process died of signal 11 (SIGSEGV)"
+    assert code == 1 and report["failures"] == [{"name": "bad", "reason": reason}]
+    assert [record["iou"] for record in report["objects"] if record["name"] != "bad"] == [1, 1, 1]
+    assert json.loads((tmp_path / "out" / "report.json").read_text()) == report

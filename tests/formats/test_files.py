@@ -1,12 +1,34 @@
-"""Digests of files."""
+"""Digests of files; writing them: whole or not at all, and what is left over goes."""
 
 import hashlib
+import os
+import time
 import tracemalloc
 
+import numpy as np
 import pytest
+import torch
+from helpers.disk import full_at
+from safetensors.torch import save_file
 
+from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
-from gamba_warp.files import check_sha256, sha256
+from gamba_warp.eval.shapes.pairs import find_pairs
+from gamba_warp.files import (
+    PART,
+    atomic_folder,
+    atomic_path,
+    check_sha256,
+    output_folder,
+    sha256,
+    sweep,
+    visible,
+    write_json,
+    write_text,
+)
+from gamba_warp.images import find_pictures, save_image
+from gamba_warp.pages.export import find_gaussians
+from gamba_warp.pages.turntable import save_turntable
 
 
 def test_sha256_of_a_large_file_takes_little_memory(tmp_path):
@@ -25,9 +47,90 @@ def test_sha256_of_a_large_file_takes_little_memory(tmp_path):
 def test_sha256_names_the_file_that_cannot_be_read(tmp_path):
     with pytest.raises(UserError, match="absent: No such file"):
         sha256(tmp_path / "absent")
-    with pytest.raises(UserError, match="Is a directory"):
+    with pytest.raises(UserError, match="not a plain file"):
         sha256(tmp_path)
     (tmp_path / "a").write_bytes(b"a")
     check_sha256(tmp_path / "a", "ca978112")
     with pytest.raises(UserError, match="SHA-256 is ca978112, expected ca978113"):
         check_sha256(tmp_path / "a", "ca978113")
+
+
+def test_leftovers_are_swept_by_age_and_nothing_else_is(tmp_path):
+    def put(name: str, days: float) -> str:
+        path = tmp_path / name
+        path.mkdir()
+        (path / "a.ply").touch()
+        for part in (path / "a.ply", path):
+            os.utime(part, (time.time() - days * 86400,) * 2)
+        return name
+
+    put(f"{PART}abcd1234", 1.1)
+    kept = [put(f"{PART}abcd1235", 0.9), put(f"{PART}abcd12345", 3), put(f"x{PART}abcd1234", 3)]
+    kept += [put(".config.settings", 3), put("results", 3)]
+    (tmp_path / f"{PART}linklink").symlink_to(tmp_path / "results")
+    output_folder(tmp_path)
+    assert sorted(os.listdir(tmp_path)) == sorted([*kept, f"{PART}linklink"])
+    sweep(tmp_path, age=0)
+    assert sorted(os.listdir(tmp_path)) == sorted([*kept[1:], f"{PART}linklink"])
+    assert os.listdir(tmp_path / "results") == ["a.ply"]
+
+
+@pytest.mark.parametrize("kind", ["safetensors", "json", "png", "mp4", "gif"])
+def test_a_full_disk_is_one_line_and_the_older_file_stays(tmp_path, kind):
+    path = tmp_path / f"a.{kind}"
+    pixels = np.random.default_rng(0).random((64, 64, 3))
+    frames = (pixels[None] * 255).astype(np.uint8).repeat(3, 0)
+
+    def write():
+        if kind == "safetensors":
+            with atomic_path(path) as temporary:
+                save_file({"a": torch.zeros(9000)}, temporary)
+        elif kind == "json":
+            write_json(path, list(range(9000)))
+        elif kind == "png":
+            save_image(path, pixels)
+        else:
+            save_turntable(path, frames)
+
+    path.write_bytes(b"older")
+    with full_at(1000), pytest.raises(UserError) as caught:
+        write()
+    assert str(caught.value).startswith(f"cannot write {path}: ") and "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == [path.name] and path.read_bytes() == b"older"
+    write()
+    assert path.stat().st_size > 1000
+
+
+def test_a_folder_appears_whole_and_replaces_only_when_told(tmp_path):
+    path = tmp_path / "a"
+    with pytest.raises(ValueError), atomic_folder(path) as temporary:
+        (temporary / "half").touch()
+        raise ValueError
+    assert os.listdir(tmp_path) == []
+    for content in ("one", "two"):
+        with atomic_folder(path, replace=True) as temporary:
+            (temporary / content).touch()
+    assert os.listdir(path) == ["two"]
+    with pytest.raises(UserError, match="cannot write"), atomic_folder(path) as temporary:
+        (temporary / "three").touch()
+    assert os.listdir(path) == ["two"] and os.listdir(tmp_path) == ["a"]
+
+
+def test_names_that_are_not_utf_8_are_written_with_escapes(tmp_path):
+    write_text(tmp_path / "a.md", os.fsdecode(b"caf\xe9"))
+    assert (tmp_path / "a.md").read_text() == "caf\\udce9"
+
+
+def test_what_begins_with_a_dot_is_no_input(tmp_path):
+    part = tmp_path / f"{PART}abcd1234"
+    part.mkdir()
+    for folder in (tmp_path, part):
+        for name in ("a.png", "a.ply", ".b.png", ".b.ply"):
+            (folder / name).write_bytes(b"x")
+    assert find_pictures([tmp_path])[0] == [tmp_path / "a.png"]
+    assert find_gaussians([tmp_path])[0] == [tmp_path / "a.ply"]
+    assert list(visible(tmp_path, "*.ply")) == [tmp_path / "a.ply"]
+    pairs, failures = find_pairs(tmp_path, tmp_path)
+    assert [pair.name for pair in pairs] == ["a"] and not failures
+    with pytest.raises(UserError):
+        open_dataset(part)

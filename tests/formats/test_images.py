@@ -1,6 +1,7 @@
 """Pictures in files: all common kinds, damaged ones, and writing that leaves all or nothing."""
 
 import io
+import os
 import random
 import struct
 import zlib
@@ -8,11 +9,18 @@ import zlib
 import numpy as np
 import pytest
 from helpers.images import bad_files, colours, encoded
-from PIL import Image
+from PIL import EpsImagePlugin, Image, ImageOps
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, output_folder, write_json
-from gamba_warp.images import load_rgba, save_image, to_uint8
+from gamba_warp.images import (
+    load_rgba,
+    load_rgba8,
+    open_picture,
+    picture_size,
+    save_image,
+    to_uint8,
+)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +159,156 @@ def test_saved_pictures_come_back(tmp_path):
         np.testing.assert_allclose(got[..., : want.shape[2]], want, atol=0.501 / 255)
 
 
+def fails(function, *arguments):
+    """The one line that it fails with."""
+    with pytest.raises(UserError) as caught:
+        function(*arguments)
+    assert len(str(caught.value).splitlines()) == 1
+    return str(caught.value)
+
+
+def bare_png(width, height):
+    """A PNG whose header states a size, and that holds next to nothing."""
+    return png16(np.zeros((1, 1, 3), int)).replace(
+        *(
+            b"IHDR" + data + zlib.crc32(b"IHDR" + data).to_bytes(4, "big")
+            for data in (
+                struct.pack(">IIBBBBB", *size, 16, 2, 0, 0, 0) for size in ((1, 1), (width, height))
+            )
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    "width, height, reason",
+    [
+        (8192, 8193, "8192x8193 is over 64 megapixels"),
+        (10**5, 900, "over 64 megapixels"),
+        (65_535, 1, "65535x1 is over 32768 pixels long"),
+        (1, 32_769, "1x32769 is over 32768 pixels long"),
+        (10**9, 10**9, "over 64 megapixels"),  # over what Pillow itself opens
+        (10**5, 10**5, "over 64 megapixels"),
+        (0, 5, ""),
+    ],
+)
+def test_sizes_are_refused_by_the_header_without_a_warning(
+    tmp_path, recwarn, width, height, reason
+):
+    path = tmp_path / "a.png"
+    path.write_bytes(bare_png(width, height))
+    for function in (load_rgba, load_rgba8, picture_size):
+        message = fails(function, path)
+        assert message.startswith(f"{path}: ") and reason in message
+    assert not recwarn.list
+
+
+def test_only_a_few_formats_are_ever_opened(tmp_path, monkeypatch):
+    """Of PostScript, whatever its name, Pillow would have another program draw a picture."""
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_: pytest.fail("Ghostscript"))
+    postscript = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n"
+    for suffix in ("png", "eps", "jpg"):
+        (tmp_path / f"a.{suffix}").write_bytes(postscript)
+        assert "not a picture" in fails(load_rgba, tmp_path / f"a.{suffix}")
+    for form in ("ICO", "TGA", "PCX", "SGI", "DDS", "JPEG2000", "PDF", "ICNS"):
+        content = io.BytesIO()
+        colours("RGBA" if form == "ICNS" else "RGB", (16, 16)).save(content, form)
+        (tmp_path / "a.png").write_bytes(content.getvalue())
+        assert "not a picture" in fails(load_rgba, tmp_path / "a.png"), form
+
+
+def test_a_picture_in_memory(tmp_path):
+    with open_picture(io.BytesIO(encoded("PNG")), "wood.png in a.glb") as image:
+        assert image.size == (40, 30)
+    for content, reason in ((b"", "not a picture"), (encoded("PNG")[:900], "cannot be decoded")):
+        with pytest.raises(UserError, match=f"wood: .*{reason}"):
+            with open_picture(io.BytesIO(content), "wood") as image:
+                image.load()
+    with pytest.raises(UserError, match="wood: 40x30 is over"):
+        with open_picture(io.BytesIO(encoded("PNG")), "wood", max_pixels=1199):
+            pass
+
+
+def test_what_is_no_plain_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")  # opening it would wait for ever
+    (tmp_path / "round.png").symlink_to("round.png")
+    (tmp_path / "file").write_text("x")
+    for name in ("pipe.png", "round.png", "file/a.png", "n" * 300, "a\0b.png"):
+        assert fails(load_rgba, tmp_path / name).startswith(str(tmp_path))
+
+
+def test_absurd_exif_does_not_hide_the_picture(tmp_path, recwarn):
+    picture = colours()
+    want = np.asarray(picture) / 255
+    exifs = [b"Exif\0\0" + bytes(rng) for rng in ([], [255] * 20, range(200))]
+    exifs += [b"Exif\0\0II*\0\x08\0\0\0" + b"\xff" * size for size in (1, 2, 9, 400)]
+    for exif in exifs:
+        picture.save(tmp_path / "a.png", exif=exif)
+        np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
+    exif = picture.getexif()
+    for value in (0, 9, 60_000):
+        exif[0x0112] = value
+        picture.save(tmp_path / "a.png", exif=exif)
+        np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_every_exif_orientation(tmp_path, orientation):
+    picture = colours()
+    exif = picture.getexif()
+    exif[0x0112] = orientation
+    picture.save(tmp_path / "a.png", exif=exif)
+    want = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png"))) / 255
+    np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
+    assert picture_size(tmp_path / "a.png") == (want.shape[1], want.shape[0])
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P", "1", "I;16", "F"])
+def test_large_pictures_are_reduced_by_whole_factors(tmp_path, mode):
+    """To no less than twice the length asked for, and as the mean of the whole picture."""
+    pixels = np.zeros((120, 160), np.uint16 if mode == "I;16" else np.float32)
+    pixels[:, :80] = 65535 if mode == "I;16" else 1
+    if mode in ("I;16", "F"):
+        picture = Image.fromarray(pixels)
+    else:
+        picture = Image.fromarray((255 * pixels).astype(np.uint8)).convert(mode)
+    path = tmp_path / ("a.tiff" if mode == "F" else "a.png")
+    picture.save(path)
+    assert load_rgba(path, 41).shape == (120, 160, 4)
+    got = load_rgba(path, 20)
+    assert got.shape == (30, 40, 4) and (got[..., 3] == 1).all()
+    np.testing.assert_allclose(got[:, :20, :3], 1, atol=1e-6)
+    np.testing.assert_allclose(got[:, 20:, :3], 0, atol=1e-6)
+
+
+def test_reducing_lets_no_background_in(tmp_path):
+    pixels = np.zeros((64, 64, 4), np.uint8)
+    pixels[..., 1] = 255  # transparent green
+    pixels[::2] = (255, 0, 0, 255)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    got = load_rgba(tmp_path / "a.png", 8)
+    assert got.shape == (16, 16, 4)
+    np.testing.assert_allclose(got, np.broadcast_to([1, 0, 0, 0.5], got.shape), atol=1 / 255)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P", "L", "LA", "CMYK"])
+def test_8_bits_are_the_same_picture(tmp_path, mode):
+    path = tmp_path / ("a.tiff" if mode == "CMYK" else "a.png")
+    colours(mode).save(path)
+    got = load_rgba8(path)
+    assert got.dtype == np.uint8
+    np.testing.assert_array_equal(got, to_uint8(load_rgba(path)))
+
+
+def test_bands_of_large_pictures_meet(tmp_path, monkeypatch):
+    colours("RGBA", (50, 40)).save(tmp_path / "a.png")
+    Image.fromarray(np.arange(2000, dtype=np.uint16).reshape(40, 50) * 30).save(tmp_path / "b.png")
+    want = [load_rgba(tmp_path / f"{name}.png") for name in "ab"]
+    monkeypatch.setattr("gamba_warp.images._BAND", 170)
+    for name, picture in zip("ab", want):
+        np.testing.assert_array_equal(load_rgba(tmp_path / f"{name}.png"), picture)
+
+
 def test_to_uint8_rounds_and_clips():
     values = np.array([-1, 0, 0.5 / 255, 0.499 / 255, 1, 2, np.nan, np.inf])
     assert to_uint8(values).tolist() == [0, 0, 1, 0, 255, 255, 0, 255]
@@ -161,7 +319,7 @@ def test_atomic_path_leaves_all_or_nothing(tmp_path):
     path.write_text("old")
     with pytest.raises(RuntimeError), atomic_path(path) as temporary:
         temporary.write_text("half")
-        assert temporary.suffix == ".txt" and temporary.parent == tmp_path
+        assert temporary.name == "a.txt" and temporary.parent.parent == tmp_path
         raise RuntimeError
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
     with atomic_path(path) as temporary:

@@ -217,3 +217,16 @@ def test_missing_file_and_folder(tmp_path):
         load_ply(tmp_path / "none.ply")
     with pytest.raises(UserError, match="Is a directory"):
         load_ply(tmp_path)
+
+
+def test_values_whose_squares_overflow(tmp_path):
+    """A long or short rotation is one; a place or a size beyond all bounds is none."""
+    rows = np.ones((3, 14), "<f4")
+    rows[1, 10:], rows[2, 10:] = 1e30, 1e-30
+    loaded = load_ply(write(tmp_path / "a.ply", header(3), rows.tobytes()))
+    torch.testing.assert_close(loaded.quats, torch.full((3, 4), 0.5))
+    for column, value, reason in ((0, 1e30, "means reach 1e"), (7, 60, "scales reach 1.14e")):
+        bad = rows.copy()
+        bad[1, column] = value
+        with pytest.raises(UserError, match=reason):
+            load_ply(write(tmp_path / "a.ply", header(3), bad.tobytes()))

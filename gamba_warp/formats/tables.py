@@ -1,0 +1,70 @@
+"""Text files of numbers, row by row: every row has the same columns, every word is a number."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from itertools import chain, islice
+from typing import BinaryIO
+
+import numpy as np
+
+from ..errors import UserError
+
+MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
+MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
+_BOM = b"\xef\xbb\xbf"
+
+
+def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
+    """Yields the lines of a text file that are not blank, of bounded length.
+
+    Args:
+        file: where the text begins.
+        source: named in errors.
+        comments: a line that begins with it is passed over; empty: there are no comments.
+
+    Raises:
+        UserError: a line is longer than ``MAX_LINE``.
+    """
+    first = True
+    while line := file.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
+        # What is not ASCII becomes a sign that no number has.
+        text = (line.removeprefix(_BOM) if first else line).decode("ascii", "replace")
+        first = False
+        if not text.isspace() and text and not (comments and text.lstrip().startswith(comments)):
+            yield text
+
+
+def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ()) -> np.ndarray:
+    """Reads lines of numbers as ``[N, C]`` float64; NaN and infinity are numbers here.
+
+    Args:
+        lines: one row each.
+        source: named in errors.
+        columns: the numbers of columns that are allowed; empty: any.
+
+    Raises:
+        UserError: a word is no number, the rows differ in their number of columns, or there are
+            more than ``MAX_VALUES`` numbers.
+    """
+    lines = iter(lines)
+    first = next(lines, None)
+    if first is None:
+        return np.zeros((0, columns[0] if columns else 0))
+    count = len(first.split())
+    if columns and count not in columns:
+        wanted = " or ".join(map(str, columns))
+        raise UserError(f"{source}: {count} columns in the first row, expected {wanted}")
+    most = MAX_VALUES // count
+    try:
+        table = np.loadtxt(islice(chain([first], lines), most + 1), comments=None, ndmin=2)
+    except ValueError as error:
+        # "...; use `usecols` to select a subset" is advice for programmers.
+        reason = re.split(r"[;\n]", str(error))[0].rstrip(".")
+        raise UserError(f"{source}: {reason[:200]}") from error
+    if len(table) > most:
+        raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
+    return table

@@ -1,0 +1,235 @@
+"""Mesh files that lie, name what is not theirs, or are large without need."""
+
+import base64
+import io
+import json
+import os
+import struct
+import time
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.meshes import MTL, write_quad
+from PIL import Image
+
+from gamba_warp.errors import UserError
+from gamba_warp.formats import materials
+from gamba_warp.formats.headers import MAX_ZEROS
+from gamba_warp.formats.meshes import load_mesh
+
+V = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+OFF = "OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 1 2 3\n"
+FACET = (
+    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+)
+STL = "solid a\n" + FACET * 3 + "endsolid a\n"
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\nshowpage\n"
+
+
+def ascii_ply(vertices, faces):
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    return head + "\n".join([*vertices, *faces]) + "\n"
+
+
+CORNERS = ["0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+BAD = {
+    "word_in_face.obj": (V + "f 1 2 3\nf 1 x 3\n", "line 6, 'f 1 x 3', is no vertex or face"),
+    "word_in_vertex.obj": (V + "v 1 0 zero\nf 1 2 3\n", "line 5, 'v 1 0 zero'"),
+    "two_numbers.obj": (V + "v 1 0\nf 1 2 3\n", "line 5"),
+    "corner_zero.obj": (V + "f 0 1 2\n", "line 5"),
+    "too_far_back.obj": (V + "f -9 1 2\n", "before the first"),
+    "huge.obj": (V.replace("1 0 0", "1e30 0 0") + "f 1 2 3\n", "coordinates reach 1e+30"),
+    "tiny.obj": (V.replace("1", "1e-30") + "f 1 2 3\n", "longest side is 1e-30"),
+    "digits.obj": (V + "v 1 2 " + "1" * 100_000 + "x\nf 1 2 3\n", "line 5"),
+    "materials.obj": (
+        V + "".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(100_000)),
+        "uses 100000 materials",
+    ),
+    "few_faces.off": (OFF[:-8], "false header, 4 vertices and 2 faces, but 5 lines follow"),
+    "more_faces.off": (OFF + "3 0 1 2\n", "but 7 lines follow"),
+    "short_face.off": (OFF[:-3] + "\n", "row 6 is not whole"),
+    "long_face.off": (OFF.replace("3 0 1 2", "999999999 0 1 2"), "row 5 is not whole"),
+    "negative.off": (OFF.replace("4 2 0", "4 -2 0"), "broken header"),
+    "truncated.stl": (STL[: STL.rindex("facet normal")], "truncated"),
+    "without_a_vertex.stl": (STL.replace("vertex 1 0 0\n", "", 1), "8 vertices"),
+    "word.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 x"]), "could not convert"),
+    "short_row.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1"]), "a row of 3 numbers, not 4"),
+    "half.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 1.5"]), "vertex_indices is 1.5"),
+    "vertex_word.ply": (ascii_ply([*CORNERS, "0 0 x"], ["3 0 1 2"]), "could not convert"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_meshes_are_one_line(tmp_path, name):
+    text, reason = BAD[name]
+    path = tmp_path / name
+    path.write_text(text)
+    start = time.process_time()
+    with pytest.raises(UserError) as caught:
+        load_mesh(path)
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
+    assert time.process_time() - start < 5  # one of them took minutes
+
+
+def test_good_meshes_pass(tmp_path):
+    good = {
+        "a.obj": "# a\n" + V.replace("v 1", "v  1") + "f 1// 2// \\\n 3//\nf -4 -3 -2 \n",
+        "a.off": OFF.replace("4 2 0", "# six rows\n4 2 0 # no edges"),
+        "b.off": OFF.replace("OFF\n", "OFF "),
+        "a.stl": STL,
+        "a.ply": ascii_ply(CORNERS, ["3 0 1 2", "4 0 1 2 3"]),
+    }
+    for name, text in good.items():
+        (tmp_path / name).write_text(text)
+        assert len(load_mesh(tmp_path / name).faces) == (2 if name[2:] in ("obj", "off") else 3)
+
+
+def mixed(indices):
+    head = ascii_ply(CORNERS, ["", ""]).partition("end_header\n")[0] + "end_header\n"
+    body = np.array([row.split() for row in CORNERS], "<f4").tobytes()
+    rows = b"".join(struct.pack(f"<B{len(row)}i", len(row), *row) for row in indices)
+    return head.replace("ascii", "binary_little_endian").encode() + body + rows
+
+
+def test_polygons_of_different_lengths(tmp_path):
+    """Such a file went to a native reader, which indices out of range killed."""
+    path = tmp_path / "a.ply"
+    path.write_bytes(mixed([[0, 1, 2], [0, 1, 2, 3]]))
+    mesh = load_mesh(path)
+    assert mesh.vertices[mesh.faces].tolist() == [
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        [[0, 0, 0], [0, 1, 0], [0, 0, 1]],
+    ]
+    for wrong in (2**31 - 1, -5):
+        path.write_bytes(mixed([[0, 1, 2], [0, 1, wrong, 3]]))
+        with pytest.raises(UserError, match=f"names vertex {wrong} of 4"):
+            load_mesh(path)
+    path.write_bytes(mixed([[0, 1], [0]]))
+    with pytest.raises(UserError, match="no faces"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "sub/../../secret.png", "link.png", "{folder}"])
+def test_textures_lie_in_the_folder(tmp_path, name):
+    inner = tmp_path / "inner"
+    (inner / "sub").mkdir(parents=True)
+    Image.new("RGB", (4, 4), (1, 2, 3)).save(tmp_path / "secret.png")
+    os.symlink(tmp_path / "secret.png", inner / "link.png")
+    name = name.format(folder=tmp_path / "secret.png")
+    mesh = load_mesh(write_quad(inner, mtl=MTL.replace("paint.png", name), texture=None))
+    assert mesh.materials[0].texture is None
+    assert any("not found" in line for line in mesh.warnings), mesh.warnings
+
+
+def test_what_is_no_picture_is_not_opened(tmp_path, monkeypatch):
+    def run(*_, **__):
+        raise AssertionError("another program was started")
+
+    monkeypatch.setattr("subprocess.check_call", run)
+    for name in ("paint.png", "paint.eps", "paint.mtl", "paint.bin"):
+        (tmp_path / name).write_bytes(POSTSCRIPT)
+        mtl = MTL.replace("paint.png", name) + f"map_d {name}\n"
+        mesh = load_mesh(write_quad(tmp_path, mtl=mtl, texture=None))
+        assert mesh.materials[0].texture is None
+        assert f"{name}: not a picture that can be read" in mesh.warnings
+    mesh = load_mesh(write_quad(tmp_path, mtl=MTL + "map_d paint.eps\n", texture="paint.png"))
+    assert mesh.materials[0].texture is not None
+    assert "paint.eps: not a picture that can be read" in mesh.warnings
+
+
+def test_sizes_beside_a_mesh_have_a_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(materials, "MAX_SIDE_FILE", 1000)
+    path = write_quad(tmp_path)
+    (tmp_path / "quad.mtl").write_text(MTL + "#" * 1000)
+    mesh = load_mesh(path)
+    assert any("quad.mtl: over" in line for line in mesh.warnings)
+    os.unlink(tmp_path / "quad.mtl")
+    os.mkfifo(tmp_path / "quad.mtl")  # reading one waits for ever
+    assert any("quad.mtl: not found" in line for line in load_mesh(path).warnings)
+
+
+def gltf(**changes):
+    points = np.eye(3, dtype="<f4").tobytes()
+    uri = "data:;base64," + base64.b64encode(points).decode()
+    return {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 0}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36, "uri": uri}],
+    } | changes
+
+
+ACCESSOR = gltf()["accessors"][0]
+DEEP = {"nodes": [{"mesh": 0, "extras": json.loads("[" * 500 + "]" * 500)}]}
+LIES = {
+    "beyond": ({"accessors": [ACCESSOR | {"byteOffset": 12}]}, "3 values of accessor 0"),
+    "negative": ({"accessors": [ACCESSOR | {"count": -1}]}, "count"),
+    "kind": ({"accessors": [ACCESSOR | {"componentType": 9}]}, "componentType"),
+    "no_view": ({"bufferViews": []}, "broken header"),
+    "view": ({"bufferViews": [{"buffer": 0, "byteLength": 36, "byteOffset": 4}]}, "view 0"),
+    "stride": ({"bufferViews": [{"buffer": 0, "byteLength": 36, "byteStride": 0}]}, "byteStride"),
+    "sparse": ({"accessors": [ACCESSOR | {"sparse": {"count": 1}}]}, "is sparse"),
+    "zeros": (
+        {
+            "accessors": [
+                ACCESSOR,
+                *[{**ACCESSOR, "bufferView": None, "count": MAX_ZEROS // 36}] * 9,
+            ]
+        },
+        "accessor 4",
+    ),
+    "lists": ({"accessors": {}}, "array"),
+    "deep": (DEEP, "nested"),
+    "outside": ({"buffers": [{"byteLength": 36, "uri": "../secret.bin"}]}, "not found"),
+    "short": ({"buffers": [{"byteLength": 36, "uri": "data:;base64,AAAA"}]}, "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_gltf_that_lies(tmp_path, name):
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    (tmp_path / "secret.bin").write_bytes(np.eye(3, dtype="<f4").tobytes())
+    path = folder / "a.gltf"
+    path.write_text(json.dumps(gltf()))
+    assert len(load_mesh(path).faces) == 1
+    changes, reason = LIES[name]
+    path.write_text(json.dumps(gltf(**changes)))
+    with pytest.raises(UserError) as caught:
+        load_mesh(path)
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_scene_that_repeats_a_part_too_often(tmp_path, monkeypatch):
+    nodes = [{"mesh": 0}] * 50
+    changes = {"nodes": nodes, "scenes": [{"nodes": list(range(50))}]}
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(gltf(**changes)))
+    assert len(load_mesh(path).faces) == 50
+    monkeypatch.setattr("gamba_warp.formats.meshes.MAX_PARTS", 100)
+    with pytest.raises(UserError, match="over 100 vertices and faces"):
+        load_mesh(path)
+
+
+def test_embedded_pictures_are_of_few_formats(tmp_path):
+    box = trimesh.creation.box()
+    pixels = io.BytesIO()
+    Image.new("RGB", (4, 4), (9, 9, 9)).save(pixels, "PNG")
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.open(io.BytesIO(pixels.getvalue()))
+    )
+    box.visual = trimesh.visual.TextureVisuals(np.zeros((len(box.vertices), 2)), material)
+    path = tmp_path / "a.glb"
+    box.export(path)
+    assert load_mesh(path).materials[0].texture is not None
+    content = path.read_bytes()
+    start = content.index(b"\x89PNG")
+    path.write_bytes(content[:start] + POSTSCRIPT[:60] + content[start + 60 :])
+    assert load_mesh(path).materials[0].texture is None
