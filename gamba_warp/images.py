@@ -1,7 +1,16 @@
-"""Reading and writing pictures; any common file becomes float RGBA, and errors name the file."""
+"""Reading and writing pictures; any common file becomes RGBA, and errors name the file.
 
-from collections.abc import Sequence
+Every picture of a stranger is opened by ``open_picture``: few formats, bounded before decoding.
+"""
+
+import os
+import stat
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -10,58 +19,206 @@ from .errors import UserError
 from .files import atomic_path
 
 MAX_PIXELS = 64 * 1024 * 1024
+MAX_SIDE = 32_768  # pixels; panoramas are shorter, and what pads to a square stays possible
+# Pillow knows thirty more; one of them (EPS) starts another program, and none is a photo's.
+# JPEG stands for MPO too.
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM")
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
 
+_COUNTED = 16 << 20  # bytes of a file whose frames are counted, which reads all of it
+_BAND = 1 << 22  # pixels that are converted at once
+_ORIENTATION = 0x0112  # of EXIF
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+_QUIET = threading.Lock()  # the filters of warnings belong to the process
 
-def load_rgba(path: str | Path) -> np.ndarray:
+
+@contextmanager
+def open_picture(
+    source: str | Path | BinaryIO,
+    name: object = None,
+    max_pixels: int = MAX_PIXELS,
+    formats: Sequence[str] = FORMATS,
+) -> Iterator[Image.Image]:
+    """Opens a picture whose size is checked before anything is decoded.
+
+    Whatever a decoder raises inside the ``with`` block becomes one line as well.
+
+    Args:
+        source: path, or a binary file that can seek.
+        name: what to call it in an error; the path, if not given.
+        max_pixels: largest width times height.
+        formats: names of Pillow's formats; nothing else is looked at, whatever the file's suffix.
+
+    Yields:
+        The picture, not decoded yet. EXIF rotation is not applied.
+
+    Raises:
+        UserError: it is missing, empty, no plain file, not a picture of these formats, larger than
+            ``max_pixels`` or ``MAX_SIDE``, or damaged.
+    """
+    name = source if name is None else name
+    if isinstance(source, (str, Path)):
+        _check_file(source, name)
+    try:
+        with _without_warnings():
+            image = Image.open(source, formats=tuple(formats))
+        with image:
+            check_size(image.width, image.height, name, max_pixels)
+            yield image
+    except UserError:
+        raise
+    except UnidentifiedImageError as error:
+        raise UserError(f"{name}: not a picture that can be read") from error
+    except Image.DecompressionBombError as error:
+        raise UserError(f"{name}: is over {max_pixels >> 20} megapixels") from error
+    except Exception as error:  # decoders raise errors of nearly any type on damaged files
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise UserError(f"{name}: cannot be decoded ({reason})") from error
+
+
+def check_size(width: int, height: int, name: object, max_pixels: int = MAX_PIXELS) -> None:
+    """Refuses a picture that is larger than ``max_pixels``, or longer than ``MAX_SIDE``.
+
+    Raises:
+        UserError: it is; the message begins with ``name``.
+    """
+    if width * height > max_pixels:
+        raise UserError(f"{name}: {width}x{height} is over {max_pixels >> 20} megapixels")
+    if max(width, height) > MAX_SIDE:
+        raise UserError(f"{name}: {width}x{height} is over {MAX_SIDE} pixels long")
+
+
+def _check_file(path: str | Path, name: object) -> None:
+    try:
+        found = os.stat(path)
+    except FileNotFoundError as error:
+        raise UserError(f"{name}: no such file") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise UserError(f"{name}: {getattr(error, 'strerror', None) or error}") from error
+    if stat.S_ISDIR(found.st_mode):
+        raise UserError(f"{name}: is a folder, not a picture")
+    if not stat.S_ISREG(found.st_mode):
+        raise UserError(f"{name}: not a plain file")
+    if found.st_size == 0:
+        raise UserError(f"{name}: the file is empty")
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Keeps Pillow's warnings of odd headers and of size to itself: the size is checked here."""
+    with _QUIET, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def load_rgba(path: str | Path, longest: int | None = None) -> np.ndarray:
     """Reads one still picture.
 
     Grey, palette, RGB and RGBA files of 8 and 16 bits are converted, and EXIF rotation is applied.
+
+    Args:
+        path: the file.
+        longest: pixels; a picture that is at least four times as long is reduced by a whole
+            factor, weighted by alpha, to no less than twice this. None keeps its size.
 
     Returns:
         ``[H, W, 4]`` float32 in [0, 1], colour not premultiplied; alpha 1 where the file has none.
 
     Raises:
-        UserError: the file is missing, empty, not a picture, truncated, animated or over 64
-            megapixels.
+        UserError: the file is missing, empty, not a picture, truncated, animated or too large.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise UserError(f"{path}: is a folder, not a picture")
-    if not path.exists():
-        raise UserError(f"{path}: no such file")
+    with _still(path) as image:
+        factor = 1 if longest is None else max(image.size) // (2 * longest)
+        return _to_rgba(_upright(_reduced(image, factor)), np.float32)
+
+
+def load_rgba8(path: str | Path) -> np.ndarray:
+    """As ``load_rgba``, but ``[H, W, 4]`` uint8, a quarter of the memory."""
+    with _still(path) as image:
+        return _to_rgba(_upright(image), np.uint8)
+
+
+def picture_size(path: str | Path) -> tuple[int, int]:
+    """Width and height of a still picture after EXIF rotation; its pixels need not be sound.
+
+    Raises:
+        UserError: as ``load_rgba``, but for damaged pixels.
+    """
+    with _still(path) as image:
+        width, height = image.size
+        return (height, width) if _orientation(image) >= 5 else (width, height)
+
+
+@contextmanager
+def _still(path: str | Path) -> Iterator[Image.Image]:
+    with open_picture(path, max_pixels=MAX_PIXELS) as image:
+        # An MPO is a phone's JPEG, followed by a preview or a depth map.
+        if image.format != "MPO" and getattr(image, "is_animated", False):
+            small = os.path.getsize(path) <= _COUNTED
+            frames = getattr(image, "n_frames", 1) if small else "many"
+            raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
+        yield image
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF's orientation, 1 to 8; 1 (upright) where EXIF is absurd, for the picture is not."""
     try:
-        if path.stat().st_size == 0:
-            raise UserError(f"{path}: the file is empty")
-        with Image.open(path) as image:
-            # An MPO is a phone's JPEG, followed by a preview or a depth map.
-            frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
-            if frames > 1:
-                raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
-            if image.width * image.height > MAX_PIXELS:
-                raise UserError(f"{path}: {image.width}x{image.height} is over 64 megapixels")
-            return _to_rgba(image)
-    except UserError:
-        raise
-    except UnidentifiedImageError as error:
-        raise UserError(f"{path}: not a picture that can be read") from error
-    except Exception as error:  # decoders raise errors of nearly any type on damaged files
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise UserError(f"{path}: cannot be decoded ({reason})") from error
+        with _without_warnings():
+            value = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # the reader of EXIF has as many kinds of errors as the decoders
+        return 1
+    return value if value in _UPRIGHT else 1
 
 
-def _to_rgba(image: Image.Image) -> np.ndarray:
-    from PIL import ImageOps
+def _upright(image: Image.Image) -> Image.Image:
+    orientation = _orientation(image)
+    if orientation not in _UPRIGHT:
+        return image
+    turned = image.transpose(_UPRIGHT[orientation])
+    image.close()  # two large pictures are too much beside the floats
+    return turned
 
-    image = ImageOps.exif_transpose(image)
-    if image.mode.startswith(("I", "F")):  # 16-bit grey (PIL reads 16-bit colour as 8-bit)
-        grey = np.asarray(image, dtype=np.float32)
-        top = 65535.0
-        if image.mode == "F":
-            top = max(1.0, float(grey.max(where=np.isfinite(grey), initial=0.0)))
-        grey = np.clip(np.nan_to_num(grey) / top, 0.0, 1.0)
-        return np.dstack([grey, grey, grey, np.ones_like(grey)])
-    return np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+
+def _reduced(image: Image.Image, factor: int) -> Image.Image:
+    if factor <= 1:
+        return image
+    if image.mode != "F":
+        image = image.convert("I" if image.mode.startswith("I") else "RGBA")
+    return image.reduce(factor)
+
+
+def _to_rgba(image: Image.Image, dtype: type) -> np.ndarray:
+    """``[H, W, 4]`` float32 in [0, 1] or uint8, made in bands, since floats take the most room."""
+    out = np.empty((image.height, image.width, 4), dtype)
+    grey, top = image.mode.startswith(("I", "F")), 65535.0  # PIL reads 16-bit colour as 8-bit
+    rows = max(1, _BAND // image.width)
+    starts = range(0, image.height, rows)
+    bands = ((0, y, image.width, min(y + rows, image.height)) for y in starts)
+    if image.mode == "F":
+        values = np.asarray(image, dtype=np.float32)
+        top = max(1.0, float(values.max(where=np.isfinite(values), initial=0.0)))
+        del values
+    for box in bands:
+        band, part = image.crop(box), out[box[1] : box[3]]
+        if grey:
+            values = np.clip(np.nan_to_num(np.asarray(band, dtype=np.float32)) / top, 0.0, 1.0)
+            part[..., :3] = (
+                values[..., None] if dtype == np.float32 else to_uint8(values)[..., None]
+            )
+            part[..., 3] = 1.0 if dtype == np.float32 else 255
+        elif dtype == np.float32:
+            np.divide(np.asarray(band.convert("RGBA")), np.float32(255.0), out=part)
+        else:
+            part[...] = np.asarray(band.convert("RGBA"))
+    return out
 
 
 def over_background(rgba, background):
@@ -113,7 +270,7 @@ def find_pictures(images: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, 
             pictures[path] = None
             continue
         try:
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+            inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() in PICTURE_SUFFIXES)
         except OSError as error:
             failures.append((path, error.strerror))
             continue

@@ -7,6 +7,7 @@ needs no saved state, and a resumed run goes on with the very same batches.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,9 +22,12 @@ from gamba_warp.errors import UserError
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.posing import posed_input, relative_cameras
 
-from .config import TrainConfig
+from .config import DataConfig, TrainConfig
+from .data.augment import Change, draw_change
 
-_TRIES = 8  # objects tried one after the other until one can be read
+_TRIES = 100  # objects tried one after the other until one can be read
+# What a bad object may raise; the last three are torch's and numpy's.
+_BAD_OBJECT = (UserError, OSError, MemoryError, RuntimeError, ValueError, ArithmeticError)
 # With --overfit all views share the network's one pass, and rendering them is cheap beside it.
 _OVERFIT_VIEWS = 9
 
@@ -34,7 +38,8 @@ class Batch:
 
     Attributes:
         uids: names of the objects, B.
-        inputs: ``[B, h, w, 3]`` RGB in [0, 1] on the model's background.
+        inputs: ``[B, h, w, 3]`` RGB in [0, 1] on the model's background, or RGBA ``[B, h, w, 4]``
+            where the model takes alpha.
         input_cameras: ``[B]``, in the model's world.
         targets: ``[B, V+1, H, W, 4]`` RGBA in [0, 1], straight alpha.
         cameras: ``[B, V+1]``.
@@ -69,6 +74,7 @@ def load_sample(
     size: int,
     config: GambaConfig,
     background: Tensor,
+    change: Change | None = None,
 ) -> Batch:
     """Loads one object as a batch of one; ``views[0]`` is the input view.
 
@@ -81,6 +87,7 @@ def load_sample(
         size: side of the pictures to match, pixels.
         config: the model's configuration.
         background: RGB ``[3]``.
+        change: what is done with the views first; None: nothing.
 
     Raises:
         UserError: the object cannot be read or its pictures are not square.
@@ -89,6 +96,8 @@ def load_sample(
     source = target
     if size != config.image_size:
         source = dataset.load(index, views[:1], config.image_size)
+    if change is not None:
+        target, source = change(target), change(source)
     for cameras in (target.cameras, source.cameras):
         if cameras.width != cameras.height:
             sides = f"{cameras.width}x{cameras.height}"
@@ -142,6 +151,11 @@ def choose_views(
     return [first, *(others[i % len(others)] for i in range(novel))]
 
 
+def reason_of(error: Exception) -> str:
+    """What an error says, in one line."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 class BatchSource:
     """Draws batches by their number (see the module's docstring)."""
 
@@ -152,15 +166,14 @@ class BatchSource:
         *,
         objects: list[int],
         batch_size: int,
-        size: int,
         reference: int | None,
-        background: str,
+        views: DataConfig,
         seed: int,
     ) -> None:
         """``batch_size`` is that of all processes together; ``objects`` may repeat an index."""
-        self.dataset, self.config = dataset, config
-        self.objects, self.batch_size, self.size = objects, batch_size, size
-        self.reference, self.background, self.seed = reference, background, seed
+        self.dataset, self.config, self.views = dataset, config, views
+        self.objects, self.batch_size, self.size = objects, batch_size, views.size
+        self.reference, self.background, self.seed = reference, views.background, seed
         self.failures: dict[str, str] = {}
 
     def _object(self, number: int) -> int:
@@ -175,21 +188,40 @@ class BatchSource:
         An object that cannot be read is recorded in ``failures``, and the next one is taken.
 
         Raises:
-            UserError: several objects in a row cannot be read.
+            UserError: more than half of the objects, or 100 in a row, cannot be read.
         """
         rng = np.random.default_rng([self.seed, 2, number])
         background = torch.ones(3) if self.background == "white" else torch.zeros(3)
         if self.background == "random":
             background = torch.from_numpy(rng.random(3, dtype=np.float32))
+        # From a source of its own, so that runs without changes stay what they were.
+        chance = np.random.default_rng([self.seed, 3, number])
+        reference = self.reference
+        if reference is None and chance.random() < self.views.front_share:
+            reference = 0
+        change = None
+        if self.views.mirror or self.views.recolor:
+            change = draw_change(chance, self.views.mirror, self.views.recolor)
         for attempt in range(_TRIES):
             index = self._object(number + attempt)
             try:
                 count = self.dataset.num_views(index)
-                views = choose_views(count, novel, self.reference, rng)
-                return load_sample(self.dataset, index, views, self.size, self.config, background)
-            except UserError as error:
-                self.failures[self.dataset.uids[index]] = reason = str(error)
+                views = choose_views(count, novel, reference, rng)
+                return load_sample(
+                    self.dataset, index, views, self.size, self.config, background, change
+                )
+            except _BAD_OBJECT as error:
+                reason = self._note(index, error)
         raise UserError(f"{_TRIES} objects in a row cannot be read; the last: {reason}")
+
+    def _note(self, index: int, error: Exception) -> str:
+        """Records a failure; raises UserError where too many objects have failed."""
+        reason = reason_of(error)
+        self.failures[self.dataset.uids[index]] = reason
+        bad, all_objects = len(self.failures), len(set(self.objects))
+        if bad > all_objects / 2:
+            raise UserError(f"{bad} of {all_objects} objects cannot be read; the last: {reason}")
+        return reason
 
     def batch(self, number: int, novel: int, rank: int = 0, size: int = 1) -> Batch:
         """Loads the part of the ``number``-th batch that process ``rank`` of ``size`` works on."""
@@ -225,20 +257,24 @@ def fixed_batches(
     objects: list[int],
     novel: int | None,
     size: int,
+    failures: dict[str, str],
 ) -> Iterator[Batch]:
     """Yields the batches of a validation, one object each, always the same views, on white.
 
-    View 0 is the input; ``novel`` others follow, evenly spaced in the list (None: all).
-
-    Raises:
-        UserError: an object cannot be read.
+    View 0 is the input; ``novel`` others follow, evenly spaced in the list (None: all). An object
+    that cannot be read is passed over, with its reason in ``failures``.
     """
     for index in objects:
-        count = dataset.num_views(index)
-        others = list(range(1, count))
-        if novel is not None and novel < len(others):
-            others = [others[i * len(others) // novel] for i in range(novel)]
-        yield load_sample(dataset, index, [0, *others], size, config, torch.ones(3))
+        try:
+            count = dataset.num_views(index)
+            others = list(range(1, count))
+            if novel is not None and novel < len(others):
+                others = [others[i * len(others) // novel] for i in range(novel)]
+            batch = load_sample(dataset, index, [0, *others], size, config, torch.ones(3))
+        except _BAD_OBJECT as error:
+            failures[dataset.uids[index]] = reason_of(error)
+            continue
+        yield batch
 
 
 @dataclass(frozen=True)
@@ -271,7 +307,7 @@ class TrainingData:
     def fingerprint(self) -> str:
         """A hash of the objects' names in their order; a run with another list is another run."""
         names = "\n".join(self.train.uids[i] for i in self.objects)
-        return hashlib.sha256(names.encode()).hexdigest()[:16]
+        return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
 def open_data(config: TrainConfig) -> TrainingData:

@@ -12,10 +12,12 @@ from typing import Annotated, Any
 import tyro
 
 from gamba_warp.errors import UserError
+from gamba_warp.untrusted.ranges import ranged
 
 from .options import ViewsOptions
 
 
+@ranged
 def eval_views_command(
     options: Annotated[ViewsOptions, tyro.conf.arg(name="")],
     json: bool = False,

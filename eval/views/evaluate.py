@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gamba_warp.files import atomic_path, output_folder
+from gamba_warp.files import output_folder, write_text
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 from gamba_warp.versions import __version__, installed
@@ -38,16 +39,16 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
         UserError: something cannot be opened or written.
     """
     job, folder = open_job(options), options.out
-    if folder:
-        (folder / "contact_sheet.png").unlink(missing_ok=True)  # that of an earlier run
     objects, interrupted = evaluate(job, options)
     report = report_of(job, options.data, objects) | {"interrupted": interrupted}
     if folder:
         save_report(report, folder)
-        with atomic_path(folder / "table.md") as temporary:
-            temporary.write_text(page(report))
-        if options.sheet and report["num_ok"] and not interrupted:
-            contact_sheet(folder / "contact_sheet.png", sheet_rows(job, objects, options.sheet))
+        write_text(folder / "table.md", page(report))
+        wanted = options.sheet and report["num_ok"] and not interrupted
+        if wanted and (rows := sheet_rows(job, objects, options.sheet)):
+            contact_sheet(folder / "contact_sheet.png", rows)
+        else:
+            (folder / "contact_sheet.png").unlink(missing_ok=True)  # that of an earlier run
     return report
 
 
@@ -55,7 +56,7 @@ def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
     """Writes rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
     rows = choose_views(len(rgb), 0, count)
     strips = [torch.cat([truth.rgb[0], rgb[row], truth.rgb[row]], 1) for row in rows]
-    path.parent.mkdir(parents=True, exist_ok=True)
+    output_folder(path.parent)
     save_image(path, torch.cat(strips, 0).cpu().numpy())
 
 
@@ -156,8 +157,11 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
     rows = []
     for rank, group in choose_ranks(len(done), each).items():
         record = done[rank]
-        truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
-        rgb, _ = render_views(job.predict(truth), truth.cameras)
+        try:
+            truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
+            rgb, _ = render_views(job.predict(truth), truth.cameras)
+        except ERRORS:  # a file that went bad meanwhile; the report has what it was
+            continue
         views = choose_views(len(rgb), 0, SHEET_VIEWS + 1)[1:]
         lines = [record["name"], f"{group}: {rank + 1} of {len(done)}"]
         for kind, values in (("novel", record), ("input", record["input"])):
@@ -195,7 +199,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         "source": job.predictions.source,
         "data": data.name,
         "uids": job.uids,
-        "uids_sha256": hashlib.sha256("\n".join(job.uids).encode()).hexdigest(),
+        "uids_sha256": hashlib.sha256(os.fsencode("\n".join(job.uids))).hexdigest(),
         "baselines": {name: MEANING[name] for name in job.baselines},
         "contact_sheet": RULE,
     }

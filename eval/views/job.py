@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gamba_warp.batch import check_not_read
 from gamba_warp.data.dataset import ViewDataset, open_dataset
 from gamba_warp.data.vgg_weights import FETCH, lpips_available
 from gamba_warp.devices import pick_device
@@ -22,7 +23,7 @@ from .options import ViewsOptions
 from .predictions import Predictions, open_predictions
 
 # errors that are the failure of one object and stop no other
-ERRORS = (UserError, ValueError, RuntimeError, ArithmeticError)
+ERRORS = (UserError, OSError, MemoryError, ValueError, RuntimeError, ArithmeticError)
 
 
 @dataclass
@@ -82,12 +83,14 @@ def open_job(options: ViewsOptions) -> Job:
     device = str(pick_device(options.device))
     dataset = open_dataset(options.data, options.split)
     uids = choose_objects(dataset.uids, (), options.limit)
+    _check_outputs(options, uids)
     predictions = open_predictions(
         options.checkpoint, options.distance, device, options.encoder_weights
     )
     network, reason = _lpips_or_reason(options.lpips, device)
     protocol = ViewsProtocol(
         split=options.split,
+        split_version=dataset.split_version,
         reference=options.reference,
         views=options.views,
         size=options.size,
@@ -113,6 +116,17 @@ def open_job(options: ViewsOptions) -> Job:
     if ceiling is not None:
         job.baselines["ceiling"] = ceiling
     return job
+
+
+def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
+    """Raises UserError where a file of this evaluation would replace one that it reads."""
+    if options.out is None:
+        return
+    targets = [options.out / "strips" / f"{uid}.png" for uid in uids[: options.strips]]
+    if options.save_gaussians:
+        targets += [options.out / "gaussians" / f"{uid}.ply" for uid in uids]
+    predicted = [options.checkpoint / f"{uid}.ply" for uid in uids]
+    check_not_read(targets, [*predicted, *(options.data / uid for uid in uids)])
 
 
 def _lpips_or_reason(wanted: bool, device: str) -> tuple[LPIPS | None, str | None]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
 
 from gamba_warp.conventions import DEFAULT_DISTANCE, DeviceChoice
 from gamba_warp.errors import UserError
-from gamba_warp.fitting.config import FitConfig
+from gamba_warp.fitting.config import FitConfig, Steps
+from gamba_warp.untrusted.ranges import check_options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,13 +27,13 @@ class ViewsOptions:
     prediction | truth); without it the table is printed and that is all."""
     split: Literal["all", "train", "val", "test"] = "test"
     """Split of the dataset."""
-    reference: int = 0
+    reference: Annotated[int, Meta(ge=0, le=100_000)] = 0
     """Index of the input view."""
-    views: int | None = None
+    views: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     """Number of views of an object, input included, evenly spaced; all by default."""
-    size: int | None = None
+    size: Annotated[int, Meta(ge=16, le=4096)] | None = None
     """Height of the pictures compared; the files' own by default."""
-    limit: int | None = None
+    limit: Annotated[int, Meta(ge=1)] | None = None
     """Only so many objects, evenly spaced in the order of names."""
     baselines: bool = True
     """Also score an empty picture, a copy of the input, the input as a billboard, and the nearest
@@ -39,18 +41,18 @@ class ViewsOptions:
     ceiling: str | None = None
     """Also score Gaussians fitted to all views: of so many objects (18 s each on two cores, kept in
     OUT/ceiling), or those in a folder that gamba fit wrote."""
-    ceiling_steps: int = FitConfig.steps
+    ceiling_steps: Steps = FitConfig.steps
     """Steps of each fit."""
     lpips: bool = True
     """LPIPS where its weights are there (gamba weights lpips)."""
-    strips: int = 8
+    strips: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
     """Comparison pictures for the first so many objects."""
-    sheet: int = 2
+    sheet: Annotated[int, Meta(ge=0, le=100)] = 2
     """So many best, median and worst objects in the contact sheet; 0 for none."""
     save_gaussians: bool = False
     """Also write OUT/gaussians/NAME.ply, in the input camera's world (eval-geometry --frame
     reference reads them)."""
-    distance: float = DEFAULT_DISTANCE
+    distance: Annotated[float, Meta(ge=0.01, le=1000)] = DEFAULT_DISTANCE
     """Distance of the input camera, for .ply files; a checkpoint states its own."""
     encoder_weights: Path | None = None
     """The image encoder's file, for a checkpoint that does not hold it."""
@@ -63,13 +65,6 @@ class ViewsOptions:
         Raises:
             UserError: a number is out of its range; the message names the option.
         """
-        least = {"views": 1, "size": 16, "limit": 1, "sheet": 0, "ceiling_steps": 1}
-        for name, bound in least.items():
-            value = getattr(self, name)
-            if value is not None and value < bound:
-                option = name.replace("_", "-")
-                raise UserError(f"--{option} {value}: must be at least {bound}")
-        if not (math.isfinite(self.distance) and self.distance > 0):
-            raise UserError(f"--distance {self.distance}: must be above 0")
+        check_options(self)
         if self.save_gaussians and self.out is None:
             raise UserError("--save-gaussians: needs --out")

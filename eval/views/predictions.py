@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
-from gamba_warp.files import sha256
+from gamba_warp.files import sha256, visible
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.checkpoint import FILE_NAME, load_model
@@ -49,8 +50,12 @@ class PlyPredictions(Predictions):
     def __init__(self, folder: Path, distance: float, device: str) -> None:
         self.folder, self.distance, self.device = folder, distance, device
         digest = hashlib.sha256()
-        for path in sorted(folder.rglob("*.ply")):
-            digest.update(f"{path.relative_to(folder).as_posix()} {sha256(path)}\n".encode())
+        for path in sorted(visible(folder, "*.ply")):
+            try:
+                content = sha256(path)
+            except UserError:  # its object fails by itself, the others are evaluated
+                content = "unreadable"
+            digest.update(os.fsencode(f"{path.relative_to(folder).as_posix()} {content}\n"))
         self.source = {"kind": "ply", "path": folder.name, "sha256": digest.hexdigest()}
 
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
@@ -92,7 +97,7 @@ def open_predictions(
     """
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint or folder of .ply files")
-    if path.is_dir() and next(path.rglob("*.ply"), None) is not None:
+    if path.is_dir() and next(visible(path, "*.ply"), None) is not None:
         return PlyPredictions(path, distance, device)
     if path.is_dir() and next(path.glob("*.safetensors"), None) is None:
         raise UserError(f"{path}: holds neither .ply files nor a checkpoint")

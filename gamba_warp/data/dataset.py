@@ -7,10 +7,12 @@ Layouts are described in ``layouts.py``. ``split.json`` in the root names the ui
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import torch
 from PIL import Image
@@ -19,11 +21,13 @@ from torch import Tensor
 from ..cameras import Cameras, from_opengl
 from ..errors import UserError
 from ..files import write_json
-from ..images import load_rgba, to_uint8
-from .layouts import LAYOUTS, ObjectFiles, find_objects, read_json
+from ..images import check_size, load_rgba8, open_picture
+from ..untrusted.documents import read_document
+from .layouts import LAYOUTS, ObjectFiles, find_objects
 
 SPLITS = ("train", "val", "test")
-SPLIT_VERSION = 1
+SPLIT_VERSION = 2  # of what is written; 1 had fewer objects in one group
+MAX_LOADED = 128 << 20  # pixels of all views of an object that are loaded together: 2 GB
 
 
 @dataclass
@@ -49,7 +53,8 @@ class ObjectViews:
 
 def split_of(key: str) -> str:
     """Returns the split (train 80 %, val 10 %, test 10 %) by the hash of a uid or of its group."""
-    part = int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "big") % 100
+    digest = hashlib.sha256(key.encode(errors="surrogatepass")).digest()
+    part = int.from_bytes(digest[:8], "big") % 100
     return "train" if part < 80 else "val" if part < 90 else "test"
 
 
@@ -67,23 +72,29 @@ def write_split(folder: str | Path, groups: Mapping[str, str]) -> None:
     write_json(Path(folder) / "split.json", {"version": SPLIT_VERSION, **parts})
 
 
-def _read_split(root: Path) -> dict[str, str]:
-    """Reads the split of each uid that ``split.json`` states; without the file there is none."""
+class _Split(msgspec.Struct):
+    """What ``split.json`` holds: the uids of each part; those that are not there do no harm."""
+
+    version: int | None = None
+    train: list[str | int] = []
+    val: list[str | int] = []
+    test: list[str | int] = []
+
+
+def _read_split(root: Path) -> tuple[int, dict[str, str]]:
+    """The version of ``split.json``, and what it states of each uid; without the file nothing."""
     path = root / "split.json"
     if not path.exists():
-        return {}
-    parts = read_json(path)
-    if parts.get("version") != SPLIT_VERSION:
-        raise UserError(f"{path}: version {parts.get('version')!r}, expected {SPLIT_VERSION}")
+        return SPLIT_VERSION, {}
+    parts = read_document(path, _Split)
+    if parts.version not in (1, SPLIT_VERSION):
+        raise UserError(f"{path}: version {parts.version!r}, expected 1 or {SPLIT_VERSION}")
     chosen: dict[str, str] = {}
     for name in SPLITS:
-        uids = parts.get(name, [])
-        if not isinstance(uids, list):
-            raise UserError(f"{path}: {name} must be a list of uids")
-        for uid in uids:
+        for uid in getattr(parts, name):
             if chosen.setdefault(str(uid), name) != name:
                 raise UserError(f"{path}: {uid} is in both {chosen[uid]} and {name}")
-    return chosen
+    return parts.version, chosen
 
 
 def open_dataset(
@@ -116,12 +127,13 @@ def open_dataset(
         objects = {root.resolve().name: root}
     else:
         objects = {folder.relative_to(root).as_posix(): folder for folder in folders}
+    version = SPLIT_VERSION
     if split != "all":
-        stated = _read_split(root)
+        version, stated = _read_split(root)
         objects = {u: f for u, f in objects.items() if stated.get(u, split_of(u)) == split}
         if not objects:
             raise UserError(f"{root}: none of its {len(folders)} objects is in the {split} split")
-    return ViewDataset(objects, layout, cache)
+    return ViewDataset(objects, layout, cache, version)
 
 
 class ViewDataset:
@@ -130,11 +142,19 @@ class ViewDataset:
     Attributes:
         uids: names of the objects, which are their paths under the root, sorted.
         layout: layout of the folders.
+        split_version: version of the rule, or of the file, that made the split.
     """
 
-    def __init__(self, objects: dict[str, Path], layout: str, cache: bool) -> None:
+    def __init__(
+        self,
+        objects: dict[str, Path],
+        layout: str,
+        cache: bool,
+        split_version: int = SPLIT_VERSION,
+    ) -> None:
         self.uids = list(objects)
         self.layout = layout
+        self.split_version = split_version
         self._folders = objects
         self._files: dict[str, ObjectFiles] = {}
         # A path and a size give the picture, and the (width, height) of the file.
@@ -159,7 +179,11 @@ class ViewDataset:
         """
         uid = self._uid(index)
         if uid not in self._files:
-            self._files[uid] = LAYOUTS[self.layout][1](self._folders[uid])
+            try:
+                self._files[uid] = LAYOUTS[self.layout][1](self._folders[uid])
+            except OSError as error:  # of a folder; the readers name the file otherwise
+                place = error.filename or self._folders[uid]
+                raise UserError(f"{place}: {error.strerror or error}") from error
         return self._files[uid]
 
     def num_views(self, index: int | str) -> int:
@@ -173,7 +197,7 @@ class ViewDataset:
             try:
                 files = self.files(uid)
                 for path in files.images + (files.depths or []):
-                    if not path.exists():
+                    if not os.path.exists(path):  # never raises, whatever the name
                         raise UserError(f"{path}: no such file")
             except UserError as error:
                 bad[uid] = str(error)
@@ -204,26 +228,32 @@ class ViewDataset:
             raise UserError(f"{uid}: view {outside[0]} asked for, it has {len(files.images)}")
         if size is not None and size < 1:
             raise UserError(f"size {size}: must be at least 1")
-        pictures, Ks = zip(*(self._view(files, v, size) for v in wanted))
-        height, width = pictures[0].shape[:2]
-        for v, picture in zip(wanted, pictures):
-            if picture.shape[:2] != (height, width):
-                got = f"{picture.shape[1]}x{picture.shape[0]}"
-                raise UserError(
-                    f"{files.images[v]}: is {got}, the object's others {width}x{height}"
-                )
-        depths = None
-        if files.depths is not None:
-            maps = [_read_depth(files.depths[v], width, height) for v in wanted]
-            depths = torch.from_numpy(np.stack(maps)) * files.depth_unit
-        poses = torch.from_numpy(files.camera_to_world[wanted])
+        images: Tensor | None = None
+        depths: Tensor | None = None
+        Ks = np.empty((len(wanted), 3, 3))
+        for number, v in enumerate(wanted):
+            picture, Ks[number] = self._view(files, v, size)
+            height, width = picture.shape[:2]
+            if images is None:
+                _check_room(len(wanted), width, height, uid)
+                images = torch.empty(len(wanted), height, width, 4)
+                if files.depths is not None:
+                    depths = torch.empty(len(wanted), height, width)
+            if picture.shape != images.shape[1:]:
+                got, others = f"{width}x{height}", f"{images.shape[2]}x{images.shape[1]}"
+                raise UserError(f"{files.images[v]}: is {got}, the object's others {others}")
+            np.divide(picture, np.float32(255), out=images[number].numpy())
+            if depths is not None and files.depths is not None:
+                depth = _read_depth(files.depths[v], width, height)
+                np.multiply(depth, np.float32(files.depth_unit), out=depths[number].numpy())
+        assert images is not None  # there is at least one view
+        height, width = images.shape[1:3]
+        viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
         return ObjectViews(
             uid=uid,
             name=files.name or uid,
-            images=torch.from_numpy(np.stack(pictures)).float() / 255.0,
-            cameras=Cameras(
-                from_opengl(poses).float(), torch.from_numpy(np.stack(Ks)).float(), width, height
-            ),
+            images=images,
+            cameras=Cameras(viewmats, torch.from_numpy(Ks).float(), width, height),
             depths=depths,
             attribution=files.attribution,
         )
@@ -237,13 +267,13 @@ class ViewDataset:
         if self._pictures is not None and key in self._pictures:
             picture, original = self._pictures[key]
         else:
-            picture = to_uint8(load_rgba(path))
+            picture = load_rgba8(path)
             original = (picture.shape[1], picture.shape[0])
             stated = files.sizes[view]
             if stated is not None and stated != original:
                 got, want = (f"{w}x{h}" for w, h in (original, stated))
                 raise UserError(f"{path}: is {got}, but its cameras are for {want}")
-            picture = _resize(picture, size)
+            picture = _resize(picture, size, path)
             if self._pictures is not None:
                 self._pictures[key] = (picture, original)
         from_size = (1.0, 1.0) if files.sizes[view] is None else original
@@ -251,11 +281,21 @@ class ViewDataset:
         return picture, files.Ks[view] * np.array(factor)[:, None]
 
 
-def _resize(picture: np.ndarray, size: int | None) -> np.ndarray:
+def _check_room(count: int, width: int, height: int, uid: str) -> None:
+    """Refuses views that together have more pixels than are kept in memory at once."""
+    if count * width * height > MAX_LOADED:
+        raise UserError(
+            f"{uid}: {count} views of {width}x{height} are over {MAX_LOADED >> 20} megapixels; "
+            "ask for smaller pictures"
+        )
+
+
+def _resize(picture: np.ndarray, size: int | None, path: Path) -> np.ndarray:
     height, width = picture.shape[:2]
     if size is None or size == height:
         return picture
     new = (max(1, round(width * size / height)), size)
+    check_size(*new, f"{path}: at height {size}")
     # PIL premultiplies RGBA by itself, and its box filter is the exact area average.
     kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
     return np.asarray(Image.fromarray(picture).resize(new, kind))
@@ -263,14 +303,12 @@ def _resize(picture: np.ndarray, size: int | None) -> np.ndarray:
 
 def _read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """Reads depth ``[height, width]`` float32, in the steps of the file."""
-    try:
-        with Image.open(path) as image:
-            if len(image.getbands()) != 1:
-                raise UserError(f"{path}: has {len(image.getbands())} channels, depth has one")
-            if image.size != (width, height):
-                image = image.resize((width, height), Image.Resampling.NEAREST)
-            return np.asarray(image, dtype=np.float32)
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file") from error
-    except (OSError, SyntaxError, ValueError) as error:
-        raise UserError(f"{path}: cannot be decoded ({str(error).splitlines()[0]})") from error
+    with open_picture(path) as image:
+        if len(image.getbands()) != 1:
+            raise UserError(f"{path}: has {len(image.getbands())} channels, depth has one")
+        if image.size != (width, height):
+            image = image.resize((width, height), Image.Resampling.NEAREST)
+        values = np.asarray(image, dtype=np.float32)
+    if not np.isfinite(values).all() or values.min() < 0:
+        raise UserError(f"{path}: a depth is negative or not finite")
+    return values

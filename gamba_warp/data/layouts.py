@@ -12,19 +12,30 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import UserError
+from ..untrusted.arrays import read_array
+from ..untrusted.documents import read_document
+from ..untrusted.names import inside
 
 GOBJAVERSE = "campos_512_v4"
 GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON states no x_fov
+MAX_VIEWS = 10_000  # of an object
+MAX_SIDE = 16_384  # pixels that a camera may state
+NEAREST, FARTHEST = 1e-3, 1e4  # of a camera from the object's centre, as the file states it
+SHORTEST, LONGEST = 1e-2, 1e3  # focal lengths, in sides of the picture
+_LARGEST = 1e9  # of any number in a camera file
+_TEXT = 500  # letters of a name or of an attribution
+_DEPTH = 64  # folders within folders
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
@@ -53,18 +64,9 @@ class ObjectFiles:
     attribution: dict[str, str] = field(default_factory=dict)
 
 
-def read_json(path: Path) -> dict:
-    """Reads a JSON object.
-
-    Raises:
-        UserError: the file is missing, is not JSON, or holds no object.
-    """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:  # JSON and UTF-8 errors both
-        raise UserError(f"{path}: not valid JSON ({error})") from error
+def _read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object. Raises UserError where the file is bad or holds something else."""
+    value = read_document(path, object)
     if not isinstance(value, dict):
         raise UserError(f"{path}: expected a JSON object")
     return value
@@ -74,25 +76,60 @@ def _pose(value: object, source: str) -> np.ndarray:
     """Makes a ``[4, 4]`` camera-to-world matrix from 3x4 or 4x4 nested numbers, and checks it."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{source}: the pose is not a matrix of numbers") from error
     if matrix.shape not in ((3, 4), (4, 4)):
         raise UserError(f"{source}: the pose has shape {matrix.shape}, expected 3x4 or 4x4")
-    if not np.isfinite(matrix).all():
-        raise UserError(f"{source}: the pose is not finite")
+    if not (np.abs(matrix) <= _LARGEST).all():
+        raise UserError(f"{source}: the pose is not finite, or over {_LARGEST:g}")
     pose = np.eye(4)
     pose[:3] = matrix[:3]
     rotation = pose[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2) or np.linalg.det(rotation) < 0:
         raise UserError(f"{source}: the pose's 3x3 part is not a rotation")
+    if not NEAREST <= np.linalg.norm(pose[:3, 3]) <= FARTHEST:
+        raise UserError(
+            f"{source}: the camera is {np.linalg.norm(pose[:3, 3]):g} from the object's centre, "
+            f"expected {NEAREST:g} to {FARTHEST:g}"
+        )
     return pose
 
 
-def _number(values: dict, key: str, source: str) -> float:
+def _number(values: dict[str, Any], key: str, source: str) -> float:
     value = values[key]
-    if not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise UserError(f"{source}: {key} is {value!r}, expected a finite number")
+    if type(value) not in (int, float) or not abs(value) <= _LARGEST:  # a bool is no number
+        raise UserError(f"{source}: {key} is {repr(value)[:40]}, expected a finite number")
     return float(value)
+
+
+def _side(values: dict[str, Any], key: str, source: str) -> int:
+    value = _number(values, key, source)
+    if not 1 <= value <= MAX_SIDE or value != int(value):
+        raise UserError(f"{source}: {key} is {value:g}, expected whole pixels, 1 to {MAX_SIDE}")
+    return int(value)
+
+
+def _focal(angle: float, source: str) -> float:
+    """The focal length, in sides of the picture, of a field of view in radians."""
+    if not 0 < angle < math.pi:
+        raise UserError(f"{source}: a field of view of {angle:g} radians, expected 0 to pi")
+    return 0.5 / math.tan(angle / 2)
+
+
+def _checked(K: np.ndarray, width: float, height: float, source: str) -> np.ndarray:
+    """K ``[3, 3]``, whose focal lengths and principal point suit the picture's size."""
+    size = np.array([width, height])
+    focal, center = np.diag(K)[:2] / size, K[:2, 2] / size
+    if not (np.isfinite(K).all() and (focal > 0).all()):
+        raise UserError(f"{source}: focal lengths must be positive")
+    if not ((focal >= SHORTEST) & (focal <= LONGEST)).all():
+        raise UserError(
+            f"{source}: focal lengths of {focal[0]:g} and {focal[1]:g} sides of the picture, "
+            f"expected {SHORTEST:g} to {LONGEST:g}"
+        )
+    if not ((center >= -1) & (center <= 2)).all():
+        raise UserError(f"{source}: the principal point is far outside the picture")
+    return K
 
 
 def _intrinsics(frame: dict, top: dict, source: str) -> tuple[np.ndarray, tuple[int, int] | None]:
@@ -100,31 +137,30 @@ def _intrinsics(frame: dict, top: dict, source: str) -> tuple[np.ndarray, tuple[
     values = {**top, **frame}
     for key in ("k1", "k2", "k3", "p1", "p2"):
         if values.get(key):
-            raise UserError(f"{source}: {key} = {values[key]}: lens distortion is not supported")
+            value = repr(values[key])[:40]
+            raise UserError(f"{source}: {key} = {value}: lens distortion is not supported")
     sized = "w" in values and "h" in values
-    width = _number(values, "w", source) if sized else 1.0
-    height = _number(values, "h", source) if sized else 1.0
+    width = _side(values, "w", source) if sized else 1
+    height = _side(values, "h", source) if sized else 1
     if "fl_x" in values and sized:
         focal_x = _number(values, "fl_x", source)
         focal_y = _number(values, "fl_y", source) if "fl_y" in values else focal_x
     elif "camera_angle_x" in values:
-        focal_x = 0.5 * width / math.tan(_number(values, "camera_angle_x", source) / 2)
+        focal_x = width * _focal(_number(values, "camera_angle_x", source), source)
         focal_y = focal_x
     else:
         raise UserError(f"{source}: no camera: needs w, h, fl_x (fl_y, cx, cy), or camera_angle_x")
-    if min(width, height, focal_x, focal_y) <= 0:
-        raise UserError(f"{source}: width, height and focal lengths must be positive")
     center_x = _number(values, "cx", source) if sized and "cx" in values else width / 2
     center_y = _number(values, "cy", source) if sized and "cy" in values else height / 2
     K = np.array([[focal_x, 0, center_x], [0, focal_y, center_y], [0, 0, 1.0]])
-    return K, (int(width), int(height)) if sized else None
+    return _checked(K, width, height, source), (width, height) if sized else None
 
 
 def _picture(folder: Path, name: object, source: str) -> Path:
     """Finds the frame's file, of whose name Blender leaves the suffix out."""
     if not isinstance(name, str) or not name:
         raise UserError(f"{source}: no file_path")
-    path = folder / name
+    path = inside(folder, name, source)
     if path.suffix:
         return path
     found = [path.with_name(path.name + suffix) for suffix in PICTURES]
@@ -133,10 +169,11 @@ def _picture(folder: Path, name: object, source: str) -> Path:
 
 def _read_transforms(folder: Path) -> ObjectFiles:
     path = folder / "transforms.json"
-    top = read_json(path)
+    top = _read_json(path)
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: no frames")
+    _check_count(len(frames), path)
     images, depths, poses, Ks, sizes = [], [], [], [], []
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
@@ -148,72 +185,86 @@ def _read_transforms(folder: Path) -> ObjectFiles:
         Ks.append(K)
         sizes.append(size)
         if frame.get("depth_file_path"):
-            depths.append(folder / frame["depth_file_path"])
+            depths.append(inside(folder, frame["depth_file_path"], source))
+    for paths in (images, depths):
+        if repeated := next((p for p, n in Counter(paths).items() if n > 1), None):
+            raise UserError(f"{path}: two frames have the picture {repeated.name}")
+    depth_unit = _number({"depth_unit": 1e-3, **top}, "depth_unit", str(path))
+    if not 0 < depth_unit <= 1e3:
+        raise UserError(f"{path}: depth_unit is {depth_unit:g}, expected above 0, at most 1000")
     attribution = top.get("attribution") or {}
     if not isinstance(attribution, dict):
-        attribution = {"text": str(attribution)}
+        attribution = {"text": attribution}
     return ObjectFiles(
         images=images,
         camera_to_world=np.stack(poses),
         Ks=np.stack(Ks),
         sizes=sizes,
         depths=depths if len(depths) == len(frames) else None,
-        depth_unit=_number({"depth_unit": 1e-3, **top}, "depth_unit", str(path)),
-        name=str(top.get("name") or ""),
-        attribution={str(k): str(v) for k, v in attribution.items()},
+        depth_unit=depth_unit,
+        name=_text(top.get("name") or ""),
+        attribution={_text(k): _text(v) for k, v in attribution.items()},
     )
+
+
+def _text(value: object) -> str:
+    """One line for people, of whatever stands in a field."""
+    return " ".join(str(value).split())[:_TEXT]
+
+
+def _check_count(count: int, path: Path) -> None:
+    if count > MAX_VIEWS:
+        raise UserError(f"{path}: {count} views, at most {MAX_VIEWS} are read")
 
 
 def _read_gobjaverse(folder: Path) -> ObjectFiles:
     views = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
     if not views:
         raise UserError(f"{folder / GOBJAVERSE}: no views")
+    _check_count(len(views), folder)
     poses, Ks = [], []
     for view in views:
         path = view / f"{view.name}.json"
-        camera = read_json(path)
+        camera = _read_json(path)
         missing = [key for key in ("x", "y", "z", "origin") if key not in camera]
         if missing:
             raise UserError(f"{path}: no {', '.join(missing)}")
         axes = [camera["x"], camera["y"], camera["z"], camera["origin"]]
         if not all(isinstance(axis, list) and len(axis) == 3 for axis in axes):
             raise UserError(f"{path}: x, y, z and origin must be three numbers each")
-        pose = _pose(np.transpose(axes).tolist(), str(path))
+        pose = _pose(list(zip(*axes)), str(path))
         pose[:3, 1:3] *= -1  # OpenCV to OpenGL
         poses.append(pose)
         focal_x = focal_y = GOBJAVERSE_FOCAL
         if "x_fov" in camera:
-            focal_x = focal_y = 0.5 / math.tan(_number(camera, "x_fov", str(path)) / 2)
+            focal_x = focal_y = _focal(_number(camera, "x_fov", str(path)), str(path))
         if "y_fov" in camera:
-            focal_y = 0.5 / math.tan(_number(camera, "y_fov", str(path)) / 2)
-        Ks.append(np.array([[focal_x, 0, 0.5], [0, focal_y, 0.5], [0, 0, 1.0]]))
-    images = [view / f"{view.name}.png" for view in views]
+            focal_y = _focal(_number(camera, "y_fov", str(path)), str(path))
+        K = np.array([[focal_x, 0, 0.5], [0, focal_y, 0.5], [0, 0, 1.0]])
+        Ks.append(_checked(K, 1, 1, str(path)))
+    images = [inside(view, f"{view.name}.png", str(view)) for view in views]
     return ObjectFiles(images, np.stack(poses), np.stack(Ks), [None] * len(views))
 
 
-def _load_array(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path}: cannot be read ({error})") from error
-    if array.shape != shape or not np.isfinite(array).all():
-        raise UserError(f"{path}: expected {shape[0]}x{shape[1]} finite numbers, got {array.shape}")
-    return array.astype(np.float64)
-
-
 def _read_openlrm(folder: Path) -> ObjectFiles:
-    images = sorted((folder / "rgba").glob("*.png"))
-    if not images:
+    names = sorted(path.name for path in (folder / "rgba").glob("*.png"))
+    if not names:
         raise UserError(f"{folder / 'rgba'}: no views")
-    focal, center, size = _load_array(folder / "intrinsics.npy", (3, 2))
+    _check_count(len(names), folder)
+    images = [inside(folder, f"rgba/{name}", str(folder)) for name in names]
+    source = str(folder / "intrinsics.npy")
+    focal, center, size = read_array(folder / "intrinsics.npy", (3, 2))
+    values = {"width": float(size[0]), "height": float(size[1])}
+    width, height = (_side(values, key, source) for key in values)
     K = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1.0]])
+    K = _checked(K, width, height, source)
     poses = []
     for image in images:
         path = folder / "pose" / f"{image.stem}.npy"
-        pose = _pose(_load_array(path, (3, 4)), str(path))
+        pose = _pose(read_array(path, (3, 4)), str(path))
         pose[:3, 3] *= 0.5  # its objects fill a cube of side 2, ours of side 1
         poses.append(pose)
-    sizes = [(int(size[0]), int(size[1]))] * len(images)
+    sizes = [(width, height)] * len(images)
     return ObjectFiles(images, np.stack(poses), np.repeat(K[None], len(images), 0), sizes)
 
 
@@ -230,6 +281,9 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
 
     ``root`` itself may be an object. ``layout`` "auto" takes the layout of the first object found.
     Folders with a leading dot are passed over.
+
+    Raises:
+        UserError: the folders are nested too deep.
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
     found = []
@@ -242,6 +296,8 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
 
 def _walk(root: Path, marks: dict[str, str]) -> Iterator[tuple[str, Path]]:
     for folder, subfolders, files in os.walk(root):
+        if folder.count(os.sep) > str(root).count(os.sep) + _DEPTH:
+            raise UserError(f"{root}: its folders are nested deeper than {_DEPTH}")
         subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
         mark = next((m for m in marks if m in files or m in subfolders), None)
         if mark is not None:

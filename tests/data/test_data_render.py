@@ -1,23 +1,27 @@
 """Rendering of meshes to views: poses, pixels, light, resumed and sharded runs, and failures."""
 
 import json
+import os
 import shutil
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.children import murderous_object
 from helpers.meshes import MTL, QUAD, write_quad
 from PIL import Image
 
 from gamba_warp.cameras import from_opengl, intrinsics
 from gamba_warp.cli import run
-from gamba_warp.data.dataset import open_dataset
+from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
+from gamba_warp.files import PART
 from gamba_warp.formats.meshes import load_mesh, to_linear
+from gamba_warp.train.data import render
+from gamba_warp.train.data.catalogue import find_meshes
 from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses
 from gamba_warp.train.data.raycast import Lights, RayCaster
-from gamba_warp.train.data.render import find_meshes
 from gamba_warp.train.data.render_command import data_render_command
 
 FOV = 49.1
@@ -220,8 +224,11 @@ def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
     before = contents(out)
     times = {name: (out / name / "000.webp").stat().st_mtime_ns for name in ("a", "sub-c")}
     shutil.rmtree(out / "b")
-    (out / ".b.part").mkdir()  # as a killed run leaves it
-    (out / ".b.part" / "000.webp").write_bytes(b"half")
+    part = out / f"{PART}abcd1234"  # as a run leaves it that was killed two days ago
+    part.mkdir()
+    (part / "000.webp").write_bytes(b"half")
+    for path in (part / "000.webp", part):
+        os.utime(path, (path.stat().st_mtime - 2 * 86400,) * 2)
     assert len(open_dataset(out)) == 2
     assert data_render_command(meshes, out, **options) == 0
     assert "2 of 3 objects are already" in capsys.readouterr().out
@@ -268,6 +275,14 @@ def test_catalogue_names_and_groups(meshes, tmp_path):
     np.testing.assert_allclose(np.array(stored["applied_transform"])[:, :3], entry["rotation"])
     parts = json.loads((out / "split.json").read_text())
     assert sum({"box-1", "box-2"} <= set(parts[name]) for name in ("train", "val", "test")) == 1
+    # A catalogue with better groups needs no new pictures.
+    better = {"objects": [{**entry, "group": "g5"}, {**twin, "group": "g3"}]}
+    (meshes / "catalogue.json").write_text(json.dumps(better))
+    data_render_command(meshes, out, views=1, size=16, workers=1, format="png")
+    parts = json.loads((out / "split.json").read_text())
+    assert parts["version"] == 2
+    assert [split_of(group) for group in ("g5", "g3")] == ["test", "train"]
+    assert "box-1" in parts["test"] and "box-2" in parts["train"]
 
 
 def test_uids_of_paths(tmp_path):
@@ -289,6 +304,11 @@ def test_uids_of_paths(tmp_path):
         ({"size": 4}, "--size 4"),
         ({"fov": 180.0}, "--fov 180"),
         ({"limit": 0}, "--limit 0"),
+        ({"seed": -1}, "--seed -1"),
+        ({"seed": 2**64}, "--seed 1844"),
+        ({"fov": float("nan")}, "--fov nan"),
+        ({"shard": "-1/2"}, "--shard -1/2"),
+        ({"shard": "0/" + "9" * 5000}, "--shard 0/9999"),
     ],
 )
 def test_bad_options(meshes, tmp_path, options, message):
@@ -313,3 +333,81 @@ def test_bad_folders(meshes, tmp_path):
 def test_limit(meshes, tmp_path):
     assert data_render_command(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
     assert len(open_dataset(tmp_path / "data")) == 2
+
+
+@pytest.mark.parametrize(
+    "entry, reason",
+    [
+        ({"uid": "/../x"}, "relative"),
+        ({"uid": "../x"}, "leaves"),
+        ({"uid": "a/b"}, "one file"),
+        ({"uid": ""}, "not text"),
+        ({"uid": "a" * 300}, "too long"),
+        ({"uid": 3}, "uid"),
+        ({"model": "../a.ply"}, "leaves"),
+        ({"model": None}, "model"),
+        ({"name": 3}, "name"),
+        ({"attribution": "me"}, "attribution"),
+        ({"attribution": {"creator": ["me"]}}, "attribution"),
+        ({"rotation": 3}, "rotation"),
+        ({"rotation": [[1, 0, 0]]}, "rotation"),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 0]]}, "rotation"),
+        ({"rotation": [[1e200, 0, 0], [0, 1, 0], [0, 0, 1]]}, "rotation"),
+    ],
+    ids=range(15),
+)
+def test_hostile_catalogues_are_one_line(tmp_path, entry, reason):
+    """Names and numbers of a catalogue; nothing is rendered, and nothing written outside."""
+    folder = tmp_path / "in" / "meshes"
+    write_box(folder / "a.ply")
+    entries = [{"uid": "box", "model": "a.ply", **entry}]
+    (folder / "catalogue.json").write_text(json.dumps({"objects": entries}))
+    with pytest.raises(UserError) as caught:
+        data_render_command(folder, tmp_path / "out", views=1, size=16, workers=1)
+    message = str(caught.value)
+    assert "catalogue.json: " in message and reason in message and "\n" not in message
+    assert [p.name for p in tmp_path.iterdir()] == ["in"]
+
+
+def test_the_same_model_twice(tmp_path):
+    write_box(tmp_path / "a.ply")
+    entries = [{"uid": uid, "model": name} for uid, name in (("x", "a.ply"), ("y", "./a.ply"))]
+    (tmp_path / "catalogue.json").write_text(json.dumps({"objects": entries}))
+    with pytest.raises(UserError, match="is there twice"):
+        find_meshes(tmp_path)
+
+
+def test_long_and_odd_names_of_files_are_fit_for_folders(tmp_path):
+    for name in ("a" * 240 + ".ply", "a" * 239 + "b.ply", "Ä" * 120 + ".ply", "__.ply"):
+        write_box(tmp_path / "m" / name)
+    uids = [mesh.uid for mesh in find_meshes(tmp_path / "m")]
+    assert len(set(uids)) == 4 and "__" in uids
+    assert max(len(uid.encode()) for uid in uids) <= 120
+
+
+def test_a_damaged_object_in_the_dataset_stops_no_other(meshes, tmp_path, capsys):
+    out, options = tmp_path / "data", dict(views=1, size=16, workers=1)
+    data_render_command(meshes, out, **options)
+    (out / "a" / "transforms.json").write_text("")
+    shutil.rmtree(out / "b")
+    assert data_render_command(meshes, out, **options) == 1
+    captured = capsys.readouterr()
+    assert "1 of 3 objects are already" in captured.out and "rendered 1 objects" in captured.out
+    assert "failed: a: " in captured.err and "remove" in captured.err
+    parts = json.loads((out / "split.json").read_text())
+    assert sorted(sum((parts[name] for name in ("train", "val", "test")), [])) == ["b", "sub-c"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_one_that_kills_its_process_is_one_failure(meshes, tmp_path, monkeypatch, workers):
+    monkeypatch.setattr(render, "_attempt", murderous_object)
+    out = tmp_path / "data"
+    found = find_meshes(meshes)
+    settings = render.Settings(1, 16, 50.0, 0, False, "png", "auto")
+    out.mkdir()
+    _, failures = render.render_meshes(found, out, settings, workers)
+    assert list(failures) == ["b"] and "its process died of signal 9 (SIGKILL)" in failures["b"]
+    assert open_dataset(out).uids == ["a", "sub-c"]
+    monkeypatch.undo()
+    assert render.render_meshes(found[1:2], out, settings, workers)[1] == {}
+    assert len(open_dataset(out)) == 3

@@ -7,8 +7,10 @@ import pytest
 import trimesh
 
 from gamba_warp.data.dataset import SPLITS, open_dataset
+from gamba_warp.errors import UserError
 from gamba_warp.images import load_rgba
 from gamba_warp.open3d import import_open3d
+from gamba_warp.train.data.starter import starter
 
 STARTER = Path(__file__).resolve().parents[2] / "starter"
 HELD_OUT = sorted(path.stem for path in (STARTER / "meshes").glob("*.ply"))
@@ -76,3 +78,10 @@ def test_geometry_lies_in_the_views_frame(uid):
         shown = image[..., 3].numpy() > 0.5
         # pixels on the outline may fall either way: up to 4 % of thin-legged objects
         assert (hit & shown).sum() / (hit | shown).sum() > 0.93, uid
+
+
+def test_folders_of_others_are_not_removed(tmp_path):
+    (tmp_path / "out" / "data").mkdir(parents=True)
+    with pytest.raises(UserError, match="data: was not made by this command"):
+        starter(tmp_path / "furniture", tmp_path / "out")
+    assert (tmp_path / "out" / "data").is_dir()

@@ -193,6 +193,9 @@ def test_bad_split_file(tmp_path):
     (tmp_path / "split.json").write_text('{"version": 1, "train": ["a"], "test": ["a"]}')
     with pytest.raises(UserError, match="in both train and test"):
         open_dataset(tmp_path, "train")
+    for version in (1, 2):  # both are read, and said
+        (tmp_path / "split.json").write_text(f'{{"version": {version}, "train": ["a"]}}')
+        assert open_dataset(tmp_path, "train").split_version == version
 
 
 def nan_pose(path):
@@ -219,7 +222,7 @@ def bad_pose(path):
         (lambda p: edit(p, frames=[{"file_path": "a.png"}]), "frame 0: no transform_matrix"),
         (lambda p: edit(p, k1=0.1), "lens distortion"),
         (lambda p: edit(p, w=15), "000.png: is 14x10, but its cameras are for 15x10"),
-        (nan_pose, "frame 1: the pose is not finite"),
+        (nan_pose, "transforms.json: not valid JSON"),
         (bad_pose, "frame 1: the pose's 3x3 part is not a rotation"),
         (lambda p: (p.parent / "images/002.png").unlink(), "002.png: no such file"),
         (lambda p: (p.parent / "images/002.png").write_bytes(b""), "002.png: the file is empty"),

@@ -300,3 +300,33 @@ def test_cuda_without_a_device_is_refused(data, capsys):
     options += ["--out", str(data / "out"), "--device", "cuda"]
     assert run("eval-views", options) == 2
     assert "no CUDA device" in capsys.readouterr().err and not (data / "out").exists()
+
+
+def test_bad_files_stop_no_other_object(data, painted, monkeypatch):
+    """Also one that goes bad between its evaluation and the contact sheet."""
+    (data / "pred" / "a.ply").unlink()
+    (data / "pred" / "a.ply").symlink_to("nowhere")
+    real = module.contact_sheet
+    monkeypatch.setattr(module, "contact_sheet", lambda *_: pytest.fail("there is nothing to show"))
+
+    def evaluate_and_spoil(job, uid, *rest):
+        if uid == "c":
+            raise OSError(5, "Input/output error")
+        record = module_evaluate(job, uid, *rest)
+        (data / "data" / uid / "0.png").write_bytes(b"not a picture")
+        return record
+
+    module_evaluate = module.evaluate_object
+    monkeypatch.setattr(module, "evaluate_object", evaluate_and_spoil)
+    code, report = evaluate(data, "--no-lpips", "--no-baselines")
+    assert code == 1 and [r["name"] for r in report["objects"] if r["status"] == "ok"] == [
+        "group/b"
+    ]
+    assert {r["name"] for r in report["failures"]} == {"a", "c"}
+    write_object(data / "data" / "new", POINTS["a"])
+    save_ply(data / "pred" / "new.ply", one(in_reference_world(POINTS["a"])))
+    monkeypatch.setattr(module, "evaluate_object", module_evaluate)
+    monkeypatch.setattr(module, "contact_sheet", real)
+    code, report = evaluate(data, "--no-lpips", "--no-baselines")
+    assert code == 1 and len(report["failures"]) == 2 and report["num_ok"] == 2
+    assert (data / "out" / "contact_sheet.png").exists()

@@ -8,26 +8,32 @@ rendered object.
 
 from __future__ import annotations
 
-import io
+import os
 import re
 import shutil
 import subprocess
-import tarfile
 import tempfile
 import zipfile
 from collections import Counter
 from pathlib import Path, PurePosixPath
 
-import numpy as np
+import msgspec
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
-from gamba_warp.files import atomic_path, output_folder, write_json
+from gamba_warp.files import PART, output_folder, write_json
+from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
+from gamba_warp.untrusted.documents import read_document
+from gamba_warp.untrusted.names import parts_of, plain_name
 
-from .render import CATALOGUE
+from .catalogue import CATALOGUE, check_rotation
+from .groups import Named, split_groups, textures_of
 
 PACKAGE = "sweethome3d-furniture"
 INSTALLED = Path("/usr/share/sweethome3d/furniture")
+_PROPERTIES = "PluginFurnitureCatalog.properties"
+_MARK = ".gamba-library.json"  # in a library's folder: what this command put there
+_MAX_TEXT = _MAX_ICON = 16 << 20  # bytes; they take a few kB
 _BY = "https://creativecommons.org/licenses/by/3.0/"
 
 # By library: whom to name, if not each model's creator; the licence; where its text is.
@@ -42,6 +48,12 @@ LIBRARIES: dict[str, tuple[str, str, str]] = {
         _BY,
     ),
 }
+
+
+class _Mark(msgspec.Struct):
+    """What ``_MARK`` holds: the names of the library's files."""
+
+    files: list[str]
 
 
 def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) -> int:
@@ -60,16 +72,84 @@ def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) 
         UserError: there are no libraries, one is damaged, or two models have one name.
     """
     out = output_folder(out)
-    with tempfile.TemporaryDirectory(dir=out, prefix=".download-") as scratch:
-        libraries = sorted(_find_libraries(deb, tree, Path(scratch)).glob("*.sh3f"))
-        if not libraries:
+    with tempfile.TemporaryDirectory(dir=out, prefix=PART) as name:
+        scratch = Path(name)
+        paths = sorted(_find_libraries(deb, tree, scratch).glob("*.sh3f"))
+        if not paths:
             raise UserError(f"{deb or tree or INSTALLED}: holds no .sh3f libraries")
-        objects = [entry for path in libraries for entry in unpack_library(path, out)]
-    repeated = [uid for uid, n in Counter(entry["uid"] for entry in objects).items() if n > 1]
-    if repeated:
-        raise UserError(f"two models are called {repeated[0]}")
+        libraries = {library_name(path): path for path in paths}
+        # Nothing in ``out`` is touched before every library is unpacked and sound.
+        for library in libraries:
+            _check_replaceable(out / library)
+        for part in ("new", "old", "icons"):
+            (scratch / part).mkdir()
+        objects = []
+        for library, path in libraries.items():
+            try:
+                objects += unpack_library(path, scratch / "new" / library, scratch / "icons")
+            except UserError as error:  # a package's library lies in a folder that goes
+                reason = str(error).replace(f"{scratch}/", f"{deb or PACKAGE}: ")
+                raise UserError(reason) from error
+        counts = Counter(entry["uid"] for entry in objects)
+        if repeated := next((uid for uid, count in counts.items() if count > 1), None):
+            raise UserError(f"two models are called {repeated}")
+        _add_groups(objects, scratch / "new")
+        try:
+            _put_in_place(scratch, out, list(libraries))
+        except OSError as error:
+            raise UserError(f"cannot write into {out}: {error.strerror or error}") from error
     write_json(out / CATALOGUE, {"objects": sorted(objects, key=lambda entry: entry["uid"])})
     return len(objects)
+
+
+def _add_groups(objects: list[dict], folder: Path) -> None:
+    """Adds ``group`` to the entries of models that are unpacked in ``folder``."""
+    named = []
+    for entry in objects:
+        library, textures = entry["model"].split("/")[0], textures_of(folder / entry["model"])
+        named.append(Named(entry["uid"], library, entry["name"], textures))
+    groups = split_groups(named)
+    for entry in objects:
+        entry["group"] = groups[entry["uid"]]
+
+
+def library_name(path: Path) -> str:
+    """The library's name, which becomes that of a folder.
+
+    Raises:
+        UserError: it is no plain name, or one that the command uses itself.
+    """
+    name = plain_name(path.stem, str(path))
+    if name.lower() in ("icons", CATALOGUE):
+        raise UserError(f"{path}: a library cannot be called {name}")
+    return name
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Refuses a folder that is there and holds anything but what this command put there."""
+    if not folder.exists() and not folder.is_symlink():
+        return
+    reason = (
+        f"{folder}: is not marked as made by this command; move it away, or choose another --out"
+    )
+    if folder.is_symlink() or not (folder / _MARK).is_file():
+        raise UserError(reason)
+    ours = read_document(folder / _MARK, _Mark)
+    found = (path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
+    strange = sorted({path.relative_to(folder).as_posix() for path in found} - {*ours.files, _MARK})
+    if strange:
+        raise UserError(f"{folder / strange[0]}: is not of the library; move it away")
+
+
+def _put_in_place(scratch: Path, out: Path, libraries: list[str]) -> None:
+    """Moves the unpacked libraries and icons into ``out``; those of an earlier run give way."""
+    for library in libraries:
+        if (out / library).exists():
+            os.replace(out / library, scratch / "old" / library)
+        os.replace(scratch / "new" / library, out / library)
+    icons = output_folder(out / "icons")
+    for icon in (scratch / "icons").iterdir():
+        os.replace(icon, icons / icon.name)
 
 
 def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
@@ -108,28 +188,16 @@ def _download(folder: Path) -> Path:
 
 def _unpack_deb(deb: Path, folder: Path) -> None:
     """Puts the .sh3f files of a .deb (an ar archive that holds a tar) into ``folder``."""
-    if not deb.is_file():
-        raise UserError(f"{deb}: no such file")
-    with deb.open("rb") as file:
-        if file.read(8) != b"!<arch>\n":
-            raise UserError(f"{deb}: not a Debian package")
-        while len(header := file.read(60)) == 60:
-            name, size = header[:16].decode("ascii", "replace").strip(), int(header[48:58])
-            if not name.startswith("data.tar"):
-                file.seek(size + size % 2, io.SEEK_CUR)
-                continue
-            try:
-                with tarfile.open(fileobj=io.BytesIO(file.read(size))) as tar:
-                    for member in tar:
-                        source = tar.extractfile(member) if member.isfile() else None
-                        if source and member.name.endswith(".sh3f"):
-                            path = folder / PurePosixPath(member.name).name
-                            with path.open("wb") as target:
-                                shutil.copyfileobj(source, target)
-            except (tarfile.TarError, EOFError, OSError) as error:
-                raise UserError(f"{deb}: {name} cannot be unpacked ({error})") from error
-            return
-    raise UserError(f"{deb}: holds no data.tar")
+    with tempfile.TemporaryFile(dir=folder) as data:
+        name = read_ar(deb, "data.tar", data)
+        with open_tar(data, f"{deb}: {name}", folder) as members:
+            for member in members:
+                if member.name.endswith(".sh3f"):
+                    file = folder / plain_name(PurePosixPath(member.name).name, str(deb))
+                    if file.exists():
+                        raise UserError(f"{deb}: {file.name} is there twice")
+                    with file.open("wb") as target:
+                        shutil.copyfileobj(member.file, target)
 
 
 def read_properties(data: bytes) -> dict[str, str]:
@@ -140,65 +208,61 @@ def read_properties(data: bytes) -> dict[str, str]:
     return {key.strip(): value.strip() for key, sign, value in pairs if sign}
 
 
-def unpack_library(path: Path, out: Path) -> list[dict]:
-    """Unpacks one .sh3f into ``out/<library>`` and its icons into ``out/icons``.
+def unpack_library(path: Path, target: Path, icons: Path) -> list[dict]:
+    """Unpacks one .sh3f into ``target``, a new folder, and its icons into ``icons``.
 
     Returns:
         The library's catalogue entries.
 
     Raises:
-        UserError: not a zip, or no furniture catalogue in it.
+        UserError: not a zip, no furniture catalogue in it, or a member that is not allowed.
     """
-    library = path.stem
-    try:
-        with zipfile.ZipFile(path) as archive:
-            catalogue = read_properties(archive.read("PluginFurnitureCatalog.properties"))
-            target = out / library
-            shutil.rmtree(target, ignore_errors=True)
-            members = [m for m in archive.namelist() if not m.endswith(".properties")]
-            for member in tqdm(members, desc=library, unit="file", leave=False):
-                archive.extract(member, target)
-            numbers = [key.split("#")[1] for key in catalogue if key.startswith("model#")]
-            entries = [_entry(library, catalogue, number) for number in numbers]
-            icons = output_folder(out / "icons")
-            for entry, number in zip(entries, numbers):
-                with atomic_path(icons / f"{entry['uid']}.png") as temporary:
-                    temporary.write_bytes(archive.read(catalogue[f"icon#{number}"].lstrip("/")))
-    except (zipfile.BadZipFile, KeyError, OSError) as error:
-        raise UserError(f"{path}: not a furniture library ({error})") from error
+    library = target.name
+    if not path.is_file() or not zipfile.is_zipfile(path):  # to read a pipe would not end
+        raise UserError(f"{path}: not a furniture library (no zip file)")
+    with open_zip(path) as archive:
+        catalogue = read_properties(archive.read(_PROPERTIES, _MAX_TEXT))
+        members = [name for name in archive.names if not name.endswith(".properties")]
+        numbers = [key.partition("#")[2] for key in catalogue if key.startswith("model#")]
+        try:
+            entries = [_entry(library, catalogue, number, path) for number in numbers]
+            pictures = [catalogue[f"icon#{number}"].lstrip("/") for number in numbers]
+        except KeyError as error:
+            raise UserError(f"{path}: not a furniture library (no {error})") from error
+        missing = {e["model"].removeprefix(f"{library}/") for e in entries} - {*members}
+        if missing:
+            raise UserError(f"{path}: not a furniture library (it holds no {min(missing)!r})")
+        target.mkdir()
+        for member in tqdm(members, desc=library, unit="file", leave=False):
+            archive.unpack(member, target)
+        for entry, picture in zip(entries, pictures):
+            (icons / f"{entry['uid']}.png").write_bytes(archive.read(picture, _MAX_ICON))
+    write_json(target / _MARK, {"files": members})
     return entries
 
 
-def _entry(library: str, catalogue: dict[str, str], number: str) -> dict:
-    """One model's entry in catalogue.json."""
-    model = PurePosixPath(catalogue[f"model#{number}"].lstrip("/"))
-    uid = f"{library}-{model.parent.name}".lower()
-    name = catalogue.get(f"name#{number}", model.stem)
+def _entry(library: str, catalogue: dict[str, str], number: str, path: Path) -> dict:
+    """One model's entry in catalogue.json; raises KeyError where a line of it is missing."""
+    source = f"{path}: model {number}"
+    model = PurePosixPath(*parts_of(catalogue[f"model#{number}"].lstrip("/"), source))
+    uid = re.sub(r"[^\w.-]+", "_", f"{library}-{model.parent.name}".lower())
+    name = " ".join(catalogue.get(f"name#{number}", model.stem).split())
     credit, licence, text = LIBRARIES.get(library, ("", catalogue.get("license", ""), ""))
-    source = catalogue.get("name", library)
+    origin = catalogue.get("name", library)
     entry = {
-        "uid": re.sub(r"[^\w.-]+", "_", uid),
+        "uid": plain_name(uid, source),
         "name": name,
-        "group": f"{library}-{_kind(name)}",
         "category": catalogue.get(f"category#{number}", ""),
         "model": f"{library}/{model}",
         "attribution": {
             "creator": credit or catalogue.get(f"creator#{number}", "unknown"),
             "licence": licence,
             "licence_text": text,
-            "source": f"Sweet Home 3D furniture library '{source}'",
+            "source": f"Sweet Home 3D furniture library '{origin}'",
         },
     }
     if f"modelRotation#{number}" in catalogue:
-        turn = [float(v) for v in catalogue[f"modelRotation#{number}"].split()]
-        entry["rotation"] = np.reshape(turn, (3, 3)).tolist()
+        entry["rotation"] = check_rotation(
+            catalogue[f"modelRotation#{number}"].split(), source
+        ).tolist()
     return entry
-
-
-def _kind(name: str) -> str:
-    """What the thing is, coarsely: the last word before any number ("Concept Sedan 02": sedan).
-
-    Libraries have many variants of one model under such names; they must not be split up.
-    """
-    words = re.findall(r"[^\W\d_]+", re.split(r"\d", name)[0]) or [name]
-    return words[-1].lower()

@@ -8,54 +8,36 @@ there: ``x_world = applied_scale · (applied_transform · [x_file, 1])``.
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import os
 import re
-import shutil
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
+import torch
 from PIL import Image
 from tqdm import tqdm
 
 from gamba_warp.cameras import intrinsics
 from gamba_warp.data.dataset import write_split
-from gamba_warp.data.layouts import read_json
 from gamba_warp.errors import UserError
-from gamba_warp.files import write_json
-from gamba_warp.formats.meshes import SUFFIXES, default_up, load_mesh
+from gamba_warp.files import atomic_folder, write_json
+from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import to_uint8
+from gamba_warp.untrusted.children import Failed, run_each
+from gamba_warp.untrusted.documents import read_document
+from gamba_warp.untrusted.names import plain_name
 
+from .catalogue import Mesh
 from .poses import sample_poses
 from .raycast import Lights, RayCaster
 
-CATALOGUE = "catalogue.json"  # beside the meshes: names and attribution, see ``find_meshes``
 DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """One object to render.
-
-    Attributes:
-        path: its file.
-        uid: its folder in the dataset.
-        name: what it is called.
-        group: name of the objects that belong on one side of a split.
-        attribution: who made it, and under which licence.
-        rotation: ``[3, 3]``, turns the file's points upright first, or None.
-    """
-
-    path: Path
-    uid: str
-    name: str
-    group: str
-    attribution: dict[str, str]
-    rotation: list[list[float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -81,52 +63,6 @@ class Settings:
     up: str
 
 
-def find_meshes(folder: Path) -> list[Mesh]:
-    """All mesh files under a folder, sorted by uid.
-
-    ``catalogue.json`` in the folder, if there, has ``objects``: a list of ``model`` (path in the
-    folder), ``uid``, ``name``, ``group`` (of variants that belong on one side of a split) and
-    ``attribution``. Other meshes are named by their path.
-
-    Raises:
-        UserError: no such folder, no meshes, a bad catalogue, or two objects with one uid.
-    """
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder")
-    catalogue = folder / CATALOGUE
-    entries = read_json(catalogue).get("objects", []) if catalogue.exists() else []
-    if not all(isinstance(e, dict) and "model" in e and "uid" in e for e in entries):
-        raise UserError(f"{catalogue}: each of its objects needs a model and a uid")
-    known = {entry["model"]: entry for entry in entries}
-    meshes: dict[str, Mesh] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() not in SUFFIXES or not path.is_file():
-            continue
-        relative = path.relative_to(folder)
-        if any(part.startswith(".") for part in relative.parts):
-            continue
-        entry = known.get(relative.as_posix(), {})
-        uid = str(entry.get("uid") or _uid(relative))
-        if uid in meshes and not entry:
-            uid = f"{uid}-{path.suffix[1:].lower()}"
-        if uid in meshes:
-            raise UserError(f"{path} and {meshes[uid].path} would both be '{uid}'")
-        name, group = str(entry.get("name") or path.stem), str(entry.get("group") or uid)
-        known_of = entry.get("attribution") or {}
-        meshes[uid] = Mesh(path, uid, name, group, known_of, entry.get("rotation"))
-    if not meshes:
-        raise UserError(f"{folder}: no mesh files ({', '.join(SUFFIXES)})")
-    return [meshes[uid] for uid in sorted(meshes)]
-
-
-def _uid(relative: Path) -> str:
-    """A folder's name from a path; ``chair/chair.obj`` is just ``chair``."""
-    parts = list(relative.with_suffix("").parts)
-    if len(parts) > 1 and parts[-1] == parts[-2]:
-        parts.pop()
-    return re.sub(r"[^\w.-]+", "_", "-".join(parts)).lstrip(".")
-
-
 def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
     """Renders one object into ``out/<uid>``, which appears only when complete.
 
@@ -145,11 +81,8 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
     caster = RayCaster(model, Lights.sample(rng))
     used = model.vertices[np.unique(model.faces)]
     poses = sample_poses(used, settings.views, settings.fov, rng)
-    # The name is always the same, so that runs that are killed leave no more than one folder.
-    part = out / f".{mesh.uid}.part"
-    try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
+    plain_name(mesh.uid, str(mesh.path))
+    with atomic_folder(out / mesh.uid) as part:
         frames = [_write_view(caster, pose, i, part, settings) for i, pose in enumerate(poses)]
         K = intrinsics(settings.size, settings.size, settings.fov).double()
         values = {
@@ -173,11 +106,6 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
         if settings.depth:
             values["depth_unit"] = DEPTH_UNIT
         write_json(part / "transforms.json", values)
-        os.replace(part, out / mesh.uid)
-    except OSError as error:
-        raise UserError(f"cannot write {out / mesh.uid}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return model.warnings
 
 
@@ -197,17 +125,46 @@ def _write_view(
     return frame
 
 
-def still_missing(meshes: Sequence[Mesh], out: Path, settings: Settings) -> list[Mesh]:
-    """The objects that are not in the dataset ``out`` yet.
+def still_missing(
+    meshes: Sequence[Mesh], out: Path, settings: Settings
+) -> tuple[list[Mesh], dict[str, str]]:
+    """The objects that are not in the dataset ``out`` yet; and, by uid, those damaged there.
 
     Raises:
         UserError: an object in it was rendered with other settings.
     """
-    return [mesh for mesh in meshes if not _is_done(out / mesh.uid, settings)]
+    missing: list[Mesh] = []
+    damaged: dict[str, str] = {}
+    for mesh in meshes:
+        path = out / mesh.uid / "transforms.json"
+        if not path.exists():
+            missing.append(mesh)
+            continue
+        try:
+            stored = read_document(path, _Stored).settings
+        except UserError as error:
+            damaged[mesh.uid] = f"{error}; remove {path.parent} to render it again"
+            continue
+        if stored != vars(settings):
+            raise UserError(
+                f"{path}: was rendered with other settings ({stored}); choose another --out"
+            )
+    return missing, damaged
+
+
+class _Stored(msgspec.Struct):
+    """What a rendered object's ``transforms.json`` says of how it was made."""
+
+    settings: dict[str, Any] | None = None
+    group: str | None = None
 
 
 def render_meshes(
-    meshes: Sequence[Mesh], out: Path, settings: Settings, workers: int
+    meshes: Sequence[Mesh],
+    out: Path,
+    settings: Settings,
+    workers: int,
+    groups: Mapping[str, str] | None = None,
 ) -> tuple[dict[str, list[str]], dict[str, str]]:
     """Renders objects into a dataset, with a progress bar, and writes its split anew.
 
@@ -216,6 +173,8 @@ def render_meshes(
         out: the dataset's folder, which is there.
         settings: what decides the pixels.
         workers: processes; 0 means one per core.
+        groups: the groups of objects that are there already, by uid, where they are other ones
+            than when these were rendered; None: they are not.
 
     Returns:
         By uid, what was missing in the files of a mesh and replaced; and by uid, why an object
@@ -229,7 +188,9 @@ def render_meshes(
             failures[mesh.uid] = result
         elif result:
             warnings[mesh.uid] = result
-    write_split(out, _groups(out))
+    stored = _groups(out)
+    changed = {uid: group for uid, group in (groups or {}).items() if uid in stored}
+    write_split(out, stored | changed)
     return warnings, failures
 
 
@@ -244,6 +205,7 @@ def check_options(settings: Settings, workers: int, limit: int | None) -> None:
         ("--size", settings.size, 8, 4096),
         ("--fov", settings.fov, 5, 120),
         ("--workers", workers, 0, 1024),
+        ("--seed", settings.seed, 0, 2**63 - 1),
         ("--limit", 1 if limit is None else limit, 1, 10**9),
     ):
         if not low <= value <= high:
@@ -256,29 +218,19 @@ def parse_shard(shard: str) -> tuple[int, int]:
     Raises:
         UserError: it is not of that form, or not 0 <= i < n.
     """
-    match = re.fullmatch(r"(\d+)/(\d+)", shard)
+    match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", shard)
     if not match or not int(match[1]) < int(match[2]):
-        raise UserError(f"--shard {shard}: expected i/n with 0 <= i < n, such as 0/4")
+        raise UserError(f"--shard {shard[:40]}: expected i/n with 0 <= i < n, such as 0/4")
     return int(match[1]), int(match[2])
 
 
-def _is_done(folder: Path, settings: Settings) -> bool:
-    """Whether the object is there. With other settings it is refused, so that none are mixed."""
-    path = folder / "transforms.json"
-    if not path.exists():
-        return False
-    stored = read_json(path).get("settings")
-    if stored != vars(settings):
-        raise UserError(
-            f"{path}: was rendered with other settings ({stored}); choose another --out"
-        )
-    return True
-
-
 def _groups(out: Path) -> dict[str, str]:
-    """The group of each object that is there, by uid."""
-    found = sorted(out.glob("[!.]*/transforms.json"))
-    return {path.parent.name: read_json(path).get("group", path.parent.name) for path in found}
+    """The group of each sound object that is there, by uid."""
+    groups = {}
+    for path in sorted(out.glob("[!.]*/transforms.json")):
+        with suppress(UserError):  # readers of the dataset say so, each time
+            groups[path.parent.name] = read_document(path, _Stored).group or path.parent.name
+    return groups
 
 
 def _run(
@@ -286,30 +238,18 @@ def _run(
 ) -> Iterator[tuple[Mesh, list[str] | str]]:
     """Yields each mesh with its warnings, or with the reason why it failed, when it is ready."""
     workers = min(workers or os.cpu_count() or 1, len(meshes))
-    if workers <= 1:
-        for mesh in meshes:
-            yield mesh, _attempt(mesh, out, settings)
-        return
-    context = multiprocessing.get_context("spawn")  # Open3D's threads do not survive a fork
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
-        waiting = {pool.submit(_attempt, mesh, out, settings): mesh for mesh in meshes}
-        try:
-            for future in as_completed(waiting):
-                try:
-                    yield waiting[future], future.result()
-                except BrokenProcessPool:
-                    yield waiting[future], "not rendered: a worker process died; run again"
-        finally:
-            pool.shutdown(cancel_futures=True)
+    threads = 1 if workers > 1 else torch.get_num_threads()
+    attempt = partial(_attempt, out=out, settings=settings, threads=threads)
+    for index, result in run_each(attempt, meshes, workers=workers):
+        mesh = meshes[index]
+        if isinstance(result, Failed):
+            result = f"{mesh.path}: {result.reason}"
+        yield mesh, result
 
 
-def _start_worker() -> None:
-    import torch
-
-    torch.set_num_threads(1)
-
-
-def _attempt(mesh: Mesh, out: Path, settings: Settings) -> list[str] | str:
+def _attempt(mesh: Mesh, out: Path, settings: Settings, threads: int) -> list[str] | str:
+    """In a child process: the mesh's warnings, or the reason why it failed."""
+    torch.set_num_threads(threads)
     try:
         return render_object(mesh, out, settings)
     except UserError as error:

@@ -44,10 +44,10 @@ def data_render_command(
         limit: stop after this many objects.
         workers: number of processes; 0 means one per core.
     """
+    from .catalogue import find_meshes
     from .render import (
         Settings,
         check_options,
-        find_meshes,
         parse_shard,
         render_meshes,
         still_missing,
@@ -56,16 +56,19 @@ def data_render_command(
     settings = Settings(views, size, fov, seed, depth, format, up)
     check_options(settings, workers, limit)
     meshes = find_meshes(folder)
+    groups = {mesh.uid: mesh.group for mesh in meshes}
     first, count = parse_shard(shard)
     meshes = meshes[first::count][:limit]
     out = output_folder(out)
-    todo = still_missing(meshes, out, settings)
-    if len(todo) < len(meshes):
-        print(f"{len(meshes) - len(todo)} of {len(meshes)} objects are already in {out}")
-    warnings, failures = render_meshes(todo, out, settings, workers)
+    todo, damaged = still_missing(meshes, out, settings)
+    if done := len(meshes) - len(todo) - len(damaged):
+        print(f"{done} of {len(meshes)} objects are already in {out}")
+    warnings, failures = render_meshes(todo, out, settings, workers, groups)
+    rendered = len(todo) - len(failures)
+    failures |= damaged
     for uid, lines in sorted(warnings.items()):
         print(f"warning: {uid}: {'; '.join(lines)}")
-    print(f"rendered {len(todo) - len(failures)} objects into {out}, {len(failures)} failed")
+    print(f"rendered {rendered} objects into {out}, {len(failures)} failed")
     for uid, reason in sorted(failures.items()):
         print(f"failed: {uid}: {reason}", file=sys.stderr)
     return 1 if failures else 0

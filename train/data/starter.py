@@ -22,7 +22,8 @@ from gamba_warp.files import atomic_path, output_folder
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import load_rgba
 
-from .render import Mesh, Settings, find_meshes, render_object
+from .catalogue import Mesh, find_meshes
+from .render import Settings, render_object
 
 SETTINGS = Settings(
     views=24, size=128, fov=DEFAULT_FOV, seed=0, depth=False, format="webp-lossless", up="auto"
@@ -38,15 +39,15 @@ blendswap-cc-by-tulip reallusion-sitmale03 scopia-birthday_cake scopia-bowlwithf
 scopia-citybus scopia-dog scopia-fireplace1 scopia-living_lamp scopia-maceta
 scopia-rattanarmchair scopia-renault-scenic scopia-shopping-basket scopia-small-oven
 scopia-sneakers scopia-table3
-blendswap-cc-0-desklamp scopia-bed1 scopia-cat scopia-truck
-blendswap-cc-0-teddybear scopia-chair3 scopia-dog-house scopia-toaster
+blendswap-cc-0-cuckooclock scopia-bicycle scopia-cat scopia-jacuzzi
+blendswap-cc-0-horse2 blendswap-cc-0-teddybear scopia-dog-house scopia-toaster
 """.split()
 
 # These are single pictures by another renderer, of objects that are in no training split.
 ICONS = """
-blendswap-cc-0-antiquechair blendswap-cc-0-armchair2 blendswap-cc-0-kitchenaid
-blendswap-cc-0-teddybear blendswap-cc-by-decorativeplant blendswap-cc-by-fordfocus
-katorlegaz-scooter scopia-bonsai-tree scopia-cardboard-box scopia-chair3 scopia-dog-house
+blendswap-cc-0-horse2 blendswap-cc-0-kitchenaid blendswap-cc-0-teddybear
+blendswap-cc-by-decorativeplant blendswap-cc-by-fordfocus katorlegaz-fire-hydrant
+scopia-bonsai-tree scopia-cardboard-box scopia-dog-house scopia-doll-house scopia-jacuzzi
 scopia-toaster
 """.split()
 
@@ -73,6 +74,11 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
         furniture: what `gamba data furniture` made.
         out: the folder to make, afresh.
     """
+    made = [out / name for name in ("data", "meshes", "icons")]
+    if not (out / "ATTRIBUTION.md").is_file():
+        for folder in made:
+            if folder.exists():
+                raise UserError(f"{folder}: was not made by this command; move it away")
     meshes = {mesh.uid: mesh for mesh in find_meshes(furniture)}
     missing = [uid for uid in (*OBJECTS, *ICONS) if uid not in meshes]
     if missing:
@@ -82,9 +88,13 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
     leaked = [uid for uid in ICONS if split_of(meshes[uid].group) == "train"]
     if leaked:
         raise UserError(f"the icon of {leaked[0]} is of a training object")
-    for name in ("data", "meshes", "icons"):
-        shutil.rmtree(out / name, ignore_errors=True)
-        output_folder(out / name)
+    output_folder(out)
+    rows = [_row(meshes[uid]) for uid in sorted({*OBJECTS, *ICONS})]
+    with atomic_path(out / "ATTRIBUTION.md") as temporary:
+        temporary.write_text(INTRO + "\n".join(rows) + "\n", encoding="utf-8")
+    for folder in made:
+        shutil.rmtree(folder, ignore_errors=True)
+        output_folder(folder)
     for uid in tqdm(OBJECTS, unit="object"):
         render_object(meshes[uid], out / "data", SETTINGS)
     write_split(out / "data", groups)
@@ -92,9 +102,6 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
         _write_geometry(meshes[uid], out / "meshes" / f"{uid}.ply")
     for uid in ICONS:
         _copy_icon(furniture / "icons" / f"{uid}.png", out / "icons" / f"{uid}.png")
-    rows = [_row(meshes[uid]) for uid in sorted({*OBJECTS, *ICONS})]
-    with atomic_path(out / "ATTRIBUTION.md") as temporary:
-        temporary.write_text(INTRO + "\n".join(rows) + "\n", encoding="utf-8")
 
 
 def _write_geometry(mesh: Mesh, path: Path) -> None:

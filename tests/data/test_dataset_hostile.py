@@ -1,0 +1,225 @@
+"""Datasets of strangers: names that leave, numbers without sense, files that are no files."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from helpers.micro import to_opengl
+from PIL import Image
+
+from gamba_warp.cameras import orbit
+from gamba_warp.data import dataset as module
+from gamba_warp.data.dataset import open_dataset, split_of
+from gamba_warp.errors import UserError
+
+SIZE = 8
+POSE = to_opengl(orbit(torch.tensor([30.0]), 15.0, 1.7)[0].double()).tolist()
+
+
+def picture(path, size=(SIZE, SIZE)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((size[1], size[0], 4), 200, np.uint8)).save(path)
+
+
+def transforms(folder, frame=None, **top):
+    """An object of two views; ``frame`` changes the second, ``top`` the rest."""
+    frames = [{"file_path": f"{i}.png", "transform_matrix": POSE} for i in range(2)]
+    frames[1] |= frame or {}
+    for i in range(2):
+        picture(folder / f"{i}.png")
+    values = {"w": SIZE, "h": SIZE, "fl_x": 9.0, "frames": frames, **top}
+    (folder / "transforms.json").write_text(json.dumps(values))
+
+
+def gobjaverse(folder, **camera):
+    view = folder / "campos_512_v4" / "00000"
+    picture(view / "00000.png")
+    axes = {key: [row[n] for row in POSE[:3]] for n, key in enumerate(("x", "y", "z", "origin"))}
+    (view / "00000.json").write_text(json.dumps({**axes, **camera}))
+
+
+def openlrm(folder, intrinsics=((9, 9), (4, 4), (SIZE, SIZE)), pose=POSE[:3]):
+    picture(folder / "rgba" / "000.png")
+    (folder / "pose").mkdir()
+    np.save(folder / "pose" / "000.npy", np.array(pose))
+    np.save(folder / "intrinsics.npy", np.array(intrinsics, float))
+
+
+def reason(folder):
+    """The one line with which the object cannot be loaded; ``check`` never fails."""
+    data = open_dataset(folder.parent)
+    data.check()
+    with pytest.raises(UserError) as caught:
+        data.load(folder.name)
+    message = str(caught.value)
+    assert str(folder) in message and len(message.splitlines()) == 1 and len(message) < 500
+    return message
+
+
+def test_the_helpers_make_sound_objects(tmp_path):
+    for write in (transforms, gobjaverse, openlrm):
+        write(tmp_path / write.__name__ / "x")
+        assert open_dataset(tmp_path / write.__name__).load("x").images.shape[2:] == (8, 4)
+
+
+@pytest.mark.parametrize("key", ["file_path", "depth_file_path"])
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "/etc/passwd.png", "a\0.png", "a" * 300, "x\\y.png", "link.png", 7]
+)
+def test_names_of_pictures_stay_inside(tmp_path, key, name):
+    picture(tmp_path / "secret.png")
+    transforms(tmp_path / "x", {key: name})
+    (tmp_path / "x" / "link.png").symlink_to(tmp_path / "secret.png")
+    assert "frame 1" in reason(tmp_path / "x")
+
+
+def test_links_of_the_other_layouts_stay_inside(tmp_path):
+    picture(tmp_path / "secret.png")
+    for write, name in ((gobjaverse, "campos_512_v4/00000/00000.png"), (openlrm, "rgba/000.png")):
+        folder = tmp_path / write.__name__ / "x"
+        write(folder)
+        (folder / name).unlink()
+        (folder / name).symlink_to(tmp_path / "secret.png")
+        assert "leaves" in reason(folder)
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ({"w": 0}, "w is 0"),
+        ({"w": 10**9}, "w is 1e+09"),
+        ({"h": 8.5}, "h is 8.5"),
+        ({"h": True}, "h is True"),
+        ({"w": [1] * 1000}, "w is [1, 1"),
+        ({"fl_x": 1e-9}, "focal lengths of"),
+        ({"fl_x": 1e8}, "focal lengths of"),
+        ({"fl_x": 10**400}, "fl_x is 1000"),
+        ({"fl_y": -1}, "must be positive"),
+        ({"cx": 1e6}, "principal point"),
+        ({"cy": "4"}, "cy is '4'"),
+        ({"depth_unit": 0}, "depth_unit is 0"),
+        ({"depth_unit": -1}, "depth_unit is -1"),
+        ({"depth_unit": 1e8}, "depth_unit is 1e+08"),
+        ({"k1": {"a": [1] * 1000}}, "lens distortion"),
+        ({"frames": {"0": {}}}, "no frames"),
+        ({"frames": [7]}, "frame 0: no transform_matrix"),
+        ({"frames": [{}] * 10_001}, "10001 views, at most 10000"),
+        ({"frame": {"file_path": "0.png"}}, "two frames have the picture 0.png"),
+        ({"frame": {"file_path": None}}, "frame 1"),
+        ({"frame": {"transform_matrix": [[1, 2], [3]]}}, "not a matrix of numbers"),
+        ({"frame": {"transform_matrix": {"a": 1}}}, "not a matrix of numbers"),
+        ({"frame": {"transform_matrix": [[[1] * 4] * 4] * 4}}, "shape (4, 4, 4)"),
+        ({"frame": {"transform_matrix": [[10**30] * 4] * 4}}, "not finite, or over"),
+        ({"frame": {"transform_matrix": np.eye(4).tolist()}}, "the camera is 0 from"),
+        ({"frame": {"transform_matrix": np.eye(3, 4, 0).tolist() + [[5e8] * 4]}}, "is 0 from"),
+        ({"frame": {"camera_angle_x": 4, "fl_x": None}}, "fl_x is None"),
+    ],
+    ids=range(27),
+)
+def test_numbers_without_sense_are_one_line(tmp_path, values, message):
+    transforms(tmp_path / "x", **values)
+    assert message in reason(tmp_path / "x")
+
+
+@pytest.mark.parametrize("angle", [0, -1, 3.1416, 200, 1e-9])
+def test_fields_of_view(tmp_path, angle):
+    transforms(tmp_path / "a" / "x", camera_angle_x=angle)
+    values = json.loads((tmp_path / "a" / "x" / "transforms.json").read_text())
+    del values["fl_x"]
+    (tmp_path / "a" / "x" / "transforms.json").write_text(json.dumps(values))
+    gobjaverse(tmp_path / "b" / "x", x_fov=angle)
+    gobjaverse(tmp_path / "c" / "x", x_fov=0.8, y_fov=angle)
+    for name in "abc":
+        message = reason(tmp_path / name / "x")
+        assert "field of view" in message or "focal lengths" in message
+
+
+def test_gobjaverse_and_openlrm(tmp_path):
+    for number, camera in enumerate(
+        ({"x": 3}, {"x": ["a", 0, 0]}, {"origin": [0, 0, 0]}, {"x_fov": "1"}, {"z": [[1], 2, 3]})
+    ):
+        gobjaverse(tmp_path / f"g{number}" / "x", **camera)
+        assert "00000.json" in reason(tmp_path / f"g{number}" / "x")
+    wide, nowhere = ((9, 9), (4, 4), (10**9, 8)), ((9, 9), (4e6, 4), (8, 8))
+    for number, values in enumerate((wide, nowhere, ((0, 9), (4, 4), (8, 8)))):
+        openlrm(tmp_path / f"o{number}" / "x", values)
+        assert "intrinsics.npy" in reason(tmp_path / f"o{number}" / "x")
+    openlrm(tmp_path / "p" / "x", pose=[[1e200] * 4] * 3)
+    assert "000.npy" in reason(tmp_path / "p" / "x")
+
+
+def test_files_that_are_folders_and_folders_that_are_files(tmp_path):
+    (tmp_path / "a" / "x").mkdir(parents=True)
+    (tmp_path / "a" / "x" / "campos_512_v4").write_text("")
+    for name, mark in (("b", "transforms.json"), ("c", "intrinsics.npy")):
+        (tmp_path / name / "x" / mark).mkdir(parents=True)
+    gobjaverse(tmp_path / "d" / "x")
+    shutil.rmtree(tmp_path / "d" / "x" / "campos_512_v4" / "00000")
+    os.mkfifo(tmp_path / "d" / "x" / "campos_512_v4" / "00000")
+    transforms(tmp_path / "e" / "x")
+    (tmp_path / "e" / "x" / "0.png").unlink()
+    os.mkfifo(tmp_path / "e" / "x" / "0.png")
+    for name in "abcde":
+        reason(tmp_path / name / "x")
+    deep = tmp_path / "deep"
+    folder = deep.joinpath(*("d" * 70))
+    folder.mkdir(parents=True)
+    with pytest.raises(UserError, match="nested deeper"):
+        open_dataset(deep)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("[]", "split.json"),
+        ("{", "not valid JSON"),
+        ('{"version": "1"}', "version"),
+        ('{"version": 1, "train": "x"}', "train"),
+        ('{"version": 1, "train": [["x"]]}', "train"),
+        ("[" * 100_000, "split.json"),
+    ],
+)
+def test_bad_splits(tmp_path, content, message):
+    transforms(tmp_path / "x")
+    (tmp_path / "split.json").write_text(content)
+    with pytest.raises(UserError, match=message) as caught:
+        open_dataset(tmp_path, "train")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_split_may_name_more_than_is_there(tmp_path):
+    transforms(tmp_path / "x")
+    (tmp_path / "split.json").write_text('{"version": 1, "train": ["x", "gone"], "val": [3]}')
+    assert open_dataset(tmp_path, "train").uids == ["x"]
+    assert split_of("\udcff\ud800") in ("train", "val", "test")
+
+
+def test_depth_is_finite_and_not_negative(tmp_path):
+    for number, value in enumerate((np.nan, np.inf, -1.0)):
+        transforms(tmp_path / f"{number}" / "x", {"depth_file_path": "d1.tiff"})
+        path = tmp_path / f"{number}" / "x" / "transforms.json"
+        values = json.loads(path.read_text())
+        values["frames"][0]["depth_file_path"] = "d0.tiff"
+        path.write_text(json.dumps(values))
+        for i in range(2):
+            depth = np.full((SIZE, SIZE), value if i else 1.0, np.float32)
+            Image.fromarray(depth).save(path.parent / f"d{i}.tiff")
+        assert "d1.tiff: a depth is negative or not finite" in reason(path.parent)
+
+
+def test_pictures_that_would_fill_the_memory(tmp_path, monkeypatch):
+    transforms(tmp_path / "x")
+    frames = [{"file_path": "wide.png", "transform_matrix": POSE}]
+    values = {"camera_angle_x": 1.0, "frames": frames}
+    (tmp_path / "x" / "transforms.json").write_text(json.dumps(values))
+    picture(tmp_path / "x" / "wide.png", (20_000, 1))
+    data = open_dataset(tmp_path)
+    assert data.load("x").images.shape == (1, 1, 20_000, 4)
+    with pytest.raises(UserError, match="wide.png: at height 128: 2560000x128 is over"):
+        data.load("x", size=128)  # 20 GB
+    monkeypatch.setattr(module, "MAX_LOADED", 19_999)
+    with pytest.raises(UserError, match="x: 1 views of 20000x1 are over"):
+        data.load("x")

@@ -1,0 +1,91 @@
+"""Protocol files of strangers, and reports that hold what JSON cannot."""
+
+import json
+import math
+import stat
+
+import pytest
+
+from gamba_warp.errors import UserError
+from gamba_warp.eval import report as reports
+from gamba_warp.eval.report import check_finite, csv_of, make_report, save_report
+from gamba_warp.eval.shapes.protocol import PRESETS, checked, read_protocol
+
+
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        ('"distance": NaN', "not valid JSON"),
+        ('"distance": Infinity', "not valid JSON"),
+        ('"distance": 1e999', "out of range"),
+        (f'"distance": 1{"0" * 400}', "distance is too large"),
+        ('"distance": 0', "distance is 0.0, must be at least 0.01 and at most 1,000"),
+        ('"thresholds": [0.1, 0]', "thresholds is 0.0, must be above 0"),
+        ('"num_points": 1000000000', "num_points is 1000000000, must be at least 1 and at most"),
+        ('"iou_voxels": 100000', "iou_voxels is 100000, must be at least 8 and at most 512"),
+        ('"seed": -1', "seed is -1, must be at least 0"),
+        ('"surface": {"truncation": -1}', "surface.truncation is -1.0, must be above 0"),
+        ('"surface": {"voxels": 100000}', "surface.voxels is 100000, must be at least 8"),
+        ('"surface": {"level": 1e300}', "surface.level is 1e+300, must be above 0 and below 1"),
+        ('"surface": {"faces": -1}', "surface.faces is -1, must be at least 0"),
+        (f'"name": "{"x" * 1000}"', "name is over 200 letters"),
+        (f'"thresholds": [{",".join(["0.1"] * 1000)}]', "thresholds must be 1 to 100 numbers"),
+        (f'"surface": {"[" * 5000}', "nested deeper than 32 levels"),
+    ],
+)
+def test_protocols_out_of_range_are_one_line(tmp_path, change, reason):
+    path = tmp_path / "p.json"
+    path.write_text(f"{{{change}}}")
+    with pytest.raises(UserError) as caught:
+        read_protocol(str(path))
+    assert reason in str(caught.value) and str(caught.value).startswith(f"{path}: ")
+
+
+def test_presets_are_in_range():
+    for preset in PRESETS.values():
+        assert checked(preset, "preset") is preset
+
+
+@pytest.fixture
+def odd():
+    objects = [
+        {"name": "good", "status": "ok", "x": 1.0, "nest": {"y": 2.0}},
+        {"name": "bad", "status": "ok", "x": 1.0, "nest": {"y": math.nan}},
+        {"name": "list", "status": "ok", "x": 1.0, "views": [{"z": math.inf}]},
+        {"name": "huge", "status": "ok", "x": 1.7e308, "nest": {"y": 2.0}},
+        {"name": "huger", "status": "ok", "x": 1.7e308, "nest": {"y": 2.0}},
+        {"name": "not \udcff UTF-8", "status": "failed", "reason": "\udcff"},
+    ]
+    return make_report({"p": math.nan}, objects, {"v": "1"}, more=[math.inf, (1.0,)])
+
+
+def test_what_is_not_finite_is_a_failure_of_its_object_and_nothing_is_lost(tmp_path, odd):
+    assert [o["name"] for o in odd["objects"] if o["status"] == "ok"] == ["good", "huge", "huger"]
+    reasons = {f["name"]: f["reason"] for f in odd["failures"]}
+    assert reasons["bad"] == "nest.y is nan" and "inf" in reasons["list"]
+    assert odd["mean"]["x"] is None and odd["mean"]["nest"]["y"] == 2.0  # the sum is no number
+    assert odd["protocol"] == {"p": None} and odd["more"] == [None, [1.0]]
+    save_report(odd, tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text()) == json.loads(json.dumps(odd))
+    rows = (tmp_path / "objects.csv").read_text().splitlines()
+    assert rows[0].startswith("name,status") and len(rows) == len(csv_of(odd).splitlines()) == 7
+    with pytest.raises(UserError, match=r"^a.b is inf"):
+        check_finite({"a": {"b": [1.0, math.inf]}})
+
+
+def test_a_report_that_cannot_be_written_goes_elsewhere(tmp_path, odd, monkeypatch):
+    real = reports.write_json
+
+    def full(path, value):
+        if path.parent == tmp_path / "out":
+            raise UserError(f"cannot write {path}: No space left on device")
+        real(path, value)
+
+    monkeypatch.setattr(reports, "write_json", full)
+    monkeypatch.setattr(reports.tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(UserError, match="No space left on device; the report is in ") as caught:
+        save_report(odd, tmp_path / "out")
+    other = tmp_path / str(caught.value).rpartition("/")[2]
+    assert json.loads((other / "report.json").read_text())["num_ok"] == 3
+    assert stat.S_ISREG((other / "objects.csv").stat().st_mode)
