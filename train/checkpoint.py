@@ -1,31 +1,52 @@
 """Checkpoints: folders ``RUN/checkpoints/step_000123/``, each of which is whole or does not exist.
 
 A checkpoint holds ``model.safetensors`` and ``ema.safetensors``, models that every command can
-load, and ``state.pt``, the tensors and plain values that a bit-identical continuation needs too.
+load, ``state.pt``, the tensors and plain values that a bit-identical continuation needs too, and
+``checksums.json``, the SHA-256 of each of these files.
 """
 
 from __future__ import annotations
 
-import os
-import pickle
 import re
-import shutil
-import tempfile
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
 import torch
-from safetensors import SafetensorError, safe_open
 
 from gamba_warp.errors import UserError
-from gamba_warp.files import write_json
-from gamba_warp.model.checkpoint import save_model
-from gamba_warp.model.config import GambaConfig
+from gamba_warp.files import atomic_folder, one_line, remove_folder, sha256, sweep, write_json
+from gamba_warp.model.checkpoint import read_config, read_weights, save_model
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.untrusted.documents import read_document
+from gamba_warp.untrusted.names import plain_name
+from gamba_warp.untrusted.torch_files import read_torch
 
+CHECKSUMS = "checksums.json"
 _NAME = re.compile(r"step_(\d+)")
-_TEMPORARY = ".partial-"
+_NEEDED = {"model.safetensors": "", "state.pt": ""}  # whatever the list of checksums says
+_Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=10**12)]
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    """The fields of ``state.pt`` (``Trainer.state``)."""
+
+    version: int
+    config: dict[str, Any]
+    objects: str
+    step: _Count
+    skipped: _Count
+    skipped_in_row: _Count
+    elapsed: Annotated[float, msgspec.Meta(ge=0, le=1e12)]
+    world_size: Annotated[int, msgspec.Meta(ge=1)]
+    ema_updates: _Count
+    optimizer: dict[str, Any]
+    rng: Any
+    rng_cuda: list[Any]
 
 
 def list_checkpoints(run: Path) -> list[Path]:
@@ -36,14 +57,14 @@ def list_checkpoints(run: Path) -> list[Path]:
 
 
 def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict, keep: int) -> Path:
-    """Writes a checkpoint to a temporary folder, renames it, and removes the oldest checkpoints.
+    """Writes a checkpoint, whole or not at all, and removes the oldest ones.
 
     Args:
         run: the run folder.
         step: optimizer steps done.
         models: models by file stem, which ``save_model`` writes.
         state: content of ``state.pt``, nested tensors and plain values.
-        keep: number of checkpoints left afterwards.
+        keep: number of checkpoints left up to this step; those of later steps stay.
 
     Returns:
         The checkpoint's folder, ``RUN/checkpoints/step_<step>``.
@@ -54,117 +75,157 @@ def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict,
     folder = run / "checkpoints"
     target = folder / f"step_{step:06d}"
 
-    def write(temporary: Path) -> None:
+    sweep(folder, age=0)  # left by killed processes: a run folder has one writer
+    with atomic_folder(target, replace=True) as temporary:
         for name, model in models.items():
             save_model(temporary / f"{name}.safetensors", model)
-        torch.save(state, temporary / "state.pt")
-
-    _write_folder(target, write)
+        _save_state(temporary / "state.pt", state)
+        write_json(temporary / CHECKSUMS, {p.name: sha256(p) for p in sorted(temporary.iterdir())})
     write_json(run / "latest.json", {"checkpoint": f"checkpoints/{target.name}", "step": step})
-    for old in list_checkpoints(run)[:-keep]:
+    done = list_checkpoints(run)
+    # Those of later steps are another branch, or damaged: they must not push out this one.
+    older = done[: done.index(target)]
+    for old in older[: max(0, len(older) + 1 - keep)]:
         _remove(old)
     return target
 
 
-def _write_folder(target: Path, write: Callable[[Path], None]) -> None:
+def _save_state(path: Path, state: dict) -> None:
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        for stale in target.parent.glob(f"{_TEMPORARY}*"):  # left by a killed process
-            shutil.rmtree(stale, ignore_errors=True)
-        temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY, dir=target.parent))
+        torch.save(state, path)
+    except RuntimeError as error:  # of its writer of zip files
+        reason = f"state.pt cannot be written whole, is the disk full? ({one_line(error)})"
+        raise OSError(reason) from error
+
+
+def _remove(checkpoint: Path) -> None:
+    try:
+        remove_folder(checkpoint)
     except OSError as error:
-        raise UserError(f"cannot write {target}: {error.strerror}") from error
-    try:
-        write(temporary)
-        for path in [*temporary.iterdir(), temporary]:
-            _sync(path)
-        temporary.chmod(0o755)
-        if target.exists():
-            _remove(target)
-        temporary.rename(target)
-        _sync(target.parent)
-    # torch.save reports a full disk as a RuntimeError of its zip writer.
-    except (OSError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise UserError(f"cannot write {target}: {reason}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        raise UserError(f"cannot remove {checkpoint}: {error.strerror or error}") from error
 
 
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _remove(folder: Path) -> None:
-    """Renames the folder before it deletes it: half of one must not look like a checkpoint."""
-    doomed = folder.with_name(f"{_TEMPORARY}{folder.name}")
-    shutil.rmtree(doomed, ignore_errors=True)
-    folder.rename(doomed)
-    shutil.rmtree(doomed, ignore_errors=True)
-
-
-def find_checkpoint(run: Path, resume: str) -> Path | None:
+def find_checkpoint(
+    run: Path, resume: str, warn: Callable[[str], None] = warnings.warn
+) -> Path | None:
     """Finds the checkpoint that ``--resume`` means, or None for a fresh start.
 
     Args:
         run: the run folder.
-        resume: "auto" (the newest of the run folder, if any), "never", or the path of a
+        resume: "auto" (the newest whole one of the run folder, if any), "never", or the path of a
             checkpoint or of another run folder.
+        warn: is given one line for each damaged checkpoint that "auto" passes over.
 
     Raises:
-        UserError: the run folder holds checkpoints in spite of "never", or the path holds none.
+        UserError: the run folder holds checkpoints in spite of "never", the path holds none, or
+            what it holds is damaged; the message names the newest whole one.
     """
     if resume in ("auto", "never"):
         found = list_checkpoints(run)
         if found and resume == "never":
             raise UserError(f"{run}: holds a run already; give another --out or --resume auto")
-        return found[-1] if found else None
+        return _newest_whole(found, warn) if found else None
     path = Path(resume)
-    if (path / "state.pt").is_file():
-        return path
-    found = list_checkpoints(path)
-    if not found:
-        raise UserError(f"--resume {path}: no checkpoint there")
-    return found[-1]
+    if not (path / "state.pt").is_file():
+        found = list_checkpoints(path)
+        if not found:
+            raise UserError(f"--resume {path}: no checkpoint there")
+        path = found[-1]
+    reason = damage(path)
+    if reason:
+        beside = [p for p in list_checkpoints(path.parent.parent) if p != path]
+        whole = next((p for p in reversed(beside) if not damage(p)), None)
+        advice = f"whole is: --resume {whole}" if whole else "no other is whole"
+        raise UserError(f"{reason}; {advice}")
+    return path
 
 
-def read_state(checkpoint: Path) -> dict:
+def _newest_whole(found: list[Path], warn: Callable[[str], None]) -> Path:
+    """The newest checkpoint that is not damaged. Raises UserError where all are."""
+    reasons = []
+    for checkpoint in reversed(found):
+        reason = damage(checkpoint)
+        if not reason:
+            for text in reasons:
+                warn(f"{text}; going on from {checkpoint}")
+            return checkpoint
+        reasons.append(reason)
+    raise UserError(f"{reasons[0]}; no checkpoint of this run is whole")
+
+
+def damage(checkpoint: Path) -> str | None:
+    """Says what is wrong with a checkpoint's files, or None where all are as they were written.
+
+    Files of older versions, without ``checksums.json``, have only their own checks.
+    """
+    try:
+        listed = checkpoint / CHECKSUMS
+        if not listed.exists():
+            read_state(checkpoint)
+            read_config(checkpoint / "model.safetensors")
+            return None
+        for name, wanted in {**_NEEDED, **read_document(listed, dict[str, _Digest])}.items():
+            path = checkpoint / plain_name(name, str(listed))
+            if path.is_symlink() or not path.is_file():  # to read a pipe would not end
+                return f"{path}: damaged, not a plain file"
+            if sha256(path) != wanted:
+                return f"{path}: damaged, it is not what was written (SHA-256)"
+    except UserError as error:
+        return str(error)
+    return None
+
+
+def read_state(checkpoint: Path) -> dict[str, Any]:
     """Reads ``state.pt`` onto the CPU.
 
     Raises:
         UserError: the file is missing, truncated or of another kind.
     """
     path = checkpoint / "state.pt"
+    state = read_torch(path, "damaged, take an older checkpoint")
+    if not isinstance(state, dict):
+        raise UserError(f"{path}: damaged, it holds no state of a run")
+    return state
+
+
+def check_state(state: dict[str, Any], source: str) -> None:
+    """Checks kinds and ranges of what ``Trainer.state`` made; the optimizer's part has its own.
+
+    Raises:
+        UserError: a field is missing, unknown, of another kind or out of its range.
+    """
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file") from error
-    except (OSError, EOFError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{path}: damaged, take an older checkpoint ({reason})") from error
+        fields = msgspec.convert(state, _State)
+        for rng in (fields.rng, *fields.rng_cuda):
+            if not isinstance(rng, torch.Tensor) or rng.dtype != torch.uint8 or rng.ndim != 1:
+                raise ValueError("rng holds no state of a generator")
+        torch.Generator().set_state(fields.rng)  # a state of another kind is refused here
+    except (ValueError, TypeError, RuntimeError) as error:  # msgspec's is a ValueError
+        raise UserError(f"{source}: damaged, {str(error).splitlines()[0]}") from error
+
+
+def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:
+    """Reads the tensors of a model file that fit a model of the same configuration.
+
+    Raises:
+        UserError: the file is missing, damaged or not finite, or its configuration differs; the
+            message names the differing fields.
+    """
+    config, _ = read_config(path)
+    stored, wanted = asdict(config), asdict(model.config)
+    differing = [name for name in wanted if stored[name] != wanted[name]]
+    if differing:
+        raise UserError(f"{path}: is a model of another {', '.join(differing)}")
+    try:
+        return read_weights(path, model)
+    except ValueError as error:
+        raise UserError(f"{path}: does not fit its own configuration: {error}") from error
 
 
 def load_weights(path: Path, model: Gamba) -> None:
     """Loads a model file into a model of the same configuration.
 
     Raises:
-        UserError: the file is missing or truncated, or its configuration differs; the message names
-            the differing fields.
+        UserError: as for ``read_weights_of``; the model is then as it was.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            config = GambaConfig.from_json((file.metadata() or {}).get("config", ""), str(path))
-            state = {name: file.get_tensor(name) for name in file.keys()}
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file") from error
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path}: not a whole safetensors file ({error})") from error
-    stored, wanted = asdict(config), asdict(model.config)
-    differing = [name for name in wanted if stored[name] != wanted[name]]
-    if differing:
-        raise UserError(f"{path}: is a model of another {', '.join(differing)}")
-    model.load_stored_state(state)
+    model.load_stored_state(read_weights_of(path, model))

@@ -8,22 +8,29 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from msgspec import Meta
 
 from gamba_warp.conventions import DeviceChoice
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig, Preset
+from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options
+
+_Count = Annotated[int, Meta(ge=1, le=10**12)]
+_Views = Annotated[int, Meta(ge=0, le=1000)]
+_Weight = Annotated[float, Meta(ge=0, le=1e6)]
+_Every = Annotated[int, Meta(ge=0, le=10**12)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LengthConfig:
     """How long to train. The schedules end with the steps or epochs, else with the minutes."""
 
-    steps: int | None = None
+    steps: _Count | None = None
     """Number of optimizer steps."""
-    epochs: float | None = None
+    epochs: Annotated[float, Meta(gt=0, le=1e9)] | None = None
     """Number of passes over the objects, or with --overfit over its views; 400 if no limit is
     given at all."""
-    minutes: float | None = None
+    minutes: Minutes | None = None
     """Training time, resumed parts included. If it is the only limit, the schedules follow the
     clock, and two runs are not the same to the bit."""
 
@@ -32,28 +39,35 @@ class LengthConfig:
 class DataConfig:
     """What a step sees."""
 
-    batch_size: int | None = None
+    batch_size: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     """Objects per step and process, before accumulation; 8 if not given, or 1 with --overfit."""
-    accumulate: int = 1
+    accumulate: Annotated[int, Meta(ge=1, le=100_000)] = 1
     """Batches per optimizer step."""
-    size: int = 128
+    size: Annotated[int, Meta(ge=1, le=4096)] = 128
     """Side of the rendered pictures, pixels."""
-    views_first: int = 2
+    views_first: _Views = 2
     """Novel views per object at the start."""
-    views_last: int = 6
+    views_last: _Views = 6
     """Novel views per object at the end; the number grows in equal shares of the run."""
-    views_per_object: int | None = None
+    views_per_object: _Views | None = None
     """A fixed number of novel views, in place of the growing one; 9 with --overfit."""
     background: Literal["white", "black", "random"] = "white"
     """Colour behind the rendered and the true pictures; "random" draws one for each object and
     step. The input picture always lies on the model's own background."""
     reference: Literal["auto", "random", "first"] = "auto"
     """The view that is the input: any, or always the first; "auto" is first with --overfit."""
+    front_share: float = 0.0
+    """Share of the samples whose input is the object's first view, which gamba data render takes
+    from the front; of the others it is any view."""
+    mirror: float = 0.0
+    """Share of the samples whose object is mirrored, with its cameras."""
+    recolor: float = 0.0
+    """Share of the samples whose colour channels change places and gamma."""
     overfit: str | None = None
     """Train on this one object (uid or number) and validate on its training views: a smoke test."""
     cache: bool = False
     """Keep decoded pictures in memory."""
-    workers: int = 1
+    workers: Annotated[int, Meta(ge=1, le=1024)] = 1
     """Threads that decode pictures ahead of the training."""
 
 
@@ -61,21 +75,26 @@ class DataConfig:
 class LossConfig:
     """Weights of the loss (paper eq. loss_train)."""
 
-    mask_weight: float = 1.0
+    mask_weight: _Weight = 1.0
     """Weight of the alpha channel's squared error."""
     lpips: Literal["auto", "on", "off"] = "auto"
     """Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" demands them."""
-    lpips_weight: float = 0.5
+    lpips_weight: _Weight = 0.5
     """Weight of LPIPS."""
-    lpips_after: int = 0
+    lpips_after: _Every = 0
     """Leave LPIPS out for this many steps; it can hold a young model in a white collapse."""
+    lpips_crop: int = 0
+    """Side of a random square, in pixels, that LPIPS compares in one view of each object; 0
+    compares all views whole, which on a CPU would take most of a step."""
+    ssim_weight: float = 0.0
+    """Weight of 1 - SSIM; the paper has no such term."""
     radial_mask: bool = True
     """The radial mask constraint on the projected centres (paper Table 2)."""
-    rdist_weight: float = 0.1
+    rdist_weight: _Weight = 0.1
     """Weight of the radial mask constraint at the start."""
-    rdist_epochs: float = 10.0
+    rdist_epochs: Annotated[float, Meta(ge=0, le=1e9)] = 10.0
     """Epochs over which the weight of the radial mask constraint falls linearly to 0."""
-    rdist_steps: int | None = None
+    rdist_steps: _Every | None = None
     """The same in steps, in place of --rdist-epochs."""
 
 
@@ -83,21 +102,21 @@ class LossConfig:
 class OptimConfig:
     """AdamW, and the running average of the weights."""
 
-    lr: float = 1e-3
+    lr: Annotated[float, Meta(gt=0, le=10)] = 1e-3
     """Peak learning rate; warm-up, then cosine to 0."""
-    warmup_steps: int = 100
+    warmup_steps: _Every = 100
     """Steps of the linear warm-up, a tenth of the run at most."""
-    weight_decay: float = 0.05
+    weight_decay: Annotated[float, Meta(ge=0, le=100)] = 0.05
     """Weight decay of matrices, except those that a module flags."""
-    beta2: float = 0.95
+    beta2: Annotated[float, Meta(ge=0, lt=1)] = 0.95
     """Second-moment decay of AdamW."""
-    clip: float = 1.0
+    clip: Annotated[float, Meta(gt=0, le=1e9)] = 1.0
     """Largest norm of the gradient."""
-    ema: float = 0.999
+    ema: Annotated[float, Meta(ge=0, lt=1)] = 0.999
     """Decay of the weights' running average, shorter at the start; 0 turns it off."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Precision in the network, by autocast; parameters, losses and rendering stay float32."""
-    max_skipped: int = 20
+    max_skipped: _Count = 20
     """Give up after so many non-finite steps in a row."""
 
 
@@ -113,28 +132,28 @@ class RunConfig:
     """Start from the weights of this model file (same architecture), with a fresh optimizer."""
     encoder_weights: str | None = None
     """File of the image encoder's weights, or "random" to train one from scratch."""
-    log_every: int = 10
+    log_every: _Count = 10
     """Steps between two lines of the log."""
-    val_every: int = 500
+    val_every: _Every = 500
     """Steps between two validations (and sample pictures); 0 for none."""
-    val_objects: int = 8
+    val_objects: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
     """Held-out objects to validate on."""
-    val_views: int = 4
+    val_views: Annotated[int, Meta(ge=0, le=100_000)] = 4
     """Novel views of each of these, evenly spaced in the list; --overfit takes all."""
-    save_every: int = 500
+    save_every: _Count = 500
     """Steps between two checkpoints; one is always saved at the end."""
-    keep: int = 2
+    keep: _Count = 2
     """Checkpoints kept; the oldest go first."""
     tensorboard: bool = True
     """Write TensorBoard files, if it is installed."""
     device: DeviceChoice = "auto"
     """Device that computes; "auto" is the GPU if there is one."""
-    threads: int | None = None
+    threads: Threads | None = None
     """Number of CPU threads; all cores if not given."""
     recompute: bool = False
     """Keep only the blocks' inputs for the gradient and run each block again there: the same
     result in less memory and more time."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the initial weights and of the order of the data."""
 
 
@@ -155,29 +174,11 @@ class TrainConfig:
     run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self) -> None:
-        positive = {
-            "steps": self.length.steps,
-            "epochs": self.length.epochs,
-            "minutes": self.length.minutes,
-            "batch-size": self.views.batch_size,
-            "accumulate": self.views.accumulate,
-            "size": self.views.size,
-            "workers": self.views.workers,
-            "log-every": self.run.log_every,
-            "save-every": self.run.save_every,
-            "keep": self.run.keep,
-            "threads": self.run.threads,
-            "lr": self.optim.lr,
-            "clip": self.optim.clip,
-        }
-        for name, value in positive.items():
-            if value is not None and not value > 0:
-                raise UserError(f"--{name} is {value}, it must be positive")
-        views = (self.views.views_first, self.views.views_last, self.views.views_per_object or 0)
-        if min(views) < 0:
-            raise UserError(f"the number of novel views is {min(views)}, it must not be negative")
-        if not 0 <= self.optim.ema < 1:
-            raise UserError(f"--ema is {self.optim.ema}, not in [0, 1)")
+        for group in (self.length, self.views, self.loss, self.optim, self.run):
+            check_options(group)
+        if self.loss.lpips == "on" and self.views.size < 16:
+            raise UserError(f"--lpips on: needs --size 16 or more, it is {self.views.size}")
+        self.model_config()
 
     def model_config(self) -> GambaConfig:
         """The preset with the changes of ``--set``.
@@ -195,9 +196,12 @@ class TrainConfig:
                 )
             try:
                 changes[name] = json.loads(text)
-            except ValueError:
+            except (ValueError, RecursionError):
                 changes[name] = text
-        return replace(PRESETS[self.preset], **changes)
+        try:
+            return replace(PRESETS[self.preset], **changes)
+        except UserError as error:
+            raise UserError(f"--set: {error}") from error
 
     def to_dict(self) -> dict:
         """JSON-ready values, the model's full configuration under ``model``."""
@@ -219,7 +223,8 @@ def config_differences(stored: dict, current: dict) -> list[str]:
     for name in sorted(old.keys() | new.keys()):
         free = name in _MAY_CHANGE or name.split(".")[0] in _MAY_CHANGE
         if old.get(name) != new.get(name) and (not free or name in _MUST_STAY):
-            differing.append(f"{name} ({old.get(name)} there, {new.get(name)} here)")
+            there, here = (str(values.get(name))[:80] for values in (old, new))
+            differing.append(f"{name} ({there} there, {here} here)")
     return differing
 
 

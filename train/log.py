@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO, TextIO
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
+from gamba_warp.files import one_line
 from gamba_warp.images import save_image
+
+_READ = 1 << 16  # bytes read at once in search of the last whole line
 
 
 class RunLog:
-    """Appends to ``RUN/log.jsonl``; every line has ``event``, ``step`` and ``time`` (Unix, s)."""
+    """Appends to ``RUN/log.jsonl``; every line has ``event``, ``step`` and ``time`` (Unix, s).
+
+    Nothing that goes wrong here stops a run: it is said once, and the run goes on without.
+    """
 
     def __init__(self, run: Path, tensorboard: bool) -> None:
         """Opens the log in the run folder.
@@ -25,32 +37,114 @@ class RunLog:
             UserError: the file cannot be written.
         """
         try:
-            self._file = open(run / "log.jsonl", "a", encoding="utf-8")
+            # Without a buffer, what could not be written is known at once and nowhere kept.
+            self._file = open(run / "log.jsonl", "a+b", buffering=0)
+            self._cut(_whole_lines(self._file))
         except OSError as error:
             raise UserError(f"cannot write {run / 'log.jsonl'}: {error.strerror}") from error
-        self._board = _summary_writer(run / "tensorboard") if tensorboard else None
+        self._said: set[str] = set()
+        self._board = None
+        if tensorboard:
+            with self._guarded("tensorboard"):
+                self._board = _summary_writer(run / "tensorboard")
+
+    @contextmanager
+    def _guarded(self, name: str) -> Iterator[None]:
+        """Says the first error of each writer in one line, and goes on."""
+        try:
+            yield
+        except Exception as error:  # TensorBoard's thread hands on whatever stopped it
+            if name not in self._said:
+                self._said.add(name)
+                say(f"gamba train: {name} cannot be written, the run goes on: {one_line(error)}")
+            if name == "tensorboard":
+                self._board = None
+
+    def _cut(self, size: int) -> None:
+        """Takes away what a full disk or a kill left of a line."""
+        if os.fstat(self._file.fileno()).st_size > size:
+            os.ftruncate(self._file.fileno(), size)
 
     def write(self, event: str, step: int, **values: object) -> None:
         """Writes a line; numbers that are not finite become null."""
         line = {"event": event, "step": step, "time": round(time.time(), 3)}
         line |= {name: _plain(value) for name, value in values.items()}
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
+        data = (json.dumps(line) + "\n").encode()
+        with self._guarded("log.jsonl"):
+            size = os.fstat(self._file.fileno()).st_size
+            try:
+                if self._file.write(data) != len(data):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError:
+                self._cut(size)
+                raise
         if self._board is not None:
-            for name, value in values.items():
-                if isinstance(value, (int, float)) and not isinstance(value, bool):
-                    self._board.add_scalar(f"{event}/{name}", value, step)
+            with self._guarded("tensorboard"):
+                for name, value in values.items():
+                    if isinstance(value, (int, float)) and not isinstance(value, bool):
+                        self._board.add_scalar(f"{event}/{name}", value, step)
 
     def warn(self, step: int, message: str) -> None:
         """Prints one line above the progress bar and logs it."""
-        tqdm.write(f"gamba train: {message}")
+        say(f"gamba train: {message}")
         self.write("warning", step, message=message)
+
+    def sample(self, step: int, path: Path, rows: list[Tensor]) -> None:
+        """Writes sample pictures, see ``save_strip``; where that fails, warns."""
+        try:
+            save_strip(path, rows)
+        except UserError as error:
+            self.warn(step, str(error))
 
     def close(self) -> None:
         """Closes the files."""
         self._file.close()
         if self._board is not None:
-            self._board.close()
+            with self._guarded("tensorboard"):
+                self._board.close()
+
+
+def say(text: str, file: TextIO | None = None) -> None:
+    """Prints a line above the progress bar; one that nobody can read any more is no error.
+
+    A terminal that was closed (SIGHUP) and a full disk under the standard output raise OSError.
+    """
+    with suppress(OSError):
+        tqdm.write(text, file or sys.stdout)
+        (file or sys.stdout).flush()
+
+
+class Quiet:
+    """A text stream for a progress bar, which stops no run where it cannot be written."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> None:
+        """Writes, or does nothing."""
+        with suppress(OSError):
+            self._stream.write(text)
+
+    def flush(self) -> None:
+        """Flushes, or does nothing."""
+        with suppress(OSError):
+            self._stream.flush()
+
+
+def _whole_lines(file: BinaryIO) -> int:
+    """Size up to the end of the last whole line, bytes."""
+    size = file.seek(0, os.SEEK_END)
+    while size:
+        start = max(0, size - _READ)
+        file.seek(start)
+        end = file.read(size - start).rfind(b"\n")
+        if end >= 0:
+            return start + end + 1
+        size = start
+    return 0
 
 
 def _plain(value: object) -> object:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,11 +20,11 @@ from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
 from .batches import Batch, BatchSource, Prefetcher, TrainingData, fixed_batches
-from .checkpoint import load_weights, read_state, save_checkpoint
+from .checkpoint import check_state, read_state, read_weights_of, save_checkpoint
 from .config import TrainConfig, config_differences
 from .ddp import World
-from .log import RunLog, save_strip
-from .optim import Ema, build_optimizer, learning_rate, novel_views, radial_weight
+from .log import Quiet, RunLog, say
+from .optim import Ema, build_optimizer, checked_moments, learning_rate, novel_views, radial_weight
 from .step import collapse_reason, compute_gradients, health, validate
 
 STATE_VERSION = 1
@@ -31,7 +32,10 @@ STATE_VERSION = 1
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """Collects SIGTERM and SIGINT in the yielded list; a second SIGINT interrupts at once."""
+    """Collects SIGTERM, SIGHUP and SIGINT in the yielded list; a second SIGINT interrupts at once.
+
+    A SIGHUP that is ignored, as below nohup, stays so.
+    """
     received: list[int] = []
 
     def note(number: int, frame: object) -> None:
@@ -39,7 +43,10 @@ def stop_signals() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         received.append(number)
 
-    old = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
+    stopping = [signal.SIGTERM, signal.SIGINT]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        stopping.append(signal.SIGHUP)
+    old = {number: signal.signal(number, note) for number in stopping}
     try:
         yield received
     finally:
@@ -73,15 +80,16 @@ class Trainer:
         self.step = self.skipped = self.skipped_in_row = 0
         self.elapsed = 0.0  # seconds of training, resumed parts included
         self._collapsed = False
+        self._unread: dict[str, str] = {}  # reasons by uid, of objects to validate on
+        self._named: set[str] = set()  # uids whose failure was said
         self._saved = self._validated = -1  # the step of the last checkpoint and validation
         self._source = BatchSource(
             data.train,
             model.config,
             objects=data.objects,
             batch_size=data.batch_size * world.size,
-            size=config.views.size,
             reference=data.reference,
-            background=config.views.background,
+            views=config.views,
             seed=config.run.seed,
         )
         length = config.length
@@ -93,7 +101,16 @@ class Trainer:
     @property
     def failures(self) -> dict[str, str]:
         """Reasons by uid, for the objects that could not be read so far."""
-        return self._source.failures
+        return self._unread | dict(self._source.failures)  # threads add to the second
+
+    def _name_failures(self) -> None:
+        """Warns of each object that could not be read, once."""
+        if self.log is None:
+            return
+        for uid, reason in self.failures.items():
+            if uid not in self._named:
+                self._named.add(uid)
+                self.log.warn(self.step, f"{uid} is skipped: {reason}")
 
     def progress(self, step: int) -> float:
         """Returns the share of the run that is done at a step, 0 to 1.
@@ -133,6 +150,7 @@ class Trainer:
             "rgb": 1.0,
             "mask": loss.mask_weight,
             "lpips": loss.lpips_weight if use_lpips else 0.0,
+            "ssim": loss.ssim_weight,
             "rdist": radial_weight(self.step, loss.rdist_weight, span) if loss.radial_mask else 0.0,
         }
 
@@ -157,6 +175,7 @@ class Trainer:
             clip=self.config.optim.clip,
             count=self.accumulate,
             lpips=self.lpips,
+            lpips_crop=self.config.loss.lpips_crop,
             precision=self.precision,
         )
         loss, norm = torch.stack([made.loss, made.norm]).tolist()
@@ -224,7 +243,13 @@ class Trainer:
             UserError: as ``train_step``, or the run folder cannot be written.
         """
         batches = Prefetcher(self.config.views.workers)
-        bar = tqdm(total=self.total, initial=self.step, unit="step", disable=not self.world.main)
+        bar = tqdm(
+            total=self.total,
+            initial=self.step,
+            unit="step",
+            disable=not self.world.main,
+            file=Quiet(sys.stderr),
+        )
         began, before = time.monotonic(), self.elapsed
         stop = 0.0
         self.model.train()
@@ -238,7 +263,7 @@ class Trainer:
                     figures = self.train_step(batches)
                     self._after_step(figures, bar)
                 if not stop:
-                    self._validate(bar)
+                    self._validate()
                 self.save()
         finally:
             batches.close()
@@ -267,6 +292,7 @@ class Trainer:
     def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
         run = self.config.run
         bar.update()
+        self._name_failures()
         if self.log is not None and self.step % run.log_every == 0:
             shown = {"loss": f"{figures['loss']:.4f}", "psnr": f"{figures['psnr']:.1f}"}
             if self.total is None:  # only minutes are limited, so the bar has no end
@@ -279,11 +305,11 @@ class Trainer:
                 self.log.warn(self.step, f"possible collapse at step {self.step}: {reason}")
             self._collapsed = reason is not None
         if run.val_every and self.step % run.val_every == 0:
-            self._validate(bar)
+            self._validate()
         if self.step % run.save_every == 0:
             self.save()
 
-    def _validate(self, bar: tqdm) -> None:
+    def _validate(self) -> None:
         """Validates the averaged weights on the main process; the others wait."""
         if self._validated == self.step or not self.config.run.val_every:
             return
@@ -296,13 +322,19 @@ class Trainer:
                 self.data.held_out,
                 self.data.val_views,
                 self.config.views.size,
+                self._unread,
             )
             weights = self.weights() | {"rdist": 0.0}
             figures, rows = validate(model, held_out, weights, self.lpips, self.world.device)
-            self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
-            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
-            bar.write(f"step {self.step}: validation {text}")
-            save_strip(self.config.run.out / "samples" / f"step_{self.step:06d}.png", rows)
+            self._name_failures()
+            if rows:
+                self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
+                text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+                say(f"step {self.step}: validation {text}")
+                name = f"step_{self.step:06d}.png"
+                self.log.sample(self.step, self.config.run.out / "samples" / name, rows)
+            else:
+                self.log.warn(self.step, "no validation: none of its objects can be read")
         self.world.barrier()
 
     def save(self) -> None:
@@ -340,21 +372,24 @@ class Trainer:
         """
         state = read_state(checkpoint)
         if state.get("version") != STATE_VERSION:
-            raise UserError(f"{checkpoint}: state of version {state.get('version')!r}")
+            raise UserError(f"{checkpoint}: state of version {str(state.get('version'))[:40]!r}")
+        check_state(state, str(checkpoint / "state.pt"))
         differing = config_differences(state["config"], self.config.to_dict())
-        for name, value in (
-            ("objects", self.data.fingerprint),
-            ("world_size", self.world.size),
-        ):
+        mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
+        for name, value in mine.items():
             if state[name] != value:
-                differing.append(f"{name} ({state[name]} there, {value} here)")
+                differing.append(f"{name} ({str(state[name])[:80]} there, {value} here)")
         if differing:
-            raise UserError(f"{checkpoint}: is of another run: {', '.join(differing)}")
-        load_weights(checkpoint / "model.safetensors", self.model)
+            raise UserError(f"{checkpoint}: is of another run: {', '.join(differing[:20])}")
+        moments = checked_moments(self.optimizer, state["optimizer"], checkpoint / "state.pt")
+        # Everything is read and checked before any of it is loaded.
+        weights = read_weights_of(checkpoint / "model.safetensors", self.model)
         if self.ema is not None:
-            load_weights(checkpoint / "ema.safetensors", self.ema.model)
+            averages = read_weights_of(checkpoint / "ema.safetensors", self.ema.model)
+            self.ema.model.load_stored_state(averages)
             self.ema.updates = state["ema_updates"]
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.model.load_stored_state(weights)
+        self.optimizer.load_state_dict(moments)
         self.step, self.skipped = state["step"], state["skipped"]
         self.skipped_in_row, self.elapsed = state["skipped_in_row"], state["elapsed"]
         self._saved = self.step if checkpoint.parent.parent == self.config.run.out else -1

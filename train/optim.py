@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
+from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
 
 
@@ -24,6 +28,51 @@ def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.op
         {"params": [p for p in trained if id(p) not in chosen], "weight_decay": 0.0},
     ]
     return torch.optim.AdamW(groups, lr=0.0, betas=(0.9, beta2), fused=True)
+
+
+def checked_moments(
+    optimizer: torch.optim.AdamW, stored: dict[str, Any], source: Path
+) -> dict[str, Any]:
+    """Checks what an optimizer's ``state_dict`` gave a file against the optimizer itself.
+
+    Args:
+        optimizer: of the model that goes on.
+        stored: the file's ``state_dict``. Its settings are not taken: they follow from the run's
+            configuration, which must be the same.
+        source: the file, for the error's message.
+
+    Returns:
+        What ``optimizer.load_state_dict`` takes.
+
+    Raises:
+        UserError: a moment is unknown, of another shape or kind, or not finite.
+    """
+    try:
+        _check_moments(optimizer, stored.get("state"))
+    except ValueError as error:
+        raise UserError(f"{source}: damaged, {error}") from error
+    return {"state": stored["state"], "param_groups": optimizer.state_dict()["param_groups"]}
+
+
+def _check_moments(optimizer: torch.optim.AdamW, moments: object) -> None:
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    if not isinstance(moments, dict):
+        raise ValueError("the optimizer has no state")
+    for index, entry in moments.items():
+        if type(index) is not int or not 0 <= index < len(parameters):
+            raise ValueError(f"the optimizer has a state of parameter {str(index)[:40]!r}")
+        names = set(entry) if isinstance(entry, dict) else set()
+        if names != {"step", "exp_avg", "exp_avg_sq"}:
+            raise ValueError(f"the optimizer's state of parameter {index} has other fields")
+        shape = parameters[index].shape
+        for name, value in entry.items():
+            wanted = torch.Size() if name == "step" else shape
+            if not isinstance(value, Tensor) or value.dtype != torch.float32:
+                raise ValueError(f"{name} of parameter {index} is no float32 tensor")
+            if value.shape != wanted:
+                raise ValueError(f"{name} of parameter {index} is {tuple(value.shape)}")
+            if not value.isfinite().all() or (name != "exp_avg" and bool((value < 0).any())):
+                raise ValueError(f"{name} of parameter {index} is not finite, or negative")
 
 
 class Ema:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
 
 import torch
 
-from gamba_warp.files import output_folder, write_json
+from gamba_warp.errors import UserError
+from gamba_warp.files import only_process, output_folder, sweep, write_json
 from gamba_warp.model.gamba import Gamba
 
-from .batches import open_data
-from .checkpoint import find_checkpoint, load_weights
+from .batches import TrainingData, open_data
+from .checkpoint import find_checkpoint, list_checkpoints, load_weights
 from .config import TrainConfig
 from .ddp import World
-from .log import RunLog
+from .log import RunLog, say
 from .loop import Trainer
 from .losses import open_lpips
 
@@ -32,9 +34,21 @@ def train(config: TrainConfig, world: World) -> int:
     Raises:
         UserError: bad data, options or run folder.
     """
-    run = config.run
     data = open_data(config)
-    checkpoint = find_checkpoint(run.out, run.resume)
+    with contextlib.ExitStack() as held:
+        return _train(config, world, data, held)
+
+
+def _train(
+    config: TrainConfig, world: World, data: TrainingData, held: contextlib.ExitStack
+) -> int:
+    run = config.run
+    lock = only_process(run.out, "trains")
+    there = run.out.is_dir()  # one that is not there is made only when nothing is bad
+    if world.main and there:
+        held.enter_context(lock)
+    damaged: list[str] = []
+    checkpoint = find_checkpoint(run.out, run.resume, damaged.append)
     lpips, warning = open_lpips(config)
     torch.manual_seed(run.seed)
     torch.set_float32_matmul_precision("high")  # TF32 where there is a GPU; no effect on a CPU
@@ -48,13 +62,19 @@ def train(config: TrainConfig, world: World) -> int:
     log = None
     if world.main:
         output_folder(run.out / "samples")
+        if not there:
+            held.enter_context(lock)
+            if list_checkpoints(run.out):
+                raise UserError(f"{run.out}: another process trained here meanwhile; start again")
+        for folder in (run.out, run.out / "samples"):
+            sweep(folder, age=0)
         log = RunLog(run.out, run.tensorboard)
     try:
         trainer = Trainer(config, model, data, world, log, lpips)
         if checkpoint is not None:
             trainer.restore(checkpoint)
         if log is not None:
-            _announce(trainer, log, checkpoint, warning)
+            _announce(trainer, log, checkpoint, [*damaged, *([warning] if warning else [])])
         code = trainer.run()
         if log is not None:
             code = _report(trainer, log, code)
@@ -64,21 +84,21 @@ def train(config: TrainConfig, world: World) -> int:
             log.close()
 
 
-def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, warning: str | None) -> None:
+def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: list[str]) -> None:
     """Says at the beginning what is trained on what, and what is missing."""
     config, data = trainer.config, trainer.data
     write_json(config.run.out / "config.json", config.to_dict())
     log.write("start", trainer.step, config=config.to_dict(), resumed_from=str(checkpoint or ""))
     parameters = sum(p.numel() for p in trainer.parameters)
     length = f"{trainer.total} steps" if trainer.total else f"{config.length.minutes} minutes"
-    print(
+    say(
         f"{len(set(data.objects))} objects, {parameters / 1e6:.1f} M parameters, {length}, "
         f"{trainer.world.device} -> {config.run.out}"
     )
-    for note in [*data.notes, *([warning] if warning else [])]:
+    for note in [*data.notes, *notes]:
         log.warn(trainer.step, note)
     if checkpoint is not None:
-        print(f"resumed {checkpoint} at step {trainer.step}")
+        say(f"resumed {checkpoint} at step {trainer.step}")
 
 
 def _report(trainer: Trainer, log: RunLog, code: int) -> int:
@@ -86,11 +106,11 @@ def _report(trainer: Trainer, log: RunLog, code: int) -> int:
     failures = trainer.failures
     log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures)
     if trainer.skipped:
-        print(f"{trainer.skipped} of {trainer.step} steps were skipped: not finite")
+        say(f"{trainer.skipped} of {trainer.step} steps were skipped: not finite")
     for uid, reason in failures.items():
-        print(f"could not read {uid}: {reason}", file=sys.stderr)
+        say(f"could not read {uid}: {reason}", sys.stderr)
     if code > 128:
-        print(f"stopped by a signal at step {trainer.step}; the same command goes on from here")
+        say(f"stopped by a signal at step {trainer.step}; the same command goes on from here")
     elif code == 0:
-        print(f"wrote {trainer.config.run.out / 'model.safetensors'}")
+        say(f"wrote {trainer.config.run.out / 'model.safetensors'}")
     return code or int(bool(failures))

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
 from gamba_warp.images import over_background
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
@@ -48,16 +49,18 @@ def forward(
     weights: Mapping[str, float],
     lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
     precision: torch.dtype = torch.float32,
+    lpips_crop: int = 0,
 ) -> Forward:
     """Predicts, renders all V+1 views and compares them with the true ones (paper eq. loss_train).
 
     Args:
         model: ``Gamba`` or a wrapper of it.
         batch: a batch on the model's device.
-        weights: weights of the terms ``rgb``, ``mask``, ``lpips`` and ``rdist``; ``lpips`` and
-            ``rdist`` are not computed at weight 0.
+        weights: weights of the terms ``rgb``, ``mask``, ``lpips``, ``ssim`` and ``rdist``; the last
+            three are not computed at weight 0.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
         precision: dtype of the network's matrix products; rendering and losses are float32.
+        lpips_crop: as for ``view_losses``.
     """
     kind = batch.inputs.device.type
     with torch.autocast(kind, precision, enabled=precision != torch.float32):
@@ -71,6 +74,8 @@ def forward(
         target,
         target_alpha,
         lpips if weights.get("lpips") else None,
+        lpips_crop,
+        bool(weights.get("ssim")),
     )
     if weights.get("rdist"):
         contours = contour_distances(target_alpha[..., 0])
@@ -104,6 +109,7 @@ def compute_gradients(
     clip: float,
     count: int = 1,
     lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
+    lpips_crop: int = 0,
     precision: torch.dtype = torch.float32,
 ) -> Gradients:
     """Sets the parameters' gradients to those of the mean loss over some batches, and clips them.
@@ -118,6 +124,7 @@ def compute_gradients(
         clip: largest norm of the gradient.
         count: number of batches, >= 1.
         lpips: see above.
+        lpips_crop: as for ``view_losses``.
         precision: see above.
     """
     optimizer.zero_grad(set_to_none=True)
@@ -127,7 +134,7 @@ def compute_gradients(
         if number < count - 1 and isinstance(model, DistributedDataParallel):
             hold = model.no_sync()
         with hold:
-            result = forward(model, batch, weights, lpips, precision)
+            result = forward(model, batch, weights, lpips, precision, lpips_crop)
             (result.loss / count).backward()
         losses.append(result.loss.detach())
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
@@ -189,9 +196,10 @@ def validate(
         device: the model's device.
 
     Returns:
-        ``loss``, ``psnr_input`` and ``psnr_novel`` (whole picture, dB, mean over views, then over
-        objects; ``psnr_novel`` is missing if there are no novel views); and rows ``[V, H, W, 3]``
-        for ``save_strip``, true above predicted for the first objects.
+        ``loss``, and ``psnr`` (dB), ``ssim``, ``mask_iou`` and, if it is given, ``lpips``, all of
+        whole pictures, each with ``_input`` for the input view and ``_novel`` for the mean over the
+        others, where there are any; pictures under 11x11 have no ``ssim``. And rows
+        ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the first objects.
     """
     was_training = model.training
     model.eval()
@@ -200,13 +208,29 @@ def validate(
     for batch in batches:
         batch = batch.to(device)
         result = forward(model, batch, weights, lpips)
-        quality = rendered_psnr(result.rendering.rgb, result.target)[0]
-        figures = {"loss": result.loss.item(), "psnr_input": quality[0].item()}
-        if len(quality) > 1:
-            figures["psnr_novel"] = quality[1:].mean().item()
+        figures = {"loss": result.loss.item()}
+        for measure, values in _quality(result, batch, lpips).items():
+            figures[f"{measure}_input"] = values[0].item()
+            if len(values) > 1:
+                figures[f"{measure}_novel"] = values[1:].mean().item()
         for name, value in figures.items():
             sums.setdefault(name, []).append(value)
         if len(rows) < 2 * STRIP_OBJECTS:
             rows += [result.target[0, :STRIP_VIEWS], result.rendering.rgb[0, :STRIP_VIEWS]]
     model.train(was_training)
     return {name: sum(values) / len(values) for name, values in sums.items()}, rows
+
+
+def _quality(
+    result: Forward, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
+) -> dict[str, Tensor]:
+    """The measures of a validation's object, each ``[V+1]``."""
+    got, want = result.rendering.rgb[0].clamp(0, 1), result.target[0]
+    masks = (result.rendering.alpha[0, ..., 0] > 0.5, batch.targets[0, ..., 3] > 0.5)
+    measures = {"psnr": psnr(got, want), "mask_iou": mask_iou(*masks)}
+    if min(want.shape[-3:-1]) >= SSIM_WINDOW:
+        measures["ssim"] = ssim(got, want)
+    if lpips is not None:
+        terms = result.terms
+        measures["lpips"] = terms["lpips"][0] if "lpips" in terms else lpips(got, want)
+    return measures

@@ -3,16 +3,38 @@
 from __future__ import annotations
 
 import json
-import math
+import re
 from dataclasses import asdict, dataclass, fields
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..errors import UserError
+from ..untrusted.ranges import Meta, check_values
 
 Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
 Background = Literal["white", "black"]
+Decoder = Literal["bins", "rays"]
+
+RAY_CHANNELS = (
+    1,
+    3,
+    1,
+    3,
+    3,
+)  # numbers of a ray's Gaussian: depth, offset, opacity, scales, colour
+RAY_STEM = 32  # channels after the first convolution of the decoder ``rays``
+# Fields that older files lack: their models are what the defaults say.
+_LATER = {
+    "decoder",
+    *(f"ray_{name}" for name in ("cells", "layers", "features", "depth", "offset")),
+}
+
+# No model that anyone trains comes near these; a file that says more is not believed.
+MAX_GAUSSIANS = 1 << 20
+MAX_INNER_WIDTH = 1 << 15
+MAX_PARAMETERS = 4 * 10**9  # 16 GB
+_IMAGE_CHANNELS = 2048  # of an image token, at most; for the estimate of the size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +49,7 @@ class GambaConfig:
         depth: number of Gamba blocks.
         state_size: SSM states per channel, 1 to 256.
         conv_size: taps of the causal convolution, 2 to 4.
-        expand: inner channels of a block per channel of a token.
+        expand: inner channels of a block per channel of a token; 32,768 inner channels at most.
         dt_rank: rank of the step size's projection; 0 means ceil(width / 16), as in mamba-ssm.
         norm: normalisation before every block and before the decoder.
         discretization: of the selective scan; "mamba" is what mamba-ssm runs, "zoh" and "bilinear"
@@ -49,67 +71,83 @@ class GambaConfig:
         scale_init: standard deviation of a Gaussian at the start, object units.
         opacity_init: opacity at the start.
         predict_rotation: whether quaternions are predicted; the paper fixes them.
+        decoder: "bins" is the paper's, one Gaussian a token; "rays" puts Gaussians on the rays of
+            the input's pixels (``model.rays``), and the fields ``ray_*`` are its own.
+        ray_cells: cells a side of a patch; it divides ``patch_size``.
+        ray_layers: Gaussians of a cell: the front one, and those for what is hidden.
+        ray_features: channels of a cell's features.
+        ray_depth: how far a Gaussian may lie before or behind the object's centre, object units.
+        ray_offset: how far it may lie off its ray, on each axis, object units.
         distance: distance of the reference camera from the object's centre, object units.
         fov: vertical field of view of the reference camera, degrees.
         background: colour that the input picture is composited on.
     """
 
-    image_size: int = 512
-    patch_size: int = 8
-    width: int = 512
-    depth: int = 14
-    state_size: int = 16
-    conv_size: int = 4
-    expand: int = 2
-    dt_rank: int = 0
+    image_size: Annotated[int, Meta(ge=1, le=4096)] = 512
+    patch_size: Annotated[int, Meta(ge=1, le=256)] = 8
+    width: Annotated[int, Meta(ge=1, le=8192)] = 512
+    depth: Annotated[int, Meta(ge=1, le=256)] = 14
+    state_size: Annotated[int, Meta(ge=1, le=256)] = 16
+    conv_size: Annotated[int, Meta(ge=2, le=4)] = 4
+    expand: Annotated[int, Meta(ge=1, le=64)] = 2
+    dt_rank: Annotated[int, Meta(ge=0, le=8192)] = 0
     norm: Norm = "layer"
     discretization: Discretization = "mamba"
-    embedding_init: float = 0.5
+    embedding_init: Annotated[float, Meta(gt=0, le=100)] = 0.5
     additive_image_tokens: bool = True
     prepend: bool = True
     camera_token: bool = True
     encoder: str = "vit_base_patch14_reg4_dinov2"
-    encoder_size: int = 336
+    encoder_size: Annotated[int, Meta(ge=1, le=4096)] = 336
     encoder_normalize: bool = True
     encoder_class_token: bool = False
     encoder_frozen: bool = True
-    decoder_width: int = 0
-    position_bins: int = 21
-    position_range: float = 0.5
-    position_init: float = 1.5
-    scale_init: float = 0.02
-    opacity_init: float = 0.5
+    decoder_width: Annotated[int, Meta(ge=0, le=8192)] = 0
+    position_bins: Annotated[int, Meta(ge=2, le=4096)] = 21
+    position_range: Annotated[float, Meta(ge=1e-3, le=100)] = 0.5
+    position_init: Annotated[float, Meta(gt=0, le=100)] = 1.5
+    scale_init: Annotated[float, Meta(ge=1e-6, le=10)] = 0.02
+    opacity_init: Annotated[float, Meta(ge=1e-6, le=1 - 1e-6)] = 0.5
     predict_rotation: bool = False
-    distance: float = DEFAULT_DISTANCE
-    fov: float = DEFAULT_FOV
+    decoder: Decoder = "bins"
+    ray_cells: Annotated[int, Meta(ge=1, le=256)] = 4
+    ray_layers: Annotated[int, Meta(ge=1, le=16)] = 4
+    ray_features: Annotated[int, Meta(ge=1, le=1024)] = 48
+    ray_depth: Annotated[float, Meta(ge=1e-3, le=100)] = 0.5
+    ray_offset: Annotated[float, Meta(ge=1e-6, le=100)] = 0.3
+    distance: Annotated[float, Meta(ge=1e-2, le=1000)] = DEFAULT_DISTANCE
+    fov: Annotated[float, Meta(ge=0.1, le=179)] = DEFAULT_FOV
     background: Background = "white"
 
     def __post_init__(self) -> None:
-        hints = get_type_hints(type(self))
-        for name, kind in hints.items():
+        for name, kind in get_type_hints(type(self)).items():
             _check_kind(name, getattr(self, name), kind)
-        may_be_zero = ("dt_rank", "decoder_width")
-        for name, kind in hints.items():
-            value = getattr(self, name)
-            if kind not in (int, float) or (value == 0 and name in may_be_zero):
-                continue
-            if not 0 < value < math.inf:
-                raise UserError(f"config: {name} is {value}, it must be positive")
+        hints = get_type_hints(type(self), include_extras=True)
+        check_values(vars(self), hints, lambda name: f"config: {name} is")
+        if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):
+            raise UserError(f"config: encoder is {self.encoder[:100]!r}, not a network's name")
         if self.image_size % self.patch_size:
             raise UserError(
                 f"config: image_size {self.image_size} is not a multiple of "
                 f"patch_size {self.patch_size}"
             )
-        limits = {"state_size": (1, 256), "conv_size": (2, 4), "position_bins": (2, 4096)}
-        for name, (low, high) in limits.items():
-            if not low <= getattr(self, name) <= high:
-                raise UserError(f"config: {name} is {getattr(self, name)}, not in {low}..{high}")
-        if not self.opacity_init < 1:
-            raise UserError(f"config: opacity_init is {self.opacity_init}, not in (0, 1)")
+        if self.decoder == "rays" and self.patch_size % self.ray_cells:
+            raise UserError(
+                f"config: patch_size {self.patch_size} is not a multiple of "
+                f"ray_cells {self.ray_cells}"
+            )
         if self.prepend and self.encoder == "none" and not self.camera_token:
             raise UserError("config: prepend needs a camera token or an encoder")
         if self.encoder == "vgg16" and not self.encoder_frozen:
             raise UserError("config: encoder vgg16 can only be used frozen")
+        limits = {
+            "num_gaussians": MAX_GAUSSIANS,
+            "inner_width": MAX_INNER_WIDTH,
+            "num_parameters": MAX_PARAMETERS,
+        }
+        for name, limit in limits.items():
+            if getattr(self, name) > limit:
+                raise UserError(f"config: {name} is {getattr(self, name):,}, over {limit:,}")
 
     @property
     def grid_size(self) -> int:
@@ -117,9 +155,26 @@ class GambaConfig:
         return self.image_size // self.patch_size
 
     @property
-    def num_gaussians(self) -> int:
-        """L, the number of 3DGS tokens and of Gaussians."""
+    def num_tokens(self) -> int:
+        """L, the number of 3DGS tokens."""
         return 4 * self.grid_size**2
+
+    @property
+    def num_gaussians(self) -> int:
+        """The number of Gaussians: L, or with "rays" that of a picture without any background."""
+        if self.decoder == "rays":
+            return self.ray_layers * (self.grid_size * self.ray_cells) ** 2
+        return self.num_tokens
+
+    @property
+    def input_channels(self) -> int:
+        """Channels of the pictures that the network takes: RGB, or with "rays" RGBA."""
+        return 4 if self.decoder == "rays" else 3
+
+    @property
+    def pixel_channels(self) -> int:
+        """What a 3DGS token sees of a pixel: that, and its Plücker ray."""
+        return self.input_channels + 6
 
     @property
     def inner_width(self) -> int:
@@ -130,6 +185,41 @@ class GambaConfig:
     def step_rank(self) -> int:
         """``dt_rank`` with its default filled in."""
         return self.dt_rank or -(-self.width // 16)
+
+    @property
+    def num_parameters(self) -> int:
+        """The number of parameters, without the image encoder's; with an encoder at most so many.
+
+        It is computed before anything is allocated: a file may claim any size.
+        """
+        inner, rank, states = self.inner_width, self.step_rank, self.state_size
+        image = _IMAGE_CHANNELS if self.prepend and self.encoder != "none" else 0
+        camera = (image or self.width) if self.prepend and self.camera_token else 0
+        norm = self.width * (2 if self.norm == "layer" else 1)
+        projections = sum((channels + 1) * self.width for channels in (camera, image) if channels)
+        scan = inner * (self.conv_size + rank + 2 * states + rank + states + 3)
+        block = norm + projections + scan + 3 * self.width * inner
+        patchify = (
+            (self.pixel_channels * self.patch_size**2 + 1) * self.width
+            if self.additive_image_tokens
+            else 0
+        )
+        token = 17 * camera + (camera + 1) * camera
+        embedding = self.num_tokens * self.width
+        return self.depth * block + norm + self._decoder_parameters() + patchify + token + embedding
+
+    def _decoder_parameters(self) -> int:
+        """The decoder's part of ``num_parameters``."""
+        if self.decoder == "bins":
+            hidden = self.decoder_width or self.width
+            heads = 3 * self.position_bins + (11 if self.predict_rotation else 7)
+            return (self.width + 1) * hidden + (hidden + 1) * (hidden + heads)
+        features, side = self.ray_features, self.patch_size // self.ray_cells + 2
+        up = (4 * self.width + 1) * self.ray_cells**2 * features
+        stem = (side**2 * self.pixel_channels + 1) * RAY_STEM
+        stem += (9 * RAY_STEM + 1 + 9 * features + 1) * features
+        each = sum(RAY_CHANNELS) + (4 if self.predict_rotation else 0)
+        return up + stem + ((features + 1) * each + 3) * self.ray_layers
 
     @property
     def background_color(self) -> float:
@@ -152,39 +242,57 @@ class GambaConfig:
             UserError: the text is not JSON, a key is unknown or missing, or a value has the wrong
                 type or range.
         """
-        try:
-            values = json.loads(text)
-        except ValueError as error:
-            raise UserError(f"{source}: the model's configuration is not JSON ({error})") from error
-        if not isinstance(values, dict):
-            raise UserError(f"{source}: the model's configuration is not a JSON object")
+        from ..untrusted.documents import parse_document  # not where torch and warp are all
+
+        where = f"{source}: the model's configuration"
+        values = parse_document(text, dict[str, Any], where)
         names = {field.name for field in fields(cls)}
-        unknown, missing = sorted(set(values) - names), sorted(names - set(values))
+        unknown, missing = sorted(set(values) - names), sorted(names - set(values) - _LATER)
         if unknown or missing:
-            parts = [f"unknown {', '.join(unknown)}"] if unknown else []
-            parts += [f"missing {', '.join(missing)}"] if missing else []
-            raise UserError(f"{source}: the model's configuration has keys {'; '.join(parts)}")
+            parts = [f"unknown {_few(unknown)}"] if unknown else []
+            parts += [f"missing {_few(missing)}"] if missing else []
+            raise UserError(f"{where} has keys {'; '.join(parts)}")
         try:
             return cls(**values)
         except UserError as error:
             raise UserError(f"{source}: {error}") from error
 
 
+def _few(names: list[str]) -> str:
+    """The first names of a list that a file may have made endless."""
+    shown = [name if name.isidentifier() else repr(name[:40]) for name in names[:8]]
+    return ", ".join(shown) + (", ..." if len(names) > 8 else "")
+
+
 def _check_kind(name: str, value: object, kind: type) -> None:
     if get_origin(kind) is Literal:
         if value not in get_args(kind):
-            raise UserError(f"config: {name} is {value!r}, not one of {', '.join(get_args(kind))}")
+            shown, known = repr(value)[:100], ", ".join(get_args(kind))
+            raise UserError(f"config: {name} is {shown}, not one of {known}")
         return
     fits = isinstance(value, (int, float) if kind is float else kind)
     if not fits or (isinstance(value, bool) and kind is not bool):
-        raise UserError(f"config: {name} is {value!r}, it must be of type {kind.__name__}")
+        shown = repr(value)[:100]
+        raise UserError(f"config: {name} is {shown}, it must be of type {kind.__name__}")
 
 
-Preset = Literal["tiny", "small", "paper"]
+Preset = Literal["tiny", "rays", "small", "paper"]
 PRESETS: dict[Preset, GambaConfig] = {
     # This one trains on two CPU cores; it has 4,096 Gaussians and no image encoder.
     "tiny": GambaConfig(
         image_size=128, patch_size=4, width=128, depth=6, encoder="none", encoder_size=128
+    ),
+    # This one trains on two CPU cores, too: three Gaussians on the ray of each pixel of the object.
+    "rays": GambaConfig(
+        image_size=128,
+        width=128,
+        depth=6,
+        encoder="none",
+        encoder_size=128,
+        decoder="rays",
+        ray_cells=8,
+        ray_layers=3,
+        ray_features=24,
     ),
     # This one trains on one small GPU; it has 9,216 Gaussians.
     "small": GambaConfig(

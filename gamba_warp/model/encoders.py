@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ..errors import UserError
-from .config import GambaConfig
+from ..untrusted.torch_files import read_torch
+from .config import MAX_PARAMETERS, GambaConfig
 from .tokens import IMAGENET_MEAN, IMAGENET_STD
 
 if TYPE_CHECKING:
@@ -113,6 +114,29 @@ def build_encoder(config: GambaConfig, weights: str | Path | None) -> ImageEncod
     return _build_vit(config, weights)
 
 
+def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
+    """Builds the encoder that ``config`` names as shapes alone, on the meta device.
+
+    Returns:
+        An encoder to build a model of meta tensors with, or None if the model has none.
+
+    Raises:
+        UserError: the network does not exist, or is larger than any model may be.
+    """
+    if config.encoder == "none" or not config.prepend:
+        return None
+    if config.encoder == "vgg16":
+        from ..data.vgg_weights import WIDTHS
+
+        return ImageEncoder(nn.Identity(), WIDTHS[-1], config)
+    with torch.device("meta"):
+        vit = _create_vit(config, pretrained=False)
+        count = sum(parameter.numel() for parameter in vit.parameters())
+        if count > MAX_PARAMETERS:
+            raise UserError(f"encoder {config.encoder}: has {count:,} parameters, too many")
+        return ImageEncoder(_ViT(vit, config), vit.num_features, config)
+
+
 def _build_vgg(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
     from .vgg import vgg16_features
 
@@ -169,29 +193,35 @@ def _load_vit(vit: VisionTransformer, path: Path) -> None:
     from timm.models.vision_transformer import checkpoint_filter_fn
 
     state = _read_state(path)
-    state = state.get("model", state.get("state_dict", state))
     if "register_tokens" in state:
         state.setdefault("mask_token", None)  # timm knows Meta's layout by this key, then drops it
     try:
         state = checkpoint_filter_fn(state, vit)
         state = {k: v for k, v in state.items() if not k.startswith("head.")}
         vit.load_state_dict(state)
-    except (RuntimeError, KeyError, AttributeError, TypeError, AssertionError) as error:
+    except Exception as error:  # a file of another network may break timm's conversion anywhere
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: not weights of this encoder ({reason})") from error
+    for name, value in vit.state_dict().items():
+        if not value.isfinite().all():
+            raise UserError(f"{path}: '{name}' has numbers that are not finite")
 
 
-def _read_state(path: Path) -> dict:
+def _read_state(path: Path) -> dict[str, Any]:
+    """The tensors of a file of weights by name."""
     if not path.is_file():
         raise UserError(f"{path}: no such file of encoder weights")
-    try:
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
+    if path.suffix == ".safetensors":
+        from safetensors.torch import load_file
 
+        try:
             return load_file(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # pickle, zip and safetensors each raise their own classes
-        raise UserError(f"{path}: cannot be read as encoder weights") from error
-    if not isinstance(state, dict):
+        except Exception as error:  # the library's own class, and those of torch
+            raise UserError(f"{path}: cannot be read as encoder weights") from error
+    state = read_torch(path, "cannot be read as encoder weights")
+    for key in ("model", "state_dict"):
+        if isinstance(state, dict) and isinstance(state.get(key), dict):
+            state = state[key]
+    if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
         raise UserError(f"{path}: holds no state dict")
     return state

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from torch import Tensor, nn
@@ -12,7 +13,9 @@ from .block import GambaBlock, State, make_norm, prefix_states, run_blocks
 from .config import GambaConfig
 from .decoder import GaussianDecoder
 from .encoders import ImageEncoder, build_encoder
-from .tokens import CameraToken, SplatTokens
+from .patches import foreground_patches
+from .rays import RayDecoder
+from .tokens import CameraToken, SplatTokens, on_background
 
 
 class Gamba(nn.Module):
@@ -55,7 +58,7 @@ class Gamba(nn.Module):
             GambaBlock(config, camera_channels, image_channels) for _ in range(config.depth)
         )
         self.norm = make_norm(config)
-        self.decoder = GaussianDecoder(config)
+        self.decoder = {"bins": GaussianDecoder, "rays": RayDecoder}[config.decoder](config)
         for parameter in self.parameters():
             if parameter.ndim == 1:
                 vars(parameter)["_no_weight_decay"] = True
@@ -67,7 +70,9 @@ class Gamba(nn.Module):
         """
         self._check(images, cameras)
         camera = self.camera_token(cameras) if self.camera_token else None
-        image = self.encoder(images) if self.encoder else None
+        image = None
+        if self.encoder:
+            image = self.encoder(on_background(images, self.config.background_color)[0])
         return prefix_states(self.blocks, camera, image)
 
     def forward(
@@ -81,7 +86,8 @@ class Gamba(nn.Module):
 
         Args:
             images: ``[B, H, W, 3]`` RGB in [0, 1] on ``config.background``, H = W =
-                ``config.image_size``.
+                ``config.image_size``; for the decoder ``rays`` ``[B, H, W, 4]`` RGBA with straight
+                alpha.
             cameras: ``viewmats [B, 4, 4]`` and ``Ks [B, 3, 3]`` of the same picture size.
             condition: the result of ``condition`` for the same pictures and cameras, if the
                 caller has it already.
@@ -89,11 +95,13 @@ class Gamba(nn.Module):
                 picture, except those within this many patches of one that is not; 0 keeps only
                 the object's own patches. This is faster, but the model was not trained for it:
                 ``gamba bench model`` states the error. None drops nothing. On CUDA it reads one
-                number back.
+                number back. The decoder ``rays`` is trained on the object's own patches and always
+                keeps only these, each picture its own; None is 0 there.
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or
-            the number of kept tokens, in their order.
+            the number of kept tokens, in their order. With ``rays`` N is that of the picture with
+            the most patches in the batch; the others are filled up with Gaussians of opacity 0.
 
         Raises:
             ValueError: a shape that does not fit, or a negative margin.
@@ -101,6 +109,8 @@ class Gamba(nn.Module):
         self._check(images, cameras)
         if condition is None:
             condition = self.condition(images, cameras)
+        if isinstance(self.decoder, RayDecoder):
+            return self._on_rays(images, cameras, condition, background_margin or 0)
         tokens = self.tokens(images, cameras)
         if background_margin is not None:
             background = self.config.background_color
@@ -108,11 +118,23 @@ class Gamba(nn.Module):
         tokens = run_blocks(self.blocks, tokens, condition, self.recompute)
         return self.decoder(self.norm(tokens))
 
+    def _on_rays(
+        self, rgba: Tensor, cameras: Cameras, condition: list[State | None], margin: int
+    ) -> Gaussians:
+        """What ``forward`` does for the decoder ``rays``."""
+        patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
+        pixels = self.tokens.pixels(rgba, cameras)
+        tokens, places = self.tokens.of_patches(pixels, patches)
+        tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute))
+        at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
+        tokens = tokens.gather(1, at).unflatten(1, places.shape[1:])
+        return self.decoder(tokens, pixels, patches, rgba, cameras)
+
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size
         batch = len(images) if images.ndim else 0
         wanted = {
-            "images": (images.shape, (batch, size, size, 3)),
+            "images": (images.shape, (batch, size, size, self.config.input_channels)),
             "cameras.viewmats": (cameras.viewmats.shape, (batch, 4, 4)),
             "cameras.Ks": (cameras.Ks.shape, (batch, 3, 3)),
             "cameras (height, width)": ((cameras.height, cameras.width), (size, size)),
@@ -134,13 +156,21 @@ class Gamba(nn.Module):
         Raises:
             ValueError: a tensor is missing, unknown or of another shape.
         """
+        self.check_stored_state({name: list(value.shape) for name, value in state.items()})
+        self.load_state_dict(state, strict=False)
+
+    def check_stored_state(self, shapes: Mapping[str, Sequence[int]]) -> None:
+        """Compares the names and shapes of tensors with those of ``stored_state``.
+
+        Raises:
+            ValueError: a tensor is missing, unknown or of another shape; it names the first.
+        """
         own = self.stored_state()
-        missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
+        missing, unknown = sorted(own.keys() - shapes.keys()), sorted(shapes.keys() - own.keys())
         if missing or unknown:
             kind, names = ("no", missing) if missing else ("an unknown", unknown)
-            raise ValueError(f"{kind} tensor '{names[0]}' ({len(names)} such)")
+            raise ValueError(f"{kind} tensor {names[0][:200]!r} ({len(names)} such)")
         for name, value in own.items():
-            if state[name].shape != value.shape:
-                got, want = tuple(state[name].shape), tuple(value.shape)
+            if tuple(shapes[name]) != value.shape:
+                got, want = tuple(shapes[name]), tuple(value.shape)
                 raise ValueError(f"tensor '{name}' is {got}, expected {want}")
-        self.load_state_dict(state, strict=False)

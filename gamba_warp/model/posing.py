@@ -56,10 +56,12 @@ def posed_input(views: ObjectViews, config: GambaConfig) -> tuple[Tensor, Camera
         config: of the model; gives the background and the distance.
 
     Returns:
-        Images ``[1, S, S, 3]`` RGB in [0, 1] and the reference camera ``[1]``, on the device of
-        ``views``.
+        Images ``[1, S, S, 3]`` RGB in [0, 1], or RGBA where the model takes it, and the reference
+        camera ``[1]``, on the device of ``views``.
     """
     from ..images import over_background  # needs PIL, which a CUDA machine may not have
 
-    images = over_background(views.images[:1], config.background_color)
+    images = views.images[:1]
+    if config.input_channels == 3:
+        images = over_background(images, config.background_color)
     return images, relative_cameras(views.cameras[:1], config.distance)

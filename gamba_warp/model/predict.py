@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..data.preprocess import composite, prepare
 from ..gaussians import Gaussians
+from .config import GambaConfig
 from .posing import reference_cameras
 
 if TYPE_CHECKING:
@@ -37,5 +39,25 @@ def reconstruct(model: Gamba, picture: str | Path | np.ndarray) -> Gaussians:
         raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config
     device = next(model.parameters()).device
-    images = composite(rgba, config.image_size, config.background_color)[None].to(device)
+    images = model_input(rgba, config).to(device)
     return model(images, reference_cameras(config, 1).to(device))[0]
+
+
+def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:
+    """A picture as a model takes it.
+
+    Args:
+        rgba: ``[S, S, 4]`` in [0, 1], straight alpha.
+        config: of the model.
+
+    Returns:
+        ``[1, s, s, 3]`` RGB on the model's background, or RGBA where the model takes alpha, on the
+        CPU; s is ``config.image_size``.
+    """
+    size = config.image_size
+    if config.input_channels == 3:
+        return composite(rgba, size, config.background_color)[None]
+    white = np.concatenate([np.ones_like(rgba[..., :3]), rgba[..., 3:]], -1)
+    alpha = composite(white, size, 0.0)[..., :1]
+    color = composite(rgba, size, 0.0) / alpha.clamp_min(1e-6)
+    return torch.cat([color.clamp(0, 1), alpha], -1)[None]

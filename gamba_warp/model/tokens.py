@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from ..cameras import Cameras, plucker_rays
 from .config import GambaConfig
+from .patches import Patches
 
 # Mean and deviation of ImageNet's pictures; every pretrained encoder here was trained with them.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -19,6 +20,22 @@ def normalize_imagenet(images: Tensor) -> Tensor:
     # A tensor made of the constants would be copied from the host, which a CUDA graph cannot hold.
     planes = zip(images.unbind(-1), IMAGENET_MEAN, IMAGENET_STD)
     return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
+
+
+def on_background(images: Tensor, background: float) -> list[Tensor]:
+    """Splits pictures into colour on the background and, where there is one, alpha.
+
+    Args:
+        images: ``[.., 3]`` RGB in [0, 1], or ``[.., 4]`` RGBA with straight alpha.
+        background: grey value in [0, 1].
+
+    Returns:
+        RGB ``[.., 3]``; of RGBA also alpha ``[.., 1]``.
+    """
+    if images.shape[-1] == 3:
+        return [images]
+    color, alpha = images.split([3, 1], -1)
+    return [color * alpha + background * (1 - alpha), alpha]
 
 
 def scan_orders(height: int, width: int) -> Tensor:
@@ -66,11 +83,13 @@ class SplatTokens(nn.Module):
     def __init__(self, config: GambaConfig) -> None:
         super().__init__()
         grid, self.patch_size = config.grid_size, config.patch_size
+        self.background = config.background_color
         self.patchify = None
         if config.additive_image_tokens:
             patch = config.patch_size
-            self.patchify = nn.Conv2d(9, config.width, kernel_size=patch, stride=patch)
-        self.embedding = nn.Parameter(torch.empty(config.num_gaussians, config.width))
+            channels = config.pixel_channels
+            self.patchify = nn.Conv2d(channels, config.width, kernel_size=patch, stride=patch)
+        self.embedding = nn.Parameter(torch.empty(config.num_tokens, config.width))
         # E is nearly as large as an image token. On plain background E alone tells the tokens
         # apart, and the positions start spread out only if the tokens differ.
         nn.init.normal_(self.embedding, std=config.embedding_init)
@@ -81,13 +100,51 @@ class SplatTokens(nn.Module):
         """Maps ``images [B, H, W, 3]`` in [0, 1] and one camera each to ``[B, L, width]``."""
         if self.patchify is None:
             return self.embedding.expand(len(images), -1, -1)
+        patches = self.patchify(self.pixels(images, cameras)).flatten(2).mT
+        return patches[:, self.orders] + self.embedding
+
+    def pixels(self, images: Tensor, cameras: Cameras) -> Tensor:
+        """What the tokens are made of: normalised colour, Plücker ray and, if given, 2 · alpha - 1.
+
+        Args:
+            images: ``[B, H, W, 3]`` RGB in [0, 1] on the model's background, or RGBA with straight
+                alpha, which is put on that background.
+            cameras: ``[B]`` of the pictures.
+
+        Returns:
+            ``[B, 9 or 10, H, W]`` float32.
+        """
         # Autocast would round the matrix products inside to 8 bits, which is too coarse for rays.
         with torch.autocast(images.device.type, enabled=False):
             height, width = images.shape[1:3]
             rays = plucker_rays(cameras.viewmats.float(), cameras.Ks.float(), width, height)
-            pixels = torch.cat([normalize_imagenet(images.float()), rays], dim=-1)
-        patches = self.patchify(pixels.permute(0, 3, 1, 2)).flatten(2).mT
-        return patches[:, self.orders] + self.embedding
+            flat, *alpha = on_background(images.float(), self.background)
+            parts = [normalize_imagenet(flat), rays, *(2 * part - 1 for part in alpha)]
+            return torch.cat(parts, dim=-1).permute(0, 3, 1, 2)
+
+    def of_patches(self, pixels: Tensor, patches: Patches) -> tuple[Tensor, Tensor]:
+        """The tokens of some patches alone; of the others not even the convolution is computed.
+
+        Args:
+            pixels: result of ``pixels``.
+            patches: F patches of each picture.
+
+        Returns:
+            Tokens ``[B, 4F, width]`` in their order, and where among them each patch has its four:
+            ``[B, F, 4]`` int64; see ``Patches.orders``.
+        """
+        kept, places = patches.orders(self.orders)
+        tokens = self.embedding[kept]
+        if self.patchify is None:
+            return tokens, places
+        cut = patches.cells(pixels, self.patch_size).flatten(2)
+        weight = self.patchify.weight.permute(0, 2, 3, 1).flatten(1)
+        found = F.linear(cut, weight, self.patchify.bias)  # [B, F, width]
+        number = torch.zeros(len(pixels), patches.grid**2, dtype=torch.int64, device=pixels.device)
+        steps = torch.arange(patches.index.shape[1], device=pixels.device)
+        number = number.scatter(1, patches.index, steps.expand_as(patches.index))
+        at = number.gather(1, self.orders[kept])[..., None]
+        return tokens + found.gather(1, at.expand(-1, -1, found.shape[-1])), places
 
     def foreground(self, images: Tensor, background: float, margin: int) -> Tensor:
         """Finds the tokens whose patch is not plain background, or is near such a patch.

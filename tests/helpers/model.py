@@ -1,9 +1,19 @@
 """A micro configuration of the model, and random input for it."""
 
+import timm
 import torch
+from timm.models.vision_transformer import _create_vision_transformer
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.model.config import GambaConfig
+
+
+@timm.models.register_model
+def gamba_test_vit(pretrained=False, **kwargs):
+    """Makes a ViT of one block, which configurations name as "gamba_test_vit"."""
+    tiny = {"patch_size": 8, "embed_dim": 16, "depth": 1, "num_heads": 2}
+    name = "vit_base_patch16_224"  # for its pretrained_cfg alone
+    return _create_vision_transformer(name, pretrained=pretrained, **(tiny | kwargs))
 
 
 def micro(**changes) -> GambaConfig:

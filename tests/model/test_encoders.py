@@ -144,7 +144,7 @@ def test_errors(changes, weights, words):
         build_encoder(_config(**changes), weights)
 
 
-@pytest.mark.parametrize("kind", ["empty", "text", "other", "list", "truncated"])
+@pytest.mark.parametrize("kind", ["empty", "text", "other", "list", "truncated", "nan", "keys"])
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
 def test_bad_files_name_the_file(tmp_path, kind, suffix):
     path = tmp_path / f"weights{suffix}"
@@ -157,11 +157,17 @@ def test_bad_files_name_the_file(tmp_path, kind, suffix):
     elif kind == "truncated":
         write(state, path)
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif kind == "nan":
+        state["norm.weight"][0] = float("nan")
+        write(state, path)
+    elif kind == "keys" and suffix == ".pth":
+        torch.save({"model": {3: torch.ones(2)}}, path)
     else:
         state.pop("norm.weight")
         write(state, path)
-    with pytest.raises(UserError, match=f"{path.name}: "):
+    with pytest.raises(UserError, match=f"{path.name}: ") as caught:
         build_encoder(_config(), path)
+    assert "\n" not in str(caught.value)
 
 
 def test_vgg16_tokens(monkeypatch):

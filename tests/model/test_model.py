@@ -1,24 +1,15 @@
 """The whole network: shapes, gradients, ablations, sizes of the presets."""
 
 import pytest
-import timm
 import torch
 from helpers import assert_rel_rms
 from helpers.model import inputs, micro
-from timm.models.vision_transformer import _create_vision_transformer
 
 from gamba_warp.cameras import Cameras, orbit
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.vgg import VGG16Features, VGG16Trunk
-
-
-@timm.models.register_model
-def gamba_test_vit(pretrained=False, **kwargs):
-    tiny = {"patch_size": 8, "embed_dim": 16, "depth": 1, "num_heads": 2}
-    name = "vit_base_patch16_224"  # for its pretrained_cfg alone
-    return _create_vision_transformer(name, pretrained=pretrained, **(tiny | kwargs))
 
 
 @pytest.mark.parametrize("batch", [1, 3])
@@ -187,8 +178,8 @@ def test_positions_start_spread_inside_the_object():
 
 
 # Without a frozen encoder. The paper's own figure is "about 10 %" of 500 M parameters of an LRM.
-PARAMETERS = {"tiny": 1_403_334, "small": 9_827_142, "paper": 44_614_726}
-LENGTHS = {"tiny": (4096, 0), "small": (9216, 144), "paper": (16384, 576)}
+PARAMETERS = {"tiny": 1_403_334, "rays": 1_835_410, "small": 9_827_142, "paper": 44_614_726}
+LENGTHS = {"tiny": (4096, 0), "rays": (49152, 0), "small": (9216, 144), "paper": (16384, 576)}
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -203,7 +194,7 @@ def test_preset_sizes(preset, monkeypatch):
         images = torch.rand(1, config.encoder_size, config.encoder_size, 3)
         image_tokens = model.encoder(images).shape[1] if model.encoder else 0
     assert (config.num_gaussians, image_tokens) == LENGTHS[preset]
-    assert model.tokens.orders.shape == (config.num_gaussians,)
+    assert model.tokens.orders.shape == (config.num_tokens,)
     count = sum(p.numel() for p in model.stored_state().values())
     assert count == PARAMETERS[preset]
     if preset == "paper":
@@ -224,7 +215,7 @@ def test_config_json_round_trip():
         ('"width": "16"', "file.x: .*width is '16'"),
         ('"width": 0', "file.x: .*width is 0"),
         ('"width": true', "file.x: .*width is True"),
-        ('"width": 16,', "file.x: .*not JSON"),
+        ('"width": 16,', "file.x: .*not valid JSON"),
     ],
 )
 def test_config_json_errors(change, words):

@@ -1,5 +1,9 @@
 """Checkpoints: bit-equal round trips, what is stored, and refusals that name the file."""
 
+import json
+import os
+import struct
+
 import pytest
 import torch
 from helpers.model import inputs, micro
@@ -8,7 +12,10 @@ from safetensors.torch import save_file
 
 from gamba_warp.errors import UserError
 from gamba_warp.model.checkpoint import FILE_NAME, load_model, save_model
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.encoders import outline_encoder
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.train.checkpoint import load_weights
 
 
 @pytest.mark.parametrize(
@@ -92,6 +99,32 @@ def _damage(path, kind):
     elif kind == "config key":
         config = metadata["config"].replace('"fov"', '"view"')
         save_file(state, path, metadata=metadata | {"config": config})
+    elif kind == "huge":
+        config = json.dumps(json.loads(metadata["config"]) | {"width": 2048, "depth": 200})
+        save_file({"x": torch.ones(1)}, path, metadata=metadata | {"config": config})
+    elif kind == "nobody's":
+        config = metadata["config"].replace('"encoder": "none"', '"encoder": "vit_of_nobody"')
+        save_file(state, path, metadata=metadata | {"config": config})
+    elif kind == "endless depth":
+        config = metadata["config"].replace('"depth": 2', '"depth": 1000000000')
+        save_file(state, path, metadata=metadata | {"config": config})
+    elif kind == "nested":
+        config = metadata["config"].replace('"depth": 2', f'"depth": {"[" * 60 + "]" * 60}')
+        save_file(state, path, metadata=metadata | {"config": config})
+    elif kind == "integers":
+        whole = {name: value.int() for name, value in state.items()}
+        save_file(whole, path, metadata=metadata)
+    elif kind == "not finite":
+        state["norm.weight"][3:5] = torch.tensor([float("nan"), float("inf")])
+        save_file(state, path, metadata=metadata)
+    elif kind == "no text":
+        header = json.dumps({"__metadata__": {"config": 7, "format": "x"}}).encode()
+        path.write_bytes(struct.pack("<Q", len(header)) + header)
+    elif kind == "header":
+        path.write_bytes(struct.pack("<Q", 1 << 40) + path.read_bytes()[8:])
+    elif kind == "pipe":
+        path.unlink()
+        os.mkfifo(path)
 
 
 @pytest.mark.parametrize(
@@ -107,6 +140,15 @@ def _damage(path, kind):
         ("tensor gone", "no tensor 'norm.weight'"),
         ("tensor more", "an unknown tensor 'stranger'"),
         ("config key", "unknown view; missing fov"),
+        ("huge", "config: num_parameters is .* over 4,000,000,000"),
+        ("endless depth", "config: depth is 1000000000, must be at least 1 and at most 256"),
+        ("nobody's", "encoder vit_of_nobody: neither"),
+        ("nested", "configuration: nested deeper than 32 levels"),
+        ("integers", "'.*' is of I32, not F32, BF16, F16"),
+        ("not finite", "2 of 16 numbers of 'norm.weight' are not finite"),
+        ("no text", "not a whole safetensors file"),
+        ("header", "not a whole safetensors file .its header is too large"),
+        ("pipe", "not a plain file"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, kind, words):
@@ -114,3 +156,46 @@ def test_bad_files_are_refused(tmp_path, kind, words):
     _damage(path, kind)
     with pytest.raises(UserError, match=f"bad.safetensors: .*{words}"):
         load_model(path)
+    with pytest.raises(UserError, match="bad.safetensors: ") as caught:
+        load_weights(path, Gamba(micro(encoder="none")))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_small_file_that_claims_a_large_model_takes_no_memory(tmp_path, monkeypatch):
+    config = micro(encoder="none", width=2048, depth=100)  # 10 GB
+    metadata = {"format": "gamba_warp.model.1", "config": config.to_json()}
+    save_file({"norm.weight": torch.ones(2048)}, tmp_path / "m.safetensors", metadata=metadata)
+    built = []
+
+    def watched(*arguments, **options):
+        built.append(torch.empty(0).device.type)
+        assert built == ["meta"]
+        return Gamba(*arguments, **options)
+
+    monkeypatch.setattr("gamba_warp.model.checkpoint.Gamba", watched)
+    with pytest.raises(UserError, match="no tensor 'blocks.0.mamba.A_log'"):
+        load_model(tmp_path / "m.safetensors")
+    assert built == ["meta"]
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_becomes_float32(tmp_path, dtype):
+    model = Gamba(micro(encoder="none"))
+    save_model(tmp_path / "m.safetensors", model)
+    with safe_open(tmp_path / "m.safetensors", framework="pt") as file:
+        metadata = file.metadata()
+    half = {name: value.to(dtype) for name, value in model.stored_state().items()}
+    save_file(half, tmp_path / "m.safetensors", metadata=metadata)
+    for name, value in load_model(tmp_path / "m.safetensors").stored_state().items():
+        assert value.dtype == torch.float32 and torch.equal(value, half[name].float()), name
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_size_of_a_model_is_known_before_it_is_built(preset):
+    config = PRESETS[preset]
+    with torch.device("meta"):
+        model = Gamba(config, encoder=outline_encoder(config))
+    names = {name for name, _ in model.named_parameters() if not name.startswith("encoder.")}
+    count = sum(p.numel() for name, p in model.named_parameters() if name in names)
+    assert count <= config.num_parameters < 2.5 * count
+    assert config.encoder != "none" or count == config.num_parameters

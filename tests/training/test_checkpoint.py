@@ -1,11 +1,14 @@
 """Checkpoints: round trip, atomicity, damage."""
 
+import copy
 import errno
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -17,12 +20,14 @@ from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train import checkpoint
 from gamba_warp.train.checkpoint import (
+    check_state,
     find_checkpoint,
     list_checkpoints,
     load_weights,
     read_state,
     save_checkpoint,
 )
+from gamba_warp.train.optim import build_optimizer, checked_moments
 
 
 @pytest.fixture
@@ -159,3 +164,163 @@ def test_other_model_is_named(tmp_path, model):
     other = Gamba(replace(model.config, width=24, norm="rms"))
     with pytest.raises(UserError, match="another width, norm"):
         load_weights(path / "model.safetensors", other)
+
+
+@pytest.fixture
+def two(tmp_path, model):
+    """Two checkpoints, steps 1 and 2."""
+    return [save_checkpoint(tmp_path, n, {"model": model}, {"a": n}, keep=3) for n in (1, 2)]
+
+
+def flip(path, share):
+    """Changes one bit of a file."""
+    data = bytearray(path.read_bytes())
+    data[int(share * (len(data) - 1))] ^= 4
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "state.pt", "checksums.json"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.97, 1.0])
+def test_a_flipped_bit_is_found_and_the_older_checkpoint_taken(tmp_path, two, name, share):
+    flip(two[1] / name, share)
+    said = []
+    assert find_checkpoint(tmp_path, "auto", said.append) == two[0]
+    assert len(said) == 1 and "step_000002" in said[0] and f"going on from {two[0]}" in said[0]
+    with pytest.raises(UserError, match=f"step_000002/.*; whole is: --resume {two[0]}") as caught:
+        find_checkpoint(tmp_path, str(two[1]))
+    assert "\n" not in str(caught.value)
+    flip(two[0] / "model.safetensors", 0.6)
+    with pytest.raises(UserError, match="no checkpoint of this run is whole"):
+        find_checkpoint(tmp_path, "auto")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link", "folder"])
+def test_what_is_no_plain_file_is_damage(tmp_path, two, kind):
+    path = two[1] / "model.safetensors"
+    path.unlink()
+    {"pipe": os.mkfifo, "folder": os.mkdir}.get(kind, lambda p: p.symlink_to("/dev/zero"))(path)
+    said = []
+    assert find_checkpoint(tmp_path, "auto", said.append) == two[0]
+    assert "not a plain file" in said[0]
+
+
+def test_a_file_that_is_gone_is_damage(tmp_path, two):
+    for name in ("model.safetensors", "state.pt"):
+        (two[1] / name).unlink()
+        assert find_checkpoint(tmp_path, "auto", [].append) == two[0], name
+    save_checkpoint(tmp_path, 2, {}, {"a": 2}, keep=3)  # a list that does not name the model
+    assert find_checkpoint(tmp_path, "auto", [].append) == two[0]
+
+
+def test_older_checkpoints_without_checksums(tmp_path, two):
+    (two[1] / "checksums.json").unlink()
+    assert find_checkpoint(tmp_path, "auto") == two[1]
+    flip(two[1] / "state.pt", 0.5)
+    assert find_checkpoint(tmp_path, "auto", [].append) == two[0]
+
+
+def test_a_damaged_later_checkpoint_pushes_out_no_whole_one(tmp_path, model):
+    for step in (1, 2, 9):
+        save_checkpoint(tmp_path, step, {"model": model}, {}, keep=3)
+    flip(tmp_path / "checkpoints" / "step_000009" / "state.pt", 0.5)
+    save_checkpoint(tmp_path, 3, {"model": model}, {}, keep=1)
+    assert names(tmp_path) == ["step_000003", "step_000009"]
+    assert find_checkpoint(tmp_path, "auto", [].append).name == "step_000003"
+
+
+STATE = {
+    "version": 1, "config": {"seed": 0}, "objects": "abc", "step": 3, "skipped": 0,
+    "skipped_in_row": 0, "elapsed": 1.5, "world_size": 1, "ema_updates": 3, "optimizer": {},
+    "rng": torch.Generator().get_state(), "rng_cuda": [],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "field, value",
+    [
+        ("step", -1), ("step", 2.5), ("step", True), ("step", None), ("step", 10**15),
+        ("skipped", "0"), ("elapsed", math.nan), ("elapsed", math.inf), ("elapsed", -1.0),
+        ("world_size", 0), ("config", []), ("optimizer", None), ("rng_cuda", None),
+        ("rng_cuda", [3]), ("rng", torch.zeros(3)), ("rng", torch.zeros(3, dtype=torch.uint8)),
+        ("rng", torch.full_like(STATE["rng"], 255)), ("surprise", 1), (None, "step"),
+    ],
+)  # fmt: skip
+def test_fields_of_a_state_are_checked(field, value):
+    check_state(STATE, "x")
+    state = dict(STATE)
+    if field is None:
+        del state[value]
+    else:
+        state[field] = value
+    with pytest.raises(UserError, match="^run/state.pt: damaged, ") as caught:
+        check_state(state, "run/state.pt")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda s: s.pop("state"), "no state"),
+        (lambda s: s["state"].update({99: {}}), "parameter '99'"),
+        (lambda s: s["state"][0].pop("step"), "parameter 0 has other fields"),
+        (lambda s: s["state"].update({0: 5}), "parameter 0 has other fields"),
+        (lambda s: s["state"][0].update(exp_avg=torch.ones(3)), r"exp_avg of parameter 0 is \(3,"),
+        (lambda s: s["state"][0].update(exp_avg=1.0), "exp_avg of parameter 0 is no float32"),
+        (lambda s: s["state"][0].update(step=torch.ones((), dtype=torch.int64)), "no float32"),
+        (lambda s: s["state"][0]["exp_avg"].fill_(math.nan), "exp_avg .* not finite"),
+        (lambda s: s["state"][0]["exp_avg_sq"].fill_(-1.0), "exp_avg_sq .* negative"),
+        (lambda s: s["state"][0]["step"].fill_(math.inf), "step .* not finite"),
+    ],
+)
+def test_moments_of_a_state_are_checked(model, change, words):
+    optimizer = build_optimizer(model, 0.05, 0.95)
+    for parameter in model.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    stored = copy.deepcopy(optimizer.state_dict())
+    stored["param_groups"][0]["betas"] = (5.0, -1.0)  # settings are not taken from a file
+    optimizer.load_state_dict(checked_moments(optimizer, stored, Path("run/state.pt")))
+    assert optimizer.param_groups[0]["betas"] == (0.9, 0.95)
+    change(stored)
+    with pytest.raises(UserError, match=f"^run/state.pt: damaged, .*{words}"):
+        checked_moments(optimizer, stored, Path("run/state.pt"))
+
+
+def repacked(path, change, packing=zipfile.ZIP_STORED):
+    """Writes a torch file again with its pickle changed, or its members packed."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", packing) as archive:
+        for name, data in members.items():
+            archive.writestr(name, change(data) if name.endswith("data.pkl") else data)
+
+
+def test_a_state_that_claims_more_than_it_holds(tmp_path):
+    path = tmp_path / "state.pt"
+
+    def refused(words):
+        with pytest.raises(UserError, match=f"state.pt: damaged.*{words}") as caught:
+            read_state(tmp_path)
+        assert "\n" not in str(caught.value)
+
+    torch.save({"a": torch.arange(10.0)}, path)
+    repacked(path, lambda data: data.replace(b"K\x0a", b"J\x40\x42\x0f\x00"))  # 10 to 1,000,000
+    refused("")
+    torch.save({"a": torch.arange(10.0)}, path)
+    repacked(path, lambda data: data, zipfile.ZIP_DEFLATED)
+    refused("packed")
+    torch.save({"a": torch.ones(1).expand(10**6, 10**6)}, path)  # one number, 4 TB as it is copied
+    refused("larger than the file")
+    endless = []
+    endless.append(endless)
+    torch.save({"a": endless}, path)
+    refused("nested deeper")
+    wide = [0]
+    for _ in range(12):
+        wide = [wide] * 10
+    torch.save({"a": wide}, path)
+    refused("over 1,000,000 values")
+    torch.save([1], path)
+    refused("holds no state")
+    torch.save({"a": torch.ones(3).to_sparse()}, path)
+    refused("not dense")

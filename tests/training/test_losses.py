@@ -5,8 +5,16 @@ import math
 import pytest
 import torch
 
+from gamba_warp.image_metrics import ssim
 from gamba_warp.images import over_background
-from gamba_warp.train.losses import mse, rendered_psnr, total_loss, view_losses
+from gamba_warp.train.losses import (
+    mse,
+    random_crops,
+    rendered_psnr,
+    structure,
+    total_loss,
+    view_losses,
+)
 
 
 def test_composite_is_straight_alpha():
@@ -49,3 +57,58 @@ def test_non_finite_pictures_are_not_hidden():
     rgb = torch.full((1, 4, 4, 3), math.nan)
     loss = total_loss({"rgb": mse(rgb, torch.zeros(1, 4, 4, 3))}, {"rgb": 1.0})
     assert not torch.isfinite(loss)
+
+
+@pytest.mark.parametrize("shape", [(3, 40, 40, 3), (2, 2, 13, 37, 3), (11, 29, 1)])
+def test_structure_is_one_minus_ssim_and_its_gradient_kornias(shape):
+    torch.manual_seed(3)
+    want = torch.ones(shape, dtype=torch.float64)
+    want[..., 2:-3, 4:-9, :] = torch.rand(want[..., 2:-3, 4:-9, :].shape, dtype=torch.float64)
+    got = (want + 0.2 * torch.randn_like(want) * (want < 1)).clamp(0, 1).requires_grad_()
+    made = structure(got, want)
+    assert made.shape == shape[:-3]
+    torch.testing.assert_close(made, 1 - ssim(got, want), rtol=0, atol=1e-12)
+    # float32: windows of plain background are exact, in the others a variance has 24 bits.
+    single = structure(got.float(), want.float()).double()
+    torch.testing.assert_close(single, made, rtol=0, atol=1e-6)
+    cotangent = torch.randn_like(made)
+    ours = torch.autograd.grad(made, got, cotangent)[0]
+    theirs = torch.autograd.grad(1 - ssim(got, want), got, cotangent)[0]
+    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
+
+
+def test_crops_are_of_one_place_in_both_and_lie_inside():
+    torch.manual_seed(0)
+    values = torch.arange(2 * 3 * 8 * 9.0).view(2, 3, 8, 9, 1)
+    seen = set()
+    for _ in range(200):
+        got, want = random_crops(values, values + 1000, 7)
+        assert got.shape == (2, 7, 7, 1) and want.equal(got + 1000)
+        for index, crop in enumerate(got[..., 0]):
+            corner = int(crop[0, 0]) - index * 216
+            view, rest = divmod(corner, 72)
+            y, x = divmod(rest, 9)
+            assert crop.equal(values[index, view, y : y + 7, x : x + 7, 0])
+            seen.add((view, y, x))
+    assert seen == {(v, y, x) for v in range(3) for y in range(2) for x in range(3)}
+
+
+def test_view_losses_have_the_terms_that_are_asked_for():
+    torch.manual_seed(0)
+    rgb, alpha = torch.rand(2, 3, 16, 16, 3), torch.rand(2, 3, 16, 16, 1)
+    shapes: list = []
+
+    def lpips(got, want):
+        shapes.append(got.shape)
+        return (got - want).square().mean((-3, -2, -1))
+
+    terms = view_losses(rgb, alpha, rgb, alpha, lpips, lpips_crop=8, ssim=True)
+    assert {name: tuple(term.shape) for name, term in terms.items()} == {
+        "rgb": (2, 3),
+        "mask": (2, 3),
+        "lpips": (2,),
+        "ssim": (2, 3),
+    }
+    assert shapes == [(2, 8, 8, 3)]
+    assert all(term.abs().max() < 1e-6 for term in terms.values())
+    assert set(view_losses(rgb, alpha, rgb, alpha)) == {"rgb", "mask"}

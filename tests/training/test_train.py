@@ -106,6 +106,34 @@ def test_resume_is_bit_identical(data, tmp_path, monkeypatch, accumulate):
     assert any(not torch.equal(first[name], last[name]) for name in first), "it did train on"
 
 
+def test_a_damaged_newest_checkpoint_is_passed_over_and_named(data, tmp_path, capsys):
+    short = {"length": {"steps": 4}, "run": {"save_every": 2, "keep": 3}}
+    assert run(data, tmp_path, **short) == 0
+    state = tmp_path / "checkpoints" / "step_000004" / "state.pt"
+    content = bytearray(state.read_bytes())
+    content[len(content) // 2] ^= 1
+    state.write_bytes(content)
+    capsys.readouterr()
+    assert run(data, tmp_path, **short) == 0
+    out = capsys.readouterr().out
+    assert "step_000004/state.pt: damaged" in out and "resumed" in out and "at step 2" in out
+    assert any("going on from" in line["message"] for line in lines(tmp_path, "warning"))
+    assert run(data, tmp_path, **short) == 0  # the fourth step has been written again
+    assert "going on from" not in capsys.readouterr().out
+
+
+def test_nothing_is_loaded_where_a_part_is_damaged(data, tmp_path, monkeypatch):
+    assert run(data, tmp_path, length={"steps": 2}) == 0
+    folder = list_checkpoints(tmp_path)[-1]
+    (folder / "checksums.json").unlink()  # as older versions wrote it
+    (folder / "ema.safetensors").unlink()
+    loaded = []
+    monkeypatch.setattr(Gamba, "load_stored_state", lambda *arguments: loaded.append(1))
+    with pytest.raises(UserError, match="ema.safetensors: no such file"):
+        run(data, tmp_path, length={"steps": 4})
+    assert not loaded
+
+
 def test_finished_run_is_left_alone_and_can_be_lengthened(data, tmp_path):
     assert run(data, tmp_path, length={"steps": 2}) == 0
     before = load_file(tmp_path / "model.safetensors")
@@ -252,7 +280,7 @@ def test_bad_data_and_bad_options(data, tmp_path):
         run(tmp_path / "missing", tmp_path / "run")
     with pytest.raises(UserError, match="--overfit cloudz"):
         run(data, tmp_path / "run", views={"overfit": "cloudz"})
-    with pytest.raises(UserError, match="--lr is -1"):
+    with pytest.raises(UserError, match="--lr -1.0: must be above 0"):
         run(data, tmp_path / "run", optim={"lr": -1.0})
     with pytest.raises(UserError, match="nofield"):
         config = micro.options(data, tmp_path / "run")

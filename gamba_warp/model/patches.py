@@ -1,0 +1,101 @@
+"""Which patches of a picture are computed: those that see something of the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+
+@dataclass
+class Patches:
+    """F patches of each picture; the others are plain background, and nothing is computed of them.
+
+    Attributes:
+        index: ``[B, F]`` int64, places in the row-major grid, ascending. A picture that has fewer
+            than F patches is filled up with places that mean nothing.
+        valid: ``[B, F]`` bool, False for the filling, which comes last.
+        grid: patches a side.
+        size: side of a patch, pixels.
+    """
+
+    index: Tensor
+    valid: Tensor
+    grid: int
+    size: int
+
+    def cells(self, maps: Tensor, count: int) -> Tensor:
+        """Cuts maps into the cells of the patches.
+
+        Args:
+            maps: ``[B, C, n, n]``, n = grid · count.
+            count: cells a side of a patch.
+
+        Returns:
+            ``[B, F, count², C]``, the cells of a patch row by row.
+        """
+        batch, channels = maps.shape[:2]
+        maps = maps.reshape(batch, channels, self.grid, count, self.grid, count)
+        maps = maps.permute(0, 2, 4, 3, 5, 1).reshape(batch, self.grid**2, -1)
+        index = self.index[..., None].expand(-1, -1, maps.shape[-1])
+        return maps.gather(1, index).unflatten(-1, (count**2, channels))
+
+    def cell_centres(self, count: int) -> Tensor:
+        """Where the cells' centres are in the picture: x, y in pixels, ``[B, F, count², 2]``."""
+        side = self.size / count
+        places = (torch.arange(count, device=self.index.device) + 0.5) * side
+        y, x = torch.meshgrid(places, places, indexing="ij")
+        row, column = self.index // self.grid, self.index % self.grid
+        corners = torch.stack([column, row], -1) * self.size
+        return corners[:, :, None] + torch.stack([x, y], -1).reshape(1, 1, -1, 2)
+
+    def orders(self, scan: Tensor) -> tuple[Tensor, Tensor]:
+        """The tokens of these patches, in the order in which the network reads all tokens.
+
+        A picture's own tokens come first, so what fills up the batch is never seen by them.
+
+        Args:
+            scan: ``[4 · grid²]`` int64, the place of each token's patch; see ``scan_orders``.
+
+        Returns:
+            ``[B, 4F]`` int64, the tokens' numbers among all; and ``[B, F, 4]`` int64, where in this
+            list each patch has its token of each of the four orders.
+        """
+        batch, total = len(self.index), self.grid**2
+        inside = self.valid.new_zeros(batch, total)
+        inside = inside.scatter_reduce(1, self.index, self.valid, "amax")[:, scan]
+        kept = torch.argsort(~inside, dim=1, stable=True)[:, : 4 * self.index.shape[1]]
+        places = inside.cumsum(1) - 1  # in the list, of each token that is in it
+        starts = total * torch.arange(4, device=scan.device)[:, None]
+        tokens = torch.argsort(scan.view(4, total), dim=1) + starts  # of a place, in each order
+        found = places.gather(1, tokens[:, self.index].permute(1, 2, 0).flatten(1))
+        found = found.unflatten(1, (-1, 4))
+        return kept, torch.where(self.valid[..., None], found, 0)
+
+
+def foreground_patches(alpha: Tensor, size: int, margin: int = 0) -> Patches:
+    """The patches in which a picture is not fully transparent.
+
+    Args:
+        alpha: ``[B, H, W]`` in [0, 1], H = W.
+        size: side of a patch, pixels.
+        margin: patches around these that are kept too, >= 0.
+
+    Returns:
+        F is the largest number of a picture in the batch; it may be 0. On CUDA the number is read
+        back.
+
+    Raises:
+        ValueError: a negative margin.
+    """
+    if margin < 0:
+        raise ValueError(f"background_margin is {margin}, it must be 0 or more")
+    seen = F.max_pool2d((alpha > 0).float()[:, None], size)
+    near = F.max_pool2d(seen, 2 * margin + 1, stride=1, padding=margin).flatten(1) > 0
+    counts = near.sum(1)
+    most = int(counts.max()) if len(counts) else 0
+    index = torch.argsort(~near, dim=1, stable=True)[:, :most]
+    valid = torch.arange(most, device=alpha.device) < counts[:, None]
+    return Patches(index, valid, alpha.shape[-1] // size, size)

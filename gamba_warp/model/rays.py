@@ -1,0 +1,140 @@
+"""Gaussians on the rays of the input picture's pixels: the decoder ``rays``.
+
+A patch of p x p pixels has k x k cells, and each cell has one Gaussian in each of several layers.
+The first layer is what the picture shows: it starts opaque, in the plane through the object's
+centre, with the colour of its cell, so that the input view is sharp before the first step. The
+other layers are for what is hidden: they start almost transparent, behind one another. The network
+predicts, for a Gaussian of layer i on a ray of direction d = (x, y, 1) in the camera's frame,
+
+    point    = d · (distance + ray_depth · tanh(depth_i + ·)) + ray_offset · tanh(·)
+    scales   = footprint · exp(size_i + ·), where footprint is the side of a cell at the distance
+    opacity  = sigmoid(opacity_i + 10 · (alpha - 1) + ·)
+    colour   = sigmoid(logit(colour of the cell) + 2 · (·))
+
+where each · is a number of the head, near 0 at the start, and alpha is the cell's mean alpha. The
+terms with the index i are learned for each layer.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ..cameras import Cameras
+from ..gaussians import Gaussians
+from .config import RAY_CHANNELS, RAY_STEM, GambaConfig
+from .patches import Patches
+
+FRONT_OPACITY = 5.0  # logit
+HIDDEN_OPACITY = -5.4  # logit; just over the 1/255 under which a Gaussian has no gradient
+FRONT_SIZE, HIDDEN_SIZE = 0.4, 0.6  # standard deviations, in sides of a cell
+LAST_DEPTH = 0.7  # where the last hidden layer starts, in ``ray_depth`` behind the middle
+COLOR_MARGIN = 0.01  # keeps the logit of a cell's colour finite
+EMPTY = 10.0  # how much lower the opacity's logit is in an empty cell than in a full one
+SIZE_LIMITS = (-4.0, 3.0)  # of the logarithm of a size, in sides of a cell
+
+
+class RayDecoder(nn.Module):
+    """From the tokens of the patches and their pixels to the Gaussians of the cells."""
+
+    def __init__(self, config: GambaConfig) -> None:
+        super().__init__()
+        self.config = config
+        cells, layers, features = config.ray_cells, config.ray_layers, config.ray_features
+        step = config.patch_size // cells  # pixels a side of a cell
+        self.up = nn.Linear(4 * config.width, cells**2 * features)
+        self.stem = nn.Sequential(
+            nn.Conv2d(config.pixel_channels, RAY_STEM, step + 2, step, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(RAY_STEM, features, 3, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(features, features, 3, padding=1),
+        )
+        self.rotates = config.predict_rotation
+        self.head = nn.Linear(features, layers * sum(self._parts()))
+        # Almost 0, so that the first picture is that of the formulas with 0 for every ·.
+        nn.init.normal_(self.head.weight, std=0.002)
+        nn.init.zeros_(self.head.bias)
+        hidden = layers - 1
+        depths = [0.0] + [LAST_DEPTH * (i + 1) / hidden for i in range(hidden)]
+        sizes = [FRONT_SIZE] + [HIDDEN_SIZE] * hidden
+        self.depth_bias = nn.Parameter(torch.tensor(depths).atanh())
+        self.scale_bias = nn.Parameter(torch.tensor(sizes).log())
+        self.opacity_bias = nn.Parameter(torch.tensor([FRONT_OPACITY] + [HIDDEN_OPACITY] * hidden))
+
+    def _parts(self) -> list[int]:
+        """How many numbers depth, offset, opacity, scales, colour and rotation take."""
+        return [*RAY_CHANNELS, 4] if self.rotates else [*RAY_CHANNELS]
+
+    def forward(
+        self, tokens: Tensor, pixels: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
+    ) -> Gaussians:
+        """Decodes the patches of each picture to F · ray_cells² · ray_layers Gaussians.
+
+        Args:
+            tokens: ``[B, F, 4, width]``, the token of each patch in each of the four orders.
+            pixels: ``[B, pixel_channels, H, W]``, what the network sees of the pictures.
+            patches: F patches of each picture; one that is only a filling gets opacity 0.
+            rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha.
+            cameras: ``[B]`` of the pictures.
+
+        Returns:
+            ``[B, F · ray_cells² · ray_layers]``, float32, in the world of ``cameras``.
+        """
+        cells = self.config.ray_cells
+        hidden = self.up(tokens.flatten(2)).unflatten(2, (cells**2, -1))
+        hidden = hidden + patches.cells(self.stem(pixels), cells)
+        # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
+        with torch.autocast(tokens.device.type, enabled=False):
+            out = self.head(F.silu(hidden.float())).unflatten(-1, (self.config.ray_layers, -1))
+            made = self._activated(out, patches, rgba.float(), cameras)
+        return made.map(lambda value: value.flatten(1, 3))
+
+    def _activated(
+        self, out: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
+    ) -> Gaussians:
+        """The formulas above: ``out [B, F, cells², layers, ·]`` to Gaussians of that shape."""
+        depth, offset, opacity, scale, color, *rotation = out.split(self._parts(), -1)
+        alpha, base = self._cells(patches, rgba)
+        logits = self.opacity_bias + EMPTY * (alpha[..., 0] - 1) + opacity[..., 0]
+        opacities = torch.where(patches.valid[:, :, None, None], logits.sigmoid(), 0.0)
+        rays, footprint = self._rays(patches, cameras)
+        distance = _each(cameras.viewmats[:, :3, 3].norm(dim=-1))
+        z = distance + self.config.ray_depth * torch.tanh(self.depth_bias[:, None] + depth)
+        points = rays * z + self.config.ray_offset * torch.tanh(offset)
+        turn, shift = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3]
+        quats = None
+        if rotation:
+            quats = rotation[0] + rotation[0].new_tensor([1.0, 0.0, 0.0, 0.0])
+        return Gaussians(
+            means=(points - shift[:, None, None, None]) @ turn[:, None, None],
+            quats=quats,
+            scales=footprint * torch.exp((self.scale_bias[:, None] + scale).clamp(*SIZE_LIMITS)),
+            opacities=opacities,
+            colors=torch.sigmoid(base + 2 * color),
+        )
+
+    def _cells(self, patches: Patches, rgba: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean alpha ``[B, F, cells², 1, 1]`` and the logit of the mean colour ``[.., 1, 3]``."""
+        cells = self.config.ray_cells
+        flat = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1).permute(0, 3, 1, 2)
+        means = patches.cells(F.avg_pool2d(flat, self.config.patch_size // cells), cells)
+        alpha = means[..., None, 3:]
+        color = means[..., None, :3] / alpha.clamp_min(1e-3)
+        return alpha, torch.logit(color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
+
+    def _rays(self, patches: Patches, cameras: Cameras) -> tuple[Tensor, Tensor]:
+        """Rays ``[B, F, cells², 1, 3]`` of depth 1, camera frame; side of a cell at the centre."""
+        x, y = patches.cell_centres(self.config.ray_cells)[..., None, :].split(1, -1)
+        K = cameras.Ks
+        x = (x - _each(K[:, 0, 2])) / _each(K[:, 0, 0])
+        y = (y - _each(K[:, 1, 2])) / _each(K[:, 1, 1])
+        side = self.config.patch_size // self.config.ray_cells
+        distance = cameras.viewmats[:, :3, 3].norm(dim=-1)
+        return torch.cat([x, y, torch.ones_like(x)], -1), _each(side * distance / K[:, 1, 1])
+
+
+def _each(values: Tensor) -> Tensor:
+    """One number a picture, ``[B]``, beside ``[B, F, cells², layers, ·]``."""
+    return values.view(-1, 1, 1, 1, 1)

@@ -1,0 +1,16 @@
+"""A disk that is full at a chosen byte."""
+
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def full_at(size: int) -> Iterator[None]:
+    """Lets no file of this process grow beyond ``size`` bytes: such a write fails (EFBIG)."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

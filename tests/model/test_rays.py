@@ -1,0 +1,264 @@
+"""The decoder ``rays``: which tokens it computes, where its Gaussians lie, and how it starts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers.model import inputs, micro
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.errors import UserError
+from gamba_warp.eval.views.baselines import billboard
+from gamba_warp.eval.views.compare import Truth
+from gamba_warp.image_metrics import mask_iou, psnr, ssim
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.patches import foreground_patches
+from gamba_warp.model.predict import model_input, reconstruct
+from gamba_warp.model.rays import RayDecoder
+from gamba_warp.render import render
+
+FIELDS = ("means", "scales", "opacities", "colors")
+# Random noise has no flat cells; a disc on the left, one pixel, a square that touches two sides.
+BOXES = [(slice(5, 9), slice(1, 5)), (slice(7, 8), slice(10, 11)), (slice(0, 12), slice(4, 12))]
+
+
+def rays(**changes) -> GambaConfig:
+    """A micro configuration with 2 x 2 cells a patch and 3 layers, without an encoder."""
+    wanted = {"decoder": "rays", "encoder": "none", "ray_cells": 2, "ray_layers": 3}
+    return micro(**(wanted | {"ray_features": 5} | changes))
+
+
+def trained(config: GambaConfig) -> Gamba:
+    """A model whose head says something, as the head of a fresh one hardly does."""
+    torch.manual_seed(4)
+    model = Gamba(config, "random" if config.encoder != "none" else None)
+    torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
+    return model
+
+
+def cut_outs(boxes=BOXES) -> tuple[torch.Tensor, Cameras]:
+    """Noise in some boxes of transparent pictures, and a camera each."""
+    torch.manual_seed(5)
+    images, cameras = inputs(len(boxes))
+    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
+    for picture, (rows, columns) in zip(rgba, boxes):
+        picture[rows, columns, 3] = 0.25 + 0.75 * torch.rand_like(picture[rows, columns, 3])
+    return rgba, cameras
+
+
+def one(cameras: Cameras, index: int) -> Cameras:
+    return replace(
+        cameras, viewmats=cameras.viewmats[index : index + 1], Ks=cameras.Ks[index : index + 1]
+    )
+
+
+def test_a_batch_of_different_sizes_is_each_picture_alone():
+    model, (rgba, cameras) = trained(rays()), cut_outs()
+    together = model(rgba, cameras)
+    assert together.num == 6 * 4 * 3  # the largest has 6 of the 9 patches
+    for index in range(len(rgba)):
+        alone = model(rgba[index : index + 1], one(cameras, index))
+        assert alone.num == (4, 1, 6)[index] * 4 * 3
+        for name in FIELDS:
+            got, want = getattr(together, name)[index], getattr(alone, name)[0]
+            # The same sums in products of other shapes: a few roundings.
+            torch.testing.assert_close(got[: alone.num], want, rtol=1e-5, atol=1e-6, msg=name)
+        assert together.opacities[index, alone.num :].eq(0).all()
+
+
+def test_what_fills_up_a_batch_gets_and_gives_no_gradient():
+    model, (rgba, cameras) = trained(rays()), cut_outs()
+    grads = []
+    for pictures, views in ((rgba[:1], one(cameras, 0)), (rgba, cameras)):
+        made = model(pictures, views)
+        loss = sum((value[0, : 4 * 4 * 3] ** 2).sum() for value in (made.means, made.colors))
+        grads.append(torch.autograd.grad(loss, list(model.parameters()), allow_unused=True))
+    for (name, _), alone, padded in zip(model.named_parameters(), *grads):
+        if alone is not None:
+            torch.testing.assert_close(padded, alone, rtol=1e-4, atol=1e-5, msg=name)
+
+
+@pytest.mark.parametrize("additive", [True, False])
+def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive):
+    tokens = Gamba(rays(additive_image_tokens=additive)).tokens
+    rgba, cameras = cut_outs()
+    whole = tokens(rgba, cameras)
+    patches = foreground_patches(rgba[..., 3], 4)
+    got, places = tokens.of_patches(tokens.pixels(rgba, cameras), patches)
+    for index in range(len(rgba)):
+        inside = torch.zeros(9, dtype=torch.bool)
+        inside[patches.index[index][patches.valid[index]]] = True
+        want = whole[index, inside[tokens.orders]]
+        torch.testing.assert_close(got[index, : len(want)], want)
+        for place, patch in zip(places[index], patches.index[index][patches.valid[index]]):
+            for order in range(4):
+                number = 9 * order + tokens.orders.view(4, 9)[order].tolist().index(patch)
+                torch.testing.assert_close(got[index, place[order]], whole[index, number])
+
+
+def test_a_picture_without_background_keeps_every_token():
+    patches = foreground_patches(torch.ones(2, 12, 12), 4)
+    orders = Gamba(rays()).tokens.orders
+    kept, _ = patches.orders(orders)
+    assert kept.tolist() == [list(range(36))] * 2 and patches.valid.all()
+
+
+@pytest.mark.parametrize("rotation", [False, True])
+def test_gaussians_follow_the_formulas(rotation):
+    """Known answer: every number of the head is set by hand, and one Gaussian computed apart."""
+    config = rays(predict_rotation=rotation)
+    model, (rgba, cameras) = Gamba(config), cut_outs()
+    numbers = [0.3, -0.2, 0.5, 0.1, 0.7, 0.2, -0.4, 0.6, 0.3, -0.1, 0.25]
+    numbers += [0.1, 0.2, -0.3, 0.4] if rotation else []
+    decoder = model.decoder
+    assert isinstance(decoder, RayDecoder)
+    with torch.no_grad():
+        decoder.head.weight.zero_()
+        decoder.head.bias.copy_(torch.tensor(numbers).repeat(3))
+    made = model(rgba, cameras)
+    # Picture 0, patch (row 1, column 0), the first of its four; cell (row 1, column 1); layer 2.
+    patch = foreground_patches(rgba[..., 3], 4).index[0].tolist().index(3)
+    place = (patch * 4 + 3) * 3 + 2
+    square = rgba[0, 6:8, 2:4].double().numpy()
+    alpha = square[..., 3].mean()
+    color = (square[..., :3] * square[..., 3:]).mean((0, 1)) / alpha
+    K, view = cameras.Ks[0].double().numpy(), cameras.viewmats[0].double().numpy()
+    distance = np.linalg.norm(view[:3, 3])
+    ray = np.array([(3 - K[0, 2]) / K[0, 0], (7 - K[1, 2]) / K[1, 1], 1.0])
+    point = ray * (distance + 0.5 * np.tanh(np.arctanh(0.7) + 0.3))
+    point = point + 0.3 * np.tanh([-0.2, 0.5, 0.1])
+    want = {
+        "means": view[:3, :3].T @ (point - view[:3, 3]),
+        "scales": 2 * distance / K[1, 1] * np.exp(np.log(0.6) + np.array([0.2, -0.4, 0.6])),
+        "opacities": 1 / (1 + np.exp(5.4 - 10 * (alpha - 1) - 0.7)),
+        "colors": 1 / (1 + (1 / color - 1) * np.exp(-2 * np.array([0.3, -0.1, 0.25]))),
+    }
+    for name, value in want.items():
+        got = getattr(made, name)[0, place].detach().double().numpy()
+        np.testing.assert_allclose(got, value, rtol=2e-5, err_msg=name)
+    if rotation:
+        got = made.quats[0, place].tolist()
+        assert got == pytest.approx([1.1, 0.2, -0.3, 0.4], abs=1e-6)
+    else:
+        assert made.quats is None
+
+
+def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
+    """A coloured disc with a soft rim as five cameras around it see a flat picture of it."""
+    x = torch.linspace(-1, 1, size)
+    radius = (x[:, None] ** 2 + x**2).sqrt()
+    alpha = ((0.7 - radius) * size / 2 + 0.5).clamp(0, 1)
+    color = torch.stack([(7 * x).sin().expand(size, size), (5 * x).cos()[:, None] + 0 * x, radius])
+    rgba = torch.cat([0.5 + 0.3 * color.clamp(-1, 1), alpha[None]]).permute(1, 2, 0)
+    viewmats = orbit(torch.tensor([0.0, 30.0, -50.0, 140.0, 215.0]), 0.0)
+    return rgba, Cameras(viewmats, intrinsics(size, size).expand(5, 3, 3), size, size)
+
+
+def test_at_the_start_the_picture_is_the_billboard():
+    """The flat picture itself is the truth: what differs is one Gaussian's blur at the edges."""
+    rgba, cameras = disc()
+    truth = Truth("disc", rgba.expand(5, -1, -1, -1), cameras, [*range(5)])
+    flat, mask = billboard(truth)
+    config = rays(image_size=48, ray_cells=4, width=8)
+    with torch.no_grad():
+        made = Gamba(config)(rgba[None], one(cameras, 0))
+    shown = render(
+        made,
+        Cameras(cameras.viewmats[None], cameras.Ks[None], 48, 48),
+        torch.ones(3),
+    )
+    rgb = shown.rgb[0].clamp(0, 1)
+    # A Gaussian of half a pixel blurs the rim, which is a tenth of this small disc.
+    assert psnr(rgb, flat).min() > 23 and ssim(rgb, flat).min() > 0.87
+    assert mask_iou(shown.alpha[0, ..., 0] > 0.5, mask).min() > 0.9
+
+
+def test_every_parameter_learns():
+    model, (rgba, cameras) = Gamba(rays()), cut_outs()
+    made = model(rgba, cameras)
+    sum(
+        (value * torch.rand_like(value)).sum()
+        for value in (made.means, made.scales, made.opacities, made.colors)
+    ).backward()
+    still = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
+    assert not still
+
+
+def test_the_hidden_layers_are_seen_by_the_rasterizer_from_the_start():
+    """Under an opacity of 1/255 a Gaussian is culled and would never learn."""
+    model, (rgba, cameras) = Gamba(rays()), cut_outs()
+    rgba[..., 3] = (rgba[..., 3] > 0).float()
+    made = model(rgba, cameras)
+    opacities = made.opacities.unflatten(1, (-1, 4, 3))[2]
+    assert opacities[..., 1:].max() > 1.05 / 255 and opacities[..., 1:].max() < 0.006
+
+
+def test_an_empty_picture_has_no_gaussians_and_may_stand_in_a_batch():
+    model, (rgba, cameras) = Gamba(rays()), cut_outs()
+    empty = torch.zeros_like(rgba[:1])
+    made = model(empty, one(cameras, 0))
+    assert made.num == 0
+    views = Cameras(cameras.viewmats[:1, None], cameras.Ks[:1, None], 12, 12)
+    assert render(made, views, torch.ones(3)).rgb.eq(1).all()
+    made = model(
+        torch.cat([empty, rgba[:1]]), Cameras(cameras.viewmats[:2], cameras.Ks[:2], 12, 12)
+    )
+    assert made.opacities[0].eq(0).all() and made.opacities[1].max() > 0.5
+    sum(value.sum() for value in (made.means, made.colors, made.scales)).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"patch_size": 6, "ray_cells": 3, "ray_layers": 1},
+        {"patch_size": 2, "ray_cells": 1, "ray_layers": 5},
+        {"encoder": "gamba_test_vit"},
+        {"prepend": False, "norm": "rms", "discretization": "zoh"},
+    ],
+)
+def test_other_shapes_and_recompute(changes):
+    model, (rgba, cameras) = trained(rays(**changes)), cut_outs()
+    config, grads = model.config, []
+    for model.recompute in (False, True):
+        made = model(rgba, cameras)
+        patches = foreground_patches(rgba[..., 3], config.patch_size).index.shape[1]
+        assert made.num == patches * config.ray_cells**2 * config.ray_layers
+        made.means.square().sum().backward()
+        grads.append(model.decoder.up.weight.grad.clone())
+        model.zero_grad()
+    torch.testing.assert_close(*grads)
+    assert sum(p.numel() for p in model.parameters() if p.requires_grad) <= config.num_parameters
+
+
+def test_the_margin_keeps_more_patches():
+    model, (rgba, cameras) = Gamba(rays()), cut_outs([BOXES[1]])
+    assert model(rgba, cameras).num == 12
+    assert model(rgba, cameras, background_margin=1).num == 6 * 12
+    with pytest.raises(ValueError, match="background_margin is -1"):
+        model(rgba, cameras, background_margin=-1)
+
+
+def test_configurations_of_older_files_mean_the_paper():
+    old = GambaConfig(encoder="none").to_json()
+    values = [
+        part for part in old[1:-1].split(", ") if "ray_" not in part and 'decoder"' not in part
+    ]
+    assert GambaConfig.from_json("{" + ", ".join(values) + "}").decoder == "bins"
+    with pytest.raises(UserError, match="patch_size 4 is not a multiple of ray_cells 3"):
+        rays(ray_cells=3)
+    with pytest.raises(ValueError, match=r"images is \(1, 12, 12, 3\), expected"):
+        Gamba(rays())(torch.rand(1, 12, 12, 3), one(cut_outs()[1], 0))
+
+
+def test_reconstruct_gives_the_alpha_to_the_model():
+    rgba = disc(40)[0].numpy()
+    small = model_input(rgba, rays())
+    assert small.shape == (1, 12, 12, 4) and small[0, 0, 0, 3] == 0 and small[0, 6, 6, 3] == 1
+    # What is transparent has no colour that could bleed in: inside, a grey disc stays grey.
+    grey = np.where(rgba[..., 3:] > 0, [0.4, 0.4, 0.4, 1.0], [0.9, 0.0, 0.0, 0.0]).astype("f4")
+    small = model_input(grey, rays())[0]
+    torch.testing.assert_close(small[small[..., 3] > 0.01][:, :3].mean(0), torch.full((3,), 0.4))
+    assert reconstruct(Gamba(rays()).eval(), rgba).num > 12

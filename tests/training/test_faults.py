@@ -1,0 +1,146 @@
+"""Training on a full disk, beside another trainer, and below a terminal that is closed."""
+
+import json
+import os
+import signal
+
+import pytest
+import torch
+from helpers import micro
+from helpers.disk import full_at
+
+from gamba_warp import cli
+from gamba_warp.errors import UserError
+from gamba_warp.files import PART, only_process
+from gamba_warp.train import loop
+from gamba_warp.train.checkpoint import list_checkpoints
+from gamba_warp.train.ddp import World
+from gamba_warp.train.log import Quiet, RunLog, say
+from gamba_warp.train.run import train
+
+ALONE = World(0, 1, torch.device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds", 2)
+
+
+def run(data, out, **groups) -> int:
+    return train(micro.options(data, out, **groups), ALONE)
+
+
+def leftovers(folder):
+    return [path for path in folder.rglob("*") if path.name.startswith(PART)]
+
+
+def tree(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_a_full_disk_ends_training_in_one_line_with_the_checkpoint_whole(data, tmp_path, share):
+    out = tmp_path / "run"
+    assert run(data, out, length={"steps": 3}) == 0
+    (saved,) = list_checkpoints(out)
+    before = tree(saved)
+    limit = int(share * max(len(content) for content in before.values()))
+    with full_at(max(limit, 4096)), pytest.raises(UserError) as caught:  # the log has room
+        run(data, out, length={"steps": 5})
+    reason = str(caught.value)
+    assert "\n" not in reason and "cannot write" in reason
+    assert list_checkpoints(out) == [saved] and tree(saved) == before and not leftovers(out)
+    assert run(data, out, length={"steps": 5}) == 0
+
+
+def test_a_log_that_cannot_be_written_is_said_once_and_training_goes_on(data, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "log.jsonl").symlink_to("/dev/full")
+    assert run(data, out, length={"steps": 3}) == 0
+    said = capsys.readouterr().out
+    assert said.count("log.jsonl cannot be written, the run goes on: No space left on device") == 1
+
+
+def test_a_log_is_of_whole_lines_whatever_happens(tmp_path, capsys):
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(b'{"event": "a"}\n{"event": "torn')  # by a kill
+    log = RunLog(tmp_path, False)
+    log.write("b", 1)
+    with full_at(path.stat().st_size + 10):
+        log.write("c", 2)
+        log.write("c", 3)
+    log.write("d", 4, loss=0.5)
+    log.close()
+    events = [json.loads(line)["event"] for line in path.read_text().splitlines()]
+    assert events == ["a", "b", "d"]
+    assert capsys.readouterr().out.count("cannot be written") == 1
+
+
+def test_tensorboard_never_stops_a_run(tmp_path, capsys):
+    log = RunLog(tmp_path, True)
+    assert log._board is not None
+
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    log._board.add_scalar = full
+    for step in range(3):
+        log.write("train", step, loss=1.0)
+    log.close()
+    assert capsys.readouterr().out.count("tensorboard cannot be written") == 1
+
+
+def test_sample_pictures_never_stop_a_run(tmp_path, capsys):
+    log = RunLog(tmp_path, False)
+    log.sample(7, tmp_path / "none" / "a.png", [torch.rand(2, 4, 4, 3)])
+    assert "cannot write" in capsys.readouterr().out
+
+
+def test_a_closed_terminal_stops_nothing():
+    with open("/dev/full", "w", buffering=1) as full:
+        say("a line", full)
+        Quiet(full).write("a bar\n")
+        Quiet(full).flush()
+        with pytest.raises(OSError):
+            full.flush()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())  # so that it closes
+
+
+def test_a_second_trainer_is_refused_and_a_dead_one_is_not_waited_for(data, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / ".lock").write_text("999999999\n")  # of a process that died
+    arguments = [str(data), "--out", str(out), "--device", "cpu", "--steps", "1"]
+    with only_process(out, "trains"):
+        assert cli.run("train", arguments) == 2
+    assert capsys.readouterr().err == (
+        f"gamba: {out}: another process trains here (pid {os.getpid()})\n"
+    )
+    assert os.listdir(out) == [".lock"]
+    assert run(data, out, length={"steps": 1}) == 0
+
+
+def test_what_killed_processes_left_goes_when_training_starts(data, tmp_path):
+    out = tmp_path / "run"
+    for folder in (out, out / "samples", out / "checkpoints"):
+        (folder / f"{PART}abcd1234").mkdir(parents=True)
+        (folder / f"{PART}abcd1234" / "model.safetensors").write_bytes(b"half")
+    assert run(data, out, length={"steps": 1}) == 0 and not leftovers(out)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_each_signal_saves_and_stops(number):
+    with loop.stop_signals() as received:
+        os.kill(os.getpid(), number)
+        assert received == [number]
+
+
+def test_nohup_holds():
+    old = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with loop.stop_signals() as received:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert received == [] and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, old)
