@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
+from unicodedata import normalize
 
 from .errors import UserError
 
@@ -63,13 +65,78 @@ def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: P
     return 1 if failures else 0
 
 
-def unique_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """A distinct output name for each path: its stem, with a number where stems meet."""
+def plan_outputs(
+    inputs: Sequence[Path],
+    suffixes: Sequence[str],
+    folder: Path = Path("."),
+    reads: Iterable[Path | None] = (),
+) -> dict[str, Path]:
+    """A name for each input: its stem, with a number where two inputs would share an output.
+
+    Two names that differ in capitals only are one name to many file systems, and so they are here.
+
+    Args:
+        inputs: files that are read.
+        suffixes: what follows the name in each output, such as ``-mesh.glb``.
+        folder: of the outputs; it need not be there yet.
+        reads: other files, and folders, that the command reads; None is passed over.
+
+    Returns:
+        The inputs by name, in their order. The outputs are ``folder / (name + suffix)``.
+
+    Raises:
+        UserError: an output would overwrite something that is read.
+    """
     names: dict[str, Path] = {}
-    for path in paths:
+    taken: set[str] = set()
+
+    def outputs_of(name: str) -> set[str]:
+        return {normalize("NFC", name + suffix).casefold() for suffix in (*suffixes, "")}
+
+    for path in inputs:
         name, number = path.stem, 1
-        while name in names:
+        while outputs_of(name) & taken:
             number += 1
             name = f"{path.stem}-{number}"
+        taken |= outputs_of(name)
         names[name] = path
+    targets = (folder / f"{name}{suffix}" for name in names for suffix in suffixes)
+    check_not_read(targets, [*inputs, *reads])
     return names
+
+
+def check_not_read(targets: Iterable[Path], reads: Iterable[Path | None]) -> None:
+    """Refuses outputs that would replace what the command reads.
+
+    Args:
+        targets: files that the command is to write; those that are not there yet are fine.
+        reads: files that it reads, and folders, of which every file may be read.
+
+    Raises:
+        UserError: a target is one of the files, also by a link or by other capitals, or a file in
+            one of the folders.
+    """
+    files: dict[tuple[int, int], Path] = {}
+    folders: dict[tuple[int, int], Path] = {}
+    for path in reads:
+        if path is not None and (found := _identity(path)) is not None:
+            (folders if path.is_dir() else files)[found] = path
+    for target in targets:
+        there = _identity(target)
+        if there is None:
+            continue
+        source = files.get(there)
+        if source is None and folders:
+            above = (_identity(parent) for parent in Path(os.path.realpath(target)).parents)
+            source = next((target for found in above if found in folders), None)
+        if source is not None:
+            raise UserError(f"{source}: would be overwritten by an output; give another --out")
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What tells a file from every other, links followed; None where there is none."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return found.st_dev, found.st_ino

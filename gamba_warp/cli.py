@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 
 from .errors import UserError
+from .files import DISK_ERRORS
 from .versions import __version__
 
 # A command has one or two words. That of the words "a b-c" is the function ``a_b_c_command`` of
@@ -27,6 +30,7 @@ COMMANDS = {
     "stress": "Random hostile cases against float64.",
     "gpu-check": "Test and measure on a CUDA machine.",
     "weights lpips": "Fetch the LPIPS-VGG weights.",
+    "endurance": "Kill and fill the disk under every command.",
     "doctor": "Say what this machine can run.",
 }
 MODULES = {
@@ -71,29 +75,68 @@ def run(name: str, arguments: list[str]) -> int:
         arguments: its options.
 
     Returns:
-        The exit code: 0 all was done, 1 some inputs failed, 2 the input is bad, 130 Ctrl-C.
+        The exit code: 0 all was done, 1 some inputs failed, 2 the input is bad or something that
+        it needs (memory, a file, the disk) cannot be had, 130 Ctrl-C. Anything else is a defect of
+        the program, and keeps its traceback.
     """
     try:
         import tyro
 
         return tyro.cli(load_command(name), args=arguments, prog=f"gamba {name}") or 0
-    except UserError as error:
-        print(f"gamba: {error}", file=sys.stderr)
-        return 2
+    except BrokenPipeError:
+        raise  # the reader of the output left; see ``main``
     except KeyboardInterrupt:
-        print("gamba: interrupted", file=sys.stderr)
+        _complain("interrupted")
         return 130
+    except Exception as error:
+        reason = _outside_reason(error)
+        if reason is None:
+            raise
+        _complain(reason)
+        return 2
+
+
+def _outside_reason(error: Exception) -> str | None:
+    """What is wrong outside of the program, in one line; None for a defect of the program."""
+    text = " ".join(str(error).split())
+    if isinstance(error, UserError):
+        return text or "bad input"
+    # torch's errors of memory are RuntimeErrors, and on the CPU of no type of their own.
+    exhausted = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
+    if isinstance(error, MemoryError) or exhausted:
+        return f"not enough memory ({text[:200]})" if text else "not enough memory"
+    if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK_ERRORS):
+        where = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return f"{where}{error.strerror or text}"
+    if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
+        return f"the name of a file is not UTF-8: {error.object[:200]!r}"
+    return None
+
+
+def _complain(text: str) -> None:
+    """Prints one line to the standard error, unless that is closed or its disk is full."""
+    with suppress(OSError, ValueError):
+        print(f"gamba: {text}", file=sys.stderr, flush=True)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the console script."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # names of files need not be UTF-8
+            stream.reconfigure(errors="backslashreplace")
     try:
         code = _main(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader left, as `head` does; Python would complain at exit
+    except OSError as error:  # Python would complain again at exit, when it flushes
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 141
+        if isinstance(error, BrokenPipeError):  # the reader left, as `head` does
+            code = 141
+        elif error.errno in DISK_ERRORS:
+            _complain(f"cannot write the standard output: {error.strerror}")
+            code = 2
+        else:
+            raise
     sys.exit(code)
 
 
@@ -107,6 +150,6 @@ def _main(arguments: list[str]) -> int:
     try:
         name, rest = _find(arguments)
     except UserError as error:
-        print(f"gamba: {error}", file=sys.stderr)
+        _complain(str(error))
         return 2
     return run(name, rest)

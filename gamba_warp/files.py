@@ -1,48 +1,192 @@
-"""Atomic writes: a file is either whole or not there."""
+"""Atomic writes: a file or folder is either whole or not there; what is unfinished has a name."""
 
+import errno
 import hashlib
 import json
 import os
+import re
+import secrets
+import shutil
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from .errors import UserError
 
 # The folder of a checkout: of this package, tests/ and starter/. An installed package has neither.
 CHECKOUT = Path(__file__).resolve().parent.parent
-_PART = 1 << 20  # bytes read at once of a file that may be larger than the memory
+# What is not finished has a name that begins so. No command takes names with a dot for inputs.
+PART = ".gamba-part-"
+_PART_NAME = re.compile(re.escape(PART) + "[a-z0-9_]{8}")
+_DAY = 24 * 3600.0  # seconds; no command writes one file for so long
+_READ = 1 << 20  # bytes read at once of a file that may be larger than the memory
+# Reasons of a failed write that are the disk's, even where the error names no file.
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, in one line; its type where it says nothing."""
+    text = getattr(error, "strerror", None) or str(error)
+    return " ".join(text.split()) or type(error).__name__
+
+
+def why_not_written(error: BaseException) -> str | None:
+    """Why a file could not be written, in one line; None if the error says something else.
+
+    safetensors has an error type of its own, also for a full disk.
+    """
+    text = one_line(error)
+    if isinstance(error, OSError):
+        return text
+    if type(error).__name__ == "SafetensorError" and "I/O error" in text:
+        return re.sub(r"^.*I/O error: | \(os error \d+\)$", "", text)
+    return None
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path in the same folder; on success it replaces ``path``, else it goes.
+    """Yields a path of the same name in a new folder beside; on success the file moves to ``path``.
 
-    The temporary name keeps the suffix of ``path``, since many writers go by it.
+    Many writers go by the suffix, and safetensors makes a temporary file of its own beside what it
+    writes: in a folder of ours both are right, and what a killed process leaves can be told.
 
     Raises:
-        UserError: the folder or the file cannot be written.
+        UserError: the folder or the file cannot be written, or the disk is full.
     """
     path = Path(path)
     try:
-        handle, name = tempfile.mkstemp(
-            prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent
-        )
+        folder = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
-    os.close(handle)
-    temporary = Path(name)
+    temporary = folder / path.name
     try:
         yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp makes 0600
+        os.chmod(temporary, 0o666 & ~_umask())  # safetensors makes 0600
         os.replace(temporary, path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+    except Exception as error:
+        reason = why_not_written(error)
+        if reason is None:
+            raise
+        raise UserError(f"cannot write {path}: {reason}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask
+
+
+@contextmanager
+def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
+    """Yields a temporary folder beside ``path``; on success it takes that name, else it goes.
+
+    Args:
+        path: the folder that is to be.
+        replace: whether a folder of that name, if there is one, goes; else it is an error.
+
+    Raises:
+        UserError: the folder or a file in it cannot be written, or the disk is full.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    try:
+        yield temporary
+        for part in [*temporary.iterdir(), temporary]:
+            _sync(part)
+        temporary.chmod(0o777 & ~_umask())  # mkdtemp makes 0700
+        with _set_aside(path) if replace else nullcontext():
+            temporary.rename(path)  # an empty folder may be there
+        _sync(path.parent)
+    except Exception as error:
+        reason = why_not_written(error)
+        if reason is None:
+            raise
+        raise UserError(f"cannot write {path}: {reason}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _set_aside(folder: Path) -> Iterator[None]:
+    """Gives a folder, if it is there, an unfinished name; it goes if all is well, else it is back.
+
+    Half of a folder must not look like a whole one while it is removed.
+    """
+    doomed = folder.with_name(PART + secrets.token_hex(4))
+    there = folder.exists()
+    if there:
+        folder.rename(doomed)
+    try:
+        yield
+    except BaseException:
+        if there:
+            doomed.rename(folder)
+        raise
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
+def remove_folder(folder: Path) -> None:
+    """Removes a folder that is ours; at no time half of it has its name.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    with _set_aside(folder):
+        pass
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sweep(folder: str | Path, age: float = _DAY) -> None:
+    """Removes what killed processes left in a folder: names of ``PART``, ours, of a certain age.
+
+    Args:
+        folder: what lies in deeper folders stays.
+        age: seconds since anything in it was last written; 0 where nobody else writes there.
+    """
+    try:
+        found = [e for e in os.scandir(folder) if _PART_NAME.fullmatch(e.name)]
+    except OSError:
+        return
+    for entry in found:
+        try:
+            if entry.stat(follow_symlinks=False).st_uid != os.geteuid() or entry.is_symlink():
+                continue
+            if time.time() - _last_written(entry) < age:
+                continue
+            if entry.is_dir():
+                shutil.rmtree(entry.path, ignore_errors=True)
+            elif entry.is_file():
+                os.unlink(entry.path)
+        except OSError:  # it has gone meanwhile
+            continue
+
+
+def _last_written(entry: os.DirEntry) -> float:
+    """When a file, or a folder and what is right in it, was last written, Unix seconds."""
+    inner = os.scandir(entry.path) if entry.is_dir(follow_symlinks=False) else ()
+    return max(e.stat(follow_symlinks=False).st_mtime for e in (entry, *inner))
+
+
+def visible(folder: Path, pattern: str) -> Iterator[Path]:
+    """Yields what matches at any depth, but nothing whose name or folder begins with a dot."""
+    for path in folder.rglob(pattern):
+        if not any(part.startswith(".") for part in path.relative_to(folder).parts):
+            yield path
 
 
 def write_json(path: str | Path, value: object) -> None:
@@ -52,8 +196,18 @@ def write_json(path: str | Path, value: object) -> None:
         temporary.write_text(text)
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Writes UTF-8 text, atomically; what of a file's name is not UTF-8 is written with escapes.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(text.encode(errors="backslashreplace"))
+
+
 def output_folder(path: str | Path) -> Path:
-    """Makes the folder, parents included, and checks that files can be made in it.
+    """Makes the folder, parents included, checks that files can be made in it, and sweeps it.
 
     Raises:
         UserError: it is a file, or cannot be made or written.
@@ -61,23 +215,62 @@ def output_folder(path: str | Path) -> Path:
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
+        with tempfile.TemporaryFile(dir=path, prefix=PART):
             pass
     except OSError as error:
         raise UserError(f"cannot write into {path}: {error.strerror}") from error
+    sweep(path)
     return path
+
+
+@contextmanager
+def only_process(folder: Path, what: str) -> Iterator[None]:
+    """Holds a folder for this process alone; the system lets go of it when the process ends.
+
+    The file ``.lock`` in the folder stays; it holds the number of the process that had it last.
+
+    Args:
+        folder: it is there.
+        what: what the process does with it, for the message: "trains", "runs".
+
+    Raises:
+        UserError: another process holds it, or the lock cannot be made.
+    """
+    from filelock import FileLock, Timeout
+
+    path = folder / ".lock"
+    lock = FileLock(path, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        try:
+            number = path.read_text().strip()[:20] or "unknown"
+        except OSError:
+            number = "unknown"
+        message = f"{folder}: another process {what} here (pid {number})"
+        raise UserError(message) from error
+    except (OSError, NotImplementedError) as error:
+        raise UserError(f"cannot lock {folder}: {why_not_written(error) or error}") from error
+    try:
+        with suppress(OSError):  # a full disk: the lock holds all the same
+            path.write_text(f"{os.getpid()}\n")
+        yield
+    finally:
+        lock.release()
 
 
 def sha256(path: str | Path) -> str:
     """The SHA-256 of a file, 64 hexadecimal digits.
 
     Raises:
-        UserError: the file cannot be read.
+        UserError: the file cannot be read, or is no plain file.
     """
     digest = hashlib.sha256()
+    if Path(path).exists() and not Path(path).is_file():  # a pipe or a device has no end
+        raise UserError(f"{path}: not a plain file")
     try:
         with open(path, "rb") as file:
-            while part := file.read(_PART):
+            while part := file.read(_READ):
                 digest.update(part)
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from error

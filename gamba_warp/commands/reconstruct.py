@@ -8,14 +8,16 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ..batch import for_each, report, unique_names
+from ..batch import for_each, plan_outputs, report
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
 from ..formats.names import GaussianFormat, MeshFormat
+from ..untrusted.ranges import Frames, Opacity, Side, ranged
 
 
+@ranged
 def reconstruct_command(
     images: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")],
     /,
@@ -25,13 +27,13 @@ def reconstruct_command(
     formats: tuple[GaussianFormat, ...] = ("ply",),
     mesh: tuple[MeshFormat, ...] = (),
     turntable: Literal["gif", "mp4", "none"] = "gif",
-    size: int = 256,
-    frames: int = 48,
+    size: Side = 256,
+    frames: Frames = 48,
     page: bool = True,
     mask: Path | None = None,
     sam: Path | None = None,
     ply_frame: Axes = "opencv",
-    min_opacity: float = 0.0,
+    min_opacity: Opacity = 0.0,
     device: DeviceChoice = "auto",
 ) -> int:
     """Turns pictures of single objects into 3D Gaussians, one forward pass each.
@@ -55,12 +57,10 @@ def reconstruct_command(
     """
     from ..data.preprocess import SamSegmenter, prepare
     from ..images import find_pictures
-    from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
+    from ..model.checkpoint import DEFAULT_CHECKPOINT, FILE_NAME, load_model
     from ..model.predict import reconstruct
     from ..pages.outputs import Outputs, write_outputs
 
-    if size < 16 or frames < 2:
-        raise UserError("--size must be at least 16 and --frames at least 2")
     if not images:
         raise UserError("give at least one picture or folder")
     pictures, failures = find_pictures(images)
@@ -70,10 +70,8 @@ def reconstruct_command(
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
     _check_there(checkpoint)
-    model = load_model(checkpoint, chosen, encoder_weights)
-    segmenter = None if sam is None else SamSegmenter(sam, chosen)
     outputs = Outputs(
-        folder=output_folder(out),
+        folder=out,
         formats=formats,
         mesh=mesh,
         turntable=turntable,
@@ -84,6 +82,11 @@ def reconstruct_command(
         min_opacity=min_opacity,
         checkpoint=checkpoint,
     )
+    file = checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
+    names = plan_outputs(pictures, outputs.suffixes(), out, (mask, sam, file, encoder_weights))
+    model = load_model(checkpoint, chosen, encoder_weights)
+    segmenter = None if sam is None else SamSegmenter(sam, chosen)
+    output_folder(out)
 
     def one(name: str, path: Path) -> None:
         rgba = prepare(path, mask=mask, segmenter=segmenter)
@@ -92,7 +95,7 @@ def reconstruct_command(
         seconds = time.perf_counter() - started
         write_outputs(name, rgba, gaussians.to(chosen), outputs, model.config, seconds)
 
-    for_each(unique_names(pictures), one, "reconstruct", "picture", failures)
+    for_each(names, one, "reconstruct", "picture", failures)
     return report(len(pictures), "picture", failures, out)
 
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import tyro
+from msgspec import Meta
 
-from ..errors import UserError
+from ..batch import check_not_read
+from ..untrusted.ranges import ranged
 
 
+@ranged
 def view_command(
     file: tyro.conf.Positional[Path],
     /,
     out: Path | None = None,
     serve: bool = False,
-    port: int = 8000,
+    port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
 ) -> None:
     """Shows Gaussians (.ply) in a browser, as one HTML page that needs no network.
@@ -33,8 +37,7 @@ def view_command(
     from ..pages.export import write_page
     from ..pages.serve import page_server
 
-    if not 0 <= port < 65536:
-        raise UserError("--port: 0 to 65535 are possible")
+    check_not_read([] if out is None else [out], [file])
     gaussians = load_ply(file)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"
     write_page(page, file.stem, gaussians)

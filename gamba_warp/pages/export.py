@@ -50,9 +50,16 @@ class ExportJob:
     frames: int
     device: torch.device
 
+    def suffixes(self) -> list[str]:
+        """What follows the name of an input in each of its files."""
+        return [f"-mesh.{kind}" for kind in self.mesh] + [f".{kind}" for kind in self.formats]
+
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Files as they are given, each once; of a folder, the .ply files in it, sorted.
+
+    Names that begin with a dot are passed over: other programs hide files by it, and it marks what
+    a killed command left unfinished.
 
     Returns:
         The files, and the inputs that are missing or hold none, with the reason.
@@ -71,7 +78,7 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
             else:
                 failures.append((path, "no such file"))
             continue
-        inside = sorted(p for p in path.iterdir() if p.suffix.lower() == ".ply")
+        inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() == ".ply")
         files.update(dict.fromkeys(inside))
         if not inside:
             failures.append((path, "the folder holds no .ply files"))
@@ -90,13 +97,8 @@ def export(name: str, path: Path, job: ExportJob) -> str:
         A line about what was written.
 
     Raises:
-        UserError: the input cannot be read, has no surface, or would be overwritten.
+        UserError: the input cannot be read, has no surface, or a file cannot be written.
     """
-    targets = [job.folder / f"{name}-mesh.{kind}" for kind in job.mesh]
-    targets += [job.folder / f"{name}.{kind}" for kind in job.formats]
-    for target in targets:
-        if target.exists() and target.samefile(path):
-            raise UserError(f"{path}: would be overwritten; give another --out")
     gaussians = load_ply(path)
     gaussians = gaussians.select(gaussians.opacities >= job.min_opacity)
     if gaussians.num == 0:

@@ -48,6 +48,12 @@ class Outputs:
     min_opacity: float
     checkpoint: Path
 
+    def suffixes(self) -> list[str]:
+        """What follows the name of a picture in each of its files."""
+        found = [f".{kind}" for kind in self.formats] + [f"-mesh.{kind}" for kind in self.mesh]
+        found += [f".{self.turntable}"] if self.turntable != "none" else []
+        return found + ([".html"] if self.page else [])
+
 
 def write_outputs(
     name: str,

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
-from ..files import atomic_path
+from ..files import write_text
 from ..formats.splat import splat_bytes
 from ..gaussians import Gaussians
 from ..images import to_uint8
@@ -106,8 +106,7 @@ def _write(
 </body>
 </html>
 """
-    with atomic_path(path) as temporary:
-        temporary.write_text(document, encoding="utf-8")
+    write_text(path, document)
 
 
 def _section(section: Section, name: str, auto: bool) -> str:

@@ -3,8 +3,46 @@
 from __future__ import annotations
 
 import http.server
+import socket
+import threading
+from typing import Any
 
 from ..errors import UserError
+
+_CONNECTIONS = 16  # at once; a browser opens six
+_READ_SECONDS = 10.0  # a request must be there within them, and each piece of the page be taken
+_PIECE = 1 << 16  # bytes
+
+
+class PageServer(http.server.ThreadingHTTPServer):
+    """A server with a thread for each connection, so that one that stalls holds up no other.
+
+    At most ``_CONNECTIONS`` are open at once; further ones are closed at the door.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, address: tuple[str, int], content: bytes) -> None:
+        self._free = threading.BoundedSemaphore(_CONNECTIONS)
+        super().__init__(address, page_handler(content))
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Starts a thread, or closes the connection where there are too many."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answers one connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Says nothing: a client that leaves in the middle is no fault of the page."""
 
 
 def page_server(content: bytes, port: int) -> http.server.HTTPServer:
@@ -18,7 +56,7 @@ def page_server(content: bytes, port: int) -> http.server.HTTPServer:
         UserError: the port is taken or not allowed.
     """
     try:
-        return http.server.HTTPServer(("127.0.0.1", port), page_handler(content))
+        return PageServer(("127.0.0.1", port), content)
     except OSError as error:
         raise UserError(f"--port {port}: {error.strerror}") from error
 
@@ -27,7 +65,21 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
     """A request handler that answers ``/`` with one page, and everything else with 404."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
+        timeout = _READ_SECONDS  # of each single read and write
+
+        def handle(self) -> None:
+            # A client that sends a letter now and then would pass every single read's limit.
+            timer = threading.Timer(_READ_SECONDS, _close, [self.connection])
+            timer.daemon = True
+            self.reading = timer
+            timer.start()
+            try:
+                super().handle()
+            finally:
+                timer.cancel()
+
         def do_GET(self) -> None:
+            self.reading.cancel()
             if self.path != "/":
                 self.send_error(404)
                 return
@@ -35,9 +87,18 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(content)))
             self.end_headers()
-            self.wfile.write(content)
+            view = memoryview(content)
+            for start in range(0, len(view), _PIECE):  # a time limit is that of one piece
+                self.wfile.write(view[start : start + _PIECE])
 
         def log_message(self, format: str, *args: object) -> None:
             """Says nothing."""
 
     return Handler
+
+
+def _close(connection: socket.socket) -> None:
+    try:
+        connection.shutdown(socket.SHUT_RDWR)
+    except OSError:  # it is closed already
+        pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -109,18 +110,12 @@ def _write_mp4(path: Path, frames: np.ndarray, seconds: float) -> None:
 
     count, height, width = frames.shape[:3]
     even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (even.shape[2], even.shape[1]),
-        fps=count / seconds,
-        codec="libx264",
-        macro_block_size=2,
-        quality=8,
-        output_params=["-movflags", "+faststart"],
-    )
-    writer.send(None)
-    try:
-        for frame in even:
-            writer.send(np.ascontiguousarray(frame))
-    finally:
-        writer.close()
+    size, rate = f"{even.shape[2]}x{even.shape[1]}", f"{count / seconds:.6f}"
+    # imageio's own writer passes over ffmpeg's exit code, so a full disk would go unnoticed.
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo"]
+    command += ["-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-", "-an", "-c:v", "libx264"]
+    command += ["-pix_fmt", "yuv420p", "-crf", "10", "-movflags", "+faststart", f"file:{path}"]
+    done = subprocess.run(command, input=even.tobytes(), stderr=subprocess.PIPE)
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").strip().splitlines()
+        raise OSError(f"ffmpeg ended with code {done.returncode} ({lines[0] if lines else ''})")

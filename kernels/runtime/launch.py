@@ -13,6 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from . import team
+from .cache import prepare_cache
 from .recording import recorder
 from .start import start_without_gpu
 from .views import view
@@ -21,6 +22,7 @@ if wp.config.log_level == wp.LOG_INFO:  # Warp's default; a level that somebody 
     wp.config.log_level = wp.LOG_WARNING
 
 
+prepare_cache()
 if not torch.cuda.is_available():
     start_without_gpu()
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from gamba_warp.batch import for_each, report
+from gamba_warp.batch import check_not_read, for_each, plan_outputs, report
 from gamba_warp.errors import UserError
 
 FAILURES = {
-    "user": UserError("user: bad\nmore"),
+    "user": UserError("user: bad\nmore"),  # such an error makes itself one line
     "value": ValueError("wrong"),
     "diverged": FloatingPointError("not finite"),
     "disk": OSError("full"),
@@ -31,7 +31,7 @@ def test_failures_are_noted_in_one_line_and_the_rest_go_on():
     assert done == [("first", "first"), ("last", "last")]
     assert failures is before and failures == [
         ("early", "no such file"),
-        *[("user", "bad"), ("value", "wrong"), ("diverged", "not finite"), ("disk", "full")],
+        *[("user", "bad more"), ("value", "wrong"), ("diverged", "not finite"), ("disk", "full")],
         *[("cuda", "out of memory"), ("memory", "MemoryError")],
     ]
 
@@ -53,3 +53,47 @@ def test_the_report_names_failures_and_gives_the_exit_code(capsys):
     assert report(2, "file", [(Path("a.ply"), "empty")], Path("out")) == 1
     said = capsys.readouterr()
     assert said.err == "gamba: failed: a.ply: empty\n" and "1 failures" in said.out
+
+
+def planned(inputs, suffixes, folder, reads=()):
+    """The plan, checked: no two inputs share an output, on any file system."""
+    names = plan_outputs(inputs, suffixes, folder, reads)
+    outputs = [(name + suffix).casefold() for name in names for suffix in suffixes]
+    assert len(set(outputs)) == len(outputs) and list(names.values()) == list(inputs)
+    return list(names)
+
+
+def test_no_two_inputs_share_an_output(tmp_path):
+    def plan(files, *suffixes):
+        return planned([tmp_path / name for name in files], suffixes, tmp_path / "out")
+
+    assert plan(["a.png", "a-mesh.png"], ".ply", "-mesh.glb") == ["a", "a-mesh"]
+    assert plan(["a.png", "a-mesh.png"], ".glb", "-mesh.glb") == ["a", "a-mesh-2"]
+    assert plan(["a-mesh.png", "a.png"], ".glb", "-mesh.glb") == ["a-mesh", "a-2"]
+    assert plan(["a.png", "A.jpg", "x/a.png"], ".ply") == ["a", "A-2", "a-3"]
+    assert plan(["\u00e9.png", "e\u0301.png"], ".ply") == ["\u00e9", "e\u0301-2"]
+
+
+def test_what_is_read_is_never_an_output(tmp_path):
+    photo, mask, out = tmp_path / "photo.gif", tmp_path / "photo.html", tmp_path / "out"
+    photo.touch(), mask.touch(), out.mkdir()
+    with pytest.raises(UserError, match="photo.gif: would be overwritten by an output"):
+        plan_outputs([photo], [".ply", ".gif"], tmp_path)
+    with pytest.raises(UserError, match="photo.html: would be overwritten"):
+        plan_outputs([photo], [".html"], tmp_path, [None, mask])
+    (out / "photo.ply").hardlink_to(mask)
+    with pytest.raises(UserError, match="photo.html: would be overwritten"):
+        plan_outputs([photo], [".ply"], out, [mask])
+    assert planned([photo], [".gif"], out) == ["photo"]
+    (out / "photo.gif").touch()  # of an earlier run
+    assert planned([photo], [".gif"], out, [tmp_path / "none"]) == ["photo"]
+
+
+def test_a_file_in_a_folder_that_is_read_is_never_an_output(tmp_path):
+    (tmp_path / "data" / "chair").mkdir(parents=True)
+    picture = tmp_path / "data" / "chair" / "a.png"
+    check_not_read([picture], [tmp_path / "data" / "chair"])
+    picture.touch()
+    with pytest.raises(UserError, match="a.png: would be overwritten"):
+        check_not_read([picture], [tmp_path / "data" / "chair"])
+    check_not_read([picture], [tmp_path / "data" / "table", tmp_path / "none"])

@@ -183,3 +183,113 @@ def test_ctrl_c_ends_training_in_one_line(tmp_path, words):
     command = [sys.executable, "-c", CTRL_C, *words, str(tmp_path), "--out", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 130 and done.stderr == "gamba: interrupted\n"
+
+
+NONSENSE = {
+    "train DATA": {
+        "seed": "-1 4294967296", "beta2": "2 1 -0.1 nan", "lr": "inf nan 0 -1 11",
+        "minutes": "inf nan 0 -1", "weight-decay": "-1 nan inf", "size": "0 -8 100000",
+        "steps": "0 -1", "epochs": "0 nan inf", "batch-size": "0 -1", "accumulate": "0",
+        "views-first": "-1 1001", "views-last": "-1", "views-per-object": "-1", "workers": "0",
+        "threads": "0 -1 1000000", "mask-weight": "nan -1", "lpips-weight": "nan inf -1",
+        "lpips-after": "-1", "rdist-weight": "nan", "rdist-epochs": "nan inf -1",
+        "rdist-steps": "-1", "warmup-steps": "-1", "clip": "nan 0 inf", "ema": "nan 1 -1",
+        "max-skipped": "0", "log-every": "0", "val-every": "-1", "val-objects": "-1",
+        "val-views": "-1", "save-every": "0 -1", "keep": "0",
+        "set": "image_size=100000000 depth=1000000000 width=-8 fov=1e999 fov=NaN depth=[[",
+    },
+    "train DATA --lpips on": {"size": "8 15"},
+    "fit DATA": {
+        "seed": "-1", "size": "7 100000 -1", "gaussians": "1 1000000000 -5", "steps": "0 -1",
+        "minutes": "inf nan 0 -1", "limit": "0 -1", "held-out": "-1 1",
+    },
+    "eval-views --checkpoint M --data DATA": {
+        "views": "0 -1", "size": "15 100000", "limit": "0", "sheet": "-1 1000", "strips": "-1",
+        "distance": "nan inf 0 -1", "reference": "-1", "ceiling-steps": "0",
+    },
+    "eval-geometry A B": {
+        "points": "7 -1 1000000000", "voxels": "7 1000000", "views": "0 100000",
+        "pixels": "7 1000000", "seed": "-1", "reference": "-1", "distance": "nan inf 0",
+    },
+    "export FILE": {
+        "voxels": "7 1000000", "views": "0 1000000", "pixels": "0 1000000", "faces": "-1",
+        "close-holes": "-1", "smooth": "-1 100000", "min-component": "nan -1 1", "size": "8 100000",
+        "min-opacity": "nan -1 2", "frames": "1 1000000000",
+    },
+    "reconstruct PICTURE": {"size": "8 100000", "frames": "1 1000000000", "min-opacity": "nan -1"},
+    "view FILE": {"port": "-1 65536"},
+    "demo": {"minutes": "0 -1 nan inf"},
+    "gpu-check": {"minutes": "0 -1 nan inf"},
+    "bench scan": {"threads": "0 -1 1000000"},
+    "stress scan": {
+        "seed": "-1", "minutes": "0 nan inf", "cases": "0 -1", "threads": "0 1000000",
+        "shrink-seconds": "nan -1 inf",
+    },
+    "data render DATA --out OUT": {
+        "views": "0 1000000", "size": "0 100000", "fov": "0 nan 180", "seed": "-1", "limit": "0",
+        "workers": "-1",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", NONSENSE)
+def test_a_value_out_of_its_range_is_one_line_before_anything_starts(
+    words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    name = max((n for n in cli.COMMANDS if words.startswith(n)), key=len)
+    for option, values in NONSENSE[words].items():
+        for value in values.split():
+            arguments = [*words.removeprefix(name).split(), f"--{option}={value}"]
+            assert cli.run(name, arguments) == 2, (option, value)
+            captured = capsys.readouterr()
+            assert captured.out == "" and captured.err.count("\n") == 1, captured
+            what = value.split("=")[0]
+            assert f"--{option}" in captured.err and what[:9] in captured.err, captured.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "error, text",
+    [
+        (MemoryError(), "not enough memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory:\n9 bytes"), "not enough memory"),
+        (FileNotFoundError(2, "No such file or directory", "a.txt"), "a.txt: No such file"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (UnicodeEncodeError("utf-8", "caf\udce9", 3, 4, "surrogates not allowed"), "not UTF-8"),
+        (UserError("two\nlines"), "two lines"),
+    ],
+)
+def test_what_is_wrong_outside_is_one_line(command, error, text, capsys):
+    def current() -> None:
+        raise error
+
+    command(current)
+    assert exit_code(["try"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("gamba: ") and text in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("error", [RecursionError(), OSError("a defect"), UnicodeError("a defect")])
+def test_other_defects_keep_their_traceback_too(command, error):
+    def current() -> None:
+        raise error
+
+    command(current)
+    with pytest.raises(type(error)):
+        cli.main(["try"])
+
+
+def test_a_full_disk_under_the_output_is_one_line(tmp_path):
+    with open("/dev/full", "w") as full:
+        result = run("--help", stdout=full)
+    assert result.returncode == 2
+    want = "gamba: cannot write the standard output: No space left on device\n"
+    assert result.stderr == want
+
+
+def test_names_that_are_not_utf_8_can_be_printed(tmp_path):
+    name = os.fsdecode(bytes(tmp_path) + b"/caf\xe9.ply")
+    result = run("export", name, stdout=subprocess.PIPE, cwd=tmp_path)
+    assert result.returncode == 2 and "Traceback" not in result.stderr
+    assert result.stderr.endswith("caf\\udce9.ply: no such file\n")

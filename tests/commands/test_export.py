@@ -132,7 +132,7 @@ def test_missing_inputs(tmp_path, capsys):
 def test_the_input_is_not_overwritten(ball, tmp_path, capsys):
     before = ball.read_bytes()
     code = export(ball, "--out", tmp_path, "--mesh", "--formats", "ply")
-    assert code == 1 and ball.read_bytes() == before
+    assert code == 2 and ball.read_bytes() == before
     assert "would be overwritten" in capsys.readouterr().err
 
 

@@ -127,6 +127,7 @@ PathFinder.find_spec = hide
 OTHERS = (
     *("tyro", "tqdm", "timm", "kornia", "safetensors", "PIL", "skimage", "scipy", "trimesh"),
     *("imageio", "imageio_ffmpeg", "pytest", "open3d", "pymeshlab", "tensorboard", "torchvision"),
+    *("msgspec", "filelock"),
 )
 
 

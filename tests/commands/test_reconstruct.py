@@ -10,7 +10,7 @@ from helpers.images import bad_files
 from PIL import Image
 
 from gamba_warp import cli
-from gamba_warp.batch import unique_names
+from gamba_warp.batch import plan_outputs
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
 from gamba_warp.data.preprocess import composite, prepare
 from gamba_warp.errors import UserError
@@ -67,7 +67,9 @@ class Recorder(torch.nn.Module):
         super().__init__()
         self.weight = torch.nn.Parameter(torch.zeros(1))
         color = 1.0 if background == "white" else 0.0
-        self.config = SimpleNamespace(image_size=24, distance=2.0, fov=40, background_color=color)
+        self.config = SimpleNamespace(
+            image_size=24, distance=2.0, fov=40, background_color=color, input_channels=3
+        )
 
     def forward(self, images, cameras):
         self.images, self.cameras = images, cameras
@@ -248,8 +250,25 @@ def test_folders_are_searched(tmp_path, checkpoint, capsys):
 
 def test_equal_stems_get_names_of_their_own(tmp_path):
     paths = [tmp_path / p for p in ("a.png", "a.jpg", "x/a.png", "a-2.png")]
-    names = unique_names(paths)
+    names = plan_outputs(paths, [])
     assert list(names) == ["a", "a-2", "a-3", "a-2-2"] and list(names.values()) == paths
+
+
+@pytest.mark.parametrize("which", ["picture", "mask", "checkpoint"])
+def test_nothing_that_is_read_is_replaced(tmp_path, checkpoint, capsys, which):
+    photo, mask = draw(tmp_path / "photo.png"), draw(tmp_path / "mask.png")
+    model = tmp_path / "model.safetensors"
+    model.write_bytes(checkpoint.read_bytes())
+    victim = {"picture": photo, "mask": mask, "checkpoint": model}[which]
+    victim = victim.rename(tmp_path / "photo.gif")  # the turntable's name
+    files = {"picture": photo, "mask": mask, "checkpoint": model} | {which: victim}
+    before = {path: path.read_bytes() for path in files.values()}
+    code = run(files["picture"], "--mask", files["mask"], "--checkpoint", files["checkpoint"],
+               "--out", tmp_path)  # fmt: skip
+    assert code == 2
+    said = capsys.readouterr().err
+    assert said == f"gamba: {victim}: would be overwritten by an output; give another --out\n"
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def refused(arguments, *reasons):

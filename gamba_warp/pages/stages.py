@@ -1,0 +1,143 @@
+"""The stages of ``gamba demo``: commands, each its own process, that are done once."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from ..errors import UserError
+from ..files import write_json
+from ..untrusted.documents import read_document
+
+_MADE = ("run", "icons", "views", "truth", "geometry")  # folders of a demo
+
+
+class Stopped(Exception):
+    """A signal ended a command; ``code`` is 128 + its number."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"stopped with code {code}")
+        self.code = code
+
+
+class _Record(msgspec.Struct):
+    begun: dict[str, list[str]] = {}
+    ended: list[str] = []
+    seconds: float = 0.0
+
+
+class Stages:
+    """What of a demo is done, as ``OUT/stages.json`` keeps it.
+
+    Attributes:
+        seconds: that the stages took which earlier processes ran.
+    """
+
+    def __init__(self, out: Path) -> None:
+        """Reads what is done in a folder.
+
+        Raises:
+            UserError: the record is damaged.
+        """
+        self._path = out / "stages.json"
+        self._record = _Record()
+        if self._path.exists():
+            self._record = read_document(self._path, _Record)
+        self.seconds = self._record.seconds
+        self._anew = False  # whether a stage has run, so that those after it must, too
+
+    def forget(self) -> None:
+        """Removes what an earlier demo made; other files stay.
+
+        Raises:
+            UserError: something cannot be removed.
+        """
+        if not self._path.exists():
+            return
+        try:
+            for name in _MADE:
+                folder = self._path.with_name(name)
+                if folder.is_dir() and not folder.is_symlink():
+                    shutil.rmtree(folder)
+            self._path.unlink()
+        except OSError as error:
+            raise UserError(f"cannot remove {error.filename}: {error.strerror}") from error
+        self._record, self.seconds = _Record(), 0.0
+
+    def gamba(self, *arguments: object, makes: Sequence[Path] = (), may_fail: bool = False) -> None:
+        """Runs one command as its own process, its output going through, if it is not done.
+
+        It is done if it ended well with the same words before, all that it makes is there, and no
+        stage before it has run anew.
+
+        Args:
+            arguments: words of the command; the first names the stage.
+            makes: files and folders that the command leaves.
+            may_fail: whether the demo goes on after a failure.
+
+        Raises:
+            UserError: it failed, or an earlier demo in the folder had other options.
+            Stopped: a signal ended it.
+        """
+        words = [str(argument) for argument in arguments]
+        stage, kept = words[0], [word.encode(errors="replace").decode() for word in words]
+        if self._record.begun.get(stage, kept) != kept:
+            where = self._path.parent
+            raise UserError(
+                f"{where}: holds a demo of other options; give --fresh or another --out"
+            )
+        print(f"\n$ gamba {' '.join(words)}", flush=True)
+        done = stage in self._record.ended and all(path.exists() for path in makes)
+        if done and not self._anew:
+            print("done before", flush=True)
+            return
+        self._record.begun[stage] = kept  # what it leaves half-done is of these options
+        if stage in self._record.ended:
+            self._record.ended.remove(stage)
+        self._write()
+        started = time.perf_counter()
+        code = _call(words)
+        self._record.seconds += time.perf_counter() - started
+        if makes:
+            self._anew = True
+            if code == 0:
+                self._record.ended.append(stage)
+        self._write()
+        if code in _STOPPED:
+            raise Stopped(code)
+        if code and not may_fail:
+            raise UserError(f"the command above ended with exit code {code}")
+
+    def _write(self) -> None:
+        write_json(self._path, msgspec.to_builtins(self._record))
+
+
+_HANDED_ON = (signal.SIGTERM, signal.SIGHUP)
+_STOPPED = {128 + number for number in (*_HANDED_ON, signal.SIGINT)}
+
+
+def _call(words: list[str]) -> int:
+    """Runs a command and waits for it whatever comes; hands on what asks this process to stop.
+
+    A Ctrl-C reaches the command by the terminal itself, and it saves before it ends.
+    """
+    process = subprocess.Popen([sys.executable, "-m", "gamba_warp", *words])
+
+    def hand_on(number: int, frame: object) -> None:
+        process.send_signal(number)
+
+    old = {number: signal.signal(number, hand_on) for number in _HANDED_ON}
+    old[signal.SIGINT] = signal.signal(signal.SIGINT, lambda number, frame: None)
+    try:
+        code = process.wait()
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+    return code if code >= 0 else 128 - code
