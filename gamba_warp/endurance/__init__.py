@@ -1,0 +1,1 @@
+"""Endurance: every writing command killed at random moments, and on a disk that fills up."""

@@ -1,0 +1,176 @@
+"""The commands that are put to the test, and the small world of files that they work on."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from .child import run_child
+
+MODEL = ("image_size=16", "patch_size=4", "width=16", "depth=1", "state_size=4", "scale_init=0.06")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One command that writes.
+
+    Attributes:
+        name: of the command.
+        words: its arguments by the folder of the results.
+        other: further arguments that change what it writes, so that older results can be told.
+    """
+
+    name: str
+    words: Callable[[Path], list[object]]
+    other: tuple[object, ...]
+
+    def function(self, out: Path, other: bool = False) -> Callable[[], int]:
+        """What a child runs; with ``other``, under the further arguments."""
+        return command(*self.name.split(), *self.words(out), *(self.other if other else ()))
+
+
+def command(*words: object) -> Callable[[], int]:
+    """What a child runs that is ``python -m gamba_warp WORDS``."""
+
+    def run() -> int:
+        sys.argv = ["gamba", *map(str, words)]
+        try:
+            runpy.run_module("gamba_warp", run_name="__main__", alter_sys=True)
+        except SystemExit as stopped:
+            return stopped.code if isinstance(stopped.code, int) else 1
+        return 0
+
+    return run
+
+
+def training(world: Path, out: Path, steps: int) -> Callable[[], int]:
+    """What a child runs that trains a tiny model, or goes on."""
+    words: list[object] = [
+        "train",
+        world / "data",
+        "--out",
+        out,
+        "--preset",
+        "tiny",
+        "--set",
+        *MODEL,
+    ]
+    words += ["--steps", steps, "--batch-size", 2, "--size", 16, "--lpips", "off"]
+    words += ["--views-last", 2, "--save-every", 3, "--val-every", 10, "--log-every", 1]
+    words += ["--device", "cpu", "--workers", 1, "--no-tensorboard"]
+    return command(*words)
+
+
+def make_world(folder: Path) -> None:
+    """Makes data, a model, pictures and meshes, each in a child, by our own commands.
+
+    Raises:
+        RuntimeError: one of them could not be made.
+    """
+    (folder / "meshes").mkdir(parents=True)
+    for function in (lambda: _make_inputs(folder), training(folder, folder / "run", 2)):
+        end = run_child(function)
+        if end.code:
+            raise RuntimeError(f"the small world cannot be made: {end.said[-2000:]}")
+
+
+def _make_inputs(folder: Path) -> int:
+    import numpy as np
+    import trimesh
+
+    from ..formats.ply import save_ply
+    from ..images import save_image
+
+    for number, name in enumerate(("ball", "box", "cone")):
+        mesh = [trimesh.creation.icosphere(1), trimesh.creation.box(), trimesh.creation.cone(1, 2)][
+            number
+        ]
+        mesh.export(folder / "meshes" / f"{name}.ply")
+    options = ["--views", "4", "--size", "16", "--workers", "1", "--out", str(folder / "data")]
+    code = command("data", "render", folder / "meshes", *options)()
+    rgba = np.zeros((20, 30, 4))
+    rgba[4:16, 8:24] = (0.8, 0.3, 0.1, 1)
+    (folder / "pictures").mkdir()
+    for name in ("a", "b"):
+        save_image(folder / "pictures" / f"{name}.png", rgba)
+    (folder / "gaussians").mkdir()
+    save_ply(folder / "gaussians" / "ball.ply", _ball())
+    return code
+
+
+def _ball():
+    import torch
+
+    from ..gaussians import Gaussians
+
+    rng = torch.Generator().manual_seed(0)
+    points = torch.randn(200, 3, generator=rng)
+    return Gaussians(
+        means=0.4 * points / points.norm(dim=1, keepdim=True),
+        quats=None,
+        scales=torch.full((200, 3), 0.08),
+        opacities=torch.full((200,), 0.95),
+        colors=torch.rand(200, 3, generator=rng),
+    )
+
+
+def jobs(world: Path) -> list[Job]:
+    """The commands that write results, each small."""
+    model, data = world / "run" / "model.safetensors", world / "data"
+    small = ("--size", 16, "--frames", 2)
+    return [
+        Job(
+            "reconstruct",
+            lambda out: [
+                *(world / "pictures", "--checkpoint", model, "--out", out, *small),
+                *("--formats", "ply", "splat", "glb", "--device", "cpu"),
+            ],
+            ("--ply-frame", "opengl"),
+        ),
+        Job(
+            "export",
+            lambda out: [
+                *(world / "gaussians", "--out", out, "--voxels", 24, "--views", 8, "--pixels", 32),
+                *("--mesh", "glb", "ply", "--formats", "ply", "html", "gif", *small),
+                *("--device", "cpu"),
+            ],
+            ("--frame", "opencv"),
+        ),
+        Job(
+            "fit",
+            lambda out: [data, "--out", out, "--steps", 4, "--gaussians", 60, "--device", "cpu"],
+            ("--seed", 1),
+        ),
+        Job(
+            "data render",
+            lambda out: [
+                world / "meshes",
+                "--out",
+                out,
+                "--views",
+                2,
+                "--size",
+                16,
+                "--workers",
+                1,
+            ],
+            (),
+        ),
+        Job(
+            "eval-views",
+            lambda out: [
+                *("--checkpoint", model, "--data", data, "--out", out, "--split", "all"),
+                *("--no-lpips", "--save-gaussians", "--device", "cpu"),
+            ],
+            ("--views", 3),
+        ),
+        Job(
+            "eval-geometry",
+            lambda out: [world / "meshes", world / "meshes", "--out", out, "--points", 500],
+            ("--seed", 1),
+        ),
+        Job("bench", lambda out: ["--render", world / "bench.json", "--out", out], ()),
+    ]
