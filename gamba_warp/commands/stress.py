@@ -1,4 +1,4 @@
-"""``gamba stress``: random and hostile cases, each against float64."""
+"""``gamba stress``: random and hostile cases, each against float64; hostile files, each read."""
 
 from __future__ import annotations
 
@@ -7,67 +7,67 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from msgspec import Meta
 
 from ..conventions import DeviceChoice
 from ..devices import pick_device
-from ..errors import UserError
 from ..files import output_folder
+from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 
 _MINUTES = 1.0
 
 
+@ranged
 def stress_command(
     what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (
         "all",
     ),
     *,
-    seed: int = 0,
-    minutes: float | None = None,
-    cases: int | None = None,
+    seed: Seed = 0,
+    minutes: Minutes | None = None,
+    cases: Annotated[int, Meta(ge=1)] | None = None,
     device: DeviceChoice = "auto",
-    threads: int | None = None,
+    threads: Threads | None = None,
     out: Path = Path("out/stress"),
-    shrink_seconds: float = 30.0,
+    shrink_seconds: Annotated[float, Meta(ge=0, le=86_400)] = 30.0,
     replay: tuple[Path, ...] = (),
 ) -> int:
     """Runs random and hostile cases of the kernels and the model, each against float64.
 
     Forward results and all gradients; a failing case is made small and written to a file that
     --replay runs again. Writes stress.json and stress.md. Ctrl-C keeps what was found.
+    With "files": hostile files for every reader, in child processes with limits of memory and time.
 
     Args:
-        what: scan (with the convolution), raster, model, or all.
+        what: scan (with the convolution), raster, model, or all (of these); or files, after which
+            names of readers may follow.
         seed: The same seed gives the same cases in the same order.
         minutes: Time limit; 1 if not given, or none with --cases.
         cases: Number of cases; as many as fit in --minutes if not given.
         device: Device of the kernels; auto is the GPU if there is one.
-        threads: Number of CPU threads; torch's own number if not given.
+        threads: Number of CPU threads; torch's own number if not given. Of "files": of child
+            processes; one per core if not given.
         out: Folder for the summary and the failing cases.
         shrink_seconds: Time limit for making one failing case small.
         replay: Run only these files of failing cases.
     """
     import torch
 
+    from ..hostile import run as files_run
     from ..measure import stress_run
 
     chosen = pick_device(device)
     if threads is not None:
-        if threads < 1:
-            raise UserError(f"--threads is {threads}, it must be positive")
         torch.set_num_threads(threads)
     if replay:
-        code = 0
-        for passes, text in stress_run.replay(replay, chosen):
-            print(text)
-            code = code if passes else 1
-        return code
-    ops = stress_run.choose_ops(what)
-    if minutes is not None and not minutes > 0:
-        raise UserError(f"--minutes is {minutes}, it must be positive")
-    if cases is not None and cases < 1:
-        raise UserError(f"--cases is {cases}, it must be positive")
+        return _replay(replay, chosen)
     endless = minutes is None and cases is not None
-    run = stress_run.StressRun(ops, chosen, output_folder(out), seed, shrink_seconds)
+    if "files" in what:
+        names = files_run.choose_readers(what)
+        run = files_run.FilesRun(names, output_folder(out), seed, shrink_seconds, threads)
+    else:
+        ops = stress_run.choose_ops(what)
+        run = stress_run.StressRun(ops, chosen, output_folder(out), seed, shrink_seconds)
     run.run(cases, math.inf if endless else 60 * (minutes or _MINUTES))
     run.write()
     print(f"{run.summary()}; wrote {out / 'stress.json'}")
@@ -75,3 +75,17 @@ def stress_command(
         print("interrupted; what was found is kept")
         return 130
     return 1 if run.failures else 0
+
+
+def _replay(paths: tuple[Path, ...], device) -> int:
+    """Runs failing cases, those of files last; returns the exit code."""
+    from ..hostile import run as files_run
+    from ..measure import stress_run
+
+    files = [path for path in paths if files_run.is_hostile_case(path)]
+    numeric = [path for path in paths if path not in files]
+    code = 0
+    for passes, text in (*stress_run.replay(numeric, device), *files_run.replay(files)):
+        print(text)
+        code = code if passes else 1
+    return code

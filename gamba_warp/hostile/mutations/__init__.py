@@ -1,0 +1,1 @@
+"""What is done to sound files: to bytes, text and JSON, to containers, to the files themselves."""

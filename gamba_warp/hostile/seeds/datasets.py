@@ -1,0 +1,140 @@
+"""Sound datasets in each layout, folders of meshes, and archives."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+import zipfile
+
+import numpy as np
+
+from .pictures import Files, depth_png, png
+from .shapes import meshes
+
+_POSE = [[1.0, 0, 0, 0], [0, 0, -1.0, -1.5], [0, 1.0, 0, 0]]
+_SIZE = 8
+_DATE = (2020, 1, 1, 0, 0, 0)
+PROPERTIES = r"""id=Some#Library
+name=Blend Swap CC-BY
+license=CC0
+id#1=A
+name#1=Caf\u00e9 chair 01
+category#1=Kitchen
+icon#1=/b/chair.png
+model#1=/b/chair/chair.obj
+creator#1=Jay
+id#2=B
+name#2=Stool 02
+icon#2=/b/stool.png
+model#2=/b/stool/stool.obj
+creator#2=Kay
+modelRotation#2=1 0 0 0 0 -1 0 1 0
+"""
+_TRIANGLE = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+def npy(array: np.ndarray) -> bytes:
+    """The bytes of a ``.npy`` file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+def transforms(uid: str, depth: bool = False) -> Files:
+    """One object of two views in the layout ``transforms``."""
+    frames, files = [], {}
+    for name in ("000.png", "001.png"):
+        frame = {"file_path": name, "transform_matrix": [*_POSE, [0, 0, 0, 1.0]]}
+        files[f"{uid}/{name}"] = png(_SIZE)
+        if depth:
+            frame["depth_file_path"] = f"depth_{name}"
+            files[f"{uid}/depth_{name}"] = depth_png(_SIZE)
+        frames.append(frame)
+    values = {"uid": uid, "name": "A chair", "group": uid, "attribution": {"creator": "Jay"}}
+    values |= {"w": _SIZE, "h": _SIZE, "fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 4.0}
+    values |= {"depth_unit": 1e-4, "frames": frames}
+    return {f"{uid}/transforms.json": json.dumps(values).encode(), **files}
+
+
+def datasets() -> dict[str, Files]:
+    """Datasets by name of the layout."""
+    split = {"version": 1, "train": ["chair"], "val": ["stool"], "test": []}
+    nested = transforms("chair", depth=True) | transforms("stool")
+    angle = {"camera_angle_x": 0.8, "frames": [{"file_path": "./r_0", "transform_matrix": _POSE}]}
+    camera = {"x": [1.0, 0, 0], "y": [0, 0, -1.0], "z": [0, 1.0, 0], "origin": [0, -1.5, 0]}
+    folder = "chair/campos_512_v4/00000/00000"
+    lrm = {f"chair/rgba/{name}.png": png(_SIZE) for name in ("000", "001")}
+    lrm |= {f"chair/pose/{name}.npy": npy(np.array(_POSE)) for name in ("000", "001")}
+    return {
+        "transforms": {**nested, "split.json": json.dumps(split).encode()},
+        "blender": {"transforms.json": json.dumps(angle).encode(), "r_0.png": png(_SIZE)},
+        "gobjaverse": {
+            f"{folder}.json": json.dumps(camera | {"x_fov": 0.8, "y_fov": 0.8}).encode(),
+            f"{folder}.png": png(_SIZE),
+        },
+        "openlrm": {"chair/intrinsics.npy": npy(np.array([[9.0, 9], [4, 4], [8, 8]])), **lrm},
+    }
+
+
+def mesh_folders() -> dict[str, Files]:
+    """Folders of meshes with a catalogue."""
+    obj = meshes()["obj"]["ball.obj"]
+    attribution = {"creator": "Jay", "licence": "CC0"}
+    entry = {"model": "b/ball.obj", "uid": "ball", "name": "Ball", "group": "balls"}
+    entry |= {"attribution": attribution, "rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
+    catalogue = json.dumps({"objects": [entry]}).encode()
+    return {"catalogue": {"catalogue.json": catalogue, "b/ball.obj": obj}}
+
+
+def zipped(members: Files, method: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """A zip archive."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", method) as archive:
+        for name, data in members.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), data, method)
+    return content.getvalue()
+
+
+def tarred(members: Files, form: str = "xz") -> bytes:
+    """A tar archive, packed by "xz" or "gz"."""
+    content = io.BytesIO()
+    with tarfile.open(fileobj=content, mode=f"w:{form}") as tar:  # pyright: ignore
+        for name, data in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+    return content.getvalue()
+
+
+def ar(members: Files) -> bytes:
+    """An ar archive, as dpkg makes it."""
+    parts = [b"!<arch>\n"]
+    for name, data in members.items():
+        parts.append(f"{name:<16}{0:<12}{0:<6}{0:<6}{100644:<8}{len(data):<10}`\n".encode())
+        parts.append(data + b"\n" * (len(data) % 2))
+    return b"".join(parts)
+
+
+def library_members() -> Files:
+    """What is in a furniture library."""
+    icon = png(8)
+    return {
+        "PluginFurnitureCatalog.properties": PROPERTIES.encode(),
+        "LICENSE.TXT": b"free",
+        "b/chair.png": icon,
+        "b/chair/chair.obj": _TRIANGLE,
+        "b/stool.png": icon,
+        "b/stool/stool.obj": _TRIANGLE,
+    }
+
+
+def furniture() -> dict[str, Files]:
+    """Furniture as a folder of libraries, and as Debian's package."""
+    library = zipped(library_members())
+    inner = tarred({"./usr/share/sweethome3d/furniture/Some.sh3f": library})
+    package = {"debian-binary": b"2.0\n", "control.tar.xz": b"x", "data.tar.xz": inner}
+    return {
+        "libraries": {"Some.sh3f": library},
+        "package": {"furniture.deb": ar(package)},
+    }
