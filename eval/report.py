@@ -8,6 +8,7 @@ import json
 import math
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gamba_warp.errors import UserError
-from gamba_warp.files import atomic_path, write_json
+from gamba_warp.files import write_json, write_text
 
 OK, FAILED = "ok", "failed"
 LEVEL = 0.95  # share of the resampled means within an interval
@@ -59,12 +60,13 @@ def intervals_of(
             return None
         random, x = np.random.default_rng(seed), np.asarray(values, np.float64)
         batch = max(1, 1_000_000 // len(x))  # number of draws at once, which bounds the memory
-        means = [
-            x[random.integers(0, len(x), (min(batch, resamples - start), len(x)))].mean(1)
-            for start in range(0, resamples, batch)
-        ]
         ends = [(1 - level) / 2, (1 + level) / 2]
-        return [float(value) for value in np.quantile(np.concatenate(means), ends)]
+        with np.errstate(all="ignore"):  # a sum may be too large for a number
+            means = [
+                x[random.integers(0, len(x), (min(batch, resamples - start), len(x)))].mean(1)
+                for start in range(0, resamples, batch)
+            ]
+            return [float(value) for value in np.quantile(np.concatenate(means), ends)]
 
     return _over_objects(records, interval)
 
@@ -97,12 +99,33 @@ def check_finite(record: dict[str, Any]) -> dict[str, Any]:
     """Returns the record as it is.
 
     Raises:
-        UserError: one of its numbers, nested ones too, is NaN or infinite; names it.
+        UserError: one of its numbers, nested ones and those of lists too, is NaN or infinite; names
+            it.
     """
-    for key, value in flat(record).items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise UserError(f"{key} is {value}")
+    for key, value in flat(record, lists=True).items():
+        for item in value if isinstance(value, list) else [value]:
+            if isinstance(item, dict):
+                check_finite({key: item})
+            elif isinstance(item, float) and not math.isfinite(item):
+                raise UserError(f"{key} is {item}")
     return record
+
+
+def finite_or_none(value: Any) -> Any:
+    """The value with None for each number, nested ones too, that JSON cannot hold."""
+    if isinstance(value, dict):
+        return {key: finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite_or_none(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _checked(record: dict[str, Any]) -> dict[str, Any]:
+    """The record, or that of a failure where one of its numbers is not finite."""
+    try:
+        return check_finite(record) if record["status"] == OK else record
+    except UserError as error:
+        return failure(record["name"], error)
 
 
 def failure(name: str, error: Exception | str) -> dict[str, str]:
@@ -124,7 +147,8 @@ def make_report(
     Args:
         protocol: everything that decides what the numbers mean.
         objects: one record for each object, with ``name`` and ``status``, and ``reason`` where it
-            failed.
+            failed. One with a number that is not finite becomes a failure: an evaluation of
+            hours must not be lost when its report is written.
         used: versions of packages by name.
         left_out: keys of the records that have no meaningful mean.
         more: further top-level entries.
@@ -133,7 +157,7 @@ def make_report(
         ``protocol, versions, objects`` (by name), ``mean, interval`` (of the mean, over objects),
         ``bootstrap`` (how the intervals are made), ``num_ok, num_failed, failures`` and ``more``.
     """
-    objects = sorted(objects, key=lambda record: record["name"])
+    objects = sorted(map(_checked, objects), key=lambda record: record["name"])
     done = [record for record in objects if record["status"] == OK]
     numbers = [{k: v for k, v in record.items() if k not in left_out} for record in done]
     failures = [
@@ -141,7 +165,7 @@ def make_report(
         for record in objects
         if record["status"] == FAILED
     ]
-    return {
+    report = {
         "protocol": protocol,
         "versions": used,
         "objects": objects,
@@ -153,6 +177,7 @@ def make_report(
         "failures": failures,
         **more,
     }
+    return finite_or_none(report)
 
 
 def json_of(report: dict[str, Any]) -> str:
@@ -178,10 +203,23 @@ def _is_words(value: Any) -> bool:
 
 
 def save_report(report: dict[str, Any], folder: Path) -> None:
-    """Writes ``report.json`` and ``objects.csv`` into an existing folder. Raises UserError."""
-    write_json(folder / "report.json", report)
-    with atomic_path(folder / "objects.csv") as temporary:
-        temporary.write_bytes(csv_of(report).encode())
+    """Writes ``report.json`` and ``objects.csv`` into an existing folder, each whole or not at all.
+
+    Raises:
+        UserError: they cannot be written there; they are then in a temporary folder, if that can be
+            written, which the message names.
+    """
+    try:
+        write_json(folder / "report.json", report)
+        write_text(folder / "objects.csv", csv_of(report))
+    except UserError as error:
+        try:
+            other = Path(tempfile.mkdtemp(prefix="gamba-report-"))
+            write_json(other / "report.json", report)
+            write_text(other / "objects.csv", csv_of(report))
+        except (OSError, UserError):
+            raise error from None
+        raise UserError(f"{error}; the report is in {other}") from error
 
 
 def summary_lines(report: dict[str, Any]) -> list[str]:

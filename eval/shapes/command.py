@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from gamba_warp.errors import UserError
+from gamba_warp.untrusted.ranges import ranged
 
 from .options import ShapesOptions
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from .protocol import GeometryProtocol
 
 
+@ranged
 def eval_geometry_command(
     options: Annotated[ShapesOptions, tyro.conf.arg(name="")],
     json: bool = False,

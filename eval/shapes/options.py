@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from msgspec import Meta
 
-from gamba_warp.errors import UserError
-from gamba_warp.surfaces.options import Method
+from gamba_warp.surfaces.options import Method, Pixels, Views, Voxels
+from gamba_warp.untrusted.ranges import Seed, check_options
 
 Align = Literal["none", "scale", "icp"]
 Frame = Literal["gt", "unit", "reference"]
@@ -20,6 +21,9 @@ Up = Literal["auto", "y", "z"]
 PointRule = Literal["area", "views"]
 GridRule = Literal["around", "lattice"]
 OccupancyRule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
+
+Reference = Annotated[int, Meta(ge=0, le=100_000)]
+Distance = Annotated[float, Meta(ge=0.01, le=1000)]
 
 
 @dataclass(frozen=True)
@@ -47,19 +51,19 @@ class ShapesOptions:
     """Upward axis of GT files; auto goes by the suffix."""
     data: Path | None = None
     """Dataset whose objects have the same names, for --frame reference."""
-    reference: int | None = None
+    reference: Reference | None = None
     """Index of the input view, for --frame reference."""
-    distance: float | None = None
+    distance: Distance | None = None
     """Distance of the input camera in the model's world, for --frame reference."""
-    points: int | None = None
+    points: Annotated[int, Meta(ge=8, le=10_000_000)] | None = None
     """Number of points on each surface."""
-    voxels: int | None = None
+    voxels: Voxels | None = None
     """Number of voxels in a unit of length, for surfaces of Gaussians."""
-    views: int | None = None
+    views: Views | None = None
     """Number of views of the TSDF."""
-    pixels: int | None = None
+    pixels: Pixels | None = None
     """Side of the TSDF's depth maps."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Seed of the random points."""
     strict: bool = False
     """Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …) are
@@ -69,9 +73,6 @@ class ShapesOptions:
         """Checks the numbers that are given here.
 
         Raises:
-            UserError: one is too small; the message names the option.
+            UserError: one is out of its range; the message names the option.
         """
-        for name in ("points", "voxels", "views", "pixels"):
-            value = getattr(self, name)
-            if value is not None and value < 8:
-                raise UserError(f"--{name} {value}: must be at least 8")
+        check_options(self)

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-import json
-import math
 import types
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from msgspec import Meta
 
 from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.errors import UserError
 from gamba_warp.surfaces.options import SurfaceOptions
+from gamba_warp.untrusted.documents import read_document
+from gamba_warp.untrusted.ranges import Seed, check_values
 
 from .occupancy import RULES
-from .options import Align, Frame, GridRule, OccupancyRule, PointRule, ShapesOptions, Up
+from .options import (
+    Align,
+    Distance,
+    Frame,
+    GridRule,
+    OccupancyRule,
+    PointRule,
+    Reference,
+    ShapesOptions,
+    Up,
+)
 
 VERSION = 2  # goes up whenever the same protocol would give other numbers
 
@@ -71,17 +83,17 @@ class GeometryProtocol:
 
     name: str = "default"
     points: PointRule = "area"
-    num_points: int = 100_000
-    seed: int = 0
-    thresholds: tuple[float, ...] = (0.01, 0.02, 0.05)
+    num_points: Annotated[int, Meta(ge=1, le=10_000_000)] = 100_000
+    seed: Seed = 0
+    thresholds: tuple[Annotated[float, Meta(gt=0, le=100)], ...] = (0.01, 0.02, 0.05)
     occupancy: OccupancyRule = "solid"
     grid: GridRule = "around"
-    iou_voxels: int = 64
+    iou_voxels: Annotated[int, Meta(ge=8, le=512)] = 64
     align: Align = "none"
     frame: Frame = "gt"
     up: Up = "auto"
-    reference: int = 0
-    distance: float = DEFAULT_DISTANCE
+    reference: Reference = 0
+    distance: Distance = DEFAULT_DISTANCE
     strict: bool = False
     surface: SurfaceOptions = field(default_factory=SurfaceOptions)
 
@@ -126,21 +138,13 @@ def checked(protocol: GeometryProtocol, where: str) -> GeometryProtocol:
     Raises:
         UserError: a number is out of its range.
     """
-    surface = protocol.surface
-    least = {
-        "num_points": (protocol.num_points, 1),
-        "iou_voxels": (protocol.iou_voxels, 8),
-        "seed": (protocol.seed, 0),
-        "reference": (protocol.reference, 0),
-        **{f"surface.{k}": (getattr(surface, k), 8) for k in ("voxels", "views", "pixels")},
-    }
-    for name, (value, bound) in least.items():
-        if not bound <= value < 2**31:
-            raise UserError(f"{where}: {name} is {value}, must be at least {bound}")
-    if not (math.isfinite(protocol.distance) and protocol.distance > 0):
-        raise UserError(f"{where}: distance is {protocol.distance}, must be above 0")
-    if not protocol.thresholds or not all(0 < t < math.inf for t in protocol.thresholds):
-        raise UserError(f"{where}: thresholds must be numbers above 0, at least one")
+    for part, prefix in ((protocol, ""), (protocol.surface, "surface.")):
+        hints = get_type_hints(type(part), include_extras=True)
+        check_values(vars(part), hints, lambda name, at=prefix: f"{where}: {at}{name} is")
+    if not 1 <= len(protocol.thresholds) <= 100:
+        raise UserError(f"{where}: thresholds must be 1 to 100 numbers")
+    if len(protocol.name) > 200:
+        raise UserError(f"{where}: name is over 200 letters long")
     return protocol
 
 
@@ -190,10 +194,7 @@ def read_protocol(choice: str) -> GeometryProtocol:
     path = Path(choice)
     if not path.is_file():
         raise UserError(f"--protocol {choice}: neither {', '.join(PRESETS)} nor a file")
-    try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: not a protocol, not JSON ({error})") from error
+    value = read_document(path, Any)
     if isinstance(value, dict) and isinstance(value.get("protocol"), dict):
         value = value["protocol"]
     if not isinstance(value, dict):
@@ -201,7 +202,8 @@ def read_protocol(choice: str) -> GeometryProtocol:
     value = dict(value)
     version, words = value.pop("version", VERSION), value.pop("definitions", None)
     if version != VERSION:
-        raise UserError(f"{path}: protocol version {version}, this program has version {VERSION}")
+        shown = str(version)[:40]
+        raise UserError(f"{path}: protocol version {shown}, this program has version {VERSION}")
     base = PRESETS["default"]
     if isinstance(value.get("name"), str):
         base = PRESETS.get(value["name"], base)
@@ -241,6 +243,8 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
         return _typed(next(c for c in choices if c is not type(None)), value, where)
     allowed = (int, float) if kind is float else (kind,) if isinstance(kind, type) else ()
     if isinstance(value, allowed) and (kind is bool or not isinstance(value, bool)):
+        if kind is float and abs(value) > 1e300:  # an integer of JSON may have any length
+            raise UserError(f"{where} is too large")
         return float(value) if kind is float else value
     name = "a list" if get_origin(kind) is tuple else getattr(kind, "__name__", "an object")
     raise UserError(f"{where} is {value!r}, must be of type {name}")

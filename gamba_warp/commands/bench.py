@@ -13,6 +13,7 @@ from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
+from ..untrusted.ranges import Threads, ranged
 
 # What is measured -> the module with ``cases(settings)`` and ``targets(settings)``. It is imported
 # when it is asked for.
@@ -26,6 +27,7 @@ SUITES = {
 }
 
 
+@ranged
 def bench_command(
     what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (
         "all",
@@ -36,7 +38,7 @@ def bench_command(
     full: bool = False,
     peers: bool = False,
     out: Path = Path("out/bench"),
-    threads: int | None = None,
+    threads: Threads | None = None,
     compare: Path | None = None,
     render: tuple[Path, ...] = (),
     static: bool = False,

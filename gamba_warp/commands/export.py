@@ -7,15 +7,26 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ..batch import for_each, report, unique_names
+from ..batch import for_each, plan_outputs, report
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
 from ..formats.names import ExportFormat, MeshFormat
-from ..surfaces.options import SurfaceOptions
+from ..surfaces.options import (
+    Faces,
+    Holes,
+    PartShare,
+    Pixels,
+    Smoothing,
+    SurfaceOptions,
+    Views,
+    Voxels,
+)
+from ..untrusted.ranges import Frames, Opacity, Side, ranged
 
 
+@ranged
 def export_command(
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
     /,
@@ -23,24 +34,25 @@ def export_command(
     mesh: tuple[MeshFormat, ...] = ("glb",),
     formats: tuple[ExportFormat, ...] = (),
     surface: Literal["tsdf", "density"] = "tsdf",
-    voxels: int = 128,
-    views: int = 64,
-    pixels: int = 256,
-    faces: int = 0,
+    voxels: Voxels = 128,
+    views: Views = 64,
+    pixels: Pixels = 256,
+    faces: Faces = 0,
     colors: bool = True,
-    close_holes: int = 30,
-    min_component: float = 0.01,
+    close_holes: Holes = 30,
+    min_component: PartShare = 0.01,
     largest: bool = False,
-    smooth: int = 0,
+    smooth: Smoothing = 0,
     frame: Axes = "opengl",
-    min_opacity: float = 0.0,
-    size: int = 256,
-    frames: int = 48,
+    min_opacity: Opacity = 0.0,
+    size: Side = 256,
+    frames: Frames = 48,
     device: DeviceChoice = "auto",
 ) -> int:
     """Turns files of Gaussians into meshes, other splat formats, pages and turntables.
 
-    Meshes are NAME-mesh.FORMAT, all else is NAME.FORMAT; files of that name are replaced.
+    Meshes are NAME-mesh.FORMAT, all else is NAME.FORMAT; files of that name are
+    replaced, but never one that is read.
 
     Args:
         inputs: Gaussians (.ply in the 3DGS layout), or folders of them.
@@ -68,7 +80,8 @@ def export_command(
 
     from ..pages.export import ExportJob, export, find_gaussians
 
-    _check(mesh, formats, min_component, size, frames)
+    if not mesh and not formats:
+        raise UserError("nothing to write: give --mesh or --formats")
     options = SurfaceOptions(
         method=surface,
         voxels=voxels,
@@ -81,26 +94,16 @@ def export_command(
         largest=largest,
         smooth=smooth,
     )
-    options.check()
     files, failures = find_gaussians(inputs)
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     chosen = pick_device(device)
-    folder = output_folder(out)
-    job = ExportJob(folder, mesh, formats, options, frame, min_opacity, size, frames, chosen)
+    job = ExportJob(out, mesh, formats, options, frame, min_opacity, size, frames, chosen)
+    names = plan_outputs(files, job.suffixes(), out)
+    output_folder(out)
 
     def one(name: str, path: Path) -> None:
         tqdm.write(export(name, path, job))
 
-    for_each(unique_names(files), one, "export", "file", failures)
+    for_each(names, one, "export", "file", failures)
     return report(len(files), "file", failures, out)
-
-
-def _check(mesh: tuple, formats: tuple, min_component: float, size: int, frames: int) -> None:
-    """Raises UserError for the first option that is out of its range."""
-    if size < 16 or frames < 2:
-        raise UserError("--size must be at least 16 and --frames at least 2")
-    if not mesh and not formats:
-        raise UserError("nothing to write: give --mesh or --formats")
-    if not 0 <= min_component < 1:
-        raise UserError("--min-component is a share, from 0 to under 1")

@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
+from msgspec import Meta
 
-from ..batch import report
+from ..batch import check_not_read, report
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
-from ..fitting.config import FitConfig, RasterizeMode
+from ..fitting.config import Count, FitConfig, RasterizeMode, Steps
+from ..untrusted.ranges import Minutes, Seed, ranged
 
 
+@ranged
 def fit_command(
     folder: tyro.conf.Positional[Path],
     out: Path = Path("out/fit"),
     objects: tuple[str, ...] = (),
     split: Literal["all", "train", "val", "test"] = "all",
-    limit: int | None = None,
-    held_out: int = 6,
-    steps: int = FitConfig.steps,
-    minutes: float | None = None,
-    gaussians: int = FitConfig.gaussians,
-    size: int | None = None,
+    limit: Annotated[int, Meta(ge=1)] | None = None,
+    held_out: Annotated[int, Meta(ge=0, le=100_000)] = 6,
+    steps: Steps = FitConfig.steps,
+    minutes: Minutes | None = None,
+    gaussians: Count = FitConfig.gaussians,
+    size: Annotated[int, Meta(ge=8, le=4096)] | None = None,
     rasterize_mode: RasterizeMode = "classic",
-    seed: int = 0,
+    seed: Seed = 0,
     device: DeviceChoice = "auto",
 ) -> int:
     """Fits Gaussians to the posed views of each object, without any model.
@@ -50,12 +52,15 @@ def fit_command(
         device: Device that computes; auto is the GPU if there is one.
     """
     from ..data.dataset import open_dataset
-    from ..fitting.objects import FitJob, choose_objects, fit_objects
+    from ..fitting.objects import FitJob, choose_objects, fit_objects, object_paths
 
-    _check(limit, held_out, steps, minutes, gaussians, size, seed)
+    if held_out == 1:
+        raise UserError("--held-out 1: would leave no view for the fit; 2 or more, or 0 for none")
     chosen = pick_device(device)
     dataset = open_dataset(folder, split)
     uids = choose_objects(dataset.uids, objects, limit)
+    targets = (path for uid in uids for path in object_paths(out, uid).values())
+    check_not_read(targets, [folder / uid for uid in uids])
     config = FitConfig(
         gaussians=gaussians,
         steps=steps,
@@ -67,23 +72,3 @@ def fit_command(
     text, failures = fit_objects(job, uids)
     print(text)
     return report(len(uids), "object", failures, out)
-
-
-def _check(limit, held_out, steps, minutes, gaussians, size, seed) -> None:
-    """Raises UserError for the first option that is out of its range."""
-    least = {"limit": 1, "steps": 1, "gaussians": 2, "size": 8, "seed": 0, "held-out": 0}
-    values = {
-        "limit": limit,
-        "steps": steps,
-        "gaussians": gaussians,
-        "size": size,
-        "seed": seed,
-        "held-out": held_out,
-    }
-    for name, value in values.items():
-        if value is not None and value < least[name]:
-            raise UserError(f"--{name} {value}: must be at least {least[name]}")
-    if held_out == 1:
-        raise UserError("--held-out 1: would leave no view for the fit; 2 or more, or 0 for none")
-    if minutes is not None and not (math.isfinite(minutes) and minutes > 0):
-        raise UserError(f"--minutes {minutes}: must be above 0")

@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import Literal
 
 from ..gpu_check.plan import MINUTES, StepName
+from ..untrusted.ranges import Minutes, ranged
 
 
+@ranged
 def gpu_check_command(
     *,
     device: Literal["cuda", "cpu"] = "cuda",
     quick: bool = False,
     out: Path = Path("out/gpu-check"),
-    minutes: float = MINUTES,
+    minutes: Minutes = MINUTES,
     steps: tuple[StepName, ...] = (),
 ) -> int:
     """Runs kernel checks, GPU tests, full-size inference and the benchmark on this machine.

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from ..untrusted.ranges import Seed, check_options
 
 RasterizeMode = Literal["classic", "antialiased"]
+Count = Annotated[int, Meta(ge=2, le=5_000_000)]
+Steps = Annotated[int, Meta(ge=1, le=10_000_000)]
+_Rate = Annotated[float, Meta(ge=0, le=10)]
+_Weight = Annotated[float, Meta(ge=0, le=1e6)]
+_Share = Annotated[float, Meta(ge=0, le=1)]
 MIN_SCALE, MAX_SCALE = 1e-3, 0.1  # object units
 
 
@@ -37,21 +46,24 @@ class FitConfig:
         seed: seed of all random numbers.
     """
 
-    gaussians: int = 8000
-    steps: int = 600
-    seconds: float | None = None
-    views: int = 5
-    lr_means: float = 2e-3
-    lr_scales: float = 2e-2
-    lr_quats: float = 2e-2
-    lr_opacities: float = 5e-2
-    lr_colors: float = 2e-2
-    lr_end: float = 0.03
-    weight_alpha: float = 0.5
-    weight_l1: float = 0.3
-    relocate_every: int = 25
-    relocate_share: float = 0.2
-    relocate_until: float = 0.7
-    min_weight: float = 1.0
+    gaussians: Count = 8000
+    steps: Annotated[int, Meta(ge=0, le=10_000_000)] = 600
+    seconds: Annotated[float, Meta(gt=0, le=1e8)] | None = None
+    views: Annotated[int, Meta(ge=1, le=1000)] = 5
+    lr_means: _Rate = 2e-3
+    lr_scales: _Rate = 2e-2
+    lr_quats: _Rate = 2e-2
+    lr_opacities: _Rate = 5e-2
+    lr_colors: _Rate = 2e-2
+    lr_end: Annotated[float, Meta(gt=0, le=1)] = 0.03
+    weight_alpha: _Weight = 0.5
+    weight_l1: _Weight = 0.3
+    relocate_every: Annotated[int, Meta(ge=0)] = 25
+    relocate_share: _Share = 0.2
+    relocate_until: _Share = 0.7
+    min_weight: _Weight = 1.0
     rasterize_mode: RasterizeMode = "classic"
-    seed: int = 0
+    seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        check_options(self)

@@ -17,7 +17,7 @@ from ..cameras import Cameras, relative_to_reference
 from ..conventions import DEFAULT_DISTANCE
 from ..data.dataset import ObjectViews, ViewDataset
 from ..errors import UserError
-from ..files import atomic_path, output_folder, write_json
+from ..files import output_folder, write_json, write_text
 from ..formats.ply import save_ply
 from ..gaussians import Gaussians
 from ..image_metrics import psnr
@@ -197,6 +197,12 @@ def _mean(values: list[float]) -> float | None:
     return sum(values) / len(values) if values else None
 
 
+def object_paths(folder: Path, uid: str) -> dict[str, Path]:
+    """The files of one object in the folder of the results, by the sub-folder that each is in."""
+    kinds = {"gaussians": ".ply", "strips": ".png", "objects": ".json"}
+    return {kind: folder / kind / f"{uid}{suffix}" for kind, suffix in kinds.items()}
+
+
 def _write_object(
     job: FitJob,
     record: dict[str, Any],
@@ -205,10 +211,7 @@ def _write_object(
     rows: Tensor,
 ) -> None:
     """Writes the ``.ply``, the strip ``[V, H, 2W, 3]`` (at most 4 views) and, last, the record."""
-    paths = {
-        kind: job.folder / kind / f"{record['name']}{suffix}"
-        for kind, suffix in (("gaussians", ".ply"), ("strips", ".png"), ("objects", ".json"))
-    }
+    paths = object_paths(job.folder, record["name"])
     for path in paths.values():
         output_folder(path.parent)
     # eval-views and eval-geometry expect predictions in the input camera's world.
@@ -252,6 +255,5 @@ def _write_report(
         cells = [form.format(record[k]) if record[k] is not None else "" for _, k, form in _TABLE]
         table.append(f"| {record['name']} | " + " | ".join(cells) + " |")
     table += ["", *(f"failed: {name}: {reason}" for name, reason in failures)]
-    with atomic_path(job.folder / "report.md") as temporary:
-        temporary.write_text(f"{text}\n\n" + "\n".join(table).rstrip() + "\n")
+    write_text(job.folder / "report.md", f"{text}\n\n" + "\n".join(table).rstrip() + "\n")
     return text

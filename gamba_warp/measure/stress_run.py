@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import importlib
-import json
 import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -29,6 +29,7 @@ from ..kernels.stress import (
     shrink,
     table,
 )
+from ..untrusted.documents import read_document
 from ..versions import __version__, installed
 
 # What is stressed -> modules with an ``OP``. They are imported when they are asked for.
@@ -170,12 +171,7 @@ def replay(paths: Sequence[Path], device: torch.device) -> Iterator[tuple[bool, 
 
 
 def _read_case(path: Path, ops: dict[str, Op]) -> Case:
-    try:
-        content = json.loads(path.read_text())
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror or 'cannot be read'}") from error
-    except ValueError as error:
-        raise UserError(f"{path}: not JSON ({error})") from error
+    content = read_document(path, Any, limit=1 << 20)
     try:
         return read_reproducer(content, ops)
     except ValueError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -12,11 +13,12 @@ from tqdm import tqdm
 from ..errors import UserError
 from ..files import atomic_path, output_folder, write_json
 from ..kernels.bench import Case, Settings, Target, measure
-from ..kernels.bench.core.document import parse_document
+from ..kernels.bench.core.document import check_document
 from ..kernels.bench.core.page import page
 from ..kernels.bench.core.report import judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
+from ..untrusted.documents import parse_document, read_bytes
 
 
 def make_settings(
@@ -25,12 +27,10 @@ def make_settings(
     """The settings of the cases from the options of the command.
 
     Raises:
-        UserError: options contradict one another or are out of range.
+        UserError: options contradict one another.
     """
     if quick and full:
         raise UserError("--quick and --full: choose one")
-    if threads is not None and threads < 1:
-        raise UserError(f"--threads is {threads}, it must be positive")
     return Settings(
         device=device,
         level="quick" if quick else "full" if full else "normal",
@@ -80,12 +80,9 @@ def read_document(path: Path) -> dict:
     Raises:
         UserError: no such file, not JSON, or not of this format.
     """
+    document = parse_document(read_bytes(path), Any, str(path))
     try:
-        return parse_document(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror or 'cannot be read'}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not JSON (not even text)") from error
+        return check_document(document)
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
 

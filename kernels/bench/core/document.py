@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 from .measure import FORMAT
 
 _TEXT, _NUMBER, _MAP, _NONE = (str,), (int, float), (dict,), (type(None),)
@@ -27,23 +25,23 @@ _MACHINE = {
     **dict.fromkeys(("cores", "threads"), (int,)),
     "date": _TEXT,
 }
+_LONGEST = 10_000  # letters of a text; the longest of ours is a message of a compiler
 _TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
 
 
-def parse_document(text: str) -> dict:
-    """Reads the text of a bench.json and checks that it holds all that reports need.
+def check_document(document: object) -> dict:
+    """Checks that the content of a bench.json holds all that reports need, and returns it.
 
     Raises:
-        ValueError: the text is not JSON or of another format, a number is not finite, or something
+        ValueError: it is of another format, a number is not finite or out of range, or something
             is missing or of another type; the message names it.
     """
-    try:
-        document = json.loads(text, parse_constant=_refuse)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"not JSON ({error})") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError(f"not a result of 'gamba bench' (format is not {FORMAT})")
     _check("machine", document.get("machine"), _MACHINE)
+    peers = document["machine"].get("peers", {})
+    if not isinstance(peers, dict) or not all(type(v) is str for v in peers.values()):
+        raise ValueError("damaged: machine.peers is no list of versions by name")
     if not isinstance(document.get("interrupted"), bool):
         raise ValueError("damaged: interrupted is missing or is no truth value")
     for name, fields in (("records", _RECORD), ("targets", _TARGET)):
@@ -53,16 +51,26 @@ def parse_document(text: str) -> dict:
         for i, row in enumerate(rows):
             _check(f"{name}[{i}]", row, fields)
     for i, record in enumerate(document["records"]):
-        if record["status"] == "ok" and None in [record[name] for name in _TIMES]:
+        times = [record[name] for name in _TIMES]
+        if record["status"] == "ok" and None in times:
             raise ValueError(f"damaged: records[{i}] has no times, but its status is ok")
-        numbers = [*record["work"].values(), record["ms_p50"] or 0, record["peer_ms"] or 0]
-        if not all(type(x) in _NUMBER and -1e300 < x < 1e300 for x in numbers):
+        if not all(t is None or t > 0 for t in (*times[:3], record["peer_ms"])):
+            raise ValueError(f"damaged: records[{i}] has a time that is not above 0")
+        if not all(_is_number(x) for x in record["work"].values()):
             raise ValueError(f"damaged: records[{i}] has what is no number, or none to be drawn")
+        if not all(_is_value(x) for x in record["parameters"].values()):
+            raise ValueError(f"damaged: records[{i}] has a parameter that is no value")
     return document
 
 
-def _refuse(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON")
+def _is_number(value: object) -> bool:
+    if type(value) not in _NUMBER or not isinstance(value, (int, float)):
+        return False
+    return -1e300 < value < 1e300
+
+
+def _is_value(value: object) -> bool:
+    return type(value) in (bool, *_TEXT, *_NONE) or _is_number(value)
 
 
 def _check(name: str, row: object, fields: dict[str, tuple[type, ...]]) -> None:
@@ -71,5 +79,7 @@ def _check(name: str, row: object, fields: dict[str, tuple[type, ...]]) -> None:
     for key, kinds in fields.items():
         if key not in row:
             raise ValueError(f"damaged: {name} has no {key}")
-        if type(row[key]) not in kinds:
-            raise ValueError(f"damaged: {name}.{key} is {str(row[key])[:40]!r}")
+        value = row[key]
+        long = type(value) is str and len(value) > _LONGEST
+        if type(value) not in kinds or long or type(value) in _NUMBER and not _is_number(value):
+            raise ValueError(f"damaged: {name}.{key} is {str(value)[:40]!r}")

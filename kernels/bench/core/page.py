@@ -39,6 +39,8 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
     if axis in ("skipped", "switched off"):
         return [_skip_chart(done, axis == "switched off")]
     series = []
+    values = [(r, r["parameters"].get(axis)) for r in done]
+    done = [r for r, value in values if type(value) in (int, float) and value > 0]
     for direction in dict.fromkeys(r["direction"] for r in done):
         found = [r for r in done if r["direction"] == direction]
         points = [Point(r["parameters"][axis], r["ms_p50"]) for r in found]

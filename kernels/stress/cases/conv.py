@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...causal_conv1d import causal_conv1d, causal_conv1d_fn
-from ..core.case import DTYPES, Case, Op, Outcome, generator
+from ..core.case import DTYPES, Case, Op, Outcome, fitted, generator
 from ..core.ranges import RANGES, fill
 from ..core.rounding import Rounding, samples_of
 from ..oracles import scan as scan_oracle
@@ -95,7 +95,8 @@ def evaluate(case: Case, device: torch.device) -> Outcome:
 
 
 def _valid(options: dict) -> dict:
-    return options | {"width": min(4, max(2, options["width"]))}
+    o = options | {"width": min(4, max(2, options["width"]))}
+    return fitted(o, ("batch", "length", "channels"), 60_000)  # more than draw can give
 
 
 _CHOICES = {

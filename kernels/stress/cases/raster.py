@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...rasterize import Skip, rasterization
-from ..core.case import DTYPES, FACTOR, Case, Comparison, Op, Outcome, generator, judge
+from ..core.case import DTYPES, FACTOR, Case, Comparison, Op, Outcome, fitted, generator, judge
 from ..core.ranges import RANGES, fill
 from ..core.rounding import SAMPLES, UNIT, Rounding, samples_of
 from ..oracles.raster import Lens, render_view
@@ -67,9 +67,13 @@ def valid(options: dict) -> dict:
     o["skip"] = min(o["skip"], 127)
     each = max(1, math.prod(LEADS[o["lead"]])) * max(1, o["views"]) * (o["channels"] + 2)
     while each * o["num"] * o["width"] * o["height"] > _LARGEST:
-        largest = max(("width", "height", "num"), key=lambda k: o[k] / (8 if k == "num" else 1))
+        names = [name for name in ("width", "height", "num") if o[name] > 1]
+        if not names:
+            break
+        largest = max(names, key=lambda k: o[k] / (8 if k == "num" else 1))
         o[largest] = (o[largest] + 1) // 2
-    return o
+    o["poison"] = min(o["poison"], 100)
+    return fitted(o, ("views", "num", "width", "height", "channels"), 5 * _LARGEST)
 
 
 def _options(o: dict) -> dict:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...selective_scan import selective_scan, selective_scan_fn, selective_scan_state
-from ..core.case import DTYPES, Case, Comparison, Op, Outcome, generator, judge
+from ..core.case import DTYPES, Case, Comparison, Op, Outcome, fitted, generator, judge
 from ..core.ranges import RANGES, fill
 from ..core.rounding import Rounding, samples_of
 from ..oracles import scan as scan_oracle
@@ -82,13 +82,14 @@ def valid(options: dict) -> dict:
     """Sizes that fit each other and the oracle; options that the API takes."""
     o = dict(options)
     while math.prod(o[k] for k in ("batch", "length", "channels", "states")) > _LARGEST:
-        if o["states"] > 1 and o["length"] < 1000:
+        if o["states"] > 1 and (o["length"] < 1000 or o["channels"] == 1):
             o["states"] = (o["states"] + 1) // 2
         else:
             o["channels"] = max(1, o["channels"] // 2)
             if o["channels"] == 1 and o["states"] == 1:
                 o["batch"] = 1
                 break
+    o = fitted(o, ("batch", "length", "channels", "states"), 4 * _LARGEST)
     o["groups"] = math.gcd(o["groups"], o["channels"])
     if o["api"] != "prefix":
         o["split"] = 0

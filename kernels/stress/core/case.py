@@ -138,6 +138,21 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
         return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
 
 
+def fitted(options: dict, sizes: tuple[str, ...], largest: int) -> dict:
+    """Halves the largest of some sizes until their product is small enough; a 0 counts as 1.
+
+    Args:
+        options: of a case.
+        sizes: names of options that are numbers.
+        largest: product of the sizes, at most.
+    """
+    o = dict(options)
+    while math.prod(max(1, o[name]) for name in sizes) > largest:
+        widest = max(sizes, key=lambda name: o[name])
+        o[widest] //= 2
+    return o
+
+
 def generator(case: Case, name: str) -> torch.Generator:
     """Makes the source of chance for one tensor of a case, independent of its other tensors."""
     return torch.Generator().manual_seed(case.seed * 1009 + sum(name.encode()))

@@ -102,17 +102,24 @@ def read_reproducer(document: object, ops: dict[str, Op]) -> Case:
         raise ValueError(f"damaged: case must have {', '.join(keys)} and nothing else")
     op = ops.get(case["op"])
     if op is None or case["kind"] not in op.kinds:
-        raise ValueError(f"this version has no case '{case['op']}, {case['kind']}'")
+        shown = f"{case['op'][:40]}, {case['kind'][:40]}"
+        raise ValueError(f"this version has no case {shown!r}")
+    if not 0 <= case["seed"] < 2**31:
+        raise ValueError("damaged: seed is not in 0 to 2147483647")
     options = case["options"]
     for name in sorted(options.keys() | op.plain.keys()):
         if name not in op.plain or name not in options:
             kind = "an unknown" if name in options else "no"
-            raise ValueError(f"{kind} option '{name}'; from another version, or damaged")
+            raise ValueError(f"{kind} option {name[:40]!r}; from another version, or damaged")
         value, plain = options[name], op.plain[name]
         allowed = op.choices.get(name)
         wrong = type(value) is not type(plain) or (allowed and value not in allowed)
         if wrong or (isinstance(value, (int, float)) and not 0 <= value <= 10**6):
-            raise ValueError(f"option '{name}' is {value!r}; from another version, or damaged")
-    if op.valid(options) != options:
-        raise ValueError("damaged: its options do not fit each other")
+            shown = repr(value)[:40]
+            raise ValueError(f"option '{name}' is {shown}; from another version, or damaged")
+    fitting = op.valid(options)
+    for name, value in options.items():
+        if fitting[name] != value:
+            text = f"'{name}' is {value}, and {fitting[name]} is the nearest that fits"
+            raise ValueError(f"damaged: its options do not fit each other: {text}")
     return Case(**case)

@@ -206,11 +206,11 @@ def files(tmp_path):
     [
         (["nonsense"], "unknown case 'nonsense'; there are scan, conv, raster"),
         (["scan", "--quick", "--full"], "choose one"),
-        (["scan", "--threads", "0"], "--threads is 0"),
+        (["scan", "--threads", "0"], "--threads 0: must be at least 1"),
         (["scan", "--out", "{}/file"], "cannot write into {}/file"),
         (["scan", "--out", "{}/file/deep"], "cannot write into {}/file/deep"),
         (["scan", "--compare", "{}/none.json"], "{}/none.json: No such file"),
-        (["scan", "--compare", "{}/broken.json"], "{}/broken.json: not JSON"),
+        (["scan", "--compare", "{}/broken.json"], "{}/broken.json: not valid JSON"),
         (["scan", "--compare", "{}/other.json"], "{}/other.json: not a result of"),
         (["scan", "--compare", "{}/half.json"], "{}/half.json: damaged"),
         (["--render", "{}/half.json"], "{}/half.json: damaged"),
@@ -517,10 +517,16 @@ def test_gswarp_is_reported_where_it_is_not():
 @pytest.mark.parametrize(
     "change, reason",
     [
-        (lambda d: d["records"][0].update(ms_p50=math.nan), "NaN is no number"),
-        (lambda d: d["records"][0].update(ms_p50=math.inf), "Infinity is no number"),
+        (lambda d: d["records"][0].update(ms_p50=math.nan), "not valid JSON"),
+        (lambda d: d["records"][0].update(ms_p50=math.inf), "not valid JSON"),
         (lambda d: d["records"][0].update(ms_p50="fast"), r"records\[0\].ms_p50 is 'fast'"),
         (lambda d: d["records"][0].update(ms_p20=None), "no times, but its status is ok"),
+        (lambda d: d["records"][0].update(ms_p50=0.0), "a time that is not above 0"),
+        (lambda d: d["records"][0].update(max_error=1e308), r"records\[0\].max_error is '1e\+308'"),
+        (lambda d: d["records"][0].update(parameters={"L": []}), "a parameter that is no value"),
+        (lambda d: d["records"][0].update(axis="a," * 10**4), r"records\[0\].axis is 'a,a,"),
+        (lambda d: d["machine"].update(peers=["x"]), "machine.peers is no list of versions"),
+        (lambda d: d["machine"].update(cores=10**18 * 10**300), r"machine.cores is .1000"),
         (lambda d: d["records"][0].update(work={"pairs": "many"}), "what is no number"),
         (lambda d: d["records"][0].pop("text"), r"records\[0\] has no text"),
         (lambda d: d["records"].append(7), r"records\[1\] is missing or is no object"),
@@ -543,8 +549,18 @@ def test_damaged_results_are_refused(tmp_path, change, reason):
         suites.read_document(path)
     for data in (b"\xff\xfe", b"[" * 10**5, b"", b"null"):
         path.write_bytes(data)
-        with pytest.raises(UserError, match="not JSON|not a result"):
+        with pytest.raises(UserError, match="not valid JSON|nested deeper|not a result"):
             suites.read_document(path)
+
+
+def test_a_parameter_that_cannot_be_drawn_is_left_out(tmp_path):
+    document = run(case(variant(), axis="L"))
+    document["records"][0]["parameters"] = {"L": 5}
+    for value in (0, -1, "long", None):
+        document["records"][0]["parameters"]["L"] = value
+        suites.write_pages([document], tmp_path)
+    del document["records"][0]["parameters"]["L"]
+    suites.write_pages([document], tmp_path)
 
 
 @pytest.mark.parametrize("axis, saved", [("skipped", 75), ("switched off", -300)])

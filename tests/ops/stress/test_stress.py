@@ -1,6 +1,7 @@
 """``gamba stress``: a short run, limits that can fail, small reproducers, and what it refuses."""
 
 import json
+import math
 import random
 
 import pytest
@@ -276,7 +277,7 @@ GOOD = {
     "content, reason",
     [
         (None, "No such file"),
-        ("{", "not JSON"),
+        ("{", "not valid JSON"),
         ("[]", "not a case"),
         (GOOD | {"format": "gamba_warp.stress.9"}, "format is not"),
         (GOOD | {"case": {}}, "damaged: case must have op, kind, seed, options"),
@@ -287,6 +288,12 @@ GOOD = {
         ({"options": {"length": -1}}, "option 'length' is -1"),
         ({"options": {"dtype": "int8"}}, "option 'dtype' is 'int8'"),
         ({"options": {"groups": 7}}, "do not fit"),
+        ({"options": {"length": 10**6}}, "'length' is 1000000, and 125000 is the nearest"),
+        ({"options": {"length": 10**6, "states": 16}}, "'length' is 1000000"),  # was endless
+        ({"options": {"length": 0, "batch": 10**6, "channels": 10**6}}, "do not fit"),
+        ({"seed": -1}, "seed is not in 0 to 2147483647"),
+        ({"kind": "x" * 10**5}, "no case 'scan, xxx"),
+        ("[" * 10**5, "nested deeper than 32 levels"),
     ],
 )
 def test_bad_files_are_told_in_one_line(tmp_path, capsys, content, reason):
@@ -295,6 +302,8 @@ def test_bad_files_are_told_in_one_line(tmp_path, capsys, content, reason):
         if "options" in content:
             options = scan.OP.plain | content["options"]
             content = GOOD | {"case": GOOD["case"] | {"options": options}}
+        elif "format" not in content:
+            content = GOOD | {"case": GOOD["case"] | content}
         content = json.dumps(content)
     if content is not None:
         path.write_text(content)
@@ -304,13 +313,25 @@ def test_bad_files_are_told_in_one_line(tmp_path, capsys, content, reason):
     assert captured.err.startswith(f"gamba: {path}: ") and reason in captured.err
 
 
+@pytest.mark.parametrize("op", OPS.values(), ids=OPS)
+def test_no_options_take_much_memory_or_no_end(op):
+    sizes = [name for name, value in op.plain.items() if type(value) is int]
+    for chosen in ([], *([name] for name in sizes), sizes[:1], sizes[1:]):
+        for other in (0, 10**6):
+            options = op.plain | dict.fromkeys(sizes, other) | dict.fromkeys(chosen, 10**6)
+            fitting = op.valid(options)
+            names = ("batch", "views", "length", "channels", "states", "num", "width", "height")
+            product = math.prod(max(1, fitting.get(name, 1)) for name in names)
+            assert product <= 500_000 and op.valid(fitting) == fitting
+
+
 @pytest.mark.parametrize(
     "arguments, reason",
     [
         (["sort"], "unknown 'sort'"),
-        (["--cases", "0"], "--cases is 0"),
-        (["--minutes", "0"], "--minutes is 0"),
-        (["--threads", "0"], "--threads is 0"),
+        (["--cases", "0"], "--cases 0: must be at least 1"),
+        (["--minutes", "0"], "--minutes 0.0: must be above 0"),
+        (["--threads", "0"], "--threads 0: must be at least 1"),
     ],
 )
 def test_bad_options_are_told_in_one_line(capsys, arguments, reason):
