@@ -196,6 +196,7 @@ def check_state(state: dict[str, Any], source: str) -> None:
     """
     try:
         fields = msgspec.convert(state, _State)
+        msgspec.json.encode(fields.config)  # plain values alone, which can be compared
         for rng in (fields.rng, *fields.rng_cuda):
             if not isinstance(rng, torch.Tensor) or rng.dtype != torch.uint8 or rng.ndim != 1:
                 raise ValueError("rng holds no state of a generator")

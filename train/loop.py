@@ -371,8 +371,9 @@ class Trainer:
                 data or number of processes; the message names the differing fields.
         """
         state = read_state(checkpoint)
-        if state.get("version") != STATE_VERSION:
-            raise UserError(f"{checkpoint}: state of version {str(state.get('version'))[:40]!r}")
+        version = state.get("version")
+        if type(version) is not int or version != STATE_VERSION:  # a tensor has no plain truth
+            raise UserError(f"{checkpoint}: state of version {str(version)[:40]!r}")
         check_state(state, str(checkpoint / "state.pt"))
         differing = config_differences(state["config"], self.config.to_dict())
         mine = {"objects": self.data.fingerprint, "world_size": self.world.size}

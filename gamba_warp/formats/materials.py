@@ -133,15 +133,17 @@ def make_material(source, path: Path, warnings: list[str], budget: Budget) -> Ma
     if isinstance(source, PBRMaterial):
         texture = _texture(source.baseColorTexture, warnings, budget)
         factor = source.baseColorFactor
-        color = np.ones(4) if factor is None else np.asarray(factor, np.float64) / 255
+        color = np.ones(4)
+        if np.shape(factor) == (4,):  # glTF may hold anything there
+            color = np.asarray(factor, np.float64) / 255
         if source.alphaMode in (None, "OPAQUE"):
             color[3] = 1.0
             if texture is not None:
                 texture[..., 3] = 255
         elif source.alphaMode == "MASK" and texture is not None:
-            cut = 0.5 if source.alphaCutoff is None else source.alphaCutoff
+            cut = source.alphaCutoff if isinstance(source.alphaCutoff, (int, float)) else 0.5
             texture[..., 3] = np.where(texture[..., 3] >= 255 * cut, 255, 0)
-        return Material(color.astype(np.float32), texture)
+        return Material(_finite(color), texture)
     grey = Material(np.array([*[to_linear(GREY)] * 3, 1], np.float32))
     # trimesh invents a material where there is none; one from an MTL file has kwargs.
     made_up = path.suffix.lower() == ".obj" and not source.kwargs
@@ -159,7 +161,13 @@ def make_material(source, path: Path, warnings: list[str], budget: Budget) -> Ma
         else:
             color[:3] = grey.color[:3]
     color[3] = _opacity(source.kwargs)
-    return Material(color, texture)
+    return Material(_finite(color), texture)
+
+
+def _finite(color: np.ndarray) -> np.ndarray:
+    """A file's colour as float32 in [0, 1]; what is no number there is grey."""
+    values = np.where(np.isnan(color), to_linear(GREY), color)
+    return np.clip(values, 0.0, 1.0).astype(np.float32)
 
 
 def _opacity(options: dict) -> float:
@@ -175,6 +183,9 @@ def _opacity(options: dict) -> float:
 
 def _texture(image: Image.Image | None, warnings: list[str], budget: Budget) -> np.ndarray | None:
     if image is None:
+        return None
+    if not isinstance(image, Image.Image):  # glTF's index of a picture may be anything
+        warnings.append("a texture: not a picture that can be read")
         return None
     name = image.info.get("file_path", "a texture")
     try:

@@ -254,8 +254,12 @@ def _flatten(
     mesh, matrix: np.ndarray, warnings: list[str], path: Path, budget: Budget
 ) -> tuple[dict, Material]:
     """The arrays of one part, moved to the scene's frame, and its material."""
-    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces, dtype=np.int64)
+    for name, array in (("vertices", vertices), ("faces", faces)):  # glTF may state others
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise UserError(f"{path}: {name} of {array.shape[1:]} numbers, expected 3")
+    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise UserError(f"{path}: a face names vertex {faces.max()} of {len(vertices)}")
     bad = ~np.isfinite(vertices).all(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -110,10 +110,12 @@ class _Stored(msgspec.Struct, forbid_unknown_fields=True):
     seed: _Name
     main: _Name
     files: Annotated[dict[_Name, _File], msgspec.Meta(max_length=1000)]
-    mutations: Annotated[list[str], msgspec.Meta(max_length=1000)] = field(default_factory=list)
+    mutations: Annotated[list[str], msgspec.Meta(max_length=1000)] = msgspec.field(
+        default_factory=list
+    )
     outcome: str = ""
     text: str = ""
-    versions: dict[str, str] = field(default_factory=dict)
+    versions: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 def stored_case(case: Case, outcome: str, text: str, versions: dict[str, str]) -> dict:

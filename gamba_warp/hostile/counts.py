@@ -44,6 +44,7 @@ def vertices_stated(data: bytes, suffix: str) -> int | None:
 
 
 def _lines(data: bytes) -> list[bytes]:
+    data = data.removeprefix(b"\xef\xbb\xbf")  # a byte order mark
     return [line for line in data.replace(b"\r", b"\n").split(b"\n") if line.strip()]
 
 

@@ -214,3 +214,15 @@ def test_the_page_states_the_limits_of_the_code():
     assert f"{MOST_LETTERS} letters" in page
     for outcome in OUTCOMES:
         assert f"| {outcome} |" in page
+
+
+def test_what_was_found_once_stays_mended(pool):
+    """``corpus/`` holds cases that failed, as they were written; each is judged again."""
+    paths = sorted((Path(__file__).parent / "corpus").glob("*.json"))
+    assert len(paths) >= 5
+    bad = {}
+    for path in paths:
+        verdict = pool.run_one(read_case(path, READERS))
+        if verdict.outcome not in ("sound", "refused"):
+            bad[path.stem] = f"{verdict.outcome}: {verdict.text}"
+    assert not bad
