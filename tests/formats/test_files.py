@@ -134,3 +134,15 @@ def test_what_begins_with_a_dot_is_no_input(tmp_path):
     assert [pair.name for pair in pairs] == ["a"] and not failures
     with pytest.raises(UserError):
         open_dataset(part)
+
+
+def test_who_reads_the_older_file_reads_it_to_its_end(tmp_path):
+    """The name changes to the new file at once; the older one is not written over."""
+    path = tmp_path / "a.txt"
+    path.write_text("old" * 100_000)
+    with open(path) as reader:
+        assert reader.read(3) == "old"
+        with atomic_path(path) as temporary:
+            temporary.write_text("new")
+        assert reader.read() == "old" * 99_999
+    assert path.read_text() == "new"
