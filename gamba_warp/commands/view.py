@@ -9,6 +9,7 @@ import tyro
 from msgspec import Meta
 
 from ..batch import check_not_read
+from ..files import output_folder
 from ..untrusted.ranges import ranged
 
 
@@ -39,6 +40,8 @@ def view_command(
 
     check_not_read([] if out is None else [out], [file])
     gaussians = load_ply(file)
+    if out is not None:
+        output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"
     write_page(page, file.stem, gaussians)
     if not serve:

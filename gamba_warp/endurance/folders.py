@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..files import PART
 
+_KEPT = (".lock", ".gamba-library.json")  # of a run; of a library that was unpacked
 _TWO_DAYS = 2 * 24 * 3600
 
 
@@ -23,8 +24,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """What killed commands left behind: all names with a dot, but for the lock of a run."""
-    found = (path for path in folder.rglob(".*") if path.name != ".lock")
+    """What killed commands left behind: all names with a dot, but for ``_KEPT``."""
+    found = (path for path in folder.rglob(".*") if path.name not in _KEPT)
     return [path for path in found if not any(p.startswith(PART) for p in path.parent.parts)]
 
 

@@ -98,7 +98,23 @@ def _make_inputs(folder: Path) -> int:
         save_image(folder / "pictures" / f"{name}.png", rgba)
     (folder / "gaussians").mkdir()
     save_ply(folder / "gaussians" / "ball.ply", _ball())
+    _make_library(folder / "libraries", folder / "pictures" / "a.png")
     return code
+
+
+def _make_library(folder: Path, icon: Path) -> None:
+    """A furniture library of 20 models, as ``gamba data furniture`` unpacks it."""
+    import zipfile
+
+    folder.mkdir()
+    lines = ["id=Some#Library", "name=Some"]
+    with zipfile.ZipFile(folder / "Some.sh3f", "w") as archive:
+        archive.write(icon, "m/icon.png")
+        for number in range(20):
+            lines += [f"name#{number}=Thing {number}", f"icon#{number}=/m/icon.png"]
+            lines += [f"model#{number}=/m/{number}/a.obj", f"creator#{number}=me"]
+            archive.writestr(f"m/{number}/a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n" * 99)
+        archive.writestr("PluginFurnitureCatalog.properties", "\n".join(lines))
 
 
 def _ball():
@@ -170,6 +186,20 @@ def jobs(world: Path) -> list[Job]:
         Job(
             "eval-geometry",
             lambda out: [world / "meshes", world / "meshes", "--out", out, "--points", 500],
+            ("--seed", 1),
+        ),
+        Job("data furniture", lambda out: ["--tree", world / "libraries", "--out", out], ()),
+        Job(
+            "view",
+            lambda out: [
+                *(world / "gaussians" / "ball.ply", "--out", out / "page.html"),
+                "--no-open-browser",
+            ],
+            (),
+        ),
+        Job(
+            "stress",
+            lambda out: ["scan", "--cases", 2, "--device", "cpu", "--out", out],
             ("--seed", 1),
         ),
         Job("bench", lambda out: ["--render", world / "bench.json", "--out", out], ()),
