@@ -134,7 +134,7 @@ def make_material(source, path: Path, warnings: list[str], budget: Budget) -> Ma
         texture = _texture(source.baseColorTexture, warnings, budget)
         factor = source.baseColorFactor
         color = np.ones(4)
-        if np.shape(factor) == (4,):  # glTF may hold anything there
+        if factor is not None and np.shape(factor) == (4,):  # glTF may hold anything there
             color = np.asarray(factor, np.float64) / 255
         if source.alphaMode in (None, "OPAQUE"):
             color[3] = 1.0

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from ..errors import UserError
 
 if TYPE_CHECKING:
-    from msgspec import Meta
+    from msgspec import Meta as Meta
 else:
     try:
         from msgspec import Meta
