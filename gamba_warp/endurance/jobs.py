@@ -188,6 +188,13 @@ def jobs(world: Path) -> list[Job]:
             lambda out: [world / "meshes", world / "meshes", "--out", out, "--points", 500],
             ("--seed", 1),
         ),
+        *_other_jobs(world),
+    ]
+
+
+def _other_jobs(world: Path) -> list[Job]:
+    """The commands that neither render nor evaluate."""
+    return [
         Job("data furniture", lambda out: ["--tree", world / "libraries", "--out", out], ()),
         Job(
             "view",

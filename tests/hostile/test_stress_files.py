@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import os
 import re
 from pathlib import Path
 
@@ -17,13 +16,11 @@ from gamba_warp.hostile.case import Case, Entry, read_case, sound_case, stored_c
 from gamba_warp.hostile.counts import points_in
 from gamba_warp.hostile.pool import Pool
 from gamba_warp.hostile.readers import READERS, REFUSED
-from gamba_warp.hostile.run import Cases, FilesRun, replay
+from gamba_warp.hostile.run import Cases, replay
 from gamba_warp.hostile.seeds.shapes import clouds
 from gamba_warp.hostile.shrink import shrink, signature
 from gamba_warp.hostile.verdict import OUTCOMES
 
-# Wall seconds of the run below; GAMBA_STRESS_MINUTES asks for a longer one.
-SECONDS = 60 * float(os.environ.get("GAMBA_STRESS_MINUTES", "1"))
 WANTED = {
     **dict.fromkeys(("raises", "exits"), "exception"),
     **dict.fromkeys(("opens", "starts", "writes"), "outside"),
@@ -101,12 +98,12 @@ def test_what_is_no_file_is_refused(pool, kind):
     assert not told
 
 
-def test_hostile_files(tmp_path):
-    run = FilesRun((), tmp_path, seed=1, shrink_seconds=5)
-    run.run(None, SECONDS)
-    run.write()
-    assert not run.failures, run.summary()
-    assert json.loads((tmp_path / "stress.json").read_text())["totals"]["cases"] > 100
+def test_hostile_files(fuzz):
+    """Two minutes of all readers; the run goes on beside the other tests (``conftest.py``)."""
+    code = fuzz.wait()
+    assert code == 0, (fuzz.out / "log.txt").read_text()[-2000:]
+    report = json.loads((fuzz.out / "stress.json").read_text())
+    assert report["totals"]["cases"] > 100 and report["failures"] == []
 
 
 def test_the_same_seed_gives_the_same_cases():
