@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TypeVar
 from unicodedata import normalize
 
-from .errors import UserError
+from .errors import UserError, first_line
 
 Item = TypeVar("Item")
 # What one bad input may raise: everything else is a defect of the program, and stops it.
-_EXPECTED = (UserError, ValueError, ArithmeticError, OSError, RuntimeError, MemoryError)
+EXPECTED = (UserError, ValueError, ArithmeticError, OSError, RuntimeError, MemoryError)
 
 
 def for_each(
@@ -41,9 +41,8 @@ def for_each(
     for name, item in tqdm(named.items(), desc=desc, unit=unit, disable=None):
         try:
             function(name, item)
-        except _EXPECTED as error:
-            lines = str(error).splitlines() or [type(error).__name__]
-            failures.append((item, lines[0].removeprefix(f"{item}: ")))
+        except EXPECTED as error:
+            failures.append((item, first_line(error).removeprefix(f"{item}: ")))
     return failures
 
 

@@ -1,4 +1,4 @@
-"""Numbers and names that every room agrees on; no imports of ours, and none that are slow."""
+"""What every room agrees on: numbers, names, alpha; no imports of ours, and none that are slow."""
 
 from typing import Literal
 
@@ -10,3 +10,17 @@ Axes = Literal["opencv", "opengl"]
 
 # Of the option --device: "auto" is the GPU if there is one, else the CPU.
 DeviceChoice = Literal["auto", "cpu", "cuda"]
+
+
+def over_background(rgba, background):
+    """Composites straight-alpha RGBA, an array or a tensor, over a colour.
+
+    Args:
+        rgba: ``[.., H, W, 4]`` in [0, 1], colour not premultiplied.
+        background: a grey value, or RGB that broadcasts with ``[.., H, W, 3]``, in [0, 1].
+
+    Returns:
+        ``[.., H, W, 3]``.
+    """
+    alpha = rgba[..., 3:]
+    return rgba[..., :3] * alpha + background * (1 - alpha)

@@ -16,6 +16,11 @@ class UserError(Exception):
         super().__init__(one_line(str(message)))
 
 
+def first_line(error: BaseException) -> str:
+    """What an error says first; its type where it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
 def one_line(text: str, most: int = MOST_LETTERS) -> str:
     """The text as one line that any terminal can show, of at most ``most`` letters (over 20)."""
     line = " ".join(part.strip() for part in text.strip().splitlines())

@@ -26,7 +26,7 @@ _READ = 1 << 20  # bytes read at once of a file that may be larger than the memo
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 
 
-def one_line(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
     """What an error says, in one line; its type where it says nothing."""
     text = getattr(error, "strerror", None) or str(error)
     return " ".join(text.split()) or type(error).__name__
@@ -37,7 +37,7 @@ def why_not_written(error: BaseException) -> str | None:
 
     safetensors has an error type of its own, also for a full disk.
     """
-    text = one_line(error)
+    text = reason_of(error)
     if isinstance(error, OSError):
         return text
     if type(error).__name__ == "SafetensorError" and "I/O error" in text:
@@ -56,22 +56,28 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         UserError: the folder or the file cannot be written, or the disk is full.
     """
     path = Path(path)
-    try:
-        folder = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
-    temporary = folder / path.name
-    try:
+    with _unfinished(path) as folder:
+        temporary = folder / path.name
         yield temporary
         os.chmod(temporary, 0o666 & ~_umask())  # safetensors makes 0600
         os.replace(temporary, path)
+
+
+@contextmanager
+def _unfinished(path: Path) -> Iterator[Path]:
+    """Yields a new folder beside ``path`` that goes in the end; what the disk raises names it."""
+    folder = None
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
+        yield folder
     except Exception as error:
         reason = why_not_written(error)
         if reason is None:
             raise
         raise UserError(f"cannot write {path}: {reason}") from error
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _umask() -> int:
@@ -94,10 +100,9 @@ def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=PART, dir=path.parent))
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
-    try:
+    with _unfinished(path) as temporary:
         yield temporary
         for part in [*temporary.iterdir(), temporary]:
             _sync(part)
@@ -105,13 +110,6 @@ def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
         with _set_aside(path) if replace else nullcontext():
             temporary.rename(path)  # an empty folder may be there
         _sync(path.parent)
-    except Exception as error:
-        reason = why_not_written(error)
-        if reason is None:
-            raise
-        raise UserError(f"cannot write {path}: {reason}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from .errors import UserError
+from .errors import UserError, first_line
 from .files import atomic_path
 
 MAX_PIXELS = 64 * 1024 * 1024
@@ -80,7 +80,7 @@ def open_picture(
     except Image.DecompressionBombError as error:
         raise UserError(f"{name}: is over {max_pixels >> 20} megapixels") from error
     except Exception as error:  # decoders raise errors of nearly any type on damaged files
-        reason = (str(error) or type(error).__name__).splitlines()[0]
+        reason = first_line(error)
         raise UserError(f"{name}: cannot be decoded ({reason})") from error
 
 
@@ -219,20 +219,6 @@ def _to_rgba(image: Image.Image, dtype: type) -> np.ndarray:
         else:
             part[...] = np.asarray(band.convert("RGBA"))
     return out
-
-
-def over_background(rgba, background):
-    """Composites straight-alpha RGBA, an array or a tensor, over a colour.
-
-    Args:
-        rgba: ``[.., H, W, 4]`` in [0, 1], colour not premultiplied.
-        background: a grey value, or RGB that broadcasts with ``[.., H, W, 3]``, in [0, 1].
-
-    Returns:
-        ``[.., H, W, 3]``.
-    """
-    alpha = rgba[..., 3:]
-    return rgba[..., :3] * alpha + background * (1 - alpha)
 
 
 def to_uint8(picture: np.ndarray) -> np.ndarray:

@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gamba_warp.batch import EXPECTED
 from gamba_warp.cameras import Cameras
 from gamba_warp.data.dataset import ViewDataset, open_dataset
-from gamba_warp.errors import UserError
+from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.posing import posed_input, relative_cameras
 
@@ -26,8 +27,6 @@ from .config import DataConfig, TrainConfig
 from .data.augment import Change, draw_change
 
 _TRIES = 100  # objects tried one after the other until one can be read
-# What a bad object may raise; the last three are torch's and numpy's.
-_BAD_OBJECT = (UserError, OSError, MemoryError, RuntimeError, ValueError, ArithmeticError)
 # With --overfit all views share the network's one pass, and rendering them is cheap beside it.
 _OVERFIT_VIEWS = 9
 
@@ -151,11 +150,6 @@ def choose_views(
     return [first, *(others[i % len(others)] for i in range(novel))]
 
 
-def reason_of(error: Exception) -> str:
-    """What an error says, in one line."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 class BatchSource:
     """Draws batches by their number (see the module's docstring)."""
 
@@ -210,13 +204,13 @@ class BatchSource:
                 return load_sample(
                     self.dataset, index, views, self.size, self.config, background, change
                 )
-            except _BAD_OBJECT as error:
+            except EXPECTED as error:
                 reason = self._note(index, error)
         raise UserError(f"{_TRIES} objects in a row cannot be read; the last: {reason}")
 
     def _note(self, index: int, error: Exception) -> str:
         """Records a failure; raises UserError where too many objects have failed."""
-        reason = reason_of(error)
+        reason = first_line(error)
         self.failures[self.dataset.uids[index]] = reason
         bad, all_objects = len(self.failures), len(set(self.objects))
         if bad > all_objects / 2:
@@ -271,8 +265,8 @@ def fixed_batches(
             if novel is not None and novel < len(others):
                 others = [others[i * len(others) // novel] for i in range(novel)]
             batch = load_sample(dataset, index, [0, *others], size, config, torch.ones(3))
-        except _BAD_OBJECT as error:
-            failures[dataset.uids[index]] = reason_of(error)
+        except EXPECTED as error:
+            failures[dataset.uids[index]] = first_line(error)
             continue
         yield batch
 

@@ -17,8 +17,8 @@ from typing import Annotated, Any
 import msgspec
 import torch
 
-from gamba_warp.errors import UserError
-from gamba_warp.files import atomic_folder, one_line, remove_folder, sha256, sweep, write_json
+from gamba_warp.errors import UserError, first_line
+from gamba_warp.files import atomic_folder, reason_of, remove_folder, sha256, sweep, write_json
 from gamba_warp.model.checkpoint import read_config, read_weights, save_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.untrusted.documents import read_document
@@ -94,7 +94,7 @@ def _save_state(path: Path, state: dict) -> None:
     try:
         torch.save(state, path)
     except RuntimeError as error:  # of its writer of zip files
-        reason = f"state.pt cannot be written whole, is the disk full? ({one_line(error)})"
+        reason = f"state.pt cannot be written whole, is the disk full? ({reason_of(error)})"
         raise OSError(reason) from error
 
 
@@ -202,7 +202,7 @@ def check_state(state: dict[str, Any], source: str) -> None:
                 raise ValueError("rng holds no state of a generator")
         torch.Generator().set_state(fields.rng)  # a state of another kind is refused here
     except (ValueError, TypeError, RuntimeError) as error:  # msgspec's is a ValueError
-        raise UserError(f"{source}: damaged, {str(error).splitlines()[0]}") from error
+        raise UserError(f"{source}: damaged, {first_line(error)}") from error
 
 
 def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:

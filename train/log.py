@@ -18,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
-from gamba_warp.files import one_line
+from gamba_warp.files import reason_of
 from gamba_warp.images import save_image
 
 _READ = 1 << 16  # bytes read at once in search of the last whole line
@@ -56,7 +56,7 @@ class RunLog:
         except Exception as error:  # TensorBoard's thread hands on whatever stopped it
             if name not in self._said:
                 self._said.add(name)
-                say(f"gamba train: {name} cannot be written, the run goes on: {one_line(error)}")
+                say(f"gamba train: {name} cannot be written, the run goes on: {reason_of(error)}")
             if name == "tensorboard":
                 self._board = None
 

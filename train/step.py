@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from gamba_warp.conventions import over_background
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
-from gamba_warp.images import over_background
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from gamba_warp.cameras import Cameras
+from gamba_warp.conventions import over_background
 from gamba_warp.data.dataset import SPLIT_VERSION, ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
-from gamba_warp.images import over_background
 from gamba_warp.model.lpips import LPIPS
 from gamba_warp.model.posing import relative_cameras
 from gamba_warp.render import render

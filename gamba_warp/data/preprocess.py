@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import UserError
-from ..images import load_rgba, over_background, picture_size
+from ..conventions import over_background
+from ..errors import UserError, first_line
+from ..images import load_rgba, picture_size
 
 BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
 WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model sees more
@@ -161,9 +162,13 @@ def shrink(rgba: np.ndarray, longest: int) -> np.ndarray:
     if max(height, width) <= longest:
         return rgba
     factor = longest / max(height, width)
-    size = max(1, round(height * factor)), max(1, round(width * factor))
+    return resize_rgba(rgba, max(1, round(height * factor)), max(1, round(width * factor)))
+
+
+def resize_rgba(rgba: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Resizes ``[H, W, 4]`` in [0, 1], straight alpha, with colours weighted by alpha."""
     alpha = rgba[..., 3:]
-    small = _resize(np.dstack([rgba[..., :3] * alpha, alpha]), *size)
+    small = _resize(np.dstack([rgba[..., :3] * alpha, alpha]), height, width)
     small[..., :3] /= np.maximum(small[..., 3:], 1e-6)
     return small.clip(0.0, 1.0)
 
@@ -215,7 +220,7 @@ class SamSegmenter:
             config = SamConfig(model_type=self._model_type(path), checkpoint=str(path))
             self._prompter = VisualPrompter(config, device=torch.device(device))
         except Exception as error:  # torch.load raises errors of many types on other files
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            reason = first_line(error)
             raise UserError(
                 f"--sam {path}: not a Segment Anything checkpoint ({reason})"
             ) from error

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..kernels.runtime.cache import writable_folder
 
 _MAX_PICKLE = 512 << 20  # bytes; that of LPIPS takes 59 MB
@@ -136,5 +136,5 @@ def load_numpy_pickle(file: BinaryIO, name: str) -> Any:
         _check_arrays(value, set())
         return value
     except Exception as error:  # a damaged pickle calls what it has with what it likes
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise UserError(f"{name}: not a pickle of numpy arrays ({reason})") from error

@@ -14,14 +14,14 @@ from tqdm import tqdm
 
 from ..batch import for_each
 from ..cameras import Cameras, relative_to_reference
-from ..conventions import DEFAULT_DISTANCE
+from ..conventions import DEFAULT_DISTANCE, over_background
 from ..data.dataset import ObjectViews, ViewDataset
 from ..errors import UserError
 from ..files import output_folder, write_json, write_text
 from ..formats.ply import save_ply
 from ..gaussians import Gaussians
 from ..image_metrics import psnr
-from ..images import over_background, save_image
+from ..images import save_image
 from ..render import render
 from ..versions import used_versions
 from .config import FitConfig

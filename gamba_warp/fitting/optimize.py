@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from ..cameras import Cameras
+from ..conventions import over_background
 from ..gaussians import Gaussians
-from ..images import over_background
 from ..render import render
 from .config import MAX_SCALE, MIN_SCALE, FitConfig
 from .relocate import relocate, shares

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..cameras import Cameras
+from ..conventions import over_background
 from ..gaussians import Gaussians, quat_multiply
-from ..images import over_background
 from ..render import render
 from .config import FitConfig, RasterizeMode
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import UserError
+from ..errors import UserError, first_line
 from .headers import check_counts, open_shape
 from .materials import GREY, Budget, Material, make_material, side_files, to_linear
 from .ply_data import PlyData, PlyList, read_ply, triangles
@@ -171,8 +171,7 @@ def _read_parts(path: Path, warnings: list[str]) -> list[tuple]:
                 parts.append((mesh, matrix))
         return parts
     except Exception as error:  # trimesh raises whatever its parsers run into
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(f"{path}: cannot be read as a mesh ({reason[0]})") from error
+        raise UserError(f"{path}: cannot be read as a mesh ({first_line(error)})") from error
 
 
 def _has_mixed_polygons(data: PlyData) -> bool:

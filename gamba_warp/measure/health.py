@@ -13,6 +13,7 @@ import warp as wp
 from ..cameras import Cameras, intrinsics, orbit
 from ..data.vgg_weights import FETCH, lpips_available
 from ..data.weights import cache_folder
+from ..errors import first_line
 from ..gaussians import Gaussians
 from ..kernels.selective_scan import selective_scan
 from ..model.checkpoint import DEFAULT_CHECKPOINT
@@ -54,7 +55,7 @@ def abilities() -> Iterator[tuple[str, str, bool]]:
             check()
             yield name, "yes", False
         except Exception as error:  # a broken installation raises anything: that is what to tell
-            yield name, f"no: {(str(error) or type(error).__name__).splitlines()[0]}", True
+            yield name, f"no: {first_line(error)}", True
     there = DEFAULT_CHECKPOINT.is_file()
     missing = "no starter model here; give --checkpoint, or train with 'gamba demo'"
     yield "reconstruct", "yes" if there else missing, False

@@ -18,7 +18,7 @@ from ..kernels.bench.core.page import page
 from ..kernels.bench.core.report import judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
-from ..untrusted.documents import parse_document, read_bytes
+from ..untrusted import documents
 
 
 def make_settings(
@@ -80,9 +80,8 @@ def read_document(path: Path) -> dict:
     Raises:
         UserError: no such file, not JSON, or not of this format.
     """
-    document = parse_document(read_bytes(path), Any, str(path))
     try:
-        return check_document(document)
+        return check_document(documents.read_document(path, Any))
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
 

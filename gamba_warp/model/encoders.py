@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..untrusted.torch_files import read_torch
 from .config import MAX_PARAMETERS, GambaConfig
 from .tokens import IMAGENET_MEAN, IMAGENET_STD
@@ -175,7 +175,7 @@ def _create_vit(config: GambaConfig, pretrained: bool) -> VisionTransformer:
     try:
         vit = timm.create_model(name, pretrained=pretrained, img_size=size, num_classes=0)
     except Exception as error:  # timm and its download raise many classes
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = first_line(error)
         action = "fetched" if pretrained else f"built for {size}x{size} pixels"
         raise UserError(f"encoder {name}: cannot be {action} ({reason})") from error
     if not isinstance(vit, VisionTransformer):

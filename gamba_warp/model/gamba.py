@@ -8,6 +8,7 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from ..cameras import Cameras
+from ..conventions import over_background
 from ..gaussians import Gaussians
 from .block import GambaBlock, State, make_norm, prefix_states, run_blocks
 from .config import GambaConfig
@@ -15,7 +16,7 @@ from .decoder import GaussianDecoder
 from .encoders import ImageEncoder, build_encoder
 from .patches import foreground_patches
 from .rays import RayDecoder
-from .tokens import CameraToken, SplatTokens, on_background
+from .tokens import CameraToken, SplatTokens
 
 
 class Gamba(nn.Module):
@@ -72,7 +73,9 @@ class Gamba(nn.Module):
         camera = self.camera_token(cameras) if self.camera_token else None
         image = None
         if self.encoder:
-            image = self.encoder(on_background(images, self.config.background_color)[0])
+            if self.config.input_channels == 4:
+                images = over_background(images, self.config.background_color)
+            image = self.encoder(images)
         return prefix_states(self.blocks, camera, image)
 
     def forward(

@@ -90,12 +90,29 @@ def foreground_patches(alpha: Tensor, size: int, margin: int = 0) -> Patches:
     Raises:
         ValueError: a negative margin.
     """
-    if margin < 0:
-        raise ValueError(f"background_margin is {margin}, it must be 0 or more")
-    seen = F.max_pool2d((alpha > 0).float()[:, None], size)
-    near = F.max_pool2d(seen, 2 * margin + 1, stride=1, padding=margin).flatten(1) > 0
+    near = near_patches(alpha > 0, size, margin)
     counts = near.sum(1)
     most = int(counts.max()) if len(counts) else 0
     index = torch.argsort(~near, dim=1, stable=True)[:, :most]
     valid = torch.arange(most, device=alpha.device) < counts[:, None]
     return Patches(index, valid, alpha.shape[-1] // size, size)
+
+
+def near_patches(seen: Tensor, size: int, margin: int) -> Tensor:
+    """The patches that hold something, and those near such a patch.
+
+    Args:
+        seen: ``[B, H, W]`` bool, the pixels of the object.
+        size: side of a patch, pixels.
+        margin: how many patches near is, >= 0.
+
+    Returns:
+        ``[B, (H/size) · (W/size)]`` bool, row by row.
+
+    Raises:
+        ValueError: a negative margin.
+    """
+    if margin < 0:
+        raise ValueError(f"background_margin is {margin}, it must be 0 or more")
+    patches = F.max_pool2d(seen.float()[:, None], size)
+    return F.max_pool2d(patches, 2 * margin + 1, stride=1, padding=margin).flatten(1) > 0

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, reference_viewmat, relative_to_reference
+from ..conventions import over_background
 from .config import GambaConfig
 
 if TYPE_CHECKING:
@@ -59,8 +60,6 @@ def posed_input(views: ObjectViews, config: GambaConfig) -> tuple[Tensor, Camera
         Images ``[1, S, S, 3]`` RGB in [0, 1], or RGBA where the model takes it, and the reference
         camera ``[1]``, on the device of ``views``.
     """
-    from ..images import over_background  # needs PIL, which a CUDA machine may not have
-
     images = views.images[:1]
     if config.input_channels == 3:
         images = over_background(images, config.background_color)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..data.preprocess import composite, prepare
+from ..data.preprocess import composite, prepare, resize_rgba
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .posing import reference_cameras
@@ -57,7 +57,4 @@ def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:
     size = config.image_size
     if config.input_channels == 3:
         return composite(rgba, size, config.background_color)[None]
-    white = np.concatenate([np.ones_like(rgba[..., :3]), rgba[..., 3:]], -1)
-    alpha = composite(white, size, 0.0)[..., :1]
-    color = composite(rgba, size, 0.0) / alpha.clamp_min(1e-6)
-    return torch.cat([color.clamp(0, 1), alpha], -1)[None]
+    return torch.from_numpy(resize_rgba(rgba, size, size))[None]

@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ..cameras import Cameras, plucker_rays
+from ..conventions import over_background
 from .config import GambaConfig
-from .patches import Patches
+from .patches import Patches, near_patches
 
 # Mean and deviation of ImageNet's pictures; every pretrained encoder here was trained with them.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -20,22 +21,6 @@ def normalize_imagenet(images: Tensor) -> Tensor:
     # A tensor made of the constants would be copied from the host, which a CUDA graph cannot hold.
     planes = zip(images.unbind(-1), IMAGENET_MEAN, IMAGENET_STD)
     return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
-
-
-def on_background(images: Tensor, background: float) -> list[Tensor]:
-    """Splits pictures into colour on the background and, where there is one, alpha.
-
-    Args:
-        images: ``[.., 3]`` RGB in [0, 1], or ``[.., 4]`` RGBA with straight alpha.
-        background: grey value in [0, 1].
-
-    Returns:
-        RGB ``[.., 3]``; of RGBA also alpha ``[.., 1]``.
-    """
-    if images.shape[-1] == 3:
-        return [images]
-    color, alpha = images.split([3, 1], -1)
-    return [color * alpha + background * (1 - alpha), alpha]
 
 
 def scan_orders(height: int, width: int) -> Tensor:
@@ -118,8 +103,10 @@ class SplatTokens(nn.Module):
         with torch.autocast(images.device.type, enabled=False):
             height, width = images.shape[1:3]
             rays = plucker_rays(cameras.viewmats.float(), cameras.Ks.float(), width, height)
-            flat, *alpha = on_background(images.float(), self.background)
-            parts = [normalize_imagenet(flat), rays, *(2 * part - 1 for part in alpha)]
+            images, alpha = images.float(), images[..., 3:].float()  # of RGB, alpha is empty
+            if alpha.shape[-1]:
+                images = over_background(images, self.background)
+            parts = [normalize_imagenet(images), rays, 2 * alpha - 1]
             return torch.cat(parts, dim=-1).permute(0, 3, 1, 2)
 
     def of_patches(self, pixels: Tensor, patches: Patches) -> tuple[Tensor, Tensor]:
@@ -161,9 +148,6 @@ class SplatTokens(nn.Module):
         Raises:
             ValueError: a negative margin.
         """
-        if margin < 0:
-            raise ValueError(f"background_margin is {margin}, it must be 0 or more")
-        pixels = ((images - background).abs() > 0.5 / 255).any(-1).any(0).float()[None]
-        patches = F.max_pool2d(pixels, self.patch_size)
-        near = F.max_pool2d(patches, 2 * margin + 1, stride=1, padding=margin)
-        return near.flatten().bool()[self.orders].nonzero()[:, 0]
+        seen = ((images - background).abs() > 0.5 / 255).any(-1).any(0, keepdim=True)
+        near = near_patches(seen, self.patch_size, margin)
+        return near[0, self.orders].nonzero()[:, 0]

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, BinaryIO, cast
 
-from ..errors import UserError
+from ..errors import UserError, first_line
 from .names import inside, parts_of
 
 MAX_MEMBERS = 50_000
@@ -59,7 +59,7 @@ def _one_line(source: object) -> Iterator[None]:
     except _DAMAGE as error:
         if isinstance(error, OSError) and error.strerror:  # gzip's own error has none
             raise UserError(f"{source}: {error.strerror}") from error
-        reason = (str(error) or type(error).__name__).splitlines()[0]
+        reason = first_line(error)
         raise UserError(f"{source}: cannot be unpacked ({reason})") from error
 
 

@@ -11,6 +11,7 @@ from helpers.micro import cloud, write_object
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
 from gamba_warp.commands.fit import fit_command
+from gamba_warp.conventions import over_background
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views import compare
 from gamba_warp.eval.views.compare import ViewsProtocol, load_truth, render_views
@@ -22,7 +23,7 @@ from gamba_warp.fitting.optimize import activate, fit
 from gamba_warp.fitting.relocate import relocate, shares
 from gamba_warp.fitting.start import random_start, sample_views, visual_hull
 from gamba_warp.image_metrics import psnr
-from gamba_warp.images import load_rgba, over_background, save_image
+from gamba_warp.images import load_rgba, save_image
 from gamba_warp.render import render
 
 SIZE, VIEWS = 32, 12

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from gamba_warp.conventions import over_background
 from gamba_warp.image_metrics import ssim
-from gamba_warp.images import over_background
 from gamba_warp.train.losses import (
     mse,
     random_crops,

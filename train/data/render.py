@@ -194,24 +194,6 @@ def render_meshes(
     return warnings, failures
 
 
-def check_options(settings: Settings, workers: int, limit: int | None) -> None:
-    """Checks the options' ranges.
-
-    Raises:
-        UserError: an option is out of its range.
-    """
-    for name, value, low, high in (
-        ("--views", settings.views, 1, 10_000),
-        ("--size", settings.size, 8, 4096),
-        ("--fov", settings.fov, 5, 120),
-        ("--workers", workers, 0, 1024),
-        ("--seed", settings.seed, 0, 2**63 - 1),
-        ("--limit", 1 if limit is None else limit, 1, 10**9),
-    ):
-        if not low <= value <= high:
-            raise UserError(f"{name} {value}: must be {low} to {high}")
-
-
 def parse_shard(shard: str) -> tuple[int, int]:
     """The numbers i and n of ``i/n``.
 

@@ -7,24 +7,27 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from msgspec import Meta
 
 from gamba_warp.conventions import DEFAULT_FOV
 from gamba_warp.files import output_folder
+from gamba_warp.untrusted.ranges import ranged
 
 
+@ranged
 def data_render_command(
     folder: tyro.conf.Positional[Path],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    views: int = 24,
-    size: int = 128,
-    fov: float = DEFAULT_FOV,
-    seed: int = 0,
+    views: Annotated[int, Meta(ge=1, le=10_000)] = 24,
+    size: Annotated[int, Meta(ge=8, le=4096)] = 128,
+    fov: Annotated[float, Meta(ge=5, le=120)] = DEFAULT_FOV,
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0,
     depth: bool = False,
     format: Literal["webp-lossless", "png"] = "webp-lossless",
     up: Literal["auto", "y", "z"] = "auto",
     shard: str = "0/1",
-    limit: int | None = None,
-    workers: int = 0,
+    limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None,
+    workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
 ) -> int:
     """Render posed RGBA views of every mesh in a folder (.obj .glb .gltf .ply .stl .off).
 
@@ -47,14 +50,12 @@ def data_render_command(
     from .catalogue import find_meshes
     from .render import (
         Settings,
-        check_options,
         parse_shard,
         render_meshes,
         still_missing,
     )
 
     settings = Settings(views, size, fov, seed, depth, format, up)
-    check_options(settings, workers, limit)
     meshes = find_meshes(folder)
     groups = {mesh.uid: mesh.group for mesh in meshes}
     first, count = parse_shard(shard)
