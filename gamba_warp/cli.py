@@ -21,6 +21,7 @@ COMMANDS = {
     "train": "Train a model on posed views.",
     "fit": "Posed views of an object to 3D Gaussians.",
     "data furniture": "Get 820 models.",
+    "data primitives": "Make models of simple solids.",
     "data render": "Meshes to posed views.",
     "eval-views": "PSNR, SSIM, LPIPS of views.",
     "eval-geometry": "Chamfer, IoU, F-score.",
@@ -36,6 +37,7 @@ COMMANDS = {
 MODULES = {
     "train": "gamba_warp.train.command",
     "data furniture": "gamba_warp.train.data.furniture_command",
+    "data primitives": "gamba_warp.train.data.primitives_command",
     "data render": "gamba_warp.train.data.render_command",
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",

@@ -25,6 +25,7 @@ from gamba_warp.model.posing import posed_input, relative_cameras
 
 from .config import DataConfig, TrainConfig
 from .data.augment import Change, draw_change
+from .data.poses import front_views
 
 _TRIES = 100  # objects tried one after the other until one can be read
 # With --overfit all views share the network's one pass, and rendering them is cheap beside it.
@@ -191,8 +192,8 @@ class BatchSource:
         # From a source of its own, so that runs without changes stay what they were.
         chance = np.random.default_rng([self.seed, 3, number])
         reference = self.reference
-        if reference is None and chance.random() < self.views.front_share:
-            reference = 0
+        front = reference is None and chance.random() < self.views.front_share
+        pick = int(chance.integers(2**32))
         change = None
         if self.views.mirror or self.views.recolor:
             change = draw_change(chance, self.views.mirror, self.views.recolor)
@@ -200,6 +201,9 @@ class BatchSource:
             index = self._object(number + attempt)
             try:
                 count = self.dataset.num_views(index)
+                if front:
+                    found = front_views(self.dataset.files(index).camera_to_world)
+                    reference = found[pick % len(found)]
                 views = choose_views(count, novel, reference, rng)
                 return load_sample(
                     self.dataset, index, views, self.size, self.config, background, change
@@ -315,6 +319,8 @@ def open_data(config: TrainConfig) -> TrainingData:
         return _open_one(config, config.views.overfit)
     views, run, notes = config.views, config.run, []
     train = open_dataset(config.data, "train", cache=views.cache)
+    for folder in views.extra:
+        train = train.joined(folder.resolve().name, open_dataset(folder, "train"))
     bad = train.check()
     objects = [i for i, uid in enumerate(train.uids) if uid not in bad]
     notes += [f"{uid} is left out: {reason}" for uid, reason in bad.items()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +14,7 @@ from msgspec import Meta
 from gamba_warp.conventions import DeviceChoice
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig, Preset
-from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options
+from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options, option
 
 _Count = Annotated[int, Meta(ge=1, le=10**12)]
 _Views = Annotated[int, Meta(ge=0, le=1000)]
@@ -32,7 +33,10 @@ class LengthConfig:
     given at all."""
     minutes: Minutes | None = None
     """Training time, resumed parts included. If it is the only limit, the schedules follow the
-    clock, and two runs are not the same to the bit."""
+    clock, and two runs are not the same to the bit. A run may be resumed with another length: the
+    learning rate then goes on from where it was, and the rest of its fall ends with the new
+    length. Where the fall was over, or almost so, it first rises again to what a run of the new
+    length has there, over a tenth of the steps that are left, and the command says so."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +60,14 @@ class DataConfig:
     step. The input picture always lies on the model's own background."""
     reference: Literal["auto", "random", "first"] = "auto"
     """The view that is the input: any, or always the first; "auto" is first with --overfit."""
-    front_share: float = 0.0
-    """Share of the samples whose input is the object's first view, which gamba data render takes
-    from the front; of the others it is any view."""
-    mirror: float = 0.0
+    extra: tuple[Path, ...] = ()
+    """More datasets, whose training objects are added to those of DATA."""
+    front_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    """Share of the samples whose input is a view from the front: the object's first, or another one
+    at -35 to 35 degrees of azimuth and 0 to 20 of elevation; of the others it is any view."""
+    mirror: Annotated[float, Meta(ge=0, le=1)] = 0.0
     """Share of the samples whose object is mirrored, with its cameras."""
-    recolor: float = 0.0
+    recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
     """Share of the samples whose colour channels change places and gamma."""
     overfit: str | None = None
     """Train on this one object (uid or number) and validate on its training views: a smoke test."""
@@ -83,11 +89,14 @@ class LossConfig:
     """Weight of LPIPS."""
     lpips_after: _Every = 0
     """Leave LPIPS out for this many steps; it can hold a young model in a white collapse."""
-    lpips_crop: int = 0
+    lpips_crop: _Every = 0
     """Side of a random square, in pixels, that LPIPS compares in one view of each object; 0
     compares all views whole, which on a CPU would take most of a step."""
-    ssim_weight: float = 0.0
+    ssim_weight: _Weight = 0.0
     """Weight of 1 - SSIM; the paper has no such term."""
+    novel_weight: _Weight = 1.0
+    """Weight of each novel view against the input view, in all terms but LPIPS of crops; the mean
+    over the views stays a mean."""
     radial_mask: bool = True
     """The radial mask constraint on the projected centres (paper Table 2)."""
     rdist_weight: _Weight = 0.1
@@ -103,7 +112,12 @@ class OptimConfig:
     """AdamW, and the running average of the weights."""
 
     lr: Annotated[float, Meta(gt=0, le=10)] = 1e-3
-    """Peak learning rate; warm-up, then cosine to 0."""
+    """Peak learning rate; after a warm-up it falls to 0 as --schedule says."""
+    schedule: Literal["cosine", "trapezoid"] = "cosine"
+    """"cosine" falls from the warm-up on, along half a cosine; "trapezoid" stays at the peak and
+    falls linearly at the end, so that a longer run begins as a shorter one does."""
+    decay_share: Annotated[float, Meta(gt=0, le=1)] = 0.2
+    """Share of the run in which "trapezoid" falls."""
     warmup_steps: _Every = 100
     """Steps of the linear warm-up, a tenth of the run at most."""
     weight_decay: Annotated[float, Meta(ge=0, le=100)] = 0.05
@@ -129,7 +143,9 @@ class RunConfig:
     resume: str = "auto"
     """"auto" goes on where the run folder stands; else "never", or the path of a checkpoint."""
     init: Path | None = None
-    """Start from the weights of this model file (same architecture), with a fresh optimizer."""
+    """Start from the weights of this model file, checkpoint or run folder (same architecture; the
+    averaged weights where there are such), with a fresh optimizer. A run of other losses or data
+    goes on so, in another --out."""
     encoder_weights: str | None = None
     """File of the image encoder's weights, or "random" to train one from scratch."""
     log_every: _Count = 10
@@ -178,6 +194,10 @@ class TrainConfig:
             check_options(group)
         if self.loss.lpips == "on" and self.views.size < 16:
             raise UserError(f"--lpips on: needs --size 16 or more, it is {self.views.size}")
+        if self.loss.lpips_crop and not 16 <= self.loss.lpips_crop <= self.views.size:
+            raise UserError(
+                f"--lpips-crop {self.loss.lpips_crop}: must be 0, or 16 to --size {self.views.size}"
+            )
         self.model_config()
 
     def model_config(self) -> GambaConfig:
@@ -214,18 +234,43 @@ class TrainConfig:
 # goes, and not what a step computes. All others must stay as they were.
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers", "views.cache"}
 _MUST_STAY = {"run.seed"}
+_TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
+_GROUPS = {
+    "length": LengthConfig,
+    "views": DataConfig,
+    "loss": LossConfig,
+    "optim": OptimConfig,
+    "run": RunConfig,
+    "model": GambaConfig,
+}
 
 
-def config_differences(stored: dict, current: dict) -> list[str]:
-    """Fields in which two ``to_dict`` values differ but may not, each with both values."""
-    old, new = _flatten(stored), _flatten(current)
+def config_differences(stored: dict, current: dict, free: bool = False) -> list[str]:
+    """Compares two ``to_dict`` values; an option that one of them lacks has its default there.
+
+    Args:
+        stored: of the run that is gone on with; an older version may have known fewer options.
+        current: of this run.
+        free: whether those that may change when a run goes on are compared, too, apart from where
+            it reads and writes.
+
+    Returns:
+        The fields that differ, each with both values.
+    """
+    defaults = _flatten(_defaults())
+    old, new = ({**defaults, **_flatten(values)} for values in (stored, current))
     differing = []
     for name in sorted(old.keys() | new.keys()):
-        free = name in _MAY_CHANGE or name.split(".")[0] in _MAY_CHANGE
-        if old.get(name) != new.get(name) and (not free or name in _MUST_STAY):
+        may_change = name in _MAY_CHANGE or name.split(".")[0] in _MAY_CHANGE
+        compared = not may_change or name in _MUST_STAY or (free and name in _TELLING)
+        if old.get(name) != new.get(name) and compared:
             there, here = (str(values.get(name))[:80] for values in (old, new))
             differing.append(f"{name} ({there} there, {here} here)")
     return differing
+
+
+def _defaults() -> dict:
+    return json.loads(json.dumps({k: asdict(v()) for k, v in _GROUPS.items()}, default=str))
 
 
 def _flatten(values: dict, prefix: str = "") -> dict:
@@ -234,5 +279,23 @@ def _flatten(values: dict, prefix: str = "") -> dict:
         if isinstance(value, dict):
             flat |= _flatten(value, f"{prefix}{name}.")
         else:
-            flat[prefix + name] = value
+            flat[f"{prefix}{name}"] = value
     return flat
+
+
+def command_line(values: dict) -> str:
+    """The ``gamba train`` command that means a ``to_dict`` value; defaults are left out."""
+    words = ["gamba", "train", str(values.get("data")), "--preset", str(values.get("preset"))]
+    if values.get("set"):
+        words += ["--set", *map(str, values["set"])]
+    for group, default in _defaults().items():
+        if group == "model":  # it follows from the preset and --set
+            continue
+        for name, value in values.get(group, {}).items():
+            if name not in default or value == default[name]:
+                continue
+            if isinstance(value, bool):
+                words.append(option(name if value else f"no_{name}"))
+            else:
+                words += [option(name), *map(str, value if isinstance(value, list) else [value])]
+    return shlex.join(words)

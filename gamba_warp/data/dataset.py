@@ -156,6 +156,7 @@ class ViewDataset:
         self.layout = layout
         self.split_version = split_version
         self._folders = objects
+        self._layouts = dict.fromkeys(objects, layout)
         self._files: dict[str, ObjectFiles] = {}
         # A path and a size give the picture, and the (width, height) of the file.
         self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
@@ -163,6 +164,21 @@ class ViewDataset:
 
     def __len__(self) -> int:
         return len(self.uids)
+
+    def joined(self, name: str, other: ViewDataset) -> ViewDataset:
+        """Returns a set with the objects of both; those of ``other`` come last, as ``name/uid``.
+
+        Raises:
+            UserError: an object has such a name already.
+        """
+        renamed = {uid: f"{name}/{uid}" for uid in other.uids}
+        if twice := sorted(set(renamed.values()) & set(self.uids)):
+            raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
+        folders = {renamed[uid]: folder for uid, folder in other._folders.items()}
+        cache = self._pictures is not None
+        made = ViewDataset(self._folders | folders, self.layout, cache, self.split_version)
+        made._layouts = self._layouts | {renamed[u]: lay for u, lay in other._layouts.items()}
+        return made
 
     def _uid(self, index: int | str) -> str:
         if isinstance(index, str):
@@ -180,7 +196,7 @@ class ViewDataset:
         uid = self._uid(index)
         if uid not in self._files:
             try:
-                self._files[uid] = LAYOUTS[self.layout][1](self._folders[uid])
+                self._files[uid] = LAYOUTS[self._layouts[uid]][1](self._folders[uid])
             except OSError as error:  # of a folder; the readers name the file otherwise
                 place = error.filename or self._folders[uid]
                 raise UserError(f"{place}: {error.strerror or error}") from error

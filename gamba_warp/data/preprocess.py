@@ -144,8 +144,11 @@ def recenter(rgba: np.ndarray, border_ratio: float = BORDER_RATIO) -> np.ndarray
         ValueError: hardly any pixel is opaque.
     """
     present = rgba[..., 3] > _PRESENT
-    if np.count_nonzero(present) < _MIN_OBJECT:
-        raise ValueError(f"no object found, {np.count_nonzero(present)} pixels are not background")
+    count = np.count_nonzero(present)
+    if count < _MIN_OBJECT:
+        raise ValueError(
+            f"no object found; pixels that are not background: {count}, needed: {_MIN_OBJECT}"
+        )
     rows, columns = np.flatnonzero(present.any(1)), np.flatnonzero(present.any(0))
     box = rgba[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     height, width = box.shape[:2]

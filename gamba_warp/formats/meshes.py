@@ -35,6 +35,8 @@ _BAD_OBJ = re.compile(
     rb"(?m)^(?:v[ \t](?!(?:[ \t]*" + _NUMBER + rb"){3,}[ \t\r]*$)"
     rb"|f[ \t](?!(?:[ \t]*" + _CORNER + rb"){3,}[ \t\r]*$)).*"
 )
+# Faces of one or two corners, which many a modeller leaves behind: they have no area.
+_THIN = re.compile(rb"(?m)^[ \t]*f(?:[ \t]+" + _CORNER + rb"){1,2}[ \t\r]*$")
 
 Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
@@ -70,7 +72,8 @@ class TexturedMesh:
 
         Args:
             up: the axis that points up in the file, "y" or "z".
-            rotation: ``[3, 3]``, applied first, for files whose object lies on its side; or None.
+            rotation: ``[3, 3]``, applied first, for files whose object lies on its side, or
+                to stretch it; or None.
 
         Returns:
             The mesh, ``transform [3, 4]`` and ``scale``: x_new = scale · (transform · [x, 1]).
@@ -81,10 +84,11 @@ class TexturedMesh:
         points = self.vertices @ turn.T
         low, high = points.min(0), points.max(0)
         center, scale = (low + high) / 2, 1.0 / (high - low).max()
+        normals = self.normals @ np.linalg.inv(turn).astype(np.float32)
         mesh = replace(
             self,
             vertices=(points - center) * scale,
-            normals=self.normals @ turn.T.astype(np.float32),
+            normals=normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12),
         )
         return mesh, np.hstack([turn, -center[:, None]]), float(scale)
 
@@ -211,6 +215,7 @@ def _checked_obj(path: Path, text: bytes) -> bytes:
         UserError: one is not.
     """
     text = text.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
+    text = _THIN.sub(b"", text)
     bad = _BAD_OBJ.search(text)
     if bad:
         line = " ".join(bad[0][:60].decode("ascii", "replace").split())

@@ -134,14 +134,15 @@ def _split(path: Path, out: Path) -> Any:
 
 
 def _catalogue(path: Path, out: Path) -> Any:
-    from gamba_warp.train.data.catalogue import find_meshes
+    from ..formats.catalogue import find_meshes
 
     return find_meshes(path)
 
 
 def _render(path: Path, out: Path) -> Any:
-    from gamba_warp.train.data.catalogue import find_meshes
     from gamba_warp.train.data.render import Settings, render_object
+
+    from ..formats.catalogue import find_meshes
 
     settings = Settings(1, 8, 49.1, 0, True, "png", "auto")
     return [_each(render_object, mesh, out, settings) for mesh in find_meshes(path)[:2]]

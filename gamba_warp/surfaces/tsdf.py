@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,8 +159,12 @@ def fuse(
     for depth, hit, pose in zip(views.depth, views.hit(), poses, strict=True):
         if hit.any():
             near = _image(torch.where(hit, depth, 0.0))
-            blocks = grid.compute_unique_block_coordinates(near, K, pose, **reach)
-            grid.hashmap().activate(blocks)
+            # It looks at every fourth pixel only, and raises where none of these hits anything.
+            with contextlib.suppress(RuntimeError):
+                blocks = grid.compute_unique_block_coordinates(near, K, pose, **reach)
+                grid.hashmap().activate(blocks)
+    if not grid.hashmap().size():
+        raise UserError("the fused depth has no surface")
     # Every view is fused into every block: views that look through a block clear it.
     blocks = grid.hashmap().key_tensor()
     blocks = blocks[grid.hashmap().active_buf_indices().to(o3d.core.int64)]

@@ -11,8 +11,8 @@ from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
+from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.train.data import furniture
-from gamba_warp.train.data.catalogue import find_meshes
 from gamba_warp.train.data.furniture import read_properties
 from gamba_warp.train.data.furniture_command import data_furniture_command
 from gamba_warp.train.data.render_command import data_render_command

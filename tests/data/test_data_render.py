@@ -17,9 +17,9 @@ from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART
+from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import load_mesh, to_linear
 from gamba_warp.train.data import render
-from gamba_warp.train.data.catalogue import find_meshes
 from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses
 from gamba_warp.train.data.raycast import Lights, RayCaster
 from gamba_warp.train.data.render_command import data_render_command

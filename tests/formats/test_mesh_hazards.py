@@ -233,3 +233,13 @@ def test_embedded_pictures_are_of_few_formats(tmp_path):
     start = content.index(b"\x89PNG")
     path.write_bytes(content[:start] + POSTSCRIPT[:60] + content[start + 60 :])
     assert load_mesh(path).materials[0].texture is None
+
+
+def test_faces_without_area_are_passed_over(tmp_path):
+    """Of one or two corners, as modellers leave them behind."""
+    path = tmp_path / "a.obj"
+    path.write_text(V + "f 1 2\nf 1 2 3\n  f 3/1/1 4/2/2 \r\nf 4\nf -4 -1\n")
+    assert len(load_mesh(path).faces) == 1
+    path.write_text(V + "f 1 2 3\nf 1 x\n")
+    with pytest.raises(UserError, match="line 6, 'f 1 x'"):
+        load_mesh(path)

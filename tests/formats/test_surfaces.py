@@ -287,3 +287,14 @@ def test_depth_quantile_compiles_for_gpus(tmp_path):
     for cubin in cubins:
         (used,) = read_cubin(cubin.read_bytes()).values()
         assert used.registers <= 64 and used.frame == 0
+
+
+@pytest.mark.parametrize("seen", [[(5, 6)], []])
+def test_a_few_pixels_that_the_fusion_passes_over_are_no_surface_in_one_line(seen):
+    """Open3D looks at every fourth pixel, and raises where none of these has a depth."""
+    cameras = sphere_cameras(3, 0.5, 32)
+    depth = torch.full((3, 32, 32), CLEAR)
+    for row, column in seen:
+        depth[:, row, column] = 1.5
+    with pytest.raises(UserError, match="^the fused depth has no surface$"):
+        fuse(Views(cameras, depth, torch.zeros(3, 32, 32, 3)), 64, 5.0, 1.0)

@@ -22,11 +22,11 @@ from tqdm import tqdm
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, output_folder, write_json
+from gamba_warp.formats.catalogue import CATALOGUE, check_rotation
 from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import parts_of, plain_name
 
-from .catalogue import CATALOGUE, check_rotation
 from .groups import Named, split_groups, textures_of
 
 PACKAGE = "sweethome3d-furniture"

@@ -8,7 +8,8 @@ import numpy as np
 
 MARGIN = 0.96  # share of the picture's half size that the object may reach
 NEAREST = 3.0  # least distance, in half sizes of the object along the camera's axes
-SPREAD = 0.2  # largest share by which a distance exceeds the least one
+SPREAD = 0.2  # largest share by which a distance exceeds the least one, unless told
+FRONT = (35.0, 0.0, 20.0)  # degrees: largest azimuth, least and largest elevation of a front view
 
 
 def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndarray:
@@ -49,30 +50,50 @@ def nearest_distance(points: np.ndarray, pose: np.ndarray, fov: float) -> float:
 
 
 def sample_poses(
-    points: np.ndarray, views: int, fov: float, rng: np.random.Generator
+    points: np.ndarray,
+    views: int,
+    fov: float,
+    rng: np.random.Generator,
+    fronts: int = 1,
+    spread: float = SPREAD,
 ) -> np.ndarray:
     """Draws ``[views, 4, 4]`` camera-to-world matrices, OpenGL frame.
 
-    View 0 sees the object roughly from the front: azimuth within 35°, elevation 0 to 20°. The
-    others are spread in azimuth by the golden ratio with a random start; nine in ten have an
-    elevation of -10 to 50°, the rest one of -30 to 75°.
+    The first views see the object roughly from the front, see ``FRONT``. The others are spread in
+    azimuth by the golden ratio with a random start; nine in ten have an elevation of -10 to 50°,
+    the rest one of -30 to 75°.
 
     Args:
         points: ``[P, 3]`` vertices of the object, which is centred at the origin.
         views: number of views.
         fov: degrees, of the picture's side.
         rng: source of chance.
+        fronts: number of views from the front.
+        spread: largest share by which a camera stands further than it must.
     """
     golden = (math.sqrt(5) - 1) / 2
     start = rng.uniform()
     poses = []
     for view in range(views):
-        if view == 0:
-            azimuth, elevation = rng.uniform(-35, 35), rng.uniform(0, 20)
+        if view < fronts:
+            azimuth, elevation = rng.uniform(-FRONT[0], FRONT[0]), rng.uniform(*FRONT[1:])
         else:
             azimuth = 360 * ((start + view * golden) % 1.0)
             elevation = rng.uniform(-30, 75) if rng.uniform() < 0.1 else rng.uniform(-10, 50)
         pose = look_at_origin(azimuth, elevation, 1.0)
-        distance = nearest_distance(points, pose, fov) * rng.uniform(1.0, 1.0 + SPREAD)
+        distance = nearest_distance(points, pose, fov) * rng.uniform(1.0, 1.0 + spread)
         poses.append(look_at_origin(azimuth, elevation, distance))
     return np.stack(poses)
+
+
+def front_views(poses: np.ndarray) -> list[int]:
+    """The views that see their object roughly from the front, see ``FRONT``; the first always.
+
+    Args:
+        poses: ``[V, 4, 4]`` camera to world, OpenGL frame; the object's centre is the origin.
+    """
+    x, y, z = np.moveaxis(poses[:, :3, 3], 1, 0)
+    azimuth = np.degrees(np.arctan2(x, -y))
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    front = (np.abs(azimuth) <= FRONT[0]) & (elevation >= FRONT[1]) & (elevation <= FRONT[2])
+    return sorted({0, *np.flatnonzero(front).tolist()})

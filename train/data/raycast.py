@@ -17,6 +17,10 @@ LAYERS = 8  # number of surfaces that a ray may pass through
 STEP = 1e-4  # object units behind a transparent surface at which its ray goes on
 GLOSS = 0.02  # share that even a black surface reflects, so that its shape shows
 OPAQUE = 0.02  # transmittance below which a ray ends
+# What the lights of an object are drawn from: height of the key light in degrees, its strength,
+# that of the ambient light, and the tint of both lights.
+USUAL = {"height": (25, 70), "key": (0.5, 0.85), "ambient": (0.4, 0.6), "tint": (0.92, 1.0)}
+VARIED = {"height": (0, 90), "key": (0.3, 1.1), "ambient": (0.2, 0.7), "tint": (0.75, 1.0)}
 
 _TO_LINEAR = to_linear(np.arange(256) / 255.0)
 
@@ -38,16 +42,22 @@ class Lights:
     head: float
 
     @classmethod
-    def sample(cls, rng: np.random.Generator) -> Lights:
-        """Draws a key light and a fill light from above, ambient light and a lamp at the camera."""
+    def sample(cls, rng: np.random.Generator, varied: bool = False) -> Lights:
+        """Draws a key light and a fill light from above, ambient light and a lamp at the camera.
+
+        Args:
+            rng: source of chance.
+            varied: whether strength, height and tint of the lights differ more than usual.
+        """
+        ranges = VARIED if varied else USUAL
         azimuth = rng.uniform(0, 2 * math.pi) + np.array([0, rng.uniform(0.5, 1.5) * math.pi])
-        height = np.sin(np.radians([rng.uniform(25, 70), rng.uniform(0, 50)]))
+        height = np.sin(np.radians([rng.uniform(*ranges["height"]), rng.uniform(0, 50)]))
         flat = np.sqrt(1 - height**2)
-        tints = rng.uniform(0.92, 1.0, (2, 3))
+        tints = rng.uniform(*ranges["tint"], size=(2, 3))
         return cls(
-            ambient=np.full(3, rng.uniform(0.4, 0.6)),
+            ambient=np.full(3, rng.uniform(*ranges["ambient"])),
             directions=np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], 1),
-            colors=tints * np.array([[rng.uniform(0.5, 0.85)], [rng.uniform(0.1, 0.3)]]),
+            colors=tints * np.array([[rng.uniform(*ranges["key"])], [rng.uniform(0.1, 0.3)]]),
             head=rng.uniform(0.1, 0.25),
         )
 

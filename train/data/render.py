@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,14 +27,14 @@ from gamba_warp.cameras import intrinsics
 from gamba_warp.data.dataset import write_split
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_folder, write_json
+from gamba_warp.formats.catalogue import Mesh
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import to_uint8
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 
-from .catalogue import Mesh
-from .poses import sample_poses
+from .poses import SPREAD, sample_poses
 from .raycast import Lights, RayCaster
 
 DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
@@ -52,6 +52,13 @@ class Settings:
         depth: whether depth pictures are written, too.
         format: "webp-lossless" or "png".
         up: the axis that points up in the files, "y" or "z", or "auto" by the suffix.
+        fronts: number of views from the front; the first ones.
+        spread: largest share by which a camera stands further than it must.
+        stretch: each object is stretched along each of the world's axes by a factor between
+            1 / stretch and this, drawn by the object; 1: as it is.
+        fov_spread: each object has a field of view of its own between fov / fov_spread and
+            fov · fov_spread; 1: all have ``fov``.
+        light: "usual", or "varied" with larger differences between objects.
     """
 
     views: int
@@ -61,6 +68,17 @@ class Settings:
     depth: bool
     format: str
     up: str
+    fronts: int = 1
+    spread: float = SPREAD
+    stretch: float = 1.0
+    fov_spread: float = 1.0
+    light: str = "usual"
+
+    def drawn(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+        """Draws the stretch along the file's axes ``[3]`` and the field of view of an object."""
+        stretch = np.exp(rng.uniform(-1, 1, 3) * np.log(self.stretch))
+        fov = self.fov * float(np.exp(rng.uniform(-1, 1) * np.log(self.fov_spread)))
+        return stretch, fov
 
 
 def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
@@ -75,16 +93,19 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
         UserError: the mesh cannot be read, or the folder cannot be written.
     """
     up = default_up(mesh.path) if settings.up == "auto" else settings.up
-    model, transform, scale = load_mesh(mesh.path).normalized(up, mesh.rotation)
     digest = hashlib.sha256(f"{settings.seed} {mesh.uid}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-    caster = RayCaster(model, Lights.sample(rng))
+    # From a source of its own, so that views without these changes stay what they were.
+    stretch, fov = settings.drawn(np.random.default_rng(int.from_bytes(digest[8:16], "big")))
+    turn = np.diag(stretch) @ (np.eye(3) if mesh.rotation is None else np.array(mesh.rotation))
+    model, transform, scale = load_mesh(mesh.path).normalized(up, turn)
+    caster = RayCaster(model, Lights.sample(rng, settings.light == "varied"))
     used = model.vertices[np.unique(model.faces)]
-    poses = sample_poses(used, settings.views, settings.fov, rng)
+    poses = sample_poses(used, settings.views, fov, rng, settings.fronts, settings.spread)
     plain_name(mesh.uid, str(mesh.path))
     with atomic_folder(out / mesh.uid) as part:
-        frames = [_write_view(caster, pose, i, part, settings) for i, pose in enumerate(poses)]
-        K = intrinsics(settings.size, settings.size, settings.fov).double()
+        frames = [_write_view(caster, pose, fov, i, part, settings) for i, pose in enumerate(poses)]
+        K = intrinsics(settings.size, settings.size, fov).double()
         values = {
             "uid": mesh.uid,
             "name": mesh.name,
@@ -110,9 +131,9 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
 
 
 def _write_view(
-    caster: RayCaster, pose: np.ndarray, index: int, folder: Path, settings: Settings
+    caster: RayCaster, pose: np.ndarray, fov: float, index: int, folder: Path, settings: Settings
 ) -> dict:
-    picture, depth = caster.render(pose, settings.size, settings.fov)
+    picture, depth = caster.render(pose, settings.size, fov)
     suffix = "png" if settings.format == "png" else "webp"
     options = {} if suffix == "png" else {"lossless": True, "method": 2, "quality": 50}
     name = f"{index:03d}.{suffix}"
@@ -145,11 +166,15 @@ def still_missing(
         except UserError as error:
             damaged[mesh.uid] = f"{error}; remove {path.parent} to render it again"
             continue
-        if stored != vars(settings):
+        if stored is None or _UNNAMED | stored != vars(settings):
             raise UserError(
                 f"{path}: was rendered with other settings ({stored}); choose another --out"
             )
     return missing, damaged
+
+
+# Sets that were made before these settings existed do not name them.
+_UNNAMED = {f.name: f.default for f in fields(Settings) if f.default is not MISSING}
 
 
 class _Stored(msgspec.Struct):

@@ -10,6 +10,7 @@ import tyro
 from msgspec import Meta
 
 from gamba_warp.conventions import DEFAULT_FOV
+from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
 from gamba_warp.untrusted.ranges import ranged
 
@@ -25,6 +26,12 @@ def data_render_command(
     depth: bool = False,
     format: Literal["webp-lossless", "png"] = "webp-lossless",
     up: Literal["auto", "y", "z"] = "auto",
+    fronts: Annotated[int, Meta(ge=0, le=10_000)] = 1,
+    spread: Annotated[float, Meta(ge=0, le=10)] = 0.2,
+    stretch: Annotated[float, Meta(ge=1, le=10)] = 1.0,
+    fov_spread: Annotated[float, Meta(ge=1, le=4)] = 1.0,
+    light: Literal["usual", "varied"] = "usual",
+    split: Literal["all", "train", "val", "test"] = "all",
     shard: str = "0/1",
     limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
@@ -36,18 +43,26 @@ def data_render_command(
     Args:
         folder: meshes, at any depth; a catalogue.json in it may give names and attribution.
         out: the dataset to make or to go on with.
-        views: number of views of an object; view 0 is from the front.
+        views: number of views of an object.
         size: pixels a side.
         fov: vertical field of view, degrees.
         seed: seed of cameras and lights; those of an object also depend on its uid.
         depth: also write 16-bit depth pictures.
         format: format of the pictures; both are lossless.
         up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
+        fronts: number of views from the front, the first ones.
+        spread: largest share by which a camera stands further away than it must.
+        stretch: stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
+        fov_spread: draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
+        light: varied makes the lights of the objects differ more.
+        split: render only the objects that lie in this part of the set.
         shard: i/n renders every n-th object from the i-th, for n machines.
         limit: stop after this many objects.
         workers: number of processes; 0 means one per core.
     """
-    from .catalogue import find_meshes
+    from gamba_warp.data.dataset import split_of
+    from gamba_warp.formats.catalogue import find_meshes
+
     from .render import (
         Settings,
         parse_shard,
@@ -55,9 +70,17 @@ def data_render_command(
         still_missing,
     )
 
-    settings = Settings(views, size, fov, seed, depth, format, up)
+    settings = Settings(
+        *(views, size, fov, seed, depth, format, up, fronts, spread, stretch, fov_spread, light)
+    )
+    if not 5 <= fov / fov_spread or not fov * fov_spread <= 120:
+        raise UserError(
+            f"--fov-spread {fov_spread:g}: makes fields of view outside 5 to 120 degrees"
+        )
     meshes = find_meshes(folder)
     groups = {mesh.uid: mesh.group for mesh in meshes}
+    if split != "all":
+        meshes = [mesh for mesh in meshes if split_of(mesh.group) == split]
     first, count = parse_shard(shard)
     meshes = meshes[first::count][:limit]
     out = output_folder(out)

@@ -19,10 +19,10 @@ from gamba_warp.conventions import DEFAULT_FOV
 from gamba_warp.data.dataset import split_of, write_split
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, output_folder
+from gamba_warp.formats.catalogue import Mesh, find_meshes
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import load_rgba
 
-from .catalogue import Mesh, find_meshes
 from .render import Settings, render_object
 
 SETTINGS = Settings(
@@ -39,7 +39,7 @@ blendswap-cc-by-tulip reallusion-sitmale03 scopia-birthday_cake scopia-bowlwithf
 scopia-citybus scopia-dog scopia-fireplace1 scopia-living_lamp scopia-maceta
 scopia-rattanarmchair scopia-renault-scenic scopia-shopping-basket scopia-small-oven
 scopia-sneakers scopia-table3
-blendswap-cc-0-cuckooclock scopia-bicycle scopia-cat scopia-jacuzzi
+blendswap-cc-0-cuckooclock scopia-cat scopia-futon scopia-jacuzzi
 blendswap-cc-0-horse2 blendswap-cc-0-teddybear scopia-dog-house scopia-toaster
 """.split()
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from gamba_warp.errors import UserError
-from gamba_warp.formats.meshes import SUFFIXES
-from gamba_warp.untrusted.documents import read_document
-from gamba_warp.untrusted.names import MAX_NAME, parts_of, plain_name
+from ..errors import UserError
+from ..untrusted.documents import read_document
+from ..untrusted.names import MAX_NAME, parts_of, plain_name
+from .meshes import SUFFIXES
 
 CATALOGUE = "catalogue.json"  # beside the meshes: names and attribution, see ``find_meshes``
 

@@ -1,0 +1,174 @@
+"""Data that differs more: stretched objects, other fields of view, views from the front, solids."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from gamba_warp.data.dataset import open_dataset, split_of
+from gamba_warp.errors import UserError
+from gamba_warp.formats.catalogue import find_meshes
+from gamba_warp.formats.meshes import load_mesh
+from gamba_warp.train.data import primitives
+from gamba_warp.train.data.poses import FRONT, front_views, look_at_origin, sample_poses
+from gamba_warp.train.data.primitives_command import data_primitives_command
+from gamba_warp.train.data.raycast import Lights
+from gamba_warp.train.data.render_command import data_render_command
+
+QUICK = {"views": 3, "size": 17, "workers": 1}
+
+
+@pytest.fixture
+def boxes(tmp_path):
+    """Two flat boxes; x, y and z of a .ply are the world's."""
+    for name in ("a", "b"):
+        (tmp_path / "meshes").mkdir(exist_ok=True)
+        trimesh.creation.box(extents=(1.0, 0.2, 0.5)).export(tmp_path / "meshes" / f"{name}.ply")
+    return tmp_path / "meshes"
+
+
+def cameras_of(folder, uid):
+    return json.loads((folder / uid / "transforms.json").read_text())
+
+
+def test_stretch_and_field_of_view_are_drawn_for_each_object_and_stated(boxes, tmp_path):
+    out = tmp_path / "data"
+    data_render_command(boxes, out, stretch=1.5, fov_spread=1.3, depth=True, **QUICK)
+    found = [cameras_of(out, uid) for uid in ("a", "b")]
+    half = 17 / 2
+    angles = [2 * np.degrees(np.arctan(half / one["fl_x"])) for one in found]
+    assert all(49.1 / 1.3 <= angle <= 49.1 * 1.3 for angle in angles) and angles[0] != angles[1]
+    for values in found:
+        # A box that is stretched along its own axes has the sides that the transform says.
+        turn = np.array(values["applied_transform"])[:, :3] * values["applied_scale"]
+        sides = np.abs(turn @ np.diag([1.0, 0.2, 0.5])).sum(1)
+        assert sides.max() == pytest.approx(1)
+        factors = np.diag(turn) / values["applied_scale"]
+        assert ((factors >= 1 / 1.5) & (factors <= 1.5)).all() and np.ptp(factors) > 0.01
+    # The depth at the middle of a view ends on the stretched box's surface.
+    views = open_dataset(out).load("a")
+    turn = np.array(found[0]["applied_transform"])[:, :3] * found[0]["applied_scale"]
+    sides = np.abs(turn @ np.diag([1.0, 0.2, 0.5])).sum(1) / 2
+    for depth, viewmat in zip(views.depths.double(), views.cameras.viewmats.double()):
+        point = (torch.tensor([0, 0, depth[8, 8]]).double() - viewmat[:3, 3]) @ viewmat[:3, :3]
+        assert (point.abs().numpy() / sides).max() == pytest.approx(1, abs=2e-3)
+
+
+def test_without_the_new_options_nothing_changes_and_older_sets_go_on(boxes, tmp_path, capsys):
+    out = tmp_path / "data"
+    data_render_command(boxes, out, **QUICK)
+    path = out / "a" / "transforms.json"
+    values = json.loads(path.read_text())
+    for name in ("fronts", "spread", "stretch", "fov_spread", "light"):
+        del values["settings"][name]
+    path.write_text(json.dumps(values))
+    assert data_render_command(boxes, out, **QUICK) == 0
+    assert "2 of 2 objects are already" in capsys.readouterr().out
+    with pytest.raises(UserError, match="rendered with other settings"):
+        data_render_command(boxes, out, stretch=1.2, **QUICK)
+
+
+def test_only_the_objects_of_one_part(tmp_path):
+    names = [f"m{i}" for i in range(12)]
+    (tmp_path / "meshes").mkdir()
+    for name in names:
+        trimesh.creation.box().export(tmp_path / "meshes" / f"{name}.ply")
+    wanted = sorted(name for name in names if split_of(name) == "train")
+    assert 0 < len(wanted) < 12
+    data_render_command(
+        *(tmp_path / "meshes", tmp_path / "data"), views=1, size=8, workers=1, split="train"
+    )
+    assert open_dataset(tmp_path / "data").uids == wanted
+
+
+def test_fields_of_view_that_no_camera_has_are_refused(boxes, tmp_path):
+    for options in ({"fov": 100.0, "fov_spread": 1.3}, {"fov": 6.0, "fov_spread": 1.3}):
+        with pytest.raises(UserError, match="--fov-spread 1.3: makes fields of view outside"):
+            data_render_command(boxes, tmp_path / "data", **options)
+    assert not (tmp_path / "data").exists()
+
+
+def test_views_from_the_front_are_found_by_their_poses():
+    rng = np.random.default_rng(2)
+    poses = sample_poses(np.ones((1, 3)), 9, 40.0, rng, fronts=4)
+    assert front_views(poses)[:4] == [0, 1, 2, 3]
+    low, high = FRONT[1:]
+    for azimuth, elevation, front in (
+        (FRONT[0] - 1, low + 1, True),
+        (-FRONT[0] - 1, low + 1, False),
+        (0, high + 1, False),
+        (0, low - 1, False),
+        (180, 10, False),
+        (359, 10, True),
+    ):
+        pair = np.stack([look_at_origin(90, 80, 2.0), look_at_origin(azimuth, elevation, 2.0)])
+        assert front_views(pair) == ([0, 1] if front else [0])
+
+
+def test_varied_lights_differ_more():
+    def strengths(varied):
+        drawn = [Lights.sample(np.random.default_rng(seed), varied) for seed in range(60)]
+        return np.array([light.ambient[0] for light in drawn])
+
+    assert np.std(strengths(True)) > 2 * np.std(strengths(False))
+
+
+def test_normals_of_a_stretched_mesh_stay_across_its_faces(tmp_path):
+    cone = trimesh.creation.cone(radius=1.0, height=1.0, sections=40)
+    cone.export(tmp_path / "cone.ply")
+    mesh = load_mesh(tmp_path / "cone.ply").normalized("z", np.diag([1.0, 1.0, 3.0]))[0]
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    side = across[:, 2] > 0.01  # not the base
+    assert np.allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-5)
+    # Smooth over the side; 40 faces turn by 9 degrees each.
+    assert ((mesh.normals[side].mean(1) * across[side]).sum(1) > 0.95).all()
+
+
+def test_primitives_are_the_same_again_and_differ_from_one_another(tmp_path, capsys):
+    out = tmp_path / "solids"
+    assert data_primitives_command(out, count=5, seed=3) == 0
+    assert "5 models" in capsys.readouterr().out
+    meshes = find_meshes(out)
+    assert [mesh.uid for mesh in meshes] == [f"primitive-3-0000{i}" for i in range(5)]
+    assert {split_of(mesh.group) for mesh in meshes} == {"train"}
+    assert {mesh.attribution["licence"] for mesh in meshes} == {"CC0 1.0"}
+    before = [mesh.path.read_bytes() for mesh in meshes]
+    meshes[1].path.unlink()
+    meshes[2].path.write_bytes(b"kept as it is")
+    data_primitives_command(out, count=5, seed=3)
+    assert meshes[1].path.read_bytes() == before[1] and len(set(before)) == 5
+    assert meshes[2].path.read_bytes() == b"kept as it is"
+
+
+@pytest.mark.parametrize("plan", [*primitives.PLANS, primitives._composition])
+def test_every_plan_makes_sound_textured_solids(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(primitives, "PLANS", [plan])
+    rng = np.random.default_rng([len(plan.__name__), 1])
+    (tmp_path / "one.glb").write_bytes(primitives.make_object(rng).export(file_type="glb"))
+    mesh = load_mesh(tmp_path / "one.glb")
+    assert not mesh.warnings and len(mesh.faces) >= 12
+    assert all(material.texture is not None for material in mesh.materials)
+    model = mesh.normalized("y")[0]
+    assert np.isfinite(model.vertices).all() and np.isfinite(model.normals).all()
+    assert np.ptp(model.vertices, axis=0).min() > 0.01  # nothing is flat
+
+
+def test_textures_are_colours_and_have_their_patterns():
+    rng = np.random.default_rng(0)
+    for pattern in primitives.PATTERNS:
+        values = pattern(rng)
+        assert values.shape == (primitives.TEXTURE,) * 2
+        assert values.min() >= 0 and values.max() <= 1
+        assert pattern is primitives._flat or np.ptp(values) > 0.3
+
+
+def test_another_catalogue_is_not_overwritten(tmp_path):
+    (tmp_path / "catalogue.json").write_text('{"objects": []}')
+    (tmp_path / "chair.glb").write_bytes(b"")
+    with pytest.raises(UserError, match="there are other objects"):
+        data_primitives_command(tmp_path, count=1)
+    assert (tmp_path / "catalogue.json").read_text() == '{"objects": []}'

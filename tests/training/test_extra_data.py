@@ -1,0 +1,84 @@
+"""Training objects from several datasets, and inputs from the front."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers import micro
+
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.train.batches import BatchSource, open_data
+from gamba_warp.train.data.poses import front_views
+
+
+@pytest.fixture
+def roots(tmp_path):
+    """Two datasets with objects of the same names: 3 to train on, and 2."""
+    for name, objects in (("first", 4), ("second", 3)):
+        micro.write_dataset(tmp_path / name, objects)
+    return tmp_path / "first", tmp_path / "second"
+
+
+def test_the_training_objects_of_all_sets_are_trained_on(roots, tmp_path):
+    first, second = roots
+    data = open_data(micro.options(first, tmp_path, views={"extra": (second,)}))
+    assert data.train.uids == ["clouda", "cloudb", "cloudc", "second/clouda", "second/cloudb"]
+    assert data.objects == [0, 1, 2, 3, 4]
+    assert data.validation.uids == ["cloudd"]  # of the first set alone
+    alone = open_dataset(second).load("cloudb")
+    assert data.train.load(4).images.equal(alone.images)
+    assert data.train.load(4).uid == "second/cloudb"
+    assert data.fingerprint != open_data(micro.options(first, tmp_path)).fingerprint
+
+
+def test_a_set_of_another_layout_is_read_by_its_own_rules(roots, tmp_path):
+    first, _ = roots
+    other = tmp_path / "third" / "some"
+    (other / "rgba").mkdir(parents=True)
+    (other / "pose").mkdir()
+    source = first / "clouda"
+    for number, frame in enumerate(json.loads((source / "transforms.json").read_text())["frames"]):
+        (source / frame["file_path"]).rename(other / "rgba" / f"{number:03d}.png")
+        pose = np.array(frame["transform_matrix"])[:3]
+        np.save(other / "pose" / f"{number:03d}.npy", pose)
+    side = micro.SIZE
+    np.save(other / "intrinsics.npy", np.array([[side, side], [side / 2, side / 2], [side, side]]))
+    joined = open_dataset(roots[1], "train").joined("third", open_dataset(tmp_path / "third"))
+    assert joined.uids[-1] == "third/some" and joined.check() == {}
+    assert joined.load("third/some").images.shape == (micro.VIEWS, side, side, 4)
+
+
+def test_one_set_twice_is_refused(roots, tmp_path):
+    with pytest.raises(UserError, match="two objects are called 'second/clouda'"):
+        open_data(micro.options(roots[0], tmp_path, views={"extra": (roots[1], roots[1])}))
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, share):
+    options = micro.options(roots[0], tmp_path, views={"front_share": share})
+    dataset = open_dataset(roots[0], "train")
+    poses = dataset.files(0).camera_to_world
+    # The clouds' cameras stand 60° apart; the one at the front is not the first.
+    assert front_views(poses) == [0, micro.VIEWS // 2] or len(front_views(poses)) >= 1
+    source = BatchSource(
+        dataset,
+        options.model_config(),
+        objects=[0],
+        batch_size=1,
+        reference=None,
+        views=options.views,
+        seed=0,
+    )
+    views = dataset.load(0)
+    seen = set()
+    for number in range(40):
+        target = source.sample(number, 1).targets[0, 0]
+        seen |= {v for v in range(micro.VIEWS) if views.images[v].equal(target)}
+    assert seen == (set(front_views(poses)) if share else set(range(micro.VIEWS)))
+
+
+@pytest.mark.parametrize("crop", [8, 17])
+def test_crops_that_lpips_cannot_see_or_no_picture_has_are_refused(roots, tmp_path, crop):
+    with pytest.raises(UserError, match=f"--lpips-crop {crop}: must be 0, or 16 to --size 16"):
+        micro.options(roots[0], tmp_path, loss={"lpips_crop": crop})
