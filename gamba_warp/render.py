@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from torch import Tensor
+from torch.profiler import record_function
 
 from .cameras import Cameras
 from .gaussians import Gaussians
@@ -45,18 +46,19 @@ def render(
     """
     if background is not None:
         background = background.expand(*cameras.viewmats.shape[:-2], 3)
-    pictures, alpha, meta = rasterization(
-        means=gaussians.means,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        opacities=gaussians.opacities,
-        colors=gaussians.colors,
-        viewmats=cameras.viewmats,
-        Ks=cameras.Ks,
-        width=cameras.width,
-        height=cameras.height,
-        backgrounds=background,
-        render_mode="RGB+ED" if depth else "RGB",
-        **options,
-    )
+    with record_function("rasterizer"):
+        pictures, alpha, meta = rasterization(
+            means=gaussians.means,
+            quats=gaussians.quats,
+            scales=gaussians.scales,
+            opacities=gaussians.opacities,
+            colors=gaussians.colors,
+            viewmats=cameras.viewmats,
+            Ks=cameras.Ks,
+            width=cameras.width,
+            height=cameras.height,
+            backgrounds=background,
+            render_mode="RGB+ED" if depth else "RGB",
+            **options,
+        )
     return Rendering(pictures[..., :3], alpha, pictures[..., 3:] if depth else None, meta)

@@ -5,11 +5,15 @@ Every term has one value per view, ``[.., V]``; ``total_loss`` weighs and averag
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad
+from torch.profiler import record_function
 
 from gamba_warp.data.vgg_weights import lpips_available
 from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
@@ -18,6 +22,8 @@ from gamba_warp.model.lpips import LPIPS, load_lpips
 from .config import TrainConfig
 
 _C1, _C2 = 0.01**2, 0.03**2  # of SSIM, for pictures in [0, 1]
+_TILE = 32  # columns of a banded product of SSIM
+_CACHED = 1 << 17  # numbers of the pictures that a CPU takes together for SSIM, two of 128²
 
 
 def mse(got: Tensor, want: Tensor) -> Tensor:
@@ -29,7 +35,8 @@ def structure(got: Tensor, want: Tensor) -> Tensor:
     """Computes 1 - SSIM, as ``image_metrics.ssim`` defines it.
 
     With s = got + want and d = got - want, SSIM needs the windowed means of s, d, s² and d² alone:
-    2ab = (s² - d²) / 2 and a² + b² = (s² + d²) / 2, for the means and for the variances alike.
+    2ab = (s² - d²) / 2 and a² + b² = (s² + d²) / 2, for the means and for the variances alike. The
+    gradient reaches ``got`` only, and has no gradient of its own.
 
     Args:
         got: ``[.., H, W, C]``, H and W at least 11.
@@ -38,32 +45,119 @@ def structure(got: Tensor, want: Tensor) -> Tensor:
     Returns:
         ``[..]``, mean over channels and whole windows, in the dtype of the pictures.
     """
-    lead, channels = got.shape[:-3], got.shape[-1]
+    return _Structure.apply(got, want)
+
+
+class _Structure(torch.autograd.Function):
+    """``structure``, whose gradient is computed with its value.
+
+    A picture's value depends on no other picture, so its gradient is a factor times its slope.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, got: Tensor, want: Tensor) -> Tensor:
+        lead, shape = got.shape[:-3], got.shape[-3:]
+        pictures, truths = (
+            x.detach().reshape(-1, *shape).movedim(-1, 1).contiguous() for x in (got, want)
+        )
+        band = _band(pictures)
+        slopes = torch.zeros_like(pictures) if ctx.needs_input_grad[0] else None
+        size = max(1, len(pictures))
+        if pictures.device.type == "cpu":
+            size = max(1, _CACHED // max(1, math.prod(pictures.shape[1:])))
+        values = []
+        for i in range(0, len(pictures), size):
+            part = slice(i, i + size)
+            slope = None if slopes is None else slopes[part]
+            values.append(_unequal(pictures[part], truths[part], band, slope))
+        if slopes is not None:
+            ctx.save_for_backward(slopes.movedim(1, -1).reshape(got.shape))
+        return torch.cat(values).reshape(lead) if values else pictures.new_zeros(lead)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None]:
+        return cotangents[0][..., None, None, None] * ctx.saved_tensors[0], None
+
+
+def _unequal(got: Tensor, want: Tensor, band: Tensor, slope: Tensor | None) -> Tensor:
+    """1 - SSIM of ``[n, C, H, W]``: ``[n]``; its derivative goes into ``slope``, if that is given.
+
+    Windows in which the pictures are equal, as they are on the background, add 0 and have no
+    slope. A CPU leaves out the rows and columns that lie in no other window.
+    """
+    count = got.shape[1] * (got.shape[2] - SSIM_WINDOW + 1) * (got.shape[3] - SSIM_WINDOW + 1)
+    if got.device.type == "cpu":
+        box = _box((got != want).flatten(0, 1).any(0))
+        if box is None:
+            return got.new_zeros(len(got))
+        got, want = got[..., box[0], box[1]], want[..., box[0], box[1]]
+        slope = None if slope is None else slope[..., box[0], box[1]]
     # The variances do not depend on a constant. Without the background, which a corner has as a
     # rule, those of flat regions are no differences of large numbers.
-    corner = want[..., :1, :1, :]
-    sums, differences = got + want - 2 * corner, got - want
-    planes = torch.stack([sums, differences]).movedim(-1, 1).reshape(-1, 1, *got.shape[-3:-1])
-    found = _window_means(torch.cat([planes, planes.square()])).unflatten(0, (2, 2, channels, -1))
-    means, squares = found
-    variances = squares - means.square()
-    shift = 2 * corner.reshape(-1, channels, 1, 1).transpose(0, 1)
-    s, d = (means[0] + shift).square(), means[1].square()
-    light = (s - d + 2 * _C1) / (s + d + 2 * _C1)
-    shape = (variances[0] - variances[1] + 2 * _C2) / (variances[0] + variances[1] + 2 * _C2)
-    return 1 - (light * shape).mean((0, 2, 3)).reshape(lead)
+    shift = 2 * want[..., :1, :1]
+    maps = got.new_empty(4, *got.shape)
+    torch.sub(torch.add(got, want, out=maps[0]), shift, out=maps[0])
+    torch.sub(got, want, out=maps[1])
+    torch.mul(maps[:2], maps[:2], out=maps[2:])
+    means = _window_means(maps, band)
+    s, d = means[0] + shift, means[1]
+    variances = means[2:] - means[:2].square()
+    bright, dark = s.square() + _C1 * 2, d.square()
+    rough, odd = variances[0] + _C2 * 2, variances[1]
+    light, shape = (bright - dark) / (bright + dark), (rough - odd) / (rough + odd)
+    if slope is not None:
+        # of the value by the means of s and d together, of s², and of d²
+        by = torch.empty_like(means[:3])
+        factor = light * (-2 / count) / (rough + odd).square()
+        torch.mul(factor, odd, out=by[1])
+        torch.mul(factor, -rough, out=by[2])
+        factor = shape * (-4 / count) / (bright + dark).square()
+        by[0] = factor * (dark * s - bright * d) - 2 * (by[1] * means[0] + by[2] * d)
+        edge = SSIM_WINDOW - 1  # the window is symmetric, so its transpose is itself, padded
+        back = _window_means(pad(by, (edge,) * 4), band)
+        slope.copy_(back[0] + 2 * (maps[0] * back[1] + maps[1] * back[2]))
+    return (1 - light * shape).sum((1, 2, 3)) / count
 
 
-def _window_means(planes: Tensor) -> Tensor:
-    """Means over SSIM's Gaussian window: ``[M, 1, H, W]`` to ``[M, H - 10, W - 10]``."""
+def _box(unequal: Tensor) -> tuple[slice, slice] | None:
+    """The rows and columns of all windows that hold a True of ``[H, W]``; None if there is none."""
+    sides = []
+    for axis in (1, 0):
+        places = unequal.any(axis).nonzero()[:, 0].tolist()
+        if not places:
+            return None
+        reach = SSIM_WINDOW - 1
+        sides.append(slice(max(0, places[0] - reach), places[-1] + reach + 1))
+    return sides[0], sides[1]
+
+
+def _band(like: Tensor) -> Tensor:
+    """SSIM's Gaussian window as the band of a matrix: ``[_TILE + 10, _TILE]``."""
     places = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     weights = torch.exp(-places.square() / (2 * SSIM_SIGMA**2))
-    weights = (weights / weights.sum()).to(planes)
-    # As channels of one picture the planes take the fast path for depthwise convolutions.
-    planes, count = planes.transpose(0, 1), len(planes)
-    for kernel in (weights[None], weights[:, None]):
-        planes = conv2d(planes, kernel.expand(count, 1, -1, -1), groups=count)
-    return planes[0]
+    band = torch.zeros(_TILE + SSIM_WINDOW - 1, _TILE, dtype=torch.float64)
+    for column in range(_TILE):
+        band[column : column + SSIM_WINDOW, column] = weights / weights.sum()
+    return band.to(like)
+
+
+def _window_means(maps: Tensor, band: Tensor) -> Tensor:
+    """Means over SSIM's window, ``[.., H, W]`` to ``[.., H - 10, W - 10]``, by products.
+
+    A matrix for whole rows would be zeros but for its band, so a product makes ``_TILE`` columns.
+    """
+    edge, lead = SSIM_WINDOW - 1, maps.shape[:-2]
+    planes = maps.reshape(-1, *maps.shape[-2:])
+    for axis in (2, 1):
+        total = planes.shape[axis] - edge
+        parts = []
+        for start in range(0, total, _TILE):
+            size = min(_TILE, total - start)
+            piece, tile = planes.narrow(axis, start, size + edge), band[: size + edge, :size]
+            parts.append(piece @ tile if axis == 2 else tile.mT @ piece)
+        planes = torch.cat(parts, axis)
+    return planes.unflatten(0, lead)
 
 
 def rendered_psnr(got: Tensor, want: Tensor) -> Tensor:
@@ -90,7 +184,7 @@ def view_losses(
 ) -> dict[str, Tensor]:
     """Computes the terms of pictures: ``rgb`` and ``mask`` (MSE), ``lpips``, ``ssim`` (1 - SSIM).
 
-    Each is ``[.., V]``, but ``lpips`` of crops is ``[..]``.
+    Each is ``[.., V]``, but ``lpips`` of crops is ``[..]``. The marks are for a profile.
 
     Args:
         rgb: ``[.., V, H, W, 3]``, on the background of ``target_rgb``.
@@ -102,12 +196,15 @@ def view_losses(
             ``random_crops``.
         ssim: whether that term is computed.
     """
-    terms = {"rgb": mse(rgb, target_rgb), "mask": mse(alpha, target_alpha)}
+    with record_function("MSE and mask"):
+        terms = {"rgb": mse(rgb, target_rgb), "mask": mse(alpha, target_alpha)}
     if lpips is not None:
-        pair = random_crops(rgb, target_rgb, lpips_crop) if lpips_crop else (rgb, target_rgb)
-        terms["lpips"] = lpips(*pair)
+        with record_function("LPIPS"):
+            pair = random_crops(rgb, target_rgb, lpips_crop) if lpips_crop else (rgb, target_rgb)
+            terms["lpips"] = lpips(*pair)
     if ssim:
-        terms["ssim"] = structure(rgb, target_rgb)
+        with record_function("SSIM"):
+            terms["ssim"] = structure(rgb, target_rgb)
     return terms
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -57,13 +58,22 @@ def forward(
         model: ``Gamba`` or a wrapper of it.
         batch: a batch on the model's device.
         weights: weights of the terms ``rgb``, ``mask``, ``lpips``, ``ssim`` and ``rdist``; the last
-            three are not computed at weight 0.
+            three are not computed at weight 0. ``novel``, if it is there, is the weight of each
+            novel view against the input view, in all terms that have one value per view.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
-        precision: dtype of the network's matrix products; rendering and losses are float32.
+        precision: dtype of the products in the network and in LPIPS; all else is float32.
         lpips_crop: as for ``view_losses``.
     """
-    kind = batch.inputs.device.type
-    with torch.autocast(kind, precision, enabled=precision != torch.float32):
+    lower = partial(
+        torch.autocast, batch.inputs.device.type, precision, enabled=precision != torch.float32
+    )
+
+    def distance(got: Tensor, want: Tensor) -> Tensor:
+        assert lpips is not None  # it is called only then
+        with lower():
+            return lpips(got, want)
+
+    with lower():
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
@@ -73,14 +83,32 @@ def forward(
         rendering.alpha,
         target,
         target_alpha,
-        lpips if weights.get("lpips") else None,
+        distance if lpips is not None and weights.get("lpips") else None,
         lpips_crop,
         bool(weights.get("ssim")),
     )
     if weights.get("rdist"):
         contours = contour_distances(target_alpha[..., 0])
         terms["rdist"] = radial_mask_loss(gaussians.means, batch.cameras, contours)
-    return Forward(total_loss(terms, weights), terms, gaussians, rendering, target)
+    weighted = weigh_views(terms, weights.get("novel", 1.0), target.shape[1])
+    return Forward(total_loss(weighted, weights), terms, gaussians, rendering, target)
+
+
+def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str, Tensor]:
+    """Makes the mean of each term over the views a weighted one.
+
+    Args:
+        terms: by name, ``[B, V+1]`` with the input view first; those of other shapes are left.
+        novel: weight of each novel view against the input view, >= 0.
+        views: V+1.
+    """
+    if novel == 1:
+        return terms
+    shares = torch.full((views,), novel)
+    shares[0] = 1.0
+    shares *= views / shares.sum()  # the mean that follows divides by the views
+    whole = {name: term for name, term in terms.items() if term.ndim == 2}  # not LPIPS of crops
+    return terms | {name: term * shares.to(term) for name, term in whole.items()}
 
 
 @dataclass

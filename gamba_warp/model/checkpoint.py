@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
-DEFAULT_CHECKPOINT = CHECKOUT / "starter" / "tiny.safetensors"
+DEFAULT_CHECKPOINT = CHECKOUT / "starter" / "rays.safetensors"
 
 MAX_HEADER = 16 << 20  # bytes; that of a model of 256 blocks takes 1 MB
 _SMALL = 10_000_000  # parameters of a model that is built at once: torch's meta device is slow

@@ -27,7 +27,8 @@ RAY_STEM = 32  # channels after the first convolution of the decoder ``rays``
 # Fields that older files lack: their models are what the defaults say.
 _LATER = {
     "decoder",
-    *(f"ray_{name}" for name in ("cells", "layers", "features", "depth", "offset")),
+    *(f"ray_{name}" for name in ("cells", "coarse", "layers", "features", "hidden")),
+    *(f"ray_{name}" for name in ("depth", "offset")),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -74,8 +75,11 @@ class GambaConfig:
         decoder: "bins" is the paper's, one Gaussian a token; "rays" puts Gaussians on the rays of
             the input's pixels (``model.rays``), and the fields ``ray_*`` are its own.
         ray_cells: cells a side of a patch; it divides ``patch_size``.
+        ray_coarse: cells a side of a patch that the tokens have features for; those of the patch's
+            cells are interpolated between them. It divides ``ray_cells``; 0 means ``ray_cells``.
         ray_layers: Gaussians of a cell: the front one, and those for what is hidden.
         ray_features: channels of a cell's features.
+        ray_hidden: channels of a layer between these and the Gaussians; 0: no such layer.
         ray_depth: how far a Gaussian may lie before or behind the object's centre, object units.
         ray_offset: how far it may lie off its ray, on each axis, object units.
         distance: distance of the reference camera from the object's centre, object units.
@@ -111,8 +115,10 @@ class GambaConfig:
     predict_rotation: bool = False
     decoder: Decoder = "bins"
     ray_cells: Annotated[int, Meta(ge=1, le=256)] = 4
+    ray_coarse: Annotated[int, Meta(ge=0, le=256)] = 0
     ray_layers: Annotated[int, Meta(ge=1, le=16)] = 4
     ray_features: Annotated[int, Meta(ge=1, le=1024)] = 48
+    ray_hidden: Annotated[int, Meta(ge=0, le=1024)] = 0
     ray_depth: Annotated[float, Meta(ge=1e-3, le=100)] = 0.5
     ray_offset: Annotated[float, Meta(ge=1e-6, le=100)] = 0.3
     distance: Annotated[float, Meta(ge=1e-2, le=1000)] = DEFAULT_DISTANCE
@@ -135,6 +141,11 @@ class GambaConfig:
             raise UserError(
                 f"config: patch_size {self.patch_size} is not a multiple of "
                 f"ray_cells {self.ray_cells}"
+            )
+        if self.decoder == "rays" and self.ray_coarse and self.ray_cells % self.ray_coarse:
+            raise UserError(
+                f"config: ray_cells {self.ray_cells} is not a multiple of "
+                f"ray_coarse {self.ray_coarse}"
             )
         if self.prepend and self.encoder == "none" and not self.camera_token:
             raise UserError("config: prepend needs a camera token or an encoder")
@@ -215,11 +226,13 @@ class GambaConfig:
             heads = 3 * self.position_bins + (11 if self.predict_rotation else 7)
             return (self.width + 1) * hidden + (hidden + 1) * (hidden + heads)
         features, side = self.ray_features, self.patch_size // self.ray_cells + 2
-        up = (4 * self.width + 1) * self.ray_cells**2 * features
+        up = (4 * self.width + 1) * (self.ray_coarse or self.ray_cells) ** 2 * features
         stem = (side**2 * self.pixel_channels + 1) * RAY_STEM
         stem += (9 * RAY_STEM + 1 + 9 * features + 1) * features
         each = sum(RAY_CHANNELS) + (4 if self.predict_rotation else 0)
-        return up + stem + ((features + 1) * each + 3) * self.ray_layers
+        mix = (features + 1) * self.ray_hidden
+        last = self.ray_hidden or features
+        return up + stem + mix + ((last + 1) * each + 3) * self.ray_layers
 
     @property
     def background_color(self) -> float:
@@ -285,14 +298,16 @@ PRESETS: dict[Preset, GambaConfig] = {
     # This one trains on two CPU cores, too: three Gaussians on the ray of each pixel of the object.
     "rays": GambaConfig(
         image_size=128,
-        width=128,
-        depth=6,
+        width=192,
+        depth=8,
         encoder="none",
         encoder_size=128,
         decoder="rays",
         ray_cells=8,
+        ray_coarse=4,
         ray_layers=3,
-        ray_features=24,
+        ray_features=48,
+        ray_hidden=64,
     ),
     # This one trains on one small GPU; it has 9,216 Gaussians.
     "small": GambaConfig(

@@ -14,8 +14,8 @@ from .block import GambaBlock, State, make_norm, prefix_states, run_blocks
 from .config import GambaConfig
 from .decoder import GaussianDecoder
 from .encoders import ImageEncoder, build_encoder
-from .patches import foreground_patches
-from .rays import RayDecoder
+from .patches import Patches, foreground_patches
+from .rays import RayDecoder, joined
 from .tokens import CameraToken, SplatTokens
 
 
@@ -126,6 +126,25 @@ class Gamba(nn.Module):
     ) -> Gaussians:
         """What ``forward`` does for the decoder ``rays``."""
         patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
+        groups = patches.groups() if rgba.device.type == "cpu" else []
+        if len(groups) < 2:
+            return self._of_patches(rgba, cameras, condition, patches)
+        parts = [
+            self._of_patches(
+                rgba[group],
+                cameras[group],
+                [state and State(*(value[group] for value in state)) for state in condition],
+                patches.of(group),
+            )
+            for group in groups
+        ]
+        order = [picture for group in groups for picture in group]
+        back = sorted(range(len(order)), key=order.__getitem__)
+        return joined(parts).map(lambda value: value[back])
+
+    def _of_patches(
+        self, rgba: Tensor, cameras: Cameras, condition: list[State | None], patches: Patches
+    ) -> Gaussians:
         pixels = self.tokens.pixels(rgba, cameras)
         tokens, places = self.tokens.of_patches(pixels, patches)
         tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute))

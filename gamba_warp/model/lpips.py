@@ -27,6 +27,8 @@ class LPIPS(nn.Module):
             self.register_buffer(f"lin{k}", torch.empty(width))
         self.register_buffer("shift", torch.tensor(_SHIFT)[:, None, None], persistent=False)
         self.register_buffer("scale", torch.tensor(_SCALE)[:, None, None], persistent=False)
+        # A picture [.., H, W, 3] is channels last already, and the convolutions keep that layout.
+        self.trunk.to(memory_format=torch.channels_last)
         renamed = {n if n.startswith("lin") else f"trunk.{n}": v for n, v in state.items()}
         self.load_state_dict(renamed)
         self.eval()

@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+# What one more pass through the network costs on a CPU, in patches of a batch.
+PASS_COST = 16
+
 
 @dataclass
 class Patches:
@@ -50,6 +53,45 @@ class Patches:
         row, column = self.index // self.grid, self.index % self.grid
         corners = torch.stack([column, row], -1) * self.size
         return corners[:, :, None] + torch.stack([x, y], -1).reshape(1, 1, -1, 2)
+
+    def groups(self) -> list[list[int]]:
+        """Pictures of like sizes, which a CPU computes together with least filling.
+
+        Sorted by their numbers of patches, the pictures are cut where all patches, fillings and
+        ``PASS_COST`` for each group included, are fewest. On CUDA the numbers are read back.
+        """
+        counts = self.valid.sum(1).tolist()
+        order = sorted(range(len(counts)), key=lambda picture: counts[picture])
+        best: list[tuple[int, int]] = [(0, 0)]  # of the first pictures: cost, start of the last cut
+        for end in range(1, len(order) + 1):
+            most = counts[order[end - 1]]
+            costs = [best[i][0] + (end - i) * most + PASS_COST for i in range(end)]
+            start = min(range(end), key=costs.__getitem__)
+            best.append((costs[start], start))
+        found, end = [], len(order)
+        while end:
+            found.append(order[best[end][1] : end])
+            end = best[end][1]
+        return found[::-1]
+
+    def of(self, pictures: list[int]) -> Patches:
+        """The patches of some of the pictures, with no more filling than these need."""
+        valid = self.valid[pictures]
+        most = int(valid.sum(1).max())
+        return Patches(self.index[pictures, :most], valid[:, :most], self.grid, self.size)
+
+    def boxes(self) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+        """The first row of each picture's patches and the row after the last; so for the columns.
+
+        Of a picture without patches it is the box of place 0. On CUDA the numbers are read back.
+        """
+        found = []
+        for index, valid in zip(self.index, self.valid):
+            own = index[valid].tolist() or [0]
+            sides = [place // self.grid for place in own], [place % self.grid for place in own]
+            (top, bottom), (left, right) = ((min(side), max(side) + 1) for side in sides)
+            found.append(((top, bottom), (left, right)))
+        return found
 
     def orders(self, scan: Tensor) -> tuple[Tensor, Tensor]:
         """The tokens of these patches, in the order in which the network reads all tokens.

@@ -26,24 +26,29 @@ from ..gaussians import Gaussians
 from .config import RAY_CHANNELS, RAY_STEM, GambaConfig
 from .patches import Patches
 
-FRONT_OPACITY = 5.0  # logit
+FRONT_OPACITY = 3.0  # logit; neighbours overlap, so together they are opaque
 HIDDEN_OPACITY = -5.4  # logit; just over the 1/255 under which a Gaussian has no gradient
-FRONT_SIZE, HIDDEN_SIZE = 0.4, 0.6  # standard deviations, in sides of a cell
+FRONT_SIZE, HIDDEN_SIZE = 0.25, 0.6  # standard deviations, in sides of a cell
 LAST_DEPTH = 0.7  # where the last hidden layer starts, in ``ray_depth`` behind the middle
 COLOR_MARGIN = 0.01  # keeps the logit of a cell's colour finite
 EMPTY = 10.0  # how much lower the opacity's logit is in an empty cell than in a full one
+STEM_REACH = 3  # how many cells beside a cell the stem sees, one for each of its convolutions
 SIZE_LIMITS = (-4.0, 3.0)  # of the logarithm of a size, in sides of a cell
 
 
 class RayDecoder(nn.Module):
     """From the tokens of the patches and their pixels to the Gaussians of the cells."""
 
+    between: Tensor  # [cells², coarse²]
+
     def __init__(self, config: GambaConfig) -> None:
         super().__init__()
         self.config = config
         cells, layers, features = config.ray_cells, config.ray_layers, config.ray_features
         step = config.patch_size // cells  # pixels a side of a cell
-        self.up = nn.Linear(4 * config.width, cells**2 * features)
+        coarse = config.ray_coarse or cells
+        self.up = nn.Linear(4 * config.width, coarse**2 * features)
+        self.register_buffer("between", _interpolation(coarse, cells), persistent=False)
         self.stem = nn.Sequential(
             nn.Conv2d(config.pixel_channels, RAY_STEM, step + 2, step, padding=1),
             nn.SiLU(),
@@ -52,7 +57,9 @@ class RayDecoder(nn.Module):
             nn.Conv2d(features, features, 3, padding=1),
         )
         self.rotates = config.predict_rotation
-        self.head = nn.Linear(features, layers * sum(self._parts()))
+        last = config.ray_hidden or features
+        self.mix = nn.Linear(features, last) if config.ray_hidden else None
+        self.head = nn.Linear(last, layers * sum(self._parts()))
         # Almost 0, so that the first picture is that of the formulas with 0 for every ·.
         nn.init.normal_(self.head.weight, std=0.002)
         nn.init.zeros_(self.head.bias)
@@ -83,13 +90,35 @@ class RayDecoder(nn.Module):
             ``[B, F · ray_cells² · ray_layers]``, float32, in the world of ``cameras``.
         """
         cells = self.config.ray_cells
-        hidden = self.up(tokens.flatten(2)).unflatten(2, (cells**2, -1))
-        hidden = hidden + patches.cells(self.stem(pixels), cells)
+        hidden = self.up(tokens.flatten(2)).unflatten(2, (self.between.shape[1], -1))
+        if self.config.ray_coarse:
+            hidden = self.between.to(hidden.dtype) @ hidden
+        hidden = hidden + patches.cells(self._stem(pixels, patches), cells)
+        if self.mix is not None:
+            hidden = self.mix(F.silu(hidden))
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
         with torch.autocast(tokens.device.type, enabled=False):
             out = self.head(F.silu(hidden.float())).unflatten(-1, (self.config.ray_layers, -1))
             made = self._activated(out, patches, rgba.float(), cameras)
         return made.map(lambda value: value.flatten(1, 3))
+
+    def _stem(self, pixels: Tensor, patches: Patches) -> Tensor:
+        """What ``stem`` makes of ``pixels``, as far as the patches use it: ``[B, C, n, n]``.
+
+        A CPU computes each picture's own rows and columns; a GPU would wait for their numbers.
+        """
+        if pixels.device.type != "cpu":
+            return self.stem(pixels)
+        cells, maps = self.config.ray_cells, []
+        side, step = patches.grid * cells, self.config.patch_size // cells
+        for picture, box in zip(pixels.split(1), patches.boxes()):
+            (top, bottom), (left, right) = (
+                (max(0, first * cells - STEM_REACH), min(side, last * cells + STEM_REACH))
+                for first, last in box
+            )
+            cut = picture[..., top * step : bottom * step, left * step : right * step]
+            maps.append(F.pad(self.stem(cut), (left, side - right, top, side - bottom)))
+        return torch.cat(maps)
 
     def _activated(
         self, out: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
@@ -133,6 +162,31 @@ class RayDecoder(nn.Module):
         side = self.config.patch_size // self.config.ray_cells
         distance = cameras.viewmats[:, :3, 3].norm(dim=-1)
         return torch.cat([x, y, torch.ones_like(x)], -1), _each(side * distance / K[:, 1, 1])
+
+
+def joined(parts: list[Gaussians]) -> Gaussians:
+    """Batches ``[B_i, N_i]`` as one, filled up with Gaussians of opacity 0 to the largest N."""
+    most = max(part.num for part in parts)
+
+    def filled(values: list[Tensor], filling: float) -> Tensor:
+        sides = ((0, 0) * (v.ndim - 2) + (0, most - v.shape[1]) for v in values)
+        return torch.cat([F.pad(v, side, value=filling) for v, side in zip(values, sides)])
+
+    quats = [part.quats for part in parts if part.quats is not None]
+    return Gaussians(
+        means=filled([part.means for part in parts], 0.0),
+        quats=filled(quats, 1.0) if quats else None,
+        scales=filled([part.scales for part in parts], 1.0),
+        opacities=filled([part.opacities for part in parts], 0.0),
+        colors=filled([part.colors for part in parts], 0.0),
+    )
+
+
+def _interpolation(coarse: int, fine: int) -> Tensor:
+    """Weights ``[fine², coarse²]`` that make a fine grid of a coarse one, bilinearly."""
+    each = torch.eye(coarse**2).view(1, coarse**2, coarse, coarse)
+    finer = F.interpolate(each, (fine, fine), mode="bilinear", align_corners=False)
+    return finer.view(coarse**2, fine**2).T.contiguous()
 
 
 def _each(values: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.eval.views.baselines import billboard
 from gamba_warp.eval.views.compare import Truth
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
+from gamba_warp.model import patches as patch_grid
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.patches import foreground_patches
@@ -78,6 +79,74 @@ def test_what_fills_up_a_batch_gets_and_gives_no_gradient():
     for (name, _), alone, padded in zip(model.named_parameters(), *grads):
         if alone is not None:
             torch.testing.assert_close(padded, alone, rtol=1e-4, atol=1e-5, msg=name)
+
+
+@pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])
+def test_pictures_taken_by_size_are_those_taken_together(monkeypatch, encoder):
+    """Four groups, of which one is an empty picture; the order of the batch stays."""
+    monkeypatch.setattr(patch_grid, "PASS_COST", 0)
+    model, (rgba, cameras) = (
+        trained(rays(encoder=encoder)),
+        cut_outs([*BOXES, (slice(0, 0), slice(0, 0))]),
+    )
+    patches = foreground_patches(rgba[..., 3], 4)
+    weights = {name: p for name, p in model.named_parameters() if p.requires_grad}
+    assert patches.groups() == [[3], [1], [0], [2]]
+    results = []
+    for cost in (0, 100):
+        monkeypatch.setattr(patch_grid, "PASS_COST", cost)
+        made = model(rgba, cameras)
+        seen = (made.opacities > 0)[..., None]
+        others = (made.means, made.scales, made.colors)
+        values = [made.opacities, *(value * seen for value in others)]
+        loss = sum(value.square().sum() for value in values)
+        grads = torch.autograd.grad(loss, list(weights.values()), allow_unused=True)
+        results.append((values, grads))
+    assert patches.groups() == [[3, 1, 0, 2]] and made.opacities[3].eq(0).all()
+    for got, want in zip(results[0][0], results[1][0]):
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
+    for name, got, want in zip(weights, results[0][1], results[1][1]):
+        if want is not None:
+            torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5, msg=name)
+
+
+def test_groups_leave_out_the_most_filling():
+    valid = torch.arange(100) < torch.tensor([90, 20, 100, 22])[:, None]
+    patches = patch_grid.Patches(torch.arange(100).expand(4, -1), valid, 10, 8)
+    assert patches.groups() == [[1, 3], [0, 2]]
+    assert patches.of([1, 3]).index.shape == (2, 22)
+    assert patches.of([1, 3]).valid.sum(1).tolist() == [20, 22]
+
+
+@pytest.mark.parametrize("cells", [1, 2, 4])
+def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
+    """The object's patches, an empty picture, and one that touches three sides."""
+    torch.manual_seed(6)
+    model = Gamba(rays(ray_cells=cells, image_size=40))
+    decoder = model.decoder
+    assert isinstance(decoder, RayDecoder)
+    boxes = [
+        (slice(21, 22), slice(17, 18)),
+        (slice(0, 0), slice(0, 0)),
+        (slice(9, 40), slice(0, 40)),
+    ]
+    rgba = torch.rand(3, 40, 40, 4)
+    for picture, (rows, columns) in zip(rgba, boxes):
+        alpha = torch.zeros(40, 40)
+        alpha[rows, columns] = 1
+        picture[..., 3] = alpha
+    patches = foreground_patches(rgba[..., 3], 4)
+    pixels = torch.rand(3, model.config.pixel_channels, 40, 40)
+    got = patches.cells(decoder._stem(pixels, patches), cells)[patches.valid]
+    want = patches.cells(decoder.stem(pixels), cells)[patches.valid]
+    torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
+    grads = [
+        torch.autograd.grad(made.square().sum(), list(decoder.stem.parameters()))
+        for made in (got, want)
+    ]
+    for ours, theirs in zip(*grads):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+    assert patches.boxes() == [((5, 6), (4, 5)), ((0, 1), (0, 1)), ((2, 10), (0, 10))]
 
 
 @pytest.mark.parametrize("additive", [True, False])
@@ -170,9 +239,9 @@ def test_at_the_start_the_picture_is_the_billboard():
         torch.ones(3),
     )
     rgb = shown.rgb[0].clamp(0, 1)
-    # A Gaussian of half a pixel blurs the rim, which is a tenth of this small disc.
-    assert psnr(rgb, flat).min() > 23 and ssim(rgb, flat).min() > 0.87
-    assert mask_iou(shown.alpha[0, ..., 0] > 0.5, mask).min() > 0.9
+    # The smallest Gaussian blurs the rim, which is a tenth of this small disc.
+    assert psnr(rgb, flat).min() > 27 and ssim(rgb, flat).min() > 0.94
+    assert mask_iou(shown.alpha[0, ..., 0] > 0.5, mask).min() > 0.93
 
 
 def test_every_parameter_learns():
@@ -205,7 +274,7 @@ def test_an_empty_picture_has_no_gaussians_and_may_stand_in_a_batch():
     made = model(
         torch.cat([empty, rgba[:1]]), Cameras(cameras.viewmats[:2], cameras.Ks[:2], 12, 12)
     )
-    assert made.opacities[0].eq(0).all() and made.opacities[1].max() > 0.5
+    assert made.opacities[0].eq(0).all() and made.opacities[1].max() > 0.1
     sum(value.sum() for value in (made.means, made.colors, made.scales)).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
 
@@ -216,6 +285,8 @@ def test_an_empty_picture_has_no_gaussians_and_may_stand_in_a_batch():
         {"patch_size": 6, "ray_cells": 3, "ray_layers": 1},
         {"patch_size": 2, "ray_cells": 1, "ray_layers": 5},
         {"encoder": "gamba_test_vit"},
+        {"ray_cells": 4, "ray_coarse": 2, "ray_hidden": 7},
+        {"ray_cells": 2, "ray_coarse": 1},
         {"prepend": False, "norm": "rms", "discretization": "zoh"},
     ],
 )
@@ -249,6 +320,8 @@ def test_configurations_of_older_files_mean_the_paper():
     assert GambaConfig.from_json("{" + ", ".join(values) + "}").decoder == "bins"
     with pytest.raises(UserError, match="patch_size 4 is not a multiple of ray_cells 3"):
         rays(ray_cells=3)
+    with pytest.raises(UserError, match="ray_cells 4 is not a multiple of ray_coarse 3"):
+        rays(ray_cells=4, ray_coarse=3)
     with pytest.raises(ValueError, match=r"images is \(1, 12, 12, 3\), expected"):
         Gamba(rays())(torch.rand(1, 12, 12, 3), one(cut_outs()[1], 0))
 
@@ -262,3 +335,12 @@ def test_reconstruct_gives_the_alpha_to_the_model():
     small = model_input(grey, rays())[0]
     torch.testing.assert_close(small[small[..., 3] > 0.01][:, :3].mean(0), torch.full((3,), 0.4))
     assert reconstruct(Gamba(rays()).eval(), rgba).num > 12
+
+
+def test_features_between_coarse_cells_are_interpolated():
+    weights = RayDecoder(rays(ray_cells=4, ray_coarse=2)).between
+    assert weights.shape == (16, 4)
+    torch.testing.assert_close(weights.sum(1), torch.ones(16))
+    # The corner of a patch has its own coarse cell alone, the middle a share of all four.
+    torch.testing.assert_close(weights[0], torch.tensor([1.0, 0, 0, 0]))
+    torch.testing.assert_close(weights[5], torch.tensor([9.0, 3, 3, 1]) / 16)
