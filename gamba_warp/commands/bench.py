@@ -42,6 +42,7 @@ def bench_command(
     compare: Path | None = None,
     render: tuple[Path, ...] = (),
     static: bool = False,
+    data: Path | None = None,
 ) -> int:
     """Measures run time against error, with what is installed beside us.
 
@@ -60,6 +61,7 @@ def bench_command(
         render: Measure nothing; make the tables and the page of these JSON files.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
             (registers, stack, shared memory, occupancy) to static.json and static.md.
+        data: Folder of posed views for train-step; made-up views if not given.
     """
     from ..measure import suites
 
@@ -73,7 +75,7 @@ def bench_command(
         print(" and ".join([f"wrote {first}", *(path.name for path in others)]))
         return 0
     chosen = _choose_suites(what)
-    settings = suites.make_settings(pick_device(device), quick, full, peers, threads)
+    settings = suites.make_settings(pick_device(device), quick, full, peers, threads, data)
     old = suites.read_document(compare) if compare is not None else None
     folder = output_folder(out)
     document = suites.run_suites({op: load_suite(op) for op in chosen}, settings)

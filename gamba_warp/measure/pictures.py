@@ -79,7 +79,9 @@ def batches(settings: Settings) -> list[Variant]:
 
 
 class _Pictures:
-    """The starter model on some of its icons; errors are of pictures from three sides."""
+    """The starter set's model of the paper's decoder, on some of its icons; errors are of pictures
+    from three sides. (The decoder rays computes no background at all.)
+    """
 
     def __init__(self, settings: Settings) -> None:
         # These are imported here because they need more packages than torch and warp, which
@@ -91,11 +93,13 @@ class _Pictures:
             from ..model.checkpoint import DEFAULT_CHECKPOINT
         except ModuleNotFoundError as error:
             raise NotInstalled(str(error.name)) from None
-        icons = sorted((DEFAULT_CHECKPOINT.parent / "icons").glob("*.png"))
+        starter = DEFAULT_CHECKPOINT.parent
+        checkpoint = starter / "tiny.safetensors"
+        icons = sorted((starter / "icons").glob("*.png"))
         count = 1 if settings.level == "quick" else 8
-        if not DEFAULT_CHECKPOINT.exists() or not icons:
-            raise NotInstalled("the starter model")
-        self.model = load_model(DEFAULT_CHECKPOINT, settings.device)
+        if not checkpoint.exists() or not icons:
+            raise NotInstalled(f"starter/{checkpoint.name}")
+        self.model = load_model(checkpoint, settings.device)
         config = self.model.config
         size, self.device = config.image_size, settings.device
         chosen = icons[:: max(1, len(icons) // count)][:count]
@@ -134,11 +138,11 @@ class _Pictures:
 
 
 def background_tokens(settings: Settings) -> list[Variant]:
-    """Tokens of plain background dropped (``Gamba.forward``'s ``background_margin``), of the
-    starter model on its icons, one after the other. The error is that of pictures from three sides
-    to those of the full model. The margin counts the patches beside the object that are kept. The
-    model was trained with all tokens, and those of the background draw parts of the object, so none
-    is dropped by default.
+    """Tokens of plain background dropped (``Gamba.forward``'s ``background_margin``), of
+    ``starter/tiny.safetensors`` on the icons, one after the other. The error is that of pictures
+    from three sides to those of the full model. The margin counts the patches beside the object
+    that are kept. The model was trained with all tokens, and those of the background draw parts of
+    the object, so none is dropped by default.
     """
     pictures = _Pictures(settings)
     made = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -42,12 +43,14 @@ class Settings:
         level: key of ``LEVELS``; cases also choose their sizes by it.
         peers: whether other people's packages are measured too, if they are installed.
         threads: number of torch's threads on the CPU; a variant may ask for another number.
+        data: folder of posed views for the cases of training; None: made-up views.
     """
 
     device: torch.device
     level: str = "normal"
     peers: bool = False
     threads: int = 1
+    data: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -148,8 +151,8 @@ class Case:
         name: unique within the op.
         text: one sentence on what is compared.
         build: function that makes the inputs and the variants; they are freed after the case.
-        axis: parameter along which cost is drawn; "error" draws time against error, and None draws
-            no chart.
+        axis: parameter along which cost is drawn; "error" draws time against error, "parts" the
+            parts that a variant's work names, and None draws no chart.
     """
 
     op: str

@@ -7,7 +7,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
+from .bars import bars
 from .charts import Axis, Point, Series, chart, pareto
+from .parts import parts_of, parts_table
 from .report import EXPLANATION, TARGET_HEADER, groups, machine_line, oracles, table, target_rows
 
 _NUMBER = re.compile(r"[0-9.,e-]+( to [0-9.,e-]+)?")
@@ -20,6 +22,7 @@ _AXES = {
     "side": "side of the picture, pixels",
     "views": "views",
     "spacing": "tokens between kept states",
+    "share": "share of the picture that the object covers, %",
 }
 
 
@@ -38,16 +41,50 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
         return [_memory_chart(done)]
     if axis in ("skipped", "switched off"):
         return [_skip_chart(done, axis == "switched off")]
+    if axis == "parts":
+        split = [(r["variant"], {n: sum(t) for n, t in parts_of(r).items()}) for r in done]
+        few = (dict(split[i : i + 3]) for i in range(0, len(split), 3))  # a colour each
+        return [bars(series, "milliseconds of a run") for series in few]
+    if axis == "share":
+        return _share_charts(case, done)
+    return [_line_chart(case, done, axis, "ms_p50", "milliseconds")]
+
+
+def _share_charts(case: str, records: Sequence[dict]) -> list[str]:
+    """Draws time and memory of each direction, and tokens, against the share of the picture."""
+    made = []
+    for direction in dict.fromkeys(r["direction"] for r in records):
+        found = [r for r in records if r["direction"] == direction]
+        for figure, label, scale in (
+            ("ms_p50", "milliseconds", 1.0),
+            ("peak_bytes", "memory, MiB", 2.0**-20),
+        ):
+            name = f"{label}, {direction}"
+            made.append(_line_chart(case, found, "share", figure, name, scale))
+    first = [r for r in records if r["direction"] == records[0]["direction"]]
+    return [*made, _line_chart(case, first, "share", "tokens", "tokens of a batch")]
+
+
+def _line_chart(
+    case: str, records: Sequence[dict], axis: str, figure: str, label: str, scale: float = 1.0
+) -> str:
+    """Draws a figure, of the record or of its work, against a parameter."""
     series = []
+    found = [(r, r.get(figure) or r["work"].get(figure)) for r in records]
+    done = [r | {"figure": scale * value} for r, value in found if value]
     values = [(r, r["parameters"].get(axis)) for r in done]
     done = [r for r, value in values if type(value) in (int, float) and value > 0]
-    for direction in dict.fromkeys(r["direction"] for r in done):
-        found = [r for r in done if r["direction"] == direction]
-        points = [Point(r["parameters"][axis], r["ms_p50"]) for r in found]
-        series.append(Series(direction, sorted(points, key=lambda p: p.x), "straight"))
+    for name in dict.fromkeys(map(_series_of, done)):
+        points = [Point(r["parameters"][axis], r["figure"]) for r in done if _series_of(r) == name]
+        series.append(Series(name, sorted(points, key=lambda p: p.x), "straight"))
     ticks = sorted({r["parameters"][axis] for r in done})
-    label = case if axis == "N" else _AXES.get(axis, axis)
-    return [chart(series, Axis(label, values=ticks), Axis("milliseconds"))]
+    axis_label = case if axis == "N" else _AXES.get(axis, axis)
+    return chart(series, Axis(axis_label, values=ticks), Axis(label))
+
+
+def _series_of(record: dict) -> str:
+    """The name of the line that a record lies on."""
+    return record["parameters"].get("series") or record["direction"]
 
 
 def _error_chart(records: Sequence[dict], direction: str) -> str:
@@ -164,6 +201,8 @@ def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
                 figures = "".join(charts_of(case, records))
                 figures = f'<div class="charts">{figures}</div>' if figures else ""
                 rows = _html_table(*table(records))
+                if split := parts_table(records):
+                    rows += _html_table(*split)
                 name = html.escape(f"{op}: {case}")
                 body.append(f"<section><h2>{name}</h2><p>{text}</p>{figures}{rows}</section>")
     return (

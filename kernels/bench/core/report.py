@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 
 from .case import Key, Target
+from .parts import parts_table
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
 
@@ -20,6 +21,8 @@ _WORK = {
     "peak_bytes": "peak",
     "products": "products",
     "tokens": "tokens",
+    "drawn": "Gaussians an object",
+    "samples": "",
     "psnr_to_full": "PSNR to the full model's",
     "flops": "",
 }
@@ -143,6 +146,8 @@ def _work(r: dict) -> str:
             text = f"{value / 2**20:,.1f} MiB"
         elif name == "flops":
             text = f"{value / 1e9:.3g} GFLOP, {value / r['ms_p50'] / 1e6:.0f} GFLOP/s"
+        elif name == "samples":
+            text = f"{1e3 * value / r['ms_p50']:.3g} samples/s"
         else:
             text = f"{value:,}"
         parts.append(f"{label} {text}".strip())
@@ -207,6 +212,8 @@ def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
             for case, records in cases.items():
                 lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
                 lines += [*_markdown_table(*table(records)), ""]
+                if split := parts_table(records):
+                    lines += [*_markdown_table(*split), ""]
     return "\n".join(lines)
 
 
