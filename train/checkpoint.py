@@ -25,6 +25,10 @@ from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 from gamba_warp.untrusted.torch_files import read_torch
 
+from .config import LengthConfig, TrainConfig, config_differences
+from .optim import NewLength
+
+STATE_VERSION = 1
 CHECKSUMS = "checksums.json"
 _NAME = re.compile(r"step_(\d+)")
 _NEEDED = {"model.safetensors": "", "state.pt": ""}  # whatever the list of checksums says
@@ -47,6 +51,7 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     optimizer: dict[str, Any]
     rng: Any
     rng_cuda: list[Any]
+    new_length: NewLength = NewLength()  # older versions have none
 
 
 def list_checkpoints(run: Path) -> list[Path]:
@@ -203,6 +208,97 @@ def check_state(state: dict[str, Any], source: str) -> None:
         torch.Generator().set_state(fields.rng)  # a state of another kind is refused here
     except (ValueError, TypeError, RuntimeError) as error:  # msgspec's is a ValueError
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
+
+
+def read_run(checkpoint: Path, config: TrainConfig, others: dict[str, Any]) -> dict[str, Any]:
+    """Reads ``state.pt`` of a run that goes on, after it is checked.
+
+    Args:
+        checkpoint: the checkpoint's folder.
+        config: options of the run that goes on.
+        others: further fields of the state that must be as they are here.
+
+    Raises:
+        UserError: the state is damaged, or of a run with other options, data or number of
+            processes; the message names what differs, and how to go on all the same.
+    """
+    state = read_state(checkpoint)
+    version = state.get("version")
+    if type(version) is not int or version != STATE_VERSION:  # a tensor has no plain truth
+        raise UserError(f"{checkpoint}: state of version {str(version)[:40]!r}")
+    check_state(state, str(checkpoint / "state.pt"))
+    differing = config_differences(state["config"], config.to_dict())
+    for name, value in others.items():
+        if state[name] != value:
+            differing.append(f"{name} ({str(state[name])[:80]} there, {value} here)")
+    if differing:
+        raise UserError(
+            f"{checkpoint}: is of another run: {', '.join(differing[:20])}; to go on from its "
+            f"weights alone: --init {checkpoint}, and another --out"
+        )
+    return state
+
+
+def read_length(state: dict[str, Any], source: str) -> tuple[LengthConfig, NewLength]:
+    """Returns how long a checked state's run was to be, and where that last changed.
+
+    Raises:
+        UserError: the configuration in it has no such values.
+    """
+    try:
+        length = msgspec.convert(state["config"].get("length"), LengthConfig)
+        return length, msgspec.convert(state.get("new_length", {}), NewLength)
+    except ValueError as error:
+        raise UserError(f"{source}: damaged, {first_line(error)}") from error
+
+
+def find_initial(path: Path, warn: Callable[[str], None] = warnings.warn) -> Path:
+    """Finds the model file that ``--init`` means.
+
+    Args:
+        path: a model file; or a checkpoint's folder, or a run folder, whose newest whole checkpoint
+            it then is. Of a checkpoint these are the averaged weights, if it has such.
+        warn: is given one line for each damaged checkpoint that is passed over.
+
+    Raises:
+        UserError: there is none, or a checkpoint is damaged.
+    """
+    if not path.is_dir():
+        return path
+    if (path / "state.pt").exists():
+        reason = damage(path)
+        if reason:
+            raise UserError(f"--init {reason}")
+    elif found := list_checkpoints(path):
+        path = _newest_whole(found, warn)
+    names = [name for name in ("ema.safetensors", "model.safetensors") if (path / name).is_file()]
+    if not names:
+        raise UserError(f"--init {path}: holds neither a model nor a checkpoint")
+    return path / names[0]
+
+
+def initial_differences(path: Path, config: TrainConfig, objects: str) -> list[str] | None:
+    """Compares this run with the one that made a model file, if that is known.
+
+    Args:
+        path: the model file; a checkpoint's state or a run's ``config.json`` may lie beside it.
+        config: options of this run.
+        objects: ``TrainingData.fingerprint`` of this run.
+
+    Returns:
+        What differs, each with both values; None where the file's run is not known.
+    """
+    try:
+        if (path.parent / "state.pt").is_file():
+            state = read_state(path.parent)
+            check_state(state, str(path.parent / "state.pt"))
+        else:
+            known = read_document(path.parent / "config.json", dict[str, Any])
+            state = {"config": known, "objects": objects}
+        differing = config_differences(state["config"], config.to_dict(), free=True)
+    except (UserError, AttributeError, TypeError):  # weights alone are what was asked for
+        return None
+    return differing + (["the list of objects"] if state["objects"] != objects else [])
 
 
 def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:

@@ -42,6 +42,7 @@ class RunLog:
             self._cut(_whole_lines(self._file))
         except OSError as error:
             raise UserError(f"cannot write {run / 'log.jsonl'}: {error.strerror}") from error
+        self._run = run
         self._said: set[str] = set()
         self._board = None
         if tensorboard:
@@ -95,6 +96,13 @@ class RunLog:
             save_strip(path, rows)
         except UserError as error:
             self.warn(step, str(error))
+
+    def page(self) -> None:
+        """Writes the run's page, ``RUN/index.html``, from what was logged so far."""
+        with self._guarded("index.html"):
+            from gamba_warp.pages.run import write_run_page
+
+            write_run_page(self._run)
 
     def close(self) -> None:
         """Closes the files."""

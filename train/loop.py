@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -20,14 +21,12 @@ from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
 from .batches import Batch, BatchSource, Prefetcher, TrainingData, fixed_batches
-from .checkpoint import check_state, read_state, read_weights_of, save_checkpoint
-from .config import TrainConfig, config_differences
+from .checkpoint import STATE_VERSION, read_length, read_run, read_weights_of, save_checkpoint
+from .config import LengthConfig, TrainConfig
 from .ddp import World
 from .log import Quiet, RunLog, say
-from .optim import Ema, build_optimizer, checked_moments, learning_rate, novel_views, radial_weight
+from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views, radial_weight
 from .step import collapse_reason, compute_gradients, health, validate
-
-STATE_VERSION = 1
 
 
 @contextlib.contextmanager
@@ -92,11 +91,15 @@ class Trainer:
             views=config.views,
             seed=config.run.seed,
         )
-        length = config.length
         self.steps_per_epoch = len(data.objects) / (self._source.batch_size * self.accumulate)
-        self.total = length.steps
-        if self.total is None and (length.epochs or not length.minutes):
-            self.total = math.ceil((length.epochs or 400) * self.steps_per_epoch)
+        self.schedule = self._schedule(config.length)
+        self.total = self.schedule.total
+
+    def _schedule(self, length: LengthConfig) -> Schedule:
+        total = length.steps
+        if total is None and (length.epochs or not length.minutes):
+            total = math.ceil((length.epochs or 400) * self.steps_per_epoch)
+        return Schedule(self.config.optim, total, length.minutes)
 
     @property
     def failures(self) -> dict[str, str]:
@@ -112,36 +115,20 @@ class Trainer:
                 self._named.add(uid)
                 self.log.warn(self.step, f"{uid} is skipped: {reason}")
 
-    def progress(self, step: int) -> float:
-        """Returns the share of the run that is done at a step, 0 to 1.
-
-        It is a share of the steps, or of the minutes where nothing else is limited.
-        """
-        if self.total is not None:
-            return min(1.0, step / self.total)
-        minutes = self.config.length.minutes
-        assert minutes is not None  # without steps or epochs, ``__init__`` sets a total
-        return min(1.0, self.elapsed / (60 * minutes))
-
     def learning_rate(self) -> float:
         """Returns the learning rate of the next step."""
-        warmup = self.config.optim.warmup_steps
-        if self.total is not None:
-            warmup = min(warmup, 0.1 * self.total)
-            return learning_rate(self.step, self.total, self.config.optim.lr, warmup)
-        # Only minutes are limited, so the total follows from the speed so far.
-        total = self.step / max(self.progress(self.step), 1e-6)
-        return learning_rate(self.step, max(total, warmup + 1), self.config.optim.lr, warmup)
+        return self.config.optim.lr * self.schedule.share(self.step, self.elapsed)
 
     def novel_views(self, step: int) -> int:
         """Returns V, the number of novel views at a step."""
         views = self.config.views
         if self.data.novel is not None:
             return self.data.novel
-        return novel_views(self.progress(step), views.views_first, views.views_last)
+        done = self.schedule.progress(step, self.elapsed)
+        return novel_views(done, views.views_first, views.views_last)
 
     def weights(self) -> dict[str, float]:
-        """Returns the weights of the loss terms at the next step."""
+        """Returns the weights of the loss terms at the next step, and that of the novel views."""
         loss = self.config.loss
         span = loss.rdist_steps
         span = loss.rdist_epochs * self.steps_per_epoch if span is None else span
@@ -151,6 +138,7 @@ class Trainer:
             "mask": loss.mask_weight,
             "lpips": loss.lpips_weight if use_lpips else 0.0,
             "ssim": loss.ssim_weight,
+            "novel": loss.novel_weight,
             "rdist": radial_weight(self.step, loss.rdist_weight, span) if loss.radial_mask else 0.0,
         }
 
@@ -299,7 +287,8 @@ class Trainer:
                 shown["minutes"] = f"{self.elapsed / 60:.1f} of {self.config.length.minutes:g}"
             bar.set_postfix(shown)
             epoch = self.step / self.steps_per_epoch
-            self.log.write("train", self.step, epoch=epoch, skipped=self.skipped, **figures)
+            done = {"minutes": self.elapsed / 60, "epoch": epoch, "skipped": self.skipped}
+            self.log.write("train", self.step, **done, **figures)
             reason = collapse_reason(figures)
             if reason and not self._collapsed:
                 self.log.warn(self.step, f"possible collapse at step {self.step}: {reason}")
@@ -333,6 +322,7 @@ class Trainer:
                 say(f"step {self.step}: validation {text}")
                 name = f"step_{self.step:06d}.png"
                 self.log.sample(self.step, self.config.run.out / "samples" / name, rows)
+                self.log.page()
             else:
                 self.log.warn(self.step, "no validation: none of its objects can be read")
         self.world.barrier()
@@ -358,30 +348,26 @@ class Trainer:
             "elapsed": self.elapsed,
             "world_size": self.world.size,
             "ema_updates": self.ema.updates if self.ema else 0,
+            "new_length": asdict(self.schedule.since),
             "optimizer": self.optimizer.state_dict(),
             "rng": torch.get_rng_state(),
             "rng_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         }
 
-    def restore(self, checkpoint: Path) -> None:
+    def restore(self, checkpoint: Path) -> str | None:
         """Continues from a checkpoint, bit-identically on one device.
+
+        Returns:
+            A line about the learning rate if the run's length is another one now.
 
         Raises:
             UserError: the checkpoint is damaged, or belongs to a run with another configuration,
                 data or number of processes; the message names the differing fields.
         """
-        state = read_state(checkpoint)
-        version = state.get("version")
-        if type(version) is not int or version != STATE_VERSION:  # a tensor has no plain truth
-            raise UserError(f"{checkpoint}: state of version {str(version)[:40]!r}")
-        check_state(state, str(checkpoint / "state.pt"))
-        differing = config_differences(state["config"], self.config.to_dict())
         mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
-        for name, value in mine.items():
-            if state[name] != value:
-                differing.append(f"{name} ({str(state[name])[:80]} there, {value} here)")
-        if differing:
-            raise UserError(f"{checkpoint}: is of another run: {', '.join(differing[:20])}")
+        state = read_run(checkpoint, self.config, mine)
+        length, since = read_length(state, str(checkpoint / "state.pt"))
+        old = replace(self._schedule(length), since=since)
         moments = checked_moments(self.optimizer, state["optimizer"], checkpoint / "state.pt")
         # Everything is read and checked before any of it is loaded.
         weights = read_weights_of(checkpoint / "model.safetensors", self.model)
@@ -393,7 +379,9 @@ class Trainer:
         self.optimizer.load_state_dict(moments)
         self.step, self.skipped = state["step"], state["skipped"]
         self.skipped_in_row, self.elapsed = state["skipped_in_row"], state["elapsed"]
+        self.schedule, note = self.schedule.after(old, self.step, self.elapsed)
         self._saved = self.step if checkpoint.parent.parent == self.config.run.out else -1
         torch.set_rng_state(state["rng"])
         if len(state["rng_cuda"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["rng_cuda"])
+        return note

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
+
+from .config import OptimConfig
+
+# A learning rate under this share of what a run of the new length has at that step is no rate to
+# go on with; it rises over this share of what is left.
+_LOW, _RISE = 0.1, 0.1
 
 
 def build_optimizer(model: Gamba, weight_decay: float, beta2: float) -> torch.optim.AdamW:
@@ -102,21 +110,6 @@ class Ema:
         self.updates += 1
 
 
-def learning_rate(step: float, total: float, base: float, warmup: float) -> float:
-    """Returns the learning rate: a linear warm-up from 0, then a half cosine down to 0.
-
-    Args:
-        step: optimizer steps done, 0 to ``total``.
-        total: steps of the whole run, > 0.
-        base: peak value.
-        warmup: steps of the rise; the first step has a rate above 0.
-    """
-    if step < warmup:
-        return base * (step + 1) / (warmup + 1)
-    progress = min(1.0, (step - warmup) / max(1e-12, total - warmup))
-    return 0.5 * base * (1 + math.cos(math.pi * progress))
-
-
 def novel_views(progress: float, first: int, last: int) -> int:
     """Returns the novel views per object, which grow evenly over the run (paper: 2 to 6).
 
@@ -138,3 +131,123 @@ def radial_weight(step: float, base: float, span: float) -> float:
 def ema_decay(updates: int, decay: float) -> float:
     """Returns the running average's decay after ``updates`` updates; it grows up to ``decay``."""
     return min(decay, (1 + updates) / (10 + updates))
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewLength:
+    """When a run was last resumed with another length, and what its learning rate was then.
+
+    Attributes:
+        step: optimizer steps done; 0 if the length never changed.
+        elapsed: seconds of training done.
+        share: the learning rate, in shares of its peak.
+        rises: whether the rate first goes to that of the new length's own schedule.
+    """
+
+    step: Annotated[int, Meta(ge=0, le=10**12)] = 0
+    elapsed: Annotated[float, Meta(ge=0, le=1e12)] = 0.0
+    share: Annotated[float, Meta(ge=0, le=1)] = 1.0
+    rises: bool = False
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The learning rate over a run, which goes on without a jump where the run's length changes.
+
+    Attributes:
+        optim: the options.
+        total: optimizer steps of the run, or None where only ``minutes`` limit it.
+        minutes: training time of the run, if it is limited.
+        since: where the length last changed.
+    """
+
+    optim: OptimConfig
+    total: int | None
+    minutes: float | None
+    since: NewLength = NewLength()
+
+    def progress(self, step: int, elapsed: float) -> float:
+        """Returns the share of the run that is done, 0 to 1, by steps or else by the clock."""
+        if self.total is not None:
+            return min(1.0, step / self.total)
+        assert self.minutes is not None  # a run without steps and epochs has minutes
+        return min(1.0, elapsed / (60 * self.minutes))
+
+    def share(self, step: int, elapsed: float) -> float:
+        """Returns the learning rate of the next step, in shares of its peak.
+
+        Args:
+            step: optimizer steps done.
+            elapsed: seconds of training done.
+        """
+        total, began = self.total, float(self.since.step)
+        if total is None:  # it follows from the speed so far
+            total = step / max(self.progress(step, elapsed), 1e-6)
+            total = max(total, self.optim.warmup_steps + 1)
+            began = self.since.elapsed * step / max(elapsed, 1e-9)
+        if not self.since.step:
+            return self._planned(step, total)
+        if total <= began:
+            return self.since.share
+        if not self.since.rises:
+            return self._rest(step, total, began)
+        rise = min(1.0, (step - began + 1) / (_RISE * (total - began) + 1))
+        return self.since.share + rise * (self._planned(step, total) - self.since.share)
+
+    def _planned(self, step: float, total: float) -> float:
+        """The rate of a run whose length never changed."""
+        warmup = self.optim.warmup_steps
+        if self.total is not None:
+            warmup = min(warmup, 0.1 * total)
+        if step < warmup:
+            return (step + 1) / (warmup + 1)
+        if self.optim.schedule == "trapezoid":
+            return _clamped((total - step) / (self.optim.decay_share * total))
+        return _half_cosine((step - warmup) / max(1e-12, total - warmup))
+
+    def _rest(self, step: float, total: float, began: float) -> float:
+        """The rest of the fall, from the rate at the change to 0 at the new end."""
+        share, left = self.since.share, (total - step) / (total - began)
+        if self.optim.schedule == "trapezoid":
+            falls = min(self.optim.decay_share * total, total - began)
+            return share * _clamped((total - step) / falls)
+        phase = math.acos(2 * share - 1) / math.pi
+        return _half_cosine(1 - (1 - phase) * left)
+
+    def after(self, old: Schedule, step: int, elapsed: float) -> tuple[Schedule, str | None]:
+        """Goes on where a run of perhaps another length stands.
+
+        Args:
+            old: the schedule so far.
+            step: optimizer steps done.
+            elapsed: seconds of training done.
+
+        Returns:
+            The schedule from here, and a line about it if the length changed.
+        """
+        if (self.total, self.total or self.minutes) == (old.total, old.total or old.minutes):
+            return replace(self, since=old.since), None
+        share, planned = old.share(step, elapsed), replace(self, since=NewLength())
+        wanted = planned.share(step, elapsed)
+        rises = step < self.optim.warmup_steps or share < _LOW * wanted
+        since = NewLength(step=step, elapsed=elapsed, share=share, rises=rises)
+        rates = [f"{self.optim.lr * value:.3g}" for value in (share, wanted)]
+        text = (
+            f"the run's length is now {self}, not {old}: the learning rate goes on from {rates[0]}"
+        )
+        if rises:
+            text += f", goes to {rates[1]}, the new length's own, in a tenth of what is left,"
+        text = f"{text} and falls to 0 at the end"
+        over = self.progress(step, elapsed) >= 1  # then there is nothing to say
+        return replace(self, since=since), None if over else text
+
+    def __str__(self) -> str:
+        return f"{self.total} steps" if self.total is not None else f"{self.minutes:g} minutes"
+
+
+def _half_cosine(phase: float) -> float:
+    return 0.5 * (1 + math.cos(math.pi * _clamped(phase)))
+
+
+def _clamped(value: float) -> float:
+    return min(1.0, max(0.0, value))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -13,8 +14,14 @@ from gamba_warp.files import only_process, output_folder, sweep, write_json
 from gamba_warp.model.gamba import Gamba
 
 from .batches import TrainingData, open_data
-from .checkpoint import find_checkpoint, list_checkpoints, load_weights
-from .config import TrainConfig
+from .checkpoint import (
+    find_checkpoint,
+    find_initial,
+    initial_differences,
+    list_checkpoints,
+    load_weights,
+)
+from .config import TrainConfig, command_line
 from .ddp import World
 from .log import RunLog, say
 from .loop import Trainer
@@ -54,8 +61,9 @@ def _train(
     torch.set_float32_matmul_precision("high")  # TF32 where there is a GPU; no effect on a CPU
     model = Gamba(config.model_config(), run.encoder_weights)
     model.recompute = run.recompute
+    started = ""
     if run.init is not None and checkpoint is None:
-        load_weights(run.init, model)
+        started = _load_initial(config, data, model, damaged.append)
     model.to(world.device)
     if lpips is not None:
         lpips.to(world.device)
@@ -71,10 +79,14 @@ def _train(
         log = RunLog(run.out, run.tensorboard)
     try:
         trainer = Trainer(config, model, data, world, log, lpips)
+        notes = [*damaged, *([warning] if warning else [])]
         if checkpoint is not None:
-            trainer.restore(checkpoint)
+            changed = trainer.restore(checkpoint)
+            notes += [changed] if changed else []
         if log is not None:
-            _announce(trainer, log, checkpoint, [*damaged, *([warning] if warning else [])])
+            _announce(trainer, log, checkpoint, notes)
+            if started:
+                say(started)
         code = trainer.run()
         if log is not None:
             code = _report(trainer, log, code)
@@ -84,16 +96,38 @@ def _train(
             log.close()
 
 
+def _load_initial(
+    config: TrainConfig, data: TrainingData, model: Gamba, warn: Callable[[str], None]
+) -> str:
+    """Loads what ``--init`` means into the model, and returns a line about it."""
+    assert config.run.init is not None
+    path = find_initial(config.run.init, warn)
+    load_weights(path, model)
+    differing = initial_differences(path, config, data.fingerprint)
+    if differing is None:
+        return f"starts from the weights of {path}; of what run they are is not known"
+    others = f"other {', '.join(differing[:20])}" if differing else "the same options"
+    return f"starts from the weights of {path}, of a run with {others}"
+
+
 def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: list[str]) -> None:
     """Says at the beginning what is trained on what, and what is missing."""
     config, data = trainer.config, trainer.data
-    write_json(config.run.out / "config.json", config.to_dict())
-    log.write("start", trainer.step, config=config.to_dict(), resumed_from=str(checkpoint or ""))
-    parameters = sum(p.numel() for p in trainer.parameters)
-    length = f"{trainer.total} steps" if trainer.total else f"{config.length.minutes} minutes"
+    values = config.to_dict()
+    write_json(config.run.out / "config.json", values)
+    facts = {
+        "objects": len(set(data.objects)),
+        "held_out": len(data.held_out),
+        "split_version": data.train.split_version,
+        "parameters": sum(p.numel() for p in trainer.parameters),
+        "steps": trainer.total,
+        "device": str(trainer.world.device),
+        "command": command_line(values),
+    }
+    log.write("start", trainer.step, config=values, resumed_from=str(checkpoint or ""), **facts)
     say(
-        f"{len(set(data.objects))} objects, {parameters / 1e6:.1f} M parameters, {length}, "
-        f"{trainer.world.device} -> {config.run.out}"
+        f"{facts['objects']} objects, {facts['parameters'] / 1e6:.1f} M parameters, "
+        f"{trainer.schedule}, {facts['device']} -> {config.run.out}"
     )
     for note in [*data.notes, *notes]:
         log.warn(trainer.step, note)
@@ -105,6 +139,7 @@ def _report(trainer: Trainer, log: RunLog, code: int) -> int:
     """Says at the end what went wrong on the way; returns the exit code."""
     failures = trainer.failures
     log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures)
+    log.page()
     if trainer.skipped:
         say(f"{trainer.skipped} of {trainer.step} steps were skipped: not finite")
     for uid, reason in failures.items():

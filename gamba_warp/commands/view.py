@@ -1,4 +1,4 @@
-"""``gamba view``: a file of Gaussians in the browser."""
+"""``gamba view``: a file of Gaussians, or a training run, in the browser."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def view_command(
     port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
 ) -> None:
-    """Shows Gaussians (.ply) in a browser, as one HTML page that needs no network.
+    """Shows Gaussians (.ply) or a training run in a browser, as one HTML page without a network.
 
     Args:
-        file: Gaussians in the 3DGS layout.
+        file: Gaussians in the 3DGS layout, or the folder of a training run.
         out: File for the page; a temporary file if not given.
         serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
         port: Port of --serve; 0 picks a free one.
@@ -36,14 +36,18 @@ def view_command(
 
     from ..formats.ply import load_ply
     from ..pages.export import write_page
+    from ..pages.run import write_run_page
     from ..pages.serve import page_server
 
     check_not_read([] if out is None else [out], [file])
-    gaussians = load_ply(file)
+    gaussians = None if file.is_dir() else load_ply(file)
     if out is not None:
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"
-    write_page(page, file.stem, gaussians)
+    if gaussians is None:
+        write_run_page(file, page)
+    else:
+        write_page(page, file.stem, gaussians)
     if not serve:
         print(page)
         if open_browser:

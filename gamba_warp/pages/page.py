@@ -45,6 +45,7 @@ class Section:
         header: names of the table's columns.
         curves: ``(x, y)`` points by label, drawn as one chart.
         curves_label: label of the chart's vertical axis.
+        fragment: HTML that is set as it is, such as that of ``curves.curves``.
         distance: distance of the viewer's camera from the origin, object units.
         fov: vertical field of view of the viewer's camera, degrees.
     """
@@ -59,6 +60,7 @@ class Section:
     header: Sequence[str] = ()
     curves: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict)
     curves_label: str = ""
+    fragment: str = ""
     distance: float = DEFAULT_DISTANCE
     fov: float = DEFAULT_FOV
 
@@ -128,6 +130,7 @@ def _section(section: Section, name: str, auto: bool) -> str:
         _views(section.views) if section.views else "",
         _table(section.header, section.table) if section.table else "",
         svg_chart(section.curves, section.curves_label) if section.curves else "",
+        section.fragment,
     ]
     return "<section>" + "\n".join(filter(None, parts)) + "</section>"
 
@@ -230,11 +233,11 @@ def svg_chart(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = 
         return bottom - (bottom - top) * (value - low) / ((high - low) or 1)
 
     parts = []
-    for value in _ticks(min(ys), max(ys), logarithmic):
+    for value in ticks(min(ys), max(ys), logarithmic):
         y = to_y(bend(value))
         parts.append(f'<line class="grid" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{left - 6}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>')
-    for value in _ticks(min(xs), max(xs), False):
+    for value in ticks(min(xs), max(xs), False):
         at = f'x="{to_x(value):.1f}" y="{bottom + 20}"'
         parts.append(f'<text {at} text-anchor="middle">{value:,.6g}</text>')
     note = f"{label} (logarithmic)" if logarithmic else label
@@ -249,8 +252,14 @@ def svg_chart(curves: Mapping[str, Sequence[tuple[float, float]]], label: str = 
     return f'<svg viewBox="0 0 640 240" role="img">{"".join(parts)}</svg>'
 
 
-def _ticks(low: float, high: float, logarithmic: bool) -> list[float]:
-    """Returns round values within the bounds, multiples of 1, 2 or 5 times a power of ten."""
+def ticks(low: float, high: float, logarithmic: bool) -> list[float]:
+    """Returns round values within the bounds, multiples of 1, 2 or 5 times a power of ten.
+
+    Args:
+        low: lower bound; above 0 if ``logarithmic``.
+        high: upper bound.
+        logarithmic: whether the axis is.
+    """
     if high <= low:
         return [low]
     if logarithmic:
