@@ -9,79 +9,17 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
 
+from .averages import LEVEL, RESAMPLES, intervals_of, mean_of, median_of
+
 OK, FAILED = "ok", "failed"
-LEVEL = 0.95  # share of the resampled means within an interval
-RESAMPLES = 10_000
-
-
-def mean_of(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """Averages the numbers of records with the same keys, nested ones too.
-
-    A number that is None in some records is averaged over the others; the mean is None where no
-    record has the number. Texts, lists and booleans are left out.
-    """
-    return _over_objects(records, lambda values: sum(values) / len(values))
-
-
-def intervals_of(
-    records: list[dict[str, Any]],
-    level: float = LEVEL,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """Computes bootstrap intervals of the means of ``mean_of``: percentiles over resamples.
-
-    Objects are drawn with repetition, as many as there are, and averaged (Efron 1979). The interval
-    tells how far the mean depends on the choice of objects and nothing else; with a handful of
-    objects it is too narrow.
-
-    Args:
-        records: records with the same keys, one for each object.
-        level: share of the resampled means within the interval.
-        resamples: number of draws.
-        seed: of the draws; every number has the same draws.
-
-    Returns:
-        The keys of ``mean_of``, each ``[low, high]``; None with fewer than 2 objects.
-    """
-
-    def interval(values: list[float]) -> list[float] | None:
-        if len(values) < 2:
-            return None
-        random, x = np.random.default_rng(seed), np.asarray(values, np.float64)
-        batch = max(1, 1_000_000 // len(x))  # number of draws at once, which bounds the memory
-        ends = [(1 - level) / 2, (1 + level) / 2]
-        with np.errstate(all="ignore"):  # a sum may be too large for a number
-            means = [
-                x[random.integers(0, len(x), (min(batch, resamples - start), len(x)))].mean(1)
-                for start in range(0, resamples, batch)
-            ]
-            return [float(value) for value in np.quantile(np.concatenate(means), ends)]
-
-    return _over_objects(records, interval)
-
-
-def _over_objects(records: list[dict[str, Any]], summary: Callable) -> dict[str, Any]:
-    """Applies ``summary`` to the values that each number has in the records; None without any."""
-    result: dict[str, Any] = {}
-    for key in dict.fromkeys(key for record in records for key in record):
-        values = [record.get(key) for record in records]
-        some = [v for v in values if v is not None]
-        if some and all(isinstance(v, dict) for v in some):
-            result[key] = _over_objects(some, summary)
-        elif all(isinstance(v, int | float) and not isinstance(v, bool) for v in some):
-            result[key] = summary(some) if some else None
-    return result
 
 
 def flat(record: dict[str, Any], prefix: str = "", lists: bool = False) -> dict[str, Any]:
@@ -155,7 +93,8 @@ def make_report(
 
     Returns:
         ``protocol, versions, objects`` (by name), ``mean, interval`` (of the mean, over objects),
-        ``bootstrap`` (how the intervals are made), ``num_ok, num_failed, failures`` and ``more``.
+        ``median, bootstrap`` (how the intervals are made), ``num_ok, num_failed, failures`` and
+        ``more``.
     """
     objects = sorted(map(_checked, objects), key=lambda record: record["name"])
     done = [record for record in objects if record["status"] == OK]
@@ -171,6 +110,7 @@ def make_report(
         "objects": objects,
         "mean": mean_of(numbers),
         "interval": intervals_of(numbers),
+        "median": median_of(numbers),
         "bootstrap": {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"},
         "num_ok": len(done),
         "num_failed": len(failures),
@@ -223,12 +163,12 @@ def save_report(report: dict[str, Any], folder: Path) -> None:
 
 
 def summary_lines(report: dict[str, Any]) -> list[str]:
-    """One line ``name  mean [low, high]`` for each number, and one for each failure."""
-    lines, intervals = [], flat(report["interval"], lists=True)
+    """One line ``name  mean [low, high]  median`` for each number, and one for each failure."""
+    lines, intervals, medians = [], flat(report["interval"], lists=True), flat(report["median"])
     for name, value in flat(report["mean"]).items():
         shown, ends = "n/a" if value is None else f"{value:.5g}", intervals.get(name)
         if ends is not None:
-            shown += f" [{ends[0]:.5g}, {ends[1]:.5g}]"
+            shown += f" [{ends[0]:.5g}, {ends[1]:.5g}]  median {medians[name]:.5g}"
         lines.append(f"{name:<24} {shown}")
     return lines + [f"failed: {item['name']}: {item['reason']}" for item in report["failures"]]
 

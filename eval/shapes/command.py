@@ -45,12 +45,14 @@ def eval_geometry_command(
     report = evaluate_shapes(options, protocol)
     if json or csv:
         print(json_of(report) if json else csv_of(report), end="")
-        return 1 if report["failures"] else 0
+        parts = [report, *report["baselines"].values()]
+        return 1 if any(part["failures"] for part in parts) else 0
     return _print_summary(report, protocol, options.out)
 
 
 def _print_summary(report: dict[str, Any], protocol: GeometryProtocol, out: Path | None) -> int:
     """Prints the protocol, the flags, the means and the failures; returns the exit code."""
+    from ..paired import page
     from ..report import print_summary
 
     changes = f", changed: {', '.join(protocol.changes())}" if protocol.changes() else ""
@@ -59,4 +61,11 @@ def _print_summary(report: dict[str, Any], protocol: GeometryProtocol, out: Path
         if counts:
             text = ", ".join(f"{count} {flag}" for flag, count in counts.items())
             print(f"{side + ' flags':<24} {text} of {report['num_ok']}")
-    return print_summary(report, out)
+    code = print_summary(report, out)
+    if report["baselines"]:
+        print("\n" + page(report), end="")
+        for name, part in report["baselines"].items():
+            for item in part["failures"]:
+                print(f"failed: {item['name']} ({name}): {item['reason']}")
+                code = 1
+    return code

@@ -29,6 +29,7 @@ from .shape import Mesh, Points, Shape, Similarity
 CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
 SUFFIXES = (*MESH_SUFFIXES, *CLOUD_SUFFIXES)
 HUGE = 1e18  # the squares of larger coordinates overflow float32
+ROUNDED = 1e-3  # how far the rotations of a catalogue, texts of few digits, may be from one
 FAR = 1e6  # units of the truth's longest side; farther out float32 holds nothing of a shape
 KINDS = {Gaussians: "gaussians", Mesh: "mesh", Points: "points"}
 
@@ -54,21 +55,26 @@ class Evaluated:
         return "open" not in self.flags if isinstance(self.shape, Mesh) else None
 
 
-def load_truth(path: Path, protocol: GeometryProtocol) -> Evaluated:
+def load_truth(
+    path: Path, protocol: GeometryProtocol, rotation: list[list[float]] | None = None
+) -> Evaluated:
     """Reads a true mesh or cloud and moves it into its unit frame.
 
     Args:
         path: file.
         protocol: says which axis of the file points up, and which flags are refused.
+        rotation: ``[3, 3]``, applied first, for files whose object lies on its side; or None.
 
     Raises:
-        UserError: it cannot be read, is made of Gaussians, or has no extent.
+        UserError: it cannot be read, is made of Gaussians, or has no extent; or ``rotation``
+            also stretches.
     """
     shape = load_shape(path)
     if isinstance(shape, Gaussians):
         raise UserError(f"{path}: Gaussians, the truth must be a mesh or a point cloud")
     try:
-        motion = unit_motion(shape, default_up(path) if protocol.up == "auto" else protocol.up)
+        up = default_up(path) if protocol.up == "auto" else protocol.up
+        motion = unit_motion(shape, up, rotation)
         return _evaluated(motion.apply(shape), KINDS[type(shape)], motion, protocol)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
@@ -98,17 +104,25 @@ def load_prediction(path: Path, motion: Similarity, protocol: GeometryProtocol) 
         raise UserError(f"{path}: {error}") from error
 
 
-def unit_motion(shape: Mesh | Points, up: str) -> Similarity:
+def unit_motion(
+    shape: Mesh | Points, up: str, rotation: list[list[float]] | None = None
+) -> Similarity:
     """The motion after which a shape is z-up and centred, with a longest side of 1.
 
     Args:
         shape: at least two places.
         up: the axis that points up, "y" or "z".
+        rotation: ``[3, 3]``, applied first; or None.
 
     Raises:
-        UserError: it has no extent, or is so far from the origin that its numbers cannot hold it.
+        UserError: it has no extent, or is so far from the origin that its numbers cannot hold it;
+            or ``rotation`` also stretches or mirrors.
     """
     turn = Y_TO_Z_UP if up == "y" else np.eye(3)
+    if rotation is not None:
+        turn = turn @ np.asarray(rotation, np.float64)
+        if abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
+            raise UserError("the rotation that its catalogue states also stretches or mirrors")
     points = _positions(shape) @ turn.T
     low, high = points.min(0), points.max(0)
     extent = (high - low).max()

@@ -35,7 +35,10 @@ class ShapesOptions:
     gt: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GT")]
     """A mesh or a point cloud; or a folder, paired with PRED by name."""
     out: Path | None = None
-    """Folder for report.json and objects.csv."""
+    """Folder for report.json, objects.csv and, with --baseline, table.md."""
+    baseline: tuple[Path, ...] = ()
+    """Folders of other predictions of the same objects: PRED is compared with each, object by
+    object. A folder's name names its row."""
     protocol: str = "default"
     """default, syncdreamer (points that 16 cameras see, parity on a 64^3 lattice), or a JSON file:
     a protocol, or the report.json of an evaluation to repeat."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,12 +18,14 @@ import numpy as np
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
-from gamba_warp.files import output_folder, sha256, visible
+from gamba_warp.files import output_folder, sha256, visible, write_text
+from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
 from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
 from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.versions import __version__, installed
 
+from ..paired import PREDICTED, differences_of, page
 from ..report import OK, check_finite, failure, make_report, save_report, stdout_to_stderr
 from .options import ShapesOptions
 from .protocol import GeometryProtocol
@@ -47,11 +49,13 @@ class Pair(NamedTuple):
         name: of the object: the path within the folders, without suffix.
         pred: the predicted shape.
         gt: the true shape.
+        rotation: ``[3, 3]`` that turns the true shape upright first, as its catalogue says; None.
     """
 
     name: str
     pred: Path
     gt: Path
+    rotation: list[list[float]] | None = None
 
 
 def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[str, Any]:
@@ -69,7 +73,7 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     """
     if (protocol.frame == "reference") != (options.data is not None):
         raise UserError("--frame reference and --data: give both or neither")
-    pairs, failures = find_pairs(options.pred, options.gt)
+    found = find_all(options.pred, options.baseline, options.gt)
     dataset = None
     if options.data is not None:
         from gamba_warp.data.dataset import open_dataset
@@ -77,17 +81,55 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         dataset = open_dataset(options.data)
     folder = output_folder(options.out) if options.out is not None else None
     with stdout_to_stderr():
-        objects = failures + evaluate_pairs(pairs, protocol, dataset)
+        objects = {
+            name: failures + evaluate_pairs(pairs, protocol, dataset)
+            for name, (pairs, failures) in found.items()
+        }
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
     inputs = {side: path.name if path else None for side, path in named.items()}
-    report = report_of(protocol, objects, inputs)
+    report = report_of(protocol, objects.pop(PREDICTED), inputs, objects)
     if folder is not None:
         save_report(report, folder)
+        if objects:
+            write_text(folder / "table.md", page(report))
     return report
 
 
-def find_pairs(pred: Path, gt: Path) -> tuple[list[Pair], list[dict[str, str]]]:
-    """Pairs two files, or the files of two folders by their paths without suffix.
+Found = tuple[list[Pair], list[dict[str, str]]]  # what find_pairs returns
+
+
+def find_all(pred: Path, baselines: Sequence[Path], gt: Path) -> dict[str, Found]:
+    """Pairs the predictions, and those of each baseline, with the truths.
+
+    Returns:
+        What ``find_pairs`` returns by name: ``PREDICTED``, and the names of the baselines' folders.
+
+    Raises:
+        UserError: as for ``find_pairs``; or a baseline is no folder, or two have one name.
+    """
+    folders = {PREDICTED: pred}
+    for path in baselines:
+        if not path.is_dir() or not pred.is_dir():
+            raise UserError(f"--baseline {path}: it and PRED must be folders")
+        if folders.setdefault(path.resolve().name, path) is not path:
+            raise UserError(f"--baseline {path}: there is another row of this name; rename it")
+    expected = {name for path in folders.values() for name in _shapes_in(path)} if baselines else ()
+    return {name: find_pairs(path, gt, expected) for name, path in folders.items()}
+
+
+def find_pairs(
+    pred: Path, gt: Path, expected: Iterable[str] = ()
+) -> tuple[list[Pair], list[dict[str, str]]]:
+    """Pairs two files, or the files of two folders by their names.
+
+    The name of a file is its path without suffix. Where the folder of truths has a
+    ``catalogue.json``, that gives the names of its files; such a folder is a library, of which only
+    what is predicted or expected is looked for.
+
+    Args:
+        pred: predicted shapes.
+        gt: true shapes.
+        expected: names of which a library must have a prediction, too.
 
     Returns:
         The pairs, sorted by name, and a failure record of each name that has no or several
@@ -103,12 +145,18 @@ def find_pairs(pred: Path, gt: Path) -> tuple[list[Pair], list[dict[str, str]]]:
         return [Pair(pred.stem, pred, gt)], []
     if pred.is_file() or gt.is_file():
         raise UserError(f"{pred} and {gt}: give two files or two folders")
-    predicted, true = _shapes_in(pred), _shapes_in(gt)
+    predicted, rotations = _shapes_in(pred), {}
+    if (gt / CATALOGUE).is_file():
+        meshes = {mesh.uid: mesh for mesh in find_meshes(gt)}
+        true = {name: [meshes[name].path] for name in {*predicted, *expected} & meshes.keys()}
+        rotations = {name: meshes[name].rotation for name in true}
+    else:
+        true = _shapes_in(gt)
     pairs, failures = [], []
-    for name in sorted(predicted.keys() | true.keys()):
+    for name in sorted({*predicted, *true, *expected}):
         sides = {"prediction": predicted.get(name, []), "ground truth": true.get(name, [])}
         if all(len(files) == 1 for files in sides.values()):
-            pairs.append(Pair(name, *(files[0] for files in sides.values())))
+            pairs.append(Pair(name, predicted[name][0], true[name][0], rotations.get(name)))
             continue
         missing = [side for side, files in sides.items() if not files]
         several = [files for files in sides.values() if len(files) > 1]
@@ -173,7 +221,7 @@ def evaluate_pair(
     from .load import load_prediction, load_truth
 
     start = time.perf_counter()
-    truth = load_truth(pair.gt, protocol)
+    truth = load_truth(pair.gt, protocol, pair.rotation)
     predicted = load_prediction(pair.pred, truth.motion if motion is None else motion, protocol)
     loaded = time.perf_counter()
     metrics = check_finite(compare(predicted.shape, truth.shape, protocol))
@@ -263,7 +311,10 @@ def _into_unit_frame(
 
 
 def report_of(
-    protocol: GeometryProtocol, objects: list[dict[str, Any]], inputs: dict[str, str | None]
+    protocol: GeometryProtocol,
+    objects: list[dict[str, Any]],
+    inputs: dict[str, str | None],
+    baselines: dict[str, list[dict[str, Any]]],
 ) -> dict[str, Any]:
     """The report: what ``make_report`` returns, ``inputs`` and ``flags``.
 
@@ -271,15 +322,31 @@ def report_of(
         protocol: what was done.
         objects: the records.
         inputs: names of what was compared.
+        baselines: the records of other predictions, by name.
+
+    Returns:
+        Besides, ``baselines``: for each what the report says of the predictions themselves; and
+        ``differences``: for each the prediction's value minus the baseline's over the ``objects``
+        that both have: ``mean, interval, median, median_interval``.
     """
-    return make_report(
+    used = {"gamba_warp": __version__} | installed(*PACKAGES)
+    report = make_report(
         protocol.to_json(),
         objects,
-        {"gamba_warp": __version__} | installed(*PACKAGES),
+        used,
         left_out=_NO_MEAN,
         inputs=inputs,
         flags=flag_counts(objects),
+        baselines={},
+        differences={},
     )
+    for name, records in baselines.items():
+        other = make_report({}, records, {}, left_out=_NO_MEAN, flags=flag_counts(records))
+        for key in ("protocol", "versions", "bootstrap"):
+            other.pop(key)
+        report["baselines"][name] = other
+        report["differences"][name] = differences_of(report["objects"], other["objects"])
+    return report
 
 
 def flag_counts(objects: list[dict[str, Any]]) -> dict[str, dict[str, int]]:

@@ -7,6 +7,7 @@ sees the input view and the cameras alone; the retrieval sees the training split
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -87,11 +88,26 @@ def billboard(truth: Truth) -> Shown:
     return (rgb + WHITE * (1 - alpha)).to(truth.rgb), alpha[..., 0] > 0.5
 
 
+class Found(NamedTuple):
+    """A training view.
+
+    Attributes:
+        uid: its object.
+        view: its index.
+        distance: from the picture that it was found for, in [0, 2]; see ``MEANING``.
+    """
+
+    uid: str
+    view: int
+    distance: float
+
+
 class Retrieval:
     """The nearest training view, and its object's views from about the same cameras.
 
     Attributes:
         failures: reasons by uid, for training objects that cannot be read.
+        found: by uid, what was found for each object shown.
     """
 
     def __init__(self, training: ViewDataset) -> None:
@@ -102,6 +118,7 @@ class Retrieval:
         """
         self.training = training
         self.failures: dict[str, str] = {}
+        self.found: dict[str, Found] = {}
         self._places: list[tuple[str, int]] = []  # (uid, view) of each thumbnail
         found = []
         for uid in tqdm(training.uids, desc="retrieval index", unit="object", disable=None):
@@ -118,7 +135,7 @@ class Retrieval:
         self._alphas = self._thumbnails[..., 3].float() / 255
         self._areas = self._alphas.sum(1)
 
-    def nearest(self, image: Tensor, uid: str) -> tuple[str, int, float] | None:
+    def nearest(self, image: Tensor, uid: str) -> Found | None:
         """Finds the nearest view of another object than ``uid``.
 
         Args:
@@ -126,7 +143,7 @@ class Retrieval:
             uid: the object shown.
 
         Returns:
-            Its uid, its view, and the distance in [0, 2]; None where there is no other object.
+            The view; None where there is no other object.
         """
         query = thumbnails(image[None])[0]
         both = torch.minimum(self._alphas, query[:, 3]).sum(1)
@@ -145,13 +162,14 @@ class Retrieval:
             value, place = (shape[part] + color).min(0)
             if value < best:
                 best, at = float(value), int(part[place])
-        return None if at < 0 else (*self._places[at], best)
+        return None if at < 0 else Found(*self._places[at], best)
 
     def __call__(self, truth: Truth) -> Shown | None:
         """Returns the pictures; None without another object. Raises UserError for a bad picture."""
         found = self.nearest(truth.images[0].cpu(), truth.uid)
         if found is None:
             return None
+        self.found[truth.uid] = found
         uid, view, _ = found
         poses = torch.from_numpy(self.training.files(uid).camera_to_world)
         viewmats = from_opengl(poses).double()

@@ -19,11 +19,12 @@ from gamba_warp.model.lpips import LPIPS
 from gamba_warp.model.posing import relative_cameras
 from gamba_warp.render import render
 
-from ..report import mean_of
+from ..averages import mean_of
 
 WHITE = 1.0
 BATCH = 4  # views compared at once, which bounds the memory of LPIPS features
 METRICS = ("psnr", "ssim", "lpips", "mask_iou")
+NEARLY_EMPTY = 0.01  # share of the picture; see ViewsProtocol
 
 Shown = tuple[Tensor, Tensor]  # rgb [V, H, W, 3] on white in [0, 1], mask [V, H, W] bool
 Values = dict[str, float | None]  # one view's metrics
@@ -50,6 +51,10 @@ class ViewsProtocol:
         averaging: order of the means.
         poses: frame and distance of the cameras.
         split_version: version of the rule or file that made the split.
+        nearly_empty: a view is nearly empty where the mean of its true alpha over the picture is
+            smaller. Such views count in all means; the report also has the same means without
+            them, because their PSNR is high whatever is predicted.
+        mean_error: how the PSNR of the mean error comes about.
     """
 
     split: str
@@ -68,6 +73,8 @@ class ViewsProtocol:
     averaging: str = "views, then objects; input view apart"
     poses: str = "relative to the input view, its distance normalised"
     split_version: int = SPLIT_VERSION
+    nearly_empty: float = NEARLY_EMPTY
+    mean_error: str = "mean squared error over views, then objects, as PSNR"
 
 
 @dataclass
@@ -81,6 +88,7 @@ class Truth:
         views: their V indices in the dataset.
         rgb: ``[V, H, W, 3]``, the pictures on white.
         mask: ``[V, H, W]`` bool.
+        coverage: V shares of the picture, in [0, 1], that the object covers: means of alpha.
         digest: SHA-256 of the pictures, 16 digits.
     """
 
@@ -91,6 +99,7 @@ class Truth:
 
     def __post_init__(self) -> None:
         self.rgb, self.mask = shown(self.images)
+        self.coverage: list[float] = self.images[..., 3].double().mean((1, 2)).tolist()
         pixels = self.images.cpu().numpy().tobytes()
         self.digest = hashlib.sha256(pixels).hexdigest()[:16]
 
@@ -141,14 +150,19 @@ def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
 
 
 def compare(candidates: dict[str, Shown], truth: Truth) -> dict[str, list[Values]]:
-    """Computes PSNR, SSIM and mask IoU of each view for each candidate; LPIPS is None yet."""
+    """Computes PSNR, SSIM and mask IoU of each view for each candidate; LPIPS is None yet.
+
+    Besides, ``mse``: the mean squared error that the PSNR states.
+    """
     result: dict[str, list[Values]] = {}
     for name, (rgb, mask) in candidates.items():
+        decibels = psnr(rgb, truth.rgb)
         values = {
-            "psnr": psnr(rgb, truth.rgb).tolist(),
+            "psnr": decibels.tolist(),
             "ssim": ssim(rgb, truth.rgb).tolist(),
             "lpips": [None] * len(rgb),
             "mask_iou": mask_iou(mask, truth.mask).tolist(),
+            "mse": (10 ** (-decibels / 10)).tolist(),
         }
         result[name] = [dict(zip(values, row)) for row in zip(*values.values())]
     return result
@@ -175,7 +189,21 @@ def add_lpips(
                 row["lpips"] = value
 
 
-def summary(views: list[Values]) -> dict[str, Any]:
-    """Means over the novel views (None without any), and the input view (the first) apart."""
-    novel: dict[str, Any] = mean_of(views[1:]) if len(views) > 1 else dict.fromkeys(METRICS)
-    return {**novel, "input": views[0]}
+def summary(views: list[Values], coverage: list[float]) -> dict[str, Any]:
+    """Means over the novel views (None without any), and the input view (the first) apart.
+
+    Args:
+        views: metrics of each view.
+        coverage: what the object covers of each, see ``Truth``.
+
+    Returns:
+        The metrics, ``input``, and ``without_nearly_empty``: the same without the views that are
+        nearly empty.
+    """
+    seen = [None if share < NEARLY_EMPTY else view for view, share in zip(views, coverage)]
+    parts = []
+    for chosen in (views, seen):
+        novel = mean_of([view for view in chosen[1:] if view is not None])
+        absent = dict.fromkeys(views[0])
+        parts.append({**absent, **novel, "input": chosen[0] or absent})
+    return {**parts[0], "without_nearly_empty": parts[1]}

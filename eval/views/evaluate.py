@@ -18,13 +18,23 @@ from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 from gamba_warp.versions import __version__, installed
 
-from ..report import OK, check_finite, failure, make_report, mean_of, save_report
+from ..averages import mean_of
+from ..report import OK, check_finite, failure, make_report, save_report
 from .baselines import MEANING
-from .compare import Truth, add_lpips, choose_views, compare, load_truth, render_views, summary
+from .compare import (
+    NEARLY_EMPTY,
+    Truth,
+    add_lpips,
+    choose_views,
+    compare,
+    load_truth,
+    render_views,
+    summary,
+)
 from .contact_sheet import RULE, Row, choose_ranks, contact_sheet
 from .job import ERRORS, Job, open_job
 from .options import ViewsOptions
-from .table import differences_of, page, table_of
+from .table import differences_of, page, table_of, without_nearly_empty
 
 SHEET_VIEWS = 4  # novel views of an object in the contact sheet
 
@@ -61,7 +71,11 @@ def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
 
 
 def evaluate_object(
-    job: Job, uid: str, strips: Path | None = None, save: Path | None = None
+    job: Job,
+    uid: str,
+    strips: Path | None = None,
+    save: Path | None = None,
+    retrieved: Path | None = None,
 ) -> dict[str, Any]:
     """Evaluates one object and its baselines.
 
@@ -70,6 +84,7 @@ def evaluate_object(
         uid: the object.
         strips: folder for its comparison picture, or None.
         save: folder for its Gaussians, or None.
+        retrieved: folder for the retrieval's mesh, or None.
 
     Returns:
         The object's record, with those of its baselines in it.
@@ -98,13 +113,24 @@ def evaluate_object(
         path = save / f"{uid}.ply"
         path.parent.mkdir(parents=True, exist_ok=True)
         save_ply(path, gaussians)
+    found = job.retrieval.found.get(uid) if job.retrieval else None
+    if retrieved is not None and found and job.meshes:
+        try:
+            job.meshes.save(retrieved / f"{uid}.ply", found, job.protocol.distance)
+        except ERRORS as error:
+            job.fail(f"{uid} (retrieval's mesh)", error)
     stages = ("load", "predict", "render", "baselines", "compare", "lpips")
     return {
         "name": uid,
         "status": OK,
-        **check_finite(summary(by_view.pop(""))),
-        "baselines": {name: check_finite(summary(views)) for name, views in by_view.items()},
+        **check_finite(summary(by_view.pop(""), truth.coverage)),
+        "baselines": {
+            name: check_finite(summary(views, truth.coverage)) for name, views in by_view.items()
+        },
+        **({"retrieval": found._asdict()} if found else {}),
         "views": truth.views,
+        "coverage": truth.coverage,
+        "num_nearly_empty": sum(share < NEARLY_EMPTY for share in truth.coverage),
         "gaussians": gaussians.num,
         "truth_sha256": truth.digest,
         "seconds": {s: round(b - a, 4) for s, a, b in zip(stages, marks, marks[1:])},
@@ -127,11 +153,12 @@ def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], boo
     objects: list[dict[str, Any]] = []
     folder = options.out
     saved = output_folder(folder / "gaussians") if folder and options.save_gaussians else None
+    placed = output_folder(folder / "retrieval") if folder and options.save_retrieval else None
     try:
         for number, uid in enumerate(tqdm(job.uids, unit="object", disable=None)):
             strips = folder / "strips" if folder and number < options.strips else None
             try:
-                objects.append(evaluate_object(job, uid, strips, saved))
+                objects.append(evaluate_object(job, uid, strips, saved, placed))
             except ERRORS as error:
                 objects.append(failure(uid, error))
     except KeyboardInterrupt:
@@ -184,8 +211,9 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         objects: the records.
 
     Returns:
-        Besides, ``baselines`` (their means), ``left_out_baselines`` (reasons by name), and the
-        rows ``table`` and ``differences`` of ``table.md``.
+        Besides, ``baselines`` (their means), ``left_out_baselines`` (reasons by name), the rows
+        ``table`` and ``differences`` of ``table.md``, ``nearly_empty`` (how many views and objects
+        are, of how many), and ``without_nearly_empty``: both sets of rows without these views.
     """
     done = [record for record in objects if record["status"] == OK]
     model = {record["name"]: record for record in done}
@@ -193,6 +221,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         name: {r["name"]: r["baselines"][name] for r in done if name in r["baselines"]}
         for name in job.baselines
     }
+    rest = without_nearly_empty({"model": model} | others)
     empty = [name for name, records in others.items() if not records]
     left_out = job.left_out | dict.fromkeys(empty, "none of the objects has it")
     protocol = asdict(job.protocol) | {
@@ -207,11 +236,26 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         protocol,
         objects,
         {"gamba_warp": __version__} | installed("torch", "kornia"),
-        left_out=("baselines",),
+        left_out=("baselines", "num_nearly_empty", "retrieval"),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},
         left_out_baselines=left_out,
         table=table_of({"model": model} | others),
         differences=differences_of(model, others),
+        nearly_empty=count_nearly_empty(done),
+        without_nearly_empty={
+            "table": table_of(rest),
+            "differences": differences_of(rest["model"], {name: rest[name] for name in others}),
+        },
     )
     report["failures"] += job.failures
     return report
+
+
+def count_nearly_empty(done: list[dict[str, Any]]) -> dict[str, int]:
+    """How many views are nearly empty, and of how many objects; of the records evaluated."""
+    return {
+        "views": sum(record["num_nearly_empty"] for record in done),
+        "of_views": sum(len(record["views"]) for record in done),
+        "objects": sum(record["num_nearly_empty"] > 0 for record in done),
+        "of_objects": len(done),
+    }

@@ -12,6 +12,7 @@ from gamba_warp.devices import pick_device
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
 from gamba_warp.fitting.objects import choose_objects
+from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.lpips import LPIPS, load_lpips
 
@@ -20,6 +21,7 @@ from .baselines import Baseline, Retrieval, background, billboard, input_copy
 from .ceiling import open_ceiling
 from .compare import Shown, Truth, ViewsProtocol
 from .options import ViewsOptions
+from .placing import TrainingMeshes
 from .predictions import Predictions, open_predictions
 
 # errors that are the failure of one object and stop no other
@@ -40,6 +42,8 @@ class Job:
         baselines: by name.
         left_out: reasons by name, of baselines that cannot be had.
         failures: ``{name, reason}`` of what failed beside objects.
+        retrieval: the baseline of this name, if it is one of them.
+        meshes: of the training objects, to be placed as the retrieval's shapes; or None.
     """
 
     predictions: Predictions
@@ -51,6 +55,8 @@ class Job:
     baselines: dict[str, Baseline] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     failures: list[dict[str, str]] = field(default_factory=list)
+    retrieval: Retrieval | None = None
+    meshes: TrainingMeshes | None = None
 
     def predict(self, truth: Truth) -> Gaussians:
         """Returns the Gaussians under test. Raises UserError where there are none."""
@@ -112,7 +118,7 @@ def open_job(options: ViewsOptions) -> Job:
             steps=options.ceiling_steps,
         )
     if options.baselines:
-        _add_baselines(job, options.data)
+        _add_baselines(job, options.data, options.save_retrieval)
     if ceiling is not None:
         job.baselines["ceiling"] = ceiling
     return job
@@ -125,8 +131,11 @@ def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
     targets = [options.out / "strips" / f"{uid}.png" for uid in uids[: options.strips]]
     if options.save_gaussians:
         targets += [options.out / "gaussians" / f"{uid}.ply" for uid in uids]
-    predicted = [options.checkpoint / f"{uid}.ply" for uid in uids]
-    check_not_read(targets, [*predicted, *(options.data / uid for uid in uids)])
+    read = [options.checkpoint / f"{uid}.ply" for uid in uids]
+    if options.save_retrieval:
+        targets += [options.out / "retrieval" / f"{uid}.ply" for uid in uids]
+        read += [mesh.path for mesh in find_meshes(options.save_retrieval)]
+    check_not_read(targets, [*read, *(options.data / uid for uid in uids)])
 
 
 def _lpips_or_reason(wanted: bool, device: str) -> tuple[LPIPS | None, str | None]:
@@ -138,12 +147,21 @@ def _lpips_or_reason(wanted: bool, device: str) -> tuple[LPIPS | None, str | Non
     return None, f"no weights; fetch them with: {FETCH}"
 
 
-def _add_baselines(job: Job, data: Path) -> None:
-    """Adds the four that need no fit; the retrieval only where there is a training split."""
+def _add_baselines(job: Job, data: Path, meshes: Path | None) -> None:
+    """Adds the four that need no fit; the retrieval only where there is a training split.
+
+    Raises:
+        UserError: ``meshes`` are asked for, and cannot be had.
+    """
     job.baselines |= {"background": background, "input_copy": input_copy, "billboard": billboard}
     try:
-        job.baselines["retrieval"] = retrieval = Retrieval(open_dataset(data, "train"))
+        training = open_dataset(data, "train")
+        if meshes is not None:
+            job.meshes = TrainingMeshes(meshes, training)
+        job.baselines["retrieval"] = job.retrieval = retrieval = Retrieval(training)
     except UserError as error:
+        if meshes is not None:
+            raise UserError(f"--save-retrieval: {error}") from error
         job.left_out["retrieval"] = str(error)
         return
     for uid, reason in retrieval.failures.items():

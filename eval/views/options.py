@@ -52,6 +52,10 @@ class ViewsOptions:
     save_gaussians: bool = False
     """Also write OUT/gaussians/NAME.ply, in the input camera's world (eval-geometry --frame
     reference reads them)."""
+    save_retrieval: Path | None = None
+    """Folder of the meshes that DATA was rendered from (with catalogue.json, or named by object):
+    also write OUT/retrieval/NAME.ply, the mesh of the training object that the retrieval takes,
+    placed where the input camera sees it as it was found (eval-geometry --frame reference)."""
     distance: Annotated[float, Meta(ge=0.01, le=1000)] = DEFAULT_DISTANCE
     """Distance of the input camera, for .ply files; a checkpoint states its own."""
     encoder_weights: Path | None = None
@@ -68,3 +72,5 @@ class ViewsOptions:
         check_options(self)
         if self.save_gaussians and self.out is None:
             raise UserError("--save-gaussians: needs --out")
+        if self.save_retrieval and (self.out is None or not self.baselines):
+            raise UserError("--save-retrieval: needs --out, and the baselines")

@@ -1,32 +1,76 @@
-"""One table of a model and its baselines, with intervals, and the paired differences."""
+"""Tables of a model and its baselines, with intervals, and the paired differences."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from ..report import LEVEL, intervals_of, mean_of
-from .compare import METRICS
+import numpy as np
 
-Records = dict[str, dict[str, Any]]  # uid -> what summary() returns
+from ..averages import LEVEL, bootstrap, summary_of
+from ..tables import cell, markdown
+from .compare import METRICS, NEARLY_EMPTY
+
+Record = dict[str, Any]
+Records = dict[str, Record]  # uid -> what summary() returns
 KINDS = ("novel", "input")
+MEAN_ERROR = "psnr_of_mean_error"
 _LABELS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "mask IoU"}
-_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "mask_iou": 3}
+_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "mask_iou": 3, MEAN_ERROR: 2}
 
 
-def _row(kind: str, name: str, records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """The means and intervals of one candidate; None where no object has such views."""
+def _decibels(errors: np.ndarray) -> np.ndarray:
+    """PSNR of the mean of squared errors ``[.., n]``."""
+    return -10 * np.log10(errors.mean(-1))
+
+
+def _row(kind: str, name: str, records: list[Record]) -> dict[str, Any] | None:
+    """Means, medians and intervals of one candidate; None where no object has such views."""
     values = [record["input"] if kind == "input" else record for record in records]
-    values = [{key: value[key] for key in METRICS} for value in values]
     values = [value for value in values if value["psnr"] is not None]
     if not values:
         return None
-    means, intervals = mean_of(values), intervals_of(values)
-    cells = {key: {"mean": means[key], "interval": intervals[key]} for key in METRICS}
-    return {"views": kind, "name": name, "objects": len(values), **cells}
+    errors = np.array([value["mse"] for value in values])
+    return {
+        "views": kind,
+        "name": name,
+        "objects": len(values),
+        **{key: summary_of([value[key] for value in values]) for key in METRICS},
+        MEAN_ERROR: {"value": float(_decibels(errors)), "interval": bootstrap(errors, _decibels)},
+    }
+
+
+def _difference(kind: str, name: str, pairs: list[tuple[Record, Record]]) -> dict[str, Any] | None:
+    """As ``_row``, of the first of each pair minus the second."""
+    if kind == "input":
+        pairs = [(a["input"], b["input"]) for a, b in pairs]
+    pairs = [(a, b) for a, b in pairs if a["psnr"] is not None and b["psnr"] is not None]
+    if not pairs:
+        return None
+    errors = np.array([[a["mse"] for a, _ in pairs], [b["mse"] for _, b in pairs]])
+
+    def gain(drawn: np.ndarray) -> np.ndarray:
+        return _decibels(drawn[0]) - _decibels(drawn[1])
+
+    return {
+        "views": kind,
+        "name": name,
+        "objects": len(pairs),
+        **{key: summary_of([_minus(a[key], b[key]) for a, b in pairs]) for key in METRICS},
+        MEAN_ERROR: {"value": float(gain(errors)), "interval": bootstrap(errors, gain)},
+    }
+
+
+def _minus(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a - b
 
 
 def table_of(candidates: dict[str, Records]) -> list[dict[str, Any]]:
-    """Rows ``{views, name, objects, psnr: {mean, interval}, …}``, novel views before the input."""
+    """Rows of all candidates, novel views before the input.
+
+    Returns:
+        ``{views, name, objects}``, for each metric ``{mean, interval, median, median_interval}``,
+        and ``psnr_of_mean_error`` ``{value, interval}``.
+    """
     rows = [
         _row(kind, name, list(records.values()))
         for kind in KINDS
@@ -37,61 +81,91 @@ def table_of(candidates: dict[str, Records]) -> list[dict[str, Any]]:
 
 def differences_of(model: Records, baselines: dict[str, Records]) -> list[dict[str, Any]]:
     """Rows like ``table_of``'s: the model's value minus the baseline's, over objects with both."""
-    rows = []
-    for kind in KINDS:
-        for name, records in baselines.items():
-            shared = [uid for uid in records if uid in model]
-            pairs = [_minus(model[uid], records[uid]) for uid in shared]
-            rows.append(_row(kind, f"model - {name}", pairs))
+    rows = [
+        _difference(
+            kind, f"model - {name}", [(model[uid], r) for uid, r in records.items() if uid in model]
+        )
+        for kind in KINDS
+        for name, records in baselines.items()
+    ]
     return [row for row in rows if row is not None]
 
 
-def _minus(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    result = {}
-    for key in (*METRICS, *(("input",) if "input" in a else ())):
-        if key == "input":
-            result[key] = _minus(a[key], b[key])
-        else:
-            result[key] = None if a[key] is None or b[key] is None else a[key] - b[key]
-    return result
+def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
+    """The same records without the views that are nearly empty."""
+    return {
+        name: {uid: record["without_nearly_empty"] for uid, record in records.items()}
+        for name, records in candidates.items()
+    }
 
 
-def _cell(key: str, value: dict[str, Any], sign: str) -> str:
-    mean, interval, digits = value["mean"], value["interval"], _DIGITS[key]
-    if mean is None:
-        return "absent"
-    ends = "" if interval is None else " [" + ", ".join(f"{x:.{digits}f}" for x in interval) + "]"
-    return f"{mean:{sign}.{digits}f}{ends}"
-
-
-def markdown(rows: list[dict[str, Any]], signed: bool = False) -> str:
-    """The rows as a Markdown table whose columns are aligned in plain text too.
+def means(rows: list[dict[str, Any]], signed: bool = False) -> str:
+    """A Markdown table of the rows' means, with their intervals.
 
     Args:
         rows: those of ``table_of`` or ``differences_of``.
         signed: whether positive means get a plus sign.
     """
-    sign = "+" if signed else ""
     lines = [["views", "", "objects", *_LABELS.values()]]
     for row in rows:
-        cells = [_cell(key, row[key], sign) for key in METRICS]
+        cells = [cell(row[k]["mean"], row[k]["interval"], _DIGITS[k], signed) for k in METRICS]
         lines.append([row["views"], row["name"], str(row["objects"]), *cells])
-    widths = [max(map(len, column)) for column in zip(*lines)]
-    texts = ["| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines]
-    rule = "| " + " | ".join("-" * max(3, width) for width in widths) + " |"
-    return "\n".join([texts[0], rule, *texts[1:]])
+    return markdown(lines)
+
+
+def medians(rows: list[dict[str, Any]], signed: bool = False) -> str:
+    """As ``means``: the PSNR of the mean error, and the medians over objects."""
+    medians_of = [f"median {label}" for label in _LABELS.values()]
+    lines = [["views", "", "objects", "PSNR of mean error [dB]", *medians_of]]
+    for row in rows:
+        error = row[MEAN_ERROR]
+        cells = [cell(error["value"], error["interval"], _DIGITS[MEAN_ERROR], signed)]
+        for key in METRICS:
+            value, ends = row[key]["median"], row[key]["median_interval"]
+            cells.append(cell(value, ends, _DIGITS[key], signed))
+        lines.append([row["views"], row["name"], str(row["objects"]), *cells])
+    return markdown(lines)
+
+
+def _first_kind(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of novel views; those of the input where there are no novel ones."""
+    return [row for row in rows if row["views"] == rows[0]["views"]]
+
+
+def nearly_empty_line(counts: dict[str, Any]) -> str:
+    """Says how many views are nearly empty, and what counts as such."""
+    few = f"the object covers under {100 * NEARLY_EMPTY:g} % of the true picture"
+    if not counts["views"]:
+        return f"None of the {counts['of_views']} views is nearly empty ({few})."
+    return (
+        f"{counts['views']} of {counts['of_views']} views, of {counts['objects']} of "
+        f"{counts['of_objects']} objects, are nearly empty ({few})."
+    )
 
 
 def page(report: dict[str, Any]) -> str:
     """The text of ``table.md``, from a report of ``eval-views``."""
-    parts = [markdown(report["table"])]
+    counts, share = report["nearly_empty"], f"{100 * LEVEL:g} %"
+    lpips = report["protocol"]["lpips_reason"]
+    parts = [means(report["table"])]
     if report["differences"]:
-        parts += ["Differences, object by object:", markdown(report["differences"], signed=True)]
-    share = f"{100 * LEVEL:g} %"
+        parts += ["Differences, object by object:", means(report["differences"], signed=True)]
     parts += [
         f"Means over objects of means over views, with {share} bootstrap intervals over objects. "
-        "LPIPS: less is better."
+        "LPIPS: less is better." + (f" LPIPS left out: {lpips}." if lpips else "")
     ]
-    if report["protocol"]["lpips_reason"]:
-        parts[-1] += f" LPIPS left out: {report['protocol']['lpips_reason']}."
+    tables = [(medians, report["table"], report["differences"])]
+    titles = ["PSNR of the mean squared error over all views and objects; medians over objects:"]
+    if counts["views"]:
+        parts[-1] += f" {nearly_empty_line(counts)} They count in these tables."
+        rest = report["without_nearly_empty"]
+        tables.append((means, rest["table"], rest["differences"]))
+        titles.append("Means as above, without the views that are nearly empty:")
+    else:
+        parts[-1] += f" {nearly_empty_line(counts)}"
+    for title, (show, rows, differences) in zip(titles, tables):
+        if rows:
+            parts += [title, show(_first_kind(rows))]
+        if differences:
+            parts.append(show(_first_kind(differences), signed=True))
     return "\n\n".join(parts) + "\n"

@@ -13,7 +13,7 @@ from gamba_warp.eval.views.baselines import Retrieval, background, billboard, in
 from gamba_warp.eval.views.ceiling import Ceiling, open_ceiling
 from gamba_warp.eval.views.compare import Truth, ViewsProtocol, compare, load_truth, summary
 from gamba_warp.eval.views.contact_sheet import Row, choose_ranks, contact_sheet
-from gamba_warp.eval.views.table import differences_of, markdown, table_of
+from gamba_warp.eval.views.table import differences_of, means, table_of
 from gamba_warp.fitting.config import FitConfig
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.gaussians import Gaussians
@@ -228,7 +228,9 @@ def test_a_whole_report(data, tmp_path, capsys):
     assert report["protocol"]["uids"] == ["twin"] and report["protocol"]["split_version"] == 1
     shown = (tmp_path / "out" / "table.md").read_text()
     assert shown in capsys.readouterr().out
-    assert shown.count("| novel |") == 6 + 5 and shown.count("| input |") == 6 + 5
+    # means, and medians beside the PSNR of the mean error; no view is nearly empty
+    assert shown.count("| novel |") == 2 * (6 + 5) and shown.count("| input |") == 6 + 5
+    assert "None of the 6 views is nearly empty" in shown
     header, row = (tmp_path / "out" / "objects.csv").read_text().splitlines()
     assert "baselines.billboard.input.psnr" in header and row.startswith("twin,ok,")
     sheet = load_rgba(tmp_path / "out" / "contact_sheet.png")
@@ -309,8 +311,9 @@ def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
     truth = load_truth(dataset, "flat", PROTOCOL, "cpu")
     first = make()(truth)
     # 25 steps are enough to be better than an empty picture by far
-    better = summary(compare({"": first}, truth)[""])["psnr"]
-    assert better > 3 + summary(compare({"": background(truth)}, truth)[""])["psnr"]
+    shown = {"fitted": first, "empty": background(truth)}
+    means = {n: summary(v, truth.coverage)["psnr"] for n, v in compare(shown, truth).items()}
+    assert means["fitted"] > 3 + means["empty"]
     assert torch.allclose(make()(truth)[0], first[0], atol=1e-5) and len(calls) == 1  # .ply logits
     make(26)(truth)
     assert len(calls) == 2  # other settings
@@ -346,6 +349,7 @@ def test_ceiling_of_nothing(data, wanted, tmp_path):
 
 def record(psnr, novel=True, lpips=None):
     values = {"psnr": psnr, "ssim": 0.5, "lpips": lpips, "mask_iou": 0.25}
+    values["mse"] = 10 ** (-psnr / 10)
     none = dict.fromkeys(values)
     return {**(values if novel else none), "input": {**values, "psnr": psnr + 1}}
 
@@ -362,9 +366,10 @@ def test_table_and_differences():
     ]
     assert rows[0]["psnr"]["mean"] == 22 and rows[0]["psnr"]["interval"] == [20, 24]
     difference, _ = differences_of(model, {"other": other})
-    assert difference["psnr"] == {"mean": 2.0, "interval": [1.0, 3.0]}  # paired: 1 and 3
-    assert difference["lpips"] == {"mean": None, "interval": None}
-    text = markdown([difference], signed=True).splitlines()
+    paired = {"mean": 2.0, "interval": [1.0, 3.0]}  # 1 and 3
+    assert difference["psnr"] == paired | {"median": 2.0, "median_interval": [1.0, 3.0]}
+    assert set(difference["lpips"].values()) == {None}
+    text = means([difference], signed=True).splitlines()
     assert len({len(line) for line in text}) == 1
     assert "+2.00 [1.00, 3.00]" in text[2] and "absent" in text[2]
 

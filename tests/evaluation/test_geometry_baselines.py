@@ -1,0 +1,279 @@
+"""The retrieval's meshes as predicted shapes, and predictions beside those of baselines."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from helpers.micro import to_opengl
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.cli import run
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.eval.shapes.load import load_truth
+from gamba_warp.eval.shapes.pairs import find_pairs, out_of_reference
+from gamba_warp.eval.shapes.protocol import PRESETS
+from gamba_warp.eval.views.baselines import Found
+from gamba_warp.eval.views.placing import TrainingMeshes
+from gamba_warp.formats.meshes import Y_TO_Z_UP, load_mesh
+from gamba_warp.formats.ply import save_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.images import save_image
+from gamba_warp.render import render
+
+SIZE = 32  # that of the thumbnails: the pictures are compared as they are
+# A quarter turn about the vertical axis of ``orbit``: bounding boxes stay bounding boxes.
+TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+ON_ITS_SIDE = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # what the catalogue turns back
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Pictures this small take longer on several threads than on one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def stairs():
+    """Three boxes that no turn brings onto themselves; centred, longest side 1."""
+    boxes = [((1.0, 0.2, 0.3), (0, 0.3, 0)), ((0.3, 0.4, 0.3), (0.35, 0, 0))]
+    boxes += [((0.2, 0.2, 0.6), (-0.4, -0.3, 0.05))]
+    parts = [trimesh.creation.box(size).apply_translation(at) for size, at in boxes]
+    mesh = trimesh.util.concatenate(parts)
+    mesh.vertices -= mesh.bounds.mean(0)
+    return mesh
+
+
+def write_views(folder, mesh, azimuths, distance):
+    """Pictures of Gaussians all over the mesh, whose colours follow the place in the file."""
+    points, _ = trimesh.sample.sample_surface(mesh, 400, seed=1)
+    means = torch.from_numpy(np.array(points)).float()
+    cloud = Gaussians(
+        means=means,
+        quats=None,
+        scales=torch.full((400, 3), 0.04),
+        opacities=torch.full((400,), 0.95),
+        colors=torch.linspace(0, 1, 400)[:, None].expand(400, 3).contiguous(),
+    )
+    count = len(azimuths)
+    K = intrinsics(SIZE, SIZE)
+    viewmats = orbit(torch.tensor(azimuths), 20.0, distance)
+    cameras = Cameras(viewmats, K.expand(count, 3, 3), SIZE, SIZE)
+    with torch.no_grad():
+        out = render(cloud, cameras)
+    rgba = torch.cat([out.rgb / out.alpha.clamp(min=1e-6), out.alpha], -1)
+    folder.mkdir(parents=True)
+    frames = []
+    for v, pose in enumerate(to_opengl(viewmats)):
+        save_image(folder / f"{v}.png", rgba[v].numpy())
+        frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
+    top = {"w": SIZE, "h": SIZE, "fl_x": float(K[0, 0]), "fl_y": float(K[0, 0]), "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(top))
+    return cloud
+
+
+@pytest.fixture
+def world(tmp_path):
+    """``twin`` is under test; ``seen``, in training, is the same thing after a quarter turn.
+
+    Its file is larger, elsewhere, y-up, and on its side; its cameras have other azimuths.
+    """
+    meshes, data = tmp_path / "meshes", tmp_path / "data"
+    (meshes / "library").mkdir(parents=True)
+    twin, turned = stairs(), stairs()
+    turned.vertices = turned.vertices @ TURN.T
+    twin.export(meshes / "library" / "t.ply")
+    filed = turned.copy()
+    to_file = np.linalg.inv(Y_TO_Z_UP @ ON_ITS_SIDE)
+    filed.vertices = 7 * (turned.vertices @ to_file.T) + [1.0, 2.0, 3.0]
+    filed.export(meshes / "library" / "s.obj")
+    trimesh.creation.box((1.0, 0.8, 0.6)).export(meshes / "library" / "other.ply")
+    entries = [{"model": "library/t.ply", "uid": "twin"}]
+    rotation = ON_ITS_SIDE.tolist()
+    entries.append({"model": "library/s.obj", "uid": "seen", "rotation": rotation})
+    entries.append({"model": "library/other.ply", "uid": "other"})
+    (meshes / "catalogue.json").write_text(json.dumps({"objects": entries}))
+    cloud = write_views(data / "twin", twin, [25.0, 140.0], 1.6)
+    write_views(data / "seen", turned, [160.0, 295.0, 115.0, 205.0, 25.0], 1.6)
+    split = {"version": 2, "train": ["seen"], "val": [], "test": ["twin"]}
+    (data / "split.json").write_text(json.dumps(split))
+    (tmp_path / "pred").mkdir()
+    save_ply(tmp_path / "pred" / "twin.ply", cloud)
+    return tmp_path
+
+
+def evaluate_views(world, *options):
+    places = ["--checkpoint", str(world / "pred"), "--data", str(world / "data")]
+    fixed = ["--out", str(world / "out"), "--no-lpips", "--device", "cpu", "--sheet", "0"]
+    code = run("eval-views", [*places, *fixed, *options])
+    path = world / "out" / "report.json"
+    return code, json.loads(path.read_text()) if path.exists() else None
+
+
+def test_the_placed_mesh_is_the_truth(world, capsys):
+    """Through both commands: the retrieval finds the turned twin, whose mesh is the truth."""
+    code, report = evaluate_views(world, "--save-retrieval", str(world / "meshes"))
+    assert code == 0
+    found = report["objects"][0]["retrieval"]
+    assert found["uid"] == "seen" and found["view"] in (1, 2) and found["distance"] < 0.02
+    placed = load_mesh(world / "out" / "retrieval" / "twin.ply")
+    motion = out_of_reference(open_dataset(world / "data"), "twin", 0, 1.5)
+    here = motion.points(placed.vertices)
+    want = stairs().vertices
+    apart = np.linalg.norm(here[:, None] - want[None], axis=-1).min(1)
+    assert apart.max() < 1e-5  # float32 in the .ply and in the poses
+    unturned = np.linalg.norm((want @ TURN.T)[:, None] - want[None], axis=-1).min(1)
+    assert unturned.max() > 0.2  # so that the mesh as its file has it would be seen
+    out = world / "shapes"
+    places = [str(world / "out" / "retrieval"), str(world / "meshes"), "--out", str(out)]
+    options = ["--frame", "reference", "--data", str(world / "data"), "--points", "3000"]
+    assert run("eval-geometry", [*places, *options]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert [record["name"] for record in report["objects"]] == ["twin"]  # of three in the library
+    assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
+    assert report["mean"]["chamfer"] < 1.2 * report["mean"]["noise_floor"]
+    assert "median" in capsys.readouterr().out and not (out / "table.md").exists()
+
+
+def test_distance_of_the_found_camera_does_not_matter(world):
+    """The unit is that in which the input camera stands at the model's distance."""
+    training = open_dataset(world / "data", "train")
+    meshes = TrainingMeshes(world / "meshes", training)
+    placed = meshes.place(Found("seen", 3, 0.1), 2.5).vertices
+    viewmat = training.load("seen", [3]).cameras.viewmats[0].numpy()
+    world_vertices = stairs().vertices @ TURN.T
+    # seen by the found camera, moved along its axis to 2.5 / 1.6 of the distance and as much larger
+    local = world_vertices @ viewmat[:3, :3].T * 2.5 / 1.6
+    apart = np.linalg.norm(placed[:, None] - local[None], axis=-1).min(1)
+    assert apart.max() < 1e-5
+    with pytest.raises(UserError, match="no mesh of the training object gone"):
+        meshes.place(Found("gone", 0, 0.1), 1.5)
+
+
+@pytest.mark.parametrize("case", ["out", "baselines", "absent", "others", "train"])
+def test_what_cannot_be_placed(world, case, capsys):
+    options, meshes = [], world / "meshes"
+    if case == "baselines":
+        options = ["--no-baselines"]
+    if case == "absent":
+        meshes = world / "nowhere"
+    if case == "others":
+        (meshes / "catalogue.json").unlink()  # the files' own names are those of no object
+    if case == "train":
+        split = {"version": 2, "train": [], "val": [], "test": ["twin", "seen"]}
+        (world / "data" / "split.json").write_text(json.dumps(split))
+    if case == "out":
+        places = ["--checkpoint", str(world / "pred"), "--data", str(world / "data")]
+        assert run("eval-views", [*places, "--no-lpips", "--save-retrieval", str(meshes)]) == 2
+    else:
+        assert evaluate_views(world, "--save-retrieval", str(meshes), *options) == (2, None)
+    error = capsys.readouterr().err
+    assert error.startswith("gamba: ") and error.count("\n") == 1
+
+
+def test_a_mesh_that_is_bad_stops_nothing(world, capsys):
+    (world / "meshes" / "library" / "s.obj").write_text("v 0 0 0\nf 1 1 x\n")
+    code, report = evaluate_views(world, "--save-retrieval", str(world / "meshes"))
+    assert code == 1 and report["num_ok"] == 1 and "retrieval" in report["baselines"]
+    assert [item["name"] for item in report["failures"]] == ["twin (retrieval's mesh)"]
+    assert list((world / "out" / "retrieval").iterdir()) == []
+
+
+def test_a_truth_is_turned_as_its_catalogue_says(world):
+    pairs, failures = find_pairs(world / "pred", world / "meshes", ["seen", "unknown"])
+    assert [(pair.name, pair.gt.name) for pair in pairs] == [("twin", "t.ply")]
+    reasons = {item["name"]: item["reason"] for item in failures}
+    assert reasons == {"seen": "no prediction", "unknown": "no prediction"}
+    protocol = PRESETS["default"]
+    path = world / "meshes" / "library" / "s.obj"
+    truth = load_truth(path, protocol, ON_ITS_SIDE.tolist()).shape
+    want = stairs().vertices @ TURN.T
+    apart = np.linalg.norm(truth.vertices[:, None] - want[None], axis=-1).min(1)
+    assert apart.max() < 1e-6
+    turned = stairs()
+    turned.vertices = want
+    (world / "upright").mkdir()
+    turned.export(world / "upright" / "seen.ply")
+    places = [str(world / "upright"), str(world / "meshes"), "--out", str(world / "out")]
+    assert run("eval-geometry", [*places, "--frame", "unit", "--points", "500"]) == 0
+    report = json.loads((world / "out" / "report.json").read_text())
+    assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
+    with pytest.raises(UserError, match="also stretches"):
+        load_truth(path, protocol, np.diag([1.0, 1, 2]).tolist())
+
+
+def boxes(folder, **sides):
+    folder.mkdir(parents=True)
+    for name, side in sides.items():
+        trimesh.creation.box((side, side, side)).export(folder / f"{name}.ply")
+
+
+def evaluate_shapes(folder, *options):
+    places = [str(folder / "pred"), str(folder / "gt"), "--out", str(folder / "out")]
+    code = run("eval-geometry", [*places, "--points", "2000", *options])
+    path = folder / "out" / "report.json"
+    return code, json.loads(path.read_text()) if path.exists() else None
+
+
+def test_differences_are_paired(tmp_path, capsys):
+    """Cubes in cubes: the IoU of one of side s in the truth is s³."""
+    boxes(tmp_path / "gt", a=1.0, b=1.0, c=1.0)
+    boxes(tmp_path / "pred", a=1.0, b=0.75, c=0.5)
+    boxes(tmp_path / "near", a=0.75, b=0.75)
+    boxes(tmp_path / "far", a=0.5, b=0.5, c=0.5)
+    options = ["--baseline", str(tmp_path / "near"), str(tmp_path / "far")]
+    code, report = evaluate_shapes(tmp_path, *options)
+    assert code == 1  # "near" lacks an object
+    assert report["failures"] == [] and list(report["baselines"]) == ["near", "far"]
+    assert report["baselines"]["near"]["failures"] == [{"name": "c", "reason": "no prediction"}]
+    near, far = report["differences"]["near"], report["differences"]["far"]
+    iou = [1.0, 0.75**3, 0.125]
+    assert (near["objects"], far["objects"]) == (2, 3)
+    assert near["mean"]["iou"] == pytest.approx((1 - iou[1]) / 2)
+    assert far["mean"]["iou"] == pytest.approx((iou[0] + iou[1] - 2 * iou[2]) / 3)
+    assert far["median"]["iou"] == pytest.approx(iou[1] - iou[2])
+    assert far["interval"]["iou"] == pytest.approx([0, 1 - iou[2]], abs=1e-6)
+    assert len(far["median_interval"]["iou"]) == 2 and far["mean"]["chamfer"] < 0
+    assert far["mean"]["fscore"].keys() == report["mean"]["fscore"].keys()
+    text = (tmp_path / "out" / "table.md").read_text()
+    printed = capsys.readouterr().out
+    assert text in printed and "failed: c (near): no prediction" in printed
+    for row in ("predicted", "near", "far", "predicted - near", "predicted - far"):
+        assert text.count(f"| {row.ljust(16)} |") == 2  # means and medians
+    assert "F-score at 0.02" in text
+
+
+def test_an_object_that_only_a_baseline_has(tmp_path):
+    """A prediction that is missing must not go unseen, in a library neither."""
+    boxes(tmp_path / "gt", a=1.0, b=1.0, unused=1.0)
+    entries = [{"model": f"{name}.ply", "uid": name} for name in ("a", "b", "unused")]
+    (tmp_path / "gt" / "catalogue.json").write_text(json.dumps({"objects": entries}))
+    boxes(tmp_path / "pred", a=1.0)
+    boxes(tmp_path / "other", a=0.5, b=0.5)
+    code, report = evaluate_shapes(tmp_path)
+    assert code == 0 and report["num_ok"] == 1 and report["baselines"] == {}
+    code, report = evaluate_shapes(tmp_path, "--baseline", str(tmp_path / "other"))
+    assert code == 1 and report["failures"] == [{"name": "b", "reason": "no prediction"}]
+    assert report["differences"]["other"]["objects"] == 1
+
+
+@pytest.mark.parametrize("case", ["file", "twice", "predicted"])
+def test_baselines_that_are_refused(tmp_path, case, capsys):
+    boxes(tmp_path / "gt", a=1.0)
+    boxes(tmp_path / "pred", a=1.0)
+    boxes(tmp_path / "x" / "predicted", a=1.0)
+    boxes(tmp_path / "y" / "predicted", a=1.0)
+    boxes(tmp_path / "x" / "one", a=1.0)
+    boxes(tmp_path / "y" / "one", a=1.0)
+    folders = {
+        "file": [tmp_path / "pred" / "a.ply"],
+        "twice": [tmp_path / "x" / "one", tmp_path / "y" / "one"],
+        "predicted": [tmp_path / "x" / "predicted"],
+    }
+    assert evaluate_shapes(tmp_path, "--baseline", *map(str, folders[case])) == (2, None)
+    error = capsys.readouterr().err
+    assert "--baseline" in error and error.count("\n") == 1
