@@ -73,16 +73,16 @@ BOXES = {
     "fitting": Box(2.8, 5, "gamba_warp", "fitting", ("one object", "by optimisation")),
     "pages": Box(2.2, 6, "gamba_warp", "pages", ("pages, turntables,", "the viewer")),
     "measure": Box(0.6, 6, "gamba_warp", "measure", ("bench and stress cases", "with the model")),
-    "train": Box(3.6, 6, "train", "train", ("batches, losses, loop;", "data/: rendering")),
+    "train": Box(3.6, 7, "train", "train", ("batches, losses, loop;", "data/: rendering")),
     "eval": Box(4.7, 6, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
     "gpu_check": Box(1, 7, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
-    "hostile": Box(3.4, 7, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
+    "hostile": Box(3.4, 8, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
     "endurance": Box(
-        4.7, 7, "gamba_warp", "endurance", ("kills and full disks", "in every command")
+        4.7, 8, "gamba_warp", "endurance", ("kills and full disks", "in every command")
     ),
-    "commands": Box(2.2, 8, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
-    "cli": Box(2.8, 9, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
-    "public": Box(0.2, 9, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
+    "commands": Box(2.2, 9, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
+    "cli": Box(2.8, 10, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
+    "public": Box(0.2, 10, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
 }
 FLOORS = 1 + max(box.floor for box in BOXES.values())
 

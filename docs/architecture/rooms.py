@@ -81,7 +81,7 @@ ROOMS = {
         ("measure", *_BENCH, *_STRESS, *_TRAIN, *_EVAL),
     ),
     "train.data": Room("furniture, rendering of meshes, starter set", _LIBRARY),
-    "train": Room("batches, losses, loop", (*_LIBRARY, *_BENCH, "train.data")),
+    "train": Room("batches, losses, loop", (*_LIBRARY, *_BENCH, "train.data"), ("pages",)),
     "eval": Room("the report that both evaluations share", _READERS),
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
     "eval.shapes": Room("Chamfer, IoU, F-score", (*_RESULTS, "eval")),

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..batch import for_each, plan_outputs, report
+from ..batch import check_not_read, for_each, plan_outputs, report
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
 from ..formats.names import GaussianFormat, MeshFormat
 from ..untrusted.ranges import Frames, Opacity, Side, ranged
+
+if TYPE_CHECKING:
+    from ..pages.sheet import Sheet
 
 
 @ranged
@@ -30,6 +33,7 @@ def reconstruct_command(
     size: Side = 256,
     frames: Frames = 48,
     page: bool = True,
+    sheet: Path | None = None,
     mask: Path | None = None,
     sam: Path | None = None,
     ply_frame: Axes = "opencv",
@@ -49,6 +53,8 @@ def reconstruct_command(
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
         page: Write an HTML page with the input, the turntable and a 3D viewer.
+        sheet: Also one picture of all results: each input, and five views around it (.png, .webp,
+            .jpg).
         mask: Picture that is white where the object is (for a single image).
         sam: Segment Anything checkpoint, for pictures with a busy background.
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
@@ -56,20 +62,14 @@ def reconstruct_command(
         device: Device that computes; auto is the GPU if there is one.
     """
     from ..data.preprocess import SamSegmenter, prepare
-    from ..images import find_pictures
-    from ..model.checkpoint import DEFAULT_CHECKPOINT, FILE_NAME, load_model
+    from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
     from ..model.predict import reconstruct
+    from ..pages.card import about_model
     from ..pages.outputs import Outputs, write_outputs
 
-    if not images:
-        raise UserError("give at least one picture or folder")
-    pictures, failures = find_pictures(images)
-    if mask is not None and len(pictures) != 1:
-        raise UserError(f"--mask goes with one picture, {len(pictures)} are given")
-    if not pictures:
-        raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
+    pictures, failures = _found(images, mask)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
-    _check_there(checkpoint)
+    file = _file_of(checkpoint)
     outputs = Outputs(
         folder=out,
         formats=formats,
@@ -81,9 +81,11 @@ def reconstruct_command(
         axes=ply_frame,
         min_opacity=min_opacity,
         checkpoint=checkpoint,
+        about=about_model(file),
     )
-    file = checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
-    names = plan_outputs(pictures, outputs.suffixes(), out, (mask, sam, file, encoder_weights))
+    reads = (mask, sam, file, encoder_weights)
+    names = plan_outputs(pictures, outputs.suffixes(), out, reads)
+    outputs.sheet = _sheet(sheet, [*pictures, *reads])
     model = load_model(checkpoint, chosen, encoder_weights)
     segmenter = None if sam is None else SamSegmenter(sam, chosen)
     output_folder(out)
@@ -96,13 +98,46 @@ def reconstruct_command(
         write_outputs(name, rgba, gaussians.to(chosen), outputs, model.config, seconds)
 
     for_each(names, one, "reconstruct", "picture", failures)
+    if outputs.sheet is not None:
+        outputs.sheet.write()
     return report(len(pictures), "picture", failures, out)
 
 
-def _check_there(checkpoint: Path) -> None:
-    """Raises UserError, with a remedy, where there is no such file."""
+def _found(
+    images: tuple[Path, ...], mask: Path | None
+) -> tuple[list[Path], list[tuple[Path, str]]]:
+    """The picture files, and what gives none with the reason. Raises UserError without a file."""
+    from ..images import find_pictures
+
+    if not images:
+        raise UserError("give at least one picture or folder")
+    pictures, failures = find_pictures(images)
+    if mask is not None and len(pictures) != 1:
+        raise UserError(f"--mask goes with one picture, {len(pictures)} are given")
+    if not pictures:
+        raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
+    return pictures, failures
+
+
+def _file_of(checkpoint: Path) -> Path:
+    """The model's file, also of a folder. Raises UserError, with a remedy, if it is not there."""
+    from ..model.checkpoint import FILE_NAME
+
     if not checkpoint.exists():
         raise UserError(
             f"{checkpoint}: no such checkpoint; train one with 'gamba train' or 'gamba demo', "
             "or give --checkpoint FILE"
         )
+    return checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
+
+
+def _sheet(path: Path | None, reads: list[Path | None]) -> Sheet | None:
+    """The sheet, if one is asked for, in a folder that is there. Raises UserError."""
+    from ..pages.sheet import Sheet
+
+    if path is None:
+        return None
+    check_not_read([path], reads)
+    sheet = Sheet(path)
+    output_folder(path.parent)
+    return sheet

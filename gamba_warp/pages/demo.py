@@ -3,42 +3,84 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
+from ..data.preprocess import prepare
+from ..errors import UserError
 from ..formats.ply import load_ply
 from ..gaussians import Gaussians
 from ..images import load_rgba
+from .card import about_model, read_card
+from .curves import draw_curves
 from .page import Section, demo_page
+from .run_log import read_run_log
 from .turntable import turntable_frames
 
 _METRICS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "Mask IoU"}
+_BASELINES = {
+    "background": "an empty picture",
+    "input_copy": "a copy of the input",
+    "billboard": "the input as a flat cut-out",
+    "retrieval": "the training object most like it",
+}
+_LIBRARY = re.compile(r"^(blendswap-cc-(0|by)|katorlegaz|reallusion|scopia)-")
+_ICON = "Icon: "
+_FIRST = 6  # pictures in the first section
+_TURN = 24  # views of a turntable
+_SHOWN = 5  # of these in the first section
+_FAINT = 1 / 255  # the rasterizer passes over what is fainter, so the page can do without
 
 
-def write_demo(
-    path: Path, run: Path, views: Path, shapes: Path, icons: Path, results: Path, text: str
-) -> None:
+@dataclass(frozen=True)
+class DemoResults:
+    """Where the commands of a demo left their results.
+
+    Attributes:
+        shipped: the model file that the demo came with.
+        icons: pictures that were reconstructed.
+        results: what ``gamba reconstruct`` made of them; some may be missing.
+        views: results of ``gamba eval-views`` of the shipped model.
+        shapes: results of ``gamba eval-geometry``; the report may be missing.
+        run: run folder of ``gamba train``; it may be missing still.
+        views_here: results of ``gamba eval-views`` of that model; they may be missing still.
+    """
+
+    shipped: Path
+    icons: Path
+    results: Path
+    views: Path
+    shapes: Path
+    run: Path
+    views_here: Path
+
+
+def write_demo(path: Path, results: DemoResults, text: str) -> None:
     """Writes the page.
 
     Args:
         path: the .html file.
-        run: run folder of ``gamba train``.
-        views: results of ``gamba eval-views``.
-        shapes: results of ``gamba eval-geometry``; the report may be missing.
-        icons: pictures that were reconstructed.
-        results: results of ``gamba reconstruct`` on them; some may be missing.
+        results: what is shown.
         text: a sentence or two for the head of the page.
 
     Raises:
         UserError: a file cannot be read or written.
     """
-    report = _report(views)
+    views, here = _report(results.views), _report(results.views_here)
+    strips = sorted((results.views / "strips").glob("*.png"))
+    icons = _icons(results)
+    held_out = [_held_out(strip, results.views, views) for strip in strips]
     sections = [
-        _numbers(report, _report(shapes)),
-        _training(run),
-        *(_held_out(strip, views, report) for strip in sorted((views / "strips").glob("*.png"))),
-        *_icons(icons, results),
+        _first(icons, held_out),
+        _numbers(views, _report(results.shapes), here),
+        Section("The shipped model", table=about_model(results.shipped)),
+        *_trained_here(results, strips if here else []),
+        *held_out,
+        *icons,
     ]
     demo_page(path, sections, text=text)
 
@@ -52,42 +94,100 @@ def _cell(value: float | None) -> str:
     return "absent" if value is None else f"{value:.3f}"
 
 
-def _numbers(views: dict, shapes: dict) -> Section:
-    """Metrics of the model beside those of the baselines, from two reports."""
-    candidates = {"this model": views["mean"], **views["baselines"]}
+def _first(icons: list[Section], held_out: list[Section]) -> Section:
+    """Some of the pictures, each with views from around what the shipped model makes of it."""
+    names = {section.title for section in held_out}
+    others = [section for section in icons if section.title.removeprefix(_ICON) not in names]
+    mixed = [section for pair in zip_longest(held_out, others) for section in pair if section]
+    rows = {section.title: _around(section) for section in mixed[:_FIRST]}
+    text = (
+        "One picture in, the first of each row; one pass of the shipped model on this machine; "
+        f"views from all around out, in steps of {360 * (_TURN // _SHOWN) // _TURN} degrees, the "
+        "first from the same side. The model was trained on none of these objects."
+    )
+    return Section("Objects that the model has never seen", text, views=rows)
+
+
+def _around(section: Section) -> np.ndarray:
+    """The input and some frames of the turntable, ``[1 + _SHOWN, S, S, 3]``."""
+    assert section.picture is not None and section.turntable is not None
+    frames = section.turntable[:: len(section.turntable) // _SHOWN][:_SHOWN] / 255.0
+    flat = section.picture[..., :3]
+    if section.picture.shape[-1] == 4:
+        flat = flat * section.picture[..., 3:] + 1 - section.picture[..., 3:]
+    side = frames.shape[1]
+    nearest = (np.arange(side) + 0.5) * len(flat) / side
+    index = nearest.astype(int)
+    return np.concatenate([flat[index][:, index][None], frames])
+
+
+def _numbers(views: dict, shapes: dict, here: dict) -> Section:
+    """Metrics of the models beside those of the baselines."""
+    models = {"the shipped model": views["mean"]}
+    if here:
+        models["the model trained here"] = here["mean"]
+    others = {_BASELINES.get(name, name): m for name, m in views["baselines"].items()}
     rows = [
-        [label, name, *(_cell(values.get(key)) for key in _METRICS)]
-        for label, values in candidates.items()
-        for name, values in (("novel", values), ("input", values["input"]))
+        [label, which, *(_cell(values.get(key)) for key in _METRICS)]
+        for which, candidates in (("new views", models | others), ("input view", models))
+        for label, mean in candidates.items()
+        for values in (mean if which == "new views" else mean["input"],)
     ]
     geometry = shapes.get("mean", {})
     keys = ("chamfer", "normal_consistency", "iou")
     found = [f"{key.replace('_', ' ')} {_cell(geometry[key])}" for key in keys if key in geometry]
-    text = f"Held-out objects: {views['num_ok']}. "
-    text += f"Geometry of this model: {', '.join(found)}." if found else "No geometry."
+    text = f"Means over {views['num_ok']} held-out objects; LPIPS is better the lower it is. "
+    text += f"Shape, by the shipped model: {', '.join(found)}." if found else "No geometry."
     return Section("Numbers", text, header=["", "views", *_METRICS.values()], table=rows)
 
 
-def _training(run: Path) -> Section:
-    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    curves = {
-        "training": [(e["step"], e["loss"]) for e in lines if e["event"] == "train" and e["loss"]],
-        "held out": [(e["step"], e["loss"]) for e in lines if e["event"] == "val" and e["loss"]],
-    }
-    steps = max((e["step"] for e in lines), default=0)
-    return Section("Training", f"{steps} steps.", curves=curves, curves_label="loss")
+def _trained_here(results: DemoResults, strips: list[Path]) -> list[Section]:
+    """The training that the demo ran, and the held-out objects by both models."""
+    log = results.run / "log.jsonl"
+    if not log.exists():
+        return [Section("Trained here", "This part is not done yet.")]
+    record = read_run_log(log)
+    text = (
+        "A model of the preset rays, trained by this demo from random weights on the training "
+        f"objects of the starter set, for {record.step:,} steps{_compared(results.shipped)}. Its "
+        "curves show that training works, its pictures what more of it is for."
+    )
+    sections = [Section("Trained here", text, fragment=draw_curves(record))]
+    for strip in strips:
+        other = results.views_here / "strips" / strip.name
+        if other.exists():
+            shipped, here = _tiles(strip), _tiles(other)
+            rows = {"Shipped": shipped[1], "Trained here": here[1], "Truth": shipped[2]}
+            sections.append(
+                Section(f"{_name(strip.stem)}: shipped, trained here, and true", views=rows)
+            )
+    return sections[:3]
+
+
+def _compared(shipped: Path) -> str:
+    try:
+        card = read_card(shipped)
+    except UserError:
+        card = None
+    return f"; the shipped one took {card.steps:,}" if card else ""
+
+
+def _tiles(strip: Path) -> np.ndarray:
+    """``[3, V, S, S, 3]``: input, prediction and truth of each view, which are a strip's rows."""
+    rgb = load_rgba(strip)[..., :3]
+    side = rgb.shape[1] // 3
+    return rgb.reshape(-1, side, 3, side, 3).transpose(2, 0, 1, 3, 4)
 
 
 def _held_out(strip: Path, views: Path, report: dict) -> Section:
-    """One object; each row of its strip is input | prediction | truth of a view."""
-    rgb = load_rgba(strip)[..., :3]
-    side = rgb.shape[1] // 3
-    tiles = rgb.reshape(-1, side, 3, side, 3).transpose(2, 0, 1, 3, 4)
-    gaussians = load_ply(views / "gaussians" / f"{strip.stem}.ply")
+    """One object with its predicted and its true views, by the shipped model."""
+    tiles = _tiles(strip)
+    gaussians = _visible(load_ply(views / "gaussians" / f"{strip.stem}.ply"))
     record = next(o for o in report["objects"] if o["name"] == strip.stem)
     return Section(
-        strip.stem,
-        f"Novel views: {record['psnr']:.1f} dB; input view: {record['input']['psnr']:.1f} dB.",
+        _name(strip.stem),
+        f"Shipped model. New views: {record['psnr']:.1f} dB; "
+        f"input view: {record['input']['psnr']:.1f} dB.",
         picture=tiles[0][0],
         gaussians=gaussians,
         turntable=_turntable(gaussians),
@@ -95,16 +195,17 @@ def _held_out(strip: Path, views: Path, report: dict) -> Section:
     )
 
 
-def _icons(icons: Path, results: Path) -> list[Section]:
+def _icons(results: DemoResults) -> list[Section]:
     sections = []
-    for icon in sorted(icons.glob("*.png")):
-        ply = results / f"{icon.stem}.ply"
+    for icon in sorted(results.icons.glob("*.png")):
+        ply = results.results / f"{icon.stem}.ply"
         if ply.exists():
-            gaussians = load_ply(ply)
+            gaussians = _visible(load_ply(ply))
             sections.append(
                 Section(
-                    f"Icon: {icon.stem}",
-                    picture=load_rgba(icon),
+                    f"{_ICON}{_name(icon.stem)}",
+                    "Shipped model; a picture by another renderer.",
+                    picture=prepare(icon),
                     turntable=_turntable(gaussians),
                     gaussians=gaussians,
                 )
@@ -112,5 +213,14 @@ def _icons(icons: Path, results: Path) -> list[Section]:
     return sections
 
 
+def _name(stem: str) -> str:
+    """The name of an object without that of its library."""
+    return _LIBRARY.sub("", stem)
+
+
+def _visible(gaussians: Gaussians) -> Gaussians:
+    return gaussians.select(gaussians.opacities >= _FAINT)
+
+
 def _turntable(gaussians: Gaussians) -> np.ndarray:
-    return turntable_frames(gaussians, size=192, frames=24)
+    return turntable_frames(gaussians, size=192, frames=_TURN)

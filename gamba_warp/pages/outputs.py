@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ..model.config import GambaConfig
 from ..surfaces.files import write_meshes
 from ..surfaces.options import SurfaceOptions
 from .page import Section, reconstruction_page
+from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
 
 
@@ -34,7 +36,9 @@ class Outputs:
         page: whether a self-contained HTML page is written, too.
         axes: axes of the ``.ply`` and of meshes.
         min_opacity: fainter Gaussians are left out of the files.
-        checkpoint: the model's file, named on the page.
+        checkpoint: the model's file, named in the ``.ply``.
+        about: labels and texts for the page, of the model.
+        sheet: gets a row of each picture, or None.
     """
 
     folder: Path
@@ -47,6 +51,8 @@ class Outputs:
     axes: Axes
     min_opacity: float
     checkpoint: Path
+    about: Sequence[tuple[str, str]] = ()
+    sheet: Sheet | None = None
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
@@ -82,6 +88,8 @@ def write_outputs(
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         options, device = SurfaceOptions(colors=True), gaussians.means.device
         write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
+    if outputs.sheet is not None:
+        outputs.sheet.add(name, rgba, gaussians, config)
     if outputs.turntable == "none" and not outputs.page:
         return
     distance, fov = config.distance, config.fov
@@ -93,8 +101,8 @@ def write_outputs(
     if outputs.page:
         table = [
             ("Gaussians", f"{gaussians.num:,}"),
-            ("Model", outputs.checkpoint.name),
             ("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}"),
+            *outputs.about,
         ]
         section = Section(
             name,

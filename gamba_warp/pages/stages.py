@@ -13,10 +13,10 @@ from pathlib import Path
 import msgspec
 
 from ..errors import UserError
-from ..files import write_json
+from ..files import sha256, write_json
 from ..untrusted.documents import read_document
 
-_MADE = ("run", "icons", "views", "truth", "geometry")  # folders of a demo
+_MADE = ("run", "icons", "views", "truth", "geometry", "views-here")  # folders of a demo
 
 
 class Stopped(Exception):
@@ -71,27 +71,39 @@ class Stages:
             raise UserError(f"cannot remove {error.filename}: {error.strerror}") from error
         self._record, self.seconds = _Record(), 0.0
 
-    def gamba(self, *arguments: object, makes: Sequence[Path] = (), may_fail: bool = False) -> None:
+    def gamba(
+        self,
+        *arguments: object,
+        makes: Sequence[Path] = (),
+        reads: Sequence[Path] = (),
+        may_fail: bool = False,
+        name: str | None = None,
+    ) -> None:
         """Runs one command as its own process, its output going through, if it is not done.
 
         It is done if it ended well with the same words before, all that it makes is there, and no
         stage before it has run anew.
 
         Args:
-            arguments: words of the command; the first names the stage.
+            arguments: words of the command.
             makes: files and folders that the command leaves.
+            reads: files that are not of the demo; with another content it is another demo.
             may_fail: whether the demo goes on after a failure.
+            name: of the stage; the command's, if not given.
 
         Raises:
-            UserError: it failed, or an earlier demo in the folder had other options.
+            UserError: it failed, or an earlier demo in the folder had other options or files.
             Stopped: a signal ended it.
         """
         words = [str(argument) for argument in arguments]
-        stage, kept = words[0], [word.encode(errors="replace").decode() for word in words]
+        stage = name or words[0]
+        kept = [word.encode(errors="replace").decode() for word in words]
+        kept += [f"{path.name} {sha256(path)[:16]}" for path in reads]
         if self._record.begun.get(stage, kept) != kept:
             where = self._path.parent
             raise UserError(
-                f"{where}: holds a demo of other options; give --fresh or another --out"
+                f"{where}: holds a demo of other options or of another model; "
+                "give --fresh or another --out"
             )
         print(f"\n$ gamba {' '.join(words)}", flush=True)
         done = stage in self._record.ended and all(path.exists() for path in makes)

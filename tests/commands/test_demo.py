@@ -7,6 +7,7 @@ import pytest
 
 from gamba_warp.cli import run
 from gamba_warp.commands.demo import STARTER
+from gamba_warp.model import checkpoint
 from gamba_warp.pages import stages
 
 OBJECTS = {"train": "scopia-dog", "val": "scopia-cat", "test": "scopia-toaster"}
@@ -22,7 +23,8 @@ def starter(tmp_path):
     (folder / "meshes").mkdir()
     shutil.copy(STARTER / "meshes" / "scopia-toaster.ply", folder / "meshes")
     (folder / "icons").mkdir()
-    shutil.copy(STARTER / "icons" / "scopia-toaster.png", folder / "icons")
+    for name in ("scopia-toaster", "katorlegaz-fire-hydrant"):
+        shutil.copy(STARTER / "icons" / f"{name}.png", folder / "icons")
     return folder
 
 
@@ -32,8 +34,24 @@ def test_demo(starter, tmp_path):
     options = ["--minutes", "0.05", "--no-lpips", "--starter", str(starter), "--out", str(out)]
     assert run("demo", options) == 0
     page = (out / "index.html").read_text()
-    for part in ("Numbers", "Training", "Predicted", "Truth", "Icon: scopia-toaster", "chamfer"):
-        assert part in page
+    for part in (
+        "Objects that the model has never seen",
+        "the shipped model",
+        "the model trained here",
+        "the input as a flat cut-out",
+        "Trained on",
+        "Trained here",
+        "toaster: shipped, trained here, and true",
+        "Predicted",
+        "Truth",
+        "Icon: fire-hydrant",
+        "chamfer",
+        "<polyline",
+    ):
+        assert part in page, part
+    # what was shipped comes before what was trained here, and the page says which is which
+    assert page.index("never seen</h2>") < page.index("Numbers") < page.index("Trained here</h2>")
+    assert "nothing of it was trained on this machine" in page
     assert json.loads((out / "geometry" / "report.json").read_text())["num_ok"] == 1
 
 
@@ -43,27 +61,43 @@ def test_without_starter_set(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_without_the_shipped_model(starter, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(checkpoint, "DEFAULT_CHECKPOINT", tmp_path / "none.safetensors")
+    assert run("demo", ["--starter", str(starter), "--out", str(tmp_path / "out")]) == 2
+    assert "none.safetensors: no such file" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 class Calls:
     """Stands in for the processes: notes the stages, and leaves what each would make."""
 
     def __init__(self, monkeypatch, out):
-        self.stages, self.out, self.codes = [], out, {}
+        self.stages, self.out, self.codes, self.pages = [], out, {}, []
         monkeypatch.setattr(stages, "_call", self)
-        monkeypatch.setattr("gamba_warp.pages.demo.write_demo", lambda *arguments: None)
+        monkeypatch.setattr(
+            "gamba_warp.pages.demo.write_demo",
+            lambda path, results, text: self.pages.append((len(self.stages), text)),
+        )
 
     def __call__(self, words):
-        self.stages.append(words[0])
-        code = self.codes.get(words[0], 0)
-        made = {"train": "run/model.safetensors", "reconstruct": "icons/a.ply"}
-        path = self.out / made.get(words[0], {"eval-views": "views"}.get(words[0], "geometry"))
-        path = path if path.suffix else path / "report.json"
+        stage = words[0] + (" here" if "--no-baselines" in words else "")
+        self.stages.append(stage)
+        code = self.codes.get(stage, 0)
+        folder = {
+            "train": "run",
+            "reconstruct": "icons",
+            "eval-views": "views",
+            "eval-views here": "views-here",
+            "eval-geometry": "geometry",
+        }[stage]
         if code == 0:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
+            (self.out / folder).mkdir(parents=True, exist_ok=True)
+            made = "model.safetensors" if stage == "train" else "report.json"
+            (self.out / folder / made).touch()
         return code
 
 
-ALL = ["train", "reconstruct", "eval-views", "eval-geometry"]
+ALL = ["reconstruct", "eval-views", "eval-geometry", "train", "eval-views here"]
 
 
 def test_an_interrupted_demo_goes_on(starter, tmp_path, monkeypatch, capsys):
@@ -71,16 +105,27 @@ def test_an_interrupted_demo_goes_on(starter, tmp_path, monkeypatch, capsys):
     options = ["--no-lpips", "--starter", str(starter), "--out", str(out)]
     calls = Calls(monkeypatch, out)
     calls.codes = {"eval-views": 143}
-    assert run("demo", options) == 143 and calls.stages == ALL[:3]
+    assert run("demo", options) == 143 and calls.stages == ALL[:2] and not calls.pages
     assert "the same command goes on" in capsys.readouterr().out
-    calls.codes, calls.stages = {"eval-views": 1}, []
-    assert run("demo", options) == 2 and calls.stages == ["eval-views"]
+    calls.codes, calls.stages = {"train": 1}, []
+    assert run("demo", options) == 2 and calls.stages == ALL[1:4]
     calls.codes, calls.stages = {}, []
-    assert run("demo", options) == 0 and calls.stages == ALL[2:]
+    assert run("demo", options) == 0 and calls.stages == ALL[3:]
     calls.stages = []
     assert run("demo", options) == 0 and calls.stages == []
     (out / "run" / "model.safetensors").unlink()  # what follows from it is made again, too
-    assert run("demo", options) == 0 and calls.stages == ALL
+    assert run("demo", options) == 0 and calls.stages == ALL[3:]
+
+
+def test_the_page_is_there_before_the_training(starter, tmp_path, monkeypatch):
+    out = tmp_path / "demo"
+    calls = Calls(monkeypatch, out)
+    assert run("demo", ["--no-lpips", "--starter", str(starter), "--out", str(out)]) == 0
+    (early, first), (late, second) = calls.pages
+    assert (early, late) == (3, 5)
+    assert "Training still runs" in first and "All of it took" in second
+    name = checkpoint.DEFAULT_CHECKPOINT.name
+    assert all(name in text and "for 2 minutes" in text for text in (first, second))
 
 
 def test_a_demo_of_other_options_is_refused_unless_fresh(starter, tmp_path, monkeypatch, capsys):
@@ -91,6 +136,18 @@ def test_a_demo_of_other_options_is_refused_unless_fresh(starter, tmp_path, monk
     (out / "mine.txt").write_text("not a demo's")
     calls.stages = []
     assert run("demo", [*options, "--minutes", "1"]) == 2 and calls.stages == []
-    assert "holds a demo of other options; give --fresh" in capsys.readouterr().err
+    assert "holds a demo of other options or of another model" in capsys.readouterr().err
     assert run("demo", [*options, "--minutes", "1", "--fresh"]) == 0 and calls.stages == ALL
     assert (out / "mine.txt").exists()
+
+
+def test_a_demo_of_another_shipped_model_is_refused(starter, tmp_path, monkeypatch, capsys):
+    out, model = tmp_path / "demo", tmp_path / "new.safetensors"
+    monkeypatch.setattr(checkpoint, "DEFAULT_CHECKPOINT", model)
+    options = ["--no-lpips", "--starter", str(starter), "--out", str(out)]
+    Calls(monkeypatch, out)
+    model.write_bytes(b"one")
+    assert run("demo", options) == 0
+    model.write_bytes(b"two")
+    assert run("demo", options) == 2
+    assert "of another model; give --fresh" in capsys.readouterr().err

@@ -183,6 +183,7 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     torch.testing.assert_close(gaussians.opacities, want.opacities, rtol=1e-5, atol=0)
     source = (out / "thing.html").read_text()
     assert "<h1>thing</h1>" in source and "model.safetensors" in source and ">64<" in source
+    assert "not known: this model has no card" in source
     assert "1 pictures, 0 failures" in capsys.readouterr().out
 
 
@@ -315,6 +316,13 @@ def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeyp
     refused(arguments, "tiny.safetensors", "--checkpoint FILE")(capsys)
     (tmp_path / "tiny.safetensors").write_bytes(checkpoint.read_bytes())
     assert run(*arguments) == 0
+
+
+def test_the_page_says_what_the_starter_model_was_trained_on(tmp_path, picture):
+    small = ["--turntable", "none", "--size", 32, "--frames", 2]
+    assert run(picture, "--out", tmp_path / "out", *small) == 0
+    source = (tmp_path / "out" / "thing.html").read_text()
+    assert "Trained on" in source and "furniture" in source and "Limits" in source
 
 
 def test_a_mask_cuts_a_busy_picture(tmp_path, checkpoint):

@@ -1,0 +1,135 @@
+r"""Puts figures into the card of the shipped model, and writes the tables of docs/model-card.md.
+
+After ``gamba eval-views`` and ``gamba eval-geometry`` of the model that ships:
+
+    python docs/model_card.py --views out/eval/report.json --geometry out/shapes/report.json \
+        --retrieval out/shapes-retrieval/report.json
+
+Without an option it only writes the tables again. Everything else in the card, ``NAME.json``
+beside the weights, is written by hand.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tyro
+
+from gamba_warp.errors import UserError
+from gamba_warp.files import write_json, write_text
+from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
+from gamba_warp.pages.card import METRICS, ModelCard, Row, card_path, read_card
+from gamba_warp.untrusted.documents import read_document
+
+PAGE = Path(__file__).with_name("model-card.md")
+MARK = "<!-- {name}: written by docs/model_card.py -->"
+TITLES = {"novel": "New views", "input": "The input view", "shape": "Shape"}
+
+
+def main(
+    views: Path | None = None, geometry: Path | None = None, retrieval: Path | None = None
+) -> None:
+    """Puts reports' figures into the card, and writes the tables.
+
+    Args:
+        views: report of eval-views.
+        geometry: report of eval-geometry of the model.
+        retrieval: report of eval-geometry of what the retrieval finds.
+    """
+    card = read_card(DEFAULT_CHECKPOINT)
+    if card is None:
+        raise UserError(f"{card_path(DEFAULT_CHECKPOINT)}: no such file")
+    rows = list(card.figures)
+    if views is not None:
+        rows = [row for row in rows if row.views == "shape"]
+        rows = [*map(_row, read_document(views, dict[str, Any])["table"]), *rows]
+    for name, path in (("model", geometry), ("retrieval", retrieval)):
+        if path is not None:
+            rows = [row for row in rows if (row.views, row.name) != ("shape", name)]
+            rows.append(_shape(name, read_document(path, dict[str, Any])))
+    card = msgspec.structs.replace(card, figures=rows)
+    write_json(card_path(DEFAULT_CHECKPOINT), msgspec.to_builtins(card))
+    write_text(PAGE, page_of(PAGE.read_text(encoding="utf-8"), card))
+
+
+def page_of(text: str, card: ModelCard) -> str:
+    """The page with the parts between its marks written from the card.
+
+    Args:
+        text: of the page.
+        card: of the model.
+
+    Raises:
+        ValueError: the page lacks a mark.
+    """
+    facts = [
+        f"- **Weights:** `starter/{DEFAULT_CHECKPOINT.name}`, "
+        f"{DEFAULT_CHECKPOINT.stat().st_size / 1e6:.1f} MB",
+        f"- **Data:** {card.data}",
+        f"- **Training:** {card.objects:,} objects, {card.steps:,} steps, seed {card.seed}",
+        f"- **Compute:** {card.compute}",
+        f"- **Meant for:** {card.use}",
+    ]
+    parts = {
+        "facts": "\n".join(facts),
+        "command": f"```bash\n{card.command}\n```",
+        "figures": "\n\n".join([card.measured, *_tables(card)]),
+        "limits": "\n".join(f"- {limit}" for limit in card.limits),
+    }
+    for name, content in parts.items():
+        begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
+        if begin not in text or end not in text:
+            raise ValueError(f"no mark {begin}")
+        head, _, rest = text.partition(begin)
+        text = f"{head}{begin}\n{content}\n{end}{rest.partition(end)[2]}"
+    return text
+
+
+def _tables(card: ModelCard) -> list[str]:
+    tables = []
+    for views, title in TITLES.items():
+        rows = [row for row in card.figures if row.views == views]
+        keys = [key for key in METRICS if any(getattr(row, key) for row in rows)]
+        if not rows:
+            continue
+        head = f"| {title}, {rows[0].objects:,} objects | "
+        lines = [head + " | ".join(METRICS[key][0] for key in keys) + " |"]
+        lines.append("| --- " * (1 + len(keys)) + "|")
+        for row in rows:
+            cells = [getattr(row, key) for key in keys]
+            texts = [cell.text(METRICS[key][1]) if cell else "–" for key, cell in zip(keys, cells)]
+            name = "**this model**" if row.name == "model" else row.name.replace("_", " ")
+            lines.append(f"| {name} | {' | '.join(texts)} |")
+        tables.append("\n".join(lines))
+    return tables
+
+
+def _row(found: dict[str, Any]) -> Row:
+    """A line of a report's table."""
+    figures = {
+        key: {"mean": found[key]["mean"], "interval": found[key]["interval"]}
+        for key in METRICS
+        if (found.get(key) or {}).get("mean") is not None
+    }
+    return msgspec.convert({**{k: found[k] for k in ("views", "name", "objects")}, **figures}, Row)
+
+
+def _shape(name: str, report: dict[str, Any]) -> Row:
+    figures = {
+        key: {"mean": report["mean"][key], "interval": report.get("interval", {}).get(key)}
+        for key in METRICS
+        if report["mean"].get(key) is not None
+    }
+    return msgspec.convert(
+        {"views": "shape", "name": name, "objects": report["num_ok"], **figures}, Row
+    )
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except UserError as error:
+        sys.exit(f"gamba: {error}")

@@ -1,0 +1,164 @@
+"""The card of a trained model: what it was trained on, and how well it does, in a few lines.
+
+It is the file ``NAME.json`` beside the weights ``NAME.safetensors``. A model without one is not
+worse for it; its pages say that nothing is known of its training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from ..errors import UserError
+from ..untrusted.documents import read_document
+
+_LIMIT = 1 << 20  # bytes; ours take a few kB
+_Text = Annotated[str, Meta(max_length=2000)]
+_Count = Annotated[int, Meta(ge=0, le=10**12)]
+_Name = Annotated[str, Meta(max_length=80)]
+# How each metric is called, and with how many digits it is shown.
+METRICS = {
+    "psnr": ("PSNR [dB]", 2),
+    "ssim": ("SSIM", 3),
+    "lpips": ("LPIPS", 3),
+    "mask_iou": ("mask IoU", 3),
+    "chamfer": ("Chamfer", 4),
+    "normal_consistency": ("normal consistency", 3),
+    "iou": ("Volume IoU", 3),
+}
+
+
+class Figure(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A mean over objects.
+
+    Attributes:
+        mean: of the objects' values.
+        interval: where it lies with 95 % certainty, or None.
+    """
+
+    mean: float
+    interval: tuple[float, float] | None = None
+
+    def text(self, digits: int) -> str:
+        """The mean, and in brackets the interval, with so many digits after the point."""
+        low_high = self.interval or ()
+        between = ", ".join(f"{value:.{digits}f}" for value in low_high)
+        return f"{self.mean:.{digits}f}" + (f" [{between}]" if between else "")
+
+
+class Row(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Figures of a model or of a baseline; a metric that was not measured is None.
+
+    Attributes:
+        views: views that were compared, or ``shape`` for the geometry.
+        name: ``model``, or the baseline's name.
+        objects: number of objects.
+    """
+
+    views: Literal["novel", "input", "shape"]
+    name: _Name
+    objects: _Count
+    psnr: Figure | None = None
+    ssim: Figure | None = None
+    lpips: Figure | None = None
+    mask_iou: Figure | None = None
+    chamfer: Figure | None = None
+    normal_consistency: Figure | None = None
+    iou: Figure | None = None
+
+
+class ModelCard(msgspec.Struct, frozen=True):
+    """What is known of a trained model.
+
+    Attributes:
+        data: what it was trained on, and its licences.
+        objects: number of training objects.
+        steps: number of optimizer steps.
+        compute: time and machine.
+        command: the training command.
+        seed: of the training.
+        use: what the model is meant for.
+        limits: what it does badly.
+        measured: commands that gave the figures, and on what.
+        figures: of the model and of the baselines.
+    """
+
+    data: _Text
+    objects: _Count
+    steps: _Count
+    compute: _Text
+    command: _Text
+    seed: _Count
+    use: _Text
+    limits: Annotated[list[_Text], Meta(max_length=20)]
+    measured: _Text = ""
+    figures: Annotated[list[Row], Meta(max_length=100)] = []
+
+
+def card_path(checkpoint: Path) -> Path:
+    """Where the card of a model file lies, whether there is one or not."""
+    return checkpoint.with_suffix(".json")
+
+
+def read_card(checkpoint: Path) -> ModelCard | None:
+    """Reads the card of a model file.
+
+    Args:
+        checkpoint: the ``.safetensors`` file.
+
+    Returns:
+        The card, or None where there is none.
+
+    Raises:
+        UserError: the file is there and is no card.
+    """
+    path = card_path(checkpoint)
+    return read_document(path, ModelCard, _LIMIT) if path.exists() else None
+
+
+def about_model(checkpoint: Path) -> list[tuple[str, str]]:
+    """What a page says of a model: labels and texts. A card that cannot be read is no error.
+
+    Args:
+        checkpoint: the ``.safetensors`` file.
+    """
+    rows = [("Model", checkpoint.name)]
+    try:
+        card = read_card(checkpoint)
+    except UserError:
+        return [*rows, ("Trained on", f"not known: {card_path(checkpoint).name} is no model card")]
+    if card is None:
+        return [*rows, ("Trained on", "not known: this model has no card")]
+    rows.append(("Trained on", card.data))
+    rows.append(("Training", f"{card.objects:,} objects, {card.steps:,} steps; {card.compute}"))
+    rows += [(f"Measured, {what}", text) for what, text in _in_short(card)]
+    return [*rows, ("Meant for", card.use), ("Limits", " ".join(card.limits))]
+
+
+def _in_short(card: ModelCard) -> Iterator[tuple[str, str]]:
+    """The model's own figures, each beside the best baseline's."""
+    names = {"novel": "new views", "input": "input view", "shape": "shape"}
+    for own in card.figures:
+        if own.name != "model":
+            continue
+        others = [row for row in card.figures if row.views == own.views and row is not own]
+        if own.views == "input":
+            others = []  # to copy the input is no feat
+        found = []
+        for key, (name, digits) in METRICS.items():
+            value = getattr(own, key)
+            if value is None:
+                continue
+            pick = min if key in ("lpips", "chamfer") else max
+            known = [(figure.mean, row.name) for row in others if (figure := getattr(row, key))]
+            best = pick(known, default=None)
+            name, bracket, unit = name.partition(" [")
+            unit = f" {unit[:-1]}" if bracket else ""
+            beside = f" ({best[1]} {best[0]:.{digits}f})" if best else ""
+            found.append(f"{name} {value.mean:.{digits}f}{unit}{beside}")
+        note = "; in brackets the best baseline" if others else ""
+        yield names[own.views], f"{', '.join(found)}{note}. {own.objects:,} objects."

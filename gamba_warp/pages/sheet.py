@@ -1,0 +1,78 @@
+"""A sheet: many pictures and what was made of them, in one picture file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from ..conventions import over_background
+from ..data.preprocess import resize_rgba
+from ..errors import UserError
+from ..files import atomic_path
+from ..gaussians import Gaussians
+from ..images import to_uint8
+from ..model.config import GambaConfig
+from .turntable import turntable_frames
+
+SUFFIXES = (".png", ".webp", ".jpg", ".jpeg")
+VIEWS = 5
+_TILE = 128  # pixels
+_LABEL, _GAP = 18, 12  # height of a name; between two columns of rows
+_TALL = 12  # rows in one column; with more there are two
+
+
+class Sheet:
+    """Collects reconstructions: of each its name, the input, and views of a turntable."""
+
+    def __init__(self, path: Path) -> None:
+        """Begins a sheet.
+
+        Args:
+            path: the file that ``write`` makes.
+
+        Raises:
+            UserError: its suffix is not one of ``SUFFIXES``.
+        """
+        if path.suffix.lower() not in SUFFIXES:
+            raise UserError(f"--sheet {path}: a sheet is one of {', '.join(SUFFIXES)}")
+        self.path = path
+        self._rows: list[tuple[str, np.ndarray]] = []
+
+    def add(self, name: str, rgba: np.ndarray, gaussians: Gaussians, config: GambaConfig) -> None:
+        """Adds a row.
+
+        Args:
+            name: stands above the row.
+            rgba: ``[S, S, 4]`` in [0, 1], what was reconstructed.
+            gaussians: ``[N]``, on the device that renders.
+            config: of the model, for the camera.
+        """
+        flat = over_background(resize_rgba(rgba, _TILE, _TILE), 1.0)
+        camera = {"distance": config.distance, "fov": config.fov}
+        turn = turntable_frames(gaussians, size=_TILE, frames=VIEWS, **camera)
+        self._rows.append((name, np.concatenate([to_uint8(flat), *turn], axis=1)))
+
+    def write(self) -> None:
+        """Writes the file, atomically; nothing if there is no row.
+
+        Raises:
+            UserError: it cannot be written.
+        """
+        if not self._rows:
+            return
+        columns = 1 if len(self._rows) <= _TALL else 2
+        tall = -(-len(self._rows) // columns)
+        wide, high = (1 + VIEWS) * _TILE, _LABEL + _TILE
+        sheet = Image.new("RGB", (columns * (wide + _GAP) - _GAP, tall * high), "white")
+        draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
+        for number, (name, row) in enumerate(self._rows):
+            column, line = divmod(number, tall)
+            x, y = column * (wide + _GAP), line * high
+            text = name.encode(errors="replace").decode()
+            draw.text((x + 4, y + 3), text, "#444444", font)
+            sheet.paste(Image.fromarray(row), (x, y + _LABEL))
+            draw.line((x + _TILE, y + _LABEL, x + _TILE, y + high - 1), "#cccccc")
+        with atomic_path(self.path) as temporary:
+            sheet.save(temporary, quality=88)  # PNG has no use for it

@@ -1,0 +1,143 @@
+"""Odd pictures through ``gamba reconstruct``, by both decoders: a sensible result, or one line."""
+
+import numpy as np
+import pytest
+import torch
+
+from gamba_warp import cli
+from gamba_warp.formats.ply import load_ply
+from gamba_warp.images import save_image
+from gamba_warp.model.checkpoint import save_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.posing import reference_cameras
+from gamba_warp.render import render
+
+SIDE = 40
+SMALL = dict(image_size=32, width=16, depth=1, state_size=4, encoder="none", encoder_size=16)
+MODELS = {
+    "bins": GambaConfig(patch_size=8, **SMALL),
+    "rays": GambaConfig(
+        patch_size=8, decoder="rays", ray_cells=8, ray_layers=2, ray_features=8, **SMALL
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("models")
+    for name, config in MODELS.items():
+        save_model(folder / f"{name}.safetensors", Gamba(config))
+    return folder
+
+
+def pictures():
+    """Alpha of each picture that has a result; the colour runs from side to side."""
+    y, x = np.mgrid[:SIDE, :SIDE] / (SIDE - 1)
+    disc = (x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.16
+    corner = np.ones((SIDE, SIDE))
+    corner[0, 0] = 0
+    return {
+        "fills": corner,
+        "side": (x - 0.9) ** 2 + (y - 0.5) ** 2 < 0.1,
+        "line": np.abs(x - 0.5) < 0.02,
+        "soft": np.clip(1 - 2 * np.hypot(x - 0.5, y - 0.5), 0, 1),
+        "white": disc,
+    }
+
+
+def save(folder, name, alpha):
+    ramp = np.linspace(0, 1, SIDE)
+    rgb = np.ones((SIDE, SIDE, 3)) if name == "white" else np.dstack([np.tile(ramp, (SIDE, 1))] * 3)
+    path = folder / f"{name}.png"
+    save_image(path, np.dstack([rgb, np.asarray(alpha, float)]))
+    return path
+
+
+def reconstruct(*words):
+    return cli.run("reconstruct", [str(word) for word in (*words, "--turntable", "none")])
+
+
+@pytest.mark.parametrize("decoder", MODELS)
+def test_odd_objects_are_reconstructed(tmp_path, checkpoints, decoder):
+    paths = [save(tmp_path, name, alpha) for name, alpha in pictures().items()]
+    out = tmp_path / "out"
+    model = checkpoints / f"{decoder}.safetensors"
+    assert reconstruct(*paths, "--checkpoint", model, "--out", out, "--no-page") == 0
+    for path in paths:
+        gaussians = load_ply(out / f"{path.stem}.ply")
+        assert gaussians.num > 0
+        for values in (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.colors):
+            assert values.isfinite().all(), path.stem
+
+
+def test_a_white_object_on_white_is_seen_by_its_alpha(tmp_path, checkpoints):
+    """Fresh weights of the decoder rays show what the picture shows, on any background."""
+    paths = [save(tmp_path, name, pictures()[name]) for name in ("white", "side")]
+    model = checkpoints / "rays.safetensors"
+    assert reconstruct(*paths, "--checkpoint", model, "--out", tmp_path, "--no-page") == 0
+    camera = reference_cameras(MODELS["rays"], 1)
+    for path in paths:
+        seen = render(load_ply(tmp_path / f"{path.stem}.ply"), camera, background=torch.zeros(3))
+        inside = seen.alpha[0, ..., 0] > 0.5
+        box = inside.nonzero()
+        # the longer side of the object is 0.8 of the picture, as for every other object
+        longest = (box.max(0).values - box.min(0).values + 1).max().item()
+        assert abs(longest - 0.8 * 32) <= 2
+        if path.stem == "white":  # and no black comes through from behind
+            assert (seen.rgb[0] / seen.alpha[0])[inside].min() > 0.9
+
+
+REFUSED = {
+    "empty": (np.zeros((SIDE, SIDE)), "no object found; pixels that are not background: 0,"),
+    "one": (
+        np.eye(SIDE)[:, :1] @ np.eye(SIDE)[:1],
+        "pixels that are not background: 1, needed: 16",
+    ),
+    "opaque": (np.ones((SIDE, SIDE)), "cannot tell object from background"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_picture_without_an_object_is_one_line(tmp_path, checkpoints, capsys, name):
+    alpha, reason = REFUSED[name]
+    path = save(tmp_path, name, alpha)
+    out = tmp_path / "out"
+    assert reconstruct(path, "--checkpoint", checkpoints / "rays.safetensors", "--out", out) == 1
+    (line,) = [s for s in capsys.readouterr().err.splitlines() if s.startswith("gamba: ")]
+    assert line.startswith(f"gamba: failed: {path}: ") and reason in line
+    assert not any(out.iterdir())
+
+
+def test_one_pixel_files_are_one_line(tmp_path, checkpoints, capsys):
+    for name, picture in {"clear": np.zeros((1, 1, 4)), "plain": np.ones((1, 1, 3))}.items():
+        save_image(tmp_path / f"{name}.png", picture)
+        words = [tmp_path / f"{name}.png", "--checkpoint", checkpoints / "bins.safetensors"]
+        assert reconstruct(*words, "--out", tmp_path / "out") == 1
+        assert "no object found; pixels that are not background: 0," in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("decoder", MODELS)
+@torch.inference_mode()
+def test_a_batch_may_hold_an_empty_object(decoder):
+    torch.manual_seed(0)
+    config = MODELS[decoder]
+    model = Gamba(config).eval()
+    channels = config.input_channels
+    full = torch.rand(1, 32, 32, channels)
+    empty = torch.ones(1, 32, 32, channels)
+    if channels == 4:
+        full[..., 3], empty[..., 3] = 1.0, 0.0
+    both = model(torch.cat([full, empty]), reference_cameras(config, 2))
+    alone = model(full, reference_cameras(config, 1))
+    # sums of another batch size may round otherwise
+    torch.testing.assert_close(both.means[:1], alone.means, rtol=0, atol=1e-5)
+    torch.testing.assert_close(both.opacities[:1], alone.opacities, rtol=0, atol=1e-5)
+    nothing = model(empty, reference_cameras(config, 1))
+    for gaussians in (both, nothing):
+        assert gaussians.means.isfinite().all() and gaussians.colors.isfinite().all()
+        picture = render(gaussians, reference_cameras(config, len(gaussians.means))[:, None])
+        assert picture.rgb.isfinite().all()
+    if decoder == "rays":
+        assert nothing.means.shape == (1, 0, 3) and both.opacities[1].max() == 0

@@ -1,0 +1,97 @@
+"""``gamba reconstruct --sheet``: every result in one picture."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.gaussians import some
+from PIL import Image
+
+from gamba_warp import cli
+from gamba_warp.errors import UserError
+from gamba_warp.images import load_rgba, save_image
+from gamba_warp.model.checkpoint import save_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.pages.sheet import VIEWS, Sheet
+from gamba_warp.pages.turntable import turntable_frames
+
+CONFIG = GambaConfig(
+    image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
+)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("model") / "model.safetensors"
+    save_model(path, Gamba(CONFIG))
+    return path
+
+
+def cut_out(path, colour=(0.8, 0.3, 0.1)):
+    rgba = np.zeros((20, 30, 4))
+    rgba[4:16, 8:24] = (*colour, 1)
+    save_image(path, rgba)
+    return path
+
+
+def run(*arguments):
+    return cli.run("reconstruct", [str(a) for a in arguments])
+
+
+def quick(checkpoint, out):
+    return ["--checkpoint", checkpoint, "--out", out, "--turntable", "none", "--no-page"]
+
+
+def test_a_row_is_the_input_and_views_around(tmp_path):
+    sheet, gaussians = Sheet(tmp_path / "s.png"), some(40)
+    rgba = np.zeros((64, 64, 4), np.float32)
+    rgba[16:48, 16:48] = (1, 0, 0, 1)
+    sheet.add("first", rgba, gaussians, CONFIG)
+    sheet.write()
+    picture = load_rgba(tmp_path / "s.png")[..., :3]
+    assert picture.shape == (18 + 128, 6 * 128, 3)
+    tiles = picture[18:].reshape(128, 1 + VIEWS, 128, 3).transpose(1, 0, 2, 3)
+    assert np.abs(tiles[0][64, 64] - (1, 0, 0)).max() < 0.01 and tiles[0][4, 4].min() == 1
+    camera = {"distance": CONFIG.distance, "fov": CONFIG.fov}
+    want = turntable_frames(gaussians, size=128, frames=VIEWS, **camera) / 255
+    np.testing.assert_array_equal(tiles[1][:, 1:], want[0].astype(np.float32)[:, 1:])  # and a line
+    np.testing.assert_array_equal(tiles[2:], want[1:].astype(np.float32))
+    assert picture[:18, 128:].min() == 1 and picture[:18, :128].min() < 0.6  # the name
+
+
+@pytest.mark.parametrize(("count", "size"), [(12, (768, 12 * 146)), (13, (2 * 768 + 12, 7 * 146))])
+def test_many_rows_stand_in_two_columns(tmp_path, count, size):
+    sheet = Sheet(tmp_path / "s.webp")
+    for number in range(count):
+        sheet._rows.append((f"n{number}\udcff", np.zeros((128, 768, 3), np.uint8)))
+    sheet.write()
+    with Image.open(tmp_path / "s.webp") as picture:
+        assert picture.size == size and picture.format == "WEBP"
+
+
+def test_the_command_writes_a_sheet_of_what_went_well(tmp_path, checkpoint, capsys):
+    paths = [cut_out(tmp_path / name) for name in ("a.png", "b.png")]
+    save_image(tmp_path / "empty.png", np.zeros((9, 9, 4)))
+    sheet = tmp_path / "new" / "sheet.png"
+    options = [*quick(checkpoint, tmp_path / "out"), "--sheet", sheet]
+    assert run(*paths, tmp_path / "empty.png", *options) == 1
+    assert load_rgba(sheet).shape[:2] == (2 * 146, 768)
+    assert (tmp_path / "out" / "b.ply").exists()
+    sheet.unlink()
+    assert run(tmp_path / "empty.png", *options) == 1 and not sheet.exists()
+
+
+def test_a_sheet_that_cannot_be_is_one_line(tmp_path, checkpoint, capsys):
+    path = cut_out(tmp_path / "a.png")
+    for sheet, reason in {
+        tmp_path / "sheet.txt": "a sheet is one of .png, .webp, .jpg",
+        path: "would be overwritten by an output",
+    }.items():
+        assert run(path, *quick(checkpoint, tmp_path / "out"), "--sheet", sheet) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1 and str(sheet) in lines[0] and reason in lines[0]
+    with pytest.raises(UserError, match="cannot write /dev/null/s.png"):
+        empty = Sheet(tmp_path.__class__("/dev/null/s.png"))
+        empty._rows.append(("a", np.zeros((128, 768, 3), np.uint8)))
+        empty.write()
