@@ -178,7 +178,7 @@ def test_positions_start_spread_inside_the_object():
 
 
 # Without a frozen encoder. The paper's own figure is "about 10 %" of 500 M parameters of an LRM.
-PARAMETERS = {"tiny": 1_403_334, "rays": 1_835_410, "small": 9_827_142, "paper": 44_614_726}
+PARAMETERS = {"tiny": 1_403_334, "rays": 3_305_514, "small": 9_827_142, "paper": 44_614_726}
 LENGTHS = {"tiny": (4096, 0), "rays": (49152, 0), "small": (9216, 144), "paper": (16384, 576)}
 
 
