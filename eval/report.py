@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gamba_warp.errors import UserError
+from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import write_json, write_text
 
 from .averages import LEVEL, RESAMPLES, intervals_of, mean_of, median_of
@@ -68,9 +68,7 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
 
 def failure(name: str, error: Exception | str) -> dict[str, str]:
     """The record of an object that could not be evaluated; its reason is one line."""
-    lines = str(error).strip().splitlines()
-    reason = lines[0] if lines else type(error).__name__
-    return {"name": name, "status": FAILED, "reason": reason}
+    return {"name": name, "status": FAILED, "reason": first_line(error)}
 
 
 def make_report(
@@ -92,9 +90,25 @@ def make_report(
         more: further top-level entries.
 
     Returns:
-        ``protocol, versions, objects`` (by name), ``mean, interval`` (of the mean, over objects),
-        ``median, bootstrap`` (how the intervals are made), ``num_ok, num_failed, failures`` and
-        ``more``.
+        ``protocol, versions, bootstrap`` (how the intervals are made), what ``over_objects``
+        returns, and ``more``.
+    """
+    report = {
+        "protocol": protocol,
+        "versions": used,
+        **over_objects(objects, left_out),
+        "bootstrap": {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"},
+        **more,
+    }
+    return finite_or_none(report)
+
+
+def over_objects(objects: list[dict[str, Any]], left_out: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The part of a report that the records decide; arguments as for ``make_report``.
+
+    Returns:
+        ``objects`` (by name), ``mean, interval`` (of the mean, over objects), ``median, num_ok,
+        num_failed`` and ``failures``.
     """
     objects = sorted(map(_checked, objects), key=lambda record: record["name"])
     done = [record for record in objects if record["status"] == OK]
@@ -104,20 +118,15 @@ def make_report(
         for record in objects
         if record["status"] == FAILED
     ]
-    report = {
-        "protocol": protocol,
-        "versions": used,
+    return {
         "objects": objects,
         "mean": mean_of(numbers),
         "interval": intervals_of(numbers),
         "median": median_of(numbers),
-        "bootstrap": {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"},
         "num_ok": len(done),
         "num_failed": len(failures),
         "failures": failures,
-        **more,
     }
-    return finite_or_none(report)
 
 
 def json_of(report: dict[str, Any]) -> str:

@@ -16,8 +16,8 @@ class UserError(Exception):
         super().__init__(one_line(str(message)))
 
 
-def first_line(error: BaseException) -> str:
-    """What an error says first; its type where it says nothing."""
+def first_line(error: BaseException | str) -> str:
+    """What an error, or a text, says first; the type where it says nothing."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 

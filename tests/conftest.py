@@ -72,6 +72,15 @@ def fuzz(request):
     return request.config.stash[FUZZ]
 
 
+@pytest.fixture
+def one_thread():
+    """Pictures of a few pixels take longer on several threads than on one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)

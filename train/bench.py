@@ -363,10 +363,9 @@ class _Covered:
 
 def _rays_model(settings: Settings) -> Gamba:
     torch.manual_seed(0)
-    path = DEFAULT_CHECKPOINT.with_name("rays.safetensors")
-    if settings.level == "quick" or not path.exists():
+    if settings.level == "quick" or not DEFAULT_CHECKPOINT.exists():
         return Gamba(_config("rays", settings)).to(settings.device)
-    return load_model(path, settings.device).train().requires_grad_()
+    return load_model(DEFAULT_CHECKPOINT, settings.device).train().requires_grad_()
 
 
 def _background(settings: Settings) -> list[Variant]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -64,16 +63,9 @@ def forward(
         precision: dtype of the products in the network and in LPIPS; all else is float32.
         lpips_crop: as for ``view_losses``.
     """
-    lower = partial(
-        torch.autocast, batch.inputs.device.type, precision, enabled=precision != torch.float32
-    )
-
-    def distance(got: Tensor, want: Tensor) -> Tensor:
-        assert lpips is not None  # it is called only then
-        with lower():
-            return lpips(got, want)
-
-    with lower():
+    kind = batch.inputs.device.type
+    lower = torch.autocast(kind, precision, enabled=precision != torch.float32)
+    with lower:
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
@@ -83,7 +75,7 @@ def forward(
         rendering.alpha,
         target,
         target_alpha,
-        distance if lpips is not None and weights.get("lpips") else None,
+        lower(lpips) if lpips is not None and weights.get("lpips") else None,
         lpips_crop,
         bool(weights.get("ssim")),
     )

@@ -26,7 +26,16 @@ from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.versions import __version__, installed
 
 from ..paired import PREDICTED, differences_of, page
-from ..report import OK, check_finite, failure, make_report, save_report, stdout_to_stderr
+from ..report import (
+    OK,
+    check_finite,
+    failure,
+    finite_or_none,
+    make_report,
+    over_objects,
+    save_report,
+    stdout_to_stderr,
+)
 from .options import ShapesOptions
 from .protocol import GeometryProtocol
 
@@ -341,10 +350,8 @@ def report_of(
         differences={},
     )
     for name, records in baselines.items():
-        other = make_report({}, records, {}, left_out=_NO_MEAN, flags=flag_counts(records))
-        for key in ("protocol", "versions", "bootstrap"):
-            other.pop(key)
-        report["baselines"][name] = other
+        other = over_objects(records, _NO_MEAN) | {"flags": flag_counts(records)}
+        report["baselines"][name] = finite_or_none(other)
         report["differences"][name] = differences_of(report["objects"], other["objects"])
     return report
 

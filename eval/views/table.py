@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..averages import LEVEL, bootstrap, summary_of
+from ..averages import LEVEL, bootstrap, minus, summary_of
 from ..tables import cell, markdown
 from .compare import METRICS, NEARLY_EMPTY
 
@@ -48,6 +48,8 @@ def _difference(kind: str, name: str, pairs: list[tuple[Record, Record]]) -> dic
         return None
     errors = np.array([[a["mse"] for a, _ in pairs], [b["mse"] for _, b in pairs]])
 
+    gains = [minus(a, b) for a, b in pairs]
+
     def gain(drawn: np.ndarray) -> np.ndarray:
         return _decibels(drawn[0]) - _decibels(drawn[1])
 
@@ -55,13 +57,9 @@ def _difference(kind: str, name: str, pairs: list[tuple[Record, Record]]) -> dic
         "views": kind,
         "name": name,
         "objects": len(pairs),
-        **{key: summary_of([_minus(a[key], b[key]) for a, b in pairs]) for key in METRICS},
+        **{key: summary_of([g[key] for g in gains]) for key in METRICS},
         MEAN_ERROR: {"value": float(gain(errors)), "interval": bootstrap(errors, gain)},
     }
-
-
-def _minus(a: float | None, b: float | None) -> float | None:
-    return None if a is None or b is None else a - b
 
 
 def table_of(candidates: dict[str, Records]) -> list[dict[str, Any]]:

@@ -20,12 +20,10 @@ _LIMIT = 1 << 20  # bytes; ours take a few kB
 _Text = Annotated[str, Meta(max_length=2000)]
 _Count = Annotated[int, Meta(ge=0, le=10**12)]
 _Name = Annotated[str, Meta(max_length=80)]
+OF_PICTURES = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "mask IoU"}
 # How each metric is called, and with how many digits it is shown.
 METRICS = {
-    "psnr": ("PSNR [dB]", 2),
-    "ssim": ("SSIM", 3),
-    "lpips": ("LPIPS", 3),
-    "mask_iou": ("mask IoU", 3),
+    **{key: (name, 2 if key == "psnr" else 3) for key, name in OF_PICTURES.items()},
     "chamfer": ("Chamfer", 4),
     "normal_consistency": ("normal consistency", 3),
     "iou": ("Volume IoU", 3),

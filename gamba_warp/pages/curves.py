@@ -6,12 +6,11 @@ import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from .page import ticks
-from .run_log import RunRecord, Series, read_run_log
+from .run_log import RunRecord, Series
 
 # Points of a curve: with more than the least they are averaged, eight or more at a time.
 _LEAST, _MOST, _EACH = 60, 100, 8
@@ -68,25 +67,17 @@ _CHARTS = (
 )
 
 
-def curves(log: Path) -> str:
+def draw_curves(record: RunRecord) -> str:
     """Draws a run's curves: losses, PSNR, SSIM, LPIPS, mask IoU, learning rate, speed.
 
     Each chart has the steps and the hours below it, and the values of a place in its tooltips.
 
     Args:
-        log: the run's ``log.jsonl``; lines in it that cannot be read are passed over.
+        record: the run's log.
 
     Returns:
         HTML for a page of ``page``, whose style sheet it needs; one sentence if the log is empty.
-
-    Raises:
-        UserError: there is no such file, or it cannot be read.
     """
-    return draw_curves(read_run_log(log))
-
-
-def draw_curves(record: RunRecord) -> str:
-    """Draws a log's curves; as for ``curves``."""
     terms = [n for n in record.series if n.startswith("train.loss_")]
     charts = list(_CHARTS)
     if len(terms) > 1:

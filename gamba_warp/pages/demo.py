@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
+from ..conventions import over_background
 from ..data.preprocess import prepare
 from ..errors import UserError
 from ..formats.ply import load_ply
 from ..gaussians import Gaussians
 from ..images import load_rgba
-from .card import about_model, read_card
+from .card import OF_PICTURES, about_model, read_card
 from .curves import draw_curves
 from .page import Section, demo_page
 from .run_log import read_run_log
 from .turntable import turntable_frames
 
-_METRICS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "Mask IoU"}
 _BASELINES = {
     "background": "an empty picture",
     "input_copy": "a copy of the input",
@@ -112,9 +112,9 @@ def _around(section: Section) -> np.ndarray:
     """The input and some frames of the turntable, ``[1 + _SHOWN, S, S, 3]``."""
     assert section.picture is not None and section.turntable is not None
     frames = section.turntable[:: len(section.turntable) // _SHOWN][:_SHOWN] / 255.0
-    flat = section.picture[..., :3]
-    if section.picture.shape[-1] == 4:
-        flat = flat * section.picture[..., 3:] + 1 - section.picture[..., 3:]
+    flat = section.picture
+    if flat.shape[-1] == 4:
+        flat = over_background(flat, 1.0)
     side = frames.shape[1]
     nearest = (np.arange(side) + 0.5) * len(flat) / side
     index = nearest.astype(int)
@@ -128,7 +128,7 @@ def _numbers(views: dict, shapes: dict, here: dict) -> Section:
         models["the model trained here"] = here["mean"]
     others = {_BASELINES.get(name, name): m for name, m in views["baselines"].items()}
     rows = [
-        [label, which, *(_cell(values.get(key)) for key in _METRICS)]
+        [label, which, *(_cell(values.get(key)) for key in OF_PICTURES)]
         for which, candidates in (("new views", models | others), ("input view", models))
         for label, mean in candidates.items()
         for values in (mean if which == "new views" else mean["input"],)
@@ -138,7 +138,7 @@ def _numbers(views: dict, shapes: dict, here: dict) -> Section:
     found = [f"{key.replace('_', ' ')} {_cell(geometry[key])}" for key in keys if key in geometry]
     text = f"Means over {views['num_ok']} held-out objects; LPIPS is better the lower it is. "
     text += f"Shape, by the shipped model: {', '.join(found)}." if found else "No geometry."
-    return Section("Numbers", text, header=["", "views", *_METRICS.values()], table=rows)
+    return Section("Numbers", text, header=["", "views", *OF_PICTURES.values()], table=rows)
 
 
 def _trained_here(results: DemoResults, strips: list[Path]) -> list[Section]:

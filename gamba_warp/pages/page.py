@@ -45,7 +45,7 @@ class Section:
         header: names of the table's columns.
         curves: ``(x, y)`` points by label, drawn as one chart.
         curves_label: label of the chart's vertical axis.
-        fragment: HTML that is set as it is, such as that of ``curves.curves``.
+        fragment: HTML that is set as it is, such as that of ``curves.draw_curves``.
         distance: distance of the viewer's camera from the origin, object units.
         fov: vertical field of view of the viewer's camera, degrees.
     """
@@ -143,14 +143,15 @@ def _figure(content: str, caption: str) -> str:
     return f"<figure>{content}<figcaption>{caption}</figcaption></figure>"
 
 
-def _data(content: bytes, kind: str) -> str:
+def data_uri(content: bytes, kind: str) -> str:
+    """The content as an address that a page can hold, of a type such as ``image/png``."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _image(picture: np.ndarray, css: str, label: str) -> str:
     content = io.BytesIO()
     Image.fromarray(to_uint8(picture)).save(content, "PNG", optimize=True)
-    source = _data(content.getvalue(), "image/png")
+    source = data_uri(content.getvalue(), "image/png")
     return f'<img class="{css}" alt="{html.escape(label)}" src="{source}">'
 
 
@@ -162,7 +163,7 @@ def _animation(frames: np.ndarray) -> str:
     first.save(
         content, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, quality=90
     )
-    return f'<img alt="turntable" src="{_data(content.getvalue(), "image/webp")}">'
+    return f'<img alt="turntable" src="{data_uri(content.getvalue(), "image/webp")}">'
 
 
 def _viewer(section: Section, gaussians: Gaussians, name: str, auto: bool, poster: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import io
 import json
@@ -15,13 +14,13 @@ from PIL import Image
 
 from ..errors import UserError
 from ..images import load_rgba, to_uint8
+from .card import OF_PICTURES
 from .curves import draw_curves
-from .page import Section, demo_page
+from .page import Section, data_uri, demo_page
 from .run_log import RunRecord, read_run_log
 
 PAGE = "index.html"
 _WARNINGS = 20  # the last ones, on the page
-_MEASURES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "mask IoU"}
 
 
 def write_run_page(run: Path, path: Path | None = None) -> Path:
@@ -117,7 +116,7 @@ def _validation(record: RunRecord) -> list[Section]:
     """The last validation as a table."""
     rows = []
     for view in ("input", "novel"):
-        found = [record.series.get(f"val.{measure}_{view}") for measure in _MEASURES]
+        found = [record.series.get(f"val.{measure}_{view}") for measure in OF_PICTURES]
         if any(found):
             cells = [f"{series.values[-1]:.4g}" if series else "absent" for series in found]
             rows.append([f"{view} view" + ("s" if view == "novel" else ""), *cells])
@@ -125,7 +124,7 @@ def _validation(record: RunRecord) -> list[Section]:
         return []
     step = int(max(s.steps[-1] for n, s in record.series.items() if n.startswith("val.")))
     text = f"Means over the held-out objects at step {step:,}."
-    return [Section("Last validation", text, header=["", *_MEASURES.values()], table=rows)]
+    return [Section("Last validation", text, header=["", *OF_PICTURES.values()], table=rows)]
 
 
 def _samples(run: Path) -> list[Section]:
@@ -150,8 +149,8 @@ def _webp(picture: np.ndarray) -> str:
     # A quarter of a PNG's size, and no difference that one sees.
     content = io.BytesIO()
     Image.fromarray(to_uint8(picture)).save(content, "WEBP", quality=85)
-    source = base64.b64encode(content.getvalue()).decode()
-    return f'<img class="strip" alt="sample pictures" src="data:image/webp;base64,{source}">'
+    source = data_uri(content.getvalue(), "image/webp")
+    return f'<img class="strip" alt="sample pictures" src="{source}">'
 
 
 def _warnings(record: RunRecord) -> list[Section]:

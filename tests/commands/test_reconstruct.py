@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.gaussians import some
-from helpers.images import bad_files
+from helpers.images import bad_files, cut_out
+from helpers.model import quick, run_reconstruct
 from PIL import Image
 
-from gamba_warp import cli
 from gamba_warp.batch import plan_outputs
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
 from gamba_warp.data.preprocess import composite, prepare
@@ -41,23 +41,7 @@ def checkpoint(tmp_path_factory):
 
 @pytest.fixture
 def picture(tmp_path):
-    return draw(tmp_path / "thing.png")
-
-
-def draw(path, colour=(0.8, 0.3, 0.1)):
-    """A cut-out square."""
-    rgba = np.zeros((20, 30, 4))
-    rgba[4:16, 8:24] = (*colour, 1)
-    save_image(path, rgba)
-    return path
-
-
-def run(*arguments):
-    return cli.run("reconstruct", [str(a) for a in arguments])
-
-
-def quick(checkpoint, out):
-    return ["--checkpoint", checkpoint, "--out", out, "--turntable", "none", "--no-page"]
+    return cut_out(tmp_path / "thing.png")
 
 
 class Recorder(torch.nn.Module):
@@ -169,7 +153,7 @@ def test_turntables_that_cannot_be_written(tmp_path):
 def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     out = tmp_path / "deep" / "out"
     arguments = [picture, "--checkpoint", checkpoint, "--out", out, "--size", 32, "--frames", 4]
-    assert run(*arguments, "--formats", "ply", "splat", "glb") == 0
+    assert run_reconstruct(*arguments, "--formats", "ply", "splat", "glb") == 0
     files = {path.name: path.stat().st_size for path in out.iterdir()}
     names = ["thing.gif", "thing.glb", "thing.html", "thing.ply", "thing.splat"]
     assert sorted(files) == names and all(files.values())
@@ -199,23 +183,23 @@ def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeyp
     )
     monkeypatch.setattr(predict, "reconstruct", lambda *_: stick)
     options = [*quick(checkpoint, tmp_path), "--mesh", "ply", "--ply-frame", frame]
-    assert run(picture, *options) == 0
+    assert run_reconstruct(picture, *options) == 0
     mesh = load_mesh(tmp_path / "thing-mesh.ply")
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     want = [0.175, -0.05 if frame == "opencv" else 0.05, 0.0]
     assert np.abs(middle - want).max() < 0.02  # half a Gaussian
-    assert run(picture, *options, "--min-opacity", 0.95) == 1  # nothing is left
+    assert run_reconstruct(picture, *options, "--min-opacity", 0.95) == 1  # nothing is left
 
 
 def test_options_reach_the_files(tmp_path, picture, checkpoint):
     arguments = [picture, "--checkpoint", checkpoint, "--out", tmp_path, "--no-page"]
-    assert run(*arguments, "--turntable", "mp4", "--size", 16, "--frames", 2) == 0
+    assert run_reconstruct(*arguments, "--turntable", "mp4", "--size", 16, "--frames", 2) == 0
     assert (tmp_path / "thing.mp4").stat().st_size > 0 and not (tmp_path / "thing.html").exists()
     plain = load_ply(tmp_path / "thing.ply")
     limit = plain.opacities.median().item()
-    assert run(*quick(checkpoint, tmp_path), picture, "--min-opacity", limit) == 0
+    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--min-opacity", limit) == 0
     assert 0 < load_ply(tmp_path / "thing.ply").num < 64
-    assert run(*quick(checkpoint, tmp_path), picture, "--ply-frame", "opengl") == 0
+    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--ply-frame", "opengl") == 0
     assert b"comment frame opengl" in (tmp_path / "thing.ply").read_bytes()
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
 
@@ -226,9 +210,9 @@ def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):
     cases = [(path, reason) for name, path, reason in bad_files(folder) if name != "folder"]
     save_image(folder / "clear.png", np.zeros((9, 9, 4)))
     save_image(folder / "noise.bmp", np.random.default_rng(0).random((9, 9, 3)))
-    first, last = draw(folder / "aa.png"), draw(folder / "zz.png")
+    first, last = cut_out(folder / "aa.png"), cut_out(folder / "zz.png")
     cases += [(folder / "clear.png", "no object"), (folder / "noise.bmp", "cannot tell object")]
-    code = run(*quick(checkpoint, out), first, *(path for path, _ in cases), last)
+    code = run_reconstruct(*quick(checkpoint, out), first, *(path for path, _ in cases), last)
     assert code == 1
     assert sorted(path.name for path in out.iterdir()) == ["aa.ply", "zz.ply"]
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gamba: ")]
@@ -241,10 +225,10 @@ def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):
 def test_folders_are_searched(tmp_path, checkpoint, capsys):
     folder, empty = tmp_path / "in", tmp_path / "empty"
     folder.mkdir(), empty.mkdir()
-    draw(folder / "b.png"), draw(folder / "a.PNG")
+    cut_out(folder / "b.png"), cut_out(folder / "a.PNG")
     (folder / "notes.txt").write_text("no picture")
     assert find_pictures([folder, folder / "b.png"]) == ([folder / "a.PNG", folder / "b.png"], [])
-    assert run(*quick(checkpoint, tmp_path / "out"), folder, empty) == 1
+    assert run_reconstruct(*quick(checkpoint, tmp_path / "out"), folder, empty) == 1
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.ply", "b.ply"]
     assert f"{empty}: the folder holds no pictures" in capsys.readouterr().err
 
@@ -257,15 +241,15 @@ def test_equal_stems_get_names_of_their_own(tmp_path):
 
 @pytest.mark.parametrize("which", ["picture", "mask", "checkpoint"])
 def test_nothing_that_is_read_is_replaced(tmp_path, checkpoint, capsys, which):
-    photo, mask = draw(tmp_path / "photo.png"), draw(tmp_path / "mask.png")
+    photo, mask = cut_out(tmp_path / "photo.png"), cut_out(tmp_path / "mask.png")
     model = tmp_path / "model.safetensors"
     model.write_bytes(checkpoint.read_bytes())
     victim = {"picture": photo, "mask": mask, "checkpoint": model}[which]
     victim = victim.rename(tmp_path / "photo.gif")  # the turntable's name
     files = {"picture": photo, "mask": mask, "checkpoint": model} | {which: victim}
     before = {path: path.read_bytes() for path in files.values()}
-    code = run(files["picture"], "--mask", files["mask"], "--checkpoint", files["checkpoint"],
-               "--out", tmp_path)  # fmt: skip
+    options = ["--mask", files["mask"], "--checkpoint", files["checkpoint"], "--out", tmp_path]
+    code = run_reconstruct(files["picture"], *options)
     assert code == 2
     said = capsys.readouterr().err
     assert said == f"gamba: {victim}: would be overwritten by an output; give another --out\n"
@@ -277,7 +261,7 @@ def refused(arguments, *reasons):
 
     def check(capsys):
         capsys.readouterr()
-        assert run(*arguments) == 2
+        assert run_reconstruct(*arguments) == 2
         captured = capsys.readouterr()
         lines = [line for line in captured.err.splitlines() if not line.startswith("Warp")]
         assert len(lines) == 1 and lines[0].startswith("gamba: "), captured.err
@@ -287,7 +271,7 @@ def refused(arguments, *reasons):
 
 
 def test_what_cannot_start_is_refused(tmp_path, picture, checkpoint, capsys):
-    other, file = draw(tmp_path / "other.png"), tmp_path / "file"
+    other, file = cut_out(tmp_path / "other.png"), tmp_path / "file"
     file.touch()
     (tmp_path / "empty").mkdir()
     ready = quick(checkpoint, tmp_path / "out")
@@ -315,12 +299,12 @@ def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeyp
     arguments = [picture, "--out", tmp_path / "out", "--turntable", "none", "--no-page"]
     refused(arguments, "tiny.safetensors", "--checkpoint FILE")(capsys)
     (tmp_path / "tiny.safetensors").write_bytes(checkpoint.read_bytes())
-    assert run(*arguments) == 0
+    assert run_reconstruct(*arguments) == 0
 
 
 def test_the_page_says_what_the_starter_model_was_trained_on(tmp_path, picture):
     small = ["--turntable", "none", "--size", 32, "--frames", 2]
-    assert run(picture, "--out", tmp_path / "out", *small) == 0
+    assert run_reconstruct(picture, "--out", tmp_path / "out", *small) == 0
     source = (tmp_path / "out" / "thing.html").read_text()
     assert "Trained on" in source and "furniture" in source and "Limits" in source
 
@@ -332,13 +316,13 @@ def test_a_mask_cuts_a_busy_picture(tmp_path, checkpoint):
     mask[5:15, 5:25] = 1
     save_image(tmp_path / "mask.png", mask)
     ready = [tmp_path / "noise.png", *quick(checkpoint, tmp_path / "out")]
-    assert run(*ready) == 1
-    assert run(*ready, "--mask", tmp_path / "mask.png") == 0
+    assert run_reconstruct(*ready) == 1
+    assert run_reconstruct(*ready, "--mask", tmp_path / "mask.png") == 0
 
 
 def test_outputs_that_cannot_be_written_are_failures(tmp_path, picture, checkpoint, capsys):
     (tmp_path / "out" / "thing.ply").mkdir(parents=True)
-    assert run(picture, *quick(checkpoint, tmp_path / "out")) == 1
+    assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
     assert f"cannot write {tmp_path}/out/thing.ply" in capsys.readouterr().err
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["thing.ply"]
 
@@ -347,13 +331,13 @@ def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monke
     gaussians = some(9)
     gaussians.means[3] = float("nan")
     monkeypatch.setattr(predict, "reconstruct", lambda model, rgba: gaussians)
-    assert run(picture, *quick(checkpoint, tmp_path / "out")) == 1
+    assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
     assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err
 
 
 def test_the_help_names_every_option(capsys):
     with pytest.raises(SystemExit) as caught:
-        run("--help")
+        run_reconstruct("--help")
     assert caught.value.code == 0
     out = capsys.readouterr().out
     for option in ("--checkpoint", "--formats", "--turntable", "--mask", "--sam", "--no-page"):
@@ -375,5 +359,5 @@ def test_pictures_of_many_kinds_go_through(tmp_path, checkpoint):
     content = io.BytesIO()
     cut.quantize(8).save(content, "GIF")
     (tmp_path / "still.gif").write_bytes(content.getvalue())
-    assert run(tmp_path, *quick(checkpoint, tmp_path / "out")) == 0
+    assert run_reconstruct(tmp_path, *quick(checkpoint, tmp_path / "out")) == 0
     assert len(list((tmp_path / "out").glob("*.ply"))) == 7

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.gaussians import some
+from helpers.images import cut_out
+from helpers.model import quick, run_reconstruct
 from PIL import Image
 
-from gamba_warp import cli
 from gamba_warp.errors import UserError
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.model.checkpoint import save_model
@@ -26,21 +27,6 @@ def checkpoint(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.safetensors"
     save_model(path, Gamba(CONFIG))
     return path
-
-
-def cut_out(path, colour=(0.8, 0.3, 0.1)):
-    rgba = np.zeros((20, 30, 4))
-    rgba[4:16, 8:24] = (*colour, 1)
-    save_image(path, rgba)
-    return path
-
-
-def run(*arguments):
-    return cli.run("reconstruct", [str(a) for a in arguments])
-
-
-def quick(checkpoint, out):
-    return ["--checkpoint", checkpoint, "--out", out, "--turntable", "none", "--no-page"]
 
 
 def test_a_row_is_the_input_and_views_around(tmp_path):
@@ -75,11 +61,11 @@ def test_the_command_writes_a_sheet_of_what_went_well(tmp_path, checkpoint, caps
     save_image(tmp_path / "empty.png", np.zeros((9, 9, 4)))
     sheet = tmp_path / "new" / "sheet.png"
     options = [*quick(checkpoint, tmp_path / "out"), "--sheet", sheet]
-    assert run(*paths, tmp_path / "empty.png", *options) == 1
+    assert run_reconstruct(*paths, tmp_path / "empty.png", *options) == 1
     assert load_rgba(sheet).shape[:2] == (2 * 146, 768)
     assert (tmp_path / "out" / "b.ply").exists()
     sheet.unlink()
-    assert run(tmp_path / "empty.png", *options) == 1 and not sheet.exists()
+    assert run_reconstruct(tmp_path / "empty.png", *options) == 1 and not sheet.exists()
 
 
 def test_a_sheet_that_cannot_be_is_one_line(tmp_path, checkpoint, capsys):
@@ -88,7 +74,7 @@ def test_a_sheet_that_cannot_be_is_one_line(tmp_path, checkpoint, capsys):
         tmp_path / "sheet.txt": "a sheet is one of .png, .webp, .jpg",
         path: "would be overwritten by an output",
     }.items():
-        assert run(path, *quick(checkpoint, tmp_path / "out"), "--sheet", sheet) == 2
+        assert run_reconstruct(path, *quick(checkpoint, tmp_path / "out"), "--sheet", sheet) == 2
         lines = capsys.readouterr().err.splitlines()
         assert len(lines) == 1 and str(sheet) in lines[0] and reason in lines[0]
     with pytest.raises(UserError, match="cannot write /dev/null/s.png"):

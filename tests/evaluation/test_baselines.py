@@ -23,13 +23,7 @@ from gamba_warp.render import render
 WIDTH, HEIGHT = 45, 33
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Pictures this small take longer on several threads than on one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def truth_at(azimuths, elevation=0.0, distance=1.5, image=None):

@@ -29,13 +29,7 @@ TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 ON_ITS_SIDE = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # what the catalogue turns back
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Pictures this small take longer on several threads than on one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def stairs():

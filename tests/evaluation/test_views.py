@@ -78,13 +78,7 @@ def in_reference_world(point, reference=0):
 POINTS = {"a": [0.1, 0.05, -0.1], "group/b": [-0.15, 0.1, 0.2], "c": [0.0, 0.2, 0.1]}
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Pictures this small take longer on several threads than on one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

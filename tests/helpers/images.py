@@ -5,6 +5,8 @@ import io
 import numpy as np
 from PIL import Image
 
+from gamba_warp.images import save_image
+
 
 def colours(mode="RGB", size=(7, 5)):
     """Makes a PIL picture of random colours, the same on each call; ``size`` is (width, height)."""
@@ -38,3 +40,11 @@ def bad_files(folder):
         yield name, folder / name, reason
     first.save(folder / "moving.gif", save_all=True, append_images=[second])
     yield "moving.gif", folder / "moving.gif", "animated picture (2 frames)"
+
+
+def cut_out(path, colour=(0.8, 0.3, 0.1)):
+    """Writes a picture of one square, cut out; returns its path."""
+    rgba = np.zeros((20, 30, 4))
+    rgba[4:16, 8:24] = (*colour, 1)
+    save_image(path, rgba)
+    return path

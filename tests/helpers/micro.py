@@ -11,7 +11,10 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
 from gamba_warp.render import render
 from gamba_warp.train.config import TrainConfig
+from gamba_warp.train.ddp import World
+from gamba_warp.train.run import train
 
+ALONE = World(0, 1, torch.device("cpu"))
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 SIZE = 16
 VIEWS = 6
@@ -95,3 +98,14 @@ def options(data: Path, out: Path, **groups: dict) -> TrainConfig:
         changes = {**quick[name], **groups.get(name, {})}
         config = replace(config, **{name: replace(getattr(config, name), **changes)})
     return config
+
+
+def run(data: Path, out: Path, **groups: dict) -> int:
+    """Trains with ``options`` in this process alone; returns the exit code."""
+    return train(options(data, out, **groups), ALONE)
+
+
+def lines(out: Path, event: str) -> list[dict]:
+    """The lines of one kind in a run's log."""
+    records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return [record for record in records if record["event"] == event]

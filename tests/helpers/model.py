@@ -4,6 +4,7 @@ import timm
 import torch
 from timm.models.vision_transformer import _create_vision_transformer
 
+from gamba_warp import cli
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.model.config import GambaConfig
 
@@ -35,3 +36,13 @@ def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
     viewmats = orbit(torch.linspace(-30, 200, batch), 11.0)
     cameras = Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
     return torch.rand(batch, size, size, 3), cameras
+
+
+def run_reconstruct(*arguments) -> int:
+    """Runs ``gamba reconstruct`` in this process; returns the exit code."""
+    return cli.run("reconstruct", [str(a) for a in arguments])
+
+
+def quick(checkpoint, out):
+    """Options of ``gamba reconstruct`` that make nothing but the Gaussians."""
+    return ["--checkpoint", checkpoint, "--out", out, "--turntable", "none", "--no-page"]

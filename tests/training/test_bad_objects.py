@@ -1,19 +1,14 @@
 """Objects that cannot be read: counted, named, passed over, and too many of them end the run."""
 
-import json
-
 import pytest
-import torch
 from helpers import micro
+from helpers.micro import ALONE, lines
 
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
 from gamba_warp.train.batches import BatchSource, fixed_batches
-from gamba_warp.train.ddp import World
 from gamba_warp.train.run import train
-
-ALONE = World(0, 1, torch.device("cpu"))
 
 
 @pytest.fixture
@@ -40,11 +35,6 @@ def source_of(root):
         views=options.views,
         seed=0,
     )
-
-
-def lines(out, event):
-    records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return [record for record in records if record["event"] == event]
 
 
 def test_objects_that_go_bad_during_a_run_are_passed_over(root):

@@ -8,26 +8,19 @@ import pytest
 import torch
 from helpers import micro
 from helpers.disk import full_at
+from helpers.micro import run
 
 from gamba_warp import cli
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, only_process
 from gamba_warp.train import loop
 from gamba_warp.train.checkpoint import list_checkpoints
-from gamba_warp.train.ddp import World
 from gamba_warp.train.log import Quiet, RunLog, say
-from gamba_warp.train.run import train
-
-ALONE = World(0, 1, torch.device("cpu"))
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds", 2)
-
-
-def run(data, out, **groups) -> int:
-    return train(micro.options(data, out, **groups), ALONE)
 
 
 def leftovers(folder):

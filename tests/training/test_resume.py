@@ -8,6 +8,7 @@ import pytest
 import torch
 import tyro
 from helpers import micro
+from helpers.micro import lines, run
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -16,11 +17,8 @@ from gamba_warp.model.checkpoint import load_model
 from gamba_warp.train import config as options
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.config import command_line, config_differences
-from gamba_warp.train.ddp import World
-from gamba_warp.train.run import train
 from gamba_warp.train.step import weigh_views
 
-ALONE = World(0, 1, torch.device("cpu"))
 STILL = {"optim": {"lr": 1e-30, "weight_decay": 0.0, "ema": 0.0}, "length": {"steps": 1}}
 
 
@@ -35,15 +33,6 @@ def done(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "done"
     assert run(data, out, length={"steps": 8}, run={"save_every": 4}, optim={"ema": 0.5}) == 0
     return out
-
-
-def run(data, out, **groups) -> int:
-    return train(micro.options(data, out, **groups), ALONE)
-
-
-def lines(out, event):
-    records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return [record for record in records if record["event"] == event]
 
 
 def same(a, b):

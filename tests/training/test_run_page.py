@@ -6,27 +6,19 @@ import re
 import xml.etree.ElementTree as ET
 
 import pytest
-import torch
 from helpers import micro
+from helpers.micro import run
 
 from gamba_warp import cli
 from gamba_warp.errors import UserError
-from gamba_warp.pages.curves import curves
+from gamba_warp.pages.curves import draw_curves
 from gamba_warp.pages.run import write_run_page
 from gamba_warp.pages.run_log import read_run_log
-from gamba_warp.train.ddp import World
-from gamba_warp.train.run import train
-
-ALONE = World(0, 1, torch.device("cpu"))
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds")
-
-
-def run(data, out, **groups) -> int:
-    return train(micro.options(data, out, **groups), ALONE)
 
 
 def write(path, *lines):
@@ -97,13 +89,13 @@ def test_a_page_in_the_middle_says_so(tmp_path):
 def test_a_log_without_figures_gives_a_sentence(tmp_path, content):
     path = tmp_path / "log.jsonl"
     path.write_bytes(content)
-    assert curves(path) == "<p>The log holds no figures yet.</p>"
+    assert draw_curves(read_run_log(path)) == "<p>The log holds no figures yet.</p>"
     assert write_run_page(tmp_path).exists()
 
 
 def test_no_log_is_one_line(tmp_path):
     with pytest.raises(UserError, match=r"log\.jsonl: no such file"):
-        curves(tmp_path / "log.jsonl")
+        draw_curves(read_run_log(tmp_path / "log.jsonl"))
     (tmp_path / "log.jsonl").mkdir()
     with pytest.raises(UserError, match="not a plain file"):
         write_run_page(tmp_path)
@@ -137,7 +129,7 @@ def test_lines_that_are_no_lines_of_a_log_are_passed_over(tmp_path):
     record = read_run_log(write(tmp_path / "log.jsonl", *bad, *good))
     assert set(record.series) == {"train.loss"}
     assert list(record.series["train.loss"].values) == [0.1, 0.05]
-    assert "Loss" in svgs(curves(tmp_path / "log.jsonl"))
+    assert "Loss" in svgs(draw_curves(read_run_log(tmp_path / "log.jsonl")))
     assert "<b>" not in write_run_page(tmp_path).read_text()
 
 
@@ -170,7 +162,7 @@ def long_log(path, every=25, total=40_000):
 
 
 def test_a_long_run_stays_small_and_its_values_are_right(tmp_path):
-    text = curves(long_log(tmp_path / "log.jsonl"))
+    text = draw_curves(read_run_log(long_log(tmp_path / "log.jsonl")))
     assert len(text) < 200_000
     charts = svgs(text)
     assert len(charts["Loss"].findall(".//circle")) == 0  # eighty validations, thinned
@@ -188,7 +180,8 @@ def _step(text):
 
 
 def test_one_point_and_equal_values_are_drawn(tmp_path):
-    charts = svgs(curves(write(tmp_path / "log.jsonl", line("train", 0, loss=0.0, psnr=-5.0))))
+    path = write(tmp_path / "log.jsonl", line("train", 0, loss=0.0, psnr=-5.0))
+    charts = svgs(draw_curves(read_run_log(path)))
     for name, y in (("Loss", "0"), ("PSNR, dB", "-5")):
         (circle,) = charts[name].iter("circle")
         assert float(circle.get("cx")) >= 0 and y in [t.text for t in charts[name].iter("text")]

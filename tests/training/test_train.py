@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import micro
+from helpers.micro import ALONE, lines, run
 from PIL import Image
 from safetensors.torch import load_file
 from torch.utils.checkpoint import checkpoint
@@ -25,25 +26,13 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.train import loop, losses, step
 from gamba_warp.train.batches import choose_views
 from gamba_warp.train.checkpoint import list_checkpoints
-from gamba_warp.train.ddp import World
 from gamba_warp.train.optim import build_optimizer
 from gamba_warp.train.run import train
-
-ALONE = World(0, 1, torch.device("cpu"))
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds")
-
-
-def run(data, out, **groups) -> int:
-    return train(micro.options(data, out, **groups), ALONE)
-
-
-def lines(out, event):
-    records = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return [record for record in records if record["event"] == event]
 
 
 def assert_same_files(a, b):

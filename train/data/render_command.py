@@ -63,17 +63,23 @@ def data_render_command(
     from gamba_warp.data.dataset import split_of
     from gamba_warp.formats.catalogue import find_meshes
 
-    from .render import (
-        Settings,
-        parse_shard,
-        render_meshes,
-        still_missing,
-    )
+    from .render import Settings, parse_shard, render_meshes, still_missing
 
     settings = Settings(
-        *(views, size, fov, seed, depth, format, up, fronts, spread, stretch, fov_spread, light)
+        views=views,
+        size=size,
+        fov=fov,
+        seed=seed,
+        depth=depth,
+        format=format,
+        up=up,
+        fronts=fronts,
+        spread=spread,
+        stretch=stretch,
+        fov_spread=fov_spread,
+        light=light,
     )
-    if not 5 <= fov / fov_spread or not fov * fov_spread <= 120:
+    if fov / fov_spread < 5 or fov * fov_spread > 120:
         raise UserError(
             f"--fov-spread {fov_spread:g}: makes fields of view outside 5 to 120 degrees"
         )
