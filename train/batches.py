@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gamba_warp.batch import EXPECTED
 from gamba_warp.cameras import Cameras
-from gamba_warp.data.dataset import ViewDataset, open_dataset
+from gamba_warp.data.dataset import ObjectViews, ViewDataset, open_dataset
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.posing import posed_input, relative_cameras
@@ -44,6 +44,8 @@ class Batch:
         targets: ``[B, V+1, H, W, 4]`` RGBA in [0, 1], straight alpha.
         cameras: ``[B, V+1]``.
         background: ``[B, 1, 3]`` RGB that pictures are rendered and composited on.
+        surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface behind each pixel of
+            the inputs, in the model's world, 0 where none is known; None: nobody asked for them.
     """
 
     uids: list[str]
@@ -52,6 +54,7 @@ class Batch:
     targets: Tensor
     cameras: Cameras
     background: Tensor
+    surfaces: Tensor | None = None
 
     def to(self, device: torch.device) -> Batch:
         """Returns the same batch on a device."""
@@ -64,6 +67,7 @@ class Batch:
             targets=self.targets.to(device, non_blocking=True),
             cameras=self.cameras.to(device, non_blocking=True),
             background=self.background.to(device, non_blocking=True),
+            surfaces=None if self.surfaces is None else self.surfaces.to(device, non_blocking=True),
         )
 
 
@@ -75,6 +79,7 @@ def load_sample(
     config: GambaConfig,
     background: Tensor,
     change: Change | None = None,
+    surfaces: bool = False,
 ) -> Batch:
     """Loads one object as a batch of one; ``views[0]`` is the input view.
 
@@ -88,14 +93,16 @@ def load_sample(
         config: the model's configuration.
         background: RGB ``[3]``.
         change: what is done with the views first; None: nothing.
+        surfaces: whether those are loaded too, where the object has depth pictures.
 
     Raises:
         UserError: the object cannot be read or its pictures are not square.
     """
-    target = dataset.load(index, views, size)
+    depths = int(surfaces)  # of the input view alone
+    target = dataset.load(index, views, size, depths)
     source = target
     if size != config.image_size:
-        source = dataset.load(index, views[:1], config.image_size)
+        source = dataset.load(index, views[:1], config.image_size, depths)
     if change is not None:
         target, source = change(target), change(source)
     for cameras in (target.cameras, source.cameras):
@@ -110,11 +117,20 @@ def load_sample(
         targets=target.images[None],
         cameras=relative_cameras(target.cameras, config.distance)[None],
         background=background.reshape(1, 1, 3),
+        surfaces=_surfaces(source, config.distance) if surfaces else None,
     )
+
+
+def _surfaces(views: ObjectViews, distance: float) -> Tensor:
+    """Those of ``Batch``, of the first view: ``[1, 2, h, w]``."""
+    empty = torch.zeros(views.images.shape[1:3])
+    found = [empty if d is None else d[0] for d in (views.depths, views.backs)]
+    return torch.stack(found)[None] * (distance / views.cameras.viewmats[0, :3, 3].norm())
 
 
 def join(samples: list[Batch]) -> Batch:
     """Joins samples to one batch; all must have the same number of views."""
+    surfaces = [s.surfaces for s in samples if s.surfaces is not None]
     return Batch(
         uids=[uid for s in samples for uid in s.uids],
         inputs=torch.cat([s.inputs for s in samples]),
@@ -122,6 +138,7 @@ def join(samples: list[Batch]) -> Batch:
         targets=torch.cat([s.targets for s in samples]),
         cameras=_join_cameras([s.cameras for s in samples]),
         background=torch.cat([s.background for s in samples]),
+        surfaces=torch.cat(surfaces) if surfaces else None,
     )
 
 
@@ -164,11 +181,13 @@ class BatchSource:
         reference: int | None,
         views: DataConfig,
         seed: int,
+        surfaces: bool = False,
     ) -> None:
         """``batch_size`` is that of all processes together; ``objects`` may repeat an index."""
         self.dataset, self.config, self.views = dataset, config, views
         self.objects, self.batch_size, self.size = objects, batch_size, views.size
         self.reference, self.background, self.seed = reference, views.background, seed
+        self.surfaces = surfaces
         self.failures: dict[str, str] = {}
 
     def _object(self, number: int) -> int:
@@ -205,9 +224,8 @@ class BatchSource:
                     found = front_views(self.dataset.files(index).camera_to_world)
                     reference = found[pick % len(found)]
                 views = choose_views(count, novel, reference, rng)
-                return load_sample(
-                    self.dataset, index, views, self.size, self.config, background, change
-                )
+                first = (self.dataset, index, views, self.size, self.config, background)
+                return load_sample(*first, change, self.surfaces)
             except EXPECTED as error:
                 reason = self._note(index, error)
         raise UserError(f"{_TRIES} objects in a row cannot be read; the last: {reason}")
@@ -326,6 +344,8 @@ def open_data(config: TrainConfig) -> TrainingData:
     notes += [f"{uid} is left out: {reason}" for uid, reason in bad.items()]
     if not objects:
         raise UserError(f"{config.data}: none of its {len(bad)} objects can be read: {notes[0]}")
+    if config.loss.depth_weight and all(train.files(i).depths is None for i in objects):
+        raise UserError(f"--depth-weight: {config.data} has no depth pictures, see data render")
     validation, held_out = train, []
     try:
         validation = open_dataset(config.data, "val")

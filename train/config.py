@@ -97,6 +97,10 @@ class LossConfig:
     novel_weight: _Weight = 1.0
     """Weight of each novel view against the input view, in all terms but LPIPS of crops; the mean
     over the views stays a mean."""
+    depth_weight: _Weight = 0.0
+    """Weight of the depth of Gaussians: that of the first layer of "rays" is held to the input
+    view's first surface, that of the last layer to the last. The data needs depth pictures (gamba
+    data render --depth); the paper has no such term."""
     radial_mask: bool = True
     """The radial mask constraint on the projected centres (paper Table 2)."""
     rdist_weight: _Weight = 0.1
@@ -198,6 +202,8 @@ class TrainConfig:
             raise UserError(
                 f"--lpips-crop {self.loss.lpips_crop}: must be 0, or 16 to --size {self.views.size}"
             )
+        if self.loss.depth_weight and self.model_config().decoder != "rays":
+            raise UserError('--depth-weight: only layers of the decoder "rays" have a depth')
         self.model_config()
 
     def model_config(self) -> GambaConfig:

@@ -90,6 +90,7 @@ class Trainer:
             reference=data.reference,
             views=config.views,
             seed=config.run.seed,
+            surfaces=config.loss.depth_weight > 0,
         )
         self.steps_per_epoch = len(data.objects) / (self._source.batch_size * self.accumulate)
         self.schedule = self._schedule(config.length)
@@ -139,6 +140,7 @@ class Trainer:
             "lpips": loss.lpips_weight if use_lpips else 0.0,
             "ssim": loss.ssim_weight,
             "novel": loss.novel_weight,
+            "depth": loss.depth_weight,
             "rdist": radial_weight(self.step, loss.rdist_weight, span) if loss.radial_mask else 0.0,
         }
 
@@ -313,7 +315,7 @@ class Trainer:
                 self.config.views.size,
                 self._unread,
             )
-            weights = self.weights() | {"rdist": 0.0}
+            weights = self.weights() | {"rdist": 0.0, "depth": 0.0}
             figures, rows = validate(model, held_out, weights, self.lpips, self.world.device)
             self._name_failures()
             if rows:

@@ -12,15 +12,19 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import pad
+from torch.nn.functional import pad, smooth_l1_loss
 from torch.profiler import record_function
 
+from gamba_warp.cameras import Cameras
 from gamba_warp.data.vgg_weights import lpips_available
+from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
 from gamba_warp.model.lpips import LPIPS, load_lpips
 
 from .config import TrainConfig
+from .radial_mask import project_means
 
+DEPTH_BEND = 0.02  # object units; see ``depth_loss``
 _C1, _C2 = 0.01**2, 0.03**2  # of SSIM, for pictures in [0, 1]
 _TILE = 32  # columns of a banded product of SSIM
 _CACHED = 1 << 17  # numbers of the pictures that a CPU takes together for SSIM, two of 128²
@@ -206,6 +210,37 @@ def view_losses(
         with record_function("SSIM"):
             terms["ssim"] = structure(rgb, target_rgb)
     return terms
+
+
+def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Tensor) -> Tensor:
+    """How far the first layer of ``rays`` is from the first surface, and the last from the last.
+
+    A Gaussian is compared at the pixel that its centre falls on, by the distance along the optical
+    axis: quadratically up to ``DEPTH_BEND`` object units, and linearly beyond.
+
+    Args:
+        gaussians: ``[B, N]``, as the decoder ``rays`` makes them: its layers lie side by side.
+        layers: number of these.
+        cameras: ``[B]`` of the inputs.
+        surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface, 0 where none is
+            known; pictures of the size that the cameras have.
+
+    Returns:
+        ``[B]``, the sum of the means over both layers; 0 where no depth is known.
+    """
+    height, width = surfaces.shape[-2:]
+    places, depths = project_means(gaussians.means, cameras[:, None])
+    column, row = places[:, 0].detach().floor().long().unbind(-1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    means = []
+    for layer, surface in zip((0, layers - 1), surfaces.unbind(1)):
+        of = (slice(None), slice(layer, None, layers))
+        true = surface.flatten(1).gather(1, pixel[of])
+        known = inside[of] & (gaussians.opacities[of] > 0) & (true > 0)
+        gaps = smooth_l1_loss(depths[:, 0][of], true, beta=DEPTH_BEND, reduction="none")
+        means.append((gaps * known).sum(1) / known.sum(1).clamp_min(1))
+    return means[0] + means[1]
 
 
 def random_crops(got: Tensor, want: Tensor, size: int) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 
 from .batches import Batch
-from .losses import rendered_psnr, total_loss, view_losses
+from .losses import depth_loss, rendered_psnr, total_loss, view_losses
 from .radial_mask import NEAR, contour_distances, project_means, radial_mask_loss
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
@@ -56,9 +56,10 @@ def forward(
     Args:
         model: ``Gamba`` or a wrapper of it.
         batch: a batch on the model's device.
-        weights: weights of the terms ``rgb``, ``mask``, ``lpips``, ``ssim`` and ``rdist``; the last
-            three are not computed at weight 0. ``novel``, if it is there, is the weight of each
-            novel view against the input view, in all terms that have one value per view.
+        weights: weights of the terms ``rgb``, ``mask``, ``lpips``, ``ssim``, ``depth`` and
+            ``rdist``; the last four are not computed at weight 0. ``novel``, if it is there, is
+            the weight of each novel view against the input view, in all terms that have one value
+            per view.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
         precision: dtype of the products in the network and in LPIPS; all else is float32.
         lpips_crop: as for ``view_losses``.
@@ -79,6 +80,9 @@ def forward(
         lpips_crop,
         bool(weights.get("ssim")),
     )
+    if weights.get("depth") and batch.surfaces is not None:
+        layers = getattr(model, "module", model).config.ray_layers  # DDP has it inside
+        terms["depth"] = depth_loss(gaussians, layers, batch.input_cameras, batch.surfaces)
     if weights.get("rdist"):
         contours = contour_distances(target_alpha[..., 0])
         terms["rdist"] = radial_mask_loss(gaussians.means, batch.cameras, contours)

@@ -39,7 +39,9 @@ class ObjectViews:
         name: name for people.
         images: ``[V, H, W, 4]`` float32 RGBA in [0, 1], colour not premultiplied.
         cameras: V cameras, float32, in object units (the object's bounding cube has side 1).
-        depths: ``[V, H, W]`` float32 along the optical axis, 0 for the background; or None.
+        depths: ``[V, H, W]`` float32 along the optical axis, 0 for the background; or None. Of the
+            first views only, where ``load`` was asked for no more.
+        backs: as ``depths``, of the last surface behind a pixel; or None.
         attribution: creator, licence, source; may be empty.
     """
 
@@ -49,6 +51,7 @@ class ObjectViews:
     cameras: Cameras
     depths: Tensor | None
     attribution: dict[str, str]
+    backs: Tensor | None = None
 
 
 def split_of(key: str) -> str:
@@ -212,7 +215,7 @@ class ViewDataset:
         for uid in self.uids:
             try:
                 files = self.files(uid)
-                for path in files.images + (files.depths or []):
+                for path in files.images + (files.depths or []) + (files.backs or []):
                     if not os.path.exists(path):  # never raises, whatever the name
                         raise UserError(f"{path}: no such file")
             except UserError as error:
@@ -220,7 +223,11 @@ class ViewDataset:
         return bad
 
     def load(
-        self, index: int | str, views: Sequence[int] | None = None, size: int | None = None
+        self,
+        index: int | str,
+        views: Sequence[int] | None = None,
+        size: int | None = None,
+        depths: int | None = None,
     ) -> ObjectViews:
         """Decodes views of one object.
 
@@ -230,6 +237,8 @@ class ViewDataset:
             size: height of the returned pictures, whose width follows; None keeps the files' size.
                 Colour is premultiplied and area-filtered, so that no background bleeds in; depth
                 takes the nearest sample.
+            depths: of how many of these views, the first ones, the depth pictures are read, where
+                there are any; None means of all.
 
         Raises:
             UserError: a file is missing, broken, or not of the size that the cameras state.
@@ -245,7 +254,6 @@ class ViewDataset:
         if size is not None and size < 1:
             raise UserError(f"size {size}: must be at least 1")
         images: Tensor | None = None
-        depths: Tensor | None = None
         Ks = np.empty((len(wanted), 3, 3))
         for number, v in enumerate(wanted):
             picture, Ks[number] = self._view(files, v, size)
@@ -253,25 +261,22 @@ class ViewDataset:
             if images is None:
                 _check_room(len(wanted), width, height, uid)
                 images = torch.empty(len(wanted), height, width, 4)
-                if files.depths is not None:
-                    depths = torch.empty(len(wanted), height, width)
             if picture.shape != images.shape[1:]:
                 got, others = f"{width}x{height}", f"{images.shape[2]}x{images.shape[1]}"
                 raise UserError(f"{files.images[v]}: is {got}, the object's others {others}")
             np.divide(picture, np.float32(255), out=images[number].numpy())
-            if depths is not None and files.depths is not None:
-                depth = _read_depth(files.depths[v], width, height)
-                np.multiply(depth, np.float32(files.depth_unit), out=depths[number].numpy())
         assert images is not None  # there is at least one view
         height, width = images.shape[1:3]
+        first = wanted[:depths]
         viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
         return ObjectViews(
             uid=uid,
             name=files.name or uid,
             images=images,
             cameras=Cameras(viewmats, torch.from_numpy(Ks).float(), width, height),
-            depths=depths,
+            depths=_read_depths(files.depths, first, width, height, files.depth_unit),
             attribution=files.attribution,
+            backs=_read_depths(files.backs, first, width, height, files.depth_unit),
         )
 
     def _view(
@@ -315,6 +320,16 @@ def _resize(picture: np.ndarray, size: int | None, path: Path) -> np.ndarray:
     # PIL premultiplies RGBA by itself, and its box filter is the exact area average.
     kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
     return np.asarray(Image.fromarray(picture).resize(new, kind))
+
+
+def _read_depths(
+    paths: list[Path] | None, views: Sequence[int], width: int, height: int, unit: float
+) -> Tensor | None:
+    """Reads depth ``[V, height, width]`` of some views, object units; None where there is none."""
+    if paths is None or not views:
+        return None
+    steps = np.stack([_read_depth(paths[v], width, height) for v in views])
+    return torch.from_numpy(steps * np.float32(unit))
 
 
 def _read_depth(path: Path, width: int, height: int) -> np.ndarray:

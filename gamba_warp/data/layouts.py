@@ -49,6 +49,7 @@ class ObjectFiles:
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: width and height of each of the V pictures as the file states them, or None.
         depths: paths of the V depth pictures, or None.
+        backs: paths of V pictures of the last surface's depth, or None.
         depth_unit: length of one step of the depth pictures, object units.
         name: name for people.
         attribution: creator, licence, source; may be empty.
@@ -59,6 +60,7 @@ class ObjectFiles:
     Ks: np.ndarray
     sizes: Sequence[tuple[int, int] | None]
     depths: list[Path] | None = None
+    backs: list[Path] | None = None
     depth_unit: float = 1.0
     name: str = ""
     attribution: dict[str, str] = field(default_factory=dict)
@@ -174,7 +176,7 @@ def _read_transforms(folder: Path) -> ObjectFiles:
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: no frames")
     _check_count(len(frames), path)
-    images, depths, poses, Ks, sizes = [], [], [], [], []
+    images, depths, backs, poses, Ks, sizes = [], [], [], [], [], []
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
@@ -184,9 +186,10 @@ def _read_transforms(folder: Path) -> ObjectFiles:
         K, size = _intrinsics(frame, top, source)
         Ks.append(K)
         sizes.append(size)
-        if frame.get("depth_file_path"):
-            depths.append(inside(folder, frame["depth_file_path"], source))
-    for paths in (images, depths):
+        for key, paths in (("depth_file_path", depths), ("back_file_path", backs)):
+            if frame.get(key):
+                paths.append(inside(folder, frame[key], source))
+    for paths in (images, depths, backs):
         if repeated := next((p for p, n in Counter(paths).items() if n > 1), None):
             raise UserError(f"{path}: two frames have the picture {repeated.name}")
     depth_unit = _number({"depth_unit": 1e-3, **top}, "depth_unit", str(path))
@@ -201,6 +204,7 @@ def _read_transforms(folder: Path) -> ObjectFiles:
         Ks=np.stack(Ks),
         sizes=sizes,
         depths=depths if len(depths) == len(frames) else None,
+        backs=backs if len(backs) == len(frames) else None,
         depth_unit=depth_unit,
         name=_text(top.get("name") or ""),
         attribution={_text(k): _text(v) for k, v in attribution.items()},

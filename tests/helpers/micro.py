@@ -78,9 +78,9 @@ def write_dataset(root: Path, objects: int = 3) -> Path:
     return root
 
 
-def options(data: Path, out: Path, **groups: dict) -> TrainConfig:
+def options(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dict) -> TrainConfig:
     """Makes quick options; ``groups`` changes them, for example ``optim={"lr": 1.0}``."""
-    config = TrainConfig(data=data, preset="tiny", set=MODEL)
+    config = TrainConfig(data=data, preset="tiny", set=model)
     quick = {
         "length": {"steps": 6},
         "views": {"batch_size": 2, "size": SIZE, "views_first": 1, "views_last": 3},
@@ -100,9 +100,9 @@ def options(data: Path, out: Path, **groups: dict) -> TrainConfig:
     return config
 
 
-def run(data: Path, out: Path, **groups: dict) -> int:
+def run(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dict) -> int:
     """Trains with ``options`` in this process alone; returns the exit code."""
-    return train(options(data, out, **groups), ALONE)
+    return train(options(data, out, model, **groups), ALONE)
 
 
 def lines(out: Path, event: str) -> list[dict]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.data.dataset import ObjectViews
@@ -67,5 +66,5 @@ def mirrored(views: ObjectViews) -> ObjectViews:
     Ks = cameras.Ks.clone()
     Ks[..., 0, 2] = cameras.width - Ks[..., 0, 2]
     made = Cameras(flip @ cameras.viewmats @ flip, Ks, cameras.width, cameras.height)
-    depths: Tensor | None = None if views.depths is None else views.depths.flip(-1)
-    return replace(views, images=views.images.flip(-2), cameras=made, depths=depths)
+    depths, backs = (None if d is None else d.flip(-1) for d in (views.depths, views.backs))
+    return replace(views, images=views.images.flip(-2), cameras=made, depths=depths, backs=backs)

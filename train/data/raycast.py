@@ -208,6 +208,28 @@ class RayCaster:
         picture = np.concatenate([to_display(np.clip(straight, 0, 1)) * (alpha > 0), alpha], -1)
         return picture, full_depth[SAMPLES // 2 :: SAMPLES, SAMPLES // 2 :: SAMPLES]
 
+    def last_depth(self, pose: np.ndarray, size: int, fov: float) -> np.ndarray:
+        """Depth of the last surface that a ray meets, however transparent what it meets is.
+
+        Args:
+            pose: as for ``render``, like ``size`` and ``fov``.
+
+        Returns:
+            ``[size, size]`` float32 along the optical axis, at the pixels' centres; 0 without a
+            hit.
+        """
+        half = math.tan(math.radians(fov) / 2)
+        x = half * (2 * (np.arange(size) + 0.5) / size - 1)
+        local = np.stack([*np.meshgrid(x, -x), np.full((size, size), -1.0)], -1)
+        directions = (local.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+        origin = pose[:3, 3].astype(np.float32)
+        corners = (self.mesh.vertices - pose[:3, 3]) @ pose[:3, 2]
+        far = max(0.0, float(-corners.min())) + 1.0  # behind all of the mesh
+        rays = np.concatenate([origin + far * directions, -directions], 1).astype(np.float32)
+        hits = self._scene.cast_rays(self._o3d.core.Tensor(rays), nthreads=self.threads)
+        depth = far - hits["t_hit"].numpy()  # what is behind the camera, or no hit, is below 0
+        return np.maximum(depth, 0).reshape(size, size).astype(np.float32)
+
     def _window(self, pose: np.ndarray, n: int, half: float) -> tuple[tuple, tuple]:
         """Finds the ranges of sample rows and columns that the object can cover."""
         local = (self.mesh.vertices - pose[:3, 3]) @ pose[:3, :3]

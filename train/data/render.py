@@ -49,7 +49,7 @@ class Settings:
         size: side of the square pictures, pixels.
         fov: vertical field of view, degrees.
         seed: seed of cameras and lights.
-        depth: whether depth pictures are written, too.
+        depth: whether depth pictures are written, too, of the first surface and of the last.
         format: "webp-lossless" or "png".
         up: the axis that points up in the files, "y" or "z", or "auto" by the suffix.
         fronts: number of views from the front; the first ones.
@@ -140,9 +140,13 @@ def _write_view(
     Image.fromarray(to_uint8(picture)).save(folder / name, **options)
     frame = {"file_path": name, "transform_matrix": pose.tolist()}
     if settings.depth:
-        steps = np.clip(np.rint(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
-        frame["depth_file_path"] = f"{index:03d}_depth.png"
-        Image.fromarray(steps).save(folder / frame["depth_file_path"])
+        for which, values in (
+            ("depth", depth),
+            ("back", caster.last_depth(pose, settings.size, fov)),
+        ):
+            steps = np.clip(np.rint(values / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+            frame[f"{which}_file_path"] = f"{index:03d}_{which}.png"
+            Image.fromarray(steps).save(folder / frame[f"{which}_file_path"])
     return frame
 
 

@@ -47,7 +47,7 @@ def data_render_command(
         size: pixels a side.
         fov: vertical field of view, degrees.
         seed: seed of cameras and lights; those of an object also depend on its uid.
-        depth: also write 16-bit depth pictures.
+        depth: also write 16-bit depth pictures, of the first and of the last surface.
         format: format of the pictures; both are lossless.
         up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
         fronts: number of views from the front, the first ones.
@@ -94,8 +94,11 @@ def data_render_command(
     if done := len(meshes) - len(todo) - len(damaged):
         print(f"{done} of {len(meshes)} objects are already in {out}")
     warnings, failures = render_meshes(todo, out, settings, workers, groups)
-    rendered = len(todo) - len(failures)
-    failures |= damaged
+    return _say(len(todo) - len(failures), out, warnings, failures | damaged)
+
+
+def _say(rendered: int, out: Path, warnings: dict[str, list[str]], failures: dict[str, str]) -> int:
+    """Prints what was done; returns the exit code."""
     for uid, lines in sorted(warnings.items()):
         print(f"warning: {uid}: {'; '.join(lines)}")
     print(f"rendered {rendered} objects into {out}, {len(failures)} failed")
