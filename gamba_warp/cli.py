@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from .errors import UserError
 from .files import DISK_ERRORS
-from .versions import __version__
+from .versions import __version__, advice, missing
 
 # A command has one or two words. That of the words "a b-c" is the function ``a_b_c_command`` of
 # the module ``gamba_warp.commands.a_b_c``, if MODULES names no other; it is imported when called.
@@ -84,6 +84,9 @@ def run(name: str, arguments: list[str]) -> int:
     try:
         import tyro
 
+        reason = None if {"-h", "--help"} & {*arguments} else missing(name)
+        if reason is not None:
+            raise UserError(reason)
         return tyro.cli(load_command(name), args=arguments, prog=f"gamba {name}") or 0
     except BrokenPipeError:
         raise  # the reader of the output left; see ``main``
@@ -91,18 +94,20 @@ def run(name: str, arguments: list[str]) -> int:
         _complain("interrupted")
         return 130
     except Exception as error:
-        reason = _outside_reason(error)
+        reason = _outside_reason(error, name)
         if reason is None:
             raise
         _complain(reason)
         return 2
 
 
-def _outside_reason(error: Exception) -> str | None:
+def _outside_reason(error: Exception, command: str) -> str | None:
     """What is wrong outside of the program, in one line; None for a defect of the program."""
     text = " ".join(str(error).split())
     if isinstance(error, UserError):
         return text or "bad input"
+    if isinstance(error, ModuleNotFoundError):
+        return advice(error.name or "", command)
     # torch's errors of memory are RuntimeErrors, and on the CPU of no type of their own.
     exhausted = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
     if isinstance(error, MemoryError) or exhausted:

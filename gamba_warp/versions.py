@@ -1,6 +1,12 @@
-"""The version of this package, and those of other packages that decide what is computed."""
+"""The version of this package, and the other packages that it uses: versions, and which may lack.
+
+The core (setup.cfg, ``install_requires``) runs the kernels and the model, and turns a picture with
+alpha into a ``.ply``, a turntable and a page. Everything else comes with ``gamba-warp[EXTRA]``.
+"""
 
 from __future__ import annotations
+
+from importlib.util import find_spec
 
 __version__ = "0.1.0"
 _USED = (
@@ -19,6 +25,48 @@ _USED = (
     "imageio-ffmpeg",
     "tyro",
 )
+# The extra that brings a library (by the name it is imported by). A command that has an extra of
+# its own names that instead, where it holds the library too.
+EXTRA_OF = {
+    "imageio_ffmpeg": "video",
+    "kornia": "eval",
+    "open3d": "mesh",
+    "pymeshlab": "mesh",
+    "scipy": "mesh",
+    "skimage": "mesh",
+    "tensorboard": "train",
+    "timm": "train",
+    "trimesh": "mesh",
+}
+OWN = {
+    "demo": "all",
+    "data primitives": "mesh",
+    "data render": "mesh",
+    "eval-geometry": "eval",
+    "eval-views": "eval",
+    "export": "mesh",
+    "fit": "eval",
+    "reconstruct": "photo",
+    "stress": "all",
+    "train": "train",
+}
+HOLDS = {
+    "photo": {"kornia", "skimage"},
+    "train": {"kornia", "tensorboard", "timm"},
+    "mesh": {"kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"},
+    "eval": {"kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"},
+    "all": set(EXTRA_OF),
+}
+# What a command cannot begin without; what only some of its options need is found missing then.
+NEEDS = {
+    "data primitives": ("trimesh",),
+    "data render": ("trimesh", "open3d"),
+    "demo": ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"),
+    "eval-geometry": ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"),
+    "eval-views": ("kornia",),
+    "fit": ("kornia",),
+    "train": ("kornia",),
+}
 
 
 def installed(*packages: str) -> dict[str, str]:
@@ -47,3 +95,30 @@ def used_versions() -> dict[str, str]:
         if name in found or not name.startswith("open3d"):  # one of its two packages is enough
             named[name] = found.get(name, "not installed")
     return named
+
+
+def missing(command: str) -> str | None:
+    """Says what a command needs and what is not installed, in one line; None if all is there.
+
+    Args:
+        command: one of ``cli.COMMANDS``.
+    """
+    absent = (name for name in NEEDS.get(command, ()) if find_spec(name) is None)
+    name = next(absent, None)
+    return None if name is None else advice(name, command)
+
+
+def advice(library: str, command: str) -> str | None:
+    """Says how to get an optional library that a command needs; None for any other library.
+
+    Args:
+        library: what could not be imported; also one of its modules, as ``scipy.spatial``.
+        command: the command that needs it.
+    """
+    name = library.partition(".")[0]
+    if name not in EXTRA_OF:
+        return None
+    extra = OWN.get(command, "")
+    if name not in HOLDS.get(extra, ()):
+        extra = EXTRA_OF[name]
+    return f"{command} needs {name}, which is not installed: pip install 'gamba-warp[{extra}]'"

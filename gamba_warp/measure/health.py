@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import imageio_ffmpeg
 import torch
 import warp as wp
 
@@ -19,6 +18,7 @@ from ..kernels.selective_scan import selective_scan
 from ..model.checkpoint import DEFAULT_CHECKPOINT
 from ..open3d import import_open3d
 from ..render import render
+from ..versions import EXTRA_OF
 
 
 def devices() -> Iterator[tuple[str, str]]:
@@ -49,11 +49,14 @@ def abilities() -> Iterator[tuple[str, str, bool]]:
 
     Weights that have to be fetched or trained are no fault; a library that does not work is one.
     """
-    working = {"open3d": _open3d, "mp4": imageio_ffmpeg.get_ffmpeg_exe}
-    for name, check in working.items():
+    for name, check in {"open3d": _open3d, "mp4": _ffmpeg}.items():
         try:
             check()
             yield name, "yes", False
+        except ModuleNotFoundError as error:  # of an extra that nobody asked for
+            extra = EXTRA_OF.get(error.name or "")
+            how = f"pip install 'gamba-warp[{extra}]'" if extra else first_line(error)
+            yield name, f"no: {how}", extra is None
         except Exception as error:  # a broken installation raises anything: that is what to tell
             yield name, f"no: {first_line(error)}", True
     there = DEFAULT_CHECKPOINT.is_file()
@@ -65,6 +68,12 @@ def abilities() -> Iterator[tuple[str, str, bool]]:
 
 def _open3d() -> None:
     import_open3d().geometry.TriangleMesh.create_box()
+
+
+def _ffmpeg() -> None:
+    import imageio_ffmpeg
+
+    imageio_ffmpeg.get_ffmpeg_exe()
 
 
 def warm_up_kernels() -> Iterator[tuple[str, float, float]]:

@@ -28,7 +28,8 @@ def imported() -> dict[str, Path]:
 def test_every_import_is_required():
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
-    lines = config["options"]["install_requires"].split("\n")
+    extras = [text for name, text in config["options.extras_require"].items() if name != "test"]
+    lines = "\n".join([config["options"]["install_requires"], *extras]).split("\n")
     required = {re.split(r"[<>=!~;\s]", line.strip())[0] for line in lines}
     libraries = imported()
     assert {"torch", "scipy", "PIL"} <= set(libraries), "the reader sees imports"

@@ -1,0 +1,128 @@
+"""The core runs without the libraries of the extras, and says how to get one that is missing."""
+
+import ast
+import configparser
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.images import cut_out
+
+from gamba_warp import cli, versions
+from gamba_warp.images import save_image
+
+ROOT = Path(__file__).resolve().parents[2]
+# A module of one command, which needs the library for everything that it does.
+ALL_OF_IT = {ROOT / "train" / "data" / "primitives.py"}
+# Refuses each library of the extras as if it were not installed, and runs a command.
+WITHOUT = """
+import importlib.util, sys
+from gamba_warp import cli, versions
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in versions.EXTRA_OF:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+real = versions.find_spec
+versions.find_spec = lambda name: None if name in versions.EXTRA_OF else real(name)
+sys.meta_path.insert(0, Refuse())
+cli.main(sys.argv[1:])
+"""
+
+
+def in_the_core(*arguments):
+    command = [sys.executable, "-c", WITHOUT, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+def declared():
+    """Names of the distributions of each extra, those of extras in it included."""
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    section = config["options.extras_require"]
+
+    def names(extra):
+        found = set()
+        for line in filter(None, map(str.strip, section[extra].split("\n"))):
+            inner = re.fullmatch(r"gamba-warp\[(.*)\]", line)
+            if inner:
+                found |= set().union(*map(names, inner[1].split(",")))
+            elif not line.startswith("#"):
+                found.add(re.split(r"[<>=!~;\s\[]", line)[0])
+        return found
+
+    return {extra: names(extra) for extra in section}
+
+
+def test_each_library_is_in_the_extras_that_are_named():
+    found = declared()
+    distributions = {"skimage": "scikit-image", "imageio_ffmpeg": "imageio-ffmpeg"}
+    for library, extra in versions.EXTRA_OF.items():
+        name = distributions.get(library, library)
+        holding = {extra} | {e for e, libraries in versions.HOLDS.items() if library in libraries}
+        for one in holding:
+            assert name in found[one], f"{one} lacks {name}"
+    assert set(versions.OWN) | set(versions.NEEDS) <= set(cli.COMMANDS)
+    assert found["all"] >= set().union(*(found[e] for e in set(versions.EXTRA_OF.values())))
+
+
+def test_no_module_imports_an_extra_when_it_is_loaded():
+    """Types are no imports, and what a function imports comes when it is called."""
+    for folder in ("gamba_warp", "kernels", "train", "eval"):
+        for path in (ROOT / folder).rglob("*.py"):
+            if path in ALL_OF_IT:
+                continue
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+                if isinstance(node, ast.ImportFrom) and node.level == 0:
+                    names = [node.module or ""]
+                for name in names:
+                    assert name.partition(".")[0] not in versions.EXTRA_OF, f"{path}: {name}"
+
+
+@pytest.mark.slow
+def test_a_picture_becomes_gaussians_and_a_page_with_the_core_alone(tmp_path):
+    picture = cut_out(tmp_path / "thing.png")
+    small = ("--size", 16, "--frames", 2, "--out", tmp_path / "out")
+    done = in_the_core("reconstruct", picture, *small, "--sheet", tmp_path / "sheet.png")
+    assert done.returncode == 0, done.stderr
+    assert {"thing.ply", "thing.gif", "thing.html"} <= {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
+    assert (tmp_path / "sheet.png").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments, library, extra",
+    [
+        (["train", "data"], "kornia", "train"),
+        (["data", "render", "meshes", "--out", "out"], "trimesh", "mesh"),
+        (["eval-views", "--checkpoint", "m", "--data", "d"], "kornia", "eval"),
+        (["demo"], "kornia", "all"),
+    ],
+)
+def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):
+    done = in_the_core(*arguments)
+    name = " ".join(arguments[:2]) if arguments[0] == "data" else arguments[0]
+    assert done.returncode == 2
+    what = f"{name} needs {library}, which is not installed"
+    assert done.stderr == f"gamba: {what}: pip install 'gamba-warp[{extra}]'\n"
+
+
+@pytest.mark.slow
+def test_what_only_an_option_needs(tmp_path):
+    picture, busy = cut_out(tmp_path / "thing.png"), tmp_path / "busy.png"
+    save_image(busy, np.ones((20, 30, 3)) * 0.9)
+    quick = ("--turntable", "none", "--no-page", "--out", tmp_path / "out")
+    for options, library, extra in (
+        ((picture, "--mesh", "glb"), "open3d", "mesh"),
+        ((busy,), "skimage", "photo"),
+    ):
+        done = in_the_core("reconstruct", *options, *quick)
+        assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].endswith(
+            f"needs {library}, which is not installed: pip install 'gamba-warp[{extra}]'"
+        ), done.stderr
