@@ -15,8 +15,12 @@ from pathlib import Path
 
 from .errors import UserError
 
-# The folder of a checkout: of this package, tests/ and starter/. An installed package has neither.
-CHECKOUT = Path(__file__).resolve().parent.parent
+PACKAGE = Path(__file__).resolve().parent
+# The folder of a checkout: of this package, of tests/ and of starter/.
+CHECKOUT = PACKAGE.parent
+# The shipped model and pictures to try it on: two in an installed package, more in a checkout,
+# where the starter set's data lie beside them.
+STARTER = PACKAGE / "starter" if (PACKAGE / "starter").is_dir() else CHECKOUT / "starter"
 # What is not finished has a name that begins so. No command takes names with a dot for inputs.
 PART = ".gamba-part-"
 _PART_NAME = re.compile(re.escape(PART) + "[a-z0-9_]{8}")

@@ -7,10 +7,8 @@ import time
 from pathlib import Path
 
 from ..errors import UserError
-from ..files import CHECKOUT, only_process, output_folder
+from ..files import STARTER, only_process, output_folder
 from ..untrusted.ranges import Minutes, ranged
-
-STARTER = CHECKOUT / "starter"
 
 
 @ranged

@@ -12,7 +12,7 @@ from ..batch import check_not_read, for_each, plan_outputs, report
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
-from ..files import output_folder
+from ..files import STARTER, output_folder
 from ..formats.names import GaussianFormat, MeshFormat
 from ..untrusted.ranges import Frames, Opacity, Side, ranged
 
@@ -110,7 +110,8 @@ def _found(
     from ..images import find_pictures
 
     if not images:
-        raise UserError("give at least one picture or folder")
+        example = next(iter(sorted((STARTER / "icons").glob("*.png"))), "photo.png")
+        raise UserError(f"give at least one picture or folder, such as {example}")
     pictures, failures = find_pictures(images)
     if mask is not None and len(pictures) != 1:
         raise UserError(f"--mask goes with one picture, {len(pictures)} are given")
@@ -125,8 +126,8 @@ def _file_of(checkpoint: Path) -> Path:
 
     if not checkpoint.exists():
         raise UserError(
-            f"{checkpoint}: no such checkpoint; train one with 'gamba train' or 'gamba demo', "
-            "or give --checkpoint FILE"
+            f"{checkpoint}: no such checkpoint; train one with 'gamba train', or give "
+            "--checkpoint FILE"
         )
     return checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UserError, first_line
-from ..files import CHECKOUT, atomic_path
+from ..files import STARTER, atomic_path
 from .config import GambaConfig
 from .encoders import outline_encoder
 from .gamba import Gamba
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
-DEFAULT_CHECKPOINT = CHECKOUT / "starter" / "rays.safetensors"
+DEFAULT_CHECKPOINT = STARTER / "rays.safetensors"
 
 MAX_HEADER = 16 << 20  # bytes; that of a model of 256 blocks takes 1 MB
 _SMALL = 10_000_000  # parameters of a model that is built at once: torch's meta device is slow
@@ -72,8 +72,8 @@ def load_model(
     """Reads a file of ``save_model``.
 
     Args:
-        path: the file, or a folder with a ``model.safetensors``; without it the small model in
-            ``starter/``, which a checkout has and an installed package does not.
+        path: the file, or a folder with a ``model.safetensors``; without it the small model that
+            comes with the package.
         device: the model's device.
         encoder_weights: as for ``build_encoder``; a frozen timm encoder needs them.
 
