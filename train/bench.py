@@ -134,8 +134,9 @@ class _MadeUp(ViewDataset):
         return self.views
 
     def load(
-        self, index: int | str, views: Sequence[int] | None = None, size: int | None = None
-    ) -> ObjectViews:
+        self, index: int | str, views: Sequence[int] | None = None, size: int | None = None,
+        depths: int | None = None,
+    ) -> ObjectViews:  # fmt: skip
         """Views of one object, as ``ViewDataset.load`` gives them; ``size`` is that of all."""
         chosen = list(range(self.views) if views is None else views)
         images = self.pictures[int(index), chosen].clone()
