@@ -1,0 +1,1 @@
+"""Other packages' public names over our kernels: only the name of the package changes."""
