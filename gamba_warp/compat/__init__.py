@@ -1,1 +1,1 @@
-"""Other packages' public names over our kernels: only the name of the package changes."""
+"""Other packages' interfaces over our kernels: change the import, keep the code."""
