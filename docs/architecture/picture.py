@@ -63,6 +63,7 @@ BOXES = {
     "kernels.bench": Box(1, 2, "kernels", "bench", ("run time against error", "of the operators")),
     "kernels.stress": Box(2, 2, "kernels", "stress", ("hostile cases", "against float64")),
     "words": Box(3.4, 2, "gamba_warp", "words", ("gaussians, cameras,", "render, images, files")),
+    "compat": Box(0, 3, "gamba_warp", "compat", ("other packages' names", "over our kernels")),
     "untrusted": Box(
         3.4, 3, "gamba_warp", "untrusted", ("what strangers' files", "go through first")
     ),

@@ -67,6 +67,7 @@ ROOMS = {
     ),
     "kernels.stress": Room("its public names", ("kernels.stress.core",)),
     "words": Room("Gaussians, cameras, images, rendering, files, errors", _KERNELS),
+    "compat": Room("other packages' interfaces over our kernels", _WORDS),
     "untrusted": Room("what strangers' files go through first", _WORDS),
     "data": Room("datasets, preprocessing, weights to fetch", _READERS),
     "formats": Room(".ply, .splat, .glb, meshes, their headers", _READERS),

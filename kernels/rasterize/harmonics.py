@@ -1,11 +1,19 @@
-"""Real spherical harmonics up to degree 3, in torch (autograd gives the gradients)."""
+"""Real spherical harmonics up to degree 4, in torch (autograd gives the gradients)."""
 
 import torch
 from torch import Tensor
 
 
-def _basis(degree: int, directions: Tensor) -> Tensor:
-    """``[.., (degree + 1)²]`` of unit ``directions [.., 3]``, in the order and signs of 3DGS."""
+def harmonics_basis(degree: int, directions: Tensor) -> Tensor:
+    """Values of the harmonics, in the order and signs of 3DGS.
+
+    Args:
+        degree: 0 to 4.
+        directions: ``[.., 3]``, unit.
+
+    Returns:
+        ``[.., (degree + 1)²]``.
+    """
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     basis = [torch.full_like(x, 0.28209479177387814)]
@@ -30,6 +38,18 @@ def _basis(degree: int, directions: Tensor) -> Tensor:
             -0.4570457994644658 * x * (4 * zz - xx - yy),
             1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    if degree > 3:
+        basis += [
+            2.5033429417967046 * x * y * (xx - yy),
+            -1.7701307697799304 * y * z * (3 * xx - yy),
+            0.9461746957575601 * x * y * (7 * zz - 1),
+            -0.6690465435572892 * y * z * (7 * zz - 3),
+            0.10578554691520431 * (35 * zz * zz - 30 * zz + 3),
+            -0.6690465435572892 * x * z * (7 * zz - 3),
+            0.47308734787878004 * (xx - yy) * (7 * zz - 1),
+            -1.7701307697799304 * x * z * (xx - 3 * yy),
+            0.6258357354491761 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ]
     return torch.stack(basis, -1)
 
@@ -56,5 +76,5 @@ def colors_from_harmonics(
     rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centers = -(rotation.mT @ translation[..., None])[..., 0]
     directions = torch.nn.functional.normalize(means[:, None] - centers[:, :, None], dim=-1)
-    colors = torch.einsum("bvnk,bnkc->bvnc", _basis(degree, directions), used) + 0.5
+    colors = torch.einsum("bvnk,bnkc->bvnc", harmonics_basis(degree, directions), used) + 0.5
     return torch.where(finite[:, None, :, None], colors.clamp_min(0), torch.nan)

@@ -45,6 +45,8 @@ class LensOptions(NamedTuple):
         alpha_min: as ``rasterization``.
         antialiased: not 0 for ``rasterize_mode="antialiased"``.
         skip_unused: not 0 to leave out gradients that are zero, as ``Skip.unused``.
+        rounded: not 0 to cull by half sides of boxes that are rounded up to whole pixels, as gsplat
+            does; a Gaussian that this keeps beside the picture has no pair.
     """
 
     width: float
@@ -56,6 +58,7 @@ class LensOptions(NamedTuple):
     alpha_min: float
     antialiased: float
     skip_unused: float
+    rounded: float = 0.0
 
     def numbers(self) -> list[float]:
         """The attributes in their order; ``LensOptions(*numbers)`` is the way back."""
@@ -95,6 +98,7 @@ class Lens:
     alpha_min: float
     antialiased: int
     skip_unused: int
+    rounded: int
 
 
 @wp.func
@@ -267,11 +271,14 @@ def _project(
             return
     cut = wp.sqrt(2.0 * wp.log(opacity / lens.alpha_min))
     extent = wp.vec2(cut * wp.sqrt(sxx), cut * wp.sqrt(syy))
-    if extent[0] <= lens.radius_clip and extent[1] <= lens.radius_clip:
+    reach = extent
+    if lens.rounded != 0:
+        reach = wp.vec2(wp.ceil(extent[0]), wp.ceil(extent[1]))
+    if reach[0] <= lens.radius_clip and reach[1] <= lens.radius_clip:
         status_out[i] = _SMALL
         return
-    inside_x = center[0] + extent[0] >= 0.0 and center[0] - extent[0] <= lens.width
-    inside_y = center[1] + extent[1] >= 0.0 and center[1] - extent[1] <= lens.height
+    inside_x = center[0] + reach[0] >= 0.0 and center[0] - reach[0] <= lens.width
+    inside_y = center[1] + reach[1] >= 0.0 and center[1] - reach[1] <= lens.height
     if not (inside_x and inside_y):
         status_out[i] = _OUTSIDE
         return
@@ -291,6 +298,7 @@ def make_lens(options: LensOptions) -> Lens:
     lens.radius_clip, lens.eps2d = options.radius_clip, options.eps2d
     lens.alpha_min = options.alpha_min
     lens.antialiased, lens.skip_unused = int(options.antialiased), int(options.skip_unused)
+    lens.rounded = int(options.rounded)
     return lens
 
 

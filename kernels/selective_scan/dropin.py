@@ -24,6 +24,15 @@ def _input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
     raise ValueError(f"{name} has shape {tuple(x.shape)}; must be (D, N), (B, N, L), (B, G, N, L)")
 
 
+def _grouped(x: Tensor, groups: int) -> Tensor:
+    """Brings ``[B, L, G, N]`` to more groups if they are a multiple, in float32 as their sum."""
+    if x.shape[2] == groups or x.shape[2] == 0 or groups % x.shape[2]:
+        return x
+    if x.shape[2] == 1:  # without a copy
+        return x.float().expand(-1, -1, groups, -1)
+    return x.float().repeat_interleave(groups // x.shape[2], dim=2)
+
+
 def selective_scan_fn(
     u: Tensor,
     delta: Tensor,
@@ -65,10 +74,7 @@ def selective_scan_fn(
     tokens = u.transpose(1, 2)
     B, C = _input_matrix(B, tokens, "B"), _input_matrix(C, tokens, "C")
     groups = max(B.shape[2], C.shape[2])
-    if B.shape[2] != groups and groups % B.shape[2] == 0:  # float32, as gradients are summed again
-        B = B.float().repeat_interleave(groups // B.shape[2], dim=2)
-    if C.shape[2] != groups and groups % C.shape[2] == 0:
-        C = C.float().repeat_interleave(groups // C.shape[2], dim=2)
+    B, C = _grouped(B, groups), _grouped(C, groups)
     out, last = selective_scan(
         u,
         tokens_first(delta, "delta"),

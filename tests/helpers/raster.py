@@ -1,11 +1,16 @@
 """Scenes for the rasterizer's tests: random Gaussians and cameras, and the limits of errors.
 
+The last two functions are what gsplat's own torch functions need to blend on the CPU.
+
 A scene is a dict of the arguments of ``rasterization``, so that a test may change one by name.
 """
+
+import types
 
 import torch
 
 from gamba_warp.cameras import orbit
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
@@ -60,3 +65,45 @@ def near_a_cut(scene, options):
         for s in (-1e-5, 1e-5)
     )
     return (low != high)[..., 0]
+
+
+def nerfacc():
+    """The two functions of nerfacc that gsplat's ``accumulate`` asks for; pairs come ray by ray."""
+
+    def render_weight_from_alpha(alphas, ray_indices, n_rays):
+        order = torch.arange(len(alphas))
+        first = torch.full((n_rays,), len(alphas)).scatter_reduce(
+            0, ray_indices, order, "amin", include_self=True
+        )
+        light = torch.log1p(-alphas)
+        before = torch.cumsum(light, 0) - light
+        transmittances = torch.exp(before - before[first[ray_indices]])
+        return transmittances * alphas, transmittances
+
+    def accumulate_along_rays(weights, values, ray_indices, n_rays):
+        values = weights[:, None] if values is None else weights[:, None] * values
+        return values.new_zeros(n_rays, values.shape[-1]).index_add(0, ray_indices, values)
+
+    module = types.ModuleType("nerfacc")
+    module.render_weight_from_alpha = render_weight_from_alpha
+    module.accumulate_along_rays = accumulate_along_rays
+    return module
+
+
+def visible_pairs(projected, opacities, width, height):
+    """Every (image, pixel, Gaussian) with alpha >= alpha_min, ray by ray and front to back."""
+    _, means2d, depths, conics, _ = projected
+    images, num = depths.flatten(0, 1).shape
+    means2d, conics = means2d.view(images, num, 2), conics.view(images, num, 3)
+    order = torch.argsort(depths.view(images, num), stable=True)
+    parts = []
+    for image in range(images):
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        pixels = torch.stack([x, y], -1).view(-1, 1, 2) + 0.5
+        d = pixels - means2d[image, order[image]]
+        a, b, c = conics[image, order[image]].unbind(-1)
+        q = a * d[..., 0] ** 2 + 2 * b * d[..., 0] * d[..., 1] + c * d[..., 1] ** 2
+        alpha = opacities.reshape(images, num)[image, order[image]] * torch.exp(-0.5 * q)
+        pixel, rank = (alpha >= ALPHA_MIN).nonzero(as_tuple=True)
+        parts.append((order[image][rank], pixel, torch.full_like(pixel, image)))
+    return tuple(torch.cat(p) for p in zip(*parts))

@@ -9,7 +9,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 # Libraries whose distribution has another name than the module.
 DISTRIBUTIONS = {"PIL": "pillow", "skimage": "scikit-image", "warp": "warp-lang"}
-OPTIONAL = {"lpips"}  # its weights are taken from the package where somebody has it
+# lpips: its weights are taken from the package where somebody has it; gsplat: its own strategies.
+OPTIONAL = {"gsplat", "lpips"}
 
 
 def imported() -> dict[str, Path]:

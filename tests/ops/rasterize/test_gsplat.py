@@ -1,18 +1,18 @@
 """The rasterizer against gsplat's own torch functions: somebody else's code for the same maths.
 
 They run on the CPU: projection, harmonics, tile lists and ``accumulate``, which blends given pairs
-of pixels and Gaussians (with two functions of nerfacc, which are written here). gsplat clamps alpha
-at 0.999 there, so opacities stay below 0.99, and never stops, so pixels are kept from saturating.
+of pixels and Gaussians (with two functions of nerfacc, written in helpers/raster.py). gsplat clamps
+alpha at 0.999 there, so opacities stay below 0.99, and never stops, so pixels are kept from
+saturating.
 """
 
 import importlib.util
 import sys
-import types
 
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.raster import NAMES, leaves, make
+from helpers.raster import NAMES, leaves, make, nerfacc, visible_pairs
 
 from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, TILE
@@ -173,52 +173,10 @@ def test_tile_lists(size, width, height):
     assert kept.float().mean() > 0.9, "few pairs are in our lists for nothing"
 
 
-def _nerfacc():
-    """The two functions of nerfacc that gsplat's ``accumulate`` asks for; pairs come ray by ray."""
-
-    def render_weight_from_alpha(alphas, ray_indices, n_rays):
-        order = torch.arange(len(alphas))
-        first = torch.full((n_rays,), len(alphas)).scatter_reduce(
-            0, ray_indices, order, "amin", include_self=True
-        )
-        light = torch.log1p(-alphas)
-        before = torch.cumsum(light, 0) - light
-        transmittances = torch.exp(before - before[first[ray_indices]])
-        return transmittances * alphas, transmittances
-
-    def accumulate_along_rays(weights, values, ray_indices, n_rays):
-        values = weights[:, None] if values is None else weights[:, None] * values
-        return values.new_zeros(n_rays, values.shape[-1]).index_add(0, ray_indices, values)
-
-    module = types.ModuleType("nerfacc")
-    module.render_weight_from_alpha = render_weight_from_alpha
-    module.accumulate_along_rays = accumulate_along_rays
-    return module
-
-
-def visible_pairs(projected, opacities, width, height):
-    """Every (image, pixel, Gaussian) with alpha >= alpha_min, ray by ray and front to back."""
-    _, means2d, depths, conics, _ = projected
-    images, num = depths.flatten(0, 1).shape
-    means2d, conics = means2d.view(images, num, 2), conics.view(images, num, 3)
-    order = torch.argsort(depths.view(images, num), stable=True)
-    parts = []
-    for image in range(images):
-        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        pixels = torch.stack([x, y], -1).view(-1, 1, 2) + 0.5
-        d = pixels - means2d[image, order[image]]
-        a, b, c = conics[image, order[image]].unbind(-1)
-        q = a * d[..., 0] ** 2 + 2 * b * d[..., 0] * d[..., 1] + c * d[..., 1] ** 2
-        alpha = opacities.reshape(images, num)[image, order[image]] * torch.exp(-0.5 * q)
-        pixel, rank = (alpha >= ALPHA_MIN).nonzero(as_tuple=True)
-        parts.append((order[image][rank], pixel, torch.full_like(pixel, image)))
-    return tuple(torch.cat(p) for p in zip(*parts))
-
-
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_pictures_and_gradients(monkeypatch, antialiased):
     """Their projection and blending from end to end, in float64."""
-    monkeypatch.setitem(sys.modules, "nerfacc", _nerfacc())
+    monkeypatch.setitem(sys.modules, "nerfacc", nerfacc())
     scene = scene_of(120, width=40, height=33)
     got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
     kind = "antialiased" if antialiased else "classic"

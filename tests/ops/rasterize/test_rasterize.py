@@ -150,9 +150,9 @@ def test_harmonics(degree):
 
 def test_harmonics_are_orthonormal():
     """∫ Y_j Y_k = δ_jk by a Monte Carlo sum: a wrong constant or sign of a term shows."""
-    from gamba_warp.kernels.rasterize.harmonics import _basis
+    from gamba_warp.kernels.rasterize.harmonics import harmonics_basis
 
     directions = torch.nn.functional.normalize(torch.randn(400_000, 3, dtype=torch.float64), dim=-1)
-    basis = _basis(3, directions)
+    basis = harmonics_basis(3, directions)
     gram = 4 * torch.pi * basis.T @ basis / len(directions)
     assert (gram - torch.eye(16)).abs().max() < 0.03  # 1 / sqrt(400000), times 4 sigma and Y² - 1

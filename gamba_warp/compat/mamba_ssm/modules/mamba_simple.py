@@ -1,0 +1,266 @@
+"""The Mamba-1 layer with mamba-ssm's arguments, attributes and names of weights."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ....kernels.causal_conv1d import causal_conv1d
+from ....kernels.selective_scan import selective_scan
+from ...causal_conv1d import causal_conv1d_update
+from ...states import check_dtype, without_gradient
+from ..ops.triton.selective_state_update import selective_state_update
+from ..utils.generation import InferenceParams
+
+CONV_SIZES = (2, 3, 4)  # what the convolution's kernel has
+
+
+def _check_sizes(d_state: int, d_conv: int, dt_rank: int | str, dt_init: str) -> None:
+    if not 1 <= d_state <= 256:
+        raise ValueError(f"d_state is {d_state}, must be from 1 to 256")
+    if d_conv not in CONV_SIZES:
+        raise ValueError(f"d_conv is {d_conv}, allowed: {CONV_SIZES}")
+    if isinstance(dt_rank, str) and dt_rank != "auto":
+        raise ValueError(f"dt_rank is {dt_rank!r}, must be a number or 'auto'")
+    if dt_init not in ("random", "constant"):
+        raise ValueError(f"dt_init is {dt_init!r}, allowed: ('random', 'constant')")
+
+
+class Mamba(nn.Module):
+    """A Mamba layer: tokens in, tokens out, each depending on itself and those before it.
+
+    Its state dict has mamba-ssm's names and shapes, so weights go both ways, and from one seed it
+    draws the weights that mamba-ssm draws. The projections are called as modules, so hooks and
+    adapters on ``in_proj``, ``x_proj`` and ``out_proj`` act.
+    """
+
+    def __init__(
+        self,
+        d_model: int,
+        d_state: int = 16,
+        d_conv: int = 4,
+        expand: int = 2,
+        dt_rank: int | str = "auto",
+        dt_min: float = 0.001,
+        dt_max: float = 0.1,
+        dt_init: str = "random",
+        dt_scale: float = 1.0,
+        dt_init_floor: float = 1e-4,
+        conv_bias: bool = True,
+        bias: bool = False,
+        use_fast_path: bool = True,
+        layer_idx: int | None = None,
+        device=None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        """Builds the layer.
+
+        Args:
+            d_model: channels of a token.
+            d_state: states of a channel, N, from 1 to 256.
+            d_conv: taps of the convolution, from 2 to 4.
+            expand: inner channels over d_model.
+            dt_rank: rank of the step's projection; "auto" is d_model / 16, rounded up.
+            dt_min: least step at the start; steps are drawn log-uniformly.
+            dt_max: largest step at the start.
+            dt_init: "random" or "constant" weights of the step's projection.
+            dt_scale: their scale.
+            dt_init_floor: no step is below it at the start.
+            conv_bias: whether the convolution has a bias.
+            bias: whether the first and the last projection have one.
+            use_fast_path: kept as an attribute; there is one path.
+            layer_idx: the layer's key in ``InferenceParams``; needed with one alone.
+            device: of the weights.
+            dtype: of the weights, but for A_log and D, which are float32.
+
+        Raises:
+            ValueError: ``d_state``, ``d_conv``, ``dt_rank`` or ``dt_init`` is not one of the above.
+        """
+        super().__init__()
+        _check_sizes(d_state, d_conv, dt_rank, dt_init)
+        self.d_model, self.d_state, self.d_conv, self.expand = d_model, d_state, d_conv, expand
+        self.d_inner = inner = int(expand * d_model)
+        self.dt_rank = math.ceil(d_model / 16) if isinstance(dt_rank, str) else dt_rank
+        self.use_fast_path, self.layer_idx = use_fast_path, layer_idx
+        self.activation, self.act = "silu", nn.SiLU()
+        at = {"device": device, "dtype": dtype}
+        # The order of what follows is that in which mamba-ssm draws: one seed, the same weights.
+        self.in_proj = nn.Linear(d_model, 2 * inner, bias=bias, **at)
+        self.conv1d = nn.Conv1d(
+            inner, inner, d_conv, padding=d_conv - 1, groups=inner, bias=conv_bias, **at
+        )
+        self.x_proj = nn.Linear(inner, self.dt_rank + 2 * d_state, bias=False, **at)
+        self.dt_proj = nn.Linear(self.dt_rank, inner, **at)
+        bound = self.dt_rank**-0.5 * dt_scale
+        if dt_init == "constant":
+            nn.init.constant_(self.dt_proj.weight, bound)
+        else:
+            nn.init.uniform_(self.dt_proj.weight, -bound, bound)
+        low, high = math.log(dt_min), math.log(dt_max)
+        step = torch.exp(torch.rand(inner, **at) * (high - low) + low).clamp(min=dt_init_floor)
+        with torch.no_grad():
+            self.dt_proj.bias.copy_(step + torch.log(-torch.expm1(-step)))  # softplus's inverse
+        vars(self.dt_proj.bias)["_no_reinit"] = True
+        states = torch.arange(1, d_state + 1, dtype=torch.float32, device=device)
+        self.A_log = nn.Parameter(states.log().repeat(inner, 1))
+        self.D = nn.Parameter(torch.ones(inner, device=device))
+        for parameter in (self.A_log, self.D):
+            vars(parameter)["_no_weight_decay"] = True
+        self.out_proj = nn.Linear(inner, d_model, bias=bias, **at)
+
+    def forward(
+        self, hidden_states: Tensor, inference_params: InferenceParams | None = None
+    ) -> Tensor:
+        """Runs over all tokens at once.
+
+        Args:
+            hidden_states: ``[B, L, d_model]`` float32, bfloat16 or float16.
+            inference_params: if given, this layer's states in it are set to those after the last
+                token (no gradient flows through them). Where its ``seqlen_offset`` is over 0, the
+                tokens go on from these states, one token by ``step`` (without a gradient).
+
+        Returns:
+            ``[B, L, d_model]``.
+
+        Raises:
+            TypeError: the dtype is none of the above.
+            ValueError: the shape is another; ``layer_idx`` is None, or the states in
+                ``inference_params`` are of another batch.
+        """
+        self._check(hidden_states)
+        if inference_params is None:
+            return self._run(hidden_states)[0]
+        states = self._get_states_from_cache(inference_params, hidden_states.shape[0])
+        begun = inference_params.seqlen_offset > 0
+        if begun and hidden_states.shape[1] == 1:
+            return self.step(hidden_states, *states)[0]
+        out, *after = self._run(hidden_states, states if begun else None)
+        with torch.no_grad():
+            for state, value in zip(states, after):
+                state.copy_(value)
+        return out
+
+    def _run(self, tokens: Tensor, states: tuple[Tensor, Tensor] | None = None):
+        """The output, and both states after the last token, in the layout of the cache."""
+        x, z = self.in_proj(tokens).chunk(2, dim=-1)
+        if states is None:
+            seen, scan_state = x.new_zeros(x.shape[0], self.d_conv, self.d_inner), None
+            conv_state = None
+        else:  # copies: the cache is overwritten, and a gradient may need what it was
+            seen, scan_state = states[0].transpose(1, 2).to(x.dtype), states[1].float().clone()
+            conv_state = seen[:, 1:].clone()
+        recent = torch.cat([seen, x[:, -self.d_conv :]], 1)[:, -self.d_conv :]
+        x = causal_conv1d(
+            x,
+            self.conv1d.weight[:, 0],
+            self.conv1d.bias,
+            activation=self.activation,
+            initial_state=conv_state,
+        )
+        low_rank, B, C = self.x_proj(x).split([self.dt_rank, self.d_state, self.d_state], dim=-1)
+        y, scan_state = selective_scan(
+            x,
+            # The bias is added inside the scan, in float32: a step of 1e-3 needs it.
+            F.linear(low_rank, self.dt_proj.weight),
+            -torch.exp(self.A_log.float()),
+            B,
+            C,
+            D=self.D.float(),
+            z=z,
+            delta_bias=self.dt_proj.bias.float(),
+            delta_softplus=True,
+            initial_state=scan_state,
+            return_last_state=True,
+        )
+        return self.out_proj(y), recent.transpose(1, 2), scan_state
+
+    @without_gradient
+    def step(
+        self, hidden_states: Tensor, conv_state: Tensor, ssm_state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Runs over one more token; no gradient flows through it.
+
+        Args:
+            hidden_states: ``[B, 1, d_model]``.
+            conv_state: ``[B, d_inner, d_conv]``, updated in place.
+            ssm_state: ``[B, d_inner, d_state]``, updated in place.
+
+        Returns:
+            ``[B, 1, d_model]``, and both states.
+
+        Raises:
+            TypeError: as ``forward``.
+            ValueError: a shape is not one of the above.
+        """
+        self._check(hidden_states)
+        if hidden_states.shape[1] != 1:
+            shape = tuple(hidden_states.shape)
+            raise ValueError(f"hidden_states has shape {shape}, must be [B, 1, {self.d_model}]")
+        x, z = self.in_proj(hidden_states[:, 0]).chunk(2, dim=-1)
+        x = causal_conv1d_update(
+            x, conv_state, self.conv1d.weight[:, 0], self.conv1d.bias, self.activation
+        )
+        low_rank, B, C = self.x_proj(x).split([self.dt_rank, self.d_state, self.d_state], dim=-1)
+        y = selective_state_update(
+            ssm_state,
+            x,
+            F.linear(low_rank, self.dt_proj.weight),
+            -torch.exp(self.A_log.float()),
+            B,
+            C,
+            self.D,
+            z=z,
+            dt_bias=self.dt_proj.bias,
+            dt_softplus=True,
+        )
+        return self.out_proj(y)[:, None], conv_state, ssm_state
+
+    def allocate_inference_cache(
+        self, batch_size: int, max_seqlen: int, dtype: torch.dtype | None = None, **kwargs
+    ) -> tuple[Tensor, Tensor]:
+        """Makes the states before the first token.
+
+        Args:
+            batch_size: B.
+            max_seqlen: not needed: the states do not grow.
+            dtype: of both states; None means the convolution's for the first and float32 for the
+                second, since a slow decay is lost when a state is rounded to 8 bits at every token.
+            **kwargs: not needed.
+
+        Returns:
+            ``[B, d_inner, d_conv]`` and ``[B, d_inner, d_state]``, zeros.
+        """
+        device = self.out_proj.weight.device
+        conv_dtype, scan_dtype = dtype or self.conv1d.weight.dtype, dtype or torch.float32
+        conv = torch.zeros(batch_size, self.d_inner, self.d_conv, device=device, dtype=conv_dtype)
+        scan = torch.zeros(batch_size, self.d_inner, self.d_state, device=device, dtype=scan_dtype)
+        return conv, scan
+
+    def _get_states_from_cache(
+        self, inference_params: InferenceParams, batch_size: int, initialize_states: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """This layer's states in ``inference_params``, made if there are none, or set to zero."""
+        if self.layer_idx is None:
+            raise ValueError("layer_idx is None, must be this layer's number to use a cache")
+        cache = inference_params.key_value_memory_dict
+        if self.layer_idx not in cache:
+            cache[self.layer_idx] = self.allocate_inference_cache(batch_size, 0)
+        conv_state, ssm_state = cache[self.layer_idx]
+        if conv_state.shape[0] != batch_size:
+            raise ValueError(
+                f"hidden_states has a batch of {batch_size}, "
+                f"the cache of layer {self.layer_idx} one of {conv_state.shape[0]}"
+            )
+        if initialize_states:
+            conv_state.zero_()
+            ssm_state.zero_()
+        return conv_state, ssm_state
+
+    def _check(self, hidden_states: Tensor) -> None:
+        check_dtype("hidden_states", hidden_states)
+        if hidden_states.dim() != 3 or hidden_states.shape[2] != self.d_model:
+            shape = tuple(hidden_states.shape)
+            raise ValueError(f"hidden_states has shape {shape}, must be [B, L, {self.d_model}]")

@@ -1,0 +1,1 @@
+"""The functions of mamba-ssm, in files of its names."""

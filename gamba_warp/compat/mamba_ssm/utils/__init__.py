@@ -1,0 +1,1 @@
+"""What generation needs, in files of mamba-ssm's names."""

@@ -1,0 +1,23 @@
+"""The example of docs/examples learns, and writes what its whole text would give."""
+
+import torch
+from examples import char_mamba
+
+
+def test_it_learns_and_writes(capsys):
+    loss = char_mamba.main(["--steps", "25", "--letters", "9", "--length", "32"])
+    out = capsys.readouterr().out
+    first = float(out.split("loss ")[1].split()[0])
+    assert loss < first - 0.3, "the average of the loss falls"
+    assert out.rpartition("letters/s:\n")[2].startswith("The statement ")
+
+
+def test_it_writes_the_letters_that_the_whole_text_gives():
+    model, prompt = char_mamba.CharModel(11, width=16), torch.tensor([3, 1, 4, 1, 5])
+    with torch.no_grad():
+        model.head.weight *= 1e4  # so that each letter is certain
+        model.head.bias *= 0
+        written = char_mamba.write(model, prompt, 12)
+        logits = model(written[None])[0]
+    assert torch.equal(written[:5], prompt)
+    assert torch.equal(logits[4:-1].argmax(-1), written[5:])

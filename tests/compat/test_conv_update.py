@@ -1,0 +1,91 @@
+"""The next tokens of a convolution: against whole sequences, with rings, rows and any lengths."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from helpers import assert_rel_rms
+
+from gamba_warp.compat.causal_conv1d import causal_conv1d_fn, causal_conv1d_update
+
+LIMITS = {torch.float32: 5e-7, torch.float16: 5e-4, torch.bfloat16: 4e-3}  # half an ulp
+
+
+def whole(tokens, weight, bias, activation):
+    """The convolution of ``[B, D, L]`` from zeros on, in float64 by torch."""
+    padded = F.pad(tokens.double(), (weight.shape[1] - 1, 0))
+    bias = None if bias is None else bias.double()
+    out = F.conv1d(padded, weight.double()[:, None], bias, groups=len(weight))
+    return out if activation is None else F.silu(out)
+
+
+@pytest.mark.parametrize("dtype", LIMITS, ids=str)
+@pytest.mark.parametrize("ring", [False, True])
+@pytest.mark.parametrize("width, size", [(2, 1), (3, 3), (4, 4), (4, 3), (3, 9)])
+@pytest.mark.parametrize("bias, activation", [(True, "silu"), (False, None)])
+def test_pieces_make_the_whole(width, size, ring, bias, activation, dtype):
+    batch, channels, pieces = 3, 5, (1, 1, 4, 2, 1, 11, 1)
+    tokens = torch.randn(batch, channels, sum(pieces)).to(dtype)
+    weight = torch.randn(channels, width)
+    bias = torch.randn(channels) if bias else None
+    state = torch.zeros(batch, channels, size).to(dtype)
+    seen, outs = 0, []
+    for piece in tokens.split(pieces, -1):
+        at = torch.full((batch,), seen, dtype=torch.int32) if ring else None
+        piece = piece[..., 0] if piece.shape[2] == 1 else piece
+        out = causal_conv1d_update(piece, state, weight, bias, activation, cache_seqlens=at)
+        assert out.shape == piece.shape and out.dtype == dtype
+        outs.append(out.view(batch, channels, -1))
+        seen += outs[-1].shape[2]
+    assert_rel_rms(torch.cat(outs, -1), whole(tokens, weight, bias, activation), LIMITS[dtype], "")
+    columns = [t % size if ring else t - seen + size for t in range(seen - size, seen)]
+    assert torch.equal(state[..., columns], tokens[..., seen - size :])
+
+
+def test_each_ring_has_its_own_place():
+    tokens, weight = torch.randn(2, 5, 9), torch.randn(5, 4)
+    state = torch.zeros(2, 5, 6)
+    causal_conv1d_update(tokens[:1, :, :5], state[:1], weight, cache_seqlens=torch.tensor([0]))
+    causal_conv1d_update(tokens[1:, :, :8], state[1:], weight, cache_seqlens=torch.tensor([0]))
+    following = torch.stack([tokens[0, :, 5], tokens[1, :, 8]])
+    out = causal_conv1d_update(following, state, weight, cache_seqlens=torch.tensor([5, 8]))
+    want = whole(tokens, weight, None, None)
+    assert_rel_rms(out, torch.stack([want[0, :, 5], want[1, :, 8]]), 5e-7, "out")
+
+
+@pytest.mark.parametrize("ring", [False, True])
+def test_rows_by_indices_and_padding(ring):
+    x, weight, bias = torch.randn(3, 5), torch.randn(5, 4), torch.randn(5)
+    state = torch.randn(7, 5, 6)
+    at = torch.tensor([3, 8, 1], dtype=torch.int32) if ring else None
+    expected = state.clone()
+    rows = expected[[4, 2]]
+    want = causal_conv1d_update(
+        x[[0, 2]], rows, weight, bias, "silu", at if at is None else at[::2]
+    )
+    expected[[4, 2]] = rows
+    indices = torch.tensor([4, -1, 2], dtype=torch.int32)
+    out = causal_conv1d_update(x, state, weight, bias, "silu", at, indices)
+    assert torch.equal(out[[0, 2]], want) and (out[1] == 0).all()
+    assert torch.equal(state, expected)
+
+
+def test_the_whole_is_that_of_the_kernel():
+    x, weight, bias = torch.randn(2, 5, 12), torch.randn(5, 3), torch.randn(5)
+    out = causal_conv1d_fn(x, weight, bias, activation="silu")
+    assert_rel_rms(out, whole(x, weight, bias, "silu"), 5e-7, "out")
+
+
+@pytest.mark.parametrize(
+    "change, error, text",
+    [
+        ({"x": torch.ones(3, 5).double()}, TypeError, "x has dtype torch.float64, allowed"),
+        ({"activation": "gelu"}, ValueError, "activation is 'gelu', allowed"),
+        ({"conv_state": torch.ones(3, 5, 2)}, ValueError, "conv_state has shape .* S >= 3"),
+        ({"weight": torch.ones(4, 4)}, ValueError, r"weight has shape \(4, 4\), must be \(5, W\)"),
+        ({"cache_seqlens": torch.ones(3)}, TypeError, "cache_seqlens has dtype torch.float32, al"),
+    ],
+)
+def test_refuses(change, error, text):
+    given = {"x": torch.ones(3, 5), "conv_state": torch.ones(3, 5, 4), "weight": torch.ones(5, 4)}
+    with pytest.raises(error, match=f"^{text}"):
+        causal_conv1d_update(**given | change)

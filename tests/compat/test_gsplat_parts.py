@@ -1,0 +1,267 @@
+"""The lower calls of the gsplat interface against gsplat's own torch functions, by name."""
+
+import importlib.util
+import sys
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers.raster import leaves, make, nerfacc, visible_pairs
+
+from gamba_warp.compat import gsplat as compat
+
+if importlib.util.find_spec("gsplat") is None:
+    pytest.skip("needs the package gsplat (pip install gsplat==1.5.3)", allow_module_level=True)
+from gsplat.cuda import _torch_impl as gsplat
+
+EXACT = 1e-5  # float32 against float64: a few hundred roundings
+GRADIENT = 1e-4  # as above, with factors up to 1 / (1 - alpha)
+WIDTH, HEIGHT = 39, 27
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Small operations: on a busy machine threads would only wait."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def scene_of(num=61, **changes):
+    scene = make(1, 2, num, **{"width": WIDTH, "height": HEIGHT, "size": 0.05, **changes})
+    scene["opacities"] = 0.02 + 0.5 * torch.rand(1, num)  # gsplat's accumulate never stops
+    del scene["backgrounds"]
+    return scene
+
+
+def compare(ours, theirs, got, want, names, limit=GRADIENT):
+    """Random cotangents on both sides; the gradients of the leaves by name."""
+    v = [torch.randn_like(x) / x.detach().abs().max().clamp_min(1e-3) for x in ours]
+    torch.autograd.backward(ours, v)
+    torch.autograd.backward(theirs, [x.double() for x in v])
+    for name in names:
+        assert got[name].grad.abs().max() > 0, name
+        assert_rel_rms(got[name].grad, want[name].grad, limit, name)
+
+
+@pytest.mark.parametrize("triu", [False, True])
+def test_covariances_and_precisions(triu):
+    made = dict(quats=torch.randn(3, 7, 4), scales=torch.rand(3, 7, 3) + 0.1)
+    got, want = leaves({**made, "Ks": torch.zeros(1)}, torch.float32), None
+    want = leaves({**made, "Ks": torch.zeros(1)}, torch.float64)
+    ours = compat.quat_scale_to_covar_preci(got["quats"], got["scales"], triu=triu)
+    theirs = gsplat._quat_scale_to_covar_preci(want["quats"], want["scales"], triu=triu)
+    for a, b in zip(ours, theirs):
+        assert a.shape == b.shape
+        assert (a - b).abs().max() <= EXACT * b.abs().max()
+    compare(ours, theirs, got, want, made)
+    some = compat.quat_scale_to_covar_preci(made["quats"], made["scales"], False, True)
+    assert some[0] is None and some[1].shape == (3, 7, 3, 3)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_harmonics(degree):
+    made = dict(dirs=torch.randn(5, 7, 3), coeffs=torch.randn(5, 7, 25, 3))
+    got = leaves({**made, "Ks": torch.zeros(1)}, torch.float32)
+    want = leaves({**made, "Ks": torch.zeros(1)}, torch.float64)
+    ours = compat.spherical_harmonics(degree, got["dirs"], got["coeffs"])
+    theirs = gsplat._spherical_harmonics(degree, want["dirs"], want["coeffs"])
+    assert (ours - theirs).abs().max() < EXACT * 10  # up to 25 terms of size 3
+    compare([ours], [theirs], got, want, ["dirs", "coeffs"][1 - bool(degree) :])
+    mask = torch.arange(7).expand(5, 7) % 2 == 0
+    masked = compat.spherical_harmonics(degree, got["dirs"], got["coeffs"], mask)
+    assert (masked[:, 1::2] == 0).all() and torch.equal(masked[:, ::2], ours[:, ::2])
+
+
+@pytest.mark.parametrize("by", ["quats", "covars"])
+@pytest.mark.parametrize("compensated", [False, True])
+def test_projection(by, compensated):
+    scene = scene_of()
+    scene["means"][..., :9, :] *= 9  # beside the picture and behind the camera
+    got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
+    covars = compat.quat_scale_to_covar_preci(got["quats"], got["scales"], triu=True)[0]
+    shape = (covars, None, None) if by == "covars" else (None, got["quats"], got["scales"])
+    views = got["viewmats"], got["Ks"], WIDTH, HEIGHT
+    found = compat.fully_fused_projection(
+        got["means"], *shape, *views, calc_compensations=compensated
+    )
+    covars = gsplat._quat_scale_to_covar_preci(want["quats"], want["scales"], True, False)[0]
+    views = want["viewmats"], want["Ks"], WIDTH, HEIGHT
+    expected = gsplat._fully_fused_projection(
+        want["means"], covars, *views, calc_compensations=compensated
+    )
+    seen, theirs = ((x[0] > 0).all(-1) for x in (found, expected))
+    assert 0.5 < seen.float().mean() < 1
+    assert not (seen & ~theirs).any()
+    assert (theirs & ~seen).sum() <= 2, "culled where the rounded box alone meets the picture"
+    assert found[0].dtype == torch.int32 and (found[0] - expected[0])[seen].abs().max() <= 1
+    ours, theirs = ([x[seen] for x in side[1:] if x is not None] for side in (found, expected))
+    assert len(ours) == 3 + compensated
+    for name, a, b in zip(("means2d", "depths", "conics", "compensations"), ours, theirs):
+        assert (a - b).abs().max() <= EXACT * b.abs().max(), name
+    compare(ours, theirs, got, want, ("means", "quats", "scales", "viewmats"))
+
+
+def test_packed_projection():
+    scene = scene_of()
+    scene["means"][..., :9, :] *= 9
+    given = [scene[k] for k in ("means", "quats", "scales", "viewmats", "Ks")]
+    given[1:1] = [None]
+    options = dict(radius_clip=4.0, opacities=scene["opacities"])
+    dense = compat.fully_fused_projection(*given, WIDTH, HEIGHT, **options)
+    packed = compat.fully_fused_projection(*given, WIDTH, HEIGHT, packed=True, **options)
+    at, rest = packed[:3], packed[3:]
+    seen = (dense[0] > 0).all(-1)
+    assert 20 < seen.sum() < 110 and (dense[0][seen] > 4).any(-1).all()
+    assert torch.equal(torch.stack(at, -1), seen.nonzero())
+    for a, b in zip(rest[:4], dense):
+        assert torch.equal(a, b[seen])
+    assert rest[4] is None
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_lists_of_tiles(packed):
+    images, num, tile, grid = 3, 47, 16, (3, 4)
+    means2d = torch.randn(images, num, 2) * 40
+    radii = torch.randint(0, 40, (images, num, 2), dtype=torch.int32)
+    depths = torch.rand(images, num)
+    counts, ids, rows = gsplat._isect_tiles(means2d, radii, depths, tile, *grid)
+    if packed:
+        flat = means2d.flatten(0, 1), radii.flatten(0, 1), depths.flatten()
+        image = torch.arange(images).repeat_interleave(num)
+        extra = dict(packed=True, n_images=images, image_ids=image, gaussian_ids=image)
+        found = compat.isect_tiles(*flat, tile, *grid, **extra)
+        counts = counts.flatten()
+    else:
+        found = compat.isect_tiles(means2d, radii, depths, tile, *grid)
+    for name, a, b in zip(
+        ("tiles_per_gauss", "isect_ids", "flatten_ids"), found, (counts, ids, rows)
+    ):
+        assert a.dtype == b.dtype and torch.equal(a, b), name
+    offsets = compat.isect_offset_encode(found[1], images, *grid)
+    assert torch.equal(offsets, gsplat._isect_offset_encode(ids, images, *grid))
+
+
+def lists_of(projected, tile):
+    radii, means2d, depths, _, _ = projected
+    columns, lines = -(-WIDTH // tile), -(-HEIGHT // tile)
+    _, ids, rows = compat.isect_tiles(means2d, radii, depths, tile, columns, lines)
+    offsets = compat.isect_offset_encode(ids, means2d[..., 0, 0].numel(), columns, lines)
+    return offsets.view(*means2d.shape[:-2], lines, columns), rows
+
+
+def blended(monkeypatch, scene, channels):
+    """Float64 leaves of the picture's parts and what gsplat's accumulate makes of them."""
+    monkeypatch.setitem(sys.modules, "nerfacc", nerfacc())
+    given = [scene[k] for k in ("means", "quats", "scales", "viewmats", "Ks")]
+    given[1:1] = [None]
+    projected = compat.fully_fused_projection(*given, WIDTH, HEIGHT)
+    num = scene["means"].shape[-2]
+    parts = dict(
+        means2d=projected[1],
+        conics=projected[3],
+        opacities=scene["opacities"][:, None].repeat(1, 2, 1),
+        colors=torch.randn(1, 2, num, channels),
+        backgrounds=torch.rand(1, 2, channels),
+    )
+    got, want = (leaves({**parts, "Ks": torch.zeros(1)}, t) for t in (torch.float32, torch.float64))
+    with torch.no_grad():
+        wide = tuple(x.double() for x in projected[:4])
+        pairs = visible_pairs((*wide, None), want["opacities"], WIDTH, HEIGHT)
+    seen = ((projected[0] > 0).all(-1)).flatten()[pairs[2] * num + pairs[0]]
+    pairs = tuple(x[seen] for x in pairs)
+    names = ("means2d", "conics", "opacities", "colors")
+    picture, alphas = gsplat.accumulate(*(want[k] for k in names), *pairs, WIDTH, HEIGHT)
+    picture = picture + (1 - alphas) * want["backgrounds"][..., None, None, :]
+    return projected, got, want, picture, alphas
+
+
+@pytest.mark.parametrize("tile, channels", [(16, 3), (5, 2), (20, 7)])
+@pytest.mark.parametrize("packed", [False, True])
+def test_pixels(monkeypatch, tile, channels, packed):
+    """Tiles of any size, also those that are no tiles of ours."""
+    projected, got, want, expected, alphas = blended(monkeypatch, scene_of(), channels)
+    names = ("means2d", "conics", "colors", "opacities")
+    offsets, rows = lists_of(projected, tile)
+    given = [got[k] for k in names]
+    if packed:
+        seen = (projected[0] > 0).all(-1)
+        given = [x[seen] for x in given]
+        rows = (seen.flatten().cumsum(0) - 1)[rows.long()].int()
+    size = WIDTH, HEIGHT, tile
+    found, alpha = compat.rasterize_to_pixels(
+        *given, *size, offsets, rows, got["backgrounds"], packed=packed
+    )
+    assert 0.1 < alphas.mean() and alphas.max() < 0.9999
+    assert (found - expected).abs().max() < 3 * EXACT  # colours of size 3
+    assert (alpha - alphas).abs().max() < EXACT
+    compare([found, alpha], [expected, alphas], got, want, (*names, "backgrounds"))
+
+
+@pytest.mark.parametrize("tile", [16, 5])
+def test_masked_tiles(tile):
+    scene = scene_of()
+    given = [scene[k] for k in ("means", "quats", "scales", "viewmats", "Ks")]
+    projected = compat.fully_fused_projection(given[0], None, *given[1:], WIDTH, HEIGHT)
+    offsets, rows = lists_of(projected, tile)
+    masks = torch.rand(offsets.shape) < 0.5
+    colors, opacities = torch.rand(1, 2, 61, 3), scene["opacities"][:, None].repeat(1, 2, 1)
+    given = projected[1], projected[3], colors, opacities, WIDTH, HEIGHT, tile, offsets, rows
+    whole, masked = (compat.rasterize_to_pixels(*given, masks=m)[0] for m in (None, masks))
+    wide = masks.repeat_interleave(tile, 2).repeat_interleave(tile, 3)[..., :HEIGHT, :WIDTH]
+    assert torch.equal(masked, whole * wide[..., None]) and (whole > 0).any()
+
+
+@pytest.mark.parametrize("tile", [16, 20])
+def test_absolute_gradients(tile):
+    """Against the gradient of every pixel by itself, in float64."""
+    width, height, num = 21, 18, 13
+    torch.manual_seed(5)
+    means2d = torch.rand(1, num, 2) * torch.tensor([width, height])
+    conics = torch.tensor([0.05, 0.02, 0.09]) * (0.5 + torch.rand(1, num, 1))
+    opacities, colors = 0.9 + 0.15 * torch.rand(1, num), torch.randn(1, num, 2)  # some are clamped
+    radii = torch.full((1, num, 2), 40, dtype=torch.int32)
+    depths = torch.arange(num).float()[None]
+    grid = -(-width // tile), -(-height // tile)
+    _, ids, rows = compat.isect_tiles(means2d, radii, depths, tile, *grid)
+    offsets = compat.isect_offset_encode(ids, 1, *grid)
+    v = [torch.randn(1, height, width, n) for n in (2, 1)]
+    means2d.requires_grad_()
+    given = means2d, conics, colors, opacities, width, height, tile, offsets, rows
+    torch.autograd.backward(compat.rasterize_to_pixels(*given, absgrad=True), v)
+
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    each = means2d.detach().double().expand(height * width, num, 2).clone().requires_grad_()
+    d = torch.stack([x, y], -1).view(-1, 1, 2) - each
+    xx, xy, yy = conics[0].double().unbind(-1)
+    q = xx * d[..., 0] ** 2 + 2 * xy * d[..., 0] * d[..., 1] + yy * d[..., 1] ** 2
+    alpha = (opacities[0].double() * torch.exp(-0.5 * q)).clamp_max(0.999)
+    alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+    after = (1 - alpha).cumprod(1)
+    weights = torch.where(after > 1e-4, after / (1 - alpha) * alpha, 0.0)
+    assert (after <= 1e-4).any() and (alpha >= 0.999).any()
+    upstream = (weights @ colors[0].double(), weights.sum(1, keepdim=True))
+    torch.autograd.backward(upstream, [x.double().flatten(0, 2) for x in v])
+    assert_rel_rms(means2d.grad[0], each.grad.sum(0), GRADIENT, "means2d")
+    assert_rel_rms(means2d.absgrad[0], each.grad.abs().sum(0), GRADIENT, "absgrad")
+    assert means2d.absgrad.sum() > 1.2 * means2d.grad.abs().sum(), "the signs matter here"
+
+
+def test_refusals():
+    scene = scene_of(3)
+    given = [scene["means"], None, scene["quats"], scene["scales"], scene["viewmats"], scene["Ks"]]
+    call = compat.fully_fused_projection
+    for name, value in (("camera_model", "fisheye"), ("sparse_grad", True)):
+        with pytest.raises(ValueError, match=f"^{name} is .*allowed is"):
+            call(*given, WIDTH, HEIGHT, **{name: value})
+    with pytest.raises(ValueError, match="covars has shape"):
+        call(scene["means"], torch.zeros(1, 3, 3, 3), *given[2:], WIDTH, HEIGHT)
+    with pytest.raises(ValueError, match="camera_model is 'ortho'"):
+        compat.proj(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3, 3), scene["Ks"][0], 4, 4, "ortho")
+    parts = torch.zeros(1, 3, 2), torch.ones(1, 3, 3), torch.zeros(1, 3, 3), torch.zeros(1, 3)
+    lists = torch.zeros(1, 1, 1, dtype=torch.int32), torch.tensor([3], dtype=torch.int32)
+    with pytest.raises(ValueError, match="flatten_ids has 3 to 3 of 3 rows"):
+        compat.rasterize_to_pixels(*parts, 4, 4, 16, *lists)
+    with pytest.raises(AttributeError, match="rasterization_2dgs is not here"):
+        compat.rasterization_2dgs  # noqa: B018

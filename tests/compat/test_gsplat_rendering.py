@@ -1,0 +1,248 @@
+"""``rasterization`` with gsplat's signature: pictures, ``meta``, options, refusals."""
+
+import inspect
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers.raster import make
+
+from gamba_warp.compat.gsplat import (
+    RollingShutterType,
+    quat_scale_to_covar_preci,
+    rasterization,
+    rasterize_to_pixels,
+)
+from gamba_warp.kernels import rasterization as ours
+
+GRADIENT = 1e-5  # the same kernels; sums by views may come in another order
+ASKED = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Small operations: on a busy machine threads would only wait."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def scene_of(lead=(2,), num=37, views=3, **changes):
+    """A scene of other leading dimensions; ``make`` has one."""
+    batch = torch.Size(lead).numel()
+    scene = make(batch, views, num, **{"width": 37, "height": 23, "size": 0.05, **changes})
+    return {
+        k: v.reshape(*lead, *v.shape[1:]) if isinstance(v, torch.Tensor) else v
+        for k, v in scene.items()
+    }
+
+
+def asking(scene):
+    copies = {k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in scene.items()}
+    for name in ASKED:
+        if copies[name] is not None:
+            copies[name].requires_grad_()
+    return copies
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+@pytest.mark.parametrize("lead, kind", [((), "classic"), ((2,), "antialiased")])
+def test_pictures_and_gradients(packed, mode, lead, kind):
+    """Ours with gsplat's clamp of alpha, which the gsplat tests of ours hold to gsplat's code."""
+    scene = scene_of(lead)
+    if mode in ("D", "ED"):
+        scene["backgrounds"] = None
+    got, want = asking(scene), asking(scene)
+    options = dict(render_mode=mode, rasterize_mode=kind)
+    renders, alphas, _ = rasterization(**got, packed=packed, **options)
+    expected, alpha, _ = ours(**want, alpha_max=0.999, **options)
+    assert renders.shape == expected.shape
+    # expected depths are divided by alpha, which has lost digits where a pixel is faint
+    solid = alpha[..., 0] > 0.05 if mode.endswith("ED") else alpha[..., 0] >= 0
+    assert (renders - expected)[solid].abs().max() < 1e-5 and torch.equal(alphas, alpha)
+    v = torch.randn_like(renders) * solid[..., None]
+    torch.autograd.backward([renders, alphas], [v, v[..., :1]])
+    torch.autograd.backward([expected, alpha], [v, v[..., :1]])
+    for name in ASKED:
+        if want[name] is None or want[name].grad is None:
+            continue
+        limit = GRADIENT if not mode.endswith("ED") else 1e-4  # the division, as above
+        if name != "colors" or "RGB" in mode:
+            assert_rel_rms(got[name].grad, want[name].grad, limit, name)
+
+
+@pytest.mark.parametrize("per_view", [False, True])
+@pytest.mark.parametrize("degree", [0, 3, 4])
+def test_harmonics(per_view, degree):
+    scene = scene_of()
+    shape = (2, 3, 37, 25, 3) if per_view else (2, 37, 25, 3)
+    scene["colors"] = torch.randn(shape)
+    got = asking(scene)
+    renders = rasterization(**got, sh_degree=degree)[0]
+    v = torch.randn_like(renders)
+    renders.backward(v)
+    for view in range(3):
+        one = {**scene, "viewmats": scene["viewmats"][:, [view]], "Ks": scene["Ks"][:, [view]]}
+        one["colors"] = scene["colors"][:, view] if per_view else scene["colors"]
+        one["backgrounds"] = scene["backgrounds"][:, [view]]
+        if degree < 4:
+            one["colors"] = one["colors"][..., :16, :]
+            picture = ours(**one, sh_degree=degree, alpha_max=0.999)[0]
+            assert (picture[:, 0] - renders[:, view]).abs().max() < 1e-5
+    assert (got["colors"].grad[..., : (degree + 1) ** 2, :] != 0).any()
+    assert (got["colors"].grad[..., (degree + 1) ** 2 :, :] == 0).all()
+    assert (got["viewmats"].grad != 0).any()
+
+
+@pytest.mark.parametrize("kind", ["classic", "antialiased"])
+def test_covariances(kind):
+    """The projection of covariances is another code, in float64."""
+    scene = scene_of()
+    scene["means"][:, :5] *= 9
+    scene["means"][:, 5] = float("nan")
+    got, want = asking(scene), asking(scene)
+    covars = quat_scale_to_covar_preci(got["quats"], got["scales"], True, False)[0]
+    given = {**got, "quats": None, "scales": None, "covars": covars}
+    renders, _, meta = rasterization(**given, rasterize_mode=kind, packed=False)
+    expected, _, theirs = rasterization(**want, rasterize_mode=kind, packed=False)
+    assert (renders - expected).abs().max() < 1e-4 and torch.isfinite(renders).all()
+    assert (meta["radii"] - theirs["radii"]).abs().max() <= 1
+    v = torch.randn_like(renders)
+    renders.backward(v)
+    expected.backward(v)
+    for name in ("means", "quats", "scales", "opacities", "viewmats"):
+        assert_rel_rms(got[name].grad, want[name].grad, 1e-4, name)
+
+
+@pytest.mark.parametrize("lead", [(), (2, 1)])
+@pytest.mark.parametrize("packed", [False, True])
+def test_meta(lead, packed):
+    scene = scene_of(lead)
+    scene["means"][..., :9, :] *= 9
+    scene["colors"].requires_grad_()
+    scene["means"].requires_grad_()
+    renders, _, meta = rasterization(**scene, packed=packed, absgrad=True)
+    batch, num = torch.Size(lead).numel(), 37
+    assert meta["n_cameras"] == 3 and meta["n_batches"] == batch
+    assert (meta["width"], meta["height"], meta["tile_size"]) == (37, 23, 16)
+    assert (meta["tile_width"], meta["tile_height"]) == (3, 2)
+    assert meta["isect_offsets"].shape == (*lead, 3, 2, 3)
+    rows = meta["radii"].shape[:-1]
+    seen = (meta["radii"] > 0).all(-1)
+    if packed:
+        assert seen.all() and 0 < len(seen) < batch * 3 * num
+        for name in ("batch_ids", "camera_ids", "gaussian_ids"):
+            assert meta[name].dtype == torch.int64 and meta[name].shape == rows
+        at = meta["batch_ids"] * 3 + meta["camera_ids"]
+        at = at * num + meta["gaussian_ids"]
+        assert (at.diff() > 0).all()
+        colors = scene["colors"].reshape(batch * num, 3)
+        colors = colors[meta["batch_ids"] * num + meta["gaussian_ids"]]
+    else:
+        assert rows == (*lead, 3, num) and 0 < seen.float().mean() < 1
+        assert meta["gaussian_ids"] is None
+        colors = scene["colors"].unsqueeze(-3).expand(*rows, 3)
+    for name, size in dict(means2d=(2,), conics=(3,), depths=(), opacities=()).items():
+        assert meta[name].shape == (*rows, *size), name
+    assert meta["radii"].dtype == meta["flatten_ids"].dtype == torch.int32
+    assert meta["tiles_per_gauss"].shape == rows
+    assert meta["tiles_per_gauss"].sum() == len(meta["flatten_ids"]) == len(meta["isect_ids"])
+    assert (meta["isect_ids"].diff() >= 0).all()
+    names = ("isect_offsets", "flatten_ids")
+    parts = meta["means2d"], meta["conics"], colors, meta["opacities"], 37, 23, 16
+    again, _ = rasterize_to_pixels(
+        *parts, *(meta[k] for k in names), scene["backgrounds"], packed=packed
+    )
+    assert (again - renders).abs().max() < 1e-5
+    meta["means2d"].retain_grad()
+    renders.backward(torch.randn_like(renders))
+    grad, absolute = meta["means2d"].grad, meta["means2d"].absgrad
+    assert (grad[seen] != 0).any(-1).float().mean() > 0.5 and (grad[~seen] == 0).all()
+    assert (absolute >= grad.abs() - 1e-4 * grad.abs().max()).all()
+    assert absolute.sum() > 1.2 * grad.abs().sum()
+
+
+def test_packing_changes_no_gradient():
+    scene = scene_of()
+    found = []
+    for packed in (False, True):
+        got = asking(scene)
+        renders, _, meta = rasterization(**got, packed=packed, absgrad=True)
+        meta["means2d"].retain_grad()
+        torch.manual_seed(1)
+        renders.backward(torch.randn_like(renders))
+        values = meta["means2d"].grad, meta["means2d"].absgrad
+        seen = (meta["radii"] > 0).all(-1)
+        found.append([*(v[seen] for v in values), *(got[k].grad for k in ASKED)])
+    for name, a, b in zip(("means2d", "absgrad", *ASKED), *found):
+        assert torch.equal(a, b), name
+
+
+def test_depth_without_colors():
+    scene = scene_of()
+    scene.update(colors=None, backgrounds=None)
+    depth = rasterization(**scene, render_mode="ED")[0]
+    scene["colors"] = torch.rand(2, 37, 3)
+    assert torch.equal(depth[..., 0], rasterization(**scene, render_mode="RGB+ED")[0][..., 3])
+    scene["colors"] = None
+    with pytest.raises(TypeError, match="^colors is NoneType, allowed is a tensor"):
+        rasterization(**scene)
+
+
+def test_no_gaussians():
+    scene = scene_of(num=0)
+    for packed in (False, True):
+        renders, alphas, meta = rasterization(**scene, packed=packed)
+        expected = scene["backgrounds"][:, :, None, None].expand_as(renders)
+        assert torch.equal(renders, expected) and (alphas == 0).all()
+        assert meta["flatten_ids"].numel() == 0
+
+
+OPTIONS = dict(
+    sparse_grad=True,
+    distributed=True,
+    camera_model="fisheye",
+    with_ut=True,
+    with_eval3d=True,
+    radial_coeffs=torch.zeros(2, 3, 6),
+    viewmats_rs=torch.zeros(2, 3, 4, 4),
+    rolling_shutter=RollingShutterType.ROLLING_TOP_TO_BOTTOM,
+    macro_tile=True,
+    return_normals=True,
+    global_z_order=False,
+    rays=torch.zeros(1),
+    extra_signals=torch.zeros(1),
+    render_mode="d",
+    rasterize_mode="fast",
+    sh_degree=5,
+    near_plane=0.0,
+    width=0,
+    opacities=torch.zeros(2, 36),
+    backgrounds=torch.zeros(2, 3, 4),
+    Ks=torch.zeros(2, 2, 3, 3),
+)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_refusals(name):
+    """One line that begins with the argument and says what is allowed."""
+    with pytest.raises(ValueError, match=rf"^{name} .*allowed (is|are) ") as error:
+        rasterization(**{**scene_of(), name: OPTIONS[name]})
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_signature():
+    """Order, names and defaults are those of the installed gsplat."""
+    theirs = pytest.importorskip("gsplat").rasterization
+    theirs = inspect.signature(theirs).parameters
+    mine = inspect.signature(rasterization).parameters
+    assert [*mine][: len(theirs)] == [*theirs]
+    for name, parameter in theirs.items():
+        default = mine[name].default
+        assert getattr(default, "name", default) == getattr(
+            parameter.default, "name", parameter.default
+        ), name
+    later = [*mine.values()][len(theirs) :]
+    assert all(p.kind == p.KEYWORD_ONLY for p in later)

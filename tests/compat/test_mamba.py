@@ -1,0 +1,217 @@
+"""The Mamba layer under mamba-ssm's name: its weights, and tokens at once or one by one."""
+
+import importlib
+
+import pytest
+import torch
+import torch.nn.functional as F
+from helpers import assert_rel_rms
+
+from gamba_warp.compat import mamba_ssm
+from gamba_warp.compat.mamba_ssm import InferenceParams, Mamba
+
+# Relative to the output's largest value. Float32: rounding of sums in another order. The halves:
+# a few roundings of 2^-9 and 2^-12 at other places than in the forward pass.
+LIMITS = {torch.float32: 1e-6, torch.bfloat16: 3e-2, torch.float16: 4e-3}
+SHAPES = [
+    {},
+    {"d_state": 5, "d_conv": 3, "expand": 3, "bias": True, "conv_bias": False, "dt_rank": 2},
+]
+
+
+def relative(got, want):
+    """The largest difference over the largest value."""
+    return ((got - want).double().abs().max() / want.double().abs().max()).item()
+
+
+def decode(layer, tokens, prefill, params=None):
+    """The outputs of a prefill at once and of the other tokens one by one."""
+    params = params or InferenceParams(max_seqlen=99, max_batch_size=len(tokens))
+    outs = [layer(tokens[:, :prefill], params)] if prefill else []
+    for t in range(prefill, tokens.shape[1]):
+        params.seqlen_offset = t
+        if t == 0:  # a cache that is empty, as generation without a prompt begins
+            states = layer._get_states_from_cache(params, len(tokens))
+            outs.append(layer.step(tokens[:, :1], *states)[0])
+        else:
+            outs.append(layer(tokens[:, t : t + 1], inference_params=params))
+    return torch.cat(outs, 1)
+
+
+@pytest.mark.parametrize("dtype", LIMITS, ids=str)
+@pytest.mark.parametrize("prefill", [0, 1, 2, 9])
+@pytest.mark.parametrize("options", SHAPES, ids=["default", "other"])
+@torch.no_grad()
+def test_one_by_one_is_at_once(options, prefill, dtype):
+    layer = Mamba(20, layer_idx=3, dtype=dtype, **options)
+    tokens = torch.randn(2, 17, 20).to(dtype)
+    got, want = decode(layer, tokens, prefill), layer(tokens)
+    assert got.dtype == dtype and relative(got, want) < LIMITS[dtype]
+
+
+@torch.no_grad()
+def test_several_tokens_go_on_from_a_cache():
+    layer, tokens = Mamba(20, layer_idx=0), torch.randn(2, 17, 20)
+    params, outs = InferenceParams(99, 2), []
+    for piece in tokens.split([5, 2, 1, 9], 1):
+        outs.append(layer(piece, params))
+        params.seqlen_offset += piece.shape[1]
+    assert relative(torch.cat(outs, 1), layer(tokens)) < LIMITS[torch.float32]
+
+
+@torch.no_grad()
+def test_a_cache_begins_anew_at_offset_zero():
+    layer, tokens = Mamba(20, layer_idx=0), torch.randn(2, 9, 20)
+    params = InferenceParams(99, 2)
+    first = decode(layer, tokens, 4, params)
+    params.reset(50, 2)
+    assert params.seqlen_offset == 0 and params.max_seqlen == 50
+    assert torch.equal(decode(layer, tokens, 4, params), first)
+
+
+@torch.no_grad()
+def test_half_weights_keep_a_float32_state_that_decays():
+    """Steps of 1e-3: in bfloat16 a state times 0.999 would be rounded to itself."""
+    layer = Mamba(8, d_state=1, dtype=torch.bfloat16)
+    layer.x_proj.weight.zero_()  # no input reaches the state
+    layer.dt_proj.bias.fill_(-6.9)  # softplus gives 1e-3
+    states = layer.allocate_inference_cache(1, 0)
+    assert [s.dtype for s in states] == [torch.bfloat16, torch.float32]
+    assert all(s.dtype == torch.half for s in layer.allocate_inference_cache(1, 0, torch.half))
+    states[1].fill_(1)
+    for _ in range(500):
+        layer.step(torch.zeros(1, 1, 8, dtype=torch.bfloat16), *states)
+    step = F.softplus(torch.tensor(-6.9).bfloat16().float())
+    assert_rel_rms(states[1], torch.exp(-500 * step).expand(1, 16, 1), 1e-4, "state")
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_gradients_are_those_of_plain_torch(cached):
+    """Against the steps of a reference in float64."""
+    layer = Mamba(6, d_state=3, layer_idx=0)
+    with torch.no_grad():
+        layer.A_log += 0.1 * torch.randn_like(layer.A_log)
+    tokens = torch.randn(2, 9, 6, requires_grad=True)
+    out = layer(tokens, InferenceParams(9, 2) if cached else None)
+    weights = {name: p.double() for name, p in layer.named_parameters()}
+    want = plain(weights, tokens.double(), layer.dt_rank)
+    assert_rel_rms(out, want, 1e-6, "out")
+    leaves = {"tokens": tokens, **dict(layer.named_parameters())}
+    cotangent = torch.randn_like(out)
+    got = torch.autograd.grad(out, leaves.values(), cotangent)
+    want = torch.autograd.grad(want, leaves.values(), cotangent.double())
+    for name, a, b in zip(leaves, got, want):
+        assert_rel_rms(a, b, 5e-6, name)  # float32, sums over 18 tokens
+
+
+def plain(w, tokens, rank):
+    """The layer written out in torch, from a state dict."""
+    x, z = (tokens @ w["in_proj.weight"].T).chunk(2, -1)
+    width = w["conv1d.weight"].shape[2]
+    padded = F.pad(x.mT, (width - 1, 0))
+    x = F.silu(F.conv1d(padded, w["conv1d.weight"], w["conv1d.bias"], groups=x.shape[2])).mT
+    states = w["A_log"].shape[1]
+    low, B, C = (x @ w["x_proj.weight"].T).split([rank, states, states], -1)
+    delta = F.softplus(low @ w["dt_proj.weight"].T + w["dt_proj.bias"])
+    h, rows = 0, []
+    for t in range(x.shape[1]):
+        step = delta[:, t, :, None]
+        h = torch.exp(-step * w["A_log"].exp()) * h + step * B[:, t, None] * x[:, t, :, None]
+        rows.append((h * C[:, t, None]).sum(-1))
+    return ((torch.stack(rows, 1) + w["D"] * x) * F.silu(z)) @ w["out_proj.weight"].T
+
+
+def test_the_state_dict_is_that_of_mamba_ssm():
+    shapes = {name: tuple(x.shape) for name, x in Mamba(32, bias=True).state_dict().items()}
+    assert shapes == {
+        "A_log": (64, 16),
+        "D": (64,),
+        "in_proj.weight": (128, 32),
+        "in_proj.bias": (128,),
+        "conv1d.weight": (64, 1, 4),
+        "conv1d.bias": (64,),
+        "x_proj.weight": (34, 64),
+        "dt_proj.weight": (64, 2),
+        "dt_proj.bias": (64,),
+        "out_proj.weight": (32, 64),
+        "out_proj.bias": (32,),
+    }
+    layer = Mamba(32, dtype=torch.bfloat16)
+    single = {name for name, p in layer.named_parameters() if p.dtype == torch.float32}
+    assert single == {"A_log", "D"}
+    assert layer.A_log._no_weight_decay and layer.D._no_weight_decay
+    assert layer.dt_proj.bias._no_reinit
+
+
+def test_the_weights_at_the_start():
+    layer = Mamba(64, d_state=3, dt_min=0.01, dt_max=0.02, dt_init="constant", dt_scale=2.0)
+    step = F.softplus(layer.dt_proj.bias)
+    assert 0.01 - 1e-6 < step.min() < 0.0105 and 0.0195 < step.max() < 0.02 + 1e-6
+    assert (layer.dt_proj.weight == 2 * 4**-0.5).all() and (layer.D == 1).all()
+    assert torch.equal(layer.A_log, torch.tensor([1.0, 2.0, 3.0]).log().expand(128, 3))
+    floor = Mamba(64, dt_min=1e-6, dt_max=1e-5, dt_init_floor=1e-4)
+    assert torch.allclose(F.softplus(floor.dt_proj.bias), torch.tensor(1e-4), rtol=1e-4)
+
+
+def test_no_gradient_flows_through_a_step():
+    layer = Mamba(8)
+    states = layer.allocate_inference_cache(1, 0)
+    assert not layer.step(torch.randn(1, 1, 8), *states)[0].requires_grad
+    assert not any(state.requires_grad for state in states)
+
+
+def test_autocast():
+    layer, tokens = Mamba(20, layer_idx=0), torch.randn(2, 9, 20)
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        got, want = decode(layer, tokens, 4), layer(tokens)
+        assert got.dtype == torch.bfloat16 and relative(got, want) < LIMITS[torch.bfloat16]
+
+
+@pytest.mark.parametrize(
+    "change, text",
+    [
+        ({"d_conv": 5}, r"d_conv is 5, allowed: \(2, 3, 4\)"),
+        ({"d_state": 257}, "d_state is 257, must be from 1 to 256"),
+        ({"dt_init": "zeros"}, "dt_init is 'zeros', allowed"),
+        ({"dt_rank": "full"}, "dt_rank is 'full', must be a number or 'auto'"),
+    ],
+)
+def test_refuses_sizes(change, text):
+    with pytest.raises(ValueError, match=f"^{text}"):
+        Mamba(8, **change)
+
+
+def test_refuses_tokens():
+    layer, tokens = Mamba(8), torch.randn(2, 3, 8)
+    with pytest.raises(TypeError, match="^hidden_states has dtype torch.float64, allowed"):
+        layer(tokens.double())
+    with pytest.raises(
+        ValueError, match=r"^hidden_states has shape \(2, 3, 7\), must be \[B, L, 8"
+    ):
+        layer(tokens[..., :7])
+    with pytest.raises(ValueError, match="^hidden_states has shape .* must be .B, 1, 8."):
+        layer.step(tokens, *layer.allocate_inference_cache(2, 0))
+    with pytest.raises(ValueError, match="^layer_idx is None"):
+        layer(tokens, InferenceParams(9, 2))
+    layer.layer_idx, params = 4, InferenceParams(9, 2)
+    layer(tokens, params)
+    with pytest.raises(ValueError, match="^hidden_states has a batch of 1, the cache of layer"):
+        layer(tokens[:1], params)
+
+
+@pytest.mark.parametrize(
+    "path, names",
+    [
+        ("mamba_ssm.ops.selective_scan_interface", "selective_scan_fn mamba_inner_fn"),
+        ("mamba_ssm.ops.triton.selective_state_update", "selective_state_update"),
+        ("mamba_ssm.modules.mamba_simple", "Mamba"),
+        ("mamba_ssm.utils.generation", "InferenceParams"),
+        ("causal_conv1d", "causal_conv1d_fn causal_conv1d_update"),
+        ("causal_conv1d.causal_conv1d_interface", "causal_conv1d_fn"),
+    ],
+)
+def test_paths_of_the_original(path, names):
+    module = importlib.import_module(f"gamba_warp.compat.{path}")
+    for name in names.split():
+        assert getattr(module, name) is getattr(mamba_ssm, name)
+    assert list(mamba_ssm.__all__) == sorted(mamba_ssm.__all__)
