@@ -350,7 +350,8 @@ def report_of(
         differences={},
     )
     for name, records in baselines.items():
-        other = over_objects(records, _NO_MEAN) | {"flags": flag_counts(records)}
+        other = over_objects(records, _NO_MEAN)
+        other["flags"] = flag_counts(records)
         report["baselines"][name] = finite_or_none(other)
         report["differences"][name] = differences_of(report["objects"], other["objects"])
     return report

@@ -64,12 +64,13 @@ def selective_state_update(
     if groups is None:
         out = _step(work, x, dt, A, B, C, D, z, dt_bias, dt_softplus)
     else:
-        per_head = (v if v is None else v.unflatten(0, (groups, -1)) for v in (A, D, dt_bias))
-        A, D, dt_bias = per_head
-        per_token = (v if v is None else v.unflatten(1, (groups, -1)) for v in (work, x, dt, z))
-        grouped, tokens, dt, z = per_token
-        B, C = B[:, :, None], C[:, :, None]
-        out = _step(grouped, tokens, dt, A, B, C, D, z, dt_bias, dt_softplus).flatten(1, 2)
+        heads = [None if v is None else v.unflatten(0, (groups, -1)) for v in (A, D, dt_bias)]
+        tokens = [None if v is None else v.unflatten(1, (groups, -1)) for v in (work, x, dt, z)]
+        (rates, straight, bias), (grouped, inputs, steps, gates) = heads, tokens
+        matrices = B[:, :, None], C[:, :, None]
+        out = _step(
+            grouped, inputs, steps, rates, *matrices, straight, gates, bias, dt_softplus
+        ).flatten(1, 2)
     if state_batch_indices is not None:
         out = put_rows(state, state_batch_indices, work, out)
     elif work is not state:
