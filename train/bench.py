@@ -143,8 +143,8 @@ class _MadeUp(ViewDataset):
         side = images.shape[1]
         viewmats = orbit(360 * torch.tensor(chosen) / self.views, distance=2.5)
         K = intrinsics(side, side, 40.0).expand(len(chosen), 3, 3)
-        cameras = Cameras(viewmats, K, side, side)
-        return ObjectViews(self.uids[int(index)], "made up", images, cameras, None, {})
+        made = images, Cameras(viewmats, K, side, side)
+        return ObjectViews(self.uids[int(index)], "made up", *made, None, {})
 
 
 def _ellipse(share: float, size: int, stretch: float) -> Tensor:
@@ -318,7 +318,8 @@ class _Covered:
     def _alone(self) -> list[Batch]:
         """The objects of the batch, each as a batch."""
         one = (slice(i, i + 1) for i in range(len(self.batch.uids)))
-        return [Batch(**{k: v[i] for k, v in vars(self.batch).items()}) for i in one]
+        fields = {k: v for k, v in vars(self.batch).items() if v is not None}
+        return [Batch(**{k: v[i] for k, v in fields.items()}) for i in one]
 
     def check(self, margin: int) -> Error:
         """Measures the error of the batch's Gaussians to those of each object alone."""
