@@ -50,19 +50,20 @@ OWN = {
     "stress": "all",
     "train": "train",
 }
+_SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
     "photo": {"kornia", "skimage"},
     "train": {"kornia", "tensorboard", "timm"},
-    "mesh": {"kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"},
-    "eval": {"kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"},
+    "mesh": set(_SHAPES),
+    "eval": set(_SHAPES),
     "all": set(EXTRA_OF),
 }
 # What a command cannot begin without; what only some of its options need is found missing then.
 NEEDS = {
     "data primitives": ("trimesh",),
     "data render": ("trimesh", "open3d"),
-    "demo": ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"),
-    "eval-geometry": ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh"),
+    "demo": _SHAPES,
+    "eval-geometry": _SHAPES,
     "eval-views": ("kornia",),
     "fit": ("kornia",),
     "train": ("kornia",),

@@ -143,8 +143,8 @@ class _MadeUp(ViewDataset):
         side = images.shape[1]
         viewmats = orbit(360 * torch.tensor(chosen) / self.views, distance=2.5)
         K = intrinsics(side, side, 40.0).expand(len(chosen), 3, 3)
-        made = images, Cameras(viewmats, K, side, side)
-        return ObjectViews(self.uids[int(index)], "made up", *made, None, {})
+        cameras = Cameras(viewmats, K, side, side)
+        return ObjectViews(self.uids[int(index)], "made up", images, cameras, None, {})
 
 
 def _ellipse(share: float, size: int, stretch: float) -> Tensor:

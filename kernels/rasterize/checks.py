@@ -14,7 +14,7 @@ _MAX_SH_DEGREE = 3
 # Options of gsplat's function that make it fast, and mean nothing here.
 _ITS_MEANS = ("packed", "tile_size", "channel_chunk", "segmented")
 # Options of gsplat's function that this rasterizer does not have: only these values are accepted.
-_NOT_HERE = {
+NOT_HERE = {
     "sparse_grad": False,
     "absgrad": False,
     "distributed": False,
@@ -40,8 +40,8 @@ def _check_gsplat_options(options: dict) -> None:
     for name, value in options.items():
         if name == "rolling_shutter":
             value, allowed = getattr(value, "name", value), "GLOBAL"
-        elif name in _NOT_HERE:
-            allowed = _NOT_HERE[name]
+        elif name in NOT_HERE:
+            allowed = NOT_HERE[name]
         elif name in _ITS_MEANS:
             continue
         else:

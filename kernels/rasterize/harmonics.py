@@ -60,21 +60,39 @@ def colors_from_harmonics(
     """Colours seen from each camera, ``max(0, ½ + Σ_k Y_k(direction) coefficient_k)``.
 
     Args:
-        degree: 0 to 3; coefficients beyond it are not used.
-        coefficients: ``[B, N, K, 3]``.
-        means: ``[B, N, 3]``.
-        viewmats: ``[B, V, 4, 4]``.
+        degree: as for ``colors_seen_from``, like ``coefficients`` and ``means``.
+        viewmats: ``[B, V, 4, 4]``, rigid.
 
     Returns:
-        ``[B, V, N, 3]``; NaN without a gradient where the mean or a used coefficient is not finite.
+        as ``colors_seen_from``.
     """
-    used = coefficients[:, :, : (degree + 1) ** 2]
-    # what is not finite must not meet a zero gradient: 0 * NaN would spread to the whole view
-    finite = means.isfinite().all(-1) & used.isfinite().flatten(2).all(-1)
-    means = torch.where(finite[..., None], means, 0.0)
-    used = torch.where(finite[..., None, None], used, 0.0)
     rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centers = -(rotation.mT @ translation[..., None])[..., 0]
+    return colors_seen_from(degree, coefficients, means, centers)
+
+
+def colors_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    """Colours seen from each point, ``max(0, ½ + Σ_k Y_k(direction) coefficient_k)``.
+
+    Args:
+        degree: 0 to 4; coefficients beyond it are not used.
+        coefficients: ``[B, N, K, D]``, or ``[B, V, N, K, D]`` for each point its own.
+        means: ``[B, N, 3]``.
+        centers: ``[B, V, 3]``, of the cameras.
+
+    Returns:
+        ``[B, V, N, D]``; NaN without a gradient where the mean or a used coefficient is not finite.
+    """
+    used = coefficients[..., : (degree + 1) ** 2, :]
+    used = used if used.dim() == 5 else used[:, None]
+    # what is not finite must not meet a zero gradient: 0 * NaN would spread to the whole view
+    finite = means.isfinite().all(-1)[:, None] & used.isfinite().flatten(-2).all(-1)
+    means = torch.where(means.isfinite().all(-1, keepdim=True), means, 0.0)
+    used = torch.where(finite[..., None, None], used, 0.0)
     directions = torch.nn.functional.normalize(means[:, None] - centers[:, :, None], dim=-1)
-    colors = torch.einsum("bvnk,bnkc->bvnc", harmonics_basis(degree, directions), used) + 0.5
-    return torch.where(finite[:, None, :, None], colors.clamp_min(0), torch.nan)
+    basis = harmonics_basis(degree, directions)
+    if used.shape[1] == 1:  # without this, the coefficients of all views would be written out
+        colors = torch.einsum("bvnk,bnkd->bvnd", basis, used[:, 0])
+    else:
+        colors = torch.einsum("bvnk,bvnkd->bvnd", basis, used)
+    return torch.where(finite[..., None], (colors + 0.5).clamp_min(0), torch.nan)

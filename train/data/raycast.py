@@ -142,6 +142,12 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.sqrt(_dot(vectors, vectors)), 1e-12)
 
 
+def _directions(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """World directions ``[H W, 3]`` of unit depth, through columns ``x [W]`` and rows ``y [H]``."""
+    local = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), -1.0)], -1)
+    return (local.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+
+
 class RayCaster:
     """Pictures of one mesh under one light.
 
@@ -192,8 +198,7 @@ class RayCaster:
         rows, columns = self._window(pose, n, half)
         y = half * (1 - 2 * (np.arange(*rows) + 0.5) / n)
         x = half * (2 * (np.arange(*columns) + 0.5) / n - 1)
-        local = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), -1.0)], -1)
-        directions = (local.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+        directions = _directions(pose, x, y)
         color, depth = self._trace(pose[:3, 3].astype(np.float32), directions, 2 * half / n)
         full = np.zeros((n, n, 4), np.float32)
         full[slice(*rows), slice(*columns)] = color.reshape(len(y), len(x), 4)
@@ -220,8 +225,7 @@ class RayCaster:
         """
         half = math.tan(math.radians(fov) / 2)
         x = half * (2 * (np.arange(size) + 0.5) / size - 1)
-        local = np.stack([*np.meshgrid(x, -x), np.full((size, size), -1.0)], -1)
-        directions = (local.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+        directions = _directions(pose, x, -x)
         origin = pose[:3, 3].astype(np.float32)
         corners = (self.mesh.vertices - pose[:3, 3]) @ pose[:3, 2]
         far = max(0.0, float(-corners.min())) + 1.0  # behind all of the mesh

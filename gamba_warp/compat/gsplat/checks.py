@@ -7,6 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
+from gamba_warp.kernels.rasterize.checks import NOT_HERE
+
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _RASTERIZE_MODES = ("classic", "antialiased")
 MAX_SIDE = 2**15  # pixels
@@ -14,17 +16,9 @@ MAX_SH_DEGREE = 4
 
 # Options of ``rasterization`` that ask for what is not here, with the one value that asks for
 # nothing. Those of the second part came after gsplat 1.5.3.
+_OWN = ("absgrad", "covars")  # what only ``gamba_warp.kernels.rasterization`` does not have
 _NEUTRAL: dict[str, Any] = {
-    "sparse_grad": False,
-    "distributed": False,
-    "camera_model": "pinhole",
-    "with_ut": False,
-    "with_eval3d": False,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "ftheta_coeffs": None,
-    "viewmats_rs": None,
+    **{name: value for name, value in NOT_HERE.items() if name not in _OWN},
     "macro_tile": False,
     "return_normals": False,
     "global_z_order": True,

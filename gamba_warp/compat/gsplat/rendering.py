@@ -9,11 +9,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, tuning_for
-from gamba_warp.kernels.rasterize.harmonics import harmonics_basis
+from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.ops import bin_op
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 
@@ -123,7 +122,9 @@ def _rasterize(a: SimpleNamespace, lead: tuple[int, ...]) -> tuple[Tensor, Tenso
         given["colors"] = a.means.new_ones(*lead, a.num, 1)
     scene = SimpleNamespace(**{k: None if x is None else flat(x, lead) for k, x in given.items()})
     if a.sh_degree is not None and "RGB" in a.render_mode:
-        scene.colors = _harmonics(a.sh_degree, scene).contiguous()
+        centers = torch.linalg.inv(scene.viewmats)[..., :3, 3]
+        colors = colors_seen_from(a.sh_degree, scene.colors, scene.means, centers)
+        scene.colors = colors.contiguous()
     lens = Lens(
         a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip,
         a.rasterize_mode == "antialiased",
@@ -145,23 +146,6 @@ def _rasterize(a: SimpleNamespace, lead: tuple[int, ...]) -> tuple[Tensor, Tenso
     _list(meta, splats, bins, tiling, a)
     renders, alphas = (x.view(*lead, a.views, *x.shape[1:]) for x in (renders, alphas))
     return renders, alphas, meta
-
-
-def _harmonics(degree: int, scene: SimpleNamespace) -> Tensor:
-    """Colours ``[B, C, N, D]`` seen from each camera, ``max(0, ½ + Σ_k Y_k coefficient_k)``."""
-    used = scene.colors[..., : (degree + 1) ** 2, :]
-    used = used if used.dim() == 5 else used[:, None]
-    # what is not finite must not meet a zero gradient: 0 * NaN would spread to the whole view
-    finite = scene.means.isfinite().all(-1)[:, None] & used.isfinite().flatten(-2).all(-1)
-    used = torch.where(finite[..., None, None], used, 0.0)
-    centers = torch.linalg.inv(scene.viewmats)[..., :3, 3]
-    directions = scene.means.nan_to_num(0, 0, 0)[:, None] - centers[:, :, None]
-    basis = harmonics_basis(degree, F.normalize(directions, dim=-1))
-    if used.shape[1] == 1:
-        values = torch.einsum("bvnk,bnkd->bvnd", basis, used[:, 0])
-    else:
-        values = torch.einsum("bvnk,bvnkd->bvnd", basis, used)
-    return torch.where(finite[..., None], (values + 0.5).clamp_min(0), torch.nan)
 
 
 def _described(splats: Splats, a: SimpleNamespace) -> tuple[dict[str, Any], Splats]:
