@@ -30,6 +30,7 @@ COMMANDS = {
     "bench": "Run time against error, on this machine.",
     "stress": "Random hostile cases against float64.",
     "gpu-check": "Test and measure on a CUDA machine.",
+    "import-released": "The authors' public weights to ours.",
     "weights lpips": "Fetch the LPIPS-VGG weights.",
     "endurance": "Kill and fill the disk under every command.",
     "doctor": "Say what this machine can run.",

@@ -5,6 +5,10 @@ from typing import Literal
 DEFAULT_FOV = 49.1  # degrees, vertical; the released data's camera
 DEFAULT_DISTANCE = 1.5  # of the reference camera from the object's centre, object units
 
+# Mean and deviation of ImageNet's pictures; every pretrained encoder here was trained with them.
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
 # Axes of a file: x right, y down, z forward; or x right, y up, z backward.
 Axes = Literal["opencv", "opengl"]
 

@@ -28,6 +28,7 @@ _USED = (
 # The extra that brings a library (by the name it is imported by). A command that has an extra of
 # its own names that instead, where it holds the library too.
 EXTRA_OF = {
+    "huggingface_hub": "hub",
     "imageio_ffmpeg": "video",
     "kornia": "eval",
     "open3d": "mesh",
@@ -48,6 +49,7 @@ OWN = {
     "fit": "eval",
     "reconstruct": "photo",
     "stress": "all",
+    "import-released": "train",
     "train": "train",
 }
 _SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
@@ -66,6 +68,7 @@ NEEDS = {
     "eval-geometry": _SHAPES,
     "eval-views": ("kornia",),
     "fit": ("kornia",),
+    "import-released": ("timm",),
     "train": ("kornia",),
 }
 

@@ -14,7 +14,6 @@ from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.data.dataset import ObjectViews, ViewDataset, open_dataset
-from gamba_warp.data.vgg_weights import lpips_available
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
 from gamba_warp.kernels.bench.core.measure import peak_bytes
@@ -22,9 +21,10 @@ from gamba_warp.kernels.bench.core.parts import measure_parts
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.lpips import load_lpips
 from gamba_warp.model.patches import foreground_patches
 from gamba_warp.render import render
+from gamba_warp.vision.lpips import load_lpips
+from gamba_warp.vision.weights import lpips_available
 
 from .batches import Batch, BatchSource
 from .config import DataConfig, OptimConfig

@@ -16,10 +16,10 @@ from torch.nn.functional import pad, smooth_l1_loss
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.data.vgg_weights import lpips_available
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
-from gamba_warp.model.lpips import LPIPS, load_lpips
+from gamba_warp.vision.lpips import LPIPS, load_lpips
+from gamba_warp.vision.weights import lpips_available
 
 from .config import TrainConfig
 from .radial_mask import project_means

@@ -67,8 +67,9 @@ BOXES = {
     "untrusted": Box(
         3.4, 3, "gamba_warp", "untrusted", ("what strangers' files", "go through first")
     ),
-    "data": Box(2.5, 4, "gamba_warp", "data", ("datasets, preprocess,", "weights to fetch")),
+    "data": Box(2.5, 4, "gamba_warp", "data", ("datasets,", "preprocessing")),
     "formats": Box(4, 4, "gamba_warp", "formats", (".ply .splat .glb,", "meshes, their headers")),
+    "vision": Box(1.4, 4, "gamba_warp", "vision", ("VGG16, LPIPS:", "weights to fetch")),
     "model": Box(1.6, 5, "gamba_warp", "model", ("posing, tokens, blocks,", "decoder")),
     "surfaces": Box(4, 5, "gamba_warp", "surfaces", ("Gaussians to meshes:", "TSDF, density")),
     "fitting": Box(2.8, 5, "gamba_warp", "fitting", ("one object", "by optimisation")),

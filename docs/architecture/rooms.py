@@ -37,7 +37,7 @@ _BENCH = tuple(f"kernels.bench{part}" for part in ("", ".core", ".cases", ".stat
 _STRESS = tuple(f"kernels.stress{part}" for part in ("", ".core", ".oracles", ".cases"))
 _WORDS = (*_KERNELS, "words")
 _READERS = (*_WORDS, "untrusted")
-_LIBRARY = (*_READERS, "data", "formats", "model")
+_LIBRARY = (*_READERS, "data", "formats", "vision", "model")
 _RESULTS = (*_LIBRARY, "surfaces", "fitting", "pages")
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
 _TRAIN = ("train", "train.data")
@@ -69,9 +69,10 @@ ROOMS = {
     "words": Room("Gaussians, cameras, images, rendering, files, errors", _KERNELS),
     "compat": Room("other packages' interfaces over our kernels", _WORDS),
     "untrusted": Room("what strangers' files go through first", _WORDS),
-    "data": Room("datasets, preprocessing, weights to fetch", _READERS),
+    "data": Room("datasets and preprocessing", _READERS),
     "formats": Room(".ply, .splat, .glb, meshes, their headers", _READERS),
-    "model": Room("tokens, blocks, decoder, checkpoints", (*_READERS, "data", "formats")),
+    "vision": Room("VGG16, LPIPS, and how their weights are fetched", _READERS),
+    "model": Room("tokens, blocks, decoder, checkpoints", (*_READERS, "data", "formats", "vision")),
     "surfaces": Room("Gaussians to meshes", _LIBRARY),
     "fitting": Room("one object by optimisation", _LIBRARY),
     "pages": Room("pages, turntables, the viewer", (*_LIBRARY, "surfaces", "fitting")),

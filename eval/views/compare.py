@@ -15,9 +15,9 @@ from gamba_warp.data.dataset import SPLIT_VERSION, ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
-from gamba_warp.model.lpips import LPIPS
 from gamba_warp.model.posing import relative_cameras
 from gamba_warp.render import render
+from gamba_warp.vision.lpips import LPIPS
 
 from ..averages import mean_of
 

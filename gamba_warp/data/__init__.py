@@ -1,1 +1,1 @@
-"""Datasets of posed views, pictures prepared for a model, and pretrained weights."""
+"""Datasets of posed views, and pictures prepared for a model."""

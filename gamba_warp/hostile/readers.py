@@ -249,6 +249,13 @@ def _encoder(path: Path, out: Path) -> Any:
     return build_encoder(replace(models.tiny_config(), **vit), path)
 
 
+def _released(path: Path, out: Path) -> Any:
+    from ..model.encoders import read_state
+    from ..model.released import convert_released
+
+    return convert_released(read_state(path), str(path))
+
+
 def _sam(path: Path, out: Path) -> Any:
     from ..data.preprocess import SamSegmenter
 
@@ -256,7 +263,7 @@ def _sam(path: Path, out: Path) -> Any:
 
 
 def _pickle(path: Path, out: Path) -> Any:
-    from ..data.weights import load_numpy_pickle
+    from ..vision.fetch import load_numpy_pickle
 
     if not path.is_file():
         raise UserError(f"{path}: no such file")
@@ -267,7 +274,7 @@ def _pickle(path: Path, out: Path) -> Any:
 def _archive(path: Path, out: Path) -> Any:
     import os
 
-    from ..data.vgg_weights import store_weights
+    from ..vision.weights import store_weights
 
     os.environ["GAMBA_CACHE"] = str(out)
     return store_weights(archive=path)
@@ -337,6 +344,7 @@ READERS: dict[str, Reader] = {
         Reader("stress", _numeric, sound.nothing, _only(models.stress_cases, "numeric"), 2),
         Reader("stress-files", _hostile, sound.hostile_case, _only(models.stress_cases, "files"),
                4),
+        Reader("released", _released, sound.released, models.released, 2),
         Reader("encoder", _encoder, sound.nothing, _only(models.weights, "torch"), 1),
         Reader("sam", _sam, sound.nothing, _only(models.weights, "torch"), 1),
         Reader("pickle", _pickle, sound.arrays, _only(models.weights, "pickle"), 4),

@@ -281,6 +281,15 @@ def model(result: Any, path: Path, out: Path) -> str | None:
     return f"{count} parameters" if count > _PARAMETERS else None
 
 
+def released(result: Any, path: Path, out: Path) -> str | None:
+    """A configuration, and finite weights of its sizes."""
+    settings, weights = result
+    for name, value in weights.items():
+        if not bool(value.isfinite().all()):
+            return f"{name} is not finite"
+    return config(settings, path, out)
+
+
 def fingerprint(trainer: Any) -> str:
     """A hash of all that a trainer restores."""
     digest = hashlib.sha256(repr([trainer.step, trainer.skipped, trainer.elapsed]).encode())

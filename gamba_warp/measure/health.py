@@ -10,8 +10,6 @@ import torch
 import warp as wp
 
 from ..cameras import Cameras, intrinsics, orbit
-from ..data.vgg_weights import FETCH, lpips_available
-from ..data.weights import cache_folder
 from ..errors import first_line
 from ..gaussians import Gaussians
 from ..kernels.selective_scan import selective_scan
@@ -19,6 +17,8 @@ from ..model.checkpoint import DEFAULT_CHECKPOINT
 from ..open3d import import_open3d
 from ..render import render
 from ..versions import EXTRA_OF
+from ..vision.fetch import cache_folder
+from ..vision.weights import FETCH, lpips_available
 
 
 def devices() -> Iterator[tuple[str, str]]:

@@ -31,9 +31,11 @@ STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamb
 SEGMENT = 2048
 
 
-def make_norm(config: GambaConfig) -> nn.LayerNorm | nn.RMSNorm:
-    """LayerNorm or RMSNorm over a token's channels, with eps 1e-5."""
-    kind = nn.LayerNorm if config.norm == "layer" else nn.RMSNorm
+def make_norm(config: GambaConfig, final: bool = False) -> nn.LayerNorm | nn.RMSNorm:
+    """LayerNorm or RMSNorm over a token's channels, with eps 1e-5; the ``final_norm`` if asked."""
+    kinds = {"layer": nn.LayerNorm, "rms": nn.RMSNorm}
+    other = final and config.final_norm != "same"
+    kind = kinds[config.final_norm if other else config.norm]
     norm = kind(config.width, eps=1e-5)
     for parameter in norm.parameters():
         vars(parameter)["_no_weight_decay"] = True

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..errors import UserError, first_line
 from ..files import STARTER, atomic_path
 from .config import GambaConfig
-from .encoders import outline_encoder
+from .encoders import Weights, outline_encoder
 from .gamba import Gamba
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 FORMAT = "gamba_warp.model.1"
 FILE_NAME = "model.safetensors"
+ENCODER_NAME = "encoder.safetensors"  # a frozen encoder's weights, in the same folder
 DEFAULT_CHECKPOINT = STARTER / "rays.safetensors"
 
 MAX_HEADER = 16 << 20  # bytes; that of a model of 256 blocks takes 1 MB
@@ -67,7 +68,7 @@ def save_model(
 def load_model(
     path: str | Path | None = None,
     device: str | torch.device = "cpu",
-    encoder_weights: str | Path | None = None,
+    encoder_weights: Weights | None = None,
 ) -> Gamba:
     """Reads a file of ``save_model``.
 
@@ -75,7 +76,8 @@ def load_model(
         path: the file, or a folder with a ``model.safetensors``; without it the small model that
             comes with the package.
         device: the model's device.
-        encoder_weights: as for ``build_encoder``; a frozen timm encoder needs them.
+        encoder_weights: as for ``build_encoder``; a frozen timm encoder needs them. Without them
+            the ``encoder.safetensors`` beside the model is taken, if there is one.
 
     Returns:
         The model in eval mode.
@@ -92,6 +94,9 @@ def load_model(
     config, encoder_sha256 = read_config(path)
     if not config.encoder_frozen and config.encoder != "none":
         encoder_weights = "random"  # the file holds the trained ones
+    beside = path.parent / ENCODER_NAME
+    if encoder_weights is None and config.encoder not in ("none", "vgg16") and beside.is_file():
+        encoder_weights = beside
     model = None
     if config.num_parameters <= _SMALL and (not config.prepend or config.encoder == "none"):
         model = Gamba(config)

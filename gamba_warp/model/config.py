@@ -15,6 +15,10 @@ Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
 Background = Literal["white", "black"]
 Decoder = Literal["bins", "rays"]
+FinalNorm = Literal["same", "layer", "rms"]
+Orders = Literal["backward", "mirrored"]
+PositionWeights = Literal["softmax", "unit"]
+Resize = Literal["bicubic", "bilinear"]
 
 RAY_CHANNELS = (
     1,
@@ -29,6 +33,7 @@ _LATER = {
     "decoder",
     *(f"ray_{name}" for name in ("cells", "coarse", "layers", "features", "hidden")),
     *(f"ray_{name}" for name in ("depth", "offset")),
+    *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -52,23 +57,31 @@ class GambaConfig:
         conv_size: taps of the causal convolution, 2 to 4.
         expand: inner channels of a block per channel of a token; 32,768 inner channels at most.
         dt_rank: rank of the step size's projection; 0 means ceil(width / 16), as in mamba-ssm.
-        norm: normalisation before every block and before the decoder.
+        norm: normalisation before every block.
+        final_norm: that before the decoder; "same" as before the blocks.
         discretization: of the selective scan; "mamba" is what mamba-ssm runs, "zoh" and "bilinear"
             are the exact zero-order hold and the paper's appendix.
+        scan_orders: the four orders of the patches: rows, columns, and "backward" both of them from
+            the end (paper §3.2), or "mirrored" each row from its end and each column from its end.
         embedding_init: standard deviation of the learned embedding E at the start.
         additive_image_tokens: False makes G = E (paper Table 2, "w/o additive 3DGS tokens").
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
         camera_token: whether the camera is prepended; the image tokens may be prepended alone.
         encoder: "none", "vgg16" or the name of a timm ViT, e.g. "vit_base_patch14_reg4_dinov2".
         encoder_size: side of the picture that the encoder sees, pixels.
+        encoder_resize: how pictures are brought to that size: "bicubic", antialiased, or "bilinear"
+            between the four nearest pixels.
         encoder_normalize: whether pictures are brought to the mean and deviation of the ViT's
             training.
         encoder_class_token: whether a ViT's class token is kept (register tokens never are).
         encoder_frozen: whether the encoder is left untrained, and out of checkpoints.
         decoder_width: channels of the decoder's shared MLP; 0 means ``width``.
         position_bins: points per axis of the position's softmax (paper: 21).
+        position_weights: what the logits of the points become: "softmax" (paper), or "unit",
+            a vector of length 1: a coordinate may then be sqrt(bins / 3) times ``position_range``.
         position_range: the largest coordinate of the points, ±, object units (paper: 0.5).
         position_init: standard deviation of the position logits at the start.
+        scale_factor: what a softplus is multiplied by to be a standard deviation, object units.
         scale_init: standard deviation of a Gaussian at the start, object units.
         opacity_init: opacity at the start.
         predict_rotation: whether quaternions are predicted; the paper fixes them.
@@ -96,6 +109,8 @@ class GambaConfig:
     expand: Annotated[int, Meta(ge=1, le=64)] = 2
     dt_rank: Annotated[int, Meta(ge=0, le=8192)] = 0
     norm: Norm = "layer"
+    final_norm: FinalNorm = "same"
+    scan_orders: Orders = "backward"
     discretization: Discretization = "mamba"
     embedding_init: Annotated[float, Meta(gt=0, le=100)] = 0.5
     additive_image_tokens: bool = True
@@ -103,13 +118,16 @@ class GambaConfig:
     camera_token: bool = True
     encoder: str = "vit_base_patch14_reg4_dinov2"
     encoder_size: Annotated[int, Meta(ge=1, le=4096)] = 336
+    encoder_resize: Resize = "bicubic"
     encoder_normalize: bool = True
     encoder_class_token: bool = False
     encoder_frozen: bool = True
     decoder_width: Annotated[int, Meta(ge=0, le=8192)] = 0
     position_bins: Annotated[int, Meta(ge=2, le=4096)] = 21
+    position_weights: PositionWeights = "softmax"
     position_range: Annotated[float, Meta(ge=1e-3, le=100)] = 0.5
     position_init: Annotated[float, Meta(gt=0, le=100)] = 1.5
+    scale_factor: Annotated[float, Meta(ge=1e-3, le=100)] = 1.0
     scale_init: Annotated[float, Meta(ge=1e-6, le=10)] = 0.02
     opacity_init: Annotated[float, Meta(ge=1e-6, le=1 - 1e-6)] = 0.5
     predict_rotation: bool = False
@@ -289,7 +307,7 @@ def _check_kind(name: str, value: object, kind: type) -> None:
         raise UserError(f"config: {name} is {shown}, it must be of type {kind.__name__}")
 
 
-Preset = Literal["tiny", "rays", "small", "paper"]
+Preset = Literal["tiny", "rays", "small", "paper", "released"]
 PRESETS: dict[Preset, GambaConfig] = {
     # This one trains on two CPU cores; it has 4,096 Gaussians and no image encoder.
     "tiny": GambaConfig(
@@ -315,4 +333,20 @@ PRESETS: dict[Preset, GambaConfig] = {
     ),
     # This is paper §4.1: 16,384 Gaussians, 576 image tokens from DINOv2 with registers.
     "paper": GambaConfig(dt_rank=32),
+    # This is what the authors' public code and weights compute (``gamba import-released``).
+    "released": GambaConfig(
+        final_norm="rms",
+        scan_orders="mirrored",
+        dt_rank=32,
+        camera_token=False,
+        encoder_resize="bilinear",
+        encoder_normalize=False,
+        encoder_class_token=True,
+        decoder_width=128,
+        position_weights="unit",
+        position_range=0.4,
+        scale_factor=0.1,
+        scale_init=0.0153,
+        opacity_init=0.1,
+    ),
 }

@@ -54,7 +54,9 @@ class GaussianDecoder(nn.Module):
         nn.init.zeros_(self.position.bias)
         odds = config.opacity_init / (1 - config.opacity_init)
         nn.init.constant_(self.opacity.bias, math.log(odds))
-        nn.init.constant_(self.scale.bias, math.log(math.expm1(config.scale_init)))
+        nn.init.constant_(
+            self.scale.bias, math.log(math.expm1(config.scale_init / config.scale_factor))
+        )
         if self.rotation is not None:
             with torch.no_grad():
                 self.rotation.bias[0] = 1.0
@@ -62,18 +64,20 @@ class GaussianDecoder(nn.Module):
     def forward(self, tokens: Tensor) -> Gaussians:
         """Decodes ``tokens [B, L, width]`` to ``[B, L]`` Gaussians in float32.
 
-        Positions lie within ±``position_range``, opacities and colours in [0, 1],
-        scales above 0.
+        Positions lie within ±``position_range`` (with unit weights beyond), opacities and colours
+        in [0, 1], scales above 0.
         """
         hidden = self.mlp(tokens)
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
         with torch.autocast(tokens.device.type, enabled=False):
             hidden = hidden.float()
             logits = self.position(hidden).unflatten(-1, (3, -1))
+            unit = self.config.position_weights == "unit"
+            weights = F.normalize(logits, dim=-1) if unit else logits.softmax(-1)
             return Gaussians(
-                means=logits.softmax(-1) @ self.points,
+                means=weights @ self.points,
                 quats=None if self.rotation is None else self.rotation(hidden),
-                scales=F.softplus(self.scale(hidden)) + MIN_SCALE,
+                scales=self.config.scale_factor * F.softplus(self.scale(hidden)) + MIN_SCALE,
                 opacities=self.opacity(hidden)[..., 0].sigmoid(),
                 colors=self.color(hidden).sigmoid(),
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -11,10 +12,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from ..errors import UserError, first_line
 from ..untrusted.torch_files import read_torch
 from .config import MAX_PARAMETERS, GambaConfig
-from .tokens import IMAGENET_MEAN, IMAGENET_STD
 
 if TYPE_CHECKING:
     from timm.models.vision_transformer import VisionTransformer
@@ -35,6 +36,7 @@ class ImageEncoder(nn.Module):
         self.channels = channels
         self.name = config.encoder
         self.size = config.encoder_size
+        self.resize = config.encoder_resize
         self.frozen = config.encoder_frozen
         network.requires_grad_(not self.frozen)
         self.train(self.training)
@@ -45,7 +47,8 @@ class ImageEncoder(nn.Module):
             if images.shape[1:3] != (self.size, self.size):
                 planes = images.permute(0, 3, 1, 2)
                 size = (self.size, self.size)
-                planes = F.interpolate(planes, size, mode="bicubic", antialias=True)
+                smooth = self.resize == "bicubic"
+                planes = F.interpolate(planes, size, mode=self.resize, antialias=smooth)
                 images = planes.permute(0, 2, 3, 1).clamp(0, 1)  # bicubic overshoots at edges
             return self.network(images)
 
@@ -54,6 +57,11 @@ class ImageEncoder(nn.Module):
         super().train(mode)
         self.network.train(mode and not self.frozen)
         return self
+
+    def weights(self) -> dict[str, Tensor]:
+        """The network's weights, by the names that ``build_encoder`` reads."""
+        network = self.network.vit if isinstance(self.network, _ViT) else self.network
+        return {name: value.contiguous() for name, value in network.state_dict().items()}
 
     @cached_property
     def fingerprint(self) -> str:
@@ -91,14 +99,17 @@ class _ViT(nn.Module):
         return torch.cat([tokens[:, :1], patches], dim=1) if self.class_token else patches
 
 
-def build_encoder(config: GambaConfig, weights: str | Path | None) -> ImageEncoder | None:
+Weights = str | Path | Mapping[str, Tensor]
+
+
+def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder | None:
     """Builds the encoder that ``config`` names, with its weights.
 
     Args:
         config: the model's configuration.
         weights: for a timm ViT a file (timm's safetensors or .pth, or Meta's DINOv2 .pth), "hub"
-            to fetch timm's own, or "random" for untrained ones, the same on every call. For
-            "vgg16" torchvision's file, or None for the one in the cache.
+            to fetch timm's own, or "random" for untrained ones, the same on every call; or what
+            such a file holds. For "vgg16" torchvision's file, or None for the one in the cache.
 
     Returns:
         The encoder, or None if ``config.encoder`` is "none".
@@ -126,7 +137,7 @@ def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
     if config.encoder == "none" or not config.prepend:
         return None
     if config.encoder == "vgg16":
-        from ..data.vgg_weights import WIDTHS
+        from ..vision.weights import WIDTHS
 
         return ImageEncoder(nn.Identity(), WIDTHS[-1], config)
     with torch.device("meta"):
@@ -137,23 +148,27 @@ def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
         return ImageEncoder(_ViT(vit, config), vit.num_features, config)
 
 
-def _build_vgg(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
-    from .vgg import vgg16_features
+def _build_vgg(config: GambaConfig, weights: Weights | None) -> ImageEncoder:
+    from ..vision.vgg import vgg16_features
 
-    if str(weights) in ("hub", "random"):
-        raise UserError(f"encoder vgg16: takes the cached weights or a file, not '{weights}'")
+    if isinstance(weights, Mapping) or str(weights) in ("hub", "random"):
+        got = "tensors" if isinstance(weights, Mapping) else f"'{weights}'"
+        raise UserError(f"encoder vgg16: takes the cached weights or a file, not {got}")
     network = vgg16_features(weights)
     return ImageEncoder(network, network.dim, config)
 
 
-def _build_vit(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
+def _build_vit(config: GambaConfig, weights: Weights | None) -> ImageEncoder:
     name = config.encoder
     if weights is None:
         raise UserError(
             f"encoder {name}: its weights must be named: a file, 'hub' to fetch them, "
             "or 'random' for an untrained one"
         )
-    if str(weights) == "random":
+    if isinstance(weights, Mapping):
+        vit = _create_vit(config, pretrained=False)
+        _load_vit(vit, dict(weights), f"encoder {name}")
+    elif str(weights) == "random":
         # Checkpoints do not store this network, so no global seed may decide its weights.
         with torch.random.fork_rng():
             torch.manual_seed(0)
@@ -161,7 +176,7 @@ def _build_vit(config: GambaConfig, weights: str | Path | None) -> ImageEncoder:
     else:
         vit = _create_vit(config, pretrained=str(weights) == "hub")
         if str(weights) != "hub":
-            _load_vit(vit, Path(weights))
+            _load_vit(vit, read_state(Path(weights)), str(weights))
     return ImageEncoder(_ViT(vit, config), vit.num_features, config)
 
 
@@ -188,11 +203,10 @@ def _create_vit(config: GambaConfig, pretrained: bool) -> VisionTransformer:
     return vit
 
 
-def _load_vit(vit: VisionTransformer, path: Path) -> None:
+def _load_vit(vit: VisionTransformer, state: dict[str, Any], path: str) -> None:
     """Loads timm's or Meta's weights; timm resizes the positions if the picture size differs."""
     from timm.models.vision_transformer import checkpoint_filter_fn
 
-    state = _read_state(path)
     if "register_tokens" in state:
         state.setdefault("mask_token", None)  # timm knows Meta's layout by this key, then drops it
     try:
@@ -207,18 +221,24 @@ def _load_vit(vit: VisionTransformer, path: Path) -> None:
             raise UserError(f"{path}: '{name}' has numbers that are not finite")
 
 
-def _read_state(path: Path) -> dict[str, Any]:
-    """The tensors of a file of weights by name."""
+def read_state(path: Path) -> dict[str, Any]:
+    """The tensors of a file of weights by name: .safetensors, or what ``torch.save`` wrote.
+
+    A state dict may lie under the key "model" or "state_dict". No code of the file runs.
+
+    Raises:
+        UserError: there is no such file, or it holds something else.
+    """
     if not path.is_file():
-        raise UserError(f"{path}: no such file of encoder weights")
+        raise UserError(f"{path}: no such file of weights")
     if path.suffix == ".safetensors":
         from safetensors.torch import load_file
 
         try:
             return load_file(path)
         except Exception as error:  # the library's own class, and those of torch
-            raise UserError(f"{path}: cannot be read as encoder weights") from error
-    state = read_torch(path, "cannot be read as encoder weights")
+            raise UserError(f"{path}: cannot be read as weights") from error
+    state = read_torch(path, "cannot be read as weights")
     for key in ("model", "state_dict"):
         if isinstance(state, dict) and isinstance(state.get(key), dict):
             state = state[key]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -13,7 +14,7 @@ from ..gaussians import Gaussians
 from .block import GambaBlock, State, make_norm, prefix_states, run_blocks
 from .config import GambaConfig
 from .decoder import GaussianDecoder
-from .encoders import ImageEncoder, build_encoder
+from .encoders import ImageEncoder, Weights, build_encoder
 from .patches import Patches, foreground_patches
 from .rays import RayDecoder, joined
 from .tokens import CameraToken, SplatTokens
@@ -30,7 +31,7 @@ class Gamba(nn.Module):
     def __init__(
         self,
         config: GambaConfig,
-        encoder_weights: str | Path | None = None,
+        encoder_weights: Weights | None = None,
         encoder: ImageEncoder | None = None,
     ) -> None:
         """Builds the network with fresh weights, the encoder's excepted.
@@ -58,7 +59,7 @@ class Gamba(nn.Module):
         self.blocks = nn.ModuleList(
             GambaBlock(config, camera_channels, image_channels) for _ in range(config.depth)
         )
-        self.norm = make_norm(config)
+        self.norm = make_norm(config, final=True)
         self.decoder = {"bins": GaussianDecoder, "rays": RayDecoder}[config.decoder](config)
         for parameter in self.parameters():
             if parameter.ndim == 1:
@@ -151,6 +152,25 @@ class Gamba(nn.Module):
         at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
         tokens = tokens.gather(1, at).unflatten(1, places.shape[1:])
         return self.decoder(tokens, pixels, patches, rgba, cameras)
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path, *args: Any, **options: Any) -> Gamba:
+        """Reads a model from a folder or the Hugging Face Hub: ``pretrained.from_pretrained``."""
+        from .pretrained import from_pretrained
+
+        return from_pretrained(name, *args, **options)
+
+    def save_pretrained(self, folder: str | Path, card: str = "") -> Path:
+        """Writes the model as a folder: ``pretrained.save_pretrained``."""
+        from .pretrained import save_pretrained
+
+        return save_pretrained(self, folder, card)
+
+    def push_to_hub(self, repo_id: str, card: str = "", **options: Any) -> str:
+        """Writes the model to the Hugging Face Hub: ``pretrained.push_to_hub``."""
+        from .pretrained import push_to_hub
+
+        return push_to_hub(self, repo_id, card, **options)
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size

@@ -7,13 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ..cameras import Cameras, plucker_rays
-from ..conventions import over_background
-from .config import GambaConfig
+from ..conventions import IMAGENET_MEAN, IMAGENET_STD, over_background
+from .config import GambaConfig, Orders
 from .patches import Patches, near_patches
-
-# Mean and deviation of ImageNet's pictures; every pretrained encoder here was trained with them.
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 def normalize_imagenet(images: Tensor) -> Tensor:
@@ -23,18 +19,20 @@ def normalize_imagenet(images: Tensor) -> Tensor:
     return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
 
 
-def scan_orders(height: int, width: int) -> Tensor:
-    """Returns the four orders in which a map is read (VMamba's cross-scan; paper §3.2).
+def scan_orders(height: int, width: int, orders: Orders = "backward") -> Tensor:
+    """Returns the four orders in which a map is read.
 
     These are: row by row from the top left, column by column from the top left, and each of the two
-    backward.
+    backward (VMamba's cross-scan; paper §3.2), or "mirrored": row by row from the top right, column
+    by column from the bottom left (the authors' public code).
 
     Returns:
         ``[4, height·width]`` int64 positions in the row-major map; each row is a permutation.
     """
-    rows = torch.arange(height * width)
-    columns = rows.reshape(height, width).T.flatten()
-    return torch.stack([rows, columns, rows.flip(0), columns.flip(0)])
+    rows = torch.arange(height * width).reshape(height, width)
+    flipped = (0, 1) if orders == "backward" else (1,)
+    passes = [rows, rows.T, rows.flip(flipped), rows.T.flip(flipped)]
+    return torch.stack([order.flatten() for order in passes])
 
 
 class CameraToken(nn.Module):
@@ -79,7 +77,9 @@ class SplatTokens(nn.Module):
         # apart, and the positions start spread out only if the tokens differ.
         nn.init.normal_(self.embedding, std=config.embedding_init)
         vars(self.embedding)["_no_weight_decay"] = True
-        self.register_buffer("orders", scan_orders(grid, grid).flatten(), persistent=False)
+        self.register_buffer(
+            "orders", scan_orders(grid, grid, config.scan_orders).flatten(), persistent=False
+        )
 
     def forward(self, images: Tensor, cameras: Cameras) -> Tensor:
         """Maps ``images [B, H, W, 3]`` in [0, 1] and one camera each to ``[B, L, width]``."""

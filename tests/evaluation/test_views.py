@@ -189,7 +189,7 @@ def test_lpips_without_weights(data, painted, monkeypatch):
 
 
 def test_lpips_with_weights(data, painted):
-    from gamba_warp.data.vgg_weights import lpips_available
+    from gamba_warp.vision.weights import lpips_available
 
     if not lpips_available():
         pytest.skip("the LPIPS weights are not in the cache (gamba weights lpips)")

@@ -9,7 +9,7 @@ from timm.models.vision_transformer import _create_vision_transformer
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.encoders import build_encoder
-from gamba_warp.model.vgg import VGG16Features, VGG16Trunk
+from gamba_warp.vision.vgg import VGG16Features, VGG16Trunk
 
 _TINY = {"patch_size": 14, "embed_dim": 24, "depth": 2, "num_heads": 2}
 
@@ -172,7 +172,7 @@ def test_bad_files_name_the_file(tmp_path, kind, suffix):
 
 def test_vgg16_tokens(monkeypatch):
     shapes = VGG16Trunk().state_dict()
-    monkeypatch.setattr("gamba_warp.model.vgg.vgg16_features", lambda path: VGG16Features(shapes))
+    monkeypatch.setattr("gamba_warp.vision.vgg.vgg16_features", lambda path: VGG16Features(shapes))
     encoder = build_encoder(_config(encoder="vgg16", encoder_size=48), None)
     assert encoder(torch.rand(2, 50, 50, 3)).shape == (2, 9, 512)
     assert encoder.channels == 512

@@ -9,7 +9,7 @@ from gamba_warp.cameras import Cameras, orbit
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.vgg import VGG16Features, VGG16Trunk
+from gamba_warp.vision.vgg import VGG16Features, VGG16Trunk
 
 
 @pytest.mark.parametrize("batch", [1, 3])
@@ -178,15 +178,22 @@ def test_positions_start_spread_inside_the_object():
 
 
 # Without a frozen encoder. The paper's own figure is "about 10 %" of 500 M parameters of an LRM.
-PARAMETERS = {"tiny": 1_403_334, "rays": 3_305_514, "small": 9_827_142, "paper": 44_614_726}
+PARAMETERS = {
+    "tiny": 1_403_334,
+    "rays": 3_305_514,
+    "small": 9_827_142,
+    "paper": 44_614_726,
+    "released": 38_028_358,
+}
 LENGTHS = {"tiny": (4096, 0), "rays": (49152, 0), "small": (9216, 144), "paper": (16384, 576)}
+LENGTHS["released"] = (16384, 577)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_preset_sizes(preset, monkeypatch):
     trunk = VGG16Trunk
     monkeypatch.setattr(
-        "gamba_warp.model.vgg.vgg16_features", lambda path: VGG16Features(trunk().state_dict())
+        "gamba_warp.vision.vgg.vgg16_features", lambda path: VGG16Features(trunk().state_dict())
     )
     config = PRESETS[preset]
     with torch.device("meta"):

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Who may call what; ``vgg_weights`` opens a wheel whose digest pip has compared.
+# Who may call what; ``vision.weights`` opens a wheel whose digest pip has compared.
 DOORS = {
     "Image.open": {"gamba_warp/images.py"},
     "tarfile.open": {"gamba_warp/untrusted/archives.py"},
     "zipfile.ZipFile": {
         "gamba_warp/untrusted/archives.py",
         "gamba_warp/untrusted/torch_files.py",
-        "gamba_warp/data/vgg_weights.py",
+        "gamba_warp/vision/weights.py",
     },
     "np.load": set(),
     "pickle.load": set(),

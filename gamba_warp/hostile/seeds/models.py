@@ -42,6 +42,29 @@ def models() -> dict[str, Files]:
         return {"model": {"model.safetensors": path.read_bytes()}}
 
 
+def released() -> dict[str, Files]:
+    """The authors' file of weights, at the smallest size, without an image encoder."""
+    import torch
+
+    from ...model.config import PRESETS
+    from ...model.encoders import ImageEncoder
+    from ...model.gamba import Gamba
+    from ...model.released import released_names
+
+    torch.manual_seed(0)
+    config = replace(PRESETS["released"], **_TINY, dt_rank=1, decoder_width=8)
+    tokens = ImageEncoder(torch.nn.Identity(), 384, config)
+    ours = Gamba(config, encoder=tokens).stored_state()
+    state = {f"model.{theirs}": ours[name] for theirs, name in released_names(1).items()}
+    points = torch.linspace(-0.4, 0.4, config.position_bins).repeat(3, 1)
+    state["model.decoder.coords"] = points
+    taps = "model.transformer.layers.0.mamba_block.mixer.conv1d.weight"
+    state[taps] = state[taps][:, None]
+    content = io.BytesIO()
+    torch.save({"model": state}, content)
+    return {"released": {"released.pth": content.getvalue()}}
+
+
 def training_options(data: Path, out: Path):
     """Options of a run that trains the smallest model; the checkpoints below are its own."""
     from gamba_warp.train.config import DataConfig, LengthConfig, LossConfig, RunConfig, TrainConfig

