@@ -88,7 +88,10 @@ def run(name: str, arguments: list[str]) -> int:
         reason = None if {"-h", "--help"} & {*arguments} else missing(name)
         if reason is not None:
             raise UserError(reason)
-        return tyro.cli(load_command(name), args=arguments, prog=f"gamba {name}") or 0
+        command = load_command(name)
+        expand = getattr(sys.modules.get(command.__module__), "expand", None)
+        arguments = expand(arguments) if expand else arguments
+        return tyro.cli(command, args=arguments, prog=f"gamba {name}") or 0
     except BrokenPipeError:
         raise  # the reader of the output left; see ``main``
     except KeyboardInterrupt:

@@ -107,8 +107,10 @@ class LossConfig:
     """Weight of the radial mask constraint at the start."""
     rdist_epochs: Annotated[float, Meta(ge=0, le=1e9)] = 10.0
     """Epochs over which the weight of the radial mask constraint falls linearly to 0."""
+    rdist_share: Annotated[float, Meta(gt=0, le=1)] = 0.25
+    """Largest share of the run in which that weight falls; it matters where the run is short."""
     rdist_steps: _Every | None = None
-    """The same in steps, in place of --rdist-epochs."""
+    """Steps over which that weight falls, in place of --rdist-epochs and --rdist-share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,6 +146,9 @@ class RunConfig:
 
     out: Path = Path("runs/gamba")
     """Run folder."""
+    config: Path | None = None
+    """Take the options of another run: its folder, or its config.json. Options beside this one
+    replace those, and so does DATA if it comes first; without --out that run itself goes on."""
     resume: str = "auto"
     """"auto" goes on where the run folder stands; else "never", or the path of a checkpoint."""
     init: Path | None = None
@@ -241,7 +246,8 @@ class TrainConfig:
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers", "views.cache"}
 _MUST_STAY = {"run.seed"}
 _TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
-_GROUPS = {
+# The groups of options in a run's config.json; "model" follows from the preset and --set.
+GROUPS = {
     "length": LengthConfig,
     "views": DataConfig,
     "loss": LossConfig,
@@ -276,7 +282,7 @@ def config_differences(stored: dict, current: dict, free: bool = False) -> list[
 
 
 def _defaults() -> dict:
-    return json.loads(json.dumps({k: asdict(v()) for k, v in _GROUPS.items()}, default=str))
+    return json.loads(json.dumps({k: asdict(v()) for k, v in GROUPS.items()}, default=str))
 
 
 def _flatten(values: dict, prefix: str = "") -> dict:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch.nn import Module
+from torch.nn.parallel import DistributedDataParallel
 
 from gamba_warp.errors import UserError
 
@@ -39,6 +43,24 @@ class World:
         tensor = torch.tensor(values, dtype=torch.float64)
         dist.all_reduce(tensor)
         return tensor.tolist()
+
+    def mean(self, figures: dict[str, float]) -> dict[str, float]:
+        """Averages each figure over all processes, which must have the same names of figures."""
+        names = sorted(figures)
+        sums = self.total(*(figures[name] for name in names))
+        return {name: value / self.size for name, value in zip(names, sums)}
+
+    def wrap(self, model: Module) -> Module:
+        """The model itself, or with several processes one that averages their gradients.
+
+        Buffers are constants here, so they are not sent around at each step.
+        """
+        if self.size == 1:
+            return model
+        known = inspect.signature(DistributedDataParallel).parameters
+        name = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
+        options: dict[str, Any] = {name: False}
+        return DistributedDataParallel(model, **options)
 
     def barrier(self) -> None:
         """Waits for all processes."""

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
@@ -71,9 +70,7 @@ class Trainer:
         self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
         self.ema = Ema(model, config.optim.ema) if config.optim.ema else None
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        self.wrapped = model
-        if world.size > 1:
-            self.wrapped = DistributedDataParallel(model, broadcast_buffers=False)
+        self.wrapped = world.wrap(model)
         self.precision = getattr(torch, config.optim.precision)
         self.accumulate = config.views.accumulate
         self.step = self.skipped = self.skipped_in_row = 0
@@ -128,24 +125,31 @@ class Trainer:
         done = self.schedule.progress(step, self.elapsed)
         return novel_views(done, views.views_first, views.views_last)
 
-    def weights(self) -> dict[str, float]:
-        """Returns the weights of the loss terms at the next step, and that of the novel views."""
+    def weights(self, constant: bool = False) -> dict[str, float]:
+        """Returns the weights of the loss terms at the next step, and that of the novel views.
+
+        Args:
+            constant: those of a validation, which do not change over the run: LPIPS from the start,
+                neither the radial mask constraint nor depth.
+        """
         loss = self.config.loss
-        span = loss.rdist_steps
-        span = loss.rdist_epochs * self.steps_per_epoch if span is None else span
-        use_lpips = self.lpips is not None and self.step >= loss.lpips_after
+        epochs = self.step / self.steps_per_epoch
+        done = self.schedule.progress(self.step, self.elapsed)
+        use_lpips = self.lpips is not None and (constant or self.step >= loss.lpips_after)
         return {
             "rgb": 1.0,
             "mask": loss.mask_weight,
             "lpips": loss.lpips_weight if use_lpips else 0.0,
             "ssim": loss.ssim_weight,
             "novel": loss.novel_weight,
-            "depth": loss.depth_weight,
-            "rdist": radial_weight(self.step, loss.rdist_weight, span) if loss.radial_mask else 0.0,
+            "depth": 0.0 if constant else loss.depth_weight,
+            "rdist": 0.0 if constant else radial_weight(loss, self.step, epochs, done),
         }
 
     def train_step(self, batches: Prefetcher) -> dict[str, float]:
         """Makes one optimizer step; returns its figures, some of them those of its last batch.
+
+        With several processes, losses and the model's health are the means over all of them.
 
         A step whose loss or gradient is not finite leaves the weights alone and is counted.
 
@@ -169,18 +173,17 @@ class Trainer:
             precision=self.precision,
         )
         loss, norm = torch.stack([made.loss, made.norm]).tolist()
-        self._apply(loss, norm)
+        loss = self._apply(loss, norm)
         seconds = time.perf_counter() - started
         views = made.batch.cameras.viewmats[..., 0, 0].numel() * self.accumulate * self.world.size
         figures = {"loss": loss, "grad_norm": norm, "lr": rate}
         figures |= {"seconds": seconds, "wait_share": sum(waits) / seconds}
         figures["views_per_second"] = views / seconds
-        if self.log is not None and self.step % self.config.run.log_every == 0:
+        if self.step % self.config.run.log_every == 0:
             terms = made.result.terms.items()
-            figures |= {f"loss_{name}": term.mean().item() for name, term in terms}
-            figures |= {
-                name: value.item() for name, value in health(made.result, made.batch).items()
-            }
+            own = {f"loss_{name}": term.mean().item() for name, term in terms}
+            known = health(made.result, made.batch).items()
+            figures |= self.world.mean(own | {name: value.item() for name, value in known})
         return figures
 
     def _take(self, batches: Prefetcher, waits: list[float]) -> Iterator[Batch]:
@@ -201,17 +204,22 @@ class Trainer:
         novel, rank, size = self.novel_views(step), self.world.rank, self.world.size
         batches.submit((step, micro), self._source.batch, number, novel, rank, size)
 
-    def _apply(self, loss: float, norm: float) -> None:
-        """Updates the weights or skips the step, on all processes alike, and counts the step."""
+    def _apply(self, loss: float, norm: float) -> float:
+        """Updates the weights or skips the step, on all processes alike, and counts the step.
+
+        Returns:
+            The mean loss over the processes.
+        """
         bad = not (math.isfinite(loss) and math.isfinite(norm))
-        bad = self.world.total(bad)[0] > 0
+        number, loss = self.world.total(bad, loss)
+        bad, loss = number > 0, loss / self.world.size
         self.step += 1
         if not bad:
             self.skipped_in_row = 0
             self.optimizer.step()
             if self.ema is not None:
                 self.ema.update()
-            return
+            return loss
         self.skipped += 1
         self.skipped_in_row += 1
         if self.log is not None:
@@ -222,6 +230,7 @@ class Trainer:
                 f"{self.skipped_in_row} steps in a row were not finite (step {self.step}); "
                 "lower --lr, or resume from an older checkpoint"
             )
+        return loss
 
     def run(self) -> int:
         """Trains until the end, the time limit or a signal, and then saves a checkpoint.
@@ -315,8 +324,8 @@ class Trainer:
                 self.config.views.size,
                 self._unread,
             )
-            weights = self.weights() | {"rdist": 0.0, "depth": 0.0}
-            figures, rows = validate(model, held_out, weights, self.lpips, self.world.device)
+            weights, device = self.weights(constant=True), self.world.device
+            figures, rows = validate(model, held_out, weights, self.lpips, device)
             self._name_failures()
             if rows:
                 self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)

@@ -16,7 +16,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
 
-from .config import OptimConfig
+from .config import LossConfig, OptimConfig
 
 # A learning rate under this share of what a run of the new length has at that step is no rate to
 # go on with; it rises over this share of what is left.
@@ -123,9 +123,23 @@ def novel_views(progress: float, first: int, last: int) -> int:
     return min(last, first + int(progress * (last - first + 1)))
 
 
-def radial_weight(step: float, base: float, span: float) -> float:
-    """Returns the radial mask constraint's weight, which falls from ``base`` to 0 in ``span``."""
-    return base * max(0.0, 1.0 - step / span) if span > 0 else 0.0
+def radial_weight(loss: LossConfig, step: int, epochs: float, done: float) -> float:
+    """Returns the radial mask constraint's weight, which falls linearly to 0.
+
+    It falls over ``rdist_steps``, or else over ``rdist_epochs``, but in ``rdist_share`` of the run
+    at most; 0 without the constraint.
+
+    Args:
+        loss: the options.
+        step: optimizer steps done.
+        epochs: the same in passes over the objects.
+        done: share of the run that is done, 0 to 1.
+    """
+    spans = [(epochs, loss.rdist_epochs), (done, loss.rdist_share)]
+    if loss.rdist_steps is not None:
+        spans = [(step, loss.rdist_steps)]
+    left = min(1.0 - now / span if span > 0 else 0.0 for now, span in spans)
+    return loss.rdist_weight * max(0.0, left) if loss.radial_mask else 0.0
 
 
 def ema_decay(updates: int, decay: float) -> float:

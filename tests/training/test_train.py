@@ -352,6 +352,10 @@ def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
     assert ["loss_lpips" in record for record in records] == [False, False, True]
     third = records[2]
     assert third["loss"] == pytest.approx(third["loss_rgb"] + third["loss_mask"] + 1.5, abs=1e-4)
+    # A validation's loss has LPIPS from the start, or it would jump where training begins it.
+    late = {"loss": loss | {"lpips_after": 9}, "run": {"val_every": 1}}
+    assert run(data, tmp_path / "late", **late, **short) == 0
+    assert all(record["loss"] > 1.5 for record in lines(tmp_path / "late", "val"))
 
 
 def test_bfloat16_keeps_float32_weights(data, tmp_path):
@@ -416,6 +420,11 @@ def test_two_processes(data, tmp_path):
         timeout=300,
     )
     assert result.returncode == 0, result.stderr[-3000:]
+    assert "FutureWarning" not in result.stderr
+    logs = [lines(tmp_path / name, "train") for name in ("one", "two")]
+    for alone, both in zip(*logs, strict=True):  # the losses of all objects, not of the first half
+        for name in ("loss", "loss_rgb", "loss_mask", "psnr", "spread"):
+            assert both[name] == pytest.approx(alone[name], rel=2e-3), name
     one = load_file(tmp_path / "one" / "model.safetensors")
     two = load_file(tmp_path / "two" / "model.safetensors")
     for name in one:

@@ -1,0 +1,80 @@
+"""``gamba train --config``: the options of another run, changed by those beside it."""
+
+import json
+
+import pytest
+from helpers import micro
+from helpers.micro import lines
+
+from gamba_warp import cli
+from gamba_warp.errors import UserError
+from gamba_warp.train.command import expand
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds")
+
+
+def _train(*words) -> int:
+    return cli.run("train", [str(word) for word in words])
+
+
+def test_a_second_run_has_the_options_of_the_first(data, tmp_path, capsys):
+    one, two = tmp_path / "one", tmp_path / "two"
+    options = ["--preset", "tiny", "--set", *micro.MODEL, "--steps", 2, "--batch-size", 1]
+    options += ["--views-per-object", 1, "--no-radial-mask", "--lpips", "off", "--size", 16]
+    assert _train(data, *options, "--val-every", 0, "--log-every", 1, "--out", one) == 0
+    assert _train("--config", one, "--out", two, "--steps", 3, "--lr", 2e-3) == 0
+    first, second = (json.loads((folder / "config.json").read_text()) for folder in (one, two))
+    changed = {"length": {"steps": 3}, "optim": {"lr": 2e-3}, "run": {"out": str(two)}}
+    for group, values in changed.items():
+        first[group] |= values
+    assert first == second and len(lines(two, "train")) == 3
+    # Without --out the same run goes on, here to another length.
+    assert _train(f"--config={one / 'config.json'}", "--steps", 4) == 0
+    assert [record["step"] for record in lines(one, "train")] == [1, 2, 3, 4]
+
+
+def test_data_may_be_another(tmp_path):
+    values = {"data": "here", "preset": "tiny", "set": ["depth=1"], "run": {"out": "run one"}}
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(values))
+    want = ["--preset", "tiny", "--set", "depth=1", "--out", "run one"]
+    assert expand(["--config", str(path)]) == ["here", *want]
+    assert expand(["there", "--config", str(path), "--lr", "1"]) == ["there", *want, "--lr", "1"]
+    assert expand(["--lr", "1", "--config", str(path)]) == ["here", *want, "--lr", "1"]
+    assert expand(["there", "--steps", "3"]) == ["there", "--steps", "3"]
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (None, "no run's config.json"),
+        (b"\xff", "no run's config.json"),
+        (b"[1]", "a run's options"),
+        (b"{}", "names no data or preset"),
+        (b'{"data": "x", "preset": "tiny", "speed": 1}', "unknown speed"),
+        (b'{"data": "x", "preset": "tiny", "optim": {"speed": 1}}', "unknown optim.speed"),
+        (b'{"data": "x", "preset": "tiny", "optim": 3}', "optim is no group"),
+        (b'{"data": "--out=/", "preset": "tiny"}', "'--out=/' is no value"),
+        (b'{"data": "x", "preset": "tiny", "optim": {"lr": {}}}', "'{}' is no value"),
+    ],
+)
+def test_bad_files_are_one_line(tmp_path, content, words):
+    path = tmp_path / "config.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=words) as caught:
+        expand(["--config", str(path)])
+    assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match="--config: expected once"):
+        expand(["--config", str(path), "--config"])
+
+
+def test_bad_values_end_with_code_two(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text('{"data": "x", "preset": "tiny", "optim": {"lr": "fast"}}')
+    with pytest.raises(SystemExit) as caught:
+        _train("--config", path)
+    assert caught.value.code == 2
