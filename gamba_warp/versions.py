@@ -23,11 +23,13 @@ _USED = (
     "open3d-cpu",
     "open3d",
     "imageio-ffmpeg",
+    "gsplat",
     "tyro",
 )
 # The extra that brings a library (by the name it is imported by). A command that has an extra of
 # its own names that instead, where it holds the library too.
 EXTRA_OF = {
+    "gsplat": "fit",
     "huggingface_hub": "hub",
     "imageio_ffmpeg": "video",
     "kornia": "eval",
@@ -46,7 +48,7 @@ OWN = {
     "eval-geometry": "eval",
     "eval-views": "eval",
     "export": "mesh",
-    "fit": "eval",
+    "fit": "fit",
     "reconstruct": "photo",
     "stress": "all",
     "import-released": "train",
@@ -58,6 +60,7 @@ HOLDS = {
     "train": {"kornia", "tensorboard", "timm"},
     "mesh": set(_SHAPES),
     "eval": set(_SHAPES),
+    "fit": {"gsplat", "kornia"},
     "all": set(EXTRA_OF),
 }
 # What a command cannot begin without; what only some of its options need is found missing then.

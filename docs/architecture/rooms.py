@@ -74,7 +74,7 @@ ROOMS = {
     "vision": Room("VGG16, LPIPS, and how their weights are fetched", _READERS),
     "model": Room("tokens, blocks, decoder, checkpoints", (*_READERS, "data", "formats", "vision")),
     "surfaces": Room("Gaussians to meshes", _LIBRARY),
-    "fitting": Room("one object by optimisation", _LIBRARY),
+    "fitting": Room("one object by optimisation", (*_LIBRARY, "compat")),
     "pages": Room("pages, turntables, the viewer", (*_LIBRARY, "surfaces", "fitting")),
     "measure": Room("benchmark and stress cases that need the model", _MEASURES),
     "hostile": Room(

@@ -13,7 +13,7 @@ from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
-from ..fitting.config import Count, FitConfig, RasterizeMode, Steps
+from ..fitting.config import Count, FitConfig, RasterizeMode, Steps, Strategy
 from ..untrusted.ranges import Minutes, Seed, ranged
 
 
@@ -28,6 +28,7 @@ def fit_command(
     steps: Steps = FitConfig.steps,
     minutes: Minutes | None = None,
     gaussians: Count = FitConfig.gaussians,
+    strategy: Strategy = FitConfig.strategy,
     size: Annotated[int, Meta(ge=8, le=4096)] | None = None,
     rasterize_mode: RasterizeMode = "classic",
     seed: Seed = 0,
@@ -44,7 +45,9 @@ def fit_command(
         held_out: One view of so many is kept from the fit and measured; 0 keeps none.
         steps: Number of Adam steps.
         minutes: Time limit of each object; the learning rates then fall with the time.
-        gaussians: Number of Gaussians in each object.
+        gaussians: Number of Gaussians in each object; the largest number with mcmc and default.
+        strategy: Fixed moves what hardly shows, and the number stays. Mcmc and default are those of
+            gsplat, which must be installed; they start with half the number and add to it.
         size: Height of the pictures; the files' own by default.
         rasterize_mode: Antialiased fits small pictures better, but files do not hold the mode, and
             most viewers (and eval-views) are classic.
@@ -52,10 +55,14 @@ def fit_command(
         device: Device that computes; auto is the GPU if there is one.
     """
     from ..data.dataset import open_dataset
+    from ..fitting.densify import make_strategy
     from ..fitting.objects import FitJob, choose_objects, fit_objects, object_paths
 
     if held_out == 1:
         raise UserError("--held-out 1: would leave no view for the fit; 2 or more, or 0 for none")
+    if minutes is not None and strategy != "fixed":
+        reason = "its schedule counts steps, and a time limit would cut it off; give --steps alone"
+        raise UserError(f"--minutes {minutes:g} with --strategy {strategy}: {reason}")
     chosen = pick_device(device)
     dataset = open_dataset(folder, split)
     uids = choose_objects(dataset.uids, objects, limit)
@@ -65,9 +72,12 @@ def fit_command(
         gaussians=gaussians,
         steps=steps,
         seconds=None if minutes is None else 60 * minutes,
+        strategy=strategy,
         rasterize_mode=rasterize_mode,
         seed=seed,
     )
+    if strategy != "fixed":
+        make_strategy(config)  # a missing gsplat ends the command before it writes
     job = FitJob(dataset, output_folder(out), config, held_out, size, chosen)
     text, failures = fit_objects(job, uids)
     print(text)

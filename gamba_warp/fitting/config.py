@@ -15,6 +15,8 @@ Steps = Annotated[int, Meta(ge=1, le=10_000_000)]
 _Rate = Annotated[float, Meta(ge=0, le=10)]
 _Weight = Annotated[float, Meta(ge=0, le=1e6)]
 _Share = Annotated[float, Meta(ge=0, le=1)]
+Strategy = Literal["fixed", "mcmc", "default"]
+BETAS = (0.9, 0.99)  # Adam's second moment forgets in 100 steps, because there are only hundreds
 MIN_SCALE, MAX_SCALE = 1e-3, 0.1  # object units
 
 
@@ -23,10 +25,10 @@ class FitConfig:
     """How one object is fitted.
 
     Attributes:
-        gaussians: N, fixed throughout.
+        gaussians: N, fixed throughout; with another strategy the most there may be.
         steps: number of Adam steps; 0 returns the start.
         seconds: time limit, or None; the learning rates then fall with the time, so the result
-            depends on the machine.
+            depends on the machine. The schedules of gsplat's strategies count steps all the same.
         views: number of views rendered in each step.
         lr_means: first learning rate of the means, object units a step.
         lr_scales: first learning rate of the scales' logarithms.
@@ -41,6 +43,17 @@ class FitConfig:
         relocate_until: share of the steps after which none is relocated.
         min_weight: a Gaussian that has less blending weight than so many pixels in all views
             together is relocated.
+        strategy: "fixed", or gsplat's "mcmc" or "default". The fields ``relocate_`` and
+            ``min_weight`` are for "fixed" alone, and those from ``start_share`` to ``grow_grad``
+            for the other two.
+        start_share: N at the start, as a share of ``gaussians``.
+        refine_start: share of the steps before gsplat's strategy changes the number.
+        refine_stop: share of the steps after which it stays.
+        refine_times: changes that the whole number of steps would have room for.
+        weight_opacity: weight of the mean opacity in the loss of "mcmc": what nothing needs fades,
+            and is moved to where it is needed.
+        noise: ``noise_lr`` of "mcmc", the noise on the means by their learning rate.
+        grow_grad: "default" splits and copies Gaussians of a larger gradient in the picture.
         rasterize_mode: mode that renders the Gaussians. Files do not hold it, and most viewers are
             classic; antialiased Gaussians fit small pictures better.
         seed: seed of all random numbers.
@@ -62,6 +75,14 @@ class FitConfig:
     relocate_share: _Share = 0.2
     relocate_until: _Share = 0.7
     min_weight: _Weight = 1.0
+    strategy: Strategy = "fixed"
+    start_share: _Share = 0.5
+    refine_start: _Share = 1 / 12
+    refine_stop: _Share = 0.7
+    refine_times: Annotated[int, Meta(ge=1, le=10_000)] = 30
+    weight_opacity: _Weight = 1e-4
+    noise: Annotated[float, Meta(ge=0, le=1e9)] = 4e4
+    grow_grad: _Weight = 2e-4
     rasterize_mode: RasterizeMode = "classic"
     seed: Seed = 0
 

@@ -20,7 +20,7 @@ from ..errors import UserError
 from ..files import output_folder, write_json, write_text
 from ..formats.ply import save_ply
 from ..gaussians import Gaussians
-from ..image_metrics import psnr
+from ..image_metrics import SSIM_WINDOW, psnr, ssim
 from ..images import save_image
 from ..render import render
 from ..versions import used_versions
@@ -37,6 +37,7 @@ PROTOCOL = {
 }
 _TABLE = (
     ("held-out PSNR [dB]", "psnr_held_out", "{:.2f}"),
+    ("held-out SSIM", "ssim_held_out", "{:.4f}"),
     ("train PSNR [dB]", "psnr_train", "{:.2f}"),
     ("seconds", "seconds", "{:.1f}"),
     ("CPU seconds", "cpu_seconds", "{:.1f}"),
@@ -171,6 +172,8 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
         rgb = render(result.gaussians, cameras, white, rasterize_mode=mode).rgb.clamp(0, 1)
     truth = over_background(images, WHITE)
     by_view = psnr(rgb, truth).tolist()
+    large = min(rgb.shape[1:3]) >= SSIM_WINDOW  # in smaller pictures it is not defined
+    similar = ssim(rgb[kept], truth[kept]).tolist() if kept and large else []
     record = {
         "name": uid,
         "views_train": fitted,
@@ -178,6 +181,7 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
         "size": [cameras.width, cameras.height],
         "psnr_train": _mean([by_view[v] for v in fitted]),
         "psnr_held_out": _mean([by_view[v] for v in kept]),
+        "ssim_held_out": _mean(similar),
         "psnr_by_view": by_view,
         "gaussians": result.gaussians.num,
         "relocated": result.relocated,
@@ -218,7 +222,8 @@ def _write_object(
     reference = cameras.viewmats[0]
     _, scale = relative_to_reference(cameras.viewmats[:1], reference)
     moved = gaussians.transformed(reference[:3, :3], reference.new_zeros(3), scale.item())
-    note = f"fitted to {record['name']} by gamba fit, rasterize_mode {job.config.rasterize_mode}"
+    how = f"strategy {job.config.strategy}, rasterize_mode {job.config.rasterize_mode}"
+    note = f"fitted to {record['name']} by gamba fit, {how}"
     save_ply(paths["gaussians"], moved, comments=[note])
     save_image(paths["strips"], rows[:4].flatten(0, 1).cpu().numpy())
     write_json(paths["objects"], {**_settings(job), **record})

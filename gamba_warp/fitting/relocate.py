@@ -11,7 +11,60 @@ from ..cameras import Cameras
 from ..conventions import over_background
 from ..gaussians import Gaussians, quat_multiply
 from ..render import render
-from .config import FitConfig, RasterizeMode
+from .config import BETAS, FitConfig, RasterizeMode
+from .start import activate
+
+
+class Fixed:
+    """A fit whose number of Gaussians stays; those that hardly show are moved now and then.
+
+    Attributes:
+        parameters: as ``random_start`` returns them; the fit changes them in place.
+        optimizers: one Adam for all.
+    """
+
+    def __init__(
+        self,
+        parameters: dict[str, Tensor],
+        images: Tensor,
+        cameras: Cameras,
+        config: FitConfig,
+        rng: torch.Generator,
+    ) -> None:
+        groups = [{"params": [p.requires_grad_()], "name": name} for name, p in parameters.items()]
+        self.parameters = parameters
+        # The gradients of single Gaussians are far below Adam's usual eps.
+        self.optimizers = {"all": torch.optim.Adam(groups, betas=BETAS, eps=1e-15)}
+        self._scene, self._config, self._rng = (images, cameras), config, rng
+
+    def draw(self, cameras: Cameras, backgrounds: Tensor) -> tuple[Tensor, Tensor]:
+        """Renders ``[V, H, W, 3]`` on ``backgrounds [V, 3]``, and alpha ``[V, H, W, 1]``."""
+        mode = self._config.rasterize_mode
+        picture = render(activate(self.parameters), cameras, backgrounds, rasterize_mode=mode)
+        return picture.rgb, picture.alpha
+
+    def penalty(self) -> float:
+        """What the loss has beside the pictures: nothing."""
+        return 0.0
+
+    def after(self, step: int, done: float) -> int:
+        """What follows a step of Adam.
+
+        Args:
+            step: its number, from 1.
+            done: share of the fit that was done before it.
+
+        Returns:
+            The number of Gaussians that were moved.
+        """
+        config = self._config
+        if not config.relocate_every or step % config.relocate_every:
+            return 0
+        if done >= config.relocate_until:
+            return 0
+        weight, error = shares(activate(self.parameters), *self._scene, config.rasterize_mode)
+        optimizer = self.optimizers["all"]
+        return relocate(self.parameters, optimizer, weight, error, config, self._rng)
 
 
 def shares(

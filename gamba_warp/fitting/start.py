@@ -1,4 +1,4 @@
-"""The start of a fit: random points in the visual hull of the pictures."""
+"""The start of a fit: random points in the visual hull of the pictures; what parameters mean."""
 
 from __future__ import annotations
 
@@ -9,9 +9,21 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool3d
 
 from ..cameras import Cameras
+from ..gaussians import Gaussians
 from .config import MAX_SCALE, MIN_SCALE
 
 HULL_GRID = 96  # voxels a side of the unit cube
+
+
+def activate(parameters: dict[str, Tensor]) -> Gaussians:
+    """Makes Gaussians of parameters as ``random_start`` returns them."""
+    return Gaussians(
+        means=parameters["means"],
+        quats=parameters["quats"],
+        scales=parameters["scales"].exp(),
+        opacities=parameters["opacities"].sigmoid(),
+        colors=parameters["colors"].sigmoid(),
+    )
 
 
 def sample_views(images: Tensor, cameras: Cameras, points: Tensor) -> Tensor:

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.micro import cloud, write_object
+from helpers.micro import cloud, photograph, views_around, write_object
 
-from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
 from gamba_warp.commands.fit import fit_command
 from gamba_warp.conventions import over_background
@@ -26,28 +25,15 @@ from gamba_warp.image_metrics import psnr
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.render import render
 
-SIZE, VIEWS = 32, 12
+VIEWS = 12
 QUICK = FitConfig(gaussians=300, steps=80, views=4, relocate_every=20)
 STILL = dict.fromkeys(("lr_means", "lr_scales", "lr_quats", "lr_opacities", "lr_colors"), 0.0)
-
-
-def views_around(count=VIEWS, width=SIZE, height=SIZE) -> Cameras:
-    azimuths = torch.arange(count) * (360.0 / count)
-    elevations = 25.0 * torch.cos(torch.arange(count) * 2.0)
-    viewmats = torch.cat([orbit(a[None], e.item(), 1.8) for a, e in zip(azimuths, elevations)])
-    return Cameras(viewmats, intrinsics(width, height).expand(count, 3, 3), width, height)
-
-
-def photograph(gaussians, cameras) -> torch.Tensor:
-    """Straight RGBA, as files hold it."""
-    picture = render(gaussians, cameras)
-    return torch.cat([picture.rgb / picture.alpha.clamp_min(1e-3), picture.alpha], -1).clamp(0, 1)
 
 
 @functools.cache
 def held_out_psnr(config: FitConfig) -> tuple[float, list[float]]:
     """Mean PSNR of three held-out views of a many-coloured cloud, on white; losses of the fit."""
-    cameras = views_around()
+    cameras = views_around(VIEWS)
     scene = cloud(3)
     scene.colors = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
     images = photograph(scene, cameras)
@@ -160,7 +146,7 @@ def test_points_project_where_the_rasterizer_draws_them():
 
 
 def test_start_lies_in_the_hull():
-    cameras = views_around()
+    cameras = views_around(VIEWS)
     images = photograph(cloud(2), cameras)
     start = random_start(images, cameras, 501, torch.Generator().manual_seed(0))
     hull = visual_hull(images[..., 3], cameras)

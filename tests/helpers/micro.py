@@ -48,6 +48,20 @@ def cloud(seed: int, num: int = 40) -> Gaussians:
     )
 
 
+def views_around(count: int, width: int = 32, height: int = 32) -> Cameras:
+    """Makes cameras on a ring of changing height about the origin."""
+    azimuths = torch.arange(count) * (360.0 / count)
+    elevations = 25.0 * torch.cos(torch.arange(count) * 2.0)
+    viewmats = torch.cat([orbit(a[None], e.item(), 1.8) for a, e in zip(azimuths, elevations)])
+    return Cameras(viewmats, intrinsics(width, height).expand(count, 3, 3), width, height)
+
+
+def photograph(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
+    """Straight RGBA, as files hold it."""
+    picture = render(gaussians, cameras)
+    return torch.cat([picture.rgb / picture.alpha.clamp_min(1e-3), picture.alpha], -1).clamp(0, 1)
+
+
 def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None:
     """Writes one object in the transforms.json layout."""
     azimuths = torch.arange(views) * (360.0 / views)

@@ -15,8 +15,11 @@ from gamba_warp import cli, versions
 from gamba_warp.images import save_image
 
 ROOT = Path(__file__).resolve().parents[2]
-# A module of one command, which needs the library for everything that it does.
-ALL_OF_IT = {ROOT / "train" / "data" / "primitives.py"}
+# They need the library for everything that they do, and are loaded when that is asked for.
+ALL_OF_IT = {
+    ROOT / "train" / "data" / "primitives.py",
+    ROOT / "gamba_warp" / "compat" / "gsplat" / "strategy.py",
+}
 # Refuses each library of the extras as if it were not installed, and runs a command.
 WITHOUT = """
 import importlib.util, sys

@@ -9,8 +9,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 # Libraries whose distribution has another name than the module.
 DISTRIBUTIONS = {"PIL": "pillow", "skimage": "scikit-image", "warp": "warp-lang"}
-# lpips: its weights are taken from the package where somebody has it; gsplat: its own strategies.
-OPTIONAL = {"gsplat", "lpips"}
+# Its weights are taken from the package where somebody has it.
+OPTIONAL = {"lpips"}
 
 
 def imported() -> dict[str, Path]:

@@ -8,16 +8,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN, EPS2D
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, EPS2D
 from gamba_warp.kernels.rasterize.ops import project
 from gamba_warp.kernels.rasterize.project import LensOptions
 
 from .checks import cameras, means_of, only, positive, shape
+from .faint import compensation_of, exact_where_faint
 from .shapes import proj, symmetric, world_to_cam
 
 # Without opacities gsplat draws a box of 3.33 standard deviations: that of this opacity, about 1.
 _OPAQUE = ALPHA_MIN * math.exp(0.5 * 3.33**2)
-_LARGE = 1e6  # an opacity that stays over alpha_min with every factor of antialiasing
+_LARGE = 1e15  # an opacity that stays over alpha_min with every factor of antialiasing from 4e-18
 
 
 class Lens(NamedTuple):
@@ -97,6 +98,8 @@ def project_views(
         ).numbers()  # fmt: skip
         given = means, quats, scales, opacities, colors.detach(), viewmats, Ks
         found = project(*given, options)[:5]
+        if lens.antialiased:
+            found = exact_where_faint(found, means, quats, scales, opacities, viewmats, Ks, lens)
     means2d, conics, depths, view_opacities, extents = found
     extents = extents.detach()
     return Splats(means2d, conics, depths, view_opacities, extents, extents.ceil().int())
@@ -126,13 +129,10 @@ def _project_covariances(
     covars = torch.where(seen[..., None, None], covars, torch.eye(3).to(covars))
     centers, plane = proj(turned, covars, Ks.double(), lens.width, lens.height)
     xx, xy, yy = plane[..., 0, 0], plane[..., 0, 1], plane[..., 1, 1]
-    before = xx * yy - xy * xy
+    factor = compensation_of(xx, xy, yy, lens.eps2d) if lens.antialiased else 1.0
     xx, yy = xx + lens.eps2d, yy + lens.eps2d
     det = xx * yy - xy * xy
-    view_opacities = opacities[:, None].double().expand_as(depths)
-    if lens.antialiased:
-        factor = (before / det).clamp_min(COMPENSATION_MIN**2).sqrt()
-        view_opacities = view_opacities * factor
+    view_opacities = opacities[:, None].double().expand_as(depths) * factor
     seen = seen & (det > 0) & (view_opacities >= ALPHA_MIN)
     with torch.no_grad():
         cut = (2 * (view_opacities / ALPHA_MIN).clamp_min(1).log()).sqrt()
@@ -205,7 +205,7 @@ def fully_fused_projection(
         radius_clip: ones with both radii up to this many pixels are culled.
         packed: return only what is seen.
         sparse_grad: False.
-        calc_compensations: also return the factor of antialiasing, at least 0.005.
+        calc_compensations: also return the factor of antialiasing.
         camera_model: "pinhole".
         opacities: ``[.., N]``, to draw the boxes no larger than needed; or None.
 
@@ -243,7 +243,8 @@ def fully_fused_projection(
         opacity = flat(opacities.detach(), lead)
         found = projected(opacity, calc_compensations)
         if calc_compensations:
-            compensations = found.opacities / opacity[:, None]
+            # an opacity of 0 is culled, and its factor is 0
+            compensations = found.opacities / opacity[:, None].clamp_min(ALPHA_MIN)
     else:
         opacity = flat(means.detach()[..., 0], lead)
         found = projected(torch.full_like(opacity, _OPAQUE), False)
