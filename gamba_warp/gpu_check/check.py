@@ -174,7 +174,7 @@ class Run:
 
             def look() -> None:
                 if path.exists():
-                    part = json.loads(path.read_text())
+                    part = json.loads(path.read_bytes())
                     if part != self.parts[name]:
                         self.parts[name] = part
                         self.write()
@@ -209,7 +209,7 @@ class Run:
             command += ["--continue-on-collection-errors", f"--junitxml={path}", *map(str, files)]
             code, said = run_python(command, seconds, lambda: None, cwd=CHECKOUT)
             if path.exists():
-                part.update(read_junit(path.read_text()), whole=True)
+                part.update(read_junit(path.read_text(encoding="utf-8")), whole=True)
         self._judge(row, code, said, seconds)
 
 
@@ -263,7 +263,10 @@ def run_python(
             code = process.poll()
         finally:
             if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
+                if hasattr(os, "killpg"):
+                    os.killpg(process.pid, signal.SIGKILL)
+                else:  # Windows: what the process started itself goes on
+                    process.kill()
                 process.wait()
         look()
         said.seek(0)
