@@ -7,6 +7,7 @@ import os
 import re
 import secrets
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from .errors import UserError
+from .kernels.runtime.system import is_own
 
 PACKAGE = Path(__file__).resolve().parent
 # The folder of a checkout: of this package, of tests/ and of starter/.
@@ -112,6 +114,8 @@ def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
             _sync(part)
         temporary.chmod(0o777 & ~_umask())  # mkdtemp makes 0700
         with _set_aside(path) if replace else nullcontext():
+            if sys.platform == "win32" and path.is_dir():
+                path.rmdir()  # there a rename does not replace an empty folder
             temporary.rename(path)  # an empty folder may be there
         _sync(path.parent)
 
@@ -146,7 +150,11 @@ def remove_folder(folder: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
+    """Waits until a file or a folder is on the disk; Windows opens no folders for this."""
+    windows = sys.platform == "win32"
+    if windows and path.is_dir():
+        return
+    handle = os.open(path, os.O_RDWR if windows else os.O_RDONLY)  # it syncs what can be written
     try:
         os.fsync(handle)
     finally:
@@ -166,7 +174,7 @@ def sweep(folder: str | Path, age: float = _DAY) -> None:
         return
     for entry in found:
         try:
-            if entry.stat(follow_symlinks=False).st_uid != os.geteuid() or entry.is_symlink():
+            if not is_own(entry.stat(follow_symlinks=False)) or entry.is_symlink():
                 continue
             if time.time() - _last_written(entry) < age:
                 continue
@@ -193,9 +201,7 @@ def visible(folder: Path, pattern: str) -> Iterator[Path]:
 
 def write_json(path: str | Path, value: object) -> None:
     """Writes ``value`` as indented JSON, atomically; NaN and infinity are refused."""
-    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    with atomic_path(path) as temporary:
-        temporary.write_text(text)
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -246,7 +252,7 @@ def only_process(folder: Path, what: str) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         try:
-            number = path.read_text().strip()[:20] or "unknown"
+            number = path.read_text(encoding="utf-8").strip()[:20] or "unknown"
         except OSError:
             number = "unknown"
         message = f"{folder}: another process {what} here (pid {number})"
@@ -255,7 +261,7 @@ def only_process(folder: Path, what: str) -> Iterator[None]:
         raise UserError(f"cannot lock {folder}: {why_not_written(error) or error}") from error
     try:
         with suppress(OSError):  # a full disk: the lock holds all the same
-            path.write_text(f"{os.getpid()}\n")
+            path.write_text(f"{os.getpid()}\n", encoding="utf-8")
         yield
     finally:
         lock.release()

@@ -85,7 +85,7 @@ def cases(settings: Settings) -> list[Case]:
         "Error: a batch padded to its largest object must give the Gaussians, and the gradient, "
         "that each object gives alone. All patches is another function, since the network then "
         "sees tokens of the background, which it was not trained with; how far its pictures are is "
-        "a PSNR. Weights: starter/rays.safetensors, or fresh ones."
+        "a PSNR. Weights: the shipped model's, or fresh ones."
     )
     builders = {
         "parts": (parts, _parts, "parts"),

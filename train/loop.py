@@ -16,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
+from gamba_warp.kernels.runtime.system import end_signals
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
@@ -32,7 +33,7 @@ from .step import collapse_reason, compute_gradients, health, validate
 def stop_signals() -> Iterator[list[int]]:
     """Collects SIGTERM, SIGHUP and SIGINT in the yielded list; a second SIGINT interrupts at once.
 
-    A SIGHUP that is ignored, as below nohup, stays so.
+    A SIGHUP that is ignored, as below nohup, stays so; Windows has none.
     """
     received: list[int] = []
 
@@ -41,9 +42,10 @@ def stop_signals() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         received.append(number)
 
-    stopping = [signal.SIGTERM, signal.SIGINT]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-        stopping.append(signal.SIGHUP)
+    stopping = [signal.SIGINT]
+    for sign in end_signals():
+        if sign == signal.SIGTERM or signal.getsignal(sign) != signal.SIG_IGN:
+            stopping.append(sign)
     old = {number: signal.signal(number, note) for number in stopping}
     try:
         yield received

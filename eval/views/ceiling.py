@@ -123,7 +123,7 @@ def _key(views: ObjectViews, config: FitConfig) -> str:
 
 def _stated(path: Path) -> str | None:
     try:
-        return json.loads(path.read_text())["key"]
+        return json.loads(path.read_bytes())["key"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

@@ -10,6 +10,12 @@ from ..errors import UserError
 from ..files import STARTER, only_process, output_folder
 from ..untrusted.ranges import Minutes, ranged
 
+# An installed package has the shipped model and two pictures, but no posed views and no meshes.
+_MAKE = (
+    "make the starter set by 'gamba data furniture --out furniture' and 'python -m "
+    "gamba_warp.train.data.starter furniture --out starter', then give --starter starter"
+)
+
 
 @ranged
 def demo_command(
@@ -22,7 +28,8 @@ def demo_command(
     """Reconstructs and evaluates with the shipped model, then trains one, on one page.
 
     The page is there as soon as the shipped model is through, and again when all is done. A demo
-    that was interrupted goes on where it was; what is done is not done again.
+    that was interrupted goes on where it was; what is done is not done again. An
+    installed package lacks most of the starter set, and says how to make it.
 
     Args:
         out: Folder for everything; OUT/index.html is the page.
@@ -37,9 +44,9 @@ def demo_command(
 
     for name in ("data", "icons", "meshes"):
         if not (starter / name).is_dir():
-            raise UserError(f"{starter / name}: no such folder; the starter set is in the checkout")
+            raise UserError(f"{starter / name}: no such folder; {_MAKE}")
     if not DEFAULT_CHECKPOINT.exists():
-        raise UserError(f"{DEFAULT_CHECKPOINT}: no such file; the shipped model is in the checkout")
+        raise UserError(f"{DEFAULT_CHECKPOINT}: no such file, but it comes with the package")
     out = output_folder(out)
     results = DemoResults(
         shipped=DEFAULT_CHECKPOINT,

@@ -19,7 +19,8 @@ def endurance_command(
     Training is killed 100 times and must come to the same bits as if nothing had happened; every
     other command 20 times; each meets a full disk (no file may grow beyond a random byte) 10
     times. Counted are older files lost, runs that did not go on, ends that were not told in one
-    line, and debris. Writes endurance.json and endurance.md. Works in a temporary folder.
+    line, and debris. Writes endurance.json and endurance.md. Works in a temporary folder. Runs on
+    Linux only.
 
     Args:
         quick: A few of each, which takes seconds.
@@ -27,12 +28,15 @@ def endurance_command(
         commands: Only these besides training; all if not given.
         seed: Seed of the random moments.
     """
+    import sys
     import tempfile
 
     from ..endurance.jobs import jobs
     from ..endurance.report import page
     from ..endurance.run import Plan, endurance
 
+    if sys.platform != "linux":
+        raise UserError("endurance runs on Linux only: it forks commands and limits their files")
     known = [job.name for job in jobs(Path())]
     unknown = [name for name in commands if name not in known]
     if unknown:

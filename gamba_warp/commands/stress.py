@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from msgspec import Meta
 
 from ..conventions import DeviceChoice
 from ..devices import pick_device
+from ..errors import UserError
 from ..files import output_folder
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 
@@ -36,7 +38,8 @@ def stress_command(
 
     Forward results and all gradients; a failing case is made small and written to a file that
     --replay runs again. Writes stress.json and stress.md. Ctrl-C keeps what was found.
-    With "files": hostile files for every reader, in child processes with limits of memory and time.
+    With "files": hostile files for every reader, in child processes with limits of memory and time;
+    on Linux only.
 
     Args:
         what: scan (with the convolution), raster, model, or all (of these); or files, after which
@@ -63,6 +66,7 @@ def stress_command(
         return _replay(replay, chosen)
     endless = minutes is None and cases is not None
     if "files" in what:
+        _only_on_linux()
         names = files_run.choose_readers(what)
         run = files_run.FilesRun(names, output_folder(out), seed, shrink_seconds, threads)
     else:
@@ -77,12 +81,19 @@ def stress_command(
     return 1 if run.failures else 0
 
 
+def _only_on_linux() -> None:
+    if sys.platform != "linux":
+        raise UserError("stress files runs on Linux only: it limits the memory of its children")
+
+
 def _replay(paths: tuple[Path, ...], device) -> int:
     """Runs failing cases, those of files last; returns the exit code."""
     from ..hostile import run as files_run
     from ..measure import stress_run
 
     files = [path for path in paths if files_run.is_hostile_case(path)]
+    if files:
+        _only_on_linux()
     numeric = [path for path in paths if path not in files]
     code = 0
     for passes, text in (*stress_run.replay(numeric, device), *files_run.replay(files)):

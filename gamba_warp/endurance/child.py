@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import select
 import signal
 import sys
@@ -105,6 +104,8 @@ def _read(pipe: int) -> list[bytes]:
 
 def _become(function: Callable[[], int | None], output: int, file_limit: int | None) -> None:
     """Runs the function as a process of its own would; never returns."""
+    import resource  # Linux alone: the command refuses elsewhere
+
     import torch
 
     code = 70
@@ -113,7 +114,11 @@ def _become(function: Callable[[], int | None], output: int, file_limit: int | N
         for target in (1, 2):
             os.dup2(output, target)
         for name, number in (("stdout", 1), ("stderr", 2)):
-            setattr(sys, name, open(number, "w", errors="backslashreplace", closefd=False))
+            setattr(
+                sys,
+                name,
+                open(number, "w", encoding="utf-8", errors="backslashreplace", closefd=False),
+            )
         torch.set_num_threads(1)
         if file_limit is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, file_limit))

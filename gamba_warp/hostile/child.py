@@ -1,14 +1,14 @@
 """A child process that reads hostile cases, one after the other, and judges what comes of each.
 
 It has limits of memory and of file sizes, sees through Python's audit events what is opened and
-started, and compares the folders around the case before and after.
+started, and compares the folders around the case before and after. Only Linux has what it needs:
+the command refuses elsewhere.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import shutil
 import signal
 import sys
@@ -109,7 +109,7 @@ class Child:
         for name in ("canary", "outer/canary", "outer/box", "here", "scratch"):
             (base / name).mkdir(parents=True)
         for folder in (base / "canary", base / "outer" / "canary"):
-            (folder / "kept.txt").write_text("kept\n")
+            (folder / "kept.txt").write_text("kept\n", encoding="utf-8")
             (folder / "kept.png").write_bytes(b"kept")
         os.chdir(base / "here")
         tempfile.tempdir = str(base / "scratch")
@@ -206,6 +206,8 @@ def _status(name: str) -> int:
 
 def _limit_memory() -> None:
     """Bounds what is allocated from here on; libraries that came meanwhile are not counted."""
+    import resource
+
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     soft = _status("VmData:") + MOST_MEMORY + _SLACK
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
@@ -214,7 +216,7 @@ def _limit_memory() -> None:
 def _reset_peak() -> int:
     """Starts the measurement of the largest memory anew; returns the memory taken now, bytes."""
     with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
     return _status("VmRSS:")
 
 
@@ -239,6 +241,8 @@ def serve(connection: Connection, base: str, prepare: Callable[[], None] | None 
         base: folder for the child's files, which is there and empty.
         prepare: called first, or None.
     """
+    import resource
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's; it ends the children
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]

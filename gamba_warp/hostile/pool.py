@@ -13,6 +13,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from ..kernels.runtime.system import end_signals
 from .case import Case
 from .child import serve
 from .verdict import Verdict
@@ -93,7 +94,7 @@ class Pool:
 
     def __enter__(self) -> Pool:
         if threading.current_thread() is threading.main_thread():  # no other may set handlers
-            for number in (signal.SIGTERM, signal.SIGHUP):  # as Ctrl-C: what was found is kept
+            for number in end_signals():  # as Ctrl-C: what was found is kept
                 self._signals[number] = signal.signal(number, signal.default_int_handler)
         return self
 

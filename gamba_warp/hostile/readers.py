@@ -153,7 +153,7 @@ def _furniture(path: Path, out: Path) -> Any:
 
     target = out / "inner" / "furniture"
     (out / "inner").mkdir()
-    (out / "inner" / "neighbour.txt").write_text("kept")
+    (out / "inner" / "neighbour.txt").write_text("kept", encoding="utf-8")
     if path.is_dir():
         return get_furniture(target, tree=path)
     return get_furniture(target, deb=path)

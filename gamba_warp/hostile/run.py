@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -16,6 +15,7 @@ from tqdm import tqdm
 
 from ..errors import UserError
 from ..files import atomic_path, write_json
+from ..kernels.runtime.system import cores
 from ..versions import __version__, installed
 from .case import FORMAT, Case, read_case, stored_case
 from .mutations.draw import draw_case
@@ -154,7 +154,7 @@ class FilesRun:
             folder,
             shrink_seconds,
         )
-        self._children = children or len(os.sched_getaffinity(0))
+        self._children = children or cores()
         self.about: dict = {"seed": seed, **versions()}
         self.rows: dict[str, Row] = {}
         self.failures: list[dict[str, str]] = []

@@ -243,7 +243,7 @@ def rendered(result: Any, path: Path, out: Path) -> str | None:
     for folder in out.iterdir():
         if folder.name.startswith("."):
             return f"{folder.name} is left behind"
-        json.loads((folder / "transforms.json").read_text(), parse_constant=_no_number)
+        json.loads((folder / "transforms.json").read_bytes(), parse_constant=_no_number)
     return None
 
 
@@ -263,7 +263,7 @@ def furniture(result: Any, path: Path, out: Path) -> str | None:
         total += inside.lstat().st_size
     if total > _UNPACKED:
         return f"{total >> 20} MB were unpacked"
-    entries = json.loads((target / "catalogue.json").read_text(), parse_constant=_no_number)
+    entries = json.loads((target / "catalogue.json").read_bytes(), parse_constant=_no_number)
     for entry in entries["objects"]:
         model_file = (target / entry["model"]).resolve()
         if not model_file.is_relative_to(target.resolve()) or not model_file.is_file():

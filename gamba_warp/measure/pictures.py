@@ -98,7 +98,7 @@ class _Pictures:
         icons = sorted((starter / "icons").glob("*.png"))
         count = 1 if settings.level == "quick" else 8
         if not checkpoint.exists() or not icons:
-            raise NotInstalled(f"starter/{checkpoint.name}")
+            raise NotInstalled(f"{checkpoint.name} (of the repository)")
         self.model = load_model(checkpoint, settings.device)
         config = self.model.config
         size, self.device = config.image_size, settings.device

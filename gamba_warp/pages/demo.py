@@ -87,7 +87,7 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
 
 def _report(folder: Path) -> dict:
     path = folder / "report.json"
-    return json.loads(path.read_text()) if path.exists() else {}
+    return json.loads(path.read_bytes()) if path.exists() else {}
 
 
 def _cell(value: float | None) -> str:

@@ -98,13 +98,13 @@ def _write(
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{html.escape(title)}</title>
 <style>
-{(here / "page.css").read_text()}</style>
+{(here / "page.css").read_text(encoding="utf-8")}</style>
 </head>
 <body>
 <header><h1>{html.escape(title)}</h1>{_paragraph(text)}</header>
 {body}
 <script>
-{(here / "viewer.js").read_text()}</script>
+{(here / "viewer.js").read_text(encoding="utf-8")}</script>
 </body>
 </html>
 """

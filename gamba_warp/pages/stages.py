@@ -14,6 +14,7 @@ import msgspec
 
 from ..errors import UserError
 from ..files import sha256, write_json
+from ..kernels.runtime.system import end_signals
 from ..untrusted.documents import read_document
 
 _MADE = ("run", "icons", "views", "truth", "geometry", "views-here")  # folders of a demo
@@ -131,7 +132,7 @@ class Stages:
         write_json(self._path, msgspec.to_builtins(self._record))
 
 
-_HANDED_ON = (signal.SIGTERM, signal.SIGHUP)
+_HANDED_ON = tuple(end_signals())
 _STOPPED = {128 + number for number in (*_HANDED_ON, signal.SIGINT)}
 
 

@@ -235,7 +235,7 @@ def _done(folder: str, memory: int | None, data: bytes) -> bytes:
 
 
 def _limit(memory: int | None) -> None:
-    if sys.platform != "linux":
+    if sys.platform != "linux":  # macOS has these limits, but heeds none of memory
         return
     import resource
 

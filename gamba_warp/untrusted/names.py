@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 import unicodedata
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -10,6 +12,8 @@ from ..errors import UserError
 
 MAX_NAME = 200  # bytes of one part, below the 255 of most file systems, so that suffixes fit
 MAX_PATH = 1024  # bytes of the whole name
+# What Windows takes for something else than the name of a file: a stream of it, a device.
+_NOT_ON_WINDOWS = re.compile(r'.*([<>:"|?*]|[. ]$)|(con|prn|aux|nul|com\d|lpt\d) *(\..*)?$', re.I)
 
 
 def inside(folder: str | Path, name: object, source: str) -> Path:
@@ -26,14 +30,16 @@ def inside(folder: str | Path, name: object, source: str) -> Path:
 
     Raises:
         UserError: no text, empty, absolute, with a drive, a ``..`` part, a backslash or a control
-            character, over-long, or its way goes through a link that leaves the folder.
+            character, over-long, on Windows also a name that it does not allow, or its way goes
+            through a link that leaves the folder.
     """
     path = Path(folder).joinpath(*parts_of(name, source))
     try:
         base, real = os.path.realpath(folder), os.path.realpath(path)
+        leaves = os.path.commonpath([base, real]) != base  # on Windows, an error for two drives
     except (OSError, ValueError) as error:
         raise UserError(f"{source}: the name {name!r} cannot be followed") from error
-    if os.path.commonpath([base, real]) != base:
+    if leaves:
         raise UserError(f"{source}: {name!r} is a link that leaves {folder}")
     return path
 
@@ -74,4 +80,6 @@ def parts_of(name: object, source: str) -> tuple[str, ...]:
     parts = PurePosixPath(name).parts
     if ".." in parts or not parts:
         raise UserError(f"{source}: the name {shown!r} leaves its folder")
+    if sys.platform == "win32" and any(_NOT_ON_WINDOWS.match(part) for part in parts):
+        raise UserError(f"{source}: Windows has no files of the name {shown!r}")
     return parts

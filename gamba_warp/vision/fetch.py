@@ -25,8 +25,10 @@ _MAX_MEMO = 1_000_000  # values that a pickle may number: room is taken up to th
 
 
 def cache_folder() -> Path:
-    """The folder ``$GAMBA_CACHE``, else ``~/.cache/gamba_warp``; it may not be there yet.
+    """The folder ``$GAMBA_CACHE``, else the system's place for caches; it may not be there yet.
 
+    That is ``~/.cache/gamba_warp`` on Linux, and everywhere if it is there; else
+    ``~/Library/Caches/gamba_warp`` on macOS, ``%LOCALAPPDATA%``'s ``gamba_warp/Cache`` on Windows.
     Where there is no home, or nothing can be made in it, a temporary folder.
     """
     chosen = os.environ.get("GAMBA_CACHE")
@@ -34,6 +36,10 @@ def cache_folder() -> Path:
         return Path(chosen).expanduser()
     try:
         wanted = Path.home() / ".cache" / "gamba_warp"
+        if sys.platform != "linux" and not wanted.is_dir():
+            from platformdirs import user_cache_path
+
+            wanted = user_cache_path("gamba_warp", appauthor=False)
     except RuntimeError:  # the system knows no home of this user
         wanted = None
     return wanted if wanted is not None and wanted.is_dir() else _usable(wanted)
@@ -66,7 +72,7 @@ def pip_download(requirement: str, digest: str, source: bool = False) -> Iterato
     name = requirement.split("==")[0]
     with tempfile.TemporaryDirectory() as folder:
         pins = Path(folder) / "pins.txt"
-        pins.write_text(f"{requirement} --hash=sha256:{digest}\n")
+        pins.write_text(f"{requirement} --hash=sha256:{digest}\n", encoding="utf-8")
         files = Path(folder) / "files"
         files.mkdir()
         form = ["--no-binary" if source else "--only-binary", name]
@@ -74,7 +80,8 @@ def pip_download(requirement: str, digest: str, source: bool = False) -> Iterato
         result = subprocess.run(
             [sys.executable, "-m", "pip", *arguments, *form, "-d", str(files), "-r", str(pins)],
             stderr=subprocess.PIPE,
-            text=True,
+            encoding="utf-8",
+            errors="replace",
         )
         found = sorted(files.iterdir())
         if result.returncode or len(found) != 1:

@@ -1,5 +1,7 @@
 """The convolution as torch operators: launches, fake results and gradients."""
 
+from typing import List
+
 import torch
 from torch import Tensor
 
@@ -71,8 +73,8 @@ def _conv_backward(
     bias: Tensor | None,
     state: Tensor | None,
     silu: bool,
-    needs: list[bool],
-) -> list[Tensor]:
+    needs: List[bool],
+) -> List[Tensor]:
     need_x, need_weight, need_bias, need_state = needs
     batch, length, channels = x.shape
     chunks = -(-length // CHUNK)

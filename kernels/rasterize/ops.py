@@ -4,6 +4,8 @@ They hold no arithmetic: each calls the launchers of its file. ``function.py`` j
 operator takes tensors and plain numbers only, so each named tuple comes as a list of its values.
 """
 
+from typing import List
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -37,7 +39,7 @@ def project(
     colors: Tensor,
     viewmats: Tensor,
     Ks: Tensor,
-    lens: list[float],
+    lens: List[float],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``project_forward`` as an operator, with the numbers of ``LensOptions``."""
     gaussians = means, quats, scales, opacities, colors
@@ -61,12 +63,12 @@ def _project_vjp(
     opacities: Tensor,
     viewmats: Tensor,
     Ks: Tensor,
-    lens: list[float],
+    lens: List[float],
     conics: Tensor,
     status: Tensor,
-    cotangents: list[Tensor],
-    wanted: list[bool],
-) -> list[Tensor]:
+    cotangents: List[Tensor],
+    wanted: List[bool],
+) -> List[Tensor]:
     grads = project_backward(
         means,
         quats,
@@ -179,7 +181,7 @@ def bin_op(
     height: int,
     alpha_min: float,
     skip: int,
-    tuning: list[int],
+    tuning: List[int],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``bin_gaussians`` as an operator, with the numbers of a ``Tuning``, whose tile it takes.
 
@@ -215,10 +217,10 @@ def composite(
     conics: Tensor,
     view_opacities: Tensor,
     colors: Tensor,
-    bins: list[Tensor],
-    size: list[int],
-    limits: list[float],
-    tuning: list[int],
+    bins: List[Tensor],
+    size: List[int],
+    limits: List[float],
+    tuning: List[int],
     skipped: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Blends the pairs: pictures, alphas and the fields of a ``Walk``.
@@ -268,15 +270,15 @@ def _composite_vjp(
     conics: Tensor,
     view_opacities: Tensor,
     colors: Tensor,
-    bins: list[Tensor],
-    size: list[int],
-    limits: list[float],
-    tuning: list[int],
-    walk: list[Tensor],
+    bins: List[Tensor],
+    size: List[int],
+    limits: List[float],
+    tuning: List[int],
+    walk: List[Tensor],
     v_renders: Tensor,
     v_alphas: Tensor,
     geometry: bool,
-) -> list[Tensor]:
+) -> List[Tensor]:
     every = Bins(*bins)
     v_pairs, written, skipped = _compositor(means2d.device).composite_backward(
         means2d,

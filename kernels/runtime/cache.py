@@ -20,6 +20,8 @@ from typing import Any
 
 import warp as wp
 
+from .system import is_own, user
+
 _SUMS = ".sha256"  # follows the name of a binary
 
 
@@ -36,7 +38,8 @@ def writable_folder(wanted: Path | None, name: str) -> Path:
     reason = "there is no home folder" if wanted is None else _fault(wanted)
     if wanted is not None and reason is None:
         return wanted
-    folder = Path(tempfile.gettempdir()) / f"{name}-{os.geteuid()}"
+    number = user()  # without numbers, the folder of temporary files is the user's own
+    folder = Path(tempfile.gettempdir()) / (name if number is None else f"{name}-{number}")
     if _fault(folder) is not None or not _is_private(folder):
         folder = Path(tempfile.mkdtemp(prefix=f"{name}-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -58,7 +61,8 @@ def _fault(folder: Path) -> str | None:
 def _is_private(folder: Path) -> bool:
     """Whether nobody else can put a file there: what is in a cache is run."""
     found = folder.lstat()
-    return not folder.is_symlink() and found.st_uid == os.geteuid() and not found.st_mode & 0o022
+    open_to_others = user() is not None and found.st_mode & 0o022  # Windows has no such bits
+    return not folder.is_symlink() and is_own(found) and not open_to_others
 
 
 def prepare_cache() -> None:
@@ -75,7 +79,10 @@ def prepare_cache() -> None:
 
 
 def _default_folder() -> Path | None:
-    """Where Warp keeps kernels if nobody says otherwise; None where there is no home."""
+    """Where Warp keeps kernels if nobody says otherwise; None where there is no home.
+
+    Warp goes by its own copy of ``appdirs``, which knows the places of Linux, macOS and Windows.
+    """
     from warp._src.thirdparty import appdirs
 
     found = appdirs.user_cache_dir(appname="warp", appauthor="NVIDIA")
@@ -134,7 +141,7 @@ def _in_cache(folder: Any) -> bool:
 def _remove(folder: Path) -> None:
     """Takes a module away by a rename, so that no other process finds half of it."""
     doomed = Path(tempfile.mkdtemp(prefix=".gamba-part-", dir=folder.parent))
-    folder.rename(doomed)
+    folder.rename(doomed / folder.name)  # onto an empty folder Windows renames nothing
     shutil.rmtree(doomed, ignore_errors=True)
 
 
@@ -153,7 +160,7 @@ def is_whole(binary: Path) -> bool:
         seal(binary)
         return True
     try:
-        wanted = json.loads(sums.read_text())
+        wanted = json.loads(sums.read_bytes())
         return all(_digest(binary.parent / Path(name).name) == wanted[name] for name in wanted)
     except (OSError, ValueError, TypeError, AttributeError):
         return False
@@ -166,7 +173,7 @@ def seal(binary: Path) -> None:
     try:
         text = json.dumps({path.name: _digest(path) for path in files})
         handle, name = tempfile.mkstemp(prefix=".gamba-part-", dir=binary.parent)
-        with os.fdopen(handle, "w") as file:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(text)
         os.replace(name, sums)
     except OSError:
@@ -181,7 +188,7 @@ def _is_plausible(binary: Path) -> bool:
     """Whether the description of a module is JSON, and its ELF file holds all its sections."""
     try:
         for meta in binary.parent.glob("*.meta"):
-            json.loads(meta.read_text())
+            json.loads(meta.read_bytes())
         data = binary.read_bytes()
     except (OSError, ValueError):
         return False

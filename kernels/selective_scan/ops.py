@@ -1,6 +1,6 @@
 """The scan as torch operators: fake results, gradients, and a kernel by device."""
 
-from __future__ import annotations
+from typing import List
 
 import torch
 from torch import Tensor
@@ -60,7 +60,7 @@ def scan(
     softplus: bool,
     discretization: str,
     save: bool,
-    tuning: list[int],
+    tuning: List[int],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``(out, last state, saved states)`` of checked tensors; B and C are ``[B, L, G, N]``.
 
@@ -94,9 +94,9 @@ def _scan_backward(
     saved: Tensor,
     softplus: bool,
     discretization: str,
-    needs: list[bool],
-    tuning: list[int],
-) -> list[Tensor]:
+    needs: List[bool],
+    tuning: List[int],
+) -> List[Tensor]:
     run = _implementation(u).backward
     grads = run(
         dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs,
@@ -154,7 +154,7 @@ def state(
     softplus: bool,
     discretization: str,
     save: bool,
-    tuning: list[int],
+    tuning: List[int],
 ) -> tuple[Tensor, Tensor]:
     """``(last state, saved states)`` of checked tensors; B is ``[B, L, G, N]``."""
     run = _implementation(u).final_state
@@ -178,9 +178,9 @@ def _state_backward(
     saved: Tensor,
     softplus: bool,
     discretization: str,
-    needs: list[bool],
-    tuning: list[int],
-) -> list[Tensor]:
+    needs: List[bool],
+    tuning: List[int],
+) -> List[Tensor]:
     run = _implementation(u).final_state_backward
     grads = run(dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs, tuning)
     return [grad for grad in grads if grad is not None]

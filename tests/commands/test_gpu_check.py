@@ -400,6 +400,7 @@ def test_pytests_results_are_read(monkeypatch, tmp_path):
     (tests / "test_c.py").write_text("def test_c(): raise SystemExit")
     (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = gpu: x")
     assert [path.stem for path in gpu_check.gpu_test_files(tests)] == ["test_a", "test_b"]
+    (tmp_path / "setup.cfg").touch()  # a checkout has it
     monkeypatch.setattr(gpu_check, "CHECKOUT", tmp_path)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})

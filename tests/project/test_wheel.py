@@ -66,6 +66,9 @@ def test_an_installed_wheel_reconstructs_its_own_picture(wheel, tmp_path):
     assert names >= {f"scopia-toaster.{end}" for end in ("ply", "gif", "html")}
     none = gamba("reconstruct")
     assert none.returncode == 2 and f"such as {site}" in none.stderr
+    demo = gamba("demo")
+    assert demo.returncode == 2 and demo.stderr.count("\n") == 1
+    assert f"{site}/gamba_warp/starter/data: no such folder; make" in demo.stderr
 
 
 @pytest.mark.slow

@@ -34,6 +34,7 @@ INSTALLED = Path("/usr/share/sweethome3d/furniture")
 _PROPERTIES = "PluginFurnitureCatalog.properties"
 _MARK = ".gamba-library.json"  # in a library's folder: what this command put there
 _MAX_TEXT = _MAX_ICON = 16 << 20  # bytes; they take a few kB
+_TEXT = {"capture_output": True, "encoding": "utf-8", "errors": "replace"}
 _BY = "https://creativecommons.org/licenses/by/3.0/"
 
 # By library: whom to name, if not each model's creator; the licence; where its text is.
@@ -175,10 +176,10 @@ def _download(folder: Path) -> Path:
         )
     print(f"downloading {PACKAGE} (125 MB) with apt-get")
     command = ["apt-get", "download", PACKAGE]
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    result = subprocess.run(command, cwd=folder, **_TEXT)
     if result.returncode:  # a fresh container has no package lists
         subprocess.run(["apt-get", "update"], capture_output=True)
-        result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+        result = subprocess.run(command, cwd=folder, **_TEXT)
     files = sorted(folder.glob("*.deb"))
     if result.returncode or not files:
         reason = (result.stderr.strip().splitlines() or ["no file came"])[-1]

@@ -95,7 +95,7 @@ def trainer(folder: Path) -> Any:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
     split = {"version": 1, "train": ["chair"], "val": [], "test": []}
-    (folder / "data" / "split.json").write_text(json.dumps(split))
+    (folder / "data" / "split.json").write_text(json.dumps(split), encoding="utf-8")
     config = training_options(folder / "data", folder / "run")
     torch.manual_seed(0)
     model = Gamba(config.model_config())

@@ -254,7 +254,7 @@ def machine(settings: Settings) -> dict:
 
 def _cpu_model() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         lines = []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -278,11 +278,11 @@ def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
     try:
         with _small_pages():
             ctypes.CDLL(None).malloc_trim(0)  # memory that is free but kept would be reused unseen
-            Path("/proc/self/clear_refs").write_text("5")
+            Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
             before = _resident("VmRSS")
             result = run()
             after = _resident("VmHWM")
-    except (OSError, AttributeError, StopIteration):
+    except (OSError, AttributeError, TypeError, StopIteration):
         return None
     del result
     return after - before
@@ -296,7 +296,7 @@ def _small_pages() -> Iterator[None]:
     the array is freed. What lies there later would be counted in steps of 2 MiB.
 
     Raises:
-        AttributeError: the system is not Linux.
+        AttributeError: the system is not Linux; TypeError on Windows.
     """
     prctl = ctypes.CDLL(None).prctl
     disabled = prctl(_GET_THP_DISABLE, *_NO_MORE)
@@ -308,7 +308,7 @@ def _small_pages() -> Iterator[None]:
 
 
 def _resident(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
 
 

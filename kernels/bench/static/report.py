@@ -215,7 +215,7 @@ def compile_kernel(launch: Launch) -> dict[int, tuple[Resources, int]]:
     symbol = launch.kernel.get_mangled_name() + "_cuda_kernel_forward"
     found = {}
     for architecture, path in zip(MACHINES, map(Path, paths)):
-        meta = json.loads((path.parent / f"{path.name.rsplit('.', 2)[0]}.meta").read_text())
+        meta = json.loads((path.parent / f"{path.name.rsplit('.', 2)[0]}.meta").read_bytes())
         dynamic = meta.get(f"{symbol}_smem_bytes", 0)
         found[architecture] = read_cubin(path.read_bytes())[symbol], dynamic
     return found

@@ -1,0 +1,33 @@
+"""What Linux, macOS and Windows do not all have, and what stands in for it where it is missing."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+
+def user() -> int | None:
+    """The number of this process's user; None on Windows, which has no such numbers."""
+    return os.geteuid() if hasattr(os, "geteuid") else None
+
+
+def is_own(found: os.stat_result) -> bool:
+    """Whether a file is of this user; always where users have no numbers.
+
+    Args:
+        found: what ``os.stat`` says of the file.
+    """
+    return user() in (None, found.st_uid)
+
+
+def end_signals() -> list[signal.Signals]:
+    """The signals by which others ask a process to end: SIGTERM, and SIGHUP where there is one."""
+    names = ("SIGTERM", "SIGHUP")
+    return [getattr(signal, name) for name in names if hasattr(signal, name)]
+
+
+def cores() -> int:
+    """How many cores this process may use; all of them where the system does not say."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
