@@ -30,7 +30,7 @@ def make_strategy(config: FitConfig) -> Any:
     """
     from ..compat.gsplat.strategy import DefaultStrategy, MCMCStrategy
 
-    times = {
+    times: dict[str, Any] = {
         "refine_start_iter": int(config.refine_start * config.steps),
         "refine_stop_iter": int(config.refine_stop * config.steps),
         "refine_every": max(1, config.steps // config.refine_times),
@@ -53,8 +53,10 @@ class Densified:
     def __init__(
         self, parameters: dict[str, Tensor], config: FitConfig, rng: torch.Generator
     ) -> None:
-        self.parameters = {name: torch.nn.Parameter(p) for name, p in parameters.items()}
-        self.optimizers = {
+        self.parameters: dict[str, Any] = {
+            name: torch.nn.Parameter(p) for name, p in parameters.items()
+        }
+        self.optimizers: dict[str, Any] = {
             name: torch.optim.Adam([{"params": [p], "name": name}], betas=BETAS, eps=1e-15)
             for name, p in self.parameters.items()
         }

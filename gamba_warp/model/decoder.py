@@ -17,6 +17,8 @@ MIN_SCALE = 1e-6  # object units; keeps finite the logarithm that files store
 class GaussianDecoder(nn.Module):
     """A shared MLP with one hidden layer, then one linear head for each attribute."""
 
+    points: Tensor
+
     def __init__(self, config: GambaConfig) -> None:
         super().__init__()
         self.config = config

@@ -100,8 +100,9 @@ def exact_where_faint(
     if len(at[0]) == 0:
         return found
     b, c, g = at
-    given = (x.double() for x in (means[b, g], quats[b, g], scales[b, g], viewmats[b, c], Ks[b, c]))
-    exact = opacities[b, g].double() * compensation(*given, lens)
+    mean, quat, scale, opacity = (x[b, g].double() for x in (means, quats, scales, opacities))
+    viewmat, K = viewmats[b, c].double(), Ks[b, c].double()
+    exact = opacity * compensation(mean, quat, scale, viewmat, K, lens)
     with torch.no_grad():
         cut = (2 * (exact / ALPHA_MIN).clamp_min(1).log()).sqrt()
         was = (2 * (shown[at].double() / ALPHA_MIN).clamp_min(1).log()).sqrt()

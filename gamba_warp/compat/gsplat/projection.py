@@ -99,6 +99,7 @@ def project_views(
         given = means, quats, scales, opacities, colors.detach(), viewmats, Ks
         found = project(*given, options)[:5]
         if lens.antialiased:
+            assert quats is not None and scales is not None
             found = exact_where_faint(found, means, quats, scales, opacities, viewmats, Ks, lens)
     means2d, conics, depths, view_opacities, extents = found
     extents = extents.detach()
