@@ -2,8 +2,9 @@
 
 ``gamba data furniture --out FURNITURE``, then
 ``python -m gamba_warp.train.data.starter FURNITURE --out starter``. The same call makes the same
-files again. The split is that of the whole furniture set (by group, see
-``gamba_warp.data.dataset``), so nothing that is held out here is trained on there.
+files again, but the set in the repository is older: its cameras are others. The split is that of
+the whole furniture set (by group, see ``gamba_warp.data.dataset``), so nothing that is held out
+here is trained on there.
 """
 
 from __future__ import annotations
