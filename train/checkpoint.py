@@ -206,7 +206,8 @@ def check_state(state: dict[str, Any], source: str) -> None:
             if not isinstance(rng, torch.Tensor) or rng.dtype != torch.uint8 or rng.ndim != 1:
                 raise ValueError("rng holds no state of a generator")
         torch.Generator().set_state(fields.rng)  # a state of another kind is refused here
-    except (ValueError, TypeError, RuntimeError) as error:  # msgspec's is a ValueError
+    except (ValueError, TypeError, RuntimeError, AttributeError) as error:
+        # msgspec's is a ValueError, but it takes a tensor for a mapping without keys
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
 
 

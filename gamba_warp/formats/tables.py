@@ -14,6 +14,8 @@ from ..errors import UserError
 MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
 _BOM = b"\xef\xbb\xbf"
+# str takes four control signs for blanks, which are none in a file: they become no ASCII.
+_STRICT = bytes(0xFF if 0x1C <= number <= 0x1F else number for number in range(256))
 
 
 def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
@@ -32,7 +34,8 @@ def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
         if len(line) == MAX_LINE:
             raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
         # What is not ASCII becomes a sign that no number has.
-        text = (line.removeprefix(_BOM) if first else line).decode("ascii", "replace")
+        line = (line.removeprefix(_BOM) if first else line).translate(_STRICT)
+        text = line.decode("ascii", "replace")
         first = False
         if not text.isspace() and text and not (comments and text.lstrip().startswith(comments)):
             yield text
