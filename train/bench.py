@@ -21,7 +21,7 @@ from gamba_warp.kernels.bench.core.parts import measure_parts
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.patches import foreground_patches
+from gamba_warp.model.parts.patches import foreground_patches
 from gamba_warp.render import render
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available

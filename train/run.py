@@ -25,7 +25,7 @@ from .config import TrainConfig, command_line
 from .ddp import World
 from .log import RunLog, say
 from .loop import Trainer
-from .losses import open_lpips
+from .objective.losses import open_lpips
 
 
 def train(config: TrainConfig, world: World) -> int:

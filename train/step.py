@@ -17,8 +17,8 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 
 from .batches import Batch
-from .losses import depth_loss, rendered_psnr, total_loss, view_losses
-from .radial_mask import NEAR, contour_distances, project_means, radial_mask_loss
+from .objective.losses import depth_loss, rendered_psnr, total_loss, view_losses
+from .objective.radial_mask import NEAR, contour_distances, project_means, radial_mask_loss
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
 STRIP_VIEWS, STRIP_OBJECTS = 6, 4  # views and objects of a validation's sample pictures

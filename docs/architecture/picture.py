@@ -82,6 +82,7 @@ BOXES = {
     "endurance": Box(
         4.7, 8, "gamba_warp", "endurance", ("kills and full disks", "in every command")
     ),
+    "ablation": Box(2.1, 8, "gamba_warp", "ablation", ("rows trained and", "evaluated alike")),
     "commands": Box(2.2, 9, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
     "cli": Box(2.8, 10, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
     "public": Box(0.2, 10, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),

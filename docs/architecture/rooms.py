@@ -37,10 +37,11 @@ _BENCH = tuple(f"kernels.bench{part}" for part in ("", ".core", ".cases", ".stat
 _STRESS = tuple(f"kernels.stress{part}" for part in ("", ".core", ".oracles", ".cases"))
 _WORDS = (*_KERNELS, "words")
 _READERS = (*_WORDS, "untrusted")
-_LIBRARY = (*_READERS, "data", "formats", "vision", "model")
+_MODEL = ("model.config", "model.parts", "model")
+_LIBRARY = (*_READERS, "data", "formats", "vision", *_MODEL)
 _RESULTS = (*_LIBRARY, "surfaces", "fitting", "pages")
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
-_TRAIN = ("train", "train.data")
+_TRAIN = ("train.config", "train.objective", "train", "train.data", "train.sources")
 _EVAL = ("eval", "eval.views", "eval.shapes")
 
 ROOMS = {
@@ -72,7 +73,12 @@ ROOMS = {
     "data": Room("datasets and preprocessing", _READERS),
     "formats": Room(".ply, .splat, .glb, meshes, their headers", _READERS),
     "vision": Room("VGG16, LPIPS, and how their weights are fetched", _READERS),
-    "model": Room("tokens, blocks, decoder, checkpoints", (*_READERS, "data", "formats", "vision")),
+    "model.config": Room("all that decides what a network computes", _READERS),
+    "model.parts": Room("tokens, blocks, decoders", (*_READERS, "model.config")),
+    "model": Room(
+        "the network, its encoders and its files",
+        (*_READERS, "data", "formats", "vision", "model.config", "model.parts"),
+    ),
     "surfaces": Room("Gaussians to meshes", _LIBRARY),
     "fitting": Room("one object by optimisation", (*_LIBRARY, "compat")),
     "pages": Room("pages, turntables, the viewer", (*_LIBRARY, "surfaces", "fitting")),
@@ -83,7 +89,14 @@ ROOMS = {
         ("measure", *_BENCH, *_STRESS, *_TRAIN, *_EVAL),
     ),
     "train.data": Room("furniture, rendering of meshes, starter set", _LIBRARY),
-    "train": Room("batches, losses, loop", (*_LIBRARY, *_BENCH, "train.data"), ("pages",)),
+    "train.sources": Room("published datasets, packs of views", (*_LIBRARY, "train.data")),
+    "train.config": Room("the options of a run", _LIBRARY),
+    "train.objective": Room("the losses", (*_LIBRARY, "train.config")),
+    "train": Room(
+        "batches, loop, checkpoints",
+        (*_LIBRARY, *_BENCH, "train.config", "train.objective", "train.data"),
+        ("pages",),
+    ),
     "eval": Room("the report that both evaluations share", _READERS),
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
     "eval.shapes": Room("Chamfer, IoU, F-score", (*_RESULTS, "eval")),
@@ -93,15 +106,20 @@ ROOMS = {
         _RESULTS,
         ("measure", *_TRAIN, *_EVAL),
     ),
+    "ablation": Room(
+        "rows that are trained and evaluated alike",
+        _RESULTS,
+        ("measure", *_TRAIN, *_EVAL),
+    ),
     "commands": Room(
         "a file a command",
-        (*_MEASURES, "measure", "hostile", "endurance", "gpu_check"),
+        (*_MEASURES, "measure", "hostile", "endurance", "ablation", "gpu_check"),
         (*_TRAIN, *_EVAL),
     ),
     "cli": Room(
         "finds the command, parses, calls",
         ("versions", "words"),
-        ("commands", "gpu_check", *_TRAIN, *_EVAL),
+        ("commands", "gpu_check", "ablation", *_TRAIN, *_EVAL),
     ),
     "public": Room("import gamba_warp: names loaded when used", ("versions", "kernels"), _RESULTS),
 }

@@ -15,8 +15,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from ..kernels.bench import Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
-from ..model.block import GambaBlock, prefix_states, run_blocks
 from ..model.config import PRESETS, GambaConfig
+from ..model.parts.block import GambaBlock, prefix_states, run_blocks
 from .pictures import background_tokens, batches, pictures
 
 BOTH = "forward+backward"

@@ -12,11 +12,11 @@ from ..kernels.stress import Case, Op, Outcome, generator, judge
 from ..kernels.stress.cases.scan import gradients_of, repeated
 from ..kernels.stress.core.rounding import SAMPLES, Rounding, samples_of
 from ..kernels.stress.oracles.scan import EXP_ULPS, conv, scan
-from ..model.block import GambaBlock, prefix_states
 from ..model.config import GambaConfig
-from ..model.decoder import MIN_SCALE
 from ..model.gamba import Gamba
-from ..model.tokens import normalize_imagenet
+from ..model.parts.block import GambaBlock, prefix_states
+from ..model.parts.decoder import MIN_SCALE
+from ..model.parts.tokens import normalize_imagenet
 
 KINDS = (
     "uniform", "white", "black", "checkerboard", "one pixel", "out of range", "tiny weights",

@@ -86,7 +86,7 @@ class GambaConfig:
         opacity_init: opacity at the start.
         predict_rotation: whether quaternions are predicted; the paper fixes them.
         decoder: "bins" is the paper's, one Gaussian a token; "rays" puts Gaussians on the rays of
-            the input's pixels (``model.rays``), and the fields ``ray_*`` are its own.
+            the input's pixels (``model.parts.rays``), and the fields ``ray_*`` are its own.
         ray_cells: cells a side of a patch; it divides ``patch_size``.
         ray_coarse: cells a side of a patch that the tokens have features for; those of the patch's
             cells are interpolated between them. It divides ``ray_cells``; 0 means ``ray_cells``.

@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from ..cameras import Cameras
 from ..conventions import over_background
 from ..gaussians import Gaussians
-from .block import GambaBlock, State, make_norm, prefix_states, run_blocks
 from .config import GambaConfig
-from .decoder import GaussianDecoder
 from .encoders import ImageEncoder, Weights, build_encoder
-from .patches import Patches, foreground_patches
-from .rays import RayDecoder, joined
-from .tokens import CameraToken, SplatTokens
+from .parts.block import GambaBlock, State, make_norm, prefix_states, run_blocks
+from .parts.decoder import GaussianDecoder
+from .parts.patches import Patches, foreground_patches
+from .parts.rays import RayDecoder, joined
+from .parts.tokens import CameraToken, SplatTokens
 
 
 class Gamba(nn.Module):

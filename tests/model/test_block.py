@@ -6,8 +6,8 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 
-from gamba_warp.model.block import GambaBlock, Mamba, prefix_states
 from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.parts.block import GambaBlock, Mamba, prefix_states
 
 
 def _config(**changes) -> GambaConfig:

@@ -3,7 +3,7 @@
 import torch
 
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.decoder import GaussianDecoder
+from gamba_warp.model.parts.decoder import GaussianDecoder
 
 
 def _config(**changes) -> GambaConfig:

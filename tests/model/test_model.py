@@ -100,7 +100,7 @@ def test_segments_change_nothing(monkeypatch):
     hook = model.blocks[0].register_forward_hook(
         lambda _, args, out: calls.append(args[0].shape[1])
     )
-    monkeypatch.setattr("gamba_warp.model.block.SEGMENT", 16)
+    monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", 16)
     with torch.no_grad():
         got = model(images, cameras)
     hook.remove()

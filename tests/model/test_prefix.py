@@ -6,9 +6,9 @@ from helpers import assert_rel_rms
 from helpers.model import inputs, micro
 from torch.nn import functional as F
 
-from gamba_warp.model.block import GambaBlock, prefix_states
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.parts.block import GambaBlock, prefix_states
 
 
 def prepend_and_drop(blocks, tokens, camera, image):

@@ -12,12 +12,12 @@ from gamba_warp.errors import UserError
 from gamba_warp.eval.views.baselines import billboard
 from gamba_warp.eval.views.compare import Truth
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
-from gamba_warp.model import patches as patch_grid
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.patches import foreground_patches
+from gamba_warp.model.parts import patches as patch_grid
+from gamba_warp.model.parts.patches import foreground_patches
+from gamba_warp.model.parts.rays import RayDecoder
 from gamba_warp.model.predict import model_input, reconstruct
-from gamba_warp.model.rays import RayDecoder
 from gamba_warp.render import render
 
 FIELDS = ("means", "scales", "opacities", "colors")

@@ -19,12 +19,12 @@ from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.model import released
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.config import PRESETS, GambaConfig
-from gamba_warp.model.decoder import GaussianDecoder
 from gamba_warp.model.encoders import build_encoder
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.parts.decoder import GaussianDecoder
+from gamba_warp.model.parts.tokens import scan_orders
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.model.released import convert_released, load_released
-from gamba_warp.model.tokens import scan_orders
 
 # What their code computed, with random weights: their state dict, its inputs and its output.
 GOLDEN = Path(__file__).with_name("released_small.npz")

@@ -6,7 +6,12 @@ import torch
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit, plucker_rays
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.tokens import SplatTokens, camera_numbers, normalize_imagenet, scan_orders
+from gamba_warp.model.parts.tokens import (
+    SplatTokens,
+    camera_numbers,
+    normalize_imagenet,
+    scan_orders,
+)
 
 
 def _config(**changes) -> GambaConfig:

@@ -16,7 +16,7 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.train.batches import load_sample
 from gamba_warp.train.data.augment import Change
 from gamba_warp.train.data.render_command import data_render_command
-from gamba_warp.train.losses import DEPTH_BEND, depth_loss
+from gamba_warp.train.objective.losses import DEPTH_BEND, depth_loss
 
 SIDES = (1.0, 0.4, 0.6)
 RAYS = (*micro.MODEL, "decoder=rays", "ray_cells=2", "ray_layers=3", "ray_features=8")

@@ -7,8 +7,8 @@ import torch
 
 from gamba_warp.conventions import over_background
 from gamba_warp.image_metrics import ssim
-from gamba_warp.train import losses
-from gamba_warp.train.losses import (
+from gamba_warp.train.objective import losses
+from gamba_warp.train.objective.losses import (
     mse,
     random_crops,
     rendered_psnr,

@@ -6,7 +6,11 @@ import pytest
 import torch
 
 from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
-from gamba_warp.train.radial_mask import contour_distances, project_means, radial_mask_loss
+from gamba_warp.train.objective.radial_mask import (
+    contour_distances,
+    project_means,
+    radial_mask_loss,
+)
 
 SIZE = 96
 CONTOUR = 0.5 / (SIZE / 2)  # half a pixel: how well a 0/1 pixel mask states a curve

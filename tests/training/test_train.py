@@ -23,9 +23,10 @@ from torch.utils.checkpoint import checkpoint
 from gamba_warp import cli
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.train import loop, losses, step
+from gamba_warp.train import loop, step
 from gamba_warp.train.batches import choose_views
 from gamba_warp.train.checkpoint import list_checkpoints
+from gamba_warp.train.objective import losses
 from gamba_warp.train.optim import build_optimizer
 from gamba_warp.train.run import train
 
@@ -63,7 +64,7 @@ def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
         calls.append(1)
         return checkpoint(*arguments, **options)
 
-    monkeypatch.setattr("gamba_warp.model.block.checkpoint", counting)
+    monkeypatch.setattr("gamba_warp.model.parts.block.checkpoint", counting)
     assert run(data, tmp_path / "lean", run={"recompute": True}) == 0
     assert len(calls) == 6  # one block, six steps; none in validation
     assert_same_files(tmp_path / "plain/model.safetensors", tmp_path / "lean/model.safetensors")

@@ -21,7 +21,7 @@ from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from .config import TrainConfig
+from ..config import TrainConfig
 from .radial_mask import project_means
 
 DEPTH_BEND = 0.02  # object units; see ``depth_loss``

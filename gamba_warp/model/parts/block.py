@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from ..kernels.causal_conv1d import causal_conv1d
-from ..kernels.selective_scan import selective_scan, selective_scan_state
-from .config import GambaConfig
+from ...kernels.causal_conv1d import causal_conv1d
+from ...kernels.selective_scan import selective_scan, selective_scan_state
+from ..config import GambaConfig
 
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
 # Number of tokens that pass through all blocks together on a CPU that keeps nothing for a gradient.

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ..cameras import Cameras, plucker_rays
-from ..conventions import IMAGENET_MEAN, IMAGENET_STD, over_background
-from .config import GambaConfig, Orders
+from ...cameras import Cameras, plucker_rays
+from ...conventions import IMAGENET_MEAN, IMAGENET_STD, over_background
+from ..config import GambaConfig, Orders
 from .patches import Patches, near_patches
 
 

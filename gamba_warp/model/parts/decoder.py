@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ..gaussians import Gaussians
-from .config import GambaConfig
+from ...gaussians import Gaussians
+from ..config import GambaConfig
 
 MIN_SCALE = 1e-6  # object units; keeps finite the logarithm that files store
 

@@ -21,9 +21,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ..cameras import Cameras
-from ..gaussians import Gaussians
-from .config import RAY_CHANNELS, RAY_STEM, GambaConfig
+from ...cameras import Cameras
+from ...gaussians import Gaussians
+from ..config import RAY_CHANNELS, RAY_STEM, GambaConfig
 from .patches import Patches
 
 FRONT_OPACITY = 3.0  # logit; neighbours overlap, so together they are opaque

@@ -1,0 +1,1 @@
+"""The parts of the network: tokens, patches, blocks, decoders."""

@@ -1,0 +1,1 @@
+"""Published datasets: G-Objaverse, Objaverse, GSO; and packs of decoded views."""
