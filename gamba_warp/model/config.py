@@ -14,19 +14,15 @@ from ..untrusted.ranges import Meta, check_values
 Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
 Background = Literal["white", "black"]
+Mixer = Literal["mamba", "attention"]
 Decoder = Literal["bins", "rays"]
 FinalNorm = Literal["same", "layer", "rms"]
 Orders = Literal["backward", "mirrored"]
 PositionWeights = Literal["softmax", "unit"]
 Resize = Literal["bicubic", "bilinear"]
 
-RAY_CHANNELS = (
-    1,
-    3,
-    1,
-    3,
-    3,
-)  # numbers of a ray's Gaussian: depth, offset, opacity, scales, colour
+# Numbers of a ray's Gaussian: depth, offset, opacity, scales, colour.
+RAY_CHANNELS = (1, 3, 1, 3, 3)
 RAY_STEM = 32  # channels after the first convolution of the decoder ``rays``
 # Fields that older files lack: their models are what the defaults say.
 _LATER = {
@@ -34,6 +30,7 @@ _LATER = {
     *(f"ray_{name}" for name in ("cells", "coarse", "layers", "features", "hidden")),
     *(f"ray_{name}" for name in ("depth", "offset")),
     *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
+    *("mixer", "attention_heads", "attention_mlp"),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -57,6 +54,12 @@ class GambaConfig:
         conv_size: taps of the causal convolution, 2 to 4.
         expand: inner channels of a block per channel of a token; 32,768 inner channels at most.
         dt_rank: rank of the step size's projection; 0 means ceil(width / 16), as in mamba-ssm.
+        mixer: what a block mixes the tokens with: "mamba", or "attention", a pre-norm transformer
+            block of the same width (paper, question Q2), which the fields ``attention_*`` describe.
+        attention_heads: heads of an attention; they divide ``width``, and 0 means one for each 64
+            channels, at least one.
+        attention_mlp: hidden channels of a transformer block's MLP per channel of a token; 32,768
+            at most. With 1 the block has about as many parameters as one of Mamba at expand 2.
         norm: normalisation before every block.
         final_norm: that before the decoder; "same" as before the blocks.
         discretization: of the selective scan; "mamba" is what mamba-ssm runs, "zoh" and "bilinear"
@@ -108,6 +111,9 @@ class GambaConfig:
     conv_size: Annotated[int, Meta(ge=2, le=4)] = 4
     expand: Annotated[int, Meta(ge=1, le=64)] = 2
     dt_rank: Annotated[int, Meta(ge=0, le=8192)] = 0
+    mixer: Mixer = "mamba"
+    attention_heads: Annotated[int, Meta(ge=0, le=8192)] = 0
+    attention_mlp: Annotated[int, Meta(ge=1, le=64)] = 4
     norm: Norm = "layer"
     final_norm: FinalNorm = "same"
     scan_orders: Orders = "backward"
@@ -150,33 +156,36 @@ class GambaConfig:
         check_values(vars(self), hints, lambda name: f"config: {name} is")
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):
             raise UserError(f"config: encoder is {self.encoder[:100]!r}, not a network's name")
-        if self.image_size % self.patch_size:
-            raise UserError(
-                f"config: image_size {self.image_size} is not a multiple of "
-                f"patch_size {self.patch_size}"
-            )
-        if self.decoder == "rays" and self.patch_size % self.ray_cells:
-            raise UserError(
-                f"config: patch_size {self.patch_size} is not a multiple of "
-                f"ray_cells {self.ray_cells}"
-            )
-        if self.decoder == "rays" and self.ray_coarse and self.ray_cells % self.ray_coarse:
-            raise UserError(
-                f"config: ray_cells {self.ray_cells} is not a multiple of "
-                f"ray_coarse {self.ray_coarse}"
-            )
-        if self.prepend and self.encoder == "none" and not self.camera_token:
-            raise UserError("config: prepend needs a camera token or an encoder")
-        if self.encoder == "vgg16" and not self.encoder_frozen:
-            raise UserError("config: encoder vgg16 can only be used frozen")
+        self._check_relations()
         limits = {
             "num_gaussians": MAX_GAUSSIANS,
             "inner_width": MAX_INNER_WIDTH,
+            "mlp_width": MAX_INNER_WIDTH,
             "num_parameters": MAX_PARAMETERS,
         }
         for name, limit in limits.items():
             if getattr(self, name) > limit:
                 raise UserError(f"config: {name} is {getattr(self, name):,}, over {limit:,}")
+
+    def _check_relations(self) -> None:
+        """Refuses fields that do not go together."""
+        rays, attention = self.decoder == "rays", self.mixer == "attention"
+        multiples = {
+            ("image_size", "patch_size"): True,
+            ("patch_size", "ray_cells"): rays,
+            ("ray_cells", "ray_coarse"): rays and self.ray_coarse > 0,
+            ("width", "num_heads"): attention,
+        }
+        for (whole, part), asked in multiples.items():
+            if asked and getattr(self, whole) % getattr(self, part):
+                raise UserError(
+                    f"config: {whole} {getattr(self, whole)} is not a multiple of "
+                    f"{part} {getattr(self, part)}"
+                )
+        if self.prepend and self.encoder == "none" and not self.camera_token:
+            raise UserError("config: prepend needs a camera token or an encoder")
+        if self.encoder == "vgg16" and not self.encoder_frozen:
+            raise UserError("config: encoder vgg16 can only be used frozen")
 
     @property
     def grid_size(self) -> int:
@@ -211,6 +220,16 @@ class GambaConfig:
         return self.expand * self.width
 
     @property
+    def num_heads(self) -> int:
+        """``attention_heads`` with its default filled in."""
+        return self.attention_heads or max(1, self.width // 64)
+
+    @property
+    def mlp_width(self) -> int:
+        """Channels inside the MLP of a transformer block."""
+        return self.attention_mlp * self.width
+
+    @property
     def step_rank(self) -> int:
         """``dt_rank`` with its default filled in."""
         return self.dt_rank or -(-self.width // 16)
@@ -221,13 +240,11 @@ class GambaConfig:
 
         It is computed before anything is allocated: a file may claim any size.
         """
-        inner, rank, states = self.inner_width, self.step_rank, self.state_size
         image = _IMAGE_CHANNELS if self.prepend and self.encoder != "none" else 0
         camera = (image or self.width) if self.prepend and self.camera_token else 0
         norm = self.width * (2 if self.norm == "layer" else 1)
         projections = sum((channels + 1) * self.width for channels in (camera, image) if channels)
-        scan = inner * (self.conv_size + rank + 2 * states + rank + states + 3)
-        block = norm + projections + scan + 3 * self.width * inner
+        block = norm + projections + self._mixer_parameters(norm)
         patchify = (
             (self.pixel_channels * self.patch_size**2 + 1) * self.width
             if self.additive_image_tokens
@@ -236,6 +253,15 @@ class GambaConfig:
         token = 17 * camera + (camera + 1) * camera
         embedding = self.num_tokens * self.width
         return self.depth * block + norm + self._decoder_parameters() + patchify + token + embedding
+
+    def _mixer_parameters(self, norm: int) -> int:
+        """What a block has behind its norm: a Mamba block, or attention, a norm and an MLP."""
+        if self.mixer == "attention":
+            inside = self.mlp_width
+            return norm + 4 * (self.width + 1) * self.width + (2 * inside + 1) * self.width + inside
+        inner, rank, states = self.inner_width, self.step_rank, self.state_size
+        scan = inner * (self.conv_size + rank + 2 * states + rank + states + 3)
+        return scan + 3 * self.width * inner
 
     def _decoder_parameters(self) -> int:
         """The decoder's part of ``num_parameters``."""

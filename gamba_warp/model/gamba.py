@@ -13,11 +13,18 @@ from ..conventions import over_background
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
-from .parts.block import GambaBlock, State, make_norm, prefix_states, run_blocks
+from .parts.attention import AttentionBlock
+from .parts.block import Block, GambaBlock, make_norm, prefix_states, run_blocks
 from .parts.decoder import GaussianDecoder
 from .parts.patches import Patches, foreground_patches
 from .parts.rays import RayDecoder, joined
 from .parts.tokens import CameraToken, SplatTokens
+
+
+def make_block(config: GambaConfig, camera_channels: int, image_channels: int) -> Block:
+    """Builds a block of ``config.mixer``; zero channels mean that there is no such condition."""
+    kinds = {"mamba": GambaBlock, "attention": AttentionBlock}
+    return kinds[config.mixer](config, camera_channels, image_channels)
 
 
 class Gamba(nn.Module):
@@ -57,7 +64,7 @@ class Gamba(nn.Module):
         self.camera_token = CameraToken(camera_channels) if camera_channels else None
         self.tokens = SplatTokens(config)
         self.blocks = nn.ModuleList(
-            GambaBlock(config, camera_channels, image_channels) for _ in range(config.depth)
+            make_block(config, camera_channels, image_channels) for _ in range(config.depth)
         )
         self.norm = make_norm(config, final=True)
         self.decoder = {"bins": GaussianDecoder, "rays": RayDecoder}[config.decoder](config)
@@ -65,7 +72,7 @@ class Gamba(nn.Module):
             if parameter.ndim == 1:
                 vars(parameter)["_no_weight_decay"] = True
 
-    def condition(self, images: Tensor, cameras: Cameras) -> list[State | None]:
+    def condition(self, images: Tensor, cameras: Cameras) -> list[Any]:
         """Computes the state that picture and camera leave in each block (``prefix_states``).
 
         It holds all that the prefix contributes. Arguments and errors are those of ``forward``.
@@ -83,7 +90,7 @@ class Gamba(nn.Module):
         self,
         images: Tensor,
         cameras: Cameras,
-        condition: list[State | None] | None = None,
+        condition: list[Any] | None = None,
         background_margin: int | None = None,
     ) -> Gaussians:
         """Predicts the Gaussians of each picture's object.
@@ -123,7 +130,7 @@ class Gamba(nn.Module):
         return self.decoder(self.norm(tokens))
 
     def _on_rays(
-        self, rgba: Tensor, cameras: Cameras, condition: list[State | None], margin: int
+        self, rgba: Tensor, cameras: Cameras, condition: list[Any], margin: int
     ) -> Gaussians:
         """What ``forward`` does for the decoder ``rays``."""
         patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
@@ -134,7 +141,7 @@ class Gamba(nn.Module):
             self._of_patches(
                 rgba[group],
                 cameras[group],
-                [state and State(*(value[group] for value in state)) for state in condition],
+                [state and state._make(value[group] for value in state) for state in condition],
                 patches.of(group),
             )
             for group in groups
@@ -144,11 +151,12 @@ class Gamba(nn.Module):
         return joined(parts).map(lambda value: value[back])
 
     def _of_patches(
-        self, rgba: Tensor, cameras: Cameras, condition: list[State | None], patches: Patches
+        self, rgba: Tensor, cameras: Cameras, condition: list[Any], patches: Patches
     ) -> Gaussians:
         pixels = self.tokens.pixels(rgba, cameras)
         tokens, places = self.tokens.of_patches(pixels, patches)
-        tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute))
+        own = 4 * patches.valid.sum(1) if len(rgba) > 1 else None
+        tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute, own))
         at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
         tokens = tokens.gather(1, at).unflatten(1, places.shape[1:])
         return self.decoder(tokens, pixels, patches, rgba, cameras)
