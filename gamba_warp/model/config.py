@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import asdict, dataclass, fields
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..errors import UserError
-from ..untrusted.ranges import Meta, check_values
+from ..untrusted.ranges import Meta, check_kind, check_values
 
 Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
@@ -30,7 +30,7 @@ _LATER = {
     *(f"ray_{name}" for name in ("cells", "coarse", "layers", "features", "hidden")),
     *(f"ray_{name}" for name in ("depth", "offset")),
     *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
-    *("mixer", "attention_heads", "attention_mlp"),
+    *("mixer", "attention_heads", "attention_mlp", "mixed_tokens"),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -68,6 +68,8 @@ class GambaConfig:
             the end (paper §3.2), or "mirrored" each row from its end and each column from its end.
         embedding_init: standard deviation of the learned embedding E at the start.
         additive_image_tokens: False makes G = E (paper Table 2, "w/o additive 3DGS tokens").
+        mixed_tokens: True makes the first quarter of the tokens of patches of twice the side, and
+            leaves the others E alone (paper, answer A4). It needs an even number of patches a side.
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
         camera_token: whether the camera is prepended; the image tokens may be prepended alone.
         encoder: "none", "vgg16" or the name of a timm ViT, e.g. "vit_base_patch14_reg4_dinov2".
@@ -120,6 +122,7 @@ class GambaConfig:
     discretization: Discretization = "mamba"
     embedding_init: Annotated[float, Meta(gt=0, le=100)] = 0.5
     additive_image_tokens: bool = True
+    mixed_tokens: bool = False
     prepend: bool = True
     camera_token: bool = True
     encoder: str = "vit_base_patch14_reg4_dinov2"
@@ -151,7 +154,7 @@ class GambaConfig:
 
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
-            _check_kind(name, getattr(self, name), kind)
+            check_kind(f"config: {name} is", getattr(self, name), kind)
         hints = get_type_hints(type(self), include_extras=True)
         check_values(vars(self), hints, lambda name: f"config: {name} is")
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):
@@ -184,6 +187,10 @@ class GambaConfig:
                 )
         if self.prepend and self.encoder == "none" and not self.camera_token:
             raise UserError("config: prepend needs a camera token or an encoder")
+        if self.mixed_tokens and (rays or not self.additive_image_tokens):
+            raise UserError("config: mixed_tokens needs additive_image_tokens, and no decoder rays")
+        if self.mixed_tokens and self.grid_size % 2:
+            raise UserError(f"config: mixed_tokens needs an even grid, not of {self.grid_size}²")
         if self.encoder == "vgg16" and not self.encoder_frozen:
             raise UserError("config: encoder vgg16 can only be used frozen")
 
@@ -191,6 +198,11 @@ class GambaConfig:
     def grid_size(self) -> int:
         """H / p, the side of the patch grid."""
         return self.image_size // self.patch_size
+
+    @property
+    def token_patch(self) -> int:
+        """Side of the patches that 3DGS tokens are made of, pixels."""
+        return self.patch_size * (2 if self.mixed_tokens else 1)
 
     @property
     def num_tokens(self) -> int:
@@ -246,7 +258,7 @@ class GambaConfig:
         projections = sum((channels + 1) * self.width for channels in (camera, image) if channels)
         block = norm + projections + self._mixer_parameters(norm)
         patchify = (
-            (self.pixel_channels * self.patch_size**2 + 1) * self.width
+            (self.pixel_channels * self.token_patch**2 + 1) * self.width
             if self.additive_image_tokens
             else 0
         )
@@ -319,18 +331,6 @@ def _few(names: list[str]) -> str:
     """The first names of a list that a file may have made endless."""
     shown = [name if name.isidentifier() else repr(name[:40]) for name in names[:8]]
     return ", ".join(shown) + (", ..." if len(names) > 8 else "")
-
-
-def _check_kind(name: str, value: object, kind: type) -> None:
-    if get_origin(kind) is Literal:
-        if value not in get_args(kind):
-            shown, known = repr(value)[:100], ", ".join(get_args(kind))
-            raise UserError(f"config: {name} is {shown}, not one of {known}")
-        return
-    fits = isinstance(value, (int, float) if kind is float else kind)
-    if not fits or (isinstance(value, bool) and kind is not bool):
-        shown = repr(value)[:100]
-        raise UserError(f"config: {name} is {shown}, it must be of type {kind.__name__}")
 
 
 Preset = Literal["tiny", "rays", "small", "paper", "released"]

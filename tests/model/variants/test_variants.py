@@ -21,11 +21,13 @@ STORED = {
     "paper": "ce8b5e294b63d7c8",
     "released": "d2aa8d5e9898f27a",
 }
-NEW = ("mixer", "attention_heads", "attention_mlp")
+NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
 VARIANTS = [
     {"mixer": "attention", "attention_heads": 2},
     {"mixer": "attention", "attention_mlp": 1, "norm": "rms", "prepend": False},
     {"mixer": "attention", "decoder": "rays", "ray_cells": 2, "ray_coarse": 1},
+    {"mixed_tokens": True, "image_size": 8},
+    {"mixed_tokens": True, "image_size": 8, "mixer": "attention"},
 ]
 
 
@@ -54,7 +56,8 @@ def test_files_hold_a_variant(tmp_path, changes):
     save_model(tmp_path / "m.safetensors", model)
     loaded = load_model(tmp_path / "m.safetensors")
     assert loaded.config == model.config
-    picture = torch.rand(12, 12, 4).numpy()
+    size = model.config.image_size
+    picture = torch.rand(size, size, 4).numpy()
     want, got = reconstruct(model, picture), reconstruct(loaded, picture)
     for name in ("means", "scales", "opacities", "colors"):
         assert torch.equal(getattr(got, name), getattr(want, name)), name
@@ -69,7 +72,7 @@ def test_every_parameter_of_a_variant_is_counted_and_learns(changes, encoder):
     count = sum(p.numel() for p in own.values())
     assert count <= model.config.num_parameters
     assert model.encoder or count == model.config.num_parameters
-    images, cameras = inputs(2)
+    images, cameras = inputs(2, model.config.image_size)
     if model.config.input_channels == 4:
         images = torch.cat([images, 0.2 + 0.6 * torch.rand_like(images[..., :1])], -1)
     made = model(images, cameras)
