@@ -15,7 +15,7 @@ Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
 Background = Literal["white", "black"]
 Mixer = Literal["mamba", "attention"]
-Decoder = Literal["bins", "rays"]
+Decoder = Literal["bins", "rays", "triplane"]
 FinalNorm = Literal["same", "layer", "rms"]
 Orders = Literal["backward", "mirrored"]
 PositionWeights = Literal["softmax", "unit"]
@@ -31,6 +31,7 @@ _LATER = {
     *(f"ray_{name}" for name in ("depth", "offset")),
     *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
     *("mixer", "attention_heads", "attention_mlp", "mixed_tokens"),
+    *("triplane_size", "triplane_features"),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -91,7 +92,11 @@ class GambaConfig:
         opacity_init: opacity at the start.
         predict_rotation: whether quaternions are predicted; the paper fixes them.
         decoder: "bins" is the paper's, one Gaussian a token; "rays" puts Gaussians on the rays of
-            the input's pixels (``model.parts.rays``), and the fields ``ray_*`` are its own.
+            the input's pixels (``model.parts.rays``), and the fields ``ray_*`` are its own;
+            "triplane" takes colours from three planes that as many blocks again make
+            (``model.parts.triplane``; paper, question Q3).
+        triplane_size: cells a side of a plane.
+        triplane_features: channels of a plane.
         ray_cells: cells a side of a patch; it divides ``patch_size``.
         ray_coarse: cells a side of a patch that the tokens have features for; those of the patch's
             cells are interpolated between them. It divides ``ray_cells``; 0 means ``ray_cells``.
@@ -141,6 +146,8 @@ class GambaConfig:
     opacity_init: Annotated[float, Meta(ge=1e-6, le=1 - 1e-6)] = 0.5
     predict_rotation: bool = False
     decoder: Decoder = "bins"
+    triplane_size: Annotated[int, Meta(ge=2, le=256)] = 32
+    triplane_features: Annotated[int, Meta(ge=1, le=1024)] = 80
     ray_cells: Annotated[int, Meta(ge=1, le=256)] = 4
     ray_coarse: Annotated[int, Meta(ge=0, le=256)] = 0
     ray_layers: Annotated[int, Meta(ge=1, le=16)] = 4
@@ -264,7 +271,12 @@ class GambaConfig:
         )
         token = 17 * camera + (camera + 1) * camera
         embedding = self.num_tokens * self.width
-        return self.depth * block + norm + self._decoder_parameters() + patchify + token + embedding
+        branch = self.depth * block + norm
+        planes = 0
+        if self.decoder == "triplane":
+            tokens = 3 * self.triplane_size**2
+            planes = branch + tokens * self.width + (self.width + 1) * self.triplane_features
+        return branch + planes + self._decoder_parameters() + patchify + token + embedding
 
     def _mixer_parameters(self, norm: int) -> int:
         """What a block has behind its norm: a Mamba block, or attention, a norm and an MLP."""
@@ -277,10 +289,11 @@ class GambaConfig:
 
     def _decoder_parameters(self) -> int:
         """The decoder's part of ``num_parameters``."""
-        if self.decoder == "bins":
+        if self.decoder != "rays":
             hidden = self.decoder_width or self.width
             heads = 3 * self.position_bins + (11 if self.predict_rotation else 7)
-            return (self.width + 1) * hidden + (hidden + 1) * (hidden + heads)
+            planes = 3 * self.triplane_features + hidden + 2 if self.decoder == "triplane" else 0
+            return (self.width + 1 + planes) * hidden + (hidden + 1) * (hidden + heads)
         features, side = self.ray_features, self.patch_size // self.ray_cells + 2
         up = (4 * self.width + 1) * (self.ray_coarse or self.ray_cells) ** 2 * features
         stem = (side**2 * self.pixel_channels + 1) * RAY_STEM

@@ -14,17 +14,18 @@ from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
 from .parts.attention import AttentionBlock
-from .parts.block import Block, GambaBlock, make_norm, prefix_states, run_blocks
+from .parts.block import GambaBlock, make_norm, prefix_states, run_blocks
 from .parts.decoder import GaussianDecoder
 from .parts.patches import Patches, foreground_patches
 from .parts.rays import RayDecoder, joined
 from .parts.tokens import CameraToken, SplatTokens
+from .parts.triplane import PlaneBranch, TriplaneDecoder
 
 
-def make_block(config: GambaConfig, camera_channels: int, image_channels: int) -> Block:
-    """Builds a block of ``config.mixer``; zero channels mean that there is no such condition."""
-    kinds = {"mamba": GambaBlock, "attention": AttentionBlock}
-    return kinds[config.mixer](config, camera_channels, image_channels)
+def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) -> nn.ModuleList:
+    """Builds the blocks of a branch; zero channels mean that there is no such condition."""
+    kind = {"mamba": GambaBlock, "attention": AttentionBlock}[config.mixer]
+    return nn.ModuleList(kind(config, camera_channels, image_channels) for _ in range(config.depth))
 
 
 class Gamba(nn.Module):
@@ -63,11 +64,14 @@ class Gamba(nn.Module):
             camera_channels = image_channels or config.width
         self.camera_token = CameraToken(camera_channels) if camera_channels else None
         self.tokens = SplatTokens(config)
-        self.blocks = nn.ModuleList(
-            make_block(config, camera_channels, image_channels) for _ in range(config.depth)
-        )
+        self.blocks = make_blocks(config, camera_channels, image_channels)
         self.norm = make_norm(config, final=True)
-        self.decoder = {"bins": GaussianDecoder, "rays": RayDecoder}[config.decoder](config)
+        kinds = {"bins": GaussianDecoder, "rays": RayDecoder, "triplane": TriplaneDecoder}
+        self.decoder = kinds[config.decoder](config)
+        self.planes = None
+        if config.decoder == "triplane":
+            blocks = make_blocks(config, camera_channels, image_channels)
+            self.planes = PlaneBranch(config, blocks)
         for parameter in self.parameters():
             if parameter.ndim == 1:
                 vars(parameter)["_no_weight_decay"] = True
@@ -75,7 +79,8 @@ class Gamba(nn.Module):
     def condition(self, images: Tensor, cameras: Cameras) -> list[Any]:
         """Computes the state that picture and camera leave in each block (``prefix_states``).
 
-        It holds all that the prefix contributes. Arguments and errors are those of ``forward``.
+        It holds all that the prefix contributes; with the decoder ``triplane`` the states of the
+        planes' blocks follow. Arguments and errors are those of ``forward``.
         """
         self._check(images, cameras)
         camera = self.camera_token(cameras) if self.camera_token else None
@@ -84,7 +89,8 @@ class Gamba(nn.Module):
             if self.config.input_channels == 4:
                 images = over_background(images, self.config.background_color)
             image = self.encoder(images)
-        return prefix_states(self.blocks, camera, image)
+        branches = [self.blocks, *([self.planes.blocks] if self.planes else [])]
+        return [s for blocks in branches for s in prefix_states(blocks, camera, image)]
 
     def forward(
         self,
@@ -126,8 +132,11 @@ class Gamba(nn.Module):
         if background_margin is not None:
             background = self.config.background_color
             tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
-        tokens = run_blocks(self.blocks, tokens, condition, self.recompute)
-        return self.decoder(self.norm(tokens))
+        ours, theirs = condition[: len(self.blocks)], condition[len(self.blocks) :]
+        tokens = self.norm(run_blocks(self.blocks, tokens, ours, self.recompute))
+        if self.planes is None:
+            return self.decoder(tokens)
+        return self.decoder(tokens, self.planes(len(images), theirs, self.recompute))
 
     def _on_rays(
         self, rgba: Tensor, cameras: Cameras, condition: list[Any], margin: int

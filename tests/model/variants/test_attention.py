@@ -8,7 +8,8 @@ from helpers.model import inputs, micro
 from gamba_warp.cameras import Cameras
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.gamba import Gamba, make_block
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.gamba import make_blocks as blocks_of
 from gamba_warp.model.parts.block import prefix_states, run_blocks
 
 FIELDS = ("means", "scales", "opacities", "colors")
@@ -16,8 +17,7 @@ FIELDS = ("means", "scales", "opacities", "colors")
 
 def make_blocks(depth: int, camera: int, image: int, **changes) -> torch.nn.ModuleList:
     small = {"width": 24, "mixer": "attention", "attention_heads": 3, "encoder": "none"}
-    config = GambaConfig(**(small | changes))
-    blocks = torch.nn.ModuleList(make_block(config, camera, image) for _ in range(depth))
+    blocks = blocks_of(GambaConfig(**(small | {"depth": depth} | changes)), camera, image)
     with torch.no_grad():
         for parameter in blocks.parameters():  # none is 0 or 1 by chance, or as in another block
             parameter += 0.1 * torch.randn_like(parameter)

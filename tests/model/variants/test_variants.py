@@ -22,12 +22,16 @@ STORED = {
     "released": "d2aa8d5e9898f27a",
 }
 NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
+NEW += ("triplane_size", "triplane_features")
 VARIANTS = [
     {"mixer": "attention", "attention_heads": 2},
     {"mixer": "attention", "attention_mlp": 1, "norm": "rms", "prepend": False},
     {"mixer": "attention", "decoder": "rays", "ray_cells": 2, "ray_coarse": 1},
     {"mixed_tokens": True, "image_size": 8},
     {"mixed_tokens": True, "image_size": 8, "mixer": "attention"},
+    {"decoder": "triplane", "triplane_size": 3, "triplane_features": 5},
+    {"decoder": "triplane", "triplane_size": 2, "mixer": "attention", "predict_rotation": True},
+    {"decoder": "triplane", "triplane_size": 5, "mixed_tokens": True, "image_size": 8},
 ]
 
 
@@ -77,6 +81,7 @@ def test_every_parameter_of_a_variant_is_counted_and_learns(changes, encoder):
         images = torch.cat([images, 0.2 + 0.6 * torch.rand_like(images[..., :1])], -1)
     made = model(images, cameras)
     parts = [made.means, made.scales, made.opacities, made.colors]
+    parts += [] if made.quats is None else [made.quats]
     sum((part * torch.randn_like(part)).sum() for part in parts).backward()
     for name, parameter in own.items():
         assert parameter.grad is not None, name
