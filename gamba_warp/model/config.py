@@ -15,6 +15,7 @@ Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
 Background = Literal["white", "black"]
 Mixer = Literal["mamba", "attention"]
+ImageTokens = Literal["prefix", "mixed"]
 Decoder = Literal["bins", "rays", "triplane"]
 FinalNorm = Literal["same", "layer", "rms"]
 Orders = Literal["backward", "mirrored"]
@@ -31,7 +32,7 @@ _LATER = {
     *(f"ray_{name}" for name in ("depth", "offset")),
     *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
     *("mixer", "attention_heads", "attention_mlp", "mixed_tokens"),
-    *("triplane_size", "triplane_features"),
+    *("triplane_size", "triplane_features", "image_tokens"),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -72,6 +73,8 @@ class GambaConfig:
         mixed_tokens: True makes the first quarter of the tokens of patches of twice the side, and
             leaves the others E alone (paper, answer A4). It needs an even number of patches a side.
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
+        image_tokens: where these stand: "prefix" prepends them, "mixed" spreads them evenly among
+            the 3DGS tokens (``model.parts.mixed``). To attention, which knows no order, it is one.
         camera_token: whether the camera is prepended; the image tokens may be prepended alone.
         encoder: "none", "vgg16" or the name of a timm ViT, e.g. "vit_base_patch14_reg4_dinov2".
         encoder_size: side of the picture that the encoder sees, pixels.
@@ -129,6 +132,7 @@ class GambaConfig:
     additive_image_tokens: bool = True
     mixed_tokens: bool = False
     prepend: bool = True
+    image_tokens: ImageTokens = "prefix"
     camera_token: bool = True
     encoder: str = "vit_base_patch14_reg4_dinov2"
     encoder_size: Annotated[int, Meta(ge=1, le=4096)] = 336
@@ -194,6 +198,8 @@ class GambaConfig:
                 )
         if self.prepend and self.encoder == "none" and not self.camera_token:
             raise UserError("config: prepend needs a camera token or an encoder")
+        if self.image_tokens == "mixed" and not self.prepend:
+            raise UserError("config: image_tokens mixed needs prepend")
         if self.mixed_tokens and (rays or not self.additive_image_tokens):
             raise UserError("config: mixed_tokens needs additive_image_tokens, and no decoder rays")
         if self.mixed_tokens and self.grid_size % 2:

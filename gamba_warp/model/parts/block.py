@@ -24,6 +24,7 @@ from torch.utils.checkpoint import checkpoint
 from ...kernels.causal_conv1d import causal_conv1d
 from ...kernels.selective_scan import selective_scan, selective_scan_state
 from ..config import GambaConfig
+from .mixed import Mixed, dropped, merged, mixed_places
 
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
 # Number of tokens that pass through all blocks together on a CPU that keeps nothing for a gradient.
@@ -185,24 +186,39 @@ class GambaBlock(Block):
     """One Gamba block: G_n = G_{n-1} + Drop(Mamba(Norm(Prepend(P_c T, P_x X, G_{n-1})))).
 
     The prefix has no residual branch of its own, since each block drops it and the next one makes
-    it anew. It enters as the state that it leaves behind, which ``prefix_states`` computes.
+    it anew. It enters as the state that it leaves behind, which ``prefix_states`` computes. With
+    ``image_tokens`` "mixed" these tokens stand among the 3DGS tokens, and the whole sequence runs.
     """
 
     def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
         """Builds the block; zero channels mean that there is no such condition."""
         super().__init__(config, camera_channels, image_channels)
+        self.mixed = config.image_tokens == "mixed"
         self.mamba = Mamba(config)
 
     def forward(
-        self, tokens: Tensor, state: State | None, layout: Tensor | None = None
-    ) -> tuple[Tensor, State]:
+        self, tokens: Tensor, state: State | Mixed | None, layout: Tensor | None = None
+    ) -> tuple[Tensor, State | Mixed]:
         """Refines the 3DGS tokens: ``Block.forward``."""
+        if isinstance(state, Mixed):
+            assert layout is not None
+            hidden, _ = self.mamba(merged(state, self.norm(tokens), layout))
+            return tokens + dropped(hidden, layout, tokens.shape[1]), state
         hidden, after = self.mamba(self.norm(tokens), state)
         return tokens + hidden, after
 
+    def layout(self, tokens: Tensor, state: Any, lengths: Tensor | None) -> Tensor | None:
+        """The places of mixed tokens; None of a prefix, behind which the tokens keep theirs."""
+        if not isinstance(state, Mixed):
+            return None
+        batch, length = tokens.shape[:2]
+        if lengths is None:
+            lengths = torch.full((batch,), length, device=tokens.device)
+        return mixed_places(state.tokens.shape[1], length, lengths)
+
     @staticmethod
-    def after(blocks: Blocks, prefix: Tensor) -> list[State]:
-        """The states after the prefix: ``Block.after``.
+    def after(blocks: Blocks, prefix: Tensor) -> list[State] | list[Mixed]:
+        """The states after the prefix, or what is to be mixed: ``Block.after``.
 
         All blocks are computed together: one batched product for each kind of matrix, one
         convolution and one scan in which each block is a group of channels. What only the dropped
@@ -210,6 +226,8 @@ class GambaBlock(Block):
         """
         first = blocks[0]
         assert isinstance(first, GambaBlock)
+        if first.mixed:
+            return [Mixed(tokens) for tokens in prefix.unbind(2)]
         mamba = first.mamba
         inner, (rank, states, _) = len(mamba.D), mamba.split
         x, conv_state = causal_conv1d(
@@ -285,8 +303,9 @@ def prefix_states(blocks: Blocks, camera: Tensor | None, image: Tensor | None) -
         image: ``[B, K, image_channels]``, or None likewise.
 
     Returns:
-        One state per block, a named tuple of tensors ``[B, ..]``: ``State`` of Mamba blocks. None
-        for each if there is neither condition.
+        One state per block, a named tuple of tensors ``[B, ..]``: ``State`` of Mamba blocks,
+        ``Mixed`` where the tokens are to be mixed, ``Memory`` of attention. None for each if there
+        is neither condition.
     """
     projections = {"project_camera": camera, "project_image": image}
     prefix = [

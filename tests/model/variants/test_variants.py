@@ -22,7 +22,7 @@ STORED = {
     "released": "d2aa8d5e9898f27a",
 }
 NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
-NEW += ("triplane_size", "triplane_features")
+NEW += ("triplane_size", "triplane_features", "image_tokens")
 VARIANTS = [
     {"mixer": "attention", "attention_heads": 2},
     {"mixer": "attention", "attention_mlp": 1, "norm": "rms", "prepend": False},
@@ -30,6 +30,9 @@ VARIANTS = [
     {"mixed_tokens": True, "image_size": 8},
     {"mixed_tokens": True, "image_size": 8, "mixer": "attention"},
     {"decoder": "triplane", "triplane_size": 3, "triplane_features": 5},
+    {"image_tokens": "mixed"},
+    {"image_tokens": "mixed", "norm": "rms", "decoder": "rays", "ray_cells": 2},
+    {"image_tokens": "mixed", "decoder": "triplane", "triplane_size": 3},
     {"decoder": "triplane", "triplane_size": 2, "mixer": "attention", "predict_rotation": True},
     {"decoder": "triplane", "triplane_size": 5, "mixed_tokens": True, "image_size": 8},
 ]
