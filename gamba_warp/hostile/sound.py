@@ -332,7 +332,11 @@ def config(result: Any, path: Path, out: Path) -> str | None:
     json.dumps(values, allow_nan=False)
     inner = result.width * result.expand
     block = inner * (2 * result.width + result.width + 3 * result.state_size + result.step_rank)
+    if result.mixer == "attention":
+        block = (4 + 2 * result.attention_mlp) * result.width**2
     tokens = result.num_gaussians * result.width + 3 * result.position_bins * result.width
+    if result.decoder == "triplane":
+        block, tokens = 2 * block, tokens + 3 * result.triplane_size**2 * result.width
     total = result.depth * block + tokens
     return f"about {total:.0e} parameters" if total > 64 * _PARAMETERS else None
 

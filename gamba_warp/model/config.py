@@ -5,28 +5,25 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import asdict, dataclass, fields
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..errors import UserError
-from ..untrusted.ranges import Meta, check_values
+from ..untrusted.ranges import Meta, check_kind, check_values
 
 Norm = Literal["layer", "rms"]
 Discretization = Literal["mamba", "bilinear", "zoh"]
 Background = Literal["white", "black"]
-Decoder = Literal["bins", "rays"]
+Mixer = Literal["mamba", "attention"]
+ImageTokens = Literal["prefix", "mixed"]
+Decoder = Literal["bins", "rays", "triplane"]
 FinalNorm = Literal["same", "layer", "rms"]
 Orders = Literal["backward", "mirrored"]
 PositionWeights = Literal["softmax", "unit"]
 Resize = Literal["bicubic", "bilinear"]
 
-RAY_CHANNELS = (
-    1,
-    3,
-    1,
-    3,
-    3,
-)  # numbers of a ray's Gaussian: depth, offset, opacity, scales, colour
+# Numbers of a ray's Gaussian: depth, offset, opacity, scales, colour.
+RAY_CHANNELS = (1, 3, 1, 3, 3)
 RAY_STEM = 32  # channels after the first convolution of the decoder ``rays``
 # Fields that older files lack: their models are what the defaults say.
 _LATER = {
@@ -34,6 +31,8 @@ _LATER = {
     *(f"ray_{name}" for name in ("cells", "coarse", "layers", "features", "hidden")),
     *(f"ray_{name}" for name in ("depth", "offset")),
     *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
+    *("mixer", "attention_heads", "attention_mlp", "mixed_tokens"),
+    *("triplane_size", "triplane_features", "image_tokens"),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -57,6 +56,12 @@ class GambaConfig:
         conv_size: taps of the causal convolution, 2 to 4.
         expand: inner channels of a block per channel of a token; 32,768 inner channels at most.
         dt_rank: rank of the step size's projection; 0 means ceil(width / 16), as in mamba-ssm.
+        mixer: what a block mixes the tokens with: "mamba", or "attention", a pre-norm transformer
+            block of the same width (paper, question Q2), which the fields ``attention_*`` describe.
+        attention_heads: heads of an attention; they divide ``width``, and 0 means one for each 64
+            channels, at least one.
+        attention_mlp: hidden channels of a transformer block's MLP per channel of a token; 32,768
+            at most. With 1 the block has about as many parameters as one of Mamba at expand 2.
         norm: normalisation before every block.
         final_norm: that before the decoder; "same" as before the blocks.
         discretization: of the selective scan; "mamba" is what mamba-ssm runs, "zoh" and "bilinear"
@@ -65,7 +70,11 @@ class GambaConfig:
             the end (paper §3.2), or "mirrored" each row from its end and each column from its end.
         embedding_init: standard deviation of the learned embedding E at the start.
         additive_image_tokens: False makes G = E (paper Table 2, "w/o additive 3DGS tokens").
+        mixed_tokens: True makes the first quarter of the tokens of patches of twice the side, and
+            leaves the others E alone (paper, answer A4). It needs an even number of patches a side.
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
+        image_tokens: where these stand: "prefix" prepends them, "mixed" spreads them evenly among
+            the 3DGS tokens (``model.parts.mixed``). To attention, which knows no order, it is one.
         camera_token: whether the camera is prepended; the image tokens may be prepended alone.
         encoder: "none", "vgg16" or the name of a timm ViT, e.g. "vit_base_patch14_reg4_dinov2".
         encoder_size: side of the picture that the encoder sees, pixels.
@@ -86,7 +95,11 @@ class GambaConfig:
         opacity_init: opacity at the start.
         predict_rotation: whether quaternions are predicted; the paper fixes them.
         decoder: "bins" is the paper's, one Gaussian a token; "rays" puts Gaussians on the rays of
-            the input's pixels (``model.parts.rays``), and the fields ``ray_*`` are its own.
+            the input's pixels (``model.parts.rays``), and the fields ``ray_*`` are its own;
+            "triplane" takes colours from three planes that as many blocks again make
+            (``model.parts.triplane``; paper, question Q3).
+        triplane_size: cells a side of a plane.
+        triplane_features: channels of a plane.
         ray_cells: cells a side of a patch; it divides ``patch_size``.
         ray_coarse: cells a side of a patch that the tokens have features for; those of the patch's
             cells are interpolated between them. It divides ``ray_cells``; 0 means ``ray_cells``.
@@ -108,13 +121,18 @@ class GambaConfig:
     conv_size: Annotated[int, Meta(ge=2, le=4)] = 4
     expand: Annotated[int, Meta(ge=1, le=64)] = 2
     dt_rank: Annotated[int, Meta(ge=0, le=8192)] = 0
+    mixer: Mixer = "mamba"
+    attention_heads: Annotated[int, Meta(ge=0, le=8192)] = 0
+    attention_mlp: Annotated[int, Meta(ge=1, le=64)] = 4
     norm: Norm = "layer"
     final_norm: FinalNorm = "same"
     scan_orders: Orders = "backward"
     discretization: Discretization = "mamba"
     embedding_init: Annotated[float, Meta(gt=0, le=100)] = 0.5
     additive_image_tokens: bool = True
+    mixed_tokens: bool = False
     prepend: bool = True
+    image_tokens: ImageTokens = "prefix"
     camera_token: bool = True
     encoder: str = "vit_base_patch14_reg4_dinov2"
     encoder_size: Annotated[int, Meta(ge=1, le=4096)] = 336
@@ -132,6 +150,8 @@ class GambaConfig:
     opacity_init: Annotated[float, Meta(ge=1e-6, le=1 - 1e-6)] = 0.5
     predict_rotation: bool = False
     decoder: Decoder = "bins"
+    triplane_size: Annotated[int, Meta(ge=2, le=256)] = 32
+    triplane_features: Annotated[int, Meta(ge=1, le=1024)] = 80
     ray_cells: Annotated[int, Meta(ge=1, le=256)] = 4
     ray_coarse: Annotated[int, Meta(ge=0, le=256)] = 0
     ray_layers: Annotated[int, Meta(ge=1, le=16)] = 4
@@ -145,43 +165,57 @@ class GambaConfig:
 
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
-            _check_kind(name, getattr(self, name), kind)
+            check_kind(f"config: {name} is", getattr(self, name), kind)
         hints = get_type_hints(type(self), include_extras=True)
         check_values(vars(self), hints, lambda name: f"config: {name} is")
         if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", self.encoder):
             raise UserError(f"config: encoder is {self.encoder[:100]!r}, not a network's name")
-        if self.image_size % self.patch_size:
-            raise UserError(
-                f"config: image_size {self.image_size} is not a multiple of "
-                f"patch_size {self.patch_size}"
-            )
-        if self.decoder == "rays" and self.patch_size % self.ray_cells:
-            raise UserError(
-                f"config: patch_size {self.patch_size} is not a multiple of "
-                f"ray_cells {self.ray_cells}"
-            )
-        if self.decoder == "rays" and self.ray_coarse and self.ray_cells % self.ray_coarse:
-            raise UserError(
-                f"config: ray_cells {self.ray_cells} is not a multiple of "
-                f"ray_coarse {self.ray_coarse}"
-            )
-        if self.prepend and self.encoder == "none" and not self.camera_token:
-            raise UserError("config: prepend needs a camera token or an encoder")
-        if self.encoder == "vgg16" and not self.encoder_frozen:
-            raise UserError("config: encoder vgg16 can only be used frozen")
+        self._check_relations()
         limits = {
             "num_gaussians": MAX_GAUSSIANS,
             "inner_width": MAX_INNER_WIDTH,
+            "mlp_width": MAX_INNER_WIDTH,
             "num_parameters": MAX_PARAMETERS,
         }
         for name, limit in limits.items():
             if getattr(self, name) > limit:
                 raise UserError(f"config: {name} is {getattr(self, name):,}, over {limit:,}")
 
+    def _check_relations(self) -> None:
+        """Refuses fields that do not go together."""
+        rays, attention = self.decoder == "rays", self.mixer == "attention"
+        multiples = {
+            ("image_size", "patch_size"): True,
+            ("patch_size", "ray_cells"): rays,
+            ("ray_cells", "ray_coarse"): rays and self.ray_coarse > 0,
+            ("width", "num_heads"): attention,
+        }
+        for (whole, part), asked in multiples.items():
+            if asked and getattr(self, whole) % getattr(self, part):
+                raise UserError(
+                    f"config: {whole} {getattr(self, whole)} is not a multiple of "
+                    f"{part} {getattr(self, part)}"
+                )
+        if self.prepend and self.encoder == "none" and not self.camera_token:
+            raise UserError("config: prepend needs a camera token or an encoder")
+        if self.image_tokens == "mixed" and not self.prepend:
+            raise UserError("config: image_tokens mixed needs prepend")
+        if self.mixed_tokens and (rays or not self.additive_image_tokens):
+            raise UserError("config: mixed_tokens needs additive_image_tokens, and no decoder rays")
+        if self.mixed_tokens and self.grid_size % 2:
+            raise UserError(f"config: mixed_tokens needs an even grid, not of {self.grid_size}²")
+        if self.encoder == "vgg16" and not self.encoder_frozen:
+            raise UserError("config: encoder vgg16 can only be used frozen")
+
     @property
     def grid_size(self) -> int:
         """H / p, the side of the patch grid."""
         return self.image_size // self.patch_size
+
+    @property
+    def token_patch(self) -> int:
+        """Side of the patches that 3DGS tokens are made of, pixels."""
+        return self.patch_size * (2 if self.mixed_tokens else 1)
 
     @property
     def num_tokens(self) -> int:
@@ -211,6 +245,16 @@ class GambaConfig:
         return self.expand * self.width
 
     @property
+    def num_heads(self) -> int:
+        """``attention_heads`` with its default filled in."""
+        return self.attention_heads or max(1, self.width // 64)
+
+    @property
+    def mlp_width(self) -> int:
+        """Channels inside the MLP of a transformer block."""
+        return self.attention_mlp * self.width
+
+    @property
     def step_rank(self) -> int:
         """``dt_rank`` with its default filled in."""
         return self.dt_rank or -(-self.width // 16)
@@ -221,28 +265,41 @@ class GambaConfig:
 
         It is computed before anything is allocated: a file may claim any size.
         """
-        inner, rank, states = self.inner_width, self.step_rank, self.state_size
         image = _IMAGE_CHANNELS if self.prepend and self.encoder != "none" else 0
         camera = (image or self.width) if self.prepend and self.camera_token else 0
         norm = self.width * (2 if self.norm == "layer" else 1)
         projections = sum((channels + 1) * self.width for channels in (camera, image) if channels)
-        scan = inner * (self.conv_size + rank + 2 * states + rank + states + 3)
-        block = norm + projections + scan + 3 * self.width * inner
+        block = norm + projections + self._mixer_parameters(norm)
         patchify = (
-            (self.pixel_channels * self.patch_size**2 + 1) * self.width
+            (self.pixel_channels * self.token_patch**2 + 1) * self.width
             if self.additive_image_tokens
             else 0
         )
         token = 17 * camera + (camera + 1) * camera
         embedding = self.num_tokens * self.width
-        return self.depth * block + norm + self._decoder_parameters() + patchify + token + embedding
+        branch = self.depth * block + norm
+        planes = 0
+        if self.decoder == "triplane":
+            tokens = 3 * self.triplane_size**2
+            planes = branch + tokens * self.width + (self.width + 1) * self.triplane_features
+        return branch + planes + self._decoder_parameters() + patchify + token + embedding
+
+    def _mixer_parameters(self, norm: int) -> int:
+        """What a block has behind its norm: a Mamba block, or attention, a norm and an MLP."""
+        if self.mixer == "attention":
+            inside = self.mlp_width
+            return norm + 4 * (self.width + 1) * self.width + (2 * inside + 1) * self.width + inside
+        inner, rank, states = self.inner_width, self.step_rank, self.state_size
+        scan = inner * (self.conv_size + rank + 2 * states + rank + states + 3)
+        return scan + 3 * self.width * inner
 
     def _decoder_parameters(self) -> int:
         """The decoder's part of ``num_parameters``."""
-        if self.decoder == "bins":
+        if self.decoder != "rays":
             hidden = self.decoder_width or self.width
             heads = 3 * self.position_bins + (11 if self.predict_rotation else 7)
-            return (self.width + 1) * hidden + (hidden + 1) * (hidden + heads)
+            planes = 3 * self.triplane_features + hidden + 2 if self.decoder == "triplane" else 0
+            return (self.width + 1 + planes) * hidden + (hidden + 1) * (hidden + heads)
         features, side = self.ray_features, self.patch_size // self.ray_cells + 2
         up = (4 * self.width + 1) * (self.ray_coarse or self.ray_cells) ** 2 * features
         stem = (side**2 * self.pixel_channels + 1) * RAY_STEM
@@ -293,18 +350,6 @@ def _few(names: list[str]) -> str:
     """The first names of a list that a file may have made endless."""
     shown = [name if name.isidentifier() else repr(name[:40]) for name in names[:8]]
     return ", ".join(shown) + (", ..." if len(names) > 8 else "")
-
-
-def _check_kind(name: str, value: object, kind: type) -> None:
-    if get_origin(kind) is Literal:
-        if value not in get_args(kind):
-            shown, known = repr(value)[:100], ", ".join(get_args(kind))
-            raise UserError(f"config: {name} is {shown}, not one of {known}")
-        return
-    fits = isinstance(value, (int, float) if kind is float else kind)
-    if not fits or (isinstance(value, bool) and kind is not bool):
-        shown = repr(value)[:100]
-        raise UserError(f"config: {name} is {shown}, it must be of type {kind.__name__}")
 
 
 Preset = Literal["tiny", "rays", "small", "paper", "released"]

@@ -13,11 +13,19 @@ from ..conventions import over_background
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
-from .parts.block import GambaBlock, State, make_norm, prefix_states, run_blocks
+from .parts.attention import AttentionBlock
+from .parts.block import GambaBlock, make_norm, prefix_states, run_blocks
 from .parts.decoder import GaussianDecoder
 from .parts.patches import Patches, foreground_patches
 from .parts.rays import RayDecoder, joined
 from .parts.tokens import CameraToken, SplatTokens
+from .parts.triplane import PlaneBranch, TriplaneDecoder
+
+
+def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) -> nn.ModuleList:
+    """Builds the blocks of a branch; zero channels mean that there is no such condition."""
+    kind = {"mamba": GambaBlock, "attention": AttentionBlock}[config.mixer]
+    return nn.ModuleList(kind(config, camera_channels, image_channels) for _ in range(config.depth))
 
 
 class Gamba(nn.Module):
@@ -56,19 +64,23 @@ class Gamba(nn.Module):
             camera_channels = image_channels or config.width
         self.camera_token = CameraToken(camera_channels) if camera_channels else None
         self.tokens = SplatTokens(config)
-        self.blocks = nn.ModuleList(
-            GambaBlock(config, camera_channels, image_channels) for _ in range(config.depth)
-        )
+        self.blocks = make_blocks(config, camera_channels, image_channels)
         self.norm = make_norm(config, final=True)
-        self.decoder = {"bins": GaussianDecoder, "rays": RayDecoder}[config.decoder](config)
+        kinds = {"bins": GaussianDecoder, "rays": RayDecoder, "triplane": TriplaneDecoder}
+        self.decoder = kinds[config.decoder](config)
+        self.planes = None
+        if config.decoder == "triplane":
+            blocks = make_blocks(config, camera_channels, image_channels)
+            self.planes = PlaneBranch(config, blocks)
         for parameter in self.parameters():
             if parameter.ndim == 1:
                 vars(parameter)["_no_weight_decay"] = True
 
-    def condition(self, images: Tensor, cameras: Cameras) -> list[State | None]:
+    def condition(self, images: Tensor, cameras: Cameras) -> list[Any]:
         """Computes the state that picture and camera leave in each block (``prefix_states``).
 
-        It holds all that the prefix contributes. Arguments and errors are those of ``forward``.
+        It holds all that the prefix contributes; with the decoder ``triplane`` the states of the
+        planes' blocks follow. Arguments and errors are those of ``forward``.
         """
         self._check(images, cameras)
         camera = self.camera_token(cameras) if self.camera_token else None
@@ -77,13 +89,14 @@ class Gamba(nn.Module):
             if self.config.input_channels == 4:
                 images = over_background(images, self.config.background_color)
             image = self.encoder(images)
-        return prefix_states(self.blocks, camera, image)
+        branches = [self.blocks, *([self.planes.blocks] if self.planes else [])]
+        return [s for blocks in branches for s in prefix_states(blocks, camera, image)]
 
     def forward(
         self,
         images: Tensor,
         cameras: Cameras,
-        condition: list[State | None] | None = None,
+        condition: list[Any] | None = None,
         background_margin: int | None = None,
     ) -> Gaussians:
         """Predicts the Gaussians of each picture's object.
@@ -119,11 +132,14 @@ class Gamba(nn.Module):
         if background_margin is not None:
             background = self.config.background_color
             tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
-        tokens = run_blocks(self.blocks, tokens, condition, self.recompute)
-        return self.decoder(self.norm(tokens))
+        ours, theirs = condition[: len(self.blocks)], condition[len(self.blocks) :]
+        tokens = self.norm(run_blocks(self.blocks, tokens, ours, self.recompute))
+        if self.planes is None:
+            return self.decoder(tokens)
+        return self.decoder(tokens, self.planes(len(images), theirs, self.recompute))
 
     def _on_rays(
-        self, rgba: Tensor, cameras: Cameras, condition: list[State | None], margin: int
+        self, rgba: Tensor, cameras: Cameras, condition: list[Any], margin: int
     ) -> Gaussians:
         """What ``forward`` does for the decoder ``rays``."""
         patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
@@ -134,7 +150,7 @@ class Gamba(nn.Module):
             self._of_patches(
                 rgba[group],
                 cameras[group],
-                [state and State(*(value[group] for value in state)) for state in condition],
+                [state and state._make(value[group] for value in state) for state in condition],
                 patches.of(group),
             )
             for group in groups
@@ -144,11 +160,12 @@ class Gamba(nn.Module):
         return joined(parts).map(lambda value: value[back])
 
     def _of_patches(
-        self, rgba: Tensor, cameras: Cameras, condition: list[State | None], patches: Patches
+        self, rgba: Tensor, cameras: Cameras, condition: list[Any], patches: Patches
     ) -> Gaussians:
         pixels = self.tokens.pixels(rgba, cameras)
         tokens, places = self.tokens.of_patches(pixels, patches)
-        tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute))
+        own = 4 * patches.valid.sum(1) if len(rgba) > 1 else None
+        tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute, own))
         at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
         tokens = tokens.gather(1, at).unflatten(1, places.shape[1:])
         return self.decoder(tokens, pixels, patches, rgba, cameras)

@@ -83,6 +83,27 @@ def check_range(label: str, value: float, limits: Meta) -> None:
         raise UserError(f"{label} {shown}{mark} {reason}")
 
 
+def check_kind(label: str, value: object, kind: Any) -> None:
+    """Refuses a value that is not of a plain type, or not one of a ``Literal``'s.
+
+    Args:
+        label: what begins the message, such as "config: width is".
+        value: any; a whole number is let through as a float, True and False only as a bool.
+        kind: the type.
+
+    Raises:
+        UserError: one line with the value and what it must be.
+    """
+    shown = repr(value)[:100]
+    if typing.get_origin(kind) is typing.Literal:
+        if value not in typing.get_args(kind):
+            raise UserError(f"{label} {shown}, not one of {', '.join(typing.get_args(kind))}")
+        return
+    fits = isinstance(value, (int, float) if kind is float else kind)
+    if not fits or (isinstance(value, bool) and kind is not bool):
+        raise UserError(f"{label} {shown}, it must be of type {kind.__name__}")
+
+
 def check_values(
     values: Mapping[str, Any], hints: Mapping[str, Any], label: Callable[[str], str]
 ) -> None:

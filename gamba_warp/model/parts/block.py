@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from functools import partial
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,11 +24,13 @@ from torch.utils.checkpoint import checkpoint
 from ...kernels.causal_conv1d import causal_conv1d
 from ...kernels.selective_scan import selective_scan, selective_scan_state
 from ..config import GambaConfig
+from .mixed import Mixed, dropped, merged, mixed_places
 
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
 # Number of tokens that pass through all blocks together on a CPU that keeps nothing for a gradient.
 # The temporaries of so few are reused at once, instead of being mapped anew each time.
 SEGMENT = 2048
+Blocks = Sequence["Block"] | nn.ModuleList
 
 
 def make_norm(config: GambaConfig, final: bool = False) -> nn.LayerNorm | nn.RMSNorm:
@@ -133,79 +135,167 @@ class Mamba(nn.Module):
         return self.out_proj(y), State(conv_state, scan_state)
 
 
-class GambaBlock(nn.Module):
-    """One Gamba block: G_n = G_{n-1} + Drop(Mamba(Norm(Prepend(P_c T, P_x X, G_{n-1})))).
+class Block(nn.Module):
+    """What a block of any mixer has: the projections of the condition, and the norm.
 
-    The prefix has no residual branch of its own, since each block drops it and the next one makes
-    it anew. It enters as the state that it leaves behind, which ``prefix_states`` computes.
+    Attributes:
+        in_segments: whether one part of the tokens may pass through all blocks before the next.
     """
 
+    in_segments = True
+
     def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
-        """Builds the block; zero channels mean that there is no such condition."""
+        """Builds these; zero channels mean that there is no such condition."""
         super().__init__()
         width = config.width
         self.project_camera = nn.Linear(camera_channels, width) if camera_channels else None
         self.project_image = nn.Linear(image_channels, width) if image_channels else None
         self.norm = make_norm(config)
-        self.mamba = Mamba(config)
 
-    def forward(self, tokens: Tensor, state: State | None) -> tuple[Tensor, State]:
+    def forward(
+        self, tokens: Tensor, state: Any, layout: Tensor | None = None
+    ) -> tuple[Tensor, Any]:
         """Refines the 3DGS tokens, all of them or the next segment.
 
         Args:
             tokens: ``[B, L, width]``.
             state: this block's entry of ``prefix_states``, or its state after the segment before.
+            layout: the result of ``layout``, the same for all blocks.
 
         Returns:
             ``[B, L, width]``, and the state after the last token.
         """
+        raise NotImplementedError
+
+    def layout(self, tokens: Tensor, state: Any, lengths: Tensor | None) -> Tensor | None:
+        """What all blocks know of the places of the tokens, or None; see ``run_blocks``."""
+        return None
+
+    @staticmethod
+    def after(blocks: Blocks, prefix: Tensor) -> list[Any]:
+        """The state of each block after its prefix.
+
+        Args:
+            blocks: all of one configuration.
+            prefix: ``[B, K, depth, width]``, K > 0, the normalised prefix of each.
+        """
+        raise NotImplementedError
+
+
+class GambaBlock(Block):
+    """One Gamba block: G_n = G_{n-1} + Drop(Mamba(Norm(Prepend(P_c T, P_x X, G_{n-1})))).
+
+    The prefix has no residual branch of its own, since each block drops it and the next one makes
+    it anew. It enters as the state that it leaves behind, which ``prefix_states`` computes. With
+    ``image_tokens`` "mixed" these tokens stand among the 3DGS tokens, and the whole sequence runs.
+    """
+
+    def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
+        """Builds the block; zero channels mean that there is no such condition."""
+        super().__init__(config, camera_channels, image_channels)
+        self.mixed = config.image_tokens == "mixed"
+        self.mamba = Mamba(config)
+
+    def forward(
+        self, tokens: Tensor, state: State | Mixed | None, layout: Tensor | None = None
+    ) -> tuple[Tensor, State | Mixed]:
+        """Refines the 3DGS tokens: ``Block.forward``."""
+        if isinstance(state, Mixed):
+            assert layout is not None
+            hidden, _ = self.mamba(merged(state, self.norm(tokens), layout))
+            return tokens + dropped(hidden, layout, tokens.shape[1]), state
         hidden, after = self.mamba(self.norm(tokens), state)
         return tokens + hidden, after
+
+    def layout(self, tokens: Tensor, state: Any, lengths: Tensor | None) -> Tensor | None:
+        """The places of mixed tokens; None of a prefix, behind which the tokens keep theirs."""
+        if not isinstance(state, Mixed):
+            return None
+        batch, length = tokens.shape[:2]
+        if lengths is None:
+            lengths = torch.full((batch,), length, device=tokens.device)
+        return mixed_places(state.tokens.shape[1], length, lengths)
+
+    @staticmethod
+    def after(blocks: Blocks, prefix: Tensor) -> list[State] | list[Mixed]:
+        """The states after the prefix, or what is to be mixed: ``Block.after``.
+
+        All blocks are computed together: one batched product for each kind of matrix, one
+        convolution and one scan in which each block is a group of channels. What only the dropped
+        outputs would need is left out: the gate z, C, D and the output projection.
+        """
+        first = blocks[0]
+        assert isinstance(first, GambaBlock)
+        if first.mixed:
+            return [Mixed(tokens) for tokens in prefix.unbind(2)]
+        mamba = first.mamba
+        inner, (rank, states, _) = len(mamba.D), mamba.split
+        x, conv_state = causal_conv1d(
+            product(prefix, stacked(blocks, "mamba.in_proj.weight", inner)).flatten(2),
+            joined(blocks, "mamba.conv_weight"),
+            joined(blocks, "mamba.conv_bias"),
+            activation="silu",
+            return_final_state=True,
+        )
+        rows = stacked(blocks, "mamba.x_proj.weight", rank + states)
+        low_rank, B = product(x.unflatten(2, (-1, inner)), rows).split([rank, states], dim=-1)
+        delta = product(low_rank, stacked(blocks, "mamba.dt_proj.weight")).flatten(2)
+        scan_state = selective_scan_state(
+            x,
+            delta,
+            -torch.exp(joined(blocks, "mamba.A_log").float()),
+            B,
+            delta_bias=joined(blocks, "mamba.dt_proj.bias").float(),
+            delta_softplus=True,
+            discretization=mamba.discretization,
+        )
+        pairs = zip(conv_state.split(inner, dim=2), scan_state.split(inner, dim=1))
+        return [State(*pair) for pair in pairs]
 
 
 def run_blocks(
     blocks: Iterable[nn.Module],
     tokens: Tensor,
-    states: Sequence[State | None],
+    states: Sequence[Any],
     recompute: bool = False,
+    lengths: Tensor | None = None,
 ) -> Tensor:
     """Runs all blocks over the 3DGS tokens.
 
     On a CPU without gradients, one segment of ``SEGMENT`` tokens after the other passes through all
-    blocks, and each block hands its state from one segment to the next.
+    blocks, and each block hands its state from one segment to the next. Blocks that see tokens in
+    both directions take all tokens at once.
 
     Args:
-        blocks: the network's blocks (``GambaBlock``) in their order.
+        blocks: the network's blocks, all of one kind, in their order.
         tokens: ``[B, L, width]``.
         states: the result of ``prefix_states``, one entry per block.
         recompute: with gradients, keep only each block's input and run the block again in the
             backward pass.
+        lengths: ``[B]`` int64, how many tokens of each picture are its own; the others only fill
+            up the batch, and these see nothing of them. None means all.
 
     Returns:
-        ``[B, L, width]``.
+        ``[B, L, width]``; what fills up has no meaning.
     """
-    states, gradients = list(states), torch.is_grad_enabled()
+    blocks, states, gradients = list(blocks), list(states), torch.is_grad_enabled()
+    first: Any = blocks[0]
+    layout = first.layout(tokens, states[0], lengths)
     segments = [tokens]
-    if tokens.device.type == "cpu" and not gradients:
+    if tokens.device.type == "cpu" and not gradients and first.in_segments and layout is None:
         segments = list(tokens.split(SEGMENT, dim=1))
     for s, segment in enumerate(segments):
         for i, block in enumerate(blocks):
             run = block
             if recompute and gradients:
                 run = partial(checkpoint, block, use_reentrant=False)
-            segment, states[i] = run(segment, states[i])
+            segment, states[i] = run(segment, states[i], layout)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
 
-def prefix_states(
-    blocks: Sequence[GambaBlock] | nn.ModuleList, camera: Tensor | None, image: Tensor | None
-) -> list[State | None]:
+def prefix_states(blocks: Blocks, camera: Tensor | None, image: Tensor | None) -> list[Any]:
     """Computes the state of each block after its prefix P_c T, P_x X, camera first.
-
-    All blocks are computed together: one batched product for each kind of matrix, one convolution
-    and one scan in which each block is a group of channels. What only the dropped outputs would
-    need is left out: the gate z, C, D and the output projection.
 
     Args:
         blocks: blocks of one configuration.
@@ -213,68 +303,45 @@ def prefix_states(
         image: ``[B, K, image_channels]``, or None likewise.
 
     Returns:
-        One state per block, or None for each if there is neither condition.
+        One state per block, a named tuple of tensors ``[B, ..]``: ``State`` of Mamba blocks,
+        ``Mixed`` where the tokens are to be mixed, ``Memory`` of attention. None for each if there
+        is neither condition.
     """
     projections = {"project_camera": camera, "project_image": image}
     prefix = [
-        F.linear(tokens, _joined(blocks, f"{name}.weight"), _joined(blocks, f"{name}.bias"))
+        F.linear(tokens, joined(blocks, f"{name}.weight"), joined(blocks, f"{name}.bias"))
         for name, tokens in projections.items()
         if tokens is not None
     ]
     if not prefix:
         return [None] * len(blocks)
     first = blocks[0]
-    assert isinstance(first, GambaBlock)
-    mamba = first.mamba
-    inner, (rank, states, _) = len(mamba.D), mamba.split
-    tokens = _normalized(blocks, first.norm, torch.cat(prefix, dim=1))
-    x, conv_state = causal_conv1d(
-        _product(tokens, _stacked(blocks, "mamba.in_proj.weight", inner)).flatten(2),
-        _joined(blocks, "mamba.conv_weight"),
-        _joined(blocks, "mamba.conv_bias"),
-        activation="silu",
-        return_final_state=True,
-    )
-    rows = _stacked(blocks, "mamba.x_proj.weight", rank + states)
-    low_rank, B = _product(x.unflatten(2, (-1, inner)), rows).split([rank, states], dim=-1)
-    delta = _product(low_rank, _stacked(blocks, "mamba.dt_proj.weight")).flatten(2)
-    scan_state = selective_scan_state(
-        x,
-        delta,
-        -torch.exp(_joined(blocks, "mamba.A_log").float()),
-        B,
-        delta_bias=_joined(blocks, "mamba.dt_proj.bias").float(),
-        delta_softplus=True,
-        discretization=mamba.discretization,
-    )
-    pairs = zip(conv_state.split(inner, dim=2), scan_state.split(inner, dim=1))
-    return [State(*pair) for pair in pairs]
+    assert isinstance(first, Block)
+    return first.after(blocks, _normalized(blocks, first.norm, torch.cat(prefix, dim=1)))
 
 
-def _joined(blocks: Iterable[nn.Module], name: str) -> Tensor:
+def joined(blocks: Blocks, name: str) -> Tensor:
     """Joins one parameter of all blocks along its first dimension."""
     return torch.cat([attrgetter(name)(block) for block in blocks])
 
 
-def _stacked(blocks: Iterable[nn.Module], name: str, rows: int | None = None) -> Tensor:
+def stacked(blocks: Blocks, name: str, rows: int | None = None) -> Tensor:
     """Stacks the first ``rows`` of one parameter of all blocks: ``[depth, rows, ..]``."""
     return torch.stack([attrgetter(name)(block)[:rows] for block in blocks])
 
 
-def _product(tokens: Tensor, matrices: Tensor) -> Tensor:
+def product(tokens: Tensor, matrices: Tensor) -> Tensor:
     """Multiplies each block's tokens by its matrix: ``[B, K, depth, in]`` to ``[.., out]``."""
     rows = tokens.flatten(0, 1).transpose(0, 1)
     return torch.bmm(rows, matrices.mT).transpose(0, 1).unflatten(0, tokens.shape[:2])
 
 
-def _normalized(
-    blocks: Sequence[GambaBlock] | nn.ModuleList, norm: nn.LayerNorm | nn.RMSNorm, tokens: Tensor
-) -> Tensor:
+def _normalized(blocks: Blocks, norm: nn.LayerNorm | nn.RMSNorm, tokens: Tensor) -> Tensor:
     """Applies each block's own norm: ``[B, K, depth·width]`` to ``[B, K, depth, width]``."""
     tokens = tokens.unflatten(2, (len(blocks), -1)).float()
     if isinstance(norm, nn.RMSNorm):
-        return F.rms_norm(tokens, norm.normalized_shape, None, norm.eps) * _stacked(
+        return F.rms_norm(tokens, norm.normalized_shape, None, norm.eps) * stacked(
             blocks, "norm.weight"
         )
     tokens = F.layer_norm(tokens, norm.normalized_shape, None, None, norm.eps)
-    return torch.addcmul(_stacked(blocks, "norm.bias"), tokens, _stacked(blocks, "norm.weight"))
+    return torch.addcmul(stacked(blocks, "norm.bias"), tokens, stacked(blocks, "norm.weight"))

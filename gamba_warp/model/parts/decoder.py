@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +16,13 @@ MIN_SCALE = 1e-6  # object units; keeps finite the logarithm that files store
 
 
 class GaussianDecoder(nn.Module):
-    """A shared MLP with one hidden layer, then one linear head for each attribute."""
+    """A shared MLP with one hidden layer, then one linear head for each attribute.
 
+    Attributes:
+        colored: whether there is a head for colours.
+    """
+
+    colored = True
     points: Tensor
 
     def __init__(self, config: GambaConfig) -> None:
@@ -29,7 +35,7 @@ class GaussianDecoder(nn.Module):
         self.position = nn.Linear(width, 3 * config.position_bins)
         self.opacity = nn.Linear(width, 1)
         self.scale = nn.Linear(width, 3)
-        self.color = nn.Linear(width, 3)
+        self.color = nn.Linear(width, 3) if self.colored else None
         self.rotation = nn.Linear(width, 4) if config.predict_rotation else None
         limit = config.position_range
         points = torch.linspace(-limit, limit, config.position_bins)
@@ -38,15 +44,10 @@ class GaussianDecoder(nn.Module):
 
     def _init_weights(self, first: nn.Linear, second: nn.Linear) -> None:
         config = self.config
-        for layer in (first, second):
-            nn.init.zeros_(layer.bias)
-        # This gives unit variance before each SiLU, whose mean square on a unit normal is 0.356.
-        nn.init.normal_(first.weight, std=first.in_features**-0.5)
-        nn.init.normal_(second.weight, std=(0.356 * second.in_features) ** -0.5)
+        self.init_mlp(first, second)
         for head in (self.opacity, self.scale, self.color, self.rotation):
             if head is not None:
-                nn.init.normal_(head.weight, std=0.02)
-                nn.init.zeros_(head.bias)
+                self.init_head(head)
         # A softmax over near-zero logits puts every Gaussian at the centre, and a heap of opaque
         # Gaussians at one point is the collapse that the radial mask loss shall prevent. Logits of
         # deviation 1.5 spread the centres by about 0.1 per axis: this is inside any object, and far
@@ -63,6 +64,20 @@ class GaussianDecoder(nn.Module):
             with torch.no_grad():
                 self.rotation.bias[0] = 1.0
 
+    @staticmethod
+    def init_mlp(first: nn.Linear, second: nn.Linear) -> None:
+        """Gives unit variance before each SiLU, whose mean square on a unit normal is 0.356."""
+        for layer in (first, second):
+            nn.init.zeros_(layer.bias)
+        nn.init.normal_(first.weight, std=first.in_features**-0.5)
+        nn.init.normal_(second.weight, std=(0.356 * second.in_features) ** -0.5)
+
+    @staticmethod
+    def init_head(head: nn.Linear) -> None:
+        """Makes what a head says almost 0 at the start."""
+        nn.init.normal_(head.weight, std=0.02)
+        nn.init.zeros_(head.bias)
+
     def forward(self, tokens: Tensor) -> Gaussians:
         """Decodes ``tokens [B, L, width]`` to ``[B, L]`` Gaussians in float32.
 
@@ -70,16 +85,21 @@ class GaussianDecoder(nn.Module):
         in [0, 1], scales above 0.
         """
         hidden = self.mlp(tokens)
-        # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
+        assert self.color is not None
         with torch.autocast(tokens.device.type, enabled=False):
+            return Gaussians(**self.shapes(hidden), colors=self.color(hidden.float()).sigmoid())
+
+    def shapes(self, hidden: Tensor) -> dict[str, Any]:
+        """All of the Gaussians but their colours, float32, from the MLP's ``[B, L, channels]``."""
+        # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
+        with torch.autocast(hidden.device.type, enabled=False):
             hidden = hidden.float()
             logits = self.position(hidden).unflatten(-1, (3, -1))
             unit = self.config.position_weights == "unit"
             weights = F.normalize(logits, dim=-1) if unit else logits.softmax(-1)
-            return Gaussians(
-                means=weights @ self.points,
-                quats=None if self.rotation is None else self.rotation(hidden),
-                scales=self.config.scale_factor * F.softplus(self.scale(hidden)) + MIN_SCALE,
-                opacities=self.opacity(hidden)[..., 0].sigmoid(),
-                colors=self.color(hidden).sigmoid(),
-            )
+            return {
+                "means": weights @ self.points,
+                "quats": None if self.rotation is None else self.rotation(hidden),
+                "scales": self.config.scale_factor * F.softplus(self.scale(hidden)) + MIN_SCALE,
+                "opacities": self.opacity(hidden)[..., 0].sigmoid(),
+            }

@@ -59,17 +59,24 @@ def camera_numbers(cameras: Cameras) -> Tensor:
 
 
 class SplatTokens(nn.Module):
-    """The 3DGS tokens G = Scan(Conv(s)) + E (paper eq. 1), or G = E without image tokens."""
+    """The 3DGS tokens G = Scan(Conv(s)) + E (paper eq. 1), or G = E without image tokens.
+
+    With ``mixed_tokens`` (paper, answer A4) Scan(Conv(s)) is that of patches of twice the side.
+    These tokens are a quarter as many and come first; those behind them are E alone.
+
+    Attributes:
+        orders: the patch of each token that has one, int64: ``[L]``, or ``[L / 4]`` if mixed.
+    """
 
     orders: Tensor
 
     def __init__(self, config: GambaConfig) -> None:
         super().__init__()
-        grid, self.patch_size = config.grid_size, config.patch_size
+        patch = self.patch_size = config.token_patch
+        grid = config.image_size // patch
         self.background = config.background_color
         self.patchify = None
         if config.additive_image_tokens:
-            patch = config.patch_size
             channels = config.pixel_channels
             self.patchify = nn.Conv2d(channels, config.width, kernel_size=patch, stride=patch)
         self.embedding = nn.Parameter(torch.empty(config.num_tokens, config.width))
@@ -85,8 +92,15 @@ class SplatTokens(nn.Module):
         """Maps ``images [B, H, W, 3]`` in [0, 1] and one camera each to ``[B, L, width]``."""
         if self.patchify is None:
             return self.embedding.expand(len(images), -1, -1)
-        patches = self.patchify(self.pixels(images, cameras)).flatten(2).mT
-        return patches[:, self.orders] + self.embedding
+        patches = self.patchify(self.pixels(images, cameras)).flatten(2).mT[:, self.orders]
+        if self._bare:
+            patches = F.pad(patches, (0, 0, 0, self._bare))
+        return patches + self.embedding
+
+    @property
+    def _bare(self) -> int:
+        """How many tokens, the last ones, have no patch."""
+        return len(self.embedding) - len(self.orders)
 
     def pixels(self, images: Tensor, cameras: Cameras) -> Tensor:
         """What the tokens are made of: normalised colour, Plücker ray and, if given, 2 · alpha - 1.
@@ -136,6 +150,8 @@ class SplatTokens(nn.Module):
     def foreground(self, images: Tensor, background: float, margin: int) -> Tensor:
         """Finds the tokens whose patch is not plain background, or is near such a patch.
 
+        Tokens without a patch (``mixed_tokens``) are found too.
+
         Args:
             images: ``[B, H, W, 3]``; a patch is plain background if it is so in all pictures.
             background: grey value; a pixel that differs by more than half of 1/255 is not
@@ -150,4 +166,4 @@ class SplatTokens(nn.Module):
         """
         seen = ((images - background).abs() > 0.5 / 255).any(-1).any(0, keepdim=True)
         near = near_patches(seen, self.patch_size, margin)
-        return near[0, self.orders].nonzero()[:, 0]
+        return F.pad(near[0, self.orders], (0, self._bare), value=True).nonzero()[:, 0]

@@ -1,0 +1,97 @@
+"""A transformer block in place of the Mamba block, for the paper's question Q2.
+
+The prefix P_c T, P_x X is seen by the 3DGS tokens, and its own outputs are dropped. So it has keys
+and values only, and these depend on no 3DGS token: ``prefix_states`` computes them once for all
+blocks, as it computes the states of Mamba blocks. Attention here is not causal, and knows of the
+tokens' order only what the embedding E says.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ..config import GambaConfig
+from .block import Block, Blocks, make_norm, product, stacked
+
+
+class Memory(NamedTuple):
+    """What an attention sees of the prefix.
+
+    Attributes:
+        keys: ``[B, heads, K, width / heads]``.
+        values: the same.
+    """
+
+    keys: Tensor
+    values: Tensor
+
+
+class AttentionBlock(Block):
+    """G' = G + Attention(Norm(Prepend(..))), G = G' + MLP(Norm(G')), with biases and a GELU."""
+
+    in_segments = False
+
+    def __init__(self, config: GambaConfig, camera_channels: int, image_channels: int) -> None:
+        """Builds the block; zero channels mean that there is no such condition."""
+        super().__init__(config, camera_channels, image_channels)
+        width, inner = config.width, config.mlp_width
+        self.heads = config.num_heads
+        self.kvq_proj = nn.Linear(width, 3 * width)  # rows of keys, of values, of queries
+        self.out_proj = nn.Linear(width, width)
+        self.mlp_norm = make_norm(config)
+        first, second = nn.Linear(width, inner), nn.Linear(inner, width)
+        self.mlp = nn.Sequential(first, nn.GELU(), second)
+        for layer in (self.kvq_proj, self.out_proj, first, second):
+            nn.init.zeros_(layer.bias)
+        # Two residual branches a block, whose sum over all blocks keeps the variance of one.
+        for layer in (self.out_proj, second):
+            with torch.no_grad():
+                layer.weight.div_(math.sqrt(2 * config.depth))
+
+    def forward(
+        self, tokens: Tensor, state: Memory | None, layout: Tensor | None = None
+    ) -> tuple[Tensor, Memory | None]:
+        """Refines the 3DGS tokens, all of them: ``Block.forward``."""
+        parts = self.kvq_proj(self.norm(tokens)).chunk(3, dim=-1)
+        keys, values, queries = (_by_head(part, self.heads) for part in parts)
+        if state is not None:
+            keys = torch.cat([state.keys.to(keys.dtype), keys], dim=2)
+            values = torch.cat([state.values.to(values.dtype), values], dim=2)
+        hidden = F.scaled_dot_product_attention(queries, keys, values, attn_mask=layout)
+        tokens = tokens + self.out_proj(hidden.transpose(1, 2).flatten(2))
+        return tokens + self.mlp(self.mlp_norm(tokens)), state
+
+    def layout(self, tokens: Tensor, state: Memory | None, lengths: Tensor | None) -> Tensor | None:
+        """Which keys are seen, ``[B, 1, 1, K + L]`` bool: the prefix, and a picture's own tokens.
+
+        A picture without tokens keeps one of its filling, since an attention to nothing may be NaN.
+        """
+        if lengths is None:
+            return None
+        steps = torch.arange(tokens.shape[1], device=tokens.device)
+        own = steps < lengths.clamp_min(1)[:, None]
+        prefix = 0 if state is None else state.keys.shape[2]
+        return F.pad(own, (prefix, 0), value=True)[:, None, None]
+
+    @staticmethod
+    def after(blocks: Blocks, prefix: Tensor) -> list[Memory]:
+        """Keys and values of each block's prefix: ``Block.after``."""
+        first = blocks[0]
+        assert isinstance(first, AttentionBlock)
+        rows = 2 * prefix.shape[-1]
+        found = product(prefix, stacked(blocks, "kvq_proj.weight", rows))
+        found = found + stacked(blocks, "kvq_proj.bias", rows)
+        return [
+            Memory(*(_by_head(half, first.heads) for half in both.chunk(2, dim=-1)))
+            for both in found.unbind(2)
+        ]
+
+
+def _by_head(tokens: Tensor, heads: int) -> Tensor:
+    """``[B, L, width]`` to ``[B, heads, L, width / heads]``."""
+    return tokens.unflatten(2, (heads, -1)).transpose(1, 2)

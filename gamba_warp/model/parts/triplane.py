@@ -1,0 +1,108 @@
+"""Colours from three planes of features: the decoder ``triplane`` (paper, question Q3, answer A3).
+
+The blocks and tokens that the other decoders have say where the Gaussians are, how large and how
+opaque. A second branch of blocks of the same depth and width, behind the same prefix, turns learned
+tokens into three square planes of features, which lie in x and y, x and z, y and z and span
+±``position_range``. Each Gaussian's centre is looked up in all three, and an MLP makes its colour
+of what it finds there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ...gaussians import Gaussians
+from ..config import GambaConfig
+from .block import make_norm, run_blocks
+from .decoder import GaussianDecoder
+
+AXES = ((0, 1), (0, 2), (1, 2))  # of the planes: the first along a row, the second down a column
+
+
+class PlaneBranch(nn.Module):
+    """The branch that makes the planes: 3n² learned tokens, its own blocks, norm and projection."""
+
+    def __init__(self, config: GambaConfig, blocks: nn.ModuleList) -> None:
+        """Builds the branch around blocks, whose states ``prefix_states`` computes apart."""
+        super().__init__()
+        side, features = config.triplane_size, config.triplane_features
+        self.sides = 3, side, side
+        self.embedding = nn.Parameter(torch.empty(3 * side**2, config.width))
+        nn.init.normal_(self.embedding, std=config.embedding_init)
+        vars(self.embedding)["_no_weight_decay"] = True
+        self.blocks = blocks
+        self.norm = make_norm(config, final=True)
+        self.features = nn.Linear(config.width, features)
+        nn.init.normal_(self.features.weight, std=config.width**-0.5)
+        nn.init.zeros_(self.features.bias)
+
+    def forward(self, batch: int, states: Sequence[Any], recompute: bool = False) -> Tensor:
+        """Makes the planes of ``batch`` pictures: ``[B, 3, features, n, n]``.
+
+        Args:
+            batch: B.
+            states: of ``blocks``, after the prefix of these pictures.
+            recompute: as for ``run_blocks``.
+        """
+        tokens = self.embedding.expand(batch, -1, -1)
+        tokens = run_blocks(self.blocks, tokens, states, recompute)
+        return self.features(self.norm(tokens)).unflatten(1, self.sides).permute(0, 1, 4, 2, 3)
+
+
+def query_planes(planes: Tensor, points: Tensor) -> Tensor:
+    """Looks points up in three planes, bilinearly between the four nearest cells' centres.
+
+    Args:
+        planes: ``[B, 3, C, n, n]``, in the order of ``AXES``.
+        points: ``[B, N, 3]``, where -1 and 1 are the outer edges of the planes. Beyond the centres
+            of the outermost cells a plane goes on as it is there.
+
+    Returns:
+        ``[B, N, 3C]``, the planes one after the other.
+    """
+    places = torch.stack([points[..., list(axes)] for axes in AXES], 1)
+    found = F.grid_sample(
+        planes.flatten(0, 1),
+        places.flatten(0, 1)[:, None],
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )
+    return found[:, :, 0].unflatten(0, (-1, 3)).permute(0, 3, 1, 2).flatten(2)
+
+
+class TriplaneDecoder(GaussianDecoder):
+    """``GaussianDecoder`` with an MLP of the planes' features in place of its head for colours."""
+
+    colored = False
+
+    def __init__(self, config: GambaConfig) -> None:
+        super().__init__(config)
+        width, features = config.decoder_width or config.width, 3 * config.triplane_features
+        first, second = nn.Linear(features, width), nn.Linear(width, width)
+        self.plane_mlp = nn.Sequential(first, nn.SiLU(), second, nn.SiLU())
+        self.init_mlp(first, second)
+        self.plane_color = nn.Linear(width, 3)
+        self.init_head(self.plane_color)
+
+    def forward(self, tokens: Tensor, planes: Tensor) -> Gaussians:
+        """Decodes tokens and planes to Gaussians in float32.
+
+        Args:
+            tokens: ``[B, L, width]``.
+            planes: the result of ``PlaneBranch``.
+
+        Returns:
+            ``[B, L]``; the ranges are those of ``GaussianDecoder``. No gradient comes to the
+            positions by the places in the planes (the authors' public code stops it, too).
+        """
+        parts = self.shapes(self.mlp(tokens))
+        places = parts["means"].detach() / self.config.position_range
+        hidden = self.plane_mlp(query_planes(planes.float(), places))
+        with torch.autocast(tokens.device.type, enabled=False):
+            return Gaussians(**parts, colors=self.plane_color(hidden.float()).sigmoid())

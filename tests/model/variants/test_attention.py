@@ -1,0 +1,206 @@
+"""Attention in place of Mamba, against a plain float64 form that prepends and drops."""
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers.model import inputs, micro
+
+from gamba_warp.cameras import Cameras
+from gamba_warp.errors import UserError
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.gamba import make_blocks as blocks_of
+from gamba_warp.model.parts.block import prefix_states, run_blocks
+
+FIELDS = ("means", "scales", "opacities", "colors")
+
+
+def make_blocks(depth: int, camera: int, image: int, **changes) -> torch.nn.ModuleList:
+    small = {"width": 24, "mixer": "attention", "attention_heads": 3, "encoder": "none"}
+    blocks = blocks_of(GambaConfig(**(small | {"depth": depth} | changes)), camera, image)
+    with torch.no_grad():
+        for parameter in blocks.parameters():  # none is 0 or 1 by chance, or as in another block
+            parameter += 0.1 * torch.randn_like(parameter)
+    return blocks
+
+
+def _norm(module: torch.nn.Module, x: torch.Tensor) -> torch.Tensor:
+    if isinstance(module, torch.nn.LayerNorm):
+        x = x - x.mean(-1, keepdim=True)
+    x = x / (x.square().mean(-1, keepdim=True) + 1e-5).sqrt() * module.weight.double()
+    return x + module.bias.double() if isinstance(module, torch.nn.LayerNorm) else x
+
+
+def _linear(layer: torch.nn.Linear, x: torch.Tensor) -> torch.Tensor:
+    return x @ layer.weight.double().T + layer.bias.double()
+
+
+def _plain_block(block, tokens, prefix):
+    """One transformer block as it is written, head by head and picture by picture."""
+    found = []
+    for sequence, before in zip(tokens, prefix):
+        whole = _norm(block.norm, torch.cat([before, sequence]))
+        keys, values, queries = _linear(block.kvq_proj, whole).chunk(3, -1)
+        size = whole.shape[-1] // block.heads
+        heads = []
+        for h in range(block.heads):
+            k, v, q = (part[:, h * size : (h + 1) * size] for part in (keys, values, queries))
+            weights = (q @ k.T / size**0.5).exp()
+            heads.append(weights / weights.sum(-1, keepdim=True) @ v)
+        mixed = _linear(block.out_proj, torch.cat(heads, -1))[len(before) :]
+        sequence = sequence + mixed
+        inner = _linear(block.mlp[0], _norm(block.mlp_norm, sequence))
+        inner = inner * 0.5 * (1 + torch.erf(inner / 2**0.5))
+        found.append(sequence + _linear(block.mlp[2], inner))
+    return torch.stack(found)
+
+
+def prepend_and_drop(blocks, tokens, camera, image):
+    tokens = tokens.double()
+    for block in blocks:
+        prefix = tokens[:, :0]
+        for project, condition in ((block.project_camera, camera), (block.project_image, image)):
+            if condition is not None:
+                prefix = torch.cat([prefix, _linear(project, condition.double())], 1)
+        tokens = _plain_block(block, tokens, prefix)
+    return tokens
+
+
+@pytest.mark.parametrize(
+    "camera, image, changes",
+    [
+        (7, 11, {}),
+        (0, 11, {"norm": "rms", "attention_mlp": 1}),
+        (7, 0, {"attention_heads": 0}),
+        (0, 0, {"attention_heads": 24}),
+    ],
+)
+def test_equals_the_plain_form(camera, image, changes):
+    blocks = make_blocks(3, camera, image, **changes)
+    leaves = {"tokens": torch.randn(2, 37, 24)}
+    if camera:
+        leaves["camera"] = torch.randn(2, 1, camera)
+    if image:
+        leaves["image"] = torch.randn(2, 5, image)
+    leaves = {name: leaf.requires_grad_() for name, leaf in leaves.items()}
+    condition = leaves.get("camera"), leaves.get("image")
+    named = {**leaves, **dict(blocks.named_parameters())}
+    cotangent = torch.randn(2, 37, 24)
+
+    def gradients(out):
+        grads = torch.autograd.grad(out, list(named.values()), cotangent.to(out.dtype))
+        return dict(zip(named, grads))
+
+    got = run_blocks(blocks, leaves["tokens"], prefix_states(blocks, *condition))
+    want = prepend_and_drop(blocks, leaves["tokens"], *condition)
+    # Float32 against float64, through three blocks.
+    assert_rel_rms(got, want, 2e-6, "tokens")
+    wanted, gotten = gradients(want), gradients(got)
+    for name, grad in wanted.items():
+        if name.endswith("kvq_proj.bias"):  # a key's bias changes nothing: its gradient is rounding
+            grad, gotten[name] = grad[24:], gotten[name][24:]
+        assert_rel_rms(gotten[name], grad, 2e-5, name)
+
+
+def test_every_token_sees_every_other_and_is_not_cut_into_segments(monkeypatch):
+    blocks, tokens = make_blocks(1, 0, 0), torch.randn(1, 9, 24)
+    monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", 2)
+    with torch.no_grad():
+        base = run_blocks(blocks, tokens, [None])
+        tokens[:, 8, :5] += 1  # of all channels the norm would take it away
+        moved = (run_blocks(blocks, tokens, [None]) - base).abs().amax(-1)
+    assert (moved > 1e-5).all()
+
+
+def test_what_fills_up_a_batch_is_not_seen():
+    blocks, lengths = make_blocks(2, 7, 0), torch.tensor([5, 9, 0])
+    tokens, camera = torch.randn(3, 9, 24), torch.randn(3, 1, 7)
+    states = prefix_states(blocks, camera, None)
+    got = run_blocks(blocks, tokens, states, lengths=lengths)
+    assert got.isfinite().all()
+    for picture, length in enumerate(lengths):
+        own = slice(picture, picture + 1)
+        alone = run_blocks(
+            blocks, tokens[own, :length], [state._make(x[own] for x in state) for state in states]
+        )
+        # Sums over another number of keys, of which some weigh 0.
+        torch.testing.assert_close(got[own, :length], alone, rtol=1e-5, atol=1e-6)
+    nothing = run_blocks(make_blocks(2, 0, 0), tokens, [None, None], lengths=lengths)
+    assert nothing.isfinite().all()
+
+
+def cut_outs() -> tuple[torch.Tensor, Cameras]:
+    """Noise in boxes of 4, 1, 6 and no patches of transparent pictures."""
+    images, cameras = inputs(4)
+    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
+    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
+    return rgba, cameras
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+def test_a_batch_on_rays_is_each_picture_alone(gradients):
+    changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
+    model = Gamba(micro(mixer="attention", attention_heads=2, encoder="none", **changes))
+    torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
+    rgba, cameras = cut_outs()
+    with torch.set_grad_enabled(gradients):
+        together = model(rgba, cameras)
+        if gradients:
+            sum(getattr(together, name).sum() for name in FIELDS).backward()
+            assert all(p.grad.isfinite().all() for p in model.parameters())
+        for index, patches in enumerate((4, 1, 6, 0)):
+            alone = model(rgba[index : index + 1], cameras[[index]])
+            assert alone.num == patches * 4 * 3
+            for name in FIELDS:
+                got = getattr(together, name)[index, : alone.num]
+                # The same sums in products of other shapes: a few roundings.
+                torch.testing.assert_close(got, getattr(alone, name)[0], rtol=2e-5, atol=2e-6)
+
+
+def test_recomputation_and_segments_change_nothing():
+    model = Gamba(micro(mixer="attention", attention_heads=4), "random")
+    images, cameras = inputs(2)
+    cotangent, grads = torch.randn(2, 36, 3), []
+    for model.recompute in (False, True):
+        model.zero_grad()
+        (model(images, cameras).means * cotangent).sum().backward()
+        grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
+    for name, grad in grads[0].items():
+        assert torch.equal(grads[1][name], grad), name
+    kept = model(images, cameras, background_margin=0)  # noise: every patch is the object's
+    with torch.no_grad():
+        condition = model.condition(images, cameras)
+        assert torch.equal(model(images, cameras, condition).means, kept.means)
+
+
+def test_bfloat16_autocast_stays_near_float32():
+    blocks = make_blocks(1, 7, 11)
+    tokens, condition = torch.randn(2, 19, 24), (torch.randn(2, 1, 7), torch.randn(2, 4, 11))
+    states = prefix_states(blocks, *condition)
+    want = run_blocks(blocks, tokens, states)
+    with torch.autocast("cpu", torch.bfloat16):
+        for given in (states, prefix_states(blocks, *condition)):
+            got = run_blocks(blocks, tokens, given)
+            assert got.dtype == torch.float32  # the residual stream is not rounded
+            # bfloat16 keeps 8 bits; each branch passes through five roundings of 0.2 to 0.4 %.
+            assert_rel_rms(got - tokens, want - tokens, 2e-2, "branch")
+
+
+def test_sizes():
+    with torch.device("meta"):
+        plain, wide = (
+            Gamba(GambaConfig(encoder="none", dt_rank=32, **changes))
+            for changes in ({}, {"mixer": "attention", "attention_mlp": 1})
+        )
+    counts = [sum(p.numel() for p in m.blocks.parameters()) for m in (plain, wide)]
+    assert 0.93 < counts[1] / counts[0] < 1.0
+    assert wide.blocks[0].heads == 8
+    assert GambaConfig(width=48).num_heads == 1
+
+
+def test_refused():
+    with pytest.raises(UserError, match="width 16 is not a multiple of num_heads 3"):
+        micro(mixer="attention", attention_heads=3)
+    assert micro(attention_heads=3).mixer == "mamba"
+    with pytest.raises(UserError, match="mlp_width is 65,536, over 32,768"):
+        GambaConfig(mixer="attention", width=4096, attention_mlp=16, depth=1)

@@ -1,0 +1,134 @@
+"""Image tokens among the 3DGS tokens: where they stand, and that a plain Mamba block runs."""
+
+import pytest
+import torch
+from helpers import assert_rel_rms
+from helpers.model import inputs, micro
+
+from gamba_warp.errors import UserError
+from gamba_warp.model.gamba import Gamba, make_blocks
+from gamba_warp.model.parts.block import prefix_states, run_blocks
+from gamba_warp.model.parts.mixed import mixed_places
+
+FIELDS = ("means", "scales", "opacities", "colors")
+
+
+def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
+    blocks = make_blocks(micro(image_tokens="mixed", depth=3, **changes), camera, image)
+    with torch.no_grad():
+        for parameter in blocks.parameters():  # none is 0 or 1 by chance, or as in another block
+            parameter += 0.1 * torch.randn_like(parameter)
+    return blocks
+
+
+def plain(blocks, tokens, camera, image):
+    """Picture by picture, each token put into a list where it belongs."""
+    for block in blocks:
+        pairs = ((block.project_camera, camera), (block.project_image, image))
+        extra = torch.cat([project(x) for project, x in pairs if x is not None], 1)
+        outputs = []
+        for own, others in zip(tokens, extra):
+            length, count = len(own), len(others)
+            sequence, kept, k = [], [], 0
+            for i in range(length):
+                while k < count and (k + 1) * length // (count + 1) == i:
+                    sequence.append(others[k])
+                    k += 1
+                kept.append(len(sequence))
+                sequence.append(own[i])
+            assert k == count  # none stands behind the last 3DGS token
+            hidden, _ = block.mamba(block.norm(torch.stack(sequence))[None])
+            outputs.append(own + hidden[0, kept])
+        tokens = torch.stack(outputs)
+    return tokens
+
+
+@pytest.mark.parametrize(
+    "camera, count, length", [(0, 1, 10), (7, 4, 37), (7, 0, 3), (0, 23, 9), (7, 64, 65)]
+)
+def test_equals_the_plain_form(camera, count, length):
+    blocks = blocks_of(camera, 11 if count else 0, norm="rms" if camera else "layer")
+    leaves = {"tokens": torch.randn(2, length, 16)}
+    if camera:
+        leaves["camera"] = torch.randn(2, 1, camera)
+    if count:
+        leaves["image"] = torch.randn(2, count, 11)
+    condition = leaves.get("camera"), leaves.get("image")
+    named = {n: x.requires_grad_() for n, x in leaves.items()} | dict(blocks.named_parameters())
+    want = plain(blocks, leaves["tokens"], *condition)
+    got = run_blocks(blocks, leaves["tokens"], prefix_states(blocks, *condition))
+    # Float32 sums in another order, through three blocks.
+    assert_rel_rms(got, want, 1e-6, "tokens")
+    cotangent = torch.randn(2, length, 16)
+    wanted, gotten = (torch.autograd.grad(out, [*named.values()], cotangent) for out in (want, got))
+    for name, grad, other in zip(named, wanted, gotten):
+        assert_rel_rms(other, grad, 1e-5, name)
+
+
+def test_places_known_answer():
+    # Of 10 own tokens and 2 others, these stand before tokens 3 and 6; the filling stays behind.
+    got = mixed_places(2, 12, torch.tensor([10, 12, 0]))
+    assert got[0].tolist() == [3, 7, 0, 1, 2, 4, 5, 6, 8, 9, 10, 11, 12, 13]
+    assert got[1, :2].tolist() == [4, 9]
+    assert got[2].tolist() == [*range(14)]
+    for row in mixed_places(5, 3, torch.tensor([3, 1])):
+        assert sorted(row.tolist()) == list(range(8))
+
+
+def test_a_token_is_seen_by_those_behind_it_alone(monkeypatch):
+    monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", 2)  # is not to cut the sequence
+    blocks, tokens, image = blocks_of(0, 11), torch.randn(1, 9, 16), torch.randn(1, 2, 11)
+    with torch.no_grad():
+        base = run_blocks(blocks, tokens, prefix_states(blocks, None, image))
+        image[0, 1] += 1
+        moved = run_blocks(blocks, tokens, prefix_states(blocks, None, image)) - base
+    assert (moved[0, :6] == 0).all() and (moved[0, 6:].abs().amax(-1) > 1e-5).all()
+
+
+def test_a_batch_on_rays_is_each_picture_alone():
+    changes = {"decoder": "rays", "ray_cells": 2, "ray_layers": 3, "ray_features": 5}
+    model = Gamba(micro(image_tokens="mixed", **changes), "random")
+    torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
+    images, cameras = inputs(4)
+    rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
+    rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
+    together = model(rgba, cameras)
+    for index, patches in enumerate((4, 1, 6, 0)):
+        alone = model(rgba[index : index + 1], cameras[[index]])
+        assert alone.num == patches * 4 * 3
+        for name in FIELDS:
+            got = getattr(together, name)[index, : alone.num]
+            # The same sums in products of other shapes: a few roundings.
+            torch.testing.assert_close(got, getattr(alone, name)[0], rtol=2e-5, atol=2e-6)
+
+
+def test_condition_recomputation_and_autocast():
+    model = Gamba(micro(image_tokens="mixed"), "random")
+    images, cameras = inputs(2)
+    cotangent, grads = torch.randn(2, 36, 3), []
+    for model.recompute in (False, True):
+        model.zero_grad()
+        (model(images, cameras).means * cotangent).sum().backward()
+        grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
+    for name, grad in grads[0].items():
+        assert torch.equal(grads[1][name], grad), name
+    with torch.no_grad():
+        want = model(images, cameras).means
+        condition = model.condition(images, cameras)
+        assert torch.equal(model(images, cameras, condition).means, want)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = model(images, cameras, condition).means
+    assert_rel_rms(rounded, want, 0.1, "bfloat16")  # 8 bits, through two blocks
+
+
+def test_attention_knows_no_order():
+    given = [micro(mixer="attention", image_tokens=kind) for kind in ("prefix", "mixed")]
+    one, other = (Gamba(config, "random") for config in given)
+    other.load_state_dict(one.state_dict())
+    batch = inputs(1)
+    assert torch.equal(one(*batch).means, other(*batch).means)
+
+
+def test_refused():
+    with pytest.raises(UserError, match="image_tokens mixed needs prepend"):
+        micro(image_tokens="mixed", prepend=False)

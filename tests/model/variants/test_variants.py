@@ -1,0 +1,91 @@
+"""The variants of the network: that the presets stay what they are, and that files hold each."""
+
+import hashlib
+import json
+
+import pytest
+import torch
+from helpers.model import inputs, micro
+
+from gamba_warp.model.checkpoint import load_model, save_model
+from gamba_warp.model.config import PRESETS, GambaConfig
+from gamba_warp.model.encoders import outline_encoder
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.predict import reconstruct
+
+# Names and shapes of the tensors that files of the presets hold; older files have the same.
+STORED = {
+    "tiny": "3f61a702eabbc5c7",
+    "rays": "8c65916990cee708",
+    "small": "7d49ecd3649f9569",
+    "paper": "ce8b5e294b63d7c8",
+    "released": "d2aa8d5e9898f27a",
+}
+NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
+NEW += ("triplane_size", "triplane_features", "image_tokens")
+VARIANTS = [
+    {"mixer": "attention", "attention_heads": 2},
+    {"mixer": "attention", "attention_mlp": 1, "norm": "rms", "prepend": False},
+    {"mixer": "attention", "decoder": "rays", "ray_cells": 2, "ray_coarse": 1},
+    {"mixed_tokens": True, "image_size": 8},
+    {"mixed_tokens": True, "image_size": 8, "mixer": "attention"},
+    {"decoder": "triplane", "triplane_size": 3, "triplane_features": 5},
+    {"image_tokens": "mixed"},
+    {"image_tokens": "mixed", "norm": "rms", "decoder": "rays", "ray_cells": 2},
+    {"image_tokens": "mixed", "decoder": "triplane", "triplane_size": 3},
+    {"decoder": "triplane", "triplane_size": 2, "mixer": "attention", "predict_rotation": True},
+    {"decoder": "triplane", "triplane_size": 5, "mixed_tokens": True, "image_size": 8},
+]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_store_what_they_stored(preset):
+    config = PRESETS[preset]
+    with torch.device("meta"):
+        state = Gamba(config, encoder=outline_encoder(config)).stored_state()
+    text = json.dumps([[name, list(value.shape)] for name, value in state.items()])
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == STORED[preset]
+
+
+def test_older_files_mean_the_defaults():
+    values = json.loads(PRESETS["tiny"].to_json())
+    old = {name: value for name, value in values.items() if name not in NEW}
+    assert len(old) == len(values) - len(NEW)
+    assert GambaConfig.from_json(json.dumps(old)) == PRESETS["tiny"]
+
+
+@pytest.mark.parametrize("changes", VARIANTS, ids=str)
+def test_files_hold_a_variant(tmp_path, changes):
+    model = Gamba(micro(**({"encoder": "none"} | changes))).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.01 * torch.randn_like(parameter)
+    save_model(tmp_path / "m.safetensors", model)
+    loaded = load_model(tmp_path / "m.safetensors")
+    assert loaded.config == model.config
+    size = model.config.image_size
+    picture = torch.rand(size, size, 4).numpy()
+    want, got = reconstruct(model, picture), reconstruct(loaded, picture)
+    for name in ("means", "scales", "opacities", "colors"):
+        assert torch.equal(getattr(got, name), getattr(want, name)), name
+        assert getattr(got, name).isfinite().all()
+
+
+@pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])
+@pytest.mark.parametrize("changes", VARIANTS, ids=str)
+def test_every_parameter_of_a_variant_is_counted_and_learns(changes, encoder):
+    model = Gamba(micro(**({"encoder": encoder} | changes)), "random")
+    own = {n: p for n, p in model.named_parameters() if not n.startswith("encoder.")}
+    count = sum(p.numel() for p in own.values())
+    assert count <= model.config.num_parameters
+    assert model.encoder or count == model.config.num_parameters
+    images, cameras = inputs(2, model.config.image_size)
+    if model.config.input_channels == 4:
+        images = torch.cat([images, 0.2 + 0.6 * torch.rand_like(images[..., :1])], -1)
+    made = model(images, cameras)
+    parts = [made.means, made.scales, made.opacities, made.colors]
+    parts += [] if made.quats is None else [made.quats]
+    sum((part * torch.randn_like(part)).sum() for part in parts).backward()
+    for name, parameter in own.items():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all() and parameter.grad.abs().max() > 0, name
