@@ -246,6 +246,14 @@ class TrainConfig:
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers", "views.cache"}
 _MUST_STAY = {"run.seed"}
 _TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
+# The processes of one run may have these apart from one another; of files their contents count.
+_OF_A_MACHINE = {"views.extra", "views.workers", "views.cache"} | {
+    f"run.{name}"
+    for name in (
+        *("out", "config", "resume", "init", "encoder_weights", "device", "threads", "keep"),
+        *("log", "tensorboard"),
+    )
+}
 # The groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {
     "length": LengthConfig,
@@ -279,6 +287,19 @@ def config_differences(stored: dict, current: dict, free: bool = False) -> list[
             there, here = (str(values.get(name))[:80] for values in (old, new))
             differing.append(f"{name} ({there} there, {here} here)")
     return differing
+
+
+def options_of_all(values: dict) -> dict[str, object]:
+    """The options that all processes of a run must have in common.
+
+    Args:
+        values: of ``to_dict``.
+
+    Returns:
+        Values by name. Left out is where a machine reads and writes, and how fast it does so.
+    """
+    flat = _flatten({name: value for name, value in values.items() if name not in ("data", "set")})
+    return {name: value for name, value in flat.items() if name not in _OF_A_MACHINE}
 
 
 def _defaults() -> dict:
