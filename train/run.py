@@ -174,17 +174,16 @@ def _refuse_newer(world: World, out: Path, resume: str, checkpoint: Path | None)
     """
     if resume != "auto":
         return
-    names = [path.name for path in list_checkpoints(out)]
-    taken = None if checkpoint is None else checkpoint.name
-    seen = world.gather([socket.gethostname(), names, taken])
+    steps = {int(path.name.split("_")[1]): str(path) for path in list_checkpoints(out)}
+    taken = -1 if checkpoint is None else int(checkpoint.name.split("_")[1])
+    seen = world.gather([socket.gethostname(), list(steps.items()), taken])
     host, known, taken = seen[0]
-    step = -1 if taken is None else int(taken.split("_")[1])
-    for rank, (other, names, _) in enumerate(seen):
-        newer = [n for n in names if n not in known and int(n.split("_")[1]) > step]
+    for rank, (other, found, _) in enumerate(seen):
+        newer = [path for step, path in found if step > taken and step not in dict(known)]
         if newer:
             raise UserError(
-                f"{out}: process {rank} on {other} sees {newer[-1]}, process 0 on {host} does "
-                "not: start with that machine as the first, or give a shared folder as --out"
+                f"process {rank} on {other} sees {newer[-1]}, process 0 on {host} does not: start "
+                "with that machine as the first, or give a shared folder as --out"
             )
 
 

@@ -1,12 +1,13 @@
 """Training in several processes, as torchrun starts them, each with its own options."""
 
 import os
-import signal
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from helpers import micro
 
@@ -46,37 +47,41 @@ def words(data: Path, out: Path, *more: object) -> list[str]:
     return [*map(str, [data, *quick, *more])]
 
 
-def run_all(arguments: list[list[str]], *, patch: dict[int, str] | None = None) -> list[End]:
-    """Runs ``gamba train`` in processes that know of one another; all of them end in time.
+def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -> list[End]:
+    """Runs ``gamba train`` in processes that know of one another.
 
     Args:
         arguments: of each process, by its rank.
         patch: by rank, Python that runs before the training.
 
     Returns:
+        As for ``run_all``.
+    """
+    commands = []
+    for rank, own in enumerate(arguments):
+        script = f"{(patch or {}).get(rank, '')}\nimport sys\nfrom gamba_warp import cli\n"
+        script += "cli.main(['train', *sys.argv[1:]])\n"
+        commands.append([sys.executable, "-c", script, *own])
+    return run_all(commands)
+
+
+def run_all(commands: list[list[str]]) -> list[End]:
+    """Runs commands that know of one another as torchrun's workers do; all of them end in time.
+
+    Returns:
         How each ended, by rank; who was still there after ``LONGEST`` has the code -9.
     """
-    port = free_port()
-    started = []
-    for rank, own in enumerate(arguments):
-        first = (patch or {}).get(rank, "")
-        script = f"import sys; sys.argv[0] = 'gamba'\n{first}\nfrom gamba_warp import cli\n"
-        script += "cli.main(['train', *sys.argv[1:]])\n"
-        place = environment(
-            RANK=rank,
-            LOCAL_RANK=rank,
-            WORLD_SIZE=len(arguments),
-            MASTER_ADDR="127.0.0.1",
-            MASTER_PORT=port,
-        )
-        command = [sys.executable, "-c", script, *own]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        started.append(subprocess.Popen(command, env=place, start_new_session=True, **pipes))
-    ends = []
+    known = {"WORLD_SIZE": len(commands), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port()}
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    started, ends = [], []
     try:
+        for rank, command in enumerate(commands):
+            place = environment(RANK=rank, LOCAL_RANK=rank, **known)
+            started.append(subprocess.Popen(command, env=place, **pipes))
+        limit = time.monotonic() + LONGEST
         for process in started:
             try:
-                out, err = process.communicate(timeout=LONGEST)
+                out, err = process.communicate(timeout=max(0.1, limit - time.monotonic()))
             except subprocess.TimeoutExpired:
                 process.kill()
                 out, err = process.communicate()
@@ -84,6 +89,6 @@ def run_all(arguments: list[list[str]], *, patch: dict[int, str] | None = None) 
     finally:
         for process in started:
             if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
+                process.kill()
                 process.wait()
     return ends
