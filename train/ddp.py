@@ -11,11 +11,14 @@ import inspect
 import json
 import os
 import re
+import secrets
 import socket
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,6 +31,7 @@ from torch.nn.parallel import DistributedDataParallel
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import sha256, why_not_written
 
+_MEETING = timedelta(minutes=5)  # processes start at different times
 _PIECE = 64 << 20  # bytes of a file that are sent at once
 _SHOWN = 4  # names of a list that a message shows
 # What gloo and NCCL say where another process has gone; of a defect they say other things.
@@ -286,15 +290,53 @@ def world(device: str = "auto") -> Iterator[World]:
     try:
         # What is small (stop flags, errors) goes through gloo; ``wrap`` takes NCCL for gradients
         # on GPUs, after it is known that all processes have one.
-        dist.init_process_group("gloo")
+        store = _meet(rank, size)
+        dist.init_process_group("gloo", store=store, rank=rank, world_size=size)
         yield World(rank, size, chosen)
     except RuntimeError as error:
+        text = re.sub(r"\[[^][]*\.(cc|cpp):\d+\] ", "", first_line(error))
         if not _GONE.search(str(error)):
             raise
         raise UserError(
-            f"process {rank} on {socket.gethostname()} lost the others: one of them has ended "
-            f"({first_line(error)[:160]})"
+            f"process {rank} on {socket.gethostname()} has lost the others: one of them has ended, "
+            f"or cannot be reached ({text[:100]})"
         ) from error
     finally:
         if dist.is_initialized():
             dist.destroy_process_group()
+
+
+def _meet(rank: int, size: int) -> dist.Store:
+    """Joins the processes that were started with this one, and gives them a store of their own.
+
+    torchrun's store outlives the processes that it starts anew, and holds addresses of dead ones.
+    torch tells them apart by the number of restarts, which each machine counts for itself, so that
+    machines wait for one another in vain. Here each process has a random name, to which rank 0
+    answers with that of the group.
+    """
+    host, port = os.environ.get("MASTER_ADDR", "127.0.0.1"), os.environ.get("MASTER_PORT", "29500")
+    held = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # by torchrun itself
+    store = dist.TCPStore(
+        host, int(port), None, rank == 0 and not held, timeout=_MEETING, wait_for_workers=False
+    )
+    mine = secrets.token_hex(8)
+    store.set(f"gamba/name/{rank}", mine)
+    if rank:
+        group = store.get(f"gamba/group-of/{mine}").decode()
+        store.set(f"gamba/{group}/knows/{rank}", "")
+        return dist.PrefixStore(f"gamba/{group}", store)
+    told: dict[int, bytes] = {}
+    limit, missing = time.monotonic() + _MEETING.total_seconds(), set(range(1, size))
+    while missing:
+        for other in [*missing]:
+            if store.check([f"gamba/{mine}/knows/{other}"]):
+                missing.remove(other)
+            elif store.check([f"gamba/name/{other}"]):
+                name = store.get(f"gamba/name/{other}")
+                if told.get(other) != name:  # the first may be of a dead one
+                    store.set(f"gamba/group-of/{name.decode()}", mine)
+                    told[other] = name
+        if time.monotonic() > limit:
+            raise UserError(f"processes {sorted(missing)} of {size} have not come to {host}:{port}")
+        time.sleep(0.02)
+    return dist.PrefixStore(f"gamba/{mine}", store)
