@@ -171,6 +171,9 @@ class RunConfig:
     """Checkpoints kept; the oldest go first."""
     tensorboard: bool = True
     """Write TensorBoard files, if it is installed."""
+    log: tuple[Literal["wandb"], ...] = ()
+    """Boards beside TensorBoard: "wandb" is Weights & Biases, which its own settings send where
+    they say (WANDB_PROJECT, WANDB_MODE=offline)."""
     device: DeviceChoice = "auto"
     """Device that computes; "auto" is the GPU if there is one."""
     threads: Threads | None = None
@@ -180,6 +183,11 @@ class RunConfig:
     result in less memory and more time."""
     seed: Seed = 0
     """Seed of the initial weights and of the order of the data."""
+
+    @property
+    def boards(self) -> tuple[str, ...]:
+        """Names of the boards that are written beside the log."""
+        return (*(("tensorboard",) if self.tensorboard else ()), *dict.fromkeys(self.log))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """One process or many: ``torchrun -m gamba_warp.train ...`` sets the environment read here.
 
-Where one process ends with an error, all end, each with one line: what may fail on one process alone
-is done inside ``World.together``, and who waits for a process that is gone learns it from gloo.
+Where one process ends with an error, all end, each with one line: what may fail on one process
+alone is done inside ``World.together``, and who waits for one that is gone learns it from gloo.
 """
 
 from __future__ import annotations

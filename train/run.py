@@ -19,6 +19,7 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.versions import installed
 
 from .batches import TrainingData, open_data
+from .boards import check_boards
 from .checkpoint import (
     find_checkpoint,
     find_initial,
@@ -34,6 +35,7 @@ from .objective.losses import open_lpips
 
 _PARTS = ("", ".kernels", ".train", ".eval")  # of the package; they lie apart in a checkout
 _COMPUTE = ("torch", "warp-lang", "numpy", "pillow", "kornia", "timm")
+_PYTHON = ".".join(map(str, sys.version_info[:2]))
 _PICTURES = 16  # objects whose first picture is compared between processes
 
 
@@ -66,6 +68,7 @@ def _train(
     checkpoint = None
     with world.together():
         if world.main:  # the others go by what it finds
+            check_boards(run.log)
             if there:
                 held.enter_context(lock)
             checkpoint = find_checkpoint(run.out, run.resume, damaged.append)
@@ -120,7 +123,7 @@ def _open_log(
             raise UserError(f"{run.out}: another process trained here meanwhile; start again")
     for folder in (run.out, run.out / "samples"):
         sweep(folder, age=0)
-    return RunLog(run.out, run.tensorboard)
+    return RunLog(run.out, run.boards)
 
 
 def _facts(
@@ -132,7 +135,7 @@ def _facts(
     return {
         "options": {**options, **known},
         "data": _contents(data),
-        "versions": {"python": "%d.%d" % sys.version_info[:2], **installed(*_COMPUTE)},
+        "versions": {"python": _PYTHON, **installed(*_COMPUTE)},
         "code": _sources(),
     }
 

@@ -38,7 +38,9 @@ def main() -> None:
             kind = tyro.conf.OmitArgPrefixes[TrainConfig]
             config = tyro.cli(kind, args=arguments[place.rank])
             own = config.run.out  # it sees no other run's folder, as if each had its own disk
-            ddp._holds = lambda folder, files, own=own: own in folder.parents and holds(folder, files)
+            ddp._holds = lambda folder, files, own=own: (
+                own in folder.parents and holds(folder, files)
+            )
             try:
                 with full:
                     ends[name] = [train(config, place), ""]

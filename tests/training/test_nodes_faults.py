@@ -40,7 +40,9 @@ def ends(data, tmp_path_factory):
 
     def step(name, out, steps, *, data=(data, data), outs=None, limits=(None, None), more=()):
         pairs = zip(data, outs or (root / out, root / out))
-        own = [words(d, o, "--steps", steps, "--save-every", 3, "--keep", 9, *more) for d, o in pairs]
+        own = [
+            words(d, o, "--steps", steps, "--save-every", 3, "--keep", 9, *more) for d, o in pairs
+        ]
         plan.append([name, own, limits])
 
     def begin(name):
