@@ -171,6 +171,9 @@ class RunConfig:
     """Checkpoints kept; the oldest go first."""
     tensorboard: bool = True
     """Write TensorBoard files, if it is installed."""
+    log: tuple[Literal["wandb"], ...] = ()
+    """Boards beside TensorBoard: "wandb" is Weights & Biases, which its own settings send where
+    they say (WANDB_PROJECT, WANDB_MODE=offline)."""
     device: DeviceChoice = "auto"
     """Device that computes; "auto" is the GPU if there is one."""
     threads: Threads | None = None
@@ -180,6 +183,11 @@ class RunConfig:
     result in less memory and more time."""
     seed: Seed = 0
     """Seed of the initial weights and of the order of the data."""
+
+    @property
+    def boards(self) -> tuple[str, ...]:
+        """Names of the boards that are written beside the log."""
+        return (*(("tensorboard",) if self.tensorboard else ()), *dict.fromkeys(self.log))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,6 +254,14 @@ class TrainConfig:
 _MAY_CHANGE = {"data", "preset", "set", "length", "run", "views.workers", "views.cache"}
 _MUST_STAY = {"run.seed"}
 _TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
+# The processes of one run may have these apart from one another; of files their contents count.
+_OF_A_MACHINE = {"views.extra", "views.workers", "views.cache"} | {
+    f"run.{name}"
+    for name in (
+        *("out", "config", "resume", "init", "encoder_weights", "device", "threads", "keep"),
+        *("log", "tensorboard"),
+    )
+}
 # The groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {
     "length": LengthConfig,
@@ -279,6 +295,19 @@ def config_differences(stored: dict, current: dict, free: bool = False) -> list[
             there, here = (str(values.get(name))[:80] for values in (old, new))
             differing.append(f"{name} ({there} there, {here} here)")
     return differing
+
+
+def options_of_all(values: dict) -> dict[str, object]:
+    """The options that all processes of a run must have in common.
+
+    Args:
+        values: of ``to_dict``.
+
+    Returns:
+        Values by name. Left out is where a machine reads and writes, and how fast it does so.
+    """
+    flat = _flatten({name: value for name, value in values.items() if name not in ("data", "set")})
+    return {name: value for name, value in flat.items() if name not in _OF_A_MACHINE}
 
 
 def _defaults() -> dict:

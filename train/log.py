@@ -1,4 +1,4 @@
-"""The run's log: one JSON object per line, TensorBoard if it is installed, and sample pictures."""
+"""The run's log: one JSON object per line, boards beside it, and sample pictures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, TextIO
@@ -21,6 +21,8 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import reason_of
 from gamba_warp.images import save_image
 
+from .boards import Board, open_board
+
 _READ = 1 << 16  # bytes read at once in search of the last whole line
 
 
@@ -30,8 +32,12 @@ class RunLog:
     Nothing that goes wrong here stops a run: it is said once, and the run goes on without.
     """
 
-    def __init__(self, run: Path, tensorboard: bool) -> None:
+    def __init__(self, run: Path, boards: Sequence[str] = ()) -> None:
         """Opens the log in the run folder.
+
+        Args:
+            run: the run folder.
+            boards: names that ``open_board`` knows.
 
         Raises:
             UserError: the file cannot be written.
@@ -44,22 +50,23 @@ class RunLog:
             raise UserError(f"cannot write {run / 'log.jsonl'}: {error.strerror}") from error
         self._run = run
         self._said: set[str] = set()
-        self._board = None
-        if tensorboard:
-            with self._guarded("tensorboard"):
-                self._board = _summary_writer(run / "tensorboard")
+        self._boards: dict[str, Board] = {}
+        for name in boards:
+            with self._guarded(name):
+                board = open_board(name, run)
+                if board is not None:
+                    self._boards[name] = board
 
     @contextmanager
     def _guarded(self, name: str) -> Iterator[None]:
         """Says the first error of each writer in one line, and goes on."""
         try:
             yield
-        except Exception as error:  # TensorBoard's thread hands on whatever stopped it
+        except Exception as error:  # a board's thread hands on whatever stopped it
             if name not in self._said:
                 self._said.add(name)
                 say(f"gamba train: {name} cannot be written, the run goes on: {reason_of(error)}")
-            if name == "tensorboard":
-                self._board = None
+            self._boards.pop(name, None)
 
     def _cut(self, size: int) -> None:
         """Takes away what a full disk or a kill left of a line."""
@@ -79,11 +86,9 @@ class RunLog:
             except OSError:
                 self._cut(size)
                 raise
-        if self._board is not None:
-            with self._guarded("tensorboard"):
-                for name, value in values.items():
-                    if isinstance(value, (int, float)) and not isinstance(value, bool):
-                        self._board.add_scalar(f"{event}/{name}", value, step)
+        for name, board in [*self._boards.items()]:
+            with self._guarded(name):
+                board.write(event, step, values)
 
     def warn(self, step: int, message: str) -> None:
         """Prints one line above the progress bar and logs it."""
@@ -107,9 +112,9 @@ class RunLog:
     def close(self) -> None:
         """Closes the files."""
         self._file.close()
-        if self._board is not None:
-            with self._guarded("tensorboard"):
-                self._board.close()
+        for name, board in [*self._boards.items()]:
+            with self._guarded(name):
+                board.close()
 
 
 def say(text: str, file: TextIO | None = None) -> None:
@@ -161,14 +166,6 @@ def _plain(value: object) -> object:
     if isinstance(value, dict):
         return {name: _plain(inner) for name, inner in value.items()}
     return value
-
-
-def _summary_writer(folder: Path):
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder))
 
 
 def save_strip(path: Path, rows: list[Tensor]) -> None:

@@ -342,12 +342,12 @@ class Trainer:
 
     def save(self) -> None:
         """Writes a checkpoint on the main process, once per step; the others wait."""
-        if self.world.main and self._saved != self.step:
-            models = {"model": self.model} | ({"ema": self.ema.model} if self.ema else {})
-            run = self.config.run
-            save_checkpoint(run.out, self.step, models, self.state(), run.keep)
-            self._saved = self.step
-        self.world.barrier()
+        with self.world.together():
+            if self.world.main and self._saved != self.step:
+                models = {"model": self.model} | ({"ema": self.ema.model} if self.ema else {})
+                run = self.config.run
+                save_checkpoint(run.out, self.step, models, self.state(), run.keep)
+                self._saved = self.step
 
     def state(self) -> dict:
         """Returns all that a continued run needs beside the weights: tensors and plain values."""

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import importlib
+import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
+from gamba_warp.batch import EXPECTED
 from gamba_warp.errors import UserError
-from gamba_warp.files import only_process, output_folder, sweep, write_json
+from gamba_warp.files import only_process, output_folder, sha256, sweep, write_json
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.versions import installed
 
 from .batches import TrainingData, open_data
+from .boards import check_boards
 from .checkpoint import (
     find_checkpoint,
     find_initial,
@@ -21,11 +27,16 @@ from .checkpoint import (
     list_checkpoints,
     load_weights,
 )
-from .config import TrainConfig, command_line
+from .config import TrainConfig, command_line, options_of_all
 from .ddp import World
 from .log import RunLog, say
 from .loop import Trainer
 from .objective.losses import open_lpips
+
+_PARTS = ("", ".kernels", ".train", ".eval")  # of the package; they lie apart in a checkout
+_COMPUTE = ("torch", "warp-lang", "numpy", "pillow", "kornia", "timm")
+_PYTHON = ".".join(map(str, sys.version_info[:2]))
+_PICTURES = 16  # objects whose first picture is compared between processes
 
 
 def train(config: TrainConfig, world: World) -> int:
@@ -39,10 +50,11 @@ def train(config: TrainConfig, world: World) -> int:
         0; 1 if some objects could not be read; 128 + n if signal n stopped it (resumable).
 
     Raises:
-        UserError: bad data, options or run folder.
+        UserError: bad data, options or run folder, or the processes do not have the same.
     """
-    data = open_data(config)
     with contextlib.ExitStack() as held:
+        with world.together():
+            data = open_data(config)
         return _train(config, world, data, held)
 
 
@@ -52,48 +64,130 @@ def _train(
     run = config.run
     lock = only_process(run.out, "trains")
     there = run.out.is_dir()  # one that is not there is made only when nothing is bad
-    if world.main and there:
-        held.enter_context(lock)
     damaged: list[str] = []
-    checkpoint = find_checkpoint(run.out, run.resume, damaged.append)
-    lpips, warning = open_lpips(config)
+    checkpoint = None
+    with world.together():
+        if world.main:  # the others go by what it finds
+            check_boards(run.log)
+            if there:
+                held.enter_context(lock)
+            checkpoint = find_checkpoint(run.out, run.resume, damaged.append)
+        lpips, warning = open_lpips(config)
+    world.agree(lambda: _facts(config, data, world, lpips is not None))
+    _refuse_newer(world, run.out, run.resume, checkpoint)
     torch.manual_seed(run.seed)
     torch.set_float32_matmul_precision("high")  # TF32 where there is a GPU; no effect on a CPU
-    model = Gamba(config.model_config(), run.encoder_weights)
-    model.recompute = run.recompute
     started = ""
-    if run.init is not None and checkpoint is None:
-        started = _load_initial(config, data, model, damaged.append)
+    with world.together():
+        model = Gamba(config.model_config(), run.encoder_weights)
+        model.recompute = run.recompute
+        if run.init is not None and checkpoint is None and world.main:  # ``wrap`` sends it around
+            started = _load_initial(config, data, model, damaged.append)
     model.to(world.device)
     if lpips is not None:
         lpips.to(world.device)
     log = None
-    if world.main:
-        output_folder(run.out / "samples")
-        if not there:
-            held.enter_context(lock)
-            if list_checkpoints(run.out):
-                raise UserError(f"{run.out}: another process trained here meanwhile; start again")
-        for folder in (run.out, run.out / "samples"):
-            sweep(folder, age=0)
-        log = RunLog(run.out, run.tensorboard)
     try:
+        with world.together():
+            if world.main:
+                log = _open_log(config, lock if not there else None, held)
         trainer = Trainer(config, model, data, world, log, lpips)
         notes = [*damaged, *([warning] if warning else [])]
-        if checkpoint is not None:
-            changed = trainer.restore(checkpoint)
-            notes += [changed] if changed else []
+        with world.copied(checkpoint) as seen, world.together():
+            if seen is not None:
+                changed = trainer.restore(seen)
+                notes += [changed] if changed else []
         if log is not None:
             _announce(trainer, log, checkpoint, notes)
             if started:
                 say(started)
         code = trainer.run()
+        failures = {uid: why for own in world.gather(trainer.failures) for uid, why in own.items()}
         if log is not None:
-            code = _report(trainer, log, code)
-        return code
+            _report(trainer, log, code, failures)
+        return code or int(bool(failures))
     finally:
         if log is not None:
             log.close()
+
+
+def _open_log(
+    config: TrainConfig, lock: contextlib.AbstractContextManager | None, held: contextlib.ExitStack
+) -> RunLog:
+    """Makes the run folder, if need be, and holds it for this process alone."""
+    run = config.run
+    output_folder(run.out / "samples")
+    if lock is not None:
+        held.enter_context(lock)
+        if list_checkpoints(run.out):
+            raise UserError(f"{run.out}: another process trained here meanwhile; start again")
+    for folder in (run.out, run.out / "samples"):
+        sweep(folder, age=0)
+    return RunLog(run.out, run.boards)
+
+
+def _facts(
+    config: TrainConfig, data: TrainingData, world: World, lpips: bool
+) -> dict[str, dict[str, object]]:
+    """What all processes must have in common, see ``World.agree``."""
+    options = options_of_all(config.to_dict())
+    known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
+    return {
+        "options": {**options, **known},
+        "data": _contents(data),
+        "versions": {"python": _PYTHON, **installed(*_COMPUTE)},
+        "code": _sources(),
+    }
+
+
+def _contents(data: TrainingData) -> dict[str, str]:
+    """SHA-256 by object, of its cameras and, of some objects, of the first picture."""
+    chosen = sorted(set(data.objects))
+    read = set(chosen[:: max(1, len(chosen) // _PICTURES)])
+    found = {}
+    for index in chosen:
+        files = data.train.files(index)
+        kinds = f"{len(files.images)} {files.depths is None} {files.backs is None}"
+        digest = hashlib.sha256(kinds.encode())
+        for numbers in (files.camera_to_world, files.Ks):
+            digest.update(numbers.tobytes())
+        if index in read:
+            with contextlib.suppress(*EXPECTED):  # the training says so where it matters
+                digest.update(data.train.load(index, [0], depths=0).images.numpy().tobytes())
+        found[data.train.uids[index]] = digest.hexdigest()
+    return found
+
+
+def _sources() -> dict[str, str]:
+    """SHA-256 of the package's own modules, by their names."""
+    found = {}
+    for part in _PARTS:
+        name = f"gamba_warp{part}"
+        folder = Path(str(importlib.import_module(name).__file__)).parent
+        for path in folder.rglob("*.py"):
+            module = ".".join([name, *path.relative_to(folder).with_suffix("").parts])
+            found[module] = sha256(path)
+    return found
+
+
+def _refuse_newer(world: World, out: Path, resume: str, checkpoint: Path | None) -> None:
+    """Refuses to go back where another process sees a newer checkpoint than the main one.
+
+    Without a shared disk this is so when the processes are counted in another order than before.
+    """
+    if resume != "auto":
+        return
+    steps = {int(path.name.split("_")[1]): str(path) for path in list_checkpoints(out)}
+    taken = -1 if checkpoint is None else int(checkpoint.name.split("_")[1])
+    seen = world.gather([socket.gethostname(), list(steps.items()), taken])
+    host, known, taken = seen[0]
+    for rank, (other, found, _) in enumerate(seen):
+        newer = [path for step, path in found if step > taken and step not in dict(known)]
+        if newer:
+            raise UserError(
+                f"process {rank} on {other} sees {newer[-1]}, process 0 on {host} does not: start "
+                "with that machine as the first, or give a shared folder as --out"
+            )
 
 
 def _load_initial(
@@ -135,9 +229,8 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
         say(f"resumed {checkpoint} at step {trainer.step}")
 
 
-def _report(trainer: Trainer, log: RunLog, code: int) -> int:
-    """Says at the end what went wrong on the way; returns the exit code."""
-    failures = trainer.failures
+def _report(trainer: Trainer, log: RunLog, code: int, failures: dict[str, str]) -> None:
+    """Says at the end what went wrong on the way, on any process."""
     log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures)
     log.page()
     if trainer.skipped:
@@ -148,4 +241,3 @@ def _report(trainer: Trainer, log: RunLog, code: int) -> int:
         say(f"stopped by a signal at step {trainer.step}; the same command goes on from here")
     elif code == 0:
         say(f"wrote {trainer.config.run.out / 'model.safetensors'}")
-    return code or int(bool(failures))

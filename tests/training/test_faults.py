@@ -58,7 +58,7 @@ def test_a_log_that_cannot_be_written_is_said_once_and_training_goes_on(data, tm
 def test_a_log_is_of_whole_lines_whatever_happens(tmp_path, capsys):
     path = tmp_path / "log.jsonl"
     path.write_bytes(b'{"event": "a"}\n{"event": "torn')  # by a kill
-    log = RunLog(tmp_path, False)
+    log = RunLog(tmp_path)
     log.write("b", 1)
     with full_at(path.stat().st_size + 10):
         log.write("c", 2)
@@ -71,13 +71,12 @@ def test_a_log_is_of_whole_lines_whatever_happens(tmp_path, capsys):
 
 
 def test_tensorboard_never_stops_a_run(tmp_path, capsys):
-    log = RunLog(tmp_path, True)
-    assert log._board is not None
+    log = RunLog(tmp_path, ["tensorboard"])
 
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    log._board.add_scalar = full
+    log._boards["tensorboard"].writer.add_scalar = full
     for step in range(3):
         log.write("train", step, loss=1.0)
     log.close()
@@ -85,7 +84,7 @@ def test_tensorboard_never_stops_a_run(tmp_path, capsys):
 
 
 def test_sample_pictures_never_stop_a_run(tmp_path, capsys):
-    log = RunLog(tmp_path, False)
+    log = RunLog(tmp_path)
     log.sample(7, tmp_path / "none" / "a.png", [torch.rand(2, 4, 4, 3)])
     assert "cannot write" in capsys.readouterr().out
 

@@ -1,0 +1,187 @@
+"""One of two training processes is killed again and again, as torchrun starts them anew."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_LONGEST = 900.0  # seconds of one run with all its kills
+_STEPS_PER_KILL = 8
+_WAIT = 0.02  # seconds between two looks
+
+
+@dataclass(frozen=True)
+class Killed:
+    """What came of it.
+
+    Attributes:
+        main: how often it was the process that writes.
+        resumed: how often the training went on from a checkpoint.
+        steps: the last step.
+        seconds: of all of it.
+        said: the end of what the processes wrote.
+    """
+
+    main: int
+    resumed: int
+    steps: int
+    seconds: float
+    said: str
+
+
+def steps_for(kills: int) -> int:
+    """Steps of a run in which so many kills find room."""
+    return _STEPS_PER_KILL * kills + 4
+
+
+def kill_one_of_two(words: list[str], out: Path, kills: int, rng: random.Random) -> Killed:
+    """Trains in two processes, each under a torchrun of its own, as on two machines.
+
+    Args:
+        words: options of ``gamba train`` but for the run folder, ``--steps`` and what is saved.
+        out: the run folder; what the processes say goes into a file beside it.
+        kills: how often one of the two is killed.
+        rng: of the moments, and of which of the two it is.
+
+    Raises:
+        RuntimeError: the run does not end well, or not in time.
+    """
+    started = time.monotonic()
+    own = ["--out", out, "--steps", steps_for(kills), "--save-every", 3, "--log-every", 1]
+    reaper = _Reaper(out / "log.jsonl", kills, rng)
+    # A kill fails both workers: the other has lost it.
+    said = _nodes([*words, *map(str, own)], out.with_name(f"{out.name}.txt"), 2 * kills, reaper)
+    return Killed(
+        main=reaper.main,
+        resumed=sum(bool(line["resumed_from"]) for line in _lines(reaper.log, "start")),
+        steps=_lines(reaper.log, "end")[-1]["step"],
+        seconds=round(time.monotonic() - started, 1),
+        said=said[-4000:],
+    )
+
+
+class _Reaper:
+    """Kills one of two workers at random moments: while they start, and while they train."""
+
+    def __init__(self, log: Path, kills: int, rng: random.Random) -> None:
+        self.log, self.left, self.rng = log, kills, rng
+        self.main = 0
+        self._gone: set[int] = set()
+        self._aim()
+
+    def _aim(self) -> None:
+        """Chooses the moment: so many more logged steps, 0 for at once, and then some seconds."""
+        wanted = self.rng.choice((0, *range(1, _STEPS_PER_KILL)))
+        self._steps = len(_lines(self.log, "train")) + wanted
+        self._wait = self.rng.uniform(0, 3.0 if wanted == 0 else 0.1)
+
+    def __call__(self, agents: list[subprocess.Popen]) -> None:
+        """Looks whether the moment has come; ``agents`` are the two torchruns."""
+        if not self.left or len(_lines(self.log, "train")) < self._steps:
+            return
+        workers = [_child(agent.pid) for agent in agents]
+        if None in workers or self._gone & {*workers}:  # not started again yet
+            return
+        time.sleep(self._wait)
+        chosen = self.rng.randrange(2)
+        number = workers[chosen]
+        assert number is not None
+        if number != _child(agents[chosen].pid):
+            return
+        os.kill(number, signal.SIGKILL)
+        self._gone |= {*filter(None, workers)}
+        self.left -= 1
+        self.main += chosen == 0
+        self._aim()
+
+
+def _nodes(
+    words: list[str], notes: Path, restarts: int, look: Callable[[list[subprocess.Popen]], None]
+) -> str:
+    """Runs two torchruns with one worker each to their end; returns what they said."""
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        port = held.getsockname()[1]
+    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes", "2"]
+    command += ["--nproc-per-node", "1", "--max-restarts", str(restarts), "--rdzv-id", "gamba"]
+    command += ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}"]
+    command += ["--local-addr", "127.0.0.1", "-m", "gamba_warp.train", *words]
+    path = os.pathsep.join(filter(None, [str(_root()), os.environ.get("PYTHONPATH")]))
+    place = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+    agents: list[subprocess.Popen[Any]] = []
+    limit = time.monotonic() + _LONGEST
+    with open(notes, "w+", encoding="utf-8", errors="replace") as file:
+        try:
+            for _ in range(2):
+                agents.append(subprocess.Popen(command, env=place, stdout=file, stderr=file))
+                time.sleep(1.0)  # so that the first is the host, and has the lower rank
+            while any(agent.poll() is None for agent in agents):
+                if time.monotonic() > limit:
+                    raise RuntimeError(f"no end after {_LONGEST:.0f} s: {_tail(notes)}")
+                look(agents)
+                time.sleep(_WAIT)
+        finally:
+            for agent in agents:
+                _end(agent)
+    if codes := [agent.returncode for agent in agents if agent.returncode]:
+        raise RuntimeError(f"torchrun ended with code {codes[0]}: {_tail(notes)}")
+    return notes.read_text(encoding="utf-8", errors="replace")
+
+
+def _root() -> Path:
+    """Where Python finds the package."""
+    import gamba_warp
+
+    return Path(str(gamba_warp.__file__)).resolve().parents[1]
+
+
+def _end(agent: subprocess.Popen) -> None:
+    """Ends a torchrun, and its worker by it."""
+    if agent.poll() is not None:
+        return
+    worker = _child(agent.pid)
+    for number in filter(None, (worker, agent.pid)):
+        with suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
+    agent.wait()
+
+
+def _child(parent: int) -> int | None:
+    """The number of a process's worker, which runs the training; None where it has none now."""
+    for entry in os.scandir("/proc"):
+        if not entry.name.isdigit():
+            continue
+        with suppress(OSError, ValueError, IndexError):
+            with open(f"/proc/{entry.name}/stat", encoding="utf-8", errors="replace") as file:
+                state, above = file.read().rpartition(")")[2].split()[:2]
+            if int(above) != parent or state == "Z":
+                continue
+            with open(f"/proc/{entry.name}/cmdline", encoding="utf-8", errors="replace") as file:
+                if "gamba_warp.train" in file.read().split("\0"):
+                    return int(entry.name)
+    return None
+
+
+def _lines(log: Path, event: str) -> list[dict]:
+    """The whole lines of one kind in a run's log; none where there is no log yet."""
+    try:
+        text = log.read_text(encoding="utf-8")
+    except OSError:
+        return []
+    whole = [json.loads(line) for line in text.split("\n")[:-1]]
+    return [line for line in whole if line["event"] == event]
+
+
+def _tail(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")[-2000:]

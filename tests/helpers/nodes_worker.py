@@ -1,0 +1,53 @@
+"""One process of several: trains again and again, as a plan says, and notes how it ends.
+
+Run as ``python -m helpers.nodes_worker PLAN RESULT``. The plan is a JSON list of ``["copy", from,
+to]``, which the first process does, and of ``[name, arguments by rank, most bytes of a file by rank
+or null]``; the result, RESULT with the rank behind it, is an object of ``[code, line]`` by name.
+"""
+
+import contextlib
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import torch
+import tyro
+
+from gamba_warp.errors import UserError
+from gamba_warp.train import ddp
+from gamba_warp.train.config import TrainConfig
+from gamba_warp.train.ddp import world
+from gamba_warp.train.run import train
+from helpers.disk import full_at
+
+
+def main() -> None:
+    plan, result = map(Path, sys.argv[1:])
+    torch.set_num_threads(1)
+    ends, holds = {}, ddp._holds
+    with world("cpu") as place:
+        for name, arguments, limits in json.loads(plan.read_text()):
+            if name == "copy":
+                with place.together():
+                    if place.main:
+                        shutil.copytree(arguments, limits)
+                continue
+            limit = limits[place.rank]
+            full = contextlib.nullcontext() if limit is None else full_at(limit)
+            kind = tyro.conf.OmitArgPrefixes[TrainConfig]
+            config = tyro.cli(kind, args=arguments[place.rank])
+            own = config.run.out  # it sees no other run's folder, as if each had its own disk
+            ddp._holds = lambda folder, files, own=own: (
+                own in folder.parents and holds(folder, files)
+            )
+            try:
+                with full:
+                    ends[name] = [train(config, place), ""]
+            except UserError as error:
+                ends[name] = [2, str(error)]
+    result.with_name(f"{result.name}{place.rank}").write_text(json.dumps(ends))
+
+
+if __name__ == "__main__":
+    main()

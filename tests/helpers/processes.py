@@ -1,0 +1,94 @@
+"""Training in several processes, as torchrun starts them, each with its own options."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from helpers import micro
+
+ROOT = Path(micro.__file__).resolve().parents[2]
+LONGEST = 120  # seconds, after which processes that wait for one another are killed
+
+
+@dataclass(frozen=True)
+class End:
+    """How a process ended: its exit code and what it wrote."""
+
+    code: int
+    out: str
+    err: str
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on now."""
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        return held.getsockname()[1]
+
+
+def environment(**more: object) -> dict[str, str]:
+    """The environment of a child: this checkout, one thread, and ``more``."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+    known = {"PYTHONPATH": path, "OMP_NUM_THREADS": 1, **more}
+    return os.environ | {name: str(value) for name, value in known.items()}
+
+
+def words(data: Path, out: Path, *more: object) -> list[str]:
+    """Arguments of ``gamba train`` for a quick run of a narrow network."""
+    quick = ["--preset", "tiny", "--set", *micro.MODEL, "--lpips", "off", "--device", "cpu"]
+    quick += ["--size", micro.SIZE, "--views-first", 1, "--views-last", 3, "--batch-size", 2]
+    quick += ["--warmup-steps", 1, "--val-every", 0, "--log-every", 1, "--no-tensorboard"]
+    quick += ["--threads", 1, "--out", out]
+    return [*map(str, [data, *quick, *more])]
+
+
+def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -> list[End]:
+    """Runs ``gamba train`` in processes that know of one another.
+
+    Args:
+        arguments: of each process, by its rank.
+        patch: by rank, Python that runs before the training.
+
+    Returns:
+        As for ``run_all``.
+    """
+    commands = []
+    for rank, own in enumerate(arguments):
+        script = f"{(patch or {}).get(rank, '')}\nimport sys\nfrom gamba_warp import cli\n"
+        script += "cli.main(['train', *sys.argv[1:]])\n"
+        commands.append([sys.executable, "-c", script, *own])
+    return run_all(commands)
+
+
+def run_all(commands: list[list[str]]) -> list[End]:
+    """Runs commands that know of one another as torchrun's workers do; all of them end in time.
+
+    Returns:
+        How each ended, by rank; who was still there after ``LONGEST`` has the code -9.
+    """
+    known = {"WORLD_SIZE": len(commands), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port()}
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    started, ends = [], []
+    try:
+        for rank, command in enumerate(commands):
+            place = environment(RANK=rank, LOCAL_RANK=rank, **known)
+            started.append(subprocess.Popen(command, env=place, **pipes))
+        limit = time.monotonic() + LONGEST
+        for process in started:
+            try:
+                out, err = process.communicate(timeout=max(0.1, limit - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                out, err = process.communicate()
+            ends.append(End(process.returncode, out, err))
+    finally:
+        for process in started:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+    return ends

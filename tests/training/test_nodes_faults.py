@@ -1,0 +1,159 @@
+"""Several processes that are not alike, have no disk in common, or find it full: no one waits."""
+
+import json
+import shutil
+import sys
+
+import pytest
+import torch
+from helpers import micro
+from helpers.micro import lines
+from helpers.processes import run_all, train_all, words
+from safetensors.torch import load_file
+
+from gamba_warp import versions
+from gamba_warp.files import PART
+from gamba_warp.train import run as run_module
+from gamba_warp.train.checkpoint import damage, list_checkpoints
+
+FULL = 20_000  # bytes: the log has room, a checkpoint has not
+FIVE = ("--views-first", 5, "--views-last", 5)  # all of them, at every step
+pytestmark = pytest.mark.slow  # a process takes seconds to import torch
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds", 4)
+
+
+@pytest.fixture(scope="module")
+def ends(data, tmp_path_factory):
+    """What two processes did one after the other, by name: exit codes and lines by rank."""
+    root = tmp_path_factory.mktemp("nodes")
+    (root / "empty").mkdir()
+    later = root / "later" / "checkpoints" / "step_000009"
+    later.mkdir(parents=True)
+    spoilt = root / "clouds"
+    shutil.copytree(data, spoilt)
+    (spoilt / "cloudb" / "003.png").write_bytes(b"no picture")  # the second process's alone
+    plan = []
+
+    def step(name, out, steps, *, data=(data, data), outs=None, limits=(None, None), more=()):
+        pairs = zip(data, outs or (root / out, root / out))
+        own = [
+            words(d, o, "--steps", steps, "--save-every", 3, "--keep", 9, *more) for d, o in pairs
+        ]
+        plan.append([name, own, limits])
+
+    def begin(name):
+        third = "checkpoints/step_000003"
+        plan.append(["copy", f"{root}/undisturbed/{third}", f"{root}/{name}/{third}"])
+
+    step("missing", "missing", 2, data=(data, root / "none"))
+    step("undisturbed", "undisturbed", 6)
+    begin("run")
+    step("full", "run", 6, limits=(FULL, None))
+    plan.append(["copy", f"{root}/run", f"{root}/left"])
+    step("goes on", "run", 6)
+    begin("far")
+    far = (root / "far", root / "elsewhere")
+    step("no copy", "far", 6, outs=far, limits=(None, FULL))
+    step("copied", "far", 6, outs=far)
+    step("newer", "far", 7, outs=(root / "far", root / "later"))
+    step("spoilt", "spoilt", 6, data=(data, spoilt), more=FIVE)
+    (root / "plan.json").write_text(json.dumps(plan))
+    command = [sys.executable, "-m", "helpers.nodes_worker", root / "plan.json", root / "end"]
+    done = run_all([[*map(str, command)]] * 2)
+    assert [end.code for end in done] == [0, 0], done
+    found = [json.loads((root / f"end{rank}").read_text()) for rank in (0, 1)]
+    return root, {name: [own[name] for own in found] for name in found[0]}
+
+
+def same_end(a, b):
+    a, b = (load_file(run / "model.safetensors") for run in (a, b))
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_folder_that_one_process_lacks_ends_all(ends):
+    root, found = ends
+    reason = f"{root / 'none'}: no such folder"
+    (main, other) = found["missing"]
+    assert other == [2, reason]
+    assert main[0] == 2 and main[1].startswith("process 1 on ") and main[1].endswith(reason)
+    assert not (root / "missing").exists()
+
+
+def test_a_full_disk_in_the_middle_of_a_checkpoint_ends_all(ends):
+    root, found = ends
+    (main, other) = found["full"]
+    assert main[0] == 2 and "cannot write" in main[1] and "run/checkpoints" in main[1]
+    assert other[0] == 2 and other[1].startswith("process 0 on ") and other[1].endswith(main[1])
+    (kept,) = list_checkpoints(root / "left")
+    assert damage(kept) is None and kept.name == "step_000003"
+    assert not [path for path in (root / "left").rglob(f"{PART}*")]
+    assert found["goes on"] == [[0, ""], [0, ""]]
+    assert same_end(root / "run", root / "undisturbed")
+
+
+def test_processes_without_a_common_disk_get_the_checkpoint_sent(ends):
+    root, found = ends
+    assert found["copied"] == [[0, ""], [0, ""]]
+    assert same_end(root / "far", root / "undisturbed")
+    assert lines(root / "far", "start")[-1]["resumed_from"].endswith("far/checkpoints/step_000003")
+    assert not (root / "elsewhere").exists()
+
+
+def test_a_full_disk_under_the_copy_ends_all(ends):
+    _, found = ends
+    (main, other) = found["no copy"]
+    assert other[0] == 2 and "cannot write a copy of" in other[1]
+    assert main[0] == 2 and main[1].startswith("process 1 on ") and main[1].endswith(other[1])
+
+
+def test_a_newer_checkpoint_elsewhere_is_not_thrown_away(ends):
+    root, found = ends
+    (main, other) = found["newer"]
+    assert main == other and main[0] == 2
+    assert main[1].startswith("process 1 on ")
+    assert f"sees {root}/later/checkpoints/step_000009, process 0 on" in main[1]
+
+
+def test_pictures_that_only_another_process_cannot_read_are_named(ends):
+    root, found = ends
+    assert found["spoilt"] == [[1, ""], [1, ""]]
+    (end,) = lines(root / "spoilt", "end")
+    assert list(end["failures"]) == ["cloudb"]
+
+
+def test_processes_that_differ_are_refused_with_the_difference(data, tmp_path):
+    """Options, data, a library's version and the package's own code, in one line on each."""
+    other = tmp_path / "clouds"
+    shutil.copytree(data, other)
+    shutil.copy(other / "cloudb" / "001.png", other / "cloudb" / "000.png")
+    patch = (
+        "import gamba_warp.train.run as r\n"
+        "a, b = r.installed, r._sources\n"
+        "r.installed = lambda *names: {**a(*names), 'torch': '9.9'}\n"
+        "r._sources = lambda: {**b(), 'gamba_warp.train.loop': '0' * 64}\n"
+    )
+    arguments = [words(folder, tmp_path / "out", "--steps", 2) for folder in (data, other)]
+    ends = train_all([arguments[0], [*arguments[1], "--lr", "0.01"]], {1: patch})
+    assert [end.code for end in ends] == [2, 2] and not (tmp_path / "out").exists()
+    assert ends[0].err == ends[1].err and ends[0].err.count("\n") == 1, ends
+    line = ends[0].err
+    for part in (
+        "gamba: process 1 on",
+        "options: optim.lr is 0.01, not 0.001;",
+        "data: cloudb is another;",
+        f"versions: torch is 9.9, not {versions.installed('torch')['torch']};",
+        "code: gamba_warp.train.loop is another",
+    ):
+        assert part in line, line
+    for word in ("run.out", "clouda", "numpy"):
+        assert word not in line
+
+
+def test_every_module_of_the_package_counts():
+    found = run_module._sources()
+    for name in ("gamba_warp.cli", "gamba_warp.train.loop", "gamba_warp.kernels.lazy"):
+        assert found[name] != found["gamba_warp.render"]

@@ -1,0 +1,35 @@
+"""Two torchruns, as on two machines: a killed process is started anew, to the same end."""
+
+import random
+
+import pytest
+import torch
+from helpers import micro
+from helpers.micro import lines, run
+from helpers.processes import words
+from safetensors.torch import load_file
+
+from gamba_warp.endurance.processes import kill_one_of_two, steps_for
+
+pytestmark = pytest.mark.slow
+
+
+def test_killed_processes_start_anew_and_end_as_if_nothing_was(tmp_path):
+    """Once the one that writes, once the other: one while it trains, one as it comes."""
+    data = micro.write_dataset(tmp_path / "clouds", 4)
+    rng = random.Random(23)  # those moments
+    found = kill_one_of_two(words(data, tmp_path / "none")[:-2], tmp_path / "two", 2, rng)
+    steps = steps_for(2)
+    assert found.main == 1 and found.resumed >= 1, found
+    assert found.steps == steps and "Traceback" not in found.said, found
+    assert {line["step"] for line in lines(tmp_path / "two", "train")} == {*range(1, steps + 1)}
+    assert [line["code"] for line in lines(tmp_path / "two", "end")] == [0]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:  # two halves of each batch in turn are the same sums, see test_nodes.py
+        options = {"length": {"steps": steps}, "views": {"batch_size": 2, "accumulate": 2}}
+        assert run(data, tmp_path / "one", **options) == 0
+    finally:
+        torch.set_num_threads(threads)
+    one, two = (load_file(tmp_path / name / "model.safetensors") for name in ("one", "two"))
+    assert one.keys() == two.keys() and all(torch.equal(one[n], two[n]) for n in one)
