@@ -58,7 +58,9 @@ def _train(
     checkpoint = find_checkpoint(run.out, run.resume, damaged.append)
     lpips, warning = open_lpips(config)
     torch.manual_seed(run.seed)
-    torch.set_float32_matmul_precision("high")  # TF32 where there is a GPU; no effect on a CPU
+    # TF32 where there is a GPU; no effect on a CPU. It is meant for the network's products, forward
+    # and backward; geometry makes none (cameras.exact_product), SSIM's keep all digits.
+    torch.set_float32_matmul_precision("high")
     model = Gamba(config.model_config(), run.encoder_weights)
     model.recompute = run.recompute
     started = ""
