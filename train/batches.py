@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -18,6 +18,7 @@ import torch
 from gamba_warp.batch import EXPECTED
 from gamba_warp.data.dataset import ViewDataset, open_dataset
 from gamba_warp.data.prefetch import Prefetcher
+from gamba_warp.data.resident import ResidentViews
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 
@@ -259,15 +260,33 @@ class TrainingData:
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
-def open_data(config: TrainConfig) -> TrainingData:
+def open_data(config: TrainConfig, device: torch.device | None = None) -> TrainingData:
     """Opens the dataset as the options say.
 
+    Args:
+        config: the options.
+        device: where ``--cache-device`` keeps the pictures; None: it is ignored.
+
     Raises:
-        UserError: the folder or the object of ``--overfit`` does not exist, or no object can be
-            read.
+        UserError: the folder or the object of ``--overfit`` does not exist, no object can be read,
+            or the device has no room for the pictures.
     """
-    if config.views.overfit is not None:
-        return _open_one(config, config.views.overfit)
+    one = config.views.overfit
+    data = _open_all(config) if one is None else _open_one(config, one)
+    sizes = {config.views.size, config.model_config().image_size}
+    packed = data.train.packed_size
+    if packed is not None and max(sizes) > packed:
+        data.notes.append(
+            f"{config.data} is packed at {packed} pixels; its pictures are enlarged to {max(sizes)}"
+        )
+    if not config.views.cache_device or device is None:
+        return data
+    train, objects = data.train, sorted(set(data.objects))
+    kept = ResidentViews(train, objects, sorted(sizes), device, config.views.workers)
+    return replace(data, train=kept)
+
+
+def _open_all(config: TrainConfig) -> TrainingData:
     views, run, notes = config.views, config.run, []
     train = open_dataset(config.data, "train", cache=views.cache)
     for folder in views.extra:

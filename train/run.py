@@ -41,7 +41,7 @@ def train(config: TrainConfig, world: World) -> int:
     Raises:
         UserError: bad data, options or run folder.
     """
-    data = open_data(config)
+    data = open_data(config, world.device)
     with contextlib.ExitStack() as held:
         return _train(config, world, data, held)
 

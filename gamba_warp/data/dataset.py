@@ -277,10 +277,9 @@ class ViewDataset:
         """
         uid = self._uid(index)
         files = self.files(uid)
-        pixels, Ks = self.pictures(uid, views, size)
+        images, Ks = self._images(uid, views, size)
         wanted = range(len(files.images)) if views is None else [int(v) for v in views]
-        images = np.divide(pixels, np.float32(255), dtype=np.float32)
-        height, width = pixels.shape[1:3]
+        height, width = images.shape[1:3]
         first = wanted[:depths]
         viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
         unit = np.float32(files.depth_unit)
@@ -291,12 +290,19 @@ class ViewDataset:
         return ObjectViews(
             uid=uid,
             name=files.name or uid,
-            images=torch.from_numpy(images),
+            images=images,
             cameras=Cameras(viewmats, torch.from_numpy(Ks).float(), width, height),
             depths=near,
             attribution=files.attribution,
             backs=far,
         )
+
+    def _images(
+        self, uid: str, views: Sequence[int] | None, size: int | None
+    ) -> tuple[Tensor, np.ndarray]:
+        """As ``pictures``, with the pictures in [0, 1] as float32."""
+        pixels, Ks = self.pictures(uid, views, size)
+        return torch.from_numpy(np.divide(pixels, np.float32(255), dtype=np.float32)), Ks
 
     def pictures(
         self, index: int | str, views: Sequence[int] | None = None, size: int | None = None

@@ -179,3 +179,53 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
     queue.take(0)
     queue.close()
     assert not asked, "the CPU's way is left alone"
+
+
+def test_pictures_kept_on_the_device_train_as_the_files_do(data, tmp_path):
+    """By another model's size than that of the targets, so that both are kept."""
+    views = {"background": "random", "mirror": 0.5, "recolor": 0.5, "size": 12}
+    for kept in (False, True):
+        changed = {"views": {**views, "cache_device": kept}, "length": {"steps": 3}}
+        assert run(data, tmp_path / str(kept), **changed) == 0
+    files, device = (load_file(tmp_path / f"{k}/model.safetensors") for k in (False, True))
+    assert all(torch.equal(files[name], device[name]) for name in files)
+
+
+def test_kept_pictures_need_no_file_any_more(tmp_path):
+    root = micro.write_dataset(tmp_path / "clouds", objects=4)
+    (root / "clouda" / "002.png").write_bytes(b"no picture")
+    config = micro.options(root, root, views={"cache_device": True, "size": 12})
+    before = open_dataset(root, "train")
+    want = before.load("cloudb", [3, 1], 12)
+    kept = batches.open_data(config, torch.device("cpu")).train
+    for path in root.rglob("*.png"):
+        path.unlink()
+    got = kept.load("cloudb", [3, 1], 12)
+    assert torch.equal(got.images, want.images) and got.images.dtype == torch.float32
+    assert torch.equal(got.cameras.Ks, want.cameras.Ks)
+    assert kept.load(1, size=micro.SIZE).images.shape == (6, 16, 16, 4)
+    for views, size, reason in (([6], 12, "view 6"), ([], 12, "no views"), (None, 9, "no such")):
+        with pytest.raises(UserError, match=reason):
+            kept.load("cloudb", views, size)
+    with pytest.raises(UserError, match="clouda/.*png"):
+        kept.load("clouda", [0], 12)
+
+
+def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
+    config = micro.options(data, data, views={"cache_device": True})
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 2000))
+    monkeypatch.setattr(
+        torch, "tensor", lambda *a, device=None, real=torch.tensor, **k: real(*a, **k)
+    )
+    with pytest.raises(UserError, match=r"^--cache-device: 30 views take 0.0 GB"):
+        batches.open_data(config, torch.device("cuda", 0))
+
+
+def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):
+    from gamba_warp.train.sources.pack import PackSettings, write_pack
+
+    write_pack(data, tmp_path / "pack", PackSettings(size=8), 1)
+    config = micro.options(tmp_path / "pack", tmp_path)
+    assert "is packed at 8 pixels" in batches.open_data(config).notes[-1]
+    write_pack(data, tmp_path / "large", PackSettings(size=16), 1)
+    assert not batches.open_data(micro.options(tmp_path / "large", tmp_path)).notes
