@@ -99,11 +99,12 @@ def load_sample(
     """
     depths = int(surfaces)  # of the input view alone
     target = dataset.load(index, views, size, depths)
-    source = target
+    source = None
     if size != config.image_size:
         source = dataset.load(index, views[:1], config.image_size, depths)
     if change is not None:
-        target, source = change(target), change(source)
+        target, source = change(target), source and change(source)
+    source = source or target
     for cameras in (target.cameras, source.cameras):
         if cameras.width != cameras.height:
             sides = f"{cameras.width}x{cameras.height}"
