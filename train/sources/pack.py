@@ -85,7 +85,9 @@ class Packed:
     failures: dict[str, str]
 
 
-def write_pack(data: Path, out: Path, settings: PackSettings, workers: int) -> Packed:
+def write_pack(
+    data: Path, out: Path, settings: PackSettings, workers: int, limit: int | None = None
+) -> Packed:
     """Packs a dataset, or goes on with a pack of it that was begun.
 
     Whole shards stay where the command is killed or the disk is full; nothing else does.
@@ -95,6 +97,7 @@ def write_pack(data: Path, out: Path, settings: PackSettings, workers: int) -> P
         out: folder of the pack, which is made where it is not there.
         settings: see there.
         workers: number of threads that decode.
+        limit: number of the objects that are packed, the first ones; None: all.
 
     Raises:
         UserError: the data cannot be opened, the folder holds something else or a pack of other
@@ -110,7 +113,8 @@ def write_pack(data: Path, out: Path, settings: PackSettings, workers: int) -> P
         index.split_version = dataset.split_version
         index.objects = _whole(out, index)
         known = {values["uid"] for values in index.objects}
-        todo = [uid for uid in dataset.uids if uid not in known]
+        wanted = dataset.uids[:limit]
+        todo = [uid for uid in wanted if uid not in known]
         _remove_unnamed(out, index)
         failures: dict[str, str] = {}
         blocks = _blocks(dataset, todo, splits, settings, workers, failures)
@@ -123,7 +127,7 @@ def write_pack(data: Path, out: Path, settings: PackSettings, workers: int) -> P
         if not index.objects:
             raise UserError(f"{data}: no object can be packed: {next(iter(failures.values()))}")
     shards = {values["shard"] for values in index.objects}
-    there = len(dataset.uids) - len(todo)
+    there = len(wanted) - len(todo)
     return Packed(len(todo) - len(failures), there, len(shards), failures)
 
 

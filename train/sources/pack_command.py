@@ -20,6 +20,7 @@ def data_pack_command(
     split: Literal["all", "train", "val", "test"] = "all",
     format: Literal["arrays", "webdataset"] = "arrays",
     shard_mb: Annotated[int, Meta(ge=1, le=100_000)] = 256,
+    limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None,
     workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
 ) -> int:
     """Decode the views of a dataset once, and write them into a few large files.
@@ -34,6 +35,7 @@ def data_pack_command(
         split: pack only the objects of this part of the set.
         format: arrays that are mapped into memory, or WebDataset's .tar files of the same arrays.
         shard_mb: a file ends with the object that passes this size, megabytes.
+        limit: stop after this many objects.
         workers: number of threads that decode; 0 means one per core.
     """
     from gamba_warp.kernels.runtime.system import cores
@@ -41,7 +43,7 @@ def data_pack_command(
     from .pack import PackSettings, write_pack
 
     settings = PackSettings(size, split, format, shard_mb << 20)
-    done = write_pack(data, out, settings, workers or cores())
+    done = write_pack(data, out, settings, workers or cores(), limit)
     if done.there:
         print(f"{done.there} objects were in {out} already")
     print(f"packed {done.written} objects into {out}, {done.shards} shards", end="")
