@@ -129,9 +129,27 @@ def relative_to_reference(
     rotation = reference[..., :3, :3]
     scale = distance / reference[..., :3, 3].norm(dim=-1)
     out = viewmats.clone()
-    out[..., :3, :3] = viewmats[..., :3, :3] @ rotation[..., None, :, :].mT
+    out[..., :3, :3] = exact_product(viewmats[..., :3, :3], rotation[..., None, :, :].mT)
     out[..., :3, 3] = viewmats[..., :3, 3] * scale[..., None, None]
     return out, scale
+
+
+def exact_product(rows: Tensor, matrix: Tensor) -> Tensor:
+    """``rows @ matrix`` for three columns and rows, with all digits in both directions.
+
+    A training lets a GPU round the factors of its matrix products to TF32, which keeps 11 bits of
+    each. That setting belongs to the process, and a backward pass runs when a guard around the
+    forward pass is over. So geometry makes no matrix products: it multiplies and adds.
+
+    Args:
+        rows: ``[.., N, 3]``.
+        matrix: ``[.., 3, K]``; leading dimensions are broadcast.
+
+    Returns:
+        ``[.., N, K]``.
+    """
+    first, second, third = (rows[..., i : i + 1] * matrix[..., i : i + 1, :] for i in range(3))
+    return first + second + third
 
 
 def _inverse(matrices: Tensor) -> Tensor:
@@ -160,10 +178,10 @@ def plucker_rays(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> Tenso
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     pixels = torch.stack([grid_x, grid_y, torch.ones_like(grid_x)], -1)
     # This is d_world = Rᵀ K⁻¹ p, written for row vectors.
-    to_world = _inverse(Ks).mT @ rotation
-    directions = pixels.reshape(-1, 3) @ to_world
+    to_world = exact_product(_inverse(Ks).mT, rotation)
+    directions = exact_product(pixels.reshape(-1, 3), to_world)
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    origin = -(rotation.mT @ translation[..., None])[..., 0]
+    origin = -exact_product(translation[..., None, :], rotation)[..., 0, :]
     moments = torch.linalg.cross(origin[..., None, :].expand_as(directions), directions)
     rays = torch.cat([moments, directions], -1)
     return rays.reshape(*viewmats.shape[:-2], height, width, 6)

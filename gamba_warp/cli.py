@@ -23,6 +23,7 @@ COMMANDS = {
     "data furniture": "Get 820 models.",
     "data primitives": "Make models of simple solids.",
     "data render": "Meshes to posed views.",
+    "data pack": "Posed views to a few large files.",
     "eval-views": "PSNR, SSIM, LPIPS of views.",
     "eval-geometry": "Chamfer, IoU, F-score.",
     "export": "Gaussians to meshes, splats and pages.",
@@ -40,6 +41,7 @@ MODULES = {
     "data furniture": "gamba_warp.train.data.furniture_command",
     "data primitives": "gamba_warp.train.data.primitives_command",
     "data render": "gamba_warp.train.data.render_command",
+    "data pack": "gamba_warp.train.sources.pack_command",
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",
 }

@@ -40,9 +40,11 @@ EXTRA_OF = {
     "tensorboard": "train",
     "timm": "train",
     "trimesh": "mesh",
+    "webdataset": "train",
 }
 OWN = {
     "demo": "all",
+    "data pack": "train",
     "data primitives": "mesh",
     "data render": "mesh",
     "eval-geometry": "eval",
@@ -57,7 +59,7 @@ OWN = {
 _SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
     "photo": {"kornia", "skimage"},
-    "train": {"kornia", "tensorboard", "timm"},
+    "train": {"kornia", "tensorboard", "timm", "webdataset"},
     "mesh": set(_SHAPES),
     "eval": set(_SHAPES),
     "fit": {"gsplat", "kornia"},

@@ -8,164 +8,42 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gamba_warp.batch import EXPECTED
-from gamba_warp.cameras import Cameras
-from gamba_warp.data.dataset import ObjectViews, ViewDataset, open_dataset
+from gamba_warp.data.dataset import ViewDataset, open_dataset
+from gamba_warp.data.prefetch import Prefetcher
+from gamba_warp.data.resident import ResidentViews
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.posing import posed_input, relative_cameras
 
 from .config import DataConfig, TrainConfig
-from .data.augment import Change, draw_change
+from .data.augment import draw_change
 from .data.poses import front_views
+from .data.samples import Batch, choose_views, join, load_sample
+from .ddp import World
 
 _TRIES = 100  # objects tried one after the other until one can be read
 # With --overfit all views share the network's one pass, and rendering them is cheap beside it.
 _OVERFIT_VIEWS = 9
 
 
-@dataclass
-class Batch:
-    """B objects, each with one input picture and V+1 pictures to match, the input view first.
+@dataclass(frozen=True)
+class Prepared:
+    """A batch as threads make it, before its failures count.
 
     Attributes:
-        uids: names of the objects, B.
-        inputs: ``[B, h, w, 3]`` RGB in [0, 1] on the model's background, or RGBA ``[B, h, w, 4]``
-            where the model takes alpha.
-        input_cameras: ``[B]``, in the model's world.
-        targets: ``[B, V+1, H, W, 4]`` RGBA in [0, 1], straight alpha.
-        cameras: ``[B, V+1]``.
-        background: ``[B, 1, 3]`` RGB that pictures are rendered and composited on.
-        surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface behind each pixel of
-            the inputs, in the model's world, 0 where none is known; None: nobody asked for them.
+        batch: the batch, or None where too many objects in a row cannot be read.
+        failures: uids of objects that could not be read, each with its reason, in their order.
     """
 
-    uids: list[str]
-    inputs: Tensor
-    input_cameras: Cameras
-    targets: Tensor
-    cameras: Cameras
-    background: Tensor
-    surfaces: Tensor | None = None
-
-    def to(self, device: torch.device) -> Batch:
-        """Returns the same batch on a device."""
-        if device.type == "cpu":
-            return self
-        return Batch(
-            uids=self.uids,
-            inputs=self.inputs.to(device, non_blocking=True),
-            input_cameras=self.input_cameras.to(device, non_blocking=True),
-            targets=self.targets.to(device, non_blocking=True),
-            cameras=self.cameras.to(device, non_blocking=True),
-            background=self.background.to(device, non_blocking=True),
-            surfaces=None if self.surfaces is None else self.surfaces.to(device, non_blocking=True),
-        )
-
-
-def load_sample(
-    dataset: ViewDataset,
-    index: int,
-    views: list[int],
-    size: int,
-    config: GambaConfig,
-    background: Tensor,
-    change: Change | None = None,
-    surfaces: bool = False,
-) -> Batch:
-    """Loads one object as a batch of one; ``views[0]`` is the input view.
-
-    Poses are relative to the input view, at the model's distance (``model.posing``).
-
-    Args:
-        dataset: the dataset.
-        index: number of the object.
-        views: the input view, then the novel ones.
-        size: side of the pictures to match, pixels.
-        config: the model's configuration.
-        background: RGB ``[3]``.
-        change: what is done with the views first; None: nothing.
-        surfaces: whether those are loaded too, where the object has depth pictures.
-
-    Raises:
-        UserError: the object cannot be read or its pictures are not square.
-    """
-    depths = int(surfaces)  # of the input view alone
-    target = dataset.load(index, views, size, depths)
-    source = target
-    if size != config.image_size:
-        source = dataset.load(index, views[:1], config.image_size, depths)
-    if change is not None:
-        target, source = change(target), change(source)
-    for cameras in (target.cameras, source.cameras):
-        if cameras.width != cameras.height:
-            sides = f"{cameras.width}x{cameras.height}"
-            raise UserError(f"{target.uid}: pictures are {sides}, training needs square ones")
-    inputs, input_cameras = posed_input(source, config)
-    return Batch(
-        uids=[target.uid],
-        inputs=inputs,
-        input_cameras=input_cameras,
-        targets=target.images[None],
-        cameras=relative_cameras(target.cameras, config.distance)[None],
-        background=background.reshape(1, 1, 3),
-        surfaces=_surfaces(source, config.distance) if surfaces else None,
-    )
-
-
-def _surfaces(views: ObjectViews, distance: float) -> Tensor:
-    """Those of ``Batch``, of the first view: ``[1, 2, h, w]``."""
-    empty = torch.zeros(views.images.shape[1:3])
-    found = [empty if d is None else d[0] for d in (views.depths, views.backs)]
-    return torch.stack(found)[None] * (distance / views.cameras.viewmats[0, :3, 3].norm())
-
-
-def join(samples: list[Batch]) -> Batch:
-    """Joins samples to one batch; all must have the same number of views."""
-    surfaces = [s.surfaces for s in samples if s.surfaces is not None]
-    return Batch(
-        uids=[uid for s in samples for uid in s.uids],
-        inputs=torch.cat([s.inputs for s in samples]),
-        input_cameras=_join_cameras([s.input_cameras for s in samples]),
-        targets=torch.cat([s.targets for s in samples]),
-        cameras=_join_cameras([s.cameras for s in samples]),
-        background=torch.cat([s.background for s in samples]),
-        surfaces=torch.cat(surfaces) if surfaces else None,
-    )
-
-
-def _join_cameras(cameras: list[Cameras]) -> Cameras:
-    return Cameras(
-        torch.cat([c.viewmats for c in cameras]),
-        torch.cat([c.Ks for c in cameras]),
-        cameras[0].width,
-        cameras[0].height,
-    )
-
-
-def choose_views(
-    count: int, novel: int, reference: int | None, rng: np.random.Generator
-) -> list[int]:
-    """Chooses an input view and ``novel`` others, which repeat only if there are too few.
-
-    Args:
-        count: number of the object's views.
-        novel: number of novel views, V.
-        reference: the input view, or None for any.
-        rng: source of chance.
-    """
-    order = rng.permutation(count)
-    first = int(order[0]) if reference is None else reference
-    others = [int(v) for v in order if v != first] or [first]
-    return [first, *(others[i % len(others)] for i in range(novel))]
+    batch: Batch | None
+    failures: list[tuple[str, str]]
 
 
 class BatchSource:
@@ -189,11 +67,15 @@ class BatchSource:
         self.reference, self.background, self.seed = reference, views.background, seed
         self.surfaces = surfaces
         self.failures: dict[str, str] = {}
+        self._order: tuple[int, np.ndarray] = (-1, np.empty(0, int))  # an epoch's number and order
 
     def _object(self, number: int) -> int:
         """Returns the object of the ``number``-th sample; each epoch has its own permutation."""
         epoch, position = divmod(number, len(self.objects))
-        order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.objects))
+        known, order = self._order  # both at once, for other threads replace them
+        if known != epoch:
+            order = np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.objects))
+            self._order = epoch, order
         return self.objects[order[position]]
 
     def sample(self, number: int, novel: int) -> Batch:
@@ -204,6 +86,10 @@ class BatchSource:
         Raises:
             UserError: more than half of the objects, or 100 in a row, cannot be read.
         """
+        return self.counted(self.prepare(number, novel))
+
+    def prepare(self, number: int, novel: int) -> Prepared:
+        """As ``sample``, but what fails is only told: threads may prepare samples in any order."""
         rng = np.random.default_rng([self.seed, 2, number])
         background = torch.ones(3) if self.background == "white" else torch.zeros(3)
         if self.background == "random":
@@ -216,6 +102,7 @@ class BatchSource:
         change = None
         if self.views.mirror or self.views.recolor:
             change = draw_change(chance, self.views.mirror, self.views.recolor)
+        failed: list[tuple[str, str]] = []
         for attempt in range(_TRIES):
             index = self._object(number + attempt)
             try:
@@ -225,46 +112,93 @@ class BatchSource:
                     reference = found[pick % len(found)]
                 views = choose_views(count, novel, reference, rng)
                 first = (self.dataset, index, views, self.size, self.config, background)
-                return load_sample(*first, change, self.surfaces)
+                return Prepared(load_sample(*first, change, self.surfaces), failed)
             except EXPECTED as error:
-                reason = self._note(index, error)
-        raise UserError(f"{_TRIES} objects in a row cannot be read; the last: {reason}")
+                failed.append((self.dataset.uids[index], first_line(error)))
+        return Prepared(None, failed)
 
-    def _note(self, index: int, error: Exception) -> str:
-        """Records a failure; raises UserError where too many objects have failed."""
-        reason = first_line(error)
-        self.failures[self.dataset.uids[index]] = reason
-        bad, all_objects = len(self.failures), len(set(self.objects))
-        if bad > all_objects / 2:
-            raise UserError(f"{bad} of {all_objects} objects cannot be read; the last: {reason}")
-        return reason
+    def counted(self, prepared: Prepared) -> Batch:
+        """Records what failed, in the order of the run, and returns the batch.
+
+        Raises:
+            UserError: as ``sample``.
+        """
+        for uid, reason in prepared.failures:
+            self.failures[uid] = reason
+            bad, known = len(self.failures), len(set(self.objects))
+            if bad > known / 2:
+                raise UserError(f"{bad} of {known} objects cannot be read; the last: {reason}")
+        if prepared.batch is None:
+            reason = prepared.failures[-1][1]
+            raise UserError(f"{_TRIES} objects in a row cannot be read; the last: {reason}")
+        return prepared.batch
+
+    def numbers(self, number: int, rank: int = 0, size: int = 1) -> list[int]:
+        """The samples of the ``number``-th batch that process ``rank`` of ``size`` works on."""
+        share = self.batch_size // size
+        first = number * self.batch_size + rank * share
+        return list(range(first, first + share))
 
     def batch(self, number: int, novel: int, rank: int = 0, size: int = 1) -> Batch:
         """Loads the part of the ``number``-th batch that process ``rank`` of ``size`` works on."""
-        share = self.batch_size // size
-        first = number * self.batch_size + rank * share
-        return join([self.sample(first + i, novel) for i in range(share)])
+        return join([self.sample(n, novel) for n in self.numbers(number, rank, size)])
 
 
-class Prefetcher:
-    """Prepares the next batches on threads while the current one is used."""
+class BatchQueue:
+    """The batches of a run in their order; as many as there are threads are prepared ahead.
 
-    def __init__(self, threads: int) -> None:
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="batches")
-        self._waiting: dict[object, Future] = {}
+    A batch is the same for any number of threads, and so is the step at which an error is raised:
+    what fails on a thread counts only when its batch is taken.
+    """
 
-    def submit(self, key: object, function, *arguments) -> None:
-        """Starts ``function(*arguments)``, unless it was started with this key before."""
-        if key not in self._waiting:
-            self._waiting[key] = self._pool.submit(function, *arguments)
+    def __init__(
+        self,
+        source: BatchSource,
+        workers: int,
+        novel: Callable[[int], int],
+        world: World,
+        last: int | None = None,
+    ) -> None:
+        """Prepares nothing yet.
 
-    def take(self, key: object) -> Batch:
-        """Waits for the result of a key; an error of its function is raised here."""
-        return self._waiting.pop(key).result()
+        Args:
+            source: draws the batches.
+            workers: number of threads, and of batches ahead of the one that is taken.
+            novel: number of novel views by the number of a batch; it is asked when the batch is
+                begun, so where it goes by the clock, it is that of ``workers`` batches before.
+            world: this process, whose part of each batch is taken to its device.
+            last: number of batches of the run; None: no end.
+        """
+        self.source, self.workers, self.novel = source, workers, novel
+        self.world, self.last = world, last
+        self._threads: Prefetcher[Prepared, Prepared] = Prefetcher(workers)
+
+    def take(self, number: int) -> Batch:
+        """Waits for the ``number``-th batch, on the device, and starts those that follow it.
+
+        Raises:
+            UserError: as ``BatchSource.sample``.
+        """
+        end = number + self.workers + 1
+        for following in range(number, end if self.last is None else min(end, self.last)):
+            if following not in self._threads:
+                numbers = self.source.numbers(following, self.world.rank, self.world.size)
+                novel = self.novel(following)
+                parts = [partial(self.source.prepare, n, novel) for n in numbers]
+                self._threads.submit(following, parts, self._joined)
+        return self.source.counted(self._threads.take(number)).to(self.world.device)
 
     def close(self) -> None:
-        """Drops what has not begun and waits for the rest."""
-        self._pool.shutdown(cancel_futures=True)
+        """Drops what has not begun; what has begun ends with a sample of each thread."""
+        self._threads.close()
+
+    def _joined(self, samples: list[Prepared]) -> Prepared:
+        failures = [failure for sample in samples for failure in sample.failures]
+        good = [sample.batch for sample in samples if sample.batch is not None]
+        if len(good) < len(samples):
+            return Prepared(None, failures)
+        batch = join(good)
+        return Prepared(batch.pinned() if self.world.device.type == "cuda" else batch, failures)
 
 
 def fixed_batches(
@@ -326,15 +260,33 @@ class TrainingData:
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
-def open_data(config: TrainConfig) -> TrainingData:
+def open_data(config: TrainConfig, device: torch.device | None = None) -> TrainingData:
     """Opens the dataset as the options say.
 
+    Args:
+        config: the options.
+        device: where ``--cache-device`` keeps the pictures; None: it is ignored.
+
     Raises:
-        UserError: the folder or the object of ``--overfit`` does not exist, or no object can be
-            read.
+        UserError: the folder or the object of ``--overfit`` does not exist, no object can be read,
+            or the device has no room for the pictures.
     """
-    if config.views.overfit is not None:
-        return _open_one(config, config.views.overfit)
+    one = config.views.overfit
+    data = _open_all(config) if one is None else _open_one(config, one)
+    sizes = {config.views.size, config.model_config().image_size}
+    packed = data.train.packed_size
+    if packed is not None and max(sizes) > packed:
+        data.notes.append(
+            f"{config.data} is packed at {packed} pixels; its pictures are enlarged to {max(sizes)}"
+        )
+    if not config.views.cache_device or device is None:
+        return data
+    train, objects = data.train, sorted(set(data.objects))
+    kept = ResidentViews(train, objects, sorted(sizes), device, config.views.workers)
+    return replace(data, train=kept)
+
+
+def _open_all(config: TrainConfig) -> TrainingData:
     views, run, notes = config.views, config.run, []
     train = open_dataset(config.data, "train", cache=views.cache)
     for folder in views.extra:

@@ -20,7 +20,7 @@ from gamba_warp.kernels.runtime.system import end_signals
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
-from .batches import Batch, BatchSource, Prefetcher, TrainingData, fixed_batches
+from .batches import Batch, BatchQueue, BatchSource, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_length, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
 from .ddp import World
@@ -104,7 +104,7 @@ class Trainer:
     @property
     def failures(self) -> dict[str, str]:
         """Reasons by uid, for the objects that could not be read so far."""
-        return self._unread | dict(self._source.failures)  # threads add to the second
+        return self._unread | self._source.failures
 
     def _name_failures(self) -> None:
         """Warns of each object that could not be read, once."""
@@ -148,7 +148,7 @@ class Trainer:
             "rdist": 0.0 if constant else radial_weight(loss, self.step, epochs, done),
         }
 
-    def train_step(self, batches: Prefetcher) -> dict[str, float]:
+    def train_step(self, batches: BatchQueue) -> dict[str, float]:
         """Makes one optimizer step; returns its figures, some of them those of its last batch.
 
         With several processes, losses and the model's health are the means over all of them.
@@ -188,23 +188,23 @@ class Trainer:
             figures |= self.world.mean(own | {name: value.item() for name, value in known})
         return figures
 
-    def _take(self, batches: Prefetcher, waits: list[float]) -> Iterator[Batch]:
+    def _take(self, batches: BatchQueue, waits: list[float]) -> Iterator[Batch]:
         """Yields this step's batches on the device, and appends the seconds waited for each."""
         for micro in range(self.accumulate):
-            self._submit(batches, self.step, micro)
             before = time.perf_counter()
-            batch = batches.take((self.step, micro)).to(self.world.device)
+            batch = batches.take(self.step * self.accumulate + micro)
             waits.append(time.perf_counter() - before)
-            following = divmod(self.step * self.accumulate + micro + 1, self.accumulate)
-            self._submit(batches, *following)
             yield batch
 
-    def _submit(self, batches: Prefetcher, step: int, micro: int) -> None:
-        if self.total is not None and step >= self.total:
-            return
-        number = step * self.accumulate + micro
-        novel, rank, size = self.novel_views(step), self.world.rank, self.world.size
-        batches.submit((step, micro), self._source.batch, number, novel, rank, size)
+    def _queue(self) -> BatchQueue:
+        """All batches of the run, prepared ahead."""
+        return BatchQueue(
+            self._source,
+            self.config.views.workers,
+            lambda number: self.novel_views(number // self.accumulate),
+            self.world,
+            last=None if self.total is None else self.total * self.accumulate,
+        )
 
     def _apply(self, loss: float, norm: float) -> float:
         """Updates the weights or skips the step, on all processes alike, and counts the step.
@@ -243,7 +243,7 @@ class Trainer:
         Raises:
             UserError: as ``train_step``, or the run folder cannot be written.
         """
-        batches = Prefetcher(self.config.views.workers)
+        batches = self._queue()
         bar = tqdm(
             total=self.total,
             initial=self.step,

@@ -54,7 +54,7 @@ def train(config: TrainConfig, world: World) -> int:
     """
     with contextlib.ExitStack() as held:
         with world.together():
-            data = open_data(config)
+            data = open_data(config, world.device)
         return _train(config, world, data, held)
 
 
@@ -76,7 +76,9 @@ def _train(
     world.agree(lambda: _facts(config, data, world, lpips is not None))
     _refuse_newer(world, run.out, run.resume, checkpoint)
     torch.manual_seed(run.seed)
-    torch.set_float32_matmul_precision("high")  # TF32 where there is a GPU; no effect on a CPU
+    # TF32 where there is a GPU; no effect on a CPU. It is meant for the network's products, forward
+    # and backward; geometry makes none (cameras.exact_product), SSIM's keep all digits.
+    torch.set_float32_matmul_precision("high")
     started = ""
     with world.together():
         model = Gamba(config.model_config(), run.encoder_weights)

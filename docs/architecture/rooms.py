@@ -94,7 +94,7 @@ ROOMS = {
     "train.objective": Room("the losses", (*_LIBRARY, "train.config")),
     "train": Room(
         "batches, loop, checkpoints",
-        (*_LIBRARY, *_BENCH, "train.config", "train.objective", "train.data"),
+        (*_LIBRARY, *_BENCH, "train.config", "train.objective", "train.data", "train.sources"),
         ("pages",),
     ),
     "eval": Room("the report that both evaluations share", _READERS),

@@ -24,6 +24,7 @@ SUITES = {
     "block": "gamba_warp.measure.blocks",
     "model": "gamba_warp.measure.blocks",
     "train-step": "gamba_warp.train.bench",
+    "loader": "gamba_warp.train.bench_loader",
 }
 
 

@@ -1,29 +1,31 @@
 """Posed views on disk; ``open_dataset`` finds the objects, ``ViewDataset.load`` decodes views.
 
-Layouts are described in ``layouts.py``. ``split.json`` in the root names the uids of ``train``,
-``val`` and ``test``; where a uid is in none, ``split_of`` decides by the hash of its name.
+Layouts are described in ``layouts.py``, packs in ``packs.py``. ``split.json`` in the root names the
+uids of ``train``, ``val`` and ``test``; where a uid is in none, ``split_of`` decides by the hash of
+its name.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from ..cameras import Cameras, from_opengl
 from ..errors import UserError
 from ..files import write_json
-from ..images import check_size, load_rgba8, open_picture
+from ..images import load_rgba8
 from ..untrusted.documents import read_document
-from .layouts import LAYOUTS, ObjectFiles, find_objects
+from .decode import read_steps, resized
+from .layouts import LAYOUTS, ObjectFiles, Stored, find_objects
+from .packs import INDEX, PackedObject, open_pack
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of what is written; 1 had fewer objects in one group
@@ -100,20 +102,30 @@ def _read_split(root: Path) -> tuple[int, dict[str, str]]:
     return parts.version, chosen
 
 
+def splits_of(folder: str | Path, uids: Iterable[str]) -> dict[str, str]:
+    """The split of each object of a dataset, whose ``split.json`` may state it.
+
+    Raises:
+        UserError: that file is bad.
+    """
+    _, stated = _read_split(Path(folder))
+    return {uid: stated.get(uid) or split_of(uid) for uid in uids}
+
+
 def open_dataset(
     folder: str | Path, split: str = "all", layout: str = "auto", cache: bool = False
 ) -> ViewDataset:
     """Finds the objects under a folder, without decoding anything yet.
 
     Args:
-        folder: a dataset, or the folder of a single object.
+        folder: a dataset, a pack of one, or the folder of a single object.
         split: "all", "train", "val" or "test".
         layout: "auto", "transforms", "gobjaverse" or "openlrm".
         cache: whether decoded views are kept in memory, with 8 bits a channel.
 
     Raises:
         UserError: the folder does not exist, holds no objects or none of the split, or its
-            ``split.json`` is bad.
+            ``split.json`` or the index of the pack is bad.
     """
     root = Path(folder)
     if split not in ("all", *SPLITS):
@@ -122,6 +134,12 @@ def open_dataset(
         raise UserError(f"layout '{layout}': expected auto, {', '.join(LAYOUTS)}")
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
+    if layout == "auto" and (root / INDEX).exists():
+        pack = open_pack(root)
+        packed = {o.uid: o for o in pack.objects if split in ("all", o.split)}
+        if not packed:
+            raise UserError(f"{root}: none of its {len(pack.objects)} objects is in split {split}")
+        return ViewDataset(packed, "pack", cache, pack.split_version, pack.size)
     layout, folders = find_objects(root, layout)
     if not folders:
         marks = ", ".join(mark for mark, _ in LAYOUTS.values())
@@ -144,21 +162,24 @@ class ViewDataset:
 
     Attributes:
         uids: names of the objects, which are their paths under the root, sorted.
-        layout: layout of the folders.
+        layout: layout of the folders, or "pack".
         split_version: version of the rule, or of the file, that made the split.
+        packed_size: height of the pictures of a pack; None: files have what size they have.
     """
 
     def __init__(
         self,
-        objects: dict[str, Path],
+        objects: Mapping[str, Path | PackedObject],
         layout: str,
         cache: bool,
         split_version: int = SPLIT_VERSION,
+        packed_size: int | None = None,
     ) -> None:
         self.uids = list(objects)
         self.layout = layout
         self.split_version = split_version
-        self._folders = objects
+        self.packed_size = packed_size
+        self._folders = dict(objects)
         self._layouts = dict.fromkeys(objects, layout)
         self._files: dict[str, ObjectFiles] = {}
         # A path and a size give the picture, and the (width, height) of the file.
@@ -179,7 +200,14 @@ class ViewDataset:
             raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
         folders = {renamed[uid]: folder for uid, folder in other._folders.items()}
         cache = self._pictures is not None
-        made = ViewDataset(self._folders | folders, self.layout, cache, self.split_version)
+        sizes = [size for size in (self.packed_size, other.packed_size) if size is not None]
+        made = ViewDataset(
+            self._folders | folders,
+            self.layout,
+            cache,
+            self.split_version,
+            min(sizes, default=None),
+        )
         made._layouts = self._layouts | {renamed[u]: lay for u, lay in other._layouts.items()}
         return made
 
@@ -198,11 +226,14 @@ class ViewDataset:
         """
         uid = self._uid(index)
         if uid not in self._files:
+            place = self._folders[uid]
             try:
-                self._files[uid] = LAYOUTS[self._layouts[uid]][1](self._folders[uid])
+                if isinstance(place, PackedObject):
+                    self._files[uid] = place.files()
+                else:
+                    self._files[uid] = LAYOUTS[self._layouts[uid]][1](place)
             except OSError as error:  # of a folder; the readers name the file otherwise
-                place = error.filename or self._folders[uid]
-                raise UserError(f"{place}: {error.strerror or error}") from error
+                raise UserError(f"{error.filename or place}: {error.strerror or error}") from error
         return self._files[uid]
 
     def num_views(self, index: int | str) -> int:
@@ -215,8 +246,9 @@ class ViewDataset:
         for uid in self.uids:
             try:
                 files = self.files(uid)
-                for path in files.images + (files.depths or []) + (files.backs or []):
-                    if not os.path.exists(path):  # never raises, whatever the name
+                for path in [*files.images, *(files.depths or []), *(files.backs or [])]:
+                    # What lies in a pack was looked for above.
+                    if isinstance(path, Path) and not os.path.exists(path):  # it never raises
                         raise UserError(f"{path}: no such file")
             except UserError as error:
                 bad[uid] = str(error)
@@ -245,7 +277,53 @@ class ViewDataset:
         """
         uid = self._uid(index)
         files = self.files(uid)
-        wanted = list(range(len(files.images))) if views is None else [int(v) for v in views]
+        images, Ks = self._images(uid, views, size)
+        wanted = range(len(files.images)) if views is None else [int(v) for v in views]
+        height, width = images.shape[1:3]
+        first = wanted[:depths]
+        viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
+        unit = np.float32(files.depth_unit)
+        near, far = (
+            None if steps is None else torch.from_numpy(steps * unit)
+            for steps in (read_steps(p, first, width, height) for p in (files.depths, files.backs))
+        )
+        return ObjectViews(
+            uid=uid,
+            name=files.name or uid,
+            images=images,
+            cameras=Cameras(viewmats, torch.from_numpy(Ks).float(), width, height),
+            depths=near,
+            attribution=files.attribution,
+            backs=far,
+        )
+
+    def _images(
+        self, uid: str, views: Sequence[int] | None, size: int | None
+    ) -> tuple[Tensor, np.ndarray]:
+        """As ``pictures``, with the pictures in [0, 1] as float32."""
+        pixels, Ks = self.pictures(uid, views, size)
+        return torch.from_numpy(np.divide(pixels, np.float32(255), dtype=np.float32)), Ks
+
+    def pictures(
+        self, index: int | str, views: Sequence[int] | None = None, size: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Decodes views of one object and leaves them as they are decoded.
+
+        Args:
+            index: as for ``load``, as are the others.
+            views: see above.
+            size: see above.
+
+        Returns:
+            RGBA ``[V, H, W, 4]`` uint8, colour not premultiplied, and K ``[V, 3, 3]`` float64 in
+            pixels of that size.
+
+        Raises:
+            UserError: as ``load``.
+        """
+        uid = self._uid(index)
+        files = self.files(uid)
+        wanted = range(len(files.images)) if views is None else [int(v) for v in views]
         if not wanted:
             raise UserError(f"{uid}: no views asked for")
         outside = [v for v in wanted if not 0 <= v < len(files.images)]
@@ -253,31 +331,41 @@ class ViewDataset:
             raise UserError(f"{uid}: view {outside[0]} asked for, it has {len(files.images)}")
         if size is not None and size < 1:
             raise UserError(f"size {size}: must be at least 1")
-        images: Tensor | None = None
+        pixels: np.ndarray | None = None
         Ks = np.empty((len(wanted), 3, 3))
         for number, v in enumerate(wanted):
             picture, Ks[number] = self._view(files, v, size)
             height, width = picture.shape[:2]
-            if images is None:
+            if pixels is None:
                 _check_room(len(wanted), width, height, uid)
-                images = torch.empty(len(wanted), height, width, 4)
-            if picture.shape != images.shape[1:]:
-                got, others = f"{width}x{height}", f"{images.shape[2]}x{images.shape[1]}"
+                pixels = np.empty((len(wanted), height, width, 4), np.uint8)
+            if picture.shape != pixels.shape[1:]:
+                got, others = f"{width}x{height}", f"{pixels.shape[2]}x{pixels.shape[1]}"
                 raise UserError(f"{files.images[v]}: is {got}, the object's others {others}")
-            np.divide(picture, np.float32(255), out=images[number].numpy())
-        assert images is not None  # there is at least one view
-        height, width = images.shape[1:3]
-        first = wanted[:depths]
-        viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
-        return ObjectViews(
-            uid=uid,
-            name=files.name or uid,
-            images=images,
-            cameras=Cameras(viewmats, torch.from_numpy(Ks).float(), width, height),
-            depths=_read_depths(files.depths, first, width, height, files.depth_unit),
-            attribution=files.attribution,
-            backs=_read_depths(files.backs, first, width, height, files.depth_unit),
-        )
+            pixels[number] = picture
+        assert pixels is not None  # there is at least one view
+        return pixels, Ks
+
+    def depth_steps(
+        self, index: int | str, width: int, height: int
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Reads all depth pictures of an object, of its first and of its last surfaces.
+
+        Args:
+            index: as for ``load``.
+            width: of the pictures, pixels.
+            height: see above.
+
+        Returns:
+            Each ``[V, height, width]`` float32 in steps of ``files(index).depth_unit``, or None.
+
+        Raises:
+            UserError: as ``load``.
+        """
+        files = self.files(index)
+        views = range(len(files.images))
+        near, far = (read_steps(p, views, width, height) for p in (files.depths, files.backs))
+        return near, far
 
     def _view(
         self, files: ObjectFiles, view: int, size: int | None
@@ -288,13 +376,13 @@ class ViewDataset:
         if self._pictures is not None and key in self._pictures:
             picture, original = self._pictures[key]
         else:
-            picture = load_rgba8(path)
+            picture = path.read() if isinstance(path, Stored) else load_rgba8(path)
             original = (picture.shape[1], picture.shape[0])
             stated = files.sizes[view]
             if stated is not None and stated != original:
                 got, want = (f"{w}x{h}" for w, h in (original, stated))
                 raise UserError(f"{path}: is {got}, but its cameras are for {want}")
-            picture = _resize(picture, size, path)
+            picture = resized(picture, size, path)
             if self._pictures is not None:
                 self._pictures[key] = (picture, original)
         from_size = (1.0, 1.0) if files.sizes[view] is None else original
@@ -309,37 +397,3 @@ def _check_room(count: int, width: int, height: int, uid: str) -> None:
             f"{uid}: {count} views of {width}x{height} are over {MAX_LOADED >> 20} megapixels; "
             "ask for smaller pictures"
         )
-
-
-def _resize(picture: np.ndarray, size: int | None, path: Path) -> np.ndarray:
-    height, width = picture.shape[:2]
-    if size is None or size == height:
-        return picture
-    new = (max(1, round(width * size / height)), size)
-    check_size(*new, f"{path}: at height {size}")
-    # PIL premultiplies RGBA by itself, and its box filter is the exact area average.
-    kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
-    return np.asarray(Image.fromarray(picture).resize(new, kind))
-
-
-def _read_depths(
-    paths: list[Path] | None, views: Sequence[int], width: int, height: int, unit: float
-) -> Tensor | None:
-    """Reads depth ``[V, height, width]`` of some views, object units; None where there is none."""
-    if paths is None or not views:
-        return None
-    steps = np.stack([_read_depth(paths[v], width, height) for v in views])
-    return torch.from_numpy(steps * np.float32(unit))
-
-
-def _read_depth(path: Path, width: int, height: int) -> np.ndarray:
-    """Reads depth ``[height, width]`` float32, in the steps of the file."""
-    with open_picture(path) as image:
-        if len(image.getbands()) != 1:
-            raise UserError(f"{path}: has {len(image.getbands())} channels, depth has one")
-        if image.size != (width, height):
-            image = image.resize((width, height), Image.Resampling.NEAREST)
-        values = np.asarray(image, dtype=np.float32)
-    if not np.isfinite(values).all() or values.min() < 0:
-        raise UserError(f"{path}: a depth is negative or not finite")
-    return values

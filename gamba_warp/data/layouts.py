@@ -39,28 +39,40 @@ _DEPTH = 64  # folders within folders
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
+class Stored:
+    """A picture that is decoded already and lies in a larger file (``packs.py``)."""
+
+    def read(self) -> np.ndarray:
+        """Its pixels: RGBA ``[H, W, 4]`` uint8, or depth ``[H, W]`` float32 in steps.
+
+        Raises:
+            UserError: it is damaged.
+        """
+        raise NotImplementedError
+
+
 @dataclass
 class ObjectFiles:
     """Where the views of one object lie, and their cameras.
 
     Attributes:
-        images: paths of the V pictures.
+        images: the V pictures: paths, or what lies in a pack.
         camera_to_world: ``[V, 4, 4]`` float64, OpenGL frame, object units.
         Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
         sizes: width and height of each of the V pictures as the file states them, or None.
-        depths: paths of the V depth pictures, or None.
-        backs: paths of V pictures of the last surface's depth, or None.
+        depths: the V depth pictures, or None.
+        backs: V pictures of the last surface's depth, or None.
         depth_unit: length of one step of the depth pictures, object units.
         name: name for people.
         attribution: creator, licence, source; may be empty.
     """
 
-    images: list[Path]
+    images: Sequence[Path | Stored]
     camera_to_world: np.ndarray
     Ks: np.ndarray
     sizes: Sequence[tuple[int, int] | None]
-    depths: list[Path] | None = None
-    backs: list[Path] | None = None
+    depths: Sequence[Path | Stored] | None = None
+    backs: Sequence[Path | Stored] | None = None
     depth_unit: float = 1.0
     name: str = ""
     attribution: dict[str, str] = field(default_factory=dict)
@@ -132,6 +144,26 @@ def _checked(K: np.ndarray, width: float, height: float, source: str) -> np.ndar
     if not ((center >= -1) & (center <= 2)).all():
         raise UserError(f"{source}: the principal point is far outside the picture")
     return K
+
+
+def check_cameras(poses: np.ndarray, Ks: np.ndarray, width: int, height: int, source: str) -> None:
+    """Refuses cameras that cannot be those of an object's views.
+
+    Args:
+        poses: ``[V, 4, 4]`` float64, camera to world.
+        Ks: ``[V, 3, 3]`` float64.
+        width: of the pictures, pixels.
+        height: see above.
+        source: the file, for the message.
+
+    Raises:
+        UserError: a pose is no rotation with a place near the object, or a K does not suit the
+            size.
+    """
+    for number, (pose, K) in enumerate(zip(poses, Ks)):
+        place = f"{source}: view {number}"
+        _pose(pose, place)
+        _checked(K, width, height, place)
 
 
 def _intrinsics(frame: dict, top: dict, source: str) -> tuple[np.ndarray, tuple[int, int] | None]:

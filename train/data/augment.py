@@ -31,6 +31,8 @@ class Change:
         """Returns the changed views."""
         if self.mirror:
             views = mirrored(views)
+        if self.channels == (0, 1, 2) and self.gamma == 1.0:
+            return views  # most samples of most trainings
         color = views.images[..., list(self.channels)] ** self.gamma
         return replace(views, images=torch.cat([color, views.images[..., 3:]], -1))
 

@@ -16,6 +16,7 @@ from torch.nn.functional import pad, smooth_l1_loss
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras
+from gamba_warp.devices import full_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
 from gamba_warp.vision.lpips import LPIPS, load_lpips
@@ -70,10 +71,11 @@ class _Structure(torch.autograd.Function):
         if pictures.device.type == "cpu":
             size = max(1, _CACHED // max(1, math.prod(pictures.shape[1:])))
         values = []
-        for i in range(0, len(pictures), size):
-            part = slice(i, i + size)
-            slope = None if slopes is None else slopes[part]
-            values.append(_unequal(pictures[part], truths[part], band, slope))
+        with full_products():  # a variance is the small difference of two means of products
+            for i in range(0, len(pictures), size):
+                part = slice(i, i + size)
+                slope = None if slopes is None else slopes[part]
+                values.append(_unequal(pictures[part], truths[part], band, slope))
         if slopes is not None:
             ctx.save_for_backward(slopes.movedim(1, -1).reshape(got.shape))
         return torch.cat(values).reshape(lead) if values else pictures.new_zeros(lead)

@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from gamba_warp.cameras import Cameras
+from gamba_warp.cameras import Cameras, exact_product
 
 RAYS = 256
 NEAR = 0.1  # object units; a centre nearer to the camera plane has no meaningful projection
@@ -65,13 +65,13 @@ def project_means(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
         position is finite but means nothing.
     """
     rotation, translation = cameras.viewmats[..., :3, :3], cameras.viewmats[..., :3, 3]
-    points = means[..., None, :, :] @ rotation.mT + translation[..., None, :]
+    points = exact_product(means[..., None, :, :], rotation.mT) + translation[..., None, :]
     depths = points[..., 2]
     safe = torch.where(depths > NEAR, depths, 1.0)
     homogeneous = torch.cat(
         [points[..., :2] / safe[..., None], torch.ones_like(safe)[..., None]], -1
     )
-    return (homogeneous @ cameras.Ks.mT)[..., :2], depths
+    return exact_product(homogeneous, cameras.Ks.mT)[..., :2], depths
 
 
 def radial_mask_loss(means: Tensor, cameras: Cameras, contours: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import io
 import json
 import tarfile
 import zipfile
+import zlib
 
 import numpy as np
 
@@ -77,6 +78,32 @@ def datasets() -> dict[str, Files]:
     }
 
 
+def packs() -> dict[str, Files]:
+    """A pack of two objects of two views, the first with depth; and one whose shard is a tar."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (2, _SIZE, _SIZE, 4), np.uint8)
+    depths = rng.integers(0, 9000, (2, _SIZE, _SIZE)).astype("<u2")
+    K = [9.0, 0, 4, 0, 9, 4, 0, 0, 1]
+    pose = [*np.ravel(_POSE), 0, 0, 0, 1]
+    rows = [[*pose, *K, zlib.crc32(i), zlib.crc32(d), 0] for i, d in zip(images, depths)]
+    cameras = np.array(rows, "<f8")
+    shard = cameras.tobytes() + images.tobytes() + depths.tobytes()
+    values = {"shard": "shard-00000.bin", "views": 2, "width": _SIZE, "height": _SIZE}
+    values |= {"crc": zlib.crc32(cameras), "cameras": 0, "images": cameras.nbytes}
+    values |= {"name": "A chair", "attribution": {"creator": "Jay"}, "depth_unit": 1e-4}
+    chair = {"uid": "chair", "split": "train", "depths": cameras.nbytes + images.nbytes}
+    stool = {"uid": "b/stool", "split": "val"}
+    index = {"format": "gamba-pack", "version": 1, "finished": True, "size": _SIZE}
+    index["objects"] = [values | chair, values | stool]
+    tar = tarred({"00000000.cameras.npy": npy(cameras), "00000000.images.npy": npy(images)}, "")
+    starts = {"cameras": tar.index(cameras.tobytes()), "images": tar.index(images.tobytes())}
+    packed = index | {"objects": [values | stool | starts | {"shard": "shard-00000.tar"}]}
+    return {
+        "arrays": {"pack.json": json.dumps(index).encode(), "shard-00000.bin": shard},
+        "webdataset": {"pack.json": json.dumps(packed).encode(), "shard-00000.tar": tar},
+    }
+
+
 def mesh_folders() -> dict[str, Files]:
     """Folders of meshes with a catalogue."""
     obj = meshes()["obj"]["ball.obj"]
@@ -97,7 +124,7 @@ def zipped(members: Files, method: int = zipfile.ZIP_DEFLATED) -> bytes:
 
 
 def tarred(members: Files, form: str = "xz") -> bytes:
-    """A tar archive, packed by "xz" or "gz"."""
+    """A tar archive, packed by "xz" or "gz", or not at all."""
     content = io.BytesIO()
     with tarfile.open(fileobj=content, mode=f"w:{form}") as tar:  # pyright: ignore
         for name, data in members.items():

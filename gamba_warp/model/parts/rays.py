@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from ...cameras import Cameras
+from ...cameras import Cameras, exact_product
 from ...gaussians import Gaussians
 from ..config import RAY_CHANNELS, RAY_STEM, GambaConfig
 from .patches import Patches
@@ -137,7 +137,7 @@ class RayDecoder(nn.Module):
         if rotation:
             quats = rotation[0] + rotation[0].new_tensor([1.0, 0.0, 0.0, 0.0])
         return Gaussians(
-            means=(points - shift[:, None, None, None]) @ turn[:, None, None],
+            means=exact_product(points - shift[:, None, None, None], turn[:, None, None]),
             quats=quats,
             scales=footprint * torch.exp((self.scale_bias[:, None] + scale).clamp(*SIZE_LIMITS)),
             opacities=opacities,

@@ -1,0 +1,152 @@
+"""TF32 is for the network's products: rays, projections and SSIM make none that it would round.
+
+Without a GPU: every matrix product that runs is noted, with the precision that it would have there.
+"""
+
+import pytest
+import torch
+from helpers import micro
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gamba_warp.cameras import (
+    exact_product,
+    plucker_rays,
+    relative_to_reference,
+)
+from gamba_warp.data.dataset import ObjectViews
+from gamba_warp.devices import full_products
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.model.posing import posed_input, relative_cameras
+from gamba_warp.render import render
+from gamba_warp.train.objective.losses import depth_loss, structure
+from gamba_warp.train.objective.radial_mask import (
+    contour_distances,
+    project_means,
+    radial_mask_loss,
+)
+
+PRODUCTS = ("mm", "bmm", "addmm", "baddbmm", "matmul", "linear", "addmv", "mv", "convolution")
+
+
+class Products(TorchDispatchMode):
+    """Notes the matrix products of float32 that a GPU would round, by name."""
+
+    def __init__(self):
+        super().__init__()
+        self.rounded = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.overloadpacket.__name__
+        floats = any(isinstance(a, torch.Tensor) and a.dtype == torch.float32 for a in args)
+        if name in PRODUCTS and floats and torch.get_float32_matmul_precision() != "highest":
+            self.rounded.append(name)
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.fixture(autouse=True)
+def high():
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")  # as a training sets it
+    yield
+    torch.set_float32_matmul_precision(before)
+
+
+@pytest.fixture
+def cameras():
+    views = micro.views_around(5, 17, 13)
+    return type(views)(views.viewmats.clone(), views.Ks.clone(), views.width, views.height)
+
+
+def means_of(count=31):
+    return micro.cloud(3, count).means.requires_grad_()
+
+
+def test_products_are_noted():
+    """What would fail the other tests: a layer of a network, forward and backward."""
+    layer = torch.nn.Linear(3, 4)
+    with Products() as seen:
+        layer(torch.randn(2, 3)).sum().backward()
+        forward = len(seen.rounded)
+        with full_products():
+            torch.randn(3, 3) @ torch.randn(3, 3)
+    assert forward >= 2 and len(seen.rounded) == forward
+
+
+def test_rays_and_poses_make_no_products(cameras):
+    with Products() as seen:
+        plucker_rays(cameras.viewmats, cameras.Ks, cameras.width, cameras.height)
+        relative_to_reference(cameras.viewmats, cameras.viewmats[0])
+        relative_cameras(cameras, 2.0)
+    assert not seen.rounded
+
+
+def test_posing_makes_no_products(cameras):
+    config = micro.options(".", ".").model_config()
+    images = torch.rand(5, cameras.height, cameras.width, 4)
+    with Products() as seen:
+        posed_input(ObjectViews("a", "a", images, cameras, None, {}), config)
+    assert not seen.rounded
+
+
+def test_projections_make_no_products_in_either_direction(cameras):
+    means, cotangents = means_of(), torch.randn(5, 31, 2)
+    masks = torch.zeros(5, 13, 17)
+    masks[:, 4:9, 5:12] = 1
+    with Products() as seen:
+        positions, _ = project_means(means, cameras)
+        (positions * cotangents).sum().backward()
+        radial_mask_loss(means, cameras, contour_distances(masks)).sum().backward()
+    assert not seen.rounded and means.grad.abs().max() > 0
+
+
+def test_rendering_and_depth_make_no_products(cameras):
+    cloud = micro.cloud(1)
+    leaf = cloud.means.clone().requires_grad_()
+    moved = Gaussians(leaf, None, cloud.scales, cloud.opacities, cloud.colors)
+    with Products() as seen:
+        render(moved, cameras).rgb.sum().backward()
+        batch = moved.map(lambda value: value[None])
+        depth_loss(batch, 2, cameras[:1], torch.rand(1, 2, 13, 17)).sum().backward()
+    assert not seen.rounded and leaf.grad.abs().max() > 0
+
+
+def test_ssim_keeps_all_digits():
+    got, want = torch.rand(2, 3, 20, 24, 3, requires_grad=True), torch.rand(2, 3, 20, 24, 3)
+    with Products() as seen:
+        structure(got, want).sum().backward()
+    assert not seen.rounded and torch.get_float32_matmul_precision() == "high"
+
+
+def test_a_whole_step_rounds_in_the_network_alone(cameras, tmp_path, monkeypatch):
+    """A training step whose model is no network: what is left is geometry, losses and rendering."""
+    from gamba_warp.train.batches import Batch
+    from gamba_warp.train.step import compute_gradients, health
+
+    cloud = micro.cloud(2)
+    leaf = torch.nn.Parameter(cloud.means[None].clone())
+
+    def model(images, input_cameras):
+        rest = (cloud.scales[None], cloud.opacities[None], cloud.colors[None])
+        return Gaussians(leaf, None, *rest)
+
+    targets = torch.rand(1, 5, 13, 17, 4)
+    batch = Batch(
+        ["a"], torch.rand(1, 8, 8, 3), cameras[:1], targets, cameras[None], torch.ones(1, 1, 3)
+    )
+    weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "lpips": 0.0, "rdist": 0.1}
+    optimizer = torch.optim.SGD([leaf], lr=0.1)
+    with Products() as seen:
+        made = compute_gradients(model, optimizer, [batch], weights, clip=1.0)
+        health(made.result, batch)
+    assert not seen.rounded and made.norm > 0
+
+
+def test_the_product_is_the_product():
+    rows, matrix = torch.randn(4, 1, 7, 3, dtype=torch.float64), torch.randn(2, 3, 5).double()
+    rows.requires_grad_()
+    matrix.requires_grad_()
+    got, want = exact_product(rows, matrix), rows @ matrix
+    torch.testing.assert_close(got, want)  # float64's own rounding
+    cotangent = torch.randn_like(want)
+    for a, b in zip(*(torch.autograd.grad(v, (rows, matrix), cotangent) for v in (got, want))):
+        torch.testing.assert_close(a, b)

@@ -1,0 +1,20 @@
+"""The benchmark of the loader runs, on views that are made up and on those of a folder."""
+
+import pytest
+import torch
+from helpers import micro
+
+from gamba_warp.commands import bench
+from gamba_warp.kernels.bench import Settings, measure
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_the_loader_is_measured(tmp_path, given):
+    data = micro.write_dataset(tmp_path / "clouds") if given else None
+    settings = Settings(device=torch.device("cpu"), level="quick", data=data)
+    module = bench.load_suite("loader")
+    records = measure(module.cases(settings), settings)["records"]
+    assert [r["status"] for r in records] == ["ok"] * 4, records
+    names = [r["variant"] for r in records]
+    assert names == ["files", "files, --cache", "pack", "pack, --cache-device"]
+    assert all(r["work"]["samples"] == 8 for r in records)

@@ -1,0 +1,149 @@
+"""Benchmark case of the training's data: batches alone, from files, from memory and from a pack."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gamba_warp.cameras import orbit
+from gamba_warp.data.dataset import ViewDataset, open_dataset
+from gamba_warp.data.resident import ResidentViews
+from gamba_warp.images import save_image
+from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
+from gamba_warp.model.config import PRESETS
+
+from .batches import BatchQueue, BatchSource
+from .config import DataConfig
+from .ddp import World
+from .sources.pack import PackSettings, write_pack
+
+OP = "loader"
+_BATCH, _NOVEL, _SIZE = 4, 3, 128  # as in the cases of a step
+_VIEWS, _OBJECTS = 24, 24  # of a folder that is made up, and of what is used of another
+_BATCHES = {"quick": 2, "normal": 24, "full": 96}
+_PACK, _WORKERS = "pack", 2
+
+
+def cases(settings: Settings) -> list[Case]:
+    """Returns the case of the loader."""
+    text = (
+        f"Batches of {_BATCH} objects in {_NOVEL + 1} views of {_SIZE}², half of them mirrored and "
+        f"three in ten recoloured, prepared by {_WORKERS} threads and taken at once, from the "
+        "first one on. Views are those of --data, or made up; up to "
+        f"{_OBJECTS} objects, so that all lie in the system's own cache of files. From there the "
+        "pictures are decoded, or were decoded before: into memory, into a pack, onto the device. "
+        "There is no oracle: a test holds the batches to be the same to the bit."
+    )
+    return [Case(op=OP, name="views", text=text, build=partial(_build, settings), axis=None)]
+
+
+def targets(settings: Settings) -> list[Target]:
+    """Returns the target; there is none at a quick run's sizes."""
+    if settings.level == "quick":
+        return []
+    return [
+        Target(
+            text="samples a second, pack alone over a step of rays (train-step)",
+            times=(Key("train-step", "parts", "rays", "forward+backward"),),
+            over=(Key(OP, "views", _PACK),),
+            scale=_BATCHES[settings.level],
+            at_least=20.0,
+        )
+    ]
+
+
+@dataclass
+class _Loader:
+    """Batches of a dataset; ``folder`` is kept for as long as they are."""
+
+    source: BatchSource
+    world: World
+    batches: int
+    folder: tempfile.TemporaryDirectory
+
+    def run(self) -> None:
+        """Takes all batches; this is what is timed."""
+        queue = BatchQueue(self.source, _WORKERS, lambda _: _NOVEL, self.world, self.batches)
+        try:
+            for number in range(self.batches):
+                queue.take(number)
+        finally:
+            queue.close()
+        if self.world.device.type == "cuda":
+            torch.cuda.synchronize(self.world.device)
+
+    def work(self) -> dict[str, float]:
+        """Counts the samples."""
+        return {"samples": _BATCH * self.batches}
+
+
+def _build(settings: Settings) -> list[Variant]:
+    folder = tempfile.TemporaryDirectory(prefix="gamba-bench-")
+    root = Path(folder.name)
+    data = settings.data
+    if data is None:
+        data = root / "views"
+        for number in range(4 if settings.level == "quick" else _OBJECTS):
+            _write_object(data / f"object{number:02d}", number)
+    files, cached = open_dataset(data), open_dataset(data, cache=True)
+    objects = list(range(min(_OBJECTS, len(files))))
+    for index in objects:
+        cached.pictures(index, None, _SIZE)
+    write_pack(data, root / "pack", PackSettings(_SIZE), _WORKERS, len(objects))
+    pack = open_dataset(root / "pack")
+    resident = ResidentViews(pack, objects, [_SIZE], settings.device, _WORKERS)
+    made: dict[str, ViewDataset] = {"files": files, "files, --cache": cached}
+    made |= {_PACK: pack, "pack, --cache-device": resident}
+    world, batches = World(0, 1, settings.device), _BATCHES[settings.level]
+    variants = []
+    for name, dataset in made.items():
+        loader = _Loader(_source(dataset, objects), world, batches, folder)
+        variants.append(
+            Variant(
+                name=name,
+                run=loader.run,
+                check=None,
+                default=name == "files",
+                rounds=9,
+                parameters={"B": _BATCH, "views": _NOVEL + 1, "side": _SIZE},
+                work=loader.work,
+            )
+        )
+    return variants
+
+
+def _source(dataset: ViewDataset, objects: list[int]) -> BatchSource:
+    return BatchSource(
+        dataset,
+        PRESETS["rays"],
+        objects=objects,
+        batch_size=_BATCH,
+        reference=None,
+        views=DataConfig(size=_SIZE, mirror=0.5, recolor=0.3),
+        seed=0,
+    )
+
+
+def _write_object(folder: Path, seed: int) -> None:
+    """An object of smooth colours behind an ellipse, in the layout ``transforms``, as WebP."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True)
+    x = np.linspace(-1, 1, _SIZE)
+    inside = (x[:, None] / 0.7) ** 2 + (x / 0.5) ** 2 < 1
+    frames = []
+    for view in range(_VIEWS):
+        waves = np.sin(rng.uniform(2, 20, (2, 3)) @ rng.uniform(-1, 1, (3, 3)))
+        color = np.sin(9 * waves[0] * x[:, None, None] + 9 * waves[1] * x[None, :, None])
+        rgba = np.dstack([(0.5 + 0.5 * color) * inside[..., None], inside])
+        save_image(folder / f"{view}.webp", rgba, lossless=True)
+        pose = torch.linalg.inv(orbit(torch.tensor([15.0 * view]), 20.0, 1.8)[0].double())
+        pose[:, 1:3] *= -1  # OpenCV to OpenGL
+        frames.append({"file_path": f"{view}.webp", "transform_matrix": pose.tolist()})
+    values = {"w": _SIZE, "h": _SIZE, "fl_x": 1.1 * _SIZE, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(values))

@@ -1,0 +1,168 @@
+"""One sample of the training: an input picture, and the pictures to match, with their cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gamba_warp.cameras import Cameras
+from gamba_warp.data.dataset import ObjectViews, ViewDataset
+from gamba_warp.errors import UserError
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.posing import posed_input, relative_cameras
+
+from .augment import Change
+
+
+@dataclass
+class Batch:
+    """B objects, each with one input picture and V+1 pictures to match, the input view first.
+
+    Attributes:
+        uids: names of the objects, B.
+        inputs: ``[B, h, w, 3]`` RGB in [0, 1] on the model's background, or RGBA ``[B, h, w, 4]``
+            where the model takes alpha.
+        input_cameras: ``[B]``, in the model's world.
+        targets: ``[B, V+1, H, W, 4]`` RGBA in [0, 1], straight alpha.
+        cameras: ``[B, V+1]``.
+        background: ``[B, 1, 3]`` RGB that pictures are rendered and composited on.
+        surfaces: ``[B, 2, h, w]`` depth of the first and of the last surface behind each pixel of
+            the inputs, in the model's world, 0 where none is known; None: nobody asked for them.
+    """
+
+    uids: list[str]
+    inputs: Tensor
+    input_cameras: Cameras
+    targets: Tensor
+    cameras: Cameras
+    background: Tensor
+    surfaces: Tensor | None = None
+
+    def to(self, device: torch.device) -> Batch:
+        """Returns the same batch on a device; a GPU gets it beside other work if it is pinned."""
+        if device.type == "cpu":
+            return self
+        return self._map(lambda values: values.to(device, non_blocking=True))
+
+    def pinned(self) -> Batch:
+        """Returns the same batch, its tensors on the CPU in page-locked memory.
+
+        Only from there does a GPU copy while the host goes on.
+        """
+        return self._map(lambda v: v.pin_memory() if v.device.type == "cpu" else v)
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Batch:
+        def cameras(c: Cameras) -> Cameras:
+            return replace(c, viewmats=change(c.viewmats), Ks=change(c.Ks))
+
+        return Batch(
+            uids=self.uids,
+            inputs=change(self.inputs),
+            input_cameras=cameras(self.input_cameras),
+            targets=change(self.targets),
+            cameras=cameras(self.cameras),
+            background=change(self.background),
+            surfaces=None if self.surfaces is None else change(self.surfaces),
+        )
+
+
+def load_sample(
+    dataset: ViewDataset,
+    index: int,
+    views: list[int],
+    size: int,
+    config: GambaConfig,
+    background: Tensor,
+    change: Change | None = None,
+    surfaces: bool = False,
+) -> Batch:
+    """Loads one object as a batch of one; ``views[0]`` is the input view.
+
+    Poses are relative to the input view, at the model's distance (``model.posing``).
+
+    Args:
+        dataset: the dataset.
+        index: number of the object.
+        views: the input view, then the novel ones.
+        size: side of the pictures to match, pixels.
+        config: the model's configuration.
+        background: RGB ``[3]``.
+        change: what is done with the views first; None: nothing.
+        surfaces: whether those are loaded too, where the object has depth pictures.
+
+    Raises:
+        UserError: the object cannot be read or its pictures are not square.
+    """
+    depths = int(surfaces)  # of the input view alone
+    target = dataset.load(index, views, size, depths)
+    source = None
+    if size != config.image_size:
+        source = dataset.load(index, views[:1], config.image_size, depths)
+    if change is not None:
+        target, source = change(target), source and change(source)
+    source = source or target
+    for cameras in (target.cameras, source.cameras):
+        if cameras.width != cameras.height:
+            sides = f"{cameras.width}x{cameras.height}"
+            raise UserError(f"{target.uid}: pictures are {sides}, training needs square ones")
+    inputs, input_cameras = posed_input(source, config)
+    return Batch(
+        uids=[target.uid],
+        inputs=inputs,
+        input_cameras=input_cameras,
+        targets=target.images[None],
+        cameras=relative_cameras(target.cameras, config.distance)[None],
+        background=background.reshape(1, 1, 3),
+        surfaces=_surfaces(source, config.distance) if surfaces else None,
+    )
+
+
+def _surfaces(views: ObjectViews, distance: float) -> Tensor:
+    """Those of ``Batch``, of the first view: ``[1, 2, h, w]``."""
+    empty = torch.zeros(views.images.shape[1:3])
+    found = [empty if d is None else d[0] for d in (views.depths, views.backs)]
+    return torch.stack(found)[None] * (distance / views.cameras.viewmats[0, :3, 3].norm())
+
+
+def join(samples: list[Batch]) -> Batch:
+    """Joins samples to one batch; all must have the same number of views."""
+    surfaces = [s.surfaces for s in samples if s.surfaces is not None]
+    return Batch(
+        uids=[uid for s in samples for uid in s.uids],
+        inputs=torch.cat([s.inputs for s in samples]),
+        input_cameras=_join_cameras([s.input_cameras for s in samples]),
+        targets=torch.cat([s.targets for s in samples]),
+        cameras=_join_cameras([s.cameras for s in samples]),
+        background=torch.cat([s.background for s in samples]),
+        surfaces=torch.cat(surfaces) if surfaces else None,
+    )
+
+
+def _join_cameras(cameras: list[Cameras]) -> Cameras:
+    return Cameras(
+        torch.cat([c.viewmats for c in cameras]),
+        torch.cat([c.Ks for c in cameras]),
+        cameras[0].width,
+        cameras[0].height,
+    )
+
+
+def choose_views(
+    count: int, novel: int, reference: int | None, rng: np.random.Generator
+) -> list[int]:
+    """Chooses an input view and ``novel`` others, which repeat only if there are too few.
+
+    Args:
+        count: number of the object's views.
+        novel: number of novel views, V.
+        reference: the input view, or None for any.
+        rng: source of chance.
+    """
+    order = rng.permutation(count)
+    first = int(order[0]) if reference is None else reference
+    others = [int(v) for v in order if v != first] or [first]
+    return [first, *(others[i % len(others)] for i in range(novel))]
