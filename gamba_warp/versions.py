@@ -45,6 +45,7 @@ OWN = {
     "demo": "all",
     "data primitives": "mesh",
     "data render": "mesh",
+    "data gso": "mesh",
     "eval-geometry": "eval",
     "eval-views": "eval",
     "export": "mesh",
@@ -67,6 +68,7 @@ HOLDS = {
 NEEDS = {
     "data primitives": ("trimesh",),
     "data render": ("trimesh", "open3d"),
+    "data gso": ("trimesh", "open3d"),
     "demo": _SHAPES,
     "eval-geometry": _SHAPES,
     "eval-views": ("kornia",),
