@@ -26,9 +26,9 @@ class ViewsOptions:
     """Folder for report.json, objects.csv, table.md, contact_sheet.png and strips/ (input |
     prediction | truth); without it the table is printed and that is all."""
     protocol: Literal["default", "gso"] = "default"
-    """gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, the first view being the
-    input, with what is missing of them in the report; --size, --reference, --views, --split and
-    --limit are then its own."""
+    """gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, the first view being
+    the input, with what is missing of them in the report; --size, --reference, --views, --split
+    and --limit are then its own."""
     split: Literal["all", "train", "val", "test"] = "test"
     """Split of the dataset."""
     reference: Annotated[int, Meta(ge=0, le=100_000)] = 0

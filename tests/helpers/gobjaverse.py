@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-# 25 views on a first orbit, of which the last repeats the first, top and bottom, and 13 on a second.
+# 25 views on an orbit, of which the last repeats the first, top and bottom, 13 on another orbit.
 VIEWS = 40
 ELEVATION = {number: 20.0 for number in range(25)} | {25: 89.9, 26: -89.9}
 ELEVATION |= {number: 2.0 for number in range(27, 40)}

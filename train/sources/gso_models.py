@@ -143,5 +143,3 @@ def attribution_of(folder: Path) -> dict[str, str]:
             if match := re.search(pattern, text):
                 known[key] = " ".join(match[1].split())
     return known
-
-

@@ -1,0 +1,146 @@
+"""A local copy of G-Objaverse as a dataset: chosen objects, linked, copied or unpacked.
+
+The set is published as ``dictionary_id/instance_id/campos_512_v4/NNNNN/NNNNN.png`` and seven more
+files a view; as a tar of each object, ``dictionary_id/instance_id.tar``; and by a script that
+leaves out the folder ``campos_512_v4``. Training needs a view's picture and camera alone.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.data.layouts import GOBJAVERSE
+from gamba_warp.errors import UserError
+from gamba_warp.files import atomic_folder
+from gamba_warp.untrusted.archives import open_tar
+from gamba_warp.untrusted.documents import read_bytes
+
+VIEWS = 40  # of an object: two orbits, top and bottom
+_NUMBER = re.compile(r"[0-9]{1,12}")
+_MEMBER = re.compile(r"(?:[^/]+/){0,3}?([0-9]{5})/\1(\.png|\.json)")
+_MOST = {".png": 64 << 20, ".json": 1 << 20}  # bytes; pictures have 0.2 MB
+
+
+def find_rendered(source: Path) -> dict[str, Path]:
+    """The objects of a local copy, by name; a folder is preferred to a tar.
+
+    Args:
+        source: folder of the set, or one that holds it as ``savedata/``.
+
+    Raises:
+        UserError: no such folder, or no objects in it.
+    """
+    if not source.is_dir():
+        raise UserError(f"--source {source}: no such folder")
+    found: dict[str, Path] = {}
+    for top in (source, source / "savedata"):
+        for group in sorted(top.iterdir()) if top.is_dir() else ():
+            if _NUMBER.fullmatch(group.name) and group.is_dir():
+                for entry in os.scandir(group):
+                    name = entry.name.removesuffix(".tar")
+                    plain = name == entry.name
+                    if _NUMBER.fullmatch(name) and entry.is_dir() == plain:
+                        if plain or f"{group.name}/{name}" not in found:
+                            found[f"{group.name}/{name}"] = Path(entry.path)
+    if not found:
+        raise UserError(
+            f"--source {source}: holds no objects of G-Objaverse (0/10010, 0/10010.tar)"
+        )
+    return found
+
+
+def take_views(
+    objects: dict[str, Path], names: Sequence[str], out: Path, least: int, copy: bool
+) -> tuple[int, dict[str, str]]:
+    """Puts objects into a dataset that are not in it yet.
+
+    Args:
+        objects: the local copy, by name.
+        names: which of it.
+        out: the dataset.
+        least: complete views that an object must have.
+        copy: whether the files of folders are copied; else their folder is linked.
+
+    Returns:
+        How many were put there now; and by name, why one could not be.
+
+    Raises:
+        UserError: the system makes no links.
+    """
+    failures: dict[str, str] = {}
+    wanted = [name for name in names if not (out / name / GOBJAVERSE).exists()]
+    for name in tqdm(wanted, unit="object", disable=None):
+        try:
+            _take(objects[name], out / name, least, copy)
+        except UserError as error:
+            failures[name] = str(error)
+    return len(wanted) - len(failures), failures
+
+
+def _take(path: Path, target: Path, least: int, copy: bool) -> None:
+    # A link that leads nowhere any more gives way; anything else that is there stays.
+    broken = (target / GOBJAVERSE).is_symlink()
+    with atomic_folder(target, replace=broken) as part:
+        if path.is_dir():
+            views = path / GOBJAVERSE if (path / GOBJAVERSE).is_dir() else path
+            if copy:
+                _copy(views, part / GOBJAVERSE)
+            else:
+                _link(views, part / GOBJAVERSE)
+        else:
+            _unpack(path, part / GOBJAVERSE)
+        _check(part, path, least)
+
+
+def _link(views: Path, target: Path) -> None:
+    try:
+        target.symlink_to(views.resolve(), target_is_directory=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"{target.name}: cannot be linked ({reason}); give --copy") from error
+
+
+def _copy(views: Path, target: Path) -> None:
+    target.mkdir()
+    for view in sorted(views.iterdir()):
+        for suffix, most in _MOST.items():
+            file = view / f"{view.name}{suffix}"
+            if re.fullmatch("[0-9]{5}", view.name) and file.is_file():
+                (target / view.name).mkdir(exist_ok=True)
+                (target / view.name / file.name).write_bytes(read_bytes(file, most))
+
+
+def _unpack(path: Path, target: Path) -> None:
+    """Writes pictures and cameras of a tar; its other files, nine tenths of it, are passed over."""
+    target.mkdir()
+    with path.open("rb") as file, open_tar(file, path, target.parent) as members:
+        for member in members:
+            match = _MEMBER.fullmatch(member.name.removeprefix("./"))
+            if not match:
+                continue
+            if member.size > _MOST[match[2]]:
+                raise UserError(f"{path}: {member.name!r} is over {_MOST[match[2]] >> 20} MB")
+            place = target / match[1] / f"{match[1]}{match[2]}"
+            if place.exists():
+                raise UserError(f"{path}: {member.name!r} is there twice")
+            place.parent.mkdir(exist_ok=True)
+            with place.open("xb") as out:
+                shutil.copyfileobj(member.file, out)
+
+
+def _check(folder: Path, path: Path, least: int) -> None:
+    """Refuses an object whose cameras cannot be read, or that has too few complete views."""
+    try:
+        count = open_dataset(folder, layout="gobjaverse").num_views(0)
+    except UserError as error:
+        reason = str(error).replace(f"{folder}{os.sep}", "").replace(str(folder), "it")
+        raise UserError(f"{path}: {reason}") from error
+    if count < least:
+        raise UserError(f"{path}: has {count} complete views, --min-views is {least}")
