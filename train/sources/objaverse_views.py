@@ -21,6 +21,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_folder
 from gamba_warp.untrusted.archives import open_tar
 from gamba_warp.untrusted.documents import read_bytes
+from gamba_warp.untrusted.names import inside
 
 VIEWS = 40  # of an object: two orbits, top and bottom
 _NUMBER = re.compile(r"[0-9]{1,12}")
@@ -111,8 +112,10 @@ def _copy(views: Path, target: Path) -> None:
     target.mkdir()
     for view in sorted(views.iterdir()):
         for suffix, most in _MOST.items():
-            file = view / f"{view.name}{suffix}"
-            if re.fullmatch("[0-9]{5}", view.name) and file.is_file():
+            if not re.fullmatch("[0-9]{5}", view.name):
+                continue
+            file = inside(views, f"{view.name}/{view.name}{suffix}", str(views))
+            if file.is_file():
                 (target / view.name).mkdir(exist_ok=True)
                 (target / view.name / file.name).write_bytes(read_bytes(file, most))
 
