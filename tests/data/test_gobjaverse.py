@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.gobjaverse import ELEVATION, VIEWS, camera, write_object
+from helpers.published.gobjaverse import ELEVATION, VIEWS, camera, write_object
 from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset

@@ -121,7 +121,7 @@ def _copy(views: Path, target: Path) -> None:
 
 
 def _unpack(path: Path, target: Path) -> None:
-    """Writes pictures and cameras of a tar; its other files, nine tenths of it, are passed over."""
+    """Writes pictures and cameras of a tar; its other files are passed over."""
     target.mkdir()
     with path.open("rb") as file, open_tar(file, path, target.parent) as members:
         for member in members:

@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from helpers.gso import PBTXT, write_model, write_zip
+from helpers.published.gso import PBTXT, write_model, write_zip
 
 from gamba_warp.cli import run
 from gamba_warp.data import gso

@@ -7,7 +7,7 @@ import sys
 import types
 
 import pytest
-from helpers.gobjaverse import VIEWS, members, write_object, write_tar
+from helpers.published.gobjaverse import VIEWS, members, write_object, write_tar
 
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
