@@ -26,6 +26,7 @@ def data_objaverse_command(
     quality: Path | None = None,
     min_views: Annotated[int, Meta(ge=1, le=10_000)] = 40,
     copy: bool = False,
+    depth: bool = False,
     shard: str = "0/1",
     limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None,
     workers: Annotated[int, Meta(ge=1, le=256)] = 1,
@@ -45,11 +46,13 @@ def data_objaverse_command(
         quality: category_annotation.json: leave out what it calls Poor-quality.
         min_views: complete views that an object of G-Objaverse must have; published are 40.
         copy: copy the files of folders in place of linking them.
+        depth: also make depth pictures of the _nd.exr files; needs the package OpenEXR.
         shard: i/n takes every n-th object from the i-th, for n machines.
         limit: stop after this many objects.
         workers: downloads at once.
     """
     from ..data.render import parse_shard
+    from .objaverse_depth import check_package
     from .objaverse_lists import Lists
     from .objaverse_meshes import PACKAGE, load_package, take_meshes
     from .objaverse_views import find_rendered, take_views
@@ -57,6 +60,8 @@ def data_objaverse_command(
     first, count = parse_shard(shard)
     lists = Lists(index, uids, without, quality)
     meshes = source == PACKAGE
+    if depth:
+        check_package()
     if meshes:
         load_package()
     objects = {} if meshes else find_rendered(Path(source))
@@ -70,7 +75,7 @@ def data_objaverse_command(
     if meshes:
         taken, failures = take_meshes(names, out, workers)
     else:
-        taken, failures = take_views(objects, names, out, min_views, copy)
+        taken, failures = take_views(objects, names, out, min_views, copy, depth)
     mark = "" if count == 1 else f".{first}-{count}"
     known = {name: chosen.uids[name] for name in names if name in chosen.uids}
     record = {"source": source, "counts": chosen.counts, "shard": shard, "objects": len(names)}
