@@ -24,6 +24,8 @@ COMMANDS = {
     "data primitives": "Make models of simple solids.",
     "data render": "Meshes to posed views.",
     "data pack": "Posed views to a few large files.",
+    "data objaverse": "Objaverse, and its G-Objaverse views.",
+    "data gso": "Google Scanned Objects, for evaluation.",
     "eval-views": "PSNR, SSIM, LPIPS of views.",
     "eval-geometry": "Chamfer, IoU, F-score.",
     "export": "Gaussians to meshes, splats and pages.",
@@ -42,6 +44,8 @@ MODULES = {
     "data primitives": "gamba_warp.train.data.primitives_command",
     "data render": "gamba_warp.train.data.render_command",
     "data pack": "gamba_warp.train.sources.pack_command",
+    "data objaverse": "gamba_warp.train.sources.objaverse_command",
+    "data gso": "gamba_warp.train.sources.gso_command",
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",
 }

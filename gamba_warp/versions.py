@@ -47,6 +47,7 @@ OWN = {
     "data pack": "train",
     "data primitives": "mesh",
     "data render": "mesh",
+    "data gso": "mesh",
     "eval-geometry": "eval",
     "eval-views": "eval",
     "export": "mesh",
@@ -69,6 +70,7 @@ HOLDS = {
 NEEDS = {
     "data primitives": ("trimesh",),
     "data render": ("trimesh", "open3d"),
+    "data gso": ("trimesh", "open3d"),
     "demo": _SHAPES,
     "eval-geometry": _SHAPES,
     "eval-views": ("kornia",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from dataclasses import fields
 from pathlib import Path
@@ -12,6 +13,7 @@ import tyro
 from gamba_warp.errors import UserError
 
 from .config import GROUPS, TrainConfig, command_line
+from .recipes import announce, recipe_words, table_of
 
 _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 4,000
 
@@ -35,7 +37,9 @@ def train_command(config: tyro.conf.OmitArgPrefixes[TrainConfig]) -> int:
 
 
 def expand(arguments: list[str]) -> list[str]:
-    """Puts the options of the run that ``--config`` names in its place, before all others.
+    """Puts the options of the run or recipe that is named in its place, before all others.
+
+    With ``--help`` it prints what the recipe sets.
 
     Args:
         arguments: of ``gamba train``.
@@ -44,10 +48,14 @@ def expand(arguments: list[str]) -> list[str]:
         The same without ``--config``; of an option that is there twice the last one counts.
 
     Raises:
-        UserError: there are two such options, or the file is no run's config.json.
+        UserError: there are two such options, the file is no run's config.json, or there is no
+            such recipe.
     """
     words = [w for word in arguments for w in (word.split("=", 1) if _names(word) else [word])]
-    if "--config" not in words or {"-h", "--help"} & {*words}:
+    helped = bool({"-h", "--help"} & {*words})
+    if "--recipe" in words:
+        return _with_recipe(words, helped)
+    if "--config" not in words or helped:
         return arguments
     at = words.index("--config")
     if words.count("--config") > 1 or at + 1 == len(words):
@@ -58,8 +66,25 @@ def expand(arguments: list[str]) -> list[str]:
     return [*(data or [taken]), *options, *before, *after]
 
 
+def _with_recipe(words: list[str], helped: bool) -> list[str]:
+    """The words with the recipe's before all others; DATA may stand at either end."""
+    if "--config" in words:
+        raise UserError("--recipe and --config: give one of them")
+    at = words.index("--recipe")
+    if words.count("--recipe") > 1 or at + 1 == len(words):
+        raise UserError("--recipe: expected once, with the name of a recipe")
+    rest = [*words[:at], *words[at + 2 :]]
+    if helped:
+        print(table_of(words[at + 1]) + "\n")
+        return rest
+    taken = recipe_words(words[at + 1], rest, os.environ)
+    announce(taken)
+    data = [rest.pop(0)] if rest and not rest[0].startswith("-") else []
+    return [*data, *taken, *rest]
+
+
 def _names(word: str) -> bool:
-    return word.startswith("--config=")
+    return word.startswith(("--config=", "--recipe="))
 
 
 def _options_of(path: Path) -> list[str]:
@@ -86,6 +111,8 @@ def _options_of(path: Path) -> list[str]:
         what = f"unknown {', '.join(sorted(names)[:5])}" if names else "it names no data or preset"
         raise UserError(f"{path}: not the options of a run ({what[:200]})")
     words = shlex.split(command_line(values))[2:]
+    if recipe := values["run"].get("recipe"):  # the record of it; its options are there already
+        words += ["--recipe", str(recipe)]
     given = [values["data"], values["preset"], *(values.get("set") or [])]
     given += [v for group in GROUPS if group != "model" for v in values[group].values()]
     for value in given:

@@ -20,6 +20,7 @@ _Count = Annotated[int, Meta(ge=1, le=10**12)]
 _Views = Annotated[int, Meta(ge=0, le=1000)]
 _Weight = Annotated[float, Meta(ge=0, le=1e6)]
 _Every = Annotated[int, Meta(ge=0, le=10**12)]
+RecipeName = Literal["paper", "tiny", "rays"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +154,10 @@ class RunConfig:
     config: Path | None = None
     """Take the options of another run: its folder, or its config.json. Options beside this one
     replace those, and so does DATA if it comes first; without --out that run itself goes on."""
+    recipe: RecipeName | None = None
+    """Options that belong together: "paper" is the paper's training, with 256 objects a step over
+    all processes; "tiny" or "rays" that of the shipped model, at its size. Options beside it win;
+    with --help it shows what the recipe sets, and from where."""
     resume: str = "auto"
     """"auto" goes on where the run folder stands; else "never", or the path of a checkpoint."""
     init: Path | None = None
@@ -338,7 +343,8 @@ def command_line(values: dict) -> str:
         if group == "model":  # it follows from the preset and --set
             continue
         for name, value in values.get(group, {}).items():
-            if name not in default or value == default[name]:
+            # A recipe's options are there by themselves, and those that were given have won.
+            if name not in default or value == default[name] or name == "recipe":
                 continue
             if isinstance(value, bool):
                 words.append(option(name if value else f"no_{name}"))

@@ -40,8 +40,9 @@ class ShapesOptions:
     """Folders of other predictions of the same objects: PRED is compared with each, object by
     object. A folder's name names its row."""
     protocol: str = "default"
-    """default, syncdreamer (points that 16 cameras see, parity on a 64^3 lattice), or a JSON file:
-    a protocol, or the report.json of an evaluation to repeat."""
+    """default, syncdreamer (points that 16 cameras see, parity on a 64^3 lattice), gso (the objects
+    of "gamba data gso", in the input camera's frame), or a JSON file: a protocol, or the
+    report.json of an evaluation to repeat."""
     surface: Method | None = None
     """How Gaussians become a surface; centers is a diagnostic."""
     align: Align | None = None

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from gamba_warp.data import gso
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, sha256, visible, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
@@ -82,7 +83,8 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     """
     if (protocol.frame == "reference") != (options.data is not None):
         raise UserError("--frame reference and --data: give both or neither")
-    found = find_all(options.pred, options.baseline, options.gt)
+    listed = gso.NAMES if protocol.name == "gso" else ()
+    found = find_all(options.pred, options.baseline, options.gt, listed)
     dataset = None
     if options.data is not None:
         from gamba_warp.data.dataset import open_dataset
@@ -97,6 +99,9 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
     inputs = {side: path.name if path else None for side, path in named.items()}
     report = report_of(protocol, objects.pop(PREDICTED), inputs, objects)
+    if listed:
+        done = [record["name"] for record in report["objects"] if record["status"] == OK]
+        report["evaluation"] = gso.protocol_of(done)
     if folder is not None:
         save_report(report, folder)
         if objects:
@@ -107,8 +112,16 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
 Found = tuple[list[Pair], list[dict[str, str]]]  # what find_pairs returns
 
 
-def find_all(pred: Path, baselines: Sequence[Path], gt: Path) -> dict[str, Found]:
+def find_all(
+    pred: Path, baselines: Sequence[Path], gt: Path, listed: Iterable[str] = ()
+) -> dict[str, Found]:
     """Pairs the predictions, and those of each baseline, with the truths.
+
+    Args:
+        pred: predicted shapes.
+        baselines: folders of other predictions.
+        gt: true shapes.
+        listed: names that the protocol lists: those that are missing are failures.
 
     Returns:
         What ``find_pairs`` returns by name: ``PREDICTED``, and the names of the baselines' folders.
@@ -123,7 +136,8 @@ def find_all(pred: Path, baselines: Sequence[Path], gt: Path) -> dict[str, Found
         if folders.setdefault(path.resolve().name, path) is not path:
             raise UserError(f"--baseline {path}: there is another row of this name; rename it")
     expected = {name for path in folders.values() for name in _shapes_in(path)} if baselines else ()
-    return {name: find_pairs(path, gt, expected) for name, path in folders.items()}
+    wanted = {*expected, *listed}
+    return {name: find_pairs(path, gt, wanted) for name, path in folders.items()}
 
 
 def find_pairs(

@@ -125,6 +125,8 @@ PRESETS = {
     "syncdreamer": GeometryProtocol(
         name="syncdreamer", points="views", occupancy="parity", grid="lattice", iou_voxels=32
     ),
+    # Predictions of "gamba eval-views --protocol gso --save-gaussians" against the set's meshes.
+    "gso": GeometryProtocol(name="gso", frame="reference", up="z"),
 }
 
 

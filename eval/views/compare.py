@@ -55,6 +55,7 @@ class ViewsProtocol:
             smaller. Such views count in all means; the report also has the same means without
             them, because their PSNR is high whatever is predicted.
         mean_error: how the PSNR of the mean error comes about.
+        evaluation: of a named evaluation, what it is and which of its objects are missing; or None.
     """
 
     split: str
@@ -75,6 +76,7 @@ class ViewsProtocol:
     split_version: int = SPLIT_VERSION
     nearly_empty: float = NEARLY_EMPTY
     mean_error: str = "mean squared error over views, then objects, as PSNR"
+    evaluation: dict[str, Any] | None = None
 
 
 @dataclass

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gamba_warp.batch import check_not_read
+from gamba_warp.data import gso
 from gamba_warp.data.dataset import ViewDataset, open_dataset
 from gamba_warp.devices import pick_device
 from gamba_warp.errors import UserError
@@ -89,6 +90,11 @@ def open_job(options: ViewsOptions) -> Job:
     device = str(pick_device(options.device))
     dataset = open_dataset(options.data, options.split)
     uids = choose_objects(dataset.uids, (), options.limit)
+    evaluation = gso.protocol_of(uids) if options.protocol == "gso" else None
+    if evaluation is not None:
+        uids = [uid for uid in uids if uid in gso.NAMES]
+        if not uids:
+            raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
     _check_outputs(options, uids)
     predictions = open_predictions(
         options.checkpoint, options.distance, device, options.encoder_weights
@@ -99,12 +105,15 @@ def open_job(options: ViewsOptions) -> Job:
         split_version=dataset.split_version,
         reference=options.reference,
         views=options.views,
-        size=options.size,
+        size=gso.SIZE if evaluation else options.size,
         lpips="VGG16, version 0.1" if network else None,
         lpips_reason=reason,
         distance=predictions.distance,
+        evaluation=evaluation,
     )
     job = Job(predictions, dataset, uids, protocol, network, device)
+    for name in evaluation["missing"] if evaluation else ():
+        job.fail(name, UserError(f"an object of --protocol gso that is not in {options.data}"))
     folder = None if options.out is None else output_folder(options.out)
     ceiling = None
     if options.ceiling is not None:

@@ -11,7 +11,7 @@ from msgspec import Meta
 from gamba_warp.conventions import DEFAULT_DISTANCE, DeviceChoice
 from gamba_warp.errors import UserError
 from gamba_warp.fitting.config import FitConfig, Steps
-from gamba_warp.untrusted.ranges import check_options
+from gamba_warp.untrusted.ranges import check_options, option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +25,10 @@ class ViewsOptions:
     out: Path | None = None
     """Folder for report.json, objects.csv, table.md, contact_sheet.png and strips/ (input |
     prediction | truth); without it the table is printed and that is all."""
+    protocol: Literal["default", "gso"] = "default"
+    """gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, the first view being
+    the input, with what is missing of them in the report; --size, --reference, --views, --split
+    and --limit are then its own."""
     split: Literal["all", "train", "val", "test"] = "test"
     """Split of the dataset."""
     reference: Annotated[int, Meta(ge=0, le=100_000)] = 0
@@ -70,6 +74,10 @@ class ViewsOptions:
             UserError: a number is out of its range; the message names the option.
         """
         check_options(self)
+        if self.protocol != "default":
+            for name in ("split", "reference", "views", "size", "limit"):
+                if getattr(self, name) != getattr(ViewsOptions, name):
+                    raise UserError(f"--protocol {self.protocol}: has its own {option(name)}")
         if self.save_gaussians and self.out is None:
             raise UserError("--save-gaussians: needs --out")
         if self.save_retrieval and (self.out is None or not self.baselines):

@@ -4,7 +4,9 @@
   cx, cy`` (or ``camera_angle_x``), for all frames or for each, and ``frames`` of ``file_path`` and
   ``transform_matrix`` (camera to world, OpenGL). ``gamba data render`` writes this layout.
 - ``gobjaverse``: ``<uid>/campos_512_v4/NNNNN/NNNNN.png`` and ``.json``, whose ``x, y, z, origin``
-  are the camera's OpenCV axes and position in the world.
+  are the camera's OpenCV axes and position in the world, which is z-up. Views that lack one of the
+  two files, as an unfinished download leaves them, are passed over. ``<uid>/depth/NNNNN.png``, if
+  there for all views, has their depth (``gamba data objaverse --depth`` makes it of ``_nd.exr``).
 - ``openlrm``: ``<uid>/rgba/NNN.png``, ``pose/NNN.npy`` (3x4, camera to world, OpenGL) and
   ``intrinsics.npy`` (3x2: focal lengths, principal point, width and height); the world's cube has
   side 2.
@@ -29,6 +31,8 @@ from ..untrusted.names import inside
 
 GOBJAVERSE = "campos_512_v4"
 GOBJAVERSE_FOCAL = 1422.222 / 1024  # in heights of the picture, if the JSON states no x_fov
+GOBJAVERSE_DEPTH = "depth"  # folder beside that of the views
+GOBJAVERSE_DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
 MAX_VIEWS = 10_000  # of an object
 MAX_SIDE = 16_384  # pixels that a camera may state
 NEAREST, FARTHEST = 1e-3, 1e4  # of a camera from the object's centre, as the file states it
@@ -254,10 +258,11 @@ def _check_count(count: int, path: Path) -> None:
 
 
 def _read_gobjaverse(folder: Path) -> ObjectFiles:
-    views = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
+    found = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
+    _check_count(len(found), folder)
+    views = [view for view in found if _is_complete(view)]
     if not views:
-        raise UserError(f"{folder / GOBJAVERSE}: no views")
-    _check_count(len(views), folder)
+        raise UserError(f"{folder / GOBJAVERSE}: no views that have both picture and camera")
     poses, Ks = [], []
     for view in views:
         path = view / f"{view.name}.json"
@@ -279,7 +284,22 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
         K = np.array([[focal_x, 0, 0.5], [0, focal_y, 0.5], [0, 0, 1.0]])
         Ks.append(_checked(K, 1, 1, str(path)))
     images = [inside(view, f"{view.name}.png", str(view)) for view in views]
-    return ObjectFiles(images, np.stack(poses), np.stack(Ks), [None] * len(views))
+    depths = None
+    if (folder / GOBJAVERSE_DEPTH).is_dir():
+        depths = [inside(folder, f"{GOBJAVERSE_DEPTH}/{v.name}.png", str(folder)) for v in views]
+    return ObjectFiles(
+        images,
+        np.stack(poses),
+        np.stack(Ks),
+        [None] * len(views),
+        depths=depths,
+        depth_unit=GOBJAVERSE_DEPTH_UNIT,
+    )
+
+
+def _is_complete(view: Path) -> bool:
+    """Whether a view has picture and camera; a broken link is there, and told when it is read."""
+    return all(os.path.lexists(view / f"{view.name}{suffix}") for suffix in (".json", ".png"))
 
 
 def _read_openlrm(folder: Path) -> ObjectFiles:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
-from . import sound
+from . import published, sound
 from .seeds import datasets, models, pictures, shapes
 from .seeds.pictures import Files
 
@@ -335,6 +335,9 @@ READERS: dict[str, Reader] = {
         Reader("furniture", _furniture, sound.furniture, _only(datasets.furniture, "libraries"),
                6, True),
         Reader("package", _furniture, sound.furniture, _only(datasets.furniture, "package"), 6),
+        Reader("gobjaverse-copy", published.copy_of_gobjaverse, sound.views, datasets.gobjaverse, 3,
+               True),
+        Reader("gso-copy", published.copy_of_gso, published.meshes, datasets.scanned, 3, True),
         Reader("model", _model, sound.model, models.models, 6),
         Reader("training", _training, sound.training, models.checkpoints, 5, True),
         Reader("start-weights", _start_weights, sound.model, models.models, 3),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -84,6 +85,25 @@ def sample_poses(
         distance = nearest_distance(points, pose, fov) * rng.uniform(1.0, 1.0 + spread)
         poses.append(look_at_origin(azimuth, elevation, distance))
     return np.stack(poses)
+
+
+def ring_poses(
+    points: np.ndarray, fov: float, elevations: Sequence[float], azimuths: Sequence[float]
+) -> np.ndarray:
+    """Returns ``[V, 4, 4]`` camera-to-world matrices, OpenGL frame, on rings about the object.
+
+    All views of an object have one distance: the least at which it is in each picture.
+
+    Args:
+        points: ``[P, 3]`` vertices of the object, which is centred at the origin.
+        fov: degrees, of the picture's side.
+        elevations: of the rings, degrees; the first ring's views come first.
+        azimuths: of each ring's views, degrees.
+    """
+    places = [(azimuth, elevation) for elevation in elevations for azimuth in azimuths]
+    around = [look_at_origin(azimuth, elevation, 1.0) for azimuth, elevation in places]
+    distance = max(nearest_distance(points, pose, fov) for pose in around)
+    return np.stack([look_at_origin(*place, distance) for place in places])
 
 
 def front_views(poses: np.ndarray) -> list[int]:

@@ -24,6 +24,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from gamba_warp.cameras import intrinsics
+from gamba_warp.data import gso
 from gamba_warp.data.dataset import write_split
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_folder, write_json
@@ -34,7 +35,7 @@ from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 
-from .poses import SPREAD, sample_poses
+from .poses import SPREAD, ring_poses, sample_poses
 from .raycast import Lights, RayCaster
 
 DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
@@ -59,6 +60,7 @@ class Settings:
         fov_spread: each object has a field of view of its own between fov / fov_spread and
             fov · fov_spread; 1: all have ``fov``.
         light: "usual", or "varied" with larger differences between objects.
+        poses: "drawn", or "gso": those of that evaluation, the input view first.
     """
 
     views: int
@@ -73,6 +75,7 @@ class Settings:
     stretch: float = 1.0
     fov_spread: float = 1.0
     light: str = "usual"
+    poses: str = "drawn"
 
     def drawn(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
         """Draws the stretch along the file's axes ``[3]`` and the field of view of an object."""
@@ -101,7 +104,10 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
     model, transform, scale = load_mesh(mesh.path).normalized(up, turn)
     caster = RayCaster(model, Lights.sample(rng, settings.light == "varied"))
     used = model.vertices[np.unique(model.faces)]
-    poses = sample_poses(used, settings.views, fov, rng, settings.fronts, settings.spread)
+    if settings.poses == "gso":
+        poses = ring_poses(used, fov, gso.ELEVATIONS, gso.AZIMUTHS)[: settings.views]
+    else:
+        poses = sample_poses(used, settings.views, fov, rng, settings.fronts, settings.spread)
     plain_name(mesh.uid, str(mesh.path))
     with atomic_folder(out / mesh.uid) as part:
         frames = [_write_view(caster, pose, fov, i, part, settings) for i, pose in enumerate(poses)]

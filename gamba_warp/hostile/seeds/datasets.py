@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import tarfile
@@ -10,6 +11,7 @@ import zlib
 
 import numpy as np
 
+from ...data.gso import NAMES
 from .pictures import Files, depth_png, png
 from .shapes import meshes
 
@@ -114,6 +116,50 @@ def mesh_folders() -> dict[str, Files]:
     return {"catalogue": {"catalogue.json": catalogue, "b/ball.obj": obj}}
 
 
+def gobjaverse() -> dict[str, Files]:
+    """Copies of G-Objaverse: a folder and a tar, with lists; and what the set's script leaves."""
+    view = {f"00000{end}": data for end, data in _published_view().items()}
+    tar = tarred({f"10011/campos_512_v4/00000/{n}": data for n, data in view.items()}, "")
+    index = {"0/10010": "000-000/aaaa.glb", "0/10011": "000-001/bbbb.glb"}
+    quality = [{"object_index": "aaaa.glb", "label": "Food"}, {"object_index": "bbbb.glb"}]
+    lists = {
+        "index.json": json.dumps(index).encode(),
+        "quality.json": json.dumps(quality).encode(),
+        "list.json.gz": gzip.compress(json.dumps({"ball": ["aaaa", "bbbb"]}).encode(), mtime=0),
+    }
+    folder = {f"0/10010/campos_512_v4/00000/{name}": data for name, data in view.items()}
+    return {
+        "lists": {"0/10011.tar": tar, **folder, **lists},
+        "script": {
+            **{f"0/10010/00000/{name}": data for name, data in view.items()},
+            "list.txt": b"0/10010\n",
+        },
+    }
+
+
+def _published_view() -> Files:
+    """The files of a view of G-Objaverse, by their ends."""
+    camera = {"x": [1.0, 0, 0], "y": [0, 0, -1.0], "z": [0, 1.0, 0], "origin": [0, -1.5, 0]}
+    camera |= {"x_fov": 0.691, "y_fov": 0.691, "max_depth": 5.0, "bbox": [[-0.5] * 3, [0.5] * 3]}
+    return {".json": json.dumps(camera).encode(), ".png": png(_SIZE), "_nd.exr": b"not read"}
+
+
+def scanned() -> dict[str, Files]:
+    """Copies of Google Scanned Objects, as a folder and as a zip of one model."""
+    ball = meshes()["obj"]["ball.obj"]
+    text = b'name: "A"\nauthors {\n  name: "Google"\n}\nlegal {\n  license: "CC BY 4.0"\n}\n'
+    files = {
+        "meshes/model.obj": b"mtllib model.mtl\nusemtl material_0\n" + ball,
+        "meshes/model.mtl": b"newmtl material_0\nmap_Kd texture.png\nKd 1.0 1.0 1.0\n",
+        "materials/textures/texture.png": png(_SIZE),
+        "metadata.pbtxt": text,
+        "thumbnails/0.jpg": b"a picture",
+    }
+    first, second = NAMES[:2]
+    folder = {f"{first}/{name}": data for name, data in files.items()}
+    return {"folder": folder, "zip": {f"{second}.zip": zipped(files)}}
+
+
 def zipped(members: Files, method: int = zipfile.ZIP_DEFLATED) -> bytes:
     """A zip archive."""
     content = io.BytesIO()
@@ -126,7 +172,8 @@ def zipped(members: Files, method: int = zipfile.ZIP_DEFLATED) -> bytes:
 def tarred(members: Files, form: str = "xz") -> bytes:
     """A tar archive, packed by "xz" or "gz", or not at all."""
     content = io.BytesIO()
-    with tarfile.open(fileobj=content, mode=f"w:{form}") as tar:  # pyright: ignore
+    mode = f"w:{form}" if form else "w"
+    with tarfile.open(fileobj=content, mode=mode) as tar:  # pyright: ignore
         for name, data in members.items():
             info = tarfile.TarInfo(name)
             info.size = len(data)

@@ -1,0 +1,90 @@
+"""G-Objaverse as it is published: its folders and tars, its lists, and what is missing in it."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.published.gobjaverse import ELEVATION, VIEWS, camera, write_object
+from PIL import Image
+
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.model.posing import relative_cameras
+
+
+def project(point, views, number):
+    """Where a point of the world lies in a picture, in shares of its side."""
+    local = views.cameras.viewmats[number, :3] @ torch.tensor([*point, 1.0])
+    pixel = views.cameras.Ks[number] @ local
+    return (pixel[:2] / pixel[2] / views.cameras.width).tolist()
+
+
+def test_the_published_layout_is_read_where_it_is(tmp_path):
+    write_object(tmp_path / "0" / "10010", "readme")
+    data = open_dataset(tmp_path)
+    assert (data.layout, data.uids, data.num_views(0)) == ("gobjaverse", ["0/10010"], VIEWS)
+    views = data.load(0)
+    assert views.images.shape == (VIEWS, 32, 32, 4)
+    # The camera's focal length is that of the published example: 1422.222 of 1024 pixels.
+    assert views.cameras.Ks[0, 0, 0].item() == pytest.approx(32 * 1422.222 / 1024, rel=1e-5)
+    # The origin is the middle of every picture; z is up; the first orbit goes around it.
+    for number in range(VIEWS):
+        assert project((0, 0, 0), views, number) == pytest.approx([0.5, 0.5], abs=1e-6)
+    for number in (0, 7, 24, 27):
+        assert project((0, 0, 0.2), views, number)[1] < 0.45
+    assert views.cameras.viewmats[3, 2, 3].item() == pytest.approx(camera(3)["distance"], rel=1e-6)
+    centre = -views.cameras.viewmats[0, :3, :3].T @ views.cameras.viewmats[0, :3, 3]
+    sine = (centre[2] / centre.norm()).item()
+    assert math.degrees(math.asin(sine)) == pytest.approx(ELEVATION[0], abs=1e-4)
+
+
+def test_poses_are_brought_to_the_models_distance(tmp_path):
+    """Paper §4.1: "the camera poses ... are normalized to a unit distance"; ours is 1.5."""
+    write_object(tmp_path / "0" / "10010", "readme")
+    views = open_dataset(tmp_path).load(0, [3, 0, 25])
+    moved = relative_cameras(views.cameras, 1.5)
+    want = torch.tensor([0.0, 0.0, 1.5])
+    torch.testing.assert_close(moved.viewmats[0, :3, 3], want, atol=1e-6, rtol=0)
+    factor = 1.5 / camera(3)["distance"]
+    for row, number in ((1, 0), (2, 25)):
+        got = moved.viewmats[row, :3, 3].norm().item()
+        assert got == pytest.approx(factor * camera(number)["distance"], rel=1e-5)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".json"])
+def test_views_that_lack_a_file_are_passed_over(tmp_path, suffix):
+    write_object(tmp_path / "0" / "10010", "readme")
+    views = tmp_path / "0" / "10010" / "campos_512_v4"
+    (views / "00007" / f"00007{suffix}").unlink()
+    (views / "00040").mkdir()  # an empty one, as an interrupted wget leaves it
+    data = open_dataset(tmp_path)
+    assert data.num_views(0) == VIEWS - 1 and not data.check()
+    assert "00007" not in {path.stem for path in data.files(0).images}
+    for view in views.iterdir():
+        for path in view.glob("?????.png"):
+            path.unlink()
+    with pytest.raises(UserError, match="no views that have both picture and camera"):
+        open_dataset(tmp_path).load(0)
+
+
+def test_depth_beside_the_views(tmp_path):
+    write_object(tmp_path / "0" / "10010", "readme")
+    depth = tmp_path / "0" / "10010" / "depth"
+    depth.mkdir()
+    for number in range(VIEWS):
+        values = np.full((32, 32), 14000 + number, np.uint16)
+        Image.fromarray(values).save(depth / f"{number:05d}.png")
+    got = open_dataset(tmp_path).load(0, [2, 9])
+    assert got.depths[:, 5, 5].tolist() == pytest.approx([1.4002, 1.4009], abs=1e-6)
+    (depth / "00003.png").unlink()
+    assert "00003.png: no such file" in open_dataset(tmp_path).check()["0/10010"]
+
+
+def test_the_cameras_file_is_as_published(tmp_path):
+    """The keys of Blender scripts that render Objaverse, which G-Objaverse's files have."""
+    write_object(tmp_path / "0" / "10010", "readme")
+    text = (tmp_path / "0/10010/campos_512_v4/00000/00000.json").read_text()
+    keys = {"bbox", "max_depth", "origin", "x", "x_fov", "y", "y_fov", "z"}
+    assert set(json.loads(text)) == keys

@@ -1,0 +1,70 @@
+"""The protocol ``gso`` of both evaluations: its options, its list, and what is missing of it."""
+
+import json
+
+import pytest
+import trimesh
+from helpers import micro
+
+from gamba_warp.cli import run
+from gamba_warp.data import gso
+from gamba_warp.formats.ply import save_ply
+
+THERE = gso.NAMES[:2]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    root = tmp_path_factory.mktemp("gso")
+    for seed, name in enumerate((*THERE, "not of the list")):
+        micro.write_object(root / "views" / name, micro.cloud(seed))
+        (root / "pred").mkdir(exist_ok=True)
+        save_ply(root / "pred" / f"{name}.ply", micro.cloud(seed))
+        (root / "meshes" / name).mkdir(parents=True)
+        trimesh.creation.box().export(root / "meshes" / name / "model.obj")
+    everything = {"version": 2, "test": [*THERE, "not of the list"]}
+    (root / "views" / "split.json").write_text(json.dumps(everything))
+    entries = [{"model": f"{name}/model.obj", "uid": name} for name in THERE]
+    (root / "meshes" / "catalogue.json").write_text(json.dumps({"objects": entries}))
+    return root
+
+
+def test_views(data, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(gso, "SIZE", 24)  # 512 pixels take a minute
+    words = ["--checkpoint", data / "pred", "--data", data / "views", "--out", tmp_path]
+    words += ["--protocol", "gso", "--no-lpips", "--no-baselines", "--sheet", 0, "--strips", 0]
+    assert run("eval-views", [str(word) for word in words]) == 1  # 58 are missing
+    report = json.loads((tmp_path / "report.json").read_text())
+    protocol = report["protocol"]
+    assert (protocol["size"], protocol["reference"], protocol["views"]) == (24, 0, None)
+    assert protocol["uids"] == list(THERE) and protocol["split"] == "test"
+    said = protocol["evaluation"]
+    assert (said["name"], said["evaluated"], len(said["missing"])) == ("gso", 2, 58)
+    assert said["others"] == ["not of the list"] and "elevation 0" in said["input"]
+    assert {f["name"] for f in report["failures"]} == set(gso.NAMES) - set(THERE)
+    assert f"failed: {gso.NAMES[2]}: an object of --protocol gso" in capsys.readouterr().err
+
+
+def test_its_options_are_its_own(data, capsys):
+    words = ["--checkpoint", str(data / "pred"), "--data", str(data / "views"), "--protocol", "gso"]
+    for option, value in (("--size", "64"), ("--reference", "1"), ("--split", "all")):
+        assert run("eval-views", [*words, option, value]) == 2
+        assert f"--protocol gso: has its own {option}" in capsys.readouterr().err
+    other = ["--checkpoint", str(data / "pred"), "--data", str(data / "views" / "not of the list")]
+    assert run("eval-views", [*other, "--protocol", "gso"]) == 2
+    capsys.readouterr()
+
+
+def test_geometry(data, tmp_path):
+    words = [data / "pred", data / "meshes", "--protocol", "gso", "--data", data / "views"]
+    words += ["--points", 256, "--views", 8, "--pixels", 32, "--voxels", 24, "--out", tmp_path]
+    assert run("eval-geometry", [str(word) for word in words]) == 1
+    report = json.loads((tmp_path / "report.json").read_text())
+    protocol = report["protocol"]
+    assert (protocol["name"], protocol["frame"], protocol["up"]) == ("gso", "reference", "z")
+    # Two were compared; of the list 58 are named as missing, and what is not of it has no truth.
+    assert report["num_ok"] == 2 and report["evaluation"]["evaluated"] == 2
+    missing = {f["name"]: f["reason"] for f in report["failures"]}
+    assert missing.pop("not of the list") == "no ground truth"
+    assert set(missing) == set(gso.NAMES) - set(THERE)
+    assert set(missing.values()) == {"no prediction"}

@@ -1,0 +1,96 @@
+"""Objects in the published layouts of G-Objaverse, small."""
+
+import io
+import json
+import math
+import tarfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+# 25 views on an orbit, of which the last repeats the first, top and bottom, 13 on another orbit.
+VIEWS = 40
+ELEVATION = {number: 20.0 for number in range(25)} | {25: 89.9, 26: -89.9}
+ELEVATION |= {number: 2.0 for number in range(27, 40)}
+SIZE = 32  # those of the set have 512
+FOV = 2 * math.atan(0.5 * 1024 / 1422.222)
+# What lies beside a view's picture and camera, and is not read.
+OTHERS = ("_albedo.png", "_hdr.exr", "_mr.png", "_nd.exr", "_ng.exr")
+
+
+def camera(number: int) -> dict:
+    """The camera of a view: its OpenCV axes in a z-up world, position and distance."""
+    azimuth = math.radians(15.0 * number if number < 25 else 30.0 * (number - 27))
+    elevation = math.radians(ELEVATION[number])
+    distance = 1.2 + 0.01 * number
+    back = np.array(
+        [
+            math.cos(azimuth) * math.cos(elevation),
+            math.sin(azimuth) * math.cos(elevation),
+            math.sin(elevation),
+        ]
+    )
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    down = np.cross(right, back)
+    return {
+        "x": right.tolist(),
+        "y": down.tolist(),
+        "z": (-back).tolist(),
+        "origin": (distance * back).tolist(),
+        "distance": distance,
+    }
+
+
+def files_of(number: int) -> dict[str, bytes]:
+    """The files of a view by their names after the number."""
+    values = camera(number)
+    values.pop("distance")
+    values |= {"x_fov": FOV, "y_fov": FOV, "max_depth": 5.0}
+    values["bbox"] = [[-0.5, -0.31, -0.5], [0.5, 0.31, 0.5]]
+    pixels = np.zeros((SIZE, SIZE, 4), np.uint8)
+    pixels[8:24, 8:24] = (200, number, 50, 255)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG")
+    others = {suffix: b"not read" for suffix in OTHERS}
+    return {".json": json.dumps(values).encode(), ".png": stream.getvalue(), **others}
+
+
+def members(name: str, views: int = VIEWS) -> dict[str, bytes]:
+    """The files of an object's tar; ``name`` is its instance_id."""
+    return {
+        f"{name}/campos_512_v4/{number:05d}/{number:05d}{suffix}": data
+        for number in range(views)
+        for suffix, data in files_of(number).items()
+    }
+
+
+def write_object(folder: Path, layout: str, views: int = VIEWS) -> None:
+    """Writes an object.
+
+    Args:
+        folder: ``ROOT/dictionary_id/instance_id``.
+        layout: "readme", as the set's README and its tars have it; "script", as its script of
+            single files leaves it; "tar".
+        views: number of views.
+    """
+    made = members(folder.name, views)
+    if layout == "tar":
+        write_tar(folder.with_suffix(".tar"), made)
+        return
+    for name, data in made.items():
+        path = folder.parent / name
+        if layout == "script":
+            path = folder / path.relative_to(folder / "campos_512_v4")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+
+def write_tar(path: Path, content: dict[str, bytes]) -> None:
+    """Writes a plain tar of these files."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(path, "w") as tar:
+        for name, data in content.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))

@@ -1,0 +1,132 @@
+"""Google Scanned Objects in their published layout: the list, the poses, views and meshes."""
+
+import json
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from helpers.published.gso import PBTXT, write_model, write_zip
+
+from gamba_warp.cli import run
+from gamba_warp.data import gso
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
+from gamba_warp.formats.catalogue import find_meshes
+from gamba_warp.formats.meshes import load_mesh
+from gamba_warp.train.data.poses import nearest_distance, ring_poses
+from gamba_warp.train.sources.gso_models import attribution_of, find_models, take_model
+
+FIRST, SECOND, THIRD = gso.NAMES[:3]
+
+
+def test_the_list_is_sixty_names_that_never_change():
+    assert len(gso.NAMES) == len(set(gso.NAMES)) == 60  # paper §4.1: totally 60 3D objects
+    assert all(len(names) == 10 for names in gso.GROUPS.values())
+    assert gso.SIZE == 512 and gso.NAMES == tuple(sorted(gso.NAMES))
+    for names in gso.GROUPS.values():
+        assert list(names) == sorted(names)
+    assert (FIRST, gso.NAMES[-1]) == ("11pro_SL_TRX_FG", "Whey_Protein_Vanilla")
+
+
+def test_the_input_view_has_zero_elevation_and_azimuth():
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)) * (1, 0.3, 0.7)
+    poses = ring_poses(points, gso.FOV, gso.ELEVATIONS, gso.AZIMUTHS)
+    assert len(poses) == gso.VIEWS == 24
+    distances = np.linalg.norm(poses[:, :3, 3], axis=1)
+    np.testing.assert_allclose(distances, distances[0])
+    np.testing.assert_allclose(poses[0, :3, 3], [0, -distances[0], 0], atol=1e-12)
+    np.testing.assert_allclose(poses[2, :3, 3], [distances[0], 0, 0], atol=1e-12)
+    height = np.degrees(np.arcsin(poses[:, 2, 3] / distances))
+    np.testing.assert_allclose(height, np.repeat([0, 20, 40], 8), atol=1e-9)
+    assert distances[0] == pytest.approx(max(nearest_distance(points, p, gso.FOV) for p in poses))
+
+
+def test_a_model_in_one_folder(tmp_path):
+    write_model(tmp_path / "set", FIRST)
+    write_zip(tmp_path / "set", SECOND)
+    write_zip(tmp_path / "set" / "models", THIRD, top=f"{THIRD}/")
+    found = find_models(tmp_path / "set")
+    assert sorted(found) == [FIRST, SECOND, THIRD]
+    for name, path in found.items():
+        take_model(name, path, tmp_path / "out")
+        names = {p.name for p in (tmp_path / "out" / name).iterdir()}
+        assert names == {"model.obj", "model.mtl", "texture.png", "metadata.pbtxt"}
+        mesh = load_mesh(tmp_path / "out" / name / "model.obj")
+        assert not mesh.warnings  # the texture is found
+        known = attribution_of(tmp_path / "out" / name)
+        assert known["creator"] == "Google" and "4.0 International" in known["licence"]
+    assert 'license: "Creative Commons Attribution' in PBTXT
+
+
+def test_views_and_meshes_of_a_copy_of_the_set(tmp_path, capsys):
+    write_model(tmp_path / "set", FIRST)
+    write_zip(tmp_path / "set", SECOND)
+    words = ["data", "gso", str(tmp_path / "out"), "--source", str(tmp_path / "set")]
+    words += ["--size", "24", "--workers", "1", "--limit", "3"]
+    assert run("data gso", words[2:]) == 1
+    said = capsys.readouterr()
+    assert f"missing: {THIRD}: not in {tmp_path / 'set'}" in said.err
+    assert "rendered 2 objects" in said.out and "1 of 3 missing" in said.out
+    data = open_dataset(tmp_path / "out" / "views", "test")
+    assert data.uids == [FIRST, SECOND] and data.num_views(0) == 24
+    with pytest.raises(UserError, match="none of its 2 objects is in the train split"):
+        open_dataset(tmp_path / "out" / "views", "train")
+    views = data.load(0)
+    # The model's box is 2 x 1 x 4 with z up in its file: upright in the picture, from the front.
+    rows = views.images[0, ..., 3].amax(1) > 0.5
+    columns = views.images[0, ..., 3].amax(0) > 0.5
+    assert rows.sum() > 1.5 * columns.sum()
+    # Its front, at -y, has the texture's left half, red; its back the right half, blue.
+    for number, channel in ((0, 0), (4, 2)):
+        colour = views.images[number, 12, 12, :3]
+        assert int(colour.argmax()) == channel, number
+    place = -views.cameras.viewmats[0, :3, :3].T @ views.cameras.viewmats[0, :3, 3]
+    torch.testing.assert_close(place / place.norm(), torch.tensor([0.0, -1, 0]), atol=1e-6, rtol=0)
+    entries = json.loads((tmp_path / "out/meshes/catalogue.json").read_text())["objects"]
+    assert [entry["uid"] for entry in entries] == [FIRST, SECOND]
+    assert find_meshes(tmp_path / "out" / "meshes")[0].attribution["creator"] == "Google"
+    # The same command goes on: what is there is neither read nor rendered again.
+    shutil.rmtree(tmp_path / "set" / FIRST)
+    write_model(tmp_path / "set", THIRD)
+    assert run("data gso", words[2:]) == 0
+    assert "rendered 1 objects" in capsys.readouterr().out
+    other = [word if word != "24" else "16" for word in words[2:]]
+    assert run("data gso", other) == 2
+    assert "rendered with other settings" in capsys.readouterr().err
+
+
+def test_shards_part_the_list(tmp_path, capsys):
+    write_model(tmp_path / "set", SECOND)
+    words = [str(tmp_path / "out"), "--source", str(tmp_path / "set"), "--size", "16"]
+    assert run("data gso", [*words, "--shard", "1/60", "--workers", "1"]) == 0
+    assert open_dataset(tmp_path / "out" / "views", "test").uids == [SECOND]
+    assert run("data gso", [*words, "--shard", "0/60"]) == 2  # none of this shard is there
+    assert "holds none of the 1 models" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        (lambda path: path.write_bytes(b"no zip"), "cannot be unpacked"),
+        (lambda path: zipfile.ZipFile(path, "w").writestr("meshes/model.mtl", ""), "holds no"),
+        (lambda path: zipfile.ZipFile(path, "a").writestr("meshes/../../x.obj", "v"), "leaves"),
+        (lambda path: zipfile.ZipFile(path, "a").writestr("meshes/texture.png", "v"), "two files"),
+    ],
+)
+def test_bad_models_are_one_line_and_leave_nothing(tmp_path, capsys, change, reason):
+    path = write_zip(tmp_path / "set", FIRST)
+    change(path)
+    words = [str(tmp_path / "out"), "--source", str(tmp_path / "set"), "--limit", "1"]
+    assert run("data gso", words) == 1
+    error = capsys.readouterr().err
+    told = [line for line in error.splitlines() if line.startswith("missing: ")]
+    assert len(told) == 1 and reason in told[0]
+    assert [p.name for p in (tmp_path / "out" / "meshes").iterdir()] == ["catalogue.json"]
+
+
+def test_what_a_report_says_of_the_evaluation():
+    said = gso.protocol_of([FIRST, "a chair"])
+    assert (said["objects"], said["evaluated"], said["others"]) == (60, 1, ["a chair"])
+    assert len(said["missing"]) == 59 and FIRST not in said["missing"]

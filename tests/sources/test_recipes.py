@@ -1,0 +1,165 @@
+"""``gamba train --recipe``: every number of the paper, batches over processes, and what wins."""
+
+import json
+import shlex
+
+import pytest
+import tyro
+from helpers import micro
+
+from gamba_warp import cli
+from gamba_warp.errors import UserError
+from gamba_warp.model.config import PRESETS
+from gamba_warp.train import command
+from gamba_warp.train.command import expand
+from gamba_warp.train.config import TrainConfig, command_line
+from gamba_warp.train.recipes import RECIPES, recipe_words, table_of
+
+# Each number of the paper's training, as its text has it.
+PAPER = [
+    ("views.size", 512, "not stated; the side of the input, §4.1, and of G-Objaverse"),
+    ("length.epochs", 400, "§4.1: for totally 400 epochs"),
+    ("optim.lr", 1e-3, "§4.1: AdamW ... with an initial learning rate of 1e-3"),
+    ("optim.weight_decay", 0.05, "§4.1: and a weight decay of 0.05"),
+    ("optim.clip", 1.0, "§4.1: Gradient clipping of value 1.0 ... the L2 norm of gradients"),
+    ("views.views_first", 2, "§3.3: we progressively increase the number of views from 2"),
+    ("views.views_last", 6, "§3.3: to 6 during training"),
+    ("loss.mask_weight", 1.0, "§4.1: λ_mask = 1 for the mask loss"),
+    ("loss.lpips_weight", 0.5, "§4.1: and λ_LPIPS = 0.5 for LPIPS loss"),
+    ("loss.lpips", "on", "§3.3: the VGG-based perceptual loss"),
+    ("loss.radial_mask", True, "§3.2: radial mask constraint"),
+    ("loss.rdist_weight", 0.1, "§4.1: λ_rdist ... is initially set at 0.1"),
+    ("loss.rdist_epochs", 10.0, "§4.1: gradually decayed to 0 over the first 10 epochs"),
+    ("loss.ssim_weight", 0.0, "eq. L_train has no such term"),
+    ("loss.depth_weight", 0.0, "eq. L_train has no such term"),
+    ("loss.novel_weight", 1.0, "eq. L_train: one mean over V + 1 views"),
+    ("loss.lpips_crop", 0, "eq. L_train: whole views"),
+    ("optim.schedule", "cosine", "not stated"),
+    ("optim.precision", "bfloat16", "not stated; the public code's"),
+]
+NETWORK = [
+    ("image_size", 512, "§4.1: the reference image, with a spatial resolution of 512 × 512"),
+    ("patch_size", 8, "§4.1: a convolution kernel with p = 8"),
+    ("depth", 14, "§4.1: N = 14 Gamba blocks"),
+    ("width", 512, "§4.1: hidden dimensions D = 512"),
+    ("num_gaussians", 16384, "§4.1: L = 16384"),
+    ("encoder", "vit_base_patch14_reg4_dinov2", "§4.1: the pretrained DINO v2 model"),
+    ("encoder_size", 336, "§4.1: tokens of length K = 576, of patches of 14 pixels"),
+]
+
+
+def parse(*words):
+    arguments = expand([str(word) for word in words])
+    return tyro.cli(tyro.conf.OmitArgPrefixes[TrainConfig], args=arguments)
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return parse("data", "--recipe", "paper")
+
+
+@pytest.mark.parametrize("field, value, source", PAPER, ids=[row[0] for row in PAPER])
+def test_the_recipe_has_the_papers_number(paper, field, value, source):
+    group, name = field.split(".")
+    assert getattr(getattr(paper, group), name) == value, source
+
+
+@pytest.mark.parametrize("field, value, source", NETWORK, ids=[row[0] for row in NETWORK])
+def test_the_recipes_network_is_the_papers(paper, field, value, source):
+    assert getattr(paper.model_config(), field) == value, source
+    assert paper.preset == "paper" and (336 // 14) ** 2 == 576
+
+
+@pytest.mark.parametrize(
+    "processes, words, share",
+    [("", [], 256), ("16", [], 16), ("4", ["--accumulate", "8"], 8), ("2", ["--accumulate=4"], 32)],
+)
+def test_a_batch_of_256_over_all_processes(monkeypatch, processes, words, share):
+    if processes:
+        monkeypatch.setenv("WORLD_SIZE", processes)
+    views = parse("data", "--recipe", "paper", *words).views
+    assert views.batch_size == share  # §4.1: with a batch size of 256
+    assert share * int(processes or 1) * views.accumulate == 256
+
+
+@pytest.mark.parametrize(
+    "processes, words",
+    [("3", []), ("16", ["--accumulate", "3"]), ("512", []), ("1", ["--accumulate", "x"])],
+)
+def test_a_batch_that_does_not_divide_is_one_line(monkeypatch, capsys, processes, words):
+    monkeypatch.setenv("WORLD_SIZE", processes)
+    assert cli.run("train", ["data", "--recipe", "paper", *words]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "does not divide" in error or "expected a number" in error
+    assert parse("data", "--recipe", "paper", "--batch-size", 5).views.batch_size == 5
+
+
+def test_a_given_option_wins_wherever_it_stands():
+    for words in (["data", "--lr", 1, "--recipe", "paper"], ["--recipe=paper", "data", "--lr", 1]):
+        config = parse(*words, "--size", 128, "--no-radial-mask", "--batch_size", 3)
+        assert (config.optim.lr, config.views.size, config.views.batch_size) == (1, 128, 3)
+        assert not config.loss.radial_mask and config.optim.weight_decay == 0.05
+        assert config.data.name == "data" and config.run.recipe == "paper"
+        # The record's command means the same without the recipe, also where a default was given.
+        text = command_line(config.to_dict())
+        again = tyro.cli(tyro.conf.OmitArgPrefixes[TrainConfig], args=shlex.split(text)[2:])
+        first, second = config.to_dict(), again.to_dict()
+        assert first["run"].pop("recipe") and not second["run"].pop("recipe")
+        assert first == second
+
+
+def test_the_shipped_models_recipe():
+    config = parse("data", "--recipe", "tiny")
+    assert config.preset == "rays" and config.model_config() == PRESETS["rays"]
+    assert RECIPES["tiny"] is RECIPES["rays"]
+    assert (config.length.steps, config.views.batch_size, config.views.size) == (19250, 4, 128)
+    assert config.loss.depth_weight == 0.3 and not config.loss.radial_mask
+
+
+def test_a_run_records_its_recipe(tmp_path, capsys):
+    data = micro.write_dataset(tmp_path / "data")
+    words = [str(data), "--recipe", "paper", "--preset", "tiny", "--set", *micro.MODEL]
+    words += ["--batch-size", "1", "--steps", "1", "--size", "16", "--lpips", "off"]
+    words += ["--precision", "float32", "--val-every", "0", "--no-tensorboard", "--device", "cpu"]
+    assert cli.run("train", [*words, "--out", str(tmp_path / "one")]) == 0
+    assert "recipe paper: --preset paper --size 512 --epochs 400" in capsys.readouterr().out
+    assert json.loads((tmp_path / "one/config.json").read_text())["run"]["recipe"] == "paper"
+    two = ["--config", str(tmp_path / "one"), "--out", str(tmp_path / "two")]
+    assert cli.run("train", two) == 0
+    one, two = (json.loads((tmp_path / n / "config.json").read_text()) for n in ("one", "two"))
+    assert one["run"].pop("out") != two["run"].pop("out")
+    assert one == two
+
+
+def test_help_shows_what_a_recipe_sets(capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.run("train", ["--recipe", "paper", "--help"])
+    text = capsys.readouterr().out
+    assert caught.value.code == 0 and table_of("paper") in text and "usage: gamba train" in text
+    for words in ("--lr 1e-3", "--batch-size 256 / (processes x accumulate)"):
+        assert words in table_of("paper")
+
+
+@pytest.mark.parametrize(
+    "words, reason",
+    [
+        (["--recipe", "rats"], "--recipe rats: expected one of paper, tiny, rays"),
+        (["--recipe", "rats", "--help"], "--recipe rats: expected one of"),
+        (["--recipe"], "--recipe: expected once"),
+        (["--recipe", "tiny", "--recipe", "paper"], "--recipe: expected once"),
+        (["--recipe", "tiny", "--config", "run"], "--recipe and --config: give one of them"),
+    ],
+)
+def test_bad_recipes_are_one_line(words, reason):
+    with pytest.raises(UserError, match=reason) as caught:
+        command.expand(["data", *words])
+    assert "\n" not in str(caught.value)
+
+
+def test_one_of_several_processes_says_it(monkeypatch, capsys):
+    words = recipe_words("rays", (), {})
+    for rank, count in (("0", 1), ("1", 0)):
+        monkeypatch.setenv("RANK", rank)
+        command.announce(words)
+        assert capsys.readouterr().out.count("recipe rays: ") == count

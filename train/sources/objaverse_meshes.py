@@ -1,0 +1,115 @@
+"""Objects of Objaverse by its own package ``objaverse``: downloaded, and named for rendering."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from gamba_warp.errors import UserError, first_line
+from gamba_warp.files import atomic_path, output_folder, write_json
+from gamba_warp.formats.catalogue import CATALOGUE
+from gamba_warp.untrusted.documents import read_document
+from gamba_warp.untrusted.names import plain_name
+
+PACKAGE = "objaverse"
+ANNOTATIONS = "annotations"  # folder beside the meshes: what Objaverse says of each
+_BATCH = 64  # objects asked for at once, so that a stopped run has lost no more
+_FIELDS = {"creator": "user", "licence": "license", "source": "viewerUrl"}
+
+
+def load_package() -> Any:
+    """The package ``objaverse``. Raises UserError where it is not installed."""
+    try:
+        return importlib.import_module(PACKAGE)
+    except ImportError as error:
+        raise UserError(
+            f"--source {PACKAGE}: needs the package of that name: pip install {PACKAGE}"
+        ) from error
+
+
+def take_meshes(names: Sequence[str], out: Path, processes: int) -> tuple[int, dict[str, str]]:
+    """Downloads objects that are not there yet, and writes the catalogue of all that are.
+
+    Args:
+        names: uids of Objaverse.
+        out: folder for ``<uid>.glb``.
+        processes: downloads at once.
+
+    Returns:
+        How many were put there now; and by uid, why one could not be.
+
+    Raises:
+        UserError: the package is not installed, or nothing comes from where it downloads.
+    """
+    package = load_package()
+    output_folder(out / ANNOTATIONS)
+    wanted = [name for name in names if not (out / f"{plain_name(name, '--uids')}.glb").is_file()]
+    failures: dict[str, str] = {}
+    # It reads 160 large files for this, so all at once.
+    known = _asked(package.load_annotations, uids=wanted) if wanted else {}
+    with tqdm(total=len(wanted), unit="object", disable=None) as progress:
+        for start in range(0, len(wanted), _BATCH):
+            batch = wanted[start : start + _BATCH]
+            paths = _asked(package.load_objects, uids=batch, download_processes=processes)
+            for name in batch:
+                try:
+                    _put(name, paths.get(name), known.get(name), out)
+                except UserError as error:
+                    failures[name] = str(error)
+            progress.update(len(batch))
+    write_catalogue(out)
+    return len(wanted) - len(failures), failures
+
+
+def _asked(function: Callable[..., dict[str, Any]], **arguments: Any) -> dict[str, Any]:
+    """What the package answers, by uid; its errors, and those of the network, in one line."""
+    try:
+        return function(**arguments)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {first_line(error)}"
+        raise UserError(
+            f"--source {PACKAGE}: nothing can be downloaded ({reason}); the same command goes on "
+            "from here"
+        ) from error
+
+
+def _put(name: str, path: str | None, known: Any, out: Path) -> None:
+    """Puts one file, a second name of that in the package's cache where the disk allows it."""
+    if path is None or not Path(path).is_file():
+        raise UserError("Objaverse has no such object")
+    write_json(out / ANNOTATIONS / f"{name}.json", _entry(name, known))
+    with atomic_path(out / f"{name}.glb") as temporary:
+        try:
+            os.link(path, temporary)
+        except OSError:
+            shutil.copyfile(path, temporary)
+
+
+def _entry(name: str, known: Any) -> dict[str, Any]:
+    """The catalogue's entry of one object."""
+    known = known if isinstance(known, dict) else {}
+    user = known.get("user")
+    values = {**known, "user": user.get("displayName") if isinstance(user, dict) else user}
+    attribution = {
+        field: " ".join(str(values[key]).split())[:500]
+        for field, key in _FIELDS.items()
+        if values.get(key)
+    }
+    title = " ".join(str(known.get("name") or name).split())[:200]
+    return {"model": f"{name}.glb", "uid": name, "name": title, "attribution": attribution}
+
+
+def write_catalogue(out: Path) -> int:
+    """Writes ``catalogue.json`` of the files in ``out``; returns how many there are."""
+    entries = []
+    for path in sorted((out / ANNOTATIONS).glob("[!.]*.json")):
+        if (out / f"{path.stem}.glb").is_file():
+            entries.append(read_document(path, dict[str, Any]))
+    write_json(out / CATALOGUE, {"objects": entries})
+    return len(entries)

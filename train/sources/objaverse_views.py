@@ -1,0 +1,192 @@
+"""A local copy of G-Objaverse as a dataset: chosen objects, linked, copied or unpacked.
+
+The set is published as ``dictionary_id/instance_id/campos_512_v4/NNNNN/NNNNN.png`` and seven more
+files a view; as a tar of each object, ``dictionary_id/instance_id.tar``; and by a script that
+leaves out the folder ``campos_512_v4``. Training needs a view's picture and camera alone.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.data.layouts import GOBJAVERSE, GOBJAVERSE_DEPTH, ObjectFiles
+from gamba_warp.errors import UserError
+from gamba_warp.files import PART, atomic_folder
+from gamba_warp.untrusted.archives import open_tar
+from gamba_warp.untrusted.documents import read_bytes
+from gamba_warp.untrusted.names import inside
+
+from .objaverse_depth import MOST, SUFFIX, DepthFile, convert
+
+VIEWS = 40  # of an object: two orbits, top and bottom
+_NUMBER = re.compile(r"[0-9]{1,12}")
+_MEMBER = re.compile(r"(?:[^/]+/){0,3}?([0-9]{5})/\1(\.png|\.json|_nd\.exr)")
+_MOST = {".png": 64 << 20, ".json": 1 << 20}  # bytes; pictures have 0.2 MB
+
+
+def find_rendered(source: Path) -> dict[str, Path]:
+    """The objects of a local copy, by name; a folder is preferred to a tar.
+
+    Args:
+        source: folder of the set, or one that holds it as ``savedata/``.
+
+    Raises:
+        UserError: no such folder, or no objects in it.
+    """
+    if not source.is_dir():
+        raise UserError(f"--source {source}: no such folder")
+    found: dict[str, Path] = {}
+    for top in (source, source / "savedata"):
+        for group in sorted(top.iterdir()) if top.is_dir() else ():
+            if _NUMBER.fullmatch(group.name) and group.is_dir():
+                for entry in os.scandir(group):
+                    name = entry.name.removesuffix(".tar")
+                    plain = name == entry.name
+                    if _NUMBER.fullmatch(name) and entry.is_dir() == plain:
+                        if plain or f"{group.name}/{name}" not in found:
+                            found[f"{group.name}/{name}"] = Path(entry.path)
+    if not found:
+        raise UserError(
+            f"--source {source}: holds no objects of G-Objaverse (0/10010, 0/10010.tar)"
+        )
+    return found
+
+
+def take_views(
+    objects: dict[str, Path],
+    names: Sequence[str],
+    out: Path,
+    least: int,
+    copy: bool,
+    depth: bool = False,
+) -> tuple[int, dict[str, str]]:
+    """Puts objects into a dataset that are not in it yet.
+
+    Args:
+        objects: the local copy, by name.
+        names: which of it.
+        out: the dataset.
+        least: complete views that an object must have.
+        copy: whether the files of folders are copied; else their folder is linked.
+        depth: whether depth pictures are made, too; also for objects that are there without.
+
+    Returns:
+        How many were put there now; and by name, why one could not be.
+
+    Raises:
+        UserError: the system makes no links.
+    """
+    failures: dict[str, str] = {}
+    marks = (GOBJAVERSE, GOBJAVERSE_DEPTH) if depth else (GOBJAVERSE,)
+    wanted = [name for name in names if not all((out / name / mark).exists() for mark in marks)]
+    for name in tqdm(wanted, unit="object", disable=None):
+        try:
+            _take(objects[name], out / name, least, copy, depth)
+        except UserError as error:
+            failures[name] = str(error)
+    return len(wanted) - len(failures), failures
+
+
+def _take(path: Path, target: Path, least: int, copy: bool, depth: bool) -> None:
+    if (target / GOBJAVERSE).exists():  # without depth, which is then all that is added
+        files = _checked(target, path, least)
+        with atomic_folder(target / GOBJAVERSE_DEPTH) as part:
+            _add_depth(files, part, path)
+        return
+    # A link that leads nowhere any more gives way; anything else that is there stays.
+    names = {p.name for p in target.iterdir()} if target.is_dir() else set()
+    broken = (target / GOBJAVERSE).is_symlink() and names <= {GOBJAVERSE, GOBJAVERSE_DEPTH}
+    with atomic_folder(target, replace=broken) as part:
+        if path.is_file():
+            _unpack(path, part / GOBJAVERSE, _MOST)
+        elif copy:
+            _copy(_views_of(path), part / GOBJAVERSE)
+        else:
+            _link(_views_of(path), part / GOBJAVERSE)
+        files = _checked(part, path, least)
+        if depth:
+            (part / GOBJAVERSE_DEPTH).mkdir()
+            _add_depth(files, part / GOBJAVERSE_DEPTH, path)
+
+
+def _views_of(path: Path) -> Path:
+    """The folder of an object's views."""
+    return path / GOBJAVERSE if (path / GOBJAVERSE).is_dir() else path
+
+
+def _link(views: Path, target: Path) -> None:
+    try:
+        target.symlink_to(views.resolve(), target_is_directory=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"{target.name}: cannot be linked ({reason}); give --copy") from error
+
+
+def _copy(views: Path, target: Path) -> None:
+    target.mkdir()
+    for view in sorted(views.iterdir()):
+        for suffix, most in _MOST.items():
+            if not re.fullmatch("[0-9]{5}", view.name):
+                continue
+            file = inside(views, f"{view.name}/{view.name}{suffix}", str(views))
+            if file.is_file():
+                (target / view.name).mkdir(exist_ok=True)
+                (target / view.name / file.name).write_bytes(read_bytes(file, most))
+
+
+def _unpack(path: Path, target: Path, most: Mapping[str, int]) -> None:
+    """Writes the views' files of a tar whose ends ``most`` has, with their largest sizes, bytes."""
+    target.mkdir()
+    with path.open("rb") as file, open_tar(file, path, target.parent) as members:
+        for member in members:
+            match = _MEMBER.fullmatch(member.name.removeprefix("./"))
+            if not match or match[2] not in most:
+                continue
+            if member.size > most[match[2]]:
+                raise UserError(f"{path}: {member.name!r} is over {most[match[2]] >> 20} MB")
+            place = target / match[1] / f"{match[1]}{match[2]}"
+            if place.exists():
+                raise UserError(f"{path}: {member.name!r} is there twice")
+            place.parent.mkdir(exist_ok=True)
+            with place.open("xb") as out:
+                shutil.copyfileobj(member.file, out)
+
+
+def _checked(folder: Path, path: Path, least: int) -> ObjectFiles:
+    """Refuses an object whose cameras cannot be read, or that has too few complete views."""
+    try:
+        files = open_dataset(folder, layout="gobjaverse").files(0)
+    except UserError as error:
+        reason = str(error).replace(f"{folder}{os.sep}", "").replace(str(folder), "it")
+        raise UserError(f"{path}: {reason}") from error
+    if len(files.images) < least:
+        count = len(files.images)
+        raise UserError(f"{path}: has {count} complete views, --min-views is {least}")
+    return files
+
+
+def _add_depth(files: ObjectFiles, target: Path, path: Path) -> None:
+    """Makes the depth pictures of an object's views in ``target``, of its depth files."""
+    with tempfile.TemporaryDirectory(dir=target, prefix=PART) as scratch:
+        raw = _views_of(path)
+        if path.is_file():
+            raw = Path(scratch) / "views"
+            _unpack(path, raw, {SUFFIX: MOST})
+        distances = np.linalg.norm(files.camera_to_world[:, :3, 3], axis=1).tolist()
+        wanted = []
+        for image, distance in zip(files.images, distances):
+            source = inside(raw, f"{image.stem}/{image.stem}{SUFFIX}", str(path))
+            wanted.append(DepthFile(source, target / f"{image.stem}.png", distance))
+        try:
+            convert(wanted)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from error
