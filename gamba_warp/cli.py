@@ -25,6 +25,7 @@ COMMANDS = {
     "data render": "Meshes to posed views.",
     "eval-views": "PSNR, SSIM, LPIPS of views.",
     "eval-geometry": "Chamfer, IoU, F-score.",
+    "compare": "Reports of several methods in one table.",
     "export": "Gaussians to meshes, splats and pages.",
     "view": "Gaussians in the browser.",
     "bench": "Run time against error, on this machine.",
@@ -42,6 +43,7 @@ MODULES = {
     "data render": "gamba_warp.train.data.render_command",
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",
+    "compare": "gamba_warp.eval.compare_command",
 }
 
 

@@ -228,7 +228,7 @@ def _lens(files: ObjectFiles, view: int) -> np.ndarray:
 def _by_name(
     folder: Path, files: ObjectFiles, views: Sequence[int]
 ) -> tuple[str, dict[int, Path], int]:
-    """ "name" or "number"; the pictures by view; and how many there are.
+    """Whether it goes by "name" or "number", the pictures by view, and how many there are.
 
     Raises:
         UserError: two pictures are of one view.
