@@ -26,17 +26,16 @@ def _table(rows: list[dict[str, Any]], signed: bool = False) -> Lines:
     lines = [["", *(label for label, _ in _COLUMNS.values())]]
     lines[0] += [] if signed else ["time [s] ↓"]
     for row in rows:
-        cells = [
-            "-"
-            if row[key] is None
-            else cell(row[key]["mean"], row[key]["interval"], digits, signed)
-            for key, (_, digits) in _COLUMNS.items()
-        ]
+        cells = [_figure(row[key], digits, signed) for key, (_, digits) in _COLUMNS.items()]
         if not signed:
             known = row["seconds"] is not None
             cells.append(f"{row['seconds']:.3g} ({row['seconds_from']})" if known else "-")
         lines.append([row["name"], *cells])
     return lines
+
+
+def _figure(summary: dict[str, Any] | None, digits: int, signed: bool) -> str:
+    return "-" if summary is None else cell(summary["mean"], summary["interval"], digits, signed)
 
 
 def _paper() -> Lines:
@@ -91,7 +90,8 @@ def markdown_page(joined: dict[str, Any], paper: bool) -> str:
 
 _STYLE = """
 :root { color-scheme: light dark; }
-body { margin: 0 auto; padding: 2rem 1.25rem; max-width: 70rem; font: 15px/1.5 system-ui, sans-serif; }
+body { margin: 0 auto; padding: 2rem 1.25rem; max-width: 70rem;
+  font: 15px/1.5 system-ui, sans-serif; }
 .scroll { overflow-x: auto; margin: 1rem 0; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem 1.2rem .3rem 0; text-align: left; border-bottom: 1px solid #8884; }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -205,30 +206,36 @@ def having(methods: list[Method], kind: str) -> dict[str, Report]:
 
 
 def _check_same(methods: list[Method], kind: str) -> list[str]:
-    """Holds the reports of a kind against the first of them; returns remarks."""
-    reports, notes = having(methods, kind), []
-    pairs = list(reports.items())
-    for name, report in pairs[1:]:
-        first_name, first = pairs[0]
-        for key, mine, other in _differences(report.protocol, first.protocol):
-            top = key.split(".")[0]
-            if top not in _FREE[kind] and not _of_surfaces_alone(top, report, first):
-                raise UserError(
-                    f"{report.path}: not of the protocol of {first.path}: "
-                    f"{key} is {_shown(mine)}, not {_shown(other)}"
-                )
-            if top == "lpips" and None not in (mine, other):
-                raise UserError(f"{report.path}: its LPIPS is {_shown(mine)}, not {_shown(other)}")
-            if top in _NOTED[kind]:
-                notes.append(
-                    f"{kind}: {key} is {_shown(other)} for {first_name}, {_shown(mine)} for {name}"
-                )
-        for uid in sorted(report.records.keys() & first.records.keys()):
-            if report.records[uid].truth != first.records[uid].truth:
-                raise UserError(
-                    f"{report.path}: {uid} was compared with another truth than in {first.path}"
-                )
+    """Holds the reports of a kind against one another; returns remarks."""
+    reports = having(methods, kind)
+    for one, other in combinations(reports.values(), 2):
+        _check_pair(one, other)
+    notes = []
+    for key in _NOTED[kind]:
+        names: dict[str, list[str]] = {}
+        for name, report in reports.items():
+            names.setdefault(_shown(report.protocol.get(key)), []).append(name)
+        if len(names) > 1:
+            parts = (f"{value} ({', '.join(who)})" for value, who in names.items())
+            notes.append(f"{kind}: {key} is {'; '.join(parts)}")
     return notes
+
+
+def _check_pair(first: Report, report: Report) -> None:
+    """Raises UserError where two reports of one kind cannot stand in one table."""
+    for key, mine, other in _differences(report.protocol, first.protocol):
+        top = key.split(".")[0]
+        free = top in _FREE[report.kind] or _of_surfaces_alone(top, report, first)
+        if not free or (top == "lpips" and None not in (mine, other)):
+            raise UserError(
+                f"{report.path}: not of the protocol of {first.path}: "
+                f"{key} is {_shown(mine)}, not {_shown(other)}"
+            )
+    for uid in sorted(report.records.keys() & first.records.keys()):
+        if report.records[uid].truth != first.records[uid].truth:
+            raise UserError(
+                f"{report.path}: {uid} was compared with another truth than in {first.path}"
+            )
 
 
 def _of_surfaces_alone(key: str, *reports: Report) -> bool:

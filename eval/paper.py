@@ -14,7 +14,6 @@ TABLE_1: dict[str, tuple[float | None, ...]] = {
     "Gamba": (24.74, 0.91, 0.08, 0.0232, 0.4289, 0.05),
 }
 CAVEAT = (
-    "The paper's own figures, of other objects and by another protocol (it states neither how its "
-    "shapes are aligned and sampled nor how its cameras are placed), on an A100. They cannot be "
-    "compared with the rows above."
+    "The paper's own figures, of other objects and by a protocol that it does not write "
+    "down, on an A100. They cannot be compared with the rows above."
 )
