@@ -51,7 +51,7 @@ def _texts(joined: dict[str, Any]) -> tuple[str, list[str]]:
     counts: dict[int, list[str]] = {}
     for key, (label, _) in _COLUMNS.items():
         counts.setdefault(len(joined["common"][key]), []).append(label[:-2])
-    of = "; ".join(f"{', '.join(labels)}: {n or 'no'} objects" for n, labels in counts.items())
+    of = "; ".join(f"{', '.join(labels)}: {_count(n)}" for n, labels in counts.items())
     note = (
         f"Means over the objects that every method with the metric has ({of}), with "
         f"{100 * LEVEL:g} % bootstrap intervals over objects. Views: novel views, each on white. "
@@ -64,8 +64,12 @@ def _texts(joined: dict[str, Any]) -> tuple[str, list[str]]:
             if missing:
                 some = "; ".join(f"{u}: {r}" for u, r in list(missing.items())[:_NAMED])
                 more = "; ..." if len(missing) > _NAMED else ""
-                lines.append(f"{kind}: {name} lacks {len(missing)} objects ({some}{more}).")
+                lines.append(f"{kind}: {name} lacks {_count(len(missing))} ({some}{more}).")
     return note, lines + [f"{note}." for note in joined["notes"]]
+
+
+def _count(number: int) -> str:
+    return f"{number or 'no'} object{'' if number == 1 else 's'}"
 
 
 def _parts(joined: dict[str, Any], paper: bool) -> list[str | Lines]:
