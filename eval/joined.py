@@ -105,7 +105,8 @@ def _common(found: dict[str, dict[str, float]]) -> list[str]:
 
 
 def _check_common(reports: dict[str, Any], common: dict[str, list[str]], kind: str) -> None:
-    if reports and not common[METRICS[kind][0]]:
+    empty = not all(report.records for report in reports.values())
+    if reports and (empty or not common[METRICS[kind][0]]):
         counts = ", ".join(f"{name} {len(r.records)}" for name, r in reports.items())
         raise UserError(f"no object was evaluated for all methods by {kind}: {counts}")
 

@@ -240,8 +240,10 @@ def _check_pair(first: Report, report: Report) -> None:
 
 def _of_surfaces_alone(key: str, *reports: Report) -> bool:
     """Whether this says only how Gaussians become surfaces, and one method has no Gaussians."""
+    if key != "surface":
+        return False
     kinds = [{record.kind for record in r.records.values()} for r in reports]
-    return key == "surface" and not all("gaussians" in kind for kind in kinds)
+    return not all("gaussians" in kind for kind in kinds)
 
 
 def _differences(one: dict[str, Any], other: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:

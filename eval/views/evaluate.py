@@ -242,10 +242,9 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         for kind, values in (("novel", record), ("input", record["input"])):
             if values["psnr"] is not None:
                 lines.append(f"{kind}: {values['psnr']:.2f} dB, SSIM {values['ssim']:.3f}")
-                last = f"IoU {values['mask_iou']:.3f}"
-                if values["lpips"] is not None:
-                    last = f"LPIPS {values['lpips']:.3f}, {last}"
-                lines.append(f"    {last}")
+                rest = (("LPIPS", values["lpips"]), ("IoU", values["mask_iou"]))
+                known = [f"{label} {value:.3f}" for label, value in rest if value is not None]
+                lines.append(f"    {', '.join(known)}")
         rows.append(Row(lines, truth.rgb[0], truth.rgb[views], rgb[views]))
     return rows
 
