@@ -28,6 +28,7 @@ COMMANDS = {
     "data gso": "Google Scanned Objects, for evaluation.",
     "eval-views": "PSNR, SSIM, LPIPS of views.",
     "eval-geometry": "Chamfer, IoU, F-score.",
+    "compare": "Reports of several methods in one table.",
     "export": "Gaussians to meshes, splats and pages.",
     "view": "Gaussians in the browser.",
     "bench": "Run time against error, on this machine.",
@@ -48,6 +49,7 @@ MODULES = {
     "data gso": "gamba_warp.train.sources.gso_command",
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",
+    "compare": "gamba_warp.eval.compare_command",
 }
 
 

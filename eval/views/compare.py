@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,6 +57,8 @@ class ViewsProtocol:
             them, because their PSNR is high whatever is predicted.
         mean_error: how the PSNR of the mean error comes about.
         evaluation: of a named evaluation, what it is and which of its objects are missing; or None.
+        pictures: how pictures under test are read and matched; None: Gaussians are rendered.
+        resize_pictures: whether those of another size are resized.
     """
 
     split: str
@@ -77,6 +80,8 @@ class ViewsProtocol:
     nearly_empty: float = NEARLY_EMPTY
     mean_error: str = "mean squared error over views, then objects, as PSNR"
     evaluation: dict[str, Any] | None = None
+    pictures: str | None = None
+    resize_pictures: bool = False
 
 
 @dataclass
@@ -151,19 +156,22 @@ def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
     return out.rgb.clamp(0, 1), out.alpha[..., 0] > 0.5
 
 
-def compare(candidates: dict[str, Shown], truth: Truth) -> dict[str, list[Values]]:
+def compare(
+    candidates: Mapping[str, tuple[Tensor, Tensor | None]], truth: Truth
+) -> dict[str, list[Values]]:
     """Computes PSNR, SSIM and mask IoU of each view for each candidate; LPIPS is None yet.
 
-    Besides, ``mse``: the mean squared error that the PSNR states.
+    Besides, ``mse``: the mean squared error that the PSNR states. Mask IoU is None where a
+    candidate has no masks.
     """
     result: dict[str, list[Values]] = {}
     for name, (rgb, mask) in candidates.items():
-        decibels = psnr(rgb, truth.rgb)
+        decibels, nothing = psnr(rgb, truth.rgb), [None] * len(rgb)
         values = {
             "psnr": decibels.tolist(),
             "ssim": ssim(rgb, truth.rgb).tolist(),
-            "lpips": [None] * len(rgb),
-            "mask_iou": mask_iou(mask, truth.mask).tolist(),
+            "lpips": nothing,
+            "mask_iou": nothing if mask is None else mask_iou(mask, truth.mask).tolist(),
             "mse": (10 ** (-decibels / 10)).tolist(),
         }
         result[name] = [dict(zip(values, row)) for row in zip(*values.values())]
@@ -172,7 +180,10 @@ def compare(candidates: dict[str, Shown], truth: Truth) -> dict[str, list[Values
 
 @torch.no_grad()
 def add_lpips(
-    values: dict[str, list[Values]], candidates: dict[str, Shown], truth: Truth, lpips: LPIPS
+    values: dict[str, list[Values]],
+    candidates: Mapping[str, tuple[Tensor, Tensor | None]],
+    truth: Truth,
+    lpips: LPIPS,
 ) -> None:
     """Adds LPIPS to what ``compare`` returned.
 

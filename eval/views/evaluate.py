@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from gamba_warp.files import output_folder, write_text
 from gamba_warp.formats.ply import save_ply
+from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
 from gamba_warp.versions import __version__, installed
 
@@ -23,6 +24,7 @@ from ..report import OK, check_finite, failure, make_report, save_report
 from .baselines import MEANING
 from .compare import (
     NEARLY_EMPTY,
+    Shown,
     Truth,
     add_lpips,
     choose_views,
@@ -34,6 +36,7 @@ from .compare import (
 from .contact_sheet import RULE, Row, choose_ranks, contact_sheet
 from .job import ERRORS, Job, open_job
 from .options import ViewsOptions
+from .pictures import Pictures, save_pictures
 from .table import differences_of, page, table_of, without_nearly_empty
 
 SHEET_VIEWS = 4  # novel views of an object in the contact sheet
@@ -70,21 +73,37 @@ def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
     save_image(path, torch.cat(strips, 0).cpu().numpy())
 
 
-def evaluate_object(
-    job: Job,
-    uid: str,
-    strips: Path | None = None,
-    save: Path | None = None,
-    retrieved: Path | None = None,
-) -> dict[str, Any]:
+def pictures_of(predicted: Gaussians | Pictures, truth: Truth) -> Pictures:
+    """What is under test as pictures of the true views: as it is, or rendered."""
+    if isinstance(predicted, Pictures):
+        return predicted
+    return Pictures(*render_views(predicted, truth.cameras))
+
+
+@dataclass(frozen=True)
+class Files:
+    """Folders for what is written of an object, each None where it is not asked for.
+
+    Attributes:
+        strips: its comparison picture.
+        gaussians: its Gaussians.
+        retrieved: the retrieval's mesh.
+        pictures: what was compared, a folder for the model and for each baseline.
+    """
+
+    strips: Path | None = None
+    gaussians: Path | None = None
+    retrieved: Path | None = None
+    pictures: Path | None = None
+
+
+def evaluate_object(job: Job, uid: str, files: Files = Files()) -> dict[str, Any]:
     """Evaluates one object and its baselines.
 
     Args:
         job: what to do.
         uid: the object.
-        strips: folder for its comparison picture, or None.
-        save: folder for its Gaussians, or None.
-        retrieved: folder for the retrieval's mesh, or None.
+        files: where what is written of it goes.
 
     Returns:
         The object's record, with those of its baselines in it.
@@ -100,25 +119,18 @@ def evaluate_object(
         return value
 
     truth = mark(load_truth(job.dataset, uid, job.protocol, job.device))
-    gaussians = mark(job.predict(truth))
-    rgb, mask = mark(render_views(gaussians, truth.cameras))
-    candidates = mark({"": (rgb, mask)} | job.shown(truth))
+    predicted = mark(job.predict(truth))
+    pictures = mark(pictures_of(predicted, truth))
+    baselines = mark(job.shown(truth))
+    candidates = {"": (pictures.rgb, pictures.mask)} | baselines
     by_view = mark(compare(candidates, truth))
     if job.network:
         add_lpips(by_view, candidates, truth, job.network)
+    if not pictures.has_input:
+        by_view[""][0] = dict.fromkeys(by_view[""][0])
     mark(None)
-    if strips is not None:
-        save_strips(strips / f"{uid}.png", rgb, truth)
-    if save is not None:
-        path = save / f"{uid}.ply"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_ply(path, gaussians)
+    _write(job, truth, predicted, pictures, baselines, files)
     found = job.retrieval.found.get(uid) if job.retrieval else None
-    if retrieved is not None and found and job.meshes:
-        try:
-            job.meshes.save(retrieved / f"{uid}.ply", found, job.protocol.distance)
-        except ERRORS as error:
-            job.fail(f"{uid} (retrieval's mesh)", error)
     stages = ("load", "predict", "render", "baselines", "compare", "lpips")
     return {
         "name": uid,
@@ -131,10 +143,40 @@ def evaluate_object(
         "views": truth.views,
         "coverage": truth.coverage,
         "num_nearly_empty": sum(share < NEARLY_EMPTY for share in truth.coverage),
-        "gaussians": gaussians.num,
+        **({"pictures": pictures.record} if pictures.record else {}),
+        **({"gaussians": predicted.num} if isinstance(predicted, Gaussians) else {}),
         "truth_sha256": truth.digest,
         "seconds": {s: round(b - a, 4) for s, a, b in zip(stages, marks, marks[1:])},
     }
+
+
+def _write(
+    job: Job,
+    truth: Truth,
+    predicted: Gaussians | Pictures,
+    pictures: Pictures,
+    baselines: dict[str, Shown],
+    files: Files,
+) -> None:
+    """Writes what is asked for of one object."""
+    uid = truth.uid
+    if files.strips is not None:
+        save_strips(files.strips / f"{uid}.png", pictures.rgb, truth)
+    if files.gaussians is not None and isinstance(predicted, Gaussians):
+        path = files.gaussians / f"{uid}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_ply(path, predicted)
+    if files.pictures is not None:
+        masked = {} if pictures.mask is None else {"model": (pictures.rgb, pictures.mask)}
+        for name, candidate in (masked | baselines).items():
+            where = files.pictures / name / uid
+            save_pictures(where, job.dataset.files(uid), truth.views, candidate)
+    found = job.retrieval.found.get(uid) if job.retrieval else None
+    if files.retrieved is not None and found and job.meshes:
+        try:
+            job.meshes.save(files.retrieved / f"{uid}.ply", found, job.protocol.distance)
+        except ERRORS as error:
+            job.fail(f"{uid} (retrieval's mesh)", error)
 
 
 def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], bool]:
@@ -152,13 +194,19 @@ def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], boo
     """
     objects: list[dict[str, Any]] = []
     folder = options.out
-    saved = output_folder(folder / "gaussians") if folder and options.save_gaussians else None
-    placed = output_folder(folder / "retrieval") if folder and options.save_retrieval else None
+    made = {
+        name: output_folder(folder / place) if folder and wanted else None
+        for name, place, wanted in (
+            ("gaussians", "gaussians", options.save_gaussians),
+            ("retrieved", "retrieval", options.save_retrieval),
+            ("pictures", "pictures", options.save_pictures),
+        )
+    }
     try:
         for number, uid in enumerate(tqdm(job.uids, unit="object", disable=None)):
             strips = folder / "strips" if folder and number < options.strips else None
             try:
-                objects.append(evaluate_object(job, uid, strips, saved, placed))
+                objects.append(evaluate_object(job, uid, Files(strips=strips, **made)))
             except ERRORS as error:
                 objects.append(failure(uid, error))
     except KeyboardInterrupt:
@@ -186,7 +234,7 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         record = done[rank]
         try:
             truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
-            rgb, _ = render_views(job.predict(truth), truth.cameras)
+            rgb = pictures_of(job.predict(truth), truth).rgb
         except ERRORS:  # a file that went bad meanwhile; the report has what it was
             continue
         views = choose_views(len(rgb), 0, SHEET_VIEWS + 1)[1:]
@@ -194,10 +242,9 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         for kind, values in (("novel", record), ("input", record["input"])):
             if values["psnr"] is not None:
                 lines.append(f"{kind}: {values['psnr']:.2f} dB, SSIM {values['ssim']:.3f}")
-                last = f"IoU {values['mask_iou']:.3f}"
-                if values["lpips"] is not None:
-                    last = f"LPIPS {values['lpips']:.3f}, {last}"
-                lines.append(f"    {last}")
+                rest = (("LPIPS", values["lpips"]), ("IoU", values["mask_iou"]))
+                known = [f"{label} {value:.3f}" for label, value in rest if value is not None]
+                lines.append(f"    {', '.join(known)}")
         rows.append(Row(lines, truth.rgb[0], truth.rgb[views], rgb[views]))
     return rows
 
@@ -236,7 +283,7 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         protocol,
         objects,
         {"gamba_warp": __version__} | installed("torch", "kornia"),
-        left_out=("baselines", "num_nearly_empty", "retrieval"),
+        left_out=("baselines", "num_nearly_empty", "retrieval", "pictures"),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},
         left_out_baselines=left_out,
         table=table_of({"model": model} | others),

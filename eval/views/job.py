@@ -22,6 +22,8 @@ from .baselines import Baseline, Retrieval, background, billboard, input_copy
 from .ceiling import open_ceiling
 from .compare import Shown, Truth, ViewsProtocol
 from .options import ViewsOptions
+from .pictures import MEANING as PICTURES
+from .pictures import PicturePredictions, Pictures
 from .placing import TrainingMeshes
 from .predictions import Predictions, open_predictions
 
@@ -47,7 +49,7 @@ class Job:
         meshes: of the training objects, to be placed as the retrieval's shapes; or None.
     """
 
-    predictions: Predictions
+    predictions: Predictions | PicturePredictions
     dataset: ViewDataset
     uids: list[str]
     protocol: ViewsProtocol
@@ -59,8 +61,10 @@ class Job:
     retrieval: Retrieval | None = None
     meshes: TrainingMeshes | None = None
 
-    def predict(self, truth: Truth) -> Gaussians:
-        """Returns the Gaussians under test. Raises UserError where there are none."""
+    def predict(self, truth: Truth) -> Gaussians | Pictures:
+        """Returns the Gaussians or pictures under test. Raises UserError where there are none."""
+        if isinstance(self.predictions, PicturePredictions):
+            return self.predictions.pictures(self.dataset, truth)
         return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
 
     def fail(self, name: str, error: Exception) -> None:
@@ -97,8 +101,20 @@ def open_job(options: ViewsOptions) -> Job:
             raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
     _check_outputs(options, uids)
     predictions = open_predictions(
-        options.checkpoint, options.distance, device, options.encoder_weights
+        options.checkpoint,
+        options.distance,
+        device,
+        options.encoder_weights,
+        options.resize_pictures,
     )
+    rendered: dict[str, str] = {}
+    if isinstance(predictions, PicturePredictions):
+        if options.save_gaussians:
+            raise UserError(f"--save-gaussians: {options.checkpoint} holds pictures")
+        predictions.check(uids)
+        rendered = {"rendering": "pictures of 8 bits", "pictures": PICTURES}
+    elif options.resize_pictures:
+        raise UserError(f"--resize-pictures: {options.checkpoint} holds no pictures")
     network, reason = _lpips_or_reason(options.lpips, device)
     protocol = ViewsProtocol(
         split=options.split,
@@ -110,6 +126,8 @@ def open_job(options: ViewsOptions) -> Job:
         lpips_reason=reason,
         distance=predictions.distance,
         evaluation=evaluation,
+        resize_pictures=options.resize_pictures,
+        **rendered,
     )
     job = Job(predictions, dataset, uids, protocol, network, device)
     for name in evaluation["missing"] if evaluation else ():
@@ -137,6 +155,10 @@ def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
     """Raises UserError where a file of this evaluation would replace one that it reads."""
     if options.out is None:
         return
+    if options.save_pictures:
+        made = (options.out / "pictures").resolve()
+        if made in (options.checkpoint.resolve(), *options.checkpoint.resolve().parents):
+            raise UserError(f"{options.checkpoint}: would be overwritten; give another --out")
     targets = [options.out / "strips" / f"{uid}.png" for uid in uids[: options.strips]]
     if options.save_gaussians:
         targets += [options.out / "gaussians" / f"{uid}.ply" for uid in uids]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import tyro
 from msgspec import Meta
 
 from gamba_warp.conventions import DEFAULT_DISTANCE, DeviceChoice
@@ -18,8 +19,9 @@ from gamba_warp.untrusted.ranges import check_options, option
 class ViewsOptions:
     """What to evaluate, and how."""
 
-    checkpoint: Path
-    """A model, or a folder of .ply files named by object."""
+    checkpoint: Annotated[Path, tyro.conf.arg(aliases=["--predictions"])]
+    """A model; a folder of .ply files named by object; or a folder with a folder of pictures for
+    each object, rendered by any method at the dataset's cameras (docs/compare-methods.md)."""
     data: Path
     """Dataset of posed views."""
     out: Path | None = None
@@ -60,6 +62,11 @@ class ViewsOptions:
     """Folder of the meshes that DATA was rendered from (with catalogue.json, or named by object):
     also write OUT/retrieval/NAME.ply, the mesh of the training object that the retrieval takes,
     placed where the input camera sees it as it was found (eval-geometry --frame reference)."""
+    save_pictures: bool = False
+    """Also write OUT/pictures/NAME/OBJECT/VIEW.png: what was compared of the model and of each
+    baseline, in the form in which pictures of other methods are read."""
+    resize_pictures: bool = False
+    """Pictures under test may have another size than those compared, and are resized to it."""
     distance: Annotated[float, Meta(ge=0.01, le=1000)] = DEFAULT_DISTANCE
     """Distance of the input camera, for .ply files; a checkpoint states its own."""
     encoder_weights: Path | None = None
@@ -80,5 +87,7 @@ class ViewsOptions:
                     raise UserError(f"--protocol {self.protocol}: has its own {option(name)}")
         if self.save_gaussians and self.out is None:
             raise UserError("--save-gaussians: needs --out")
+        if self.save_pictures and self.out is None:
+            raise UserError("--save-pictures: needs --out")
         if self.save_retrieval and (self.out is None or not self.baselines):
             raise UserError("--save-retrieval: needs --out, and the baselines")

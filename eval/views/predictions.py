@@ -1,4 +1,4 @@
-"""The Gaussians under test: those of a checkpoint, or of a folder of ``.ply`` files."""
+"""What is under test: a checkpoint, a folder of Gaussians as ``.ply`` files, or one of pictures."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from gamba_warp.formats.ply import load_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.checkpoint import FILE_NAME, load_model
 from gamba_warp.model.posing import posed_input
+
+from .pictures import PicturePredictions, holds_pictures
 
 
 class Predictions(ABC):
@@ -82,23 +84,32 @@ class ModelPredictions(Predictions):
 
 
 def open_predictions(
-    path: Path, distance: float, device: str, encoder_weights: Path | None = None
-) -> Predictions:
-    """Opens a folder with ``.ply`` files, else a checkpoint.
+    path: Path,
+    distance: float,
+    device: str,
+    encoder_weights: Path | None = None,
+    resize: bool = False,
+) -> Predictions | PicturePredictions:
+    """Opens a folder with ``.ply`` files or with pictures, else a checkpoint.
 
     Args:
         path: the folder or the checkpoint.
         distance: of the reference camera, for ``.ply`` files; a checkpoint states its own.
         device: torch device.
         encoder_weights: as for ``load_model``.
+        resize: whether pictures of another size are resized.
 
     Raises:
         UserError: there is nothing, or the checkpoint cannot be read.
     """
     if not path.exists():
-        raise UserError(f"{path}: no such checkpoint or folder of .ply files")
+        raise UserError(f"{path}: no such checkpoint, folder of .ply files or of pictures")
     if path.is_dir() and next(visible(path, "*.ply"), None) is not None:
         return PlyPredictions(path, distance, device)
     if path.is_dir() and next(path.glob("*.safetensors"), None) is None:
-        raise UserError(f"{path}: holds neither .ply files nor a checkpoint")
+        if not holds_pictures(path):
+            raise UserError(
+                f"{path}: holds neither .ply files nor folders of pictures nor a checkpoint"
+            )
+        return PicturePredictions(path, distance, device, resize)
     return ModelPredictions(path, device, encoder_weights)

@@ -23,6 +23,7 @@ SUITES = {
     "raster": "gamba_warp.kernels.bench.cases.raster",
     "block": "gamba_warp.measure.blocks",
     "model": "gamba_warp.measure.blocks",
+    "lengths": "gamba_warp.measure.lengths",
     "train-step": "gamba_warp.train.bench",
     "loader": "gamba_warp.train.bench_loader",
 }
@@ -51,7 +52,8 @@ def bench_command(
     bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
 
     Args:
-        what: scan, conv, raster, block, model, train-step, or all.
+        what: scan, conv, raster, block, model, lengths (a Mamba block against a transformer block
+            over the number of tokens), train-step, or all.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes, many rounds, and the torch loop at full length.

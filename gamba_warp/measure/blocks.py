@@ -186,14 +186,16 @@ class _Backbone:
         )
 
 
-def reference_block(block: GambaBlock, tokens: Tensor, camera: Tensor, image: Tensor) -> Tensor:
+def reference_block(
+    block: GambaBlock, tokens: Tensor, camera: Tensor | None, image: Tensor | None
+) -> Tensor:
     """Runs one Gamba block in float64 torch on the CPU, prepending and dropping (paper eq. 2).
 
     Args:
         block: the block whose weights are used.
         tokens: ``[B, L, width]`` float64.
-        camera: ``[B, 1, channels]``.
-        image: ``[B, K, channels]``.
+        camera: ``[B, 1, channels]``; None for a block without this condition.
+        image: ``[B, K, channels]``, or None likewise.
 
     Returns:
         ``[B, L, width]`` float64.
@@ -204,10 +206,8 @@ def reference_block(block: GambaBlock, tokens: Tensor, camera: Tensor, image: Te
         return F.linear(x, weights[f"{name}.weight"], weights.get(f"{name}.bias"))
 
     mamba, width = block.mamba, tokens.shape[2]
-    prefix = [
-        linear(camera.double().cpu(), "project_camera"),
-        linear(image.double().cpu(), "project_image"),
-    ]
+    conditions = {"project_camera": camera, "project_image": image}
+    prefix = [linear(x.double().cpu(), name) for name, x in conditions.items() if x is not None]
     x = torch.cat([*prefix, tokens], dim=1)
     if isinstance(block.norm, nn.RMSNorm):
         x = F.rms_norm(x, (width,), weights["norm.weight"], block.norm.eps)

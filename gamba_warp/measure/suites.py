@@ -13,6 +13,7 @@ from tqdm import tqdm
 from ..errors import UserError
 from ..files import atomic_path, output_folder, write_json
 from ..kernels.bench import Case, Settings, Target, measure
+from ..kernels.bench.core.crossing import crossings
 from ..kernels.bench.core.document import check_document
 from ..kernels.bench.core.page import page
 from ..kernels.bench.core.report import judge, markdown, ratio_table
@@ -66,6 +67,7 @@ def run_suites(suites: Mapping[str, ModuleType], settings: Settings) -> dict:
         document = measure(cases, settings, _progress(bar))
     document["machine"]["peers"] = versions() if settings.peers else {}
     document["targets"] = judge(targets, document["records"])
+    document["crossings"] = [c._asdict() for c in crossings(document["records"])]
     return document
 
 
@@ -163,6 +165,9 @@ def summary(document: dict, old: dict | None) -> str:
         word = {True: "reached", False: "missed", None: "not measured"}[t["reached"]]
         value = "" if t["value"] is None else f"{t['value']:.3g}"
         lines.append(f"{word:<12} {value:>8}  ({t['wanted']})  {t['op']}: {t['text']}")
+    lines += [f"{c.op}: {c.text()}" for c in crossings(document["records"])]
+    stopped = (r for r in document["records"] if r["status"].startswith("stopped"))
+    lines += [f"{r['op']}: {r['variant']}, {r['direction']}: {r['status']}" for r in stopped]
     if old is not None:
         lines.append(ratio_table(old, document))
     for r in failed_records(document):

@@ -1,6 +1,17 @@
 """Benchmarks of run time against error: cases, and how they are measured, for ``gamba bench``."""
 
-from .core.case import LEVELS, Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
+from .core.case import (
+    LEVELS,
+    Case,
+    Error,
+    Key,
+    NotInstalled,
+    Settings,
+    Stopped,
+    Target,
+    Variant,
+    compare,
+)
 from .core.measure import FORMAT, measure
 
 __all__ = [
@@ -11,6 +22,7 @@ __all__ = [
     "Key",
     "NotInstalled",
     "Settings",
+    "Stopped",
     "Target",
     "Variant",
     "compare",

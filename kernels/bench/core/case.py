@@ -16,6 +16,10 @@ class NotInstalled(Exception):
     """Raised for a peer that is not installed; ``str(error)`` names its package."""
 
 
+class Stopped(Exception):
+    """Raised in place of a run that would go beyond a limit; ``str(error)`` says which."""
+
+
 @dataclass(frozen=True)
 class Level:
     """How long to measure.
@@ -152,7 +156,8 @@ class Case:
         text: one sentence on what is compared.
         build: function that makes the inputs and the variants; they are freed after the case.
         axis: parameter along which cost is drawn; "error" draws time against error, "parts" the
-            parts that a variant's work names, and None draws no chart.
+            parts that a variant's work names, "lengths" time and memory against L with the
+            crossing of two series, and None draws no chart.
     """
 
     op: str

@@ -20,7 +20,7 @@ import warp as wp
 
 from gamba_warp.versions import __version__
 
-from .case import LEVELS, Case, NotInstalled, Settings, Variant
+from .case import LEVELS, Case, NotInstalled, Settings, Stopped, Variant
 
 FORMAT = "gamba_warp.bench.1"
 _TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
@@ -227,6 +227,8 @@ def _set_peers(records: list[dict]) -> None:
 def _reason(error: Exception) -> str:
     if isinstance(error, NotInstalled):
         return f"not installed: {error}"
+    if isinstance(error, Stopped):
+        return f"stopped: {error}"
     lines = str(error).strip().splitlines()
     return f"failed: {type(error).__name__}: {lines[0] if lines else ''}"
 

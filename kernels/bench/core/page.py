@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from .bars import bars
 from .charts import Axis, Point, Series, chart, pareto
+from .crossing import FIGURES, crossings, series_of
 from .parts import parts_of, parts_table
 from .report import EXPLANATION, TARGET_HEADER, groups, machine_line, oracles, table, target_rows
 
@@ -47,6 +48,8 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
         return [bars(series, "milliseconds of a run") for series in few]
     if axis == "share":
         return _share_charts(case, done)
+    if axis == "lengths":
+        return _length_charts(done)
     return [_line_chart(case, done, axis, "ms_p50", "milliseconds")]
 
 
@@ -63,6 +66,28 @@ def _share_charts(case: str, records: Sequence[dict]) -> list[str]:
             made.append(_line_chart(case, found, "share", figure, name, scale))
     first = [r for r in records if r["direction"] == records[0]["direction"]]
     return [*made, _line_chart(case, first, "share", "tokens", "tokens of a batch")]
+
+
+def _length_charts(records: Sequence[dict]) -> list[str]:
+    """Draws time and memory of each direction and dtype against L, and where two lines cross."""
+    made = []
+    for direction, dtype in dict.fromkeys((r["direction"], r["dtype"]) for r in records):
+        found = [r for r in records if (r["direction"], r["dtype"]) == (direction, dtype)]
+        for figure, (name, unit, _) in FIGURES.items():
+            lines = series_of(found, figure)
+            drawn = [
+                Series(s, [Point(x, y) for x, y in sorted(line.items())], "straight")
+                for s, line in lines.items()
+            ]
+            drawn += [
+                Series("crossing", [Point(c.at, c.value, f"L* = {c.at:,.0f}", "default")])
+                for c in crossings(found)
+                if c.figure == name and c.at is not None and c.value is not None
+            ]
+            ticks = sorted({x for line in lines.values() for x in line})
+            label = f"{unit}, {direction}, {dtype}"
+            made.append(chart(drawn, Axis("tokens L", values=ticks), Axis(label)))
+    return made
 
 
 def _line_chart(
@@ -203,8 +228,11 @@ def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
                 rows = _html_table(*table(records))
                 if split := parts_table(records):
                     rows += _html_table(*split)
+                lines = "".join(f"<p>{html.escape(c.text())}</p>" for c in crossings(records))
                 name = html.escape(f"{op}: {case}")
-                body.append(f"<section><h2>{name}</h2><p>{text}</p>{figures}{rows}</section>")
+                body.append(
+                    f"<section><h2>{name}</h2><p>{text}</p>{lines}{figures}{rows}</section>"
+                )
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 
 from .case import Key, Target
+from .crossing import crossings
 from .parts import parts_table
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
@@ -211,6 +212,7 @@ def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
         for op, cases in groups(document).items():
             for case, records in cases.items():
                 lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
+                lines += [line for c in crossings(records) for line in (c.text(), "")]
                 lines += [*_markdown_table(*table(records)), ""]
                 if split := parts_table(records):
                     lines += [*_markdown_table(*split), ""]

@@ -1,0 +1,121 @@
+"""Compares methods by their files, in one table: how pictures and meshes of any method must look.
+
+Run ``python docs/examples/compare_methods.py --out out/compare`` in a checkout; it takes the
+starter set, and ends with the table of ``gamba compare``. The methods:
+
+- **shipped**: the shipped model, evaluated as a model. Its pictures and Gaussians are written too.
+- **retrieval**, **billboard**: two baselines as somebody else's results, folders of pictures named
+  as the true ones are. They have no meshes, and "-" in the table.
+- **hull**: the convex hull of the *true* shape, in grey. No method can make it from one picture;
+  it stands for a program that is not ours: pictures with cameras of their own
+  (``transforms.json``), and meshes in the frame of the true ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+
+import trimesh
+
+from gamba_warp.cli import run
+from gamba_warp.files import STARTER
+
+
+def gamba(*words: object) -> None:
+    """Runs a command as a user types it; ends the program where it fails."""
+    print("$ gamba", *words)
+    name, *arguments = map(str, words)
+    if name == "data":
+        name, arguments = f"data {arguments[0]}", arguments[1:]
+    if code := run(name, arguments):
+        raise SystemExit(code)
+
+
+def evaluate_shipped(out: Path, options: argparse.Namespace) -> list[str]:
+    """Evaluates the shipped model's views; returns the names of the objects."""
+    gamba(
+        *("eval-views", "--checkpoint", STARTER / "rays.safetensors", "--out", out / "shipped"),
+        *("--save-gaussians", "--save-pictures", *common(options)),
+    )
+    report = json.loads((out / "shipped" / "report.json").read_text())
+    return [record["name"] for record in report["objects"]]
+
+
+def common(options: argparse.Namespace) -> list[object]:
+    """The options that all evaluations of views share; else ``gamba compare`` refuses them."""
+    words: list[object] = ["--data", options.data, "--limit", options.objects]
+    words += ["--views", options.views, "--device", "cpu", "--strips", 0, "--sheet", 0]
+    return words if options.lpips else [*words, "--no-lpips"]
+
+
+def make_hulls(out: Path, meshes: Path, uids: list[str], cameras: int) -> None:
+    """The fourth method's files: ``meshes/NAME.ply``, and ``pictures/NAME`` with cameras.
+
+    ``data render`` puts its cameras where the dataset's are, for it has the same seed.
+    """
+    (out / "meshes").mkdir(parents=True, exist_ok=True)
+    for uid in uids:
+        mesh = trimesh.load(meshes / f"{uid}.ply", force="mesh")
+        mesh.convex_hull.export(out / "meshes" / f"{uid}.ply")
+    shutil.rmtree(out / "pictures", ignore_errors=True)
+    gamba(
+        *("data", "render", out / "meshes", "--out", out / "pictures"),
+        *("--views", cameras, "--workers", 1),
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Makes the files of all methods, evaluates them and prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/compare"))
+    parser.add_argument("--data", type=Path, default=STARTER / "data", help="posed views")
+    parser.add_argument("--meshes", type=Path, default=STARTER / "meshes", help="their meshes")
+    parser.add_argument("--objects", type=int, default=4, help="of the test split")
+    parser.add_argument("--views", type=int, default=9, help="of an object, the input included")
+    parser.add_argument("--points", type=int, default=100_000, help="on each surface")
+    parser.add_argument("--voxels", type=int, default=128, help="a unit, for surfaces of Gaussians")
+    parser.add_argument("--no-lpips", dest="lpips", action="store_false")
+    options = parser.parse_args(arguments)
+    out: Path = options.out
+    uids = evaluate_shipped(out, options)
+    cameras = json.loads((options.data / uids[0] / "transforms.json").read_text())["frames"]
+    make_hulls(out / "hull", options.meshes, uids, len(cameras))
+
+    # Pictures: a folder for each method, in it a folder for each object.
+    pictures = {
+        "retrieval": out / "shipped" / "pictures" / "retrieval",
+        "billboard": out / "shipped" / "pictures" / "billboard",
+        "hull": out / "hull" / "pictures",
+    }
+    reports = {"shipped": [out / "shipped"]}
+    for name, folder in pictures.items():
+        place = out / f"{name}-views"
+        words = ["--predictions", folder, "--no-baselines", "--out", place]
+        gamba("eval-views", *words, *common(options))
+        reports[name] = [place]
+
+    # Shapes: a file for each object, of the names of the true ones.
+    truths = out / "truths"
+    truths.mkdir(exist_ok=True)
+    for uid in uids:
+        shutil.copy(options.meshes / f"{uid}.ply", truths)
+    points = ["--points", options.points, "--voxels", options.voxels]
+    shapes = {
+        "shipped": [out / "shipped" / "gaussians", truths, "--frame", "reference"],
+        "hull": [out / "hull" / "meshes", truths],
+    }
+    for name, words in shapes.items():
+        place = out / f"{name}-shapes"
+        data = ["--data", options.data] if name == "shipped" else []
+        gamba("eval-geometry", *words, *data, *points, "--out", place)
+        reports[name].append(place)
+
+    words = [f"{name}={place}" for name, places in reports.items() for place in places]
+    gamba("compare", *words, "--against", "shipped", "--paper", "--out", out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,362 @@
+"""Benchmark cases over the number of tokens: a Mamba block against a transformer block.
+
+The paper's question 2 asks what the linear cost of Mamba is worth. Both blocks have the same width
+and see the same tokens, one sequence; the condition of a Gamba block is left out (its cost does not
+grow with L). The transformer block attends to all tokens, as those of reconstruction models do.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from ..kernels.bench import Case, Error, Settings, Stopped, Target, Variant, compare
+from ..kernels.bench.core.measure import peak_bytes, synchronize
+from ..model.config import PRESETS
+from ..model.parts.block import GambaBlock, run_blocks
+from .blocks import BACKWARD_LIMIT, BOTH, LIMIT, reference_block
+
+OP = "lengths"
+MAMBA, ATTENTION = "Mamba block", "transformer block"
+HEAD = 64  # channels of a head
+MLP = 4  # hidden channels of the MLP per channel of a token
+HALF_LIMITS = {"forward": 0.02, BOTH: 0.1}  # of bfloat16: 8 bits of a number, through a few sums
+_TOKENS = 64  # first tokens that are compared with the oracle
+_SPARE = 0.8  # share of the free memory that a run may take
+_GROWTH = 2.5  # of the memory from one length to the next, at most: both blocks need O(L)
+# The kernels that never hold the L x L matrix; torch raises where it has none of them.
+_FUSED = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What a run measures.
+
+    Attributes:
+        lengths: numbers of tokens, ascending.
+        width: channels of a token, of both blocks.
+        seconds: a series ends after the first length at which a call takes longer.
+    """
+
+    lengths: tuple[int, ...]
+    width: int
+    seconds: float
+
+
+def sizes_of(settings: Settings) -> Sizes:
+    """The sizes of a level; the paper's width where the device is CUDA, or the level "full"."""
+    powers = tuple(2**k for k in range(10, 17))
+    if settings.level == "quick":
+        return Sizes((128, 256, 512), 64, 2.0)
+    wide = settings.device.type == "cuda" or settings.level == "full"
+    width = PRESETS["paper"].width if wide else 256
+    return Sizes(powers, width, 300.0 if settings.level == "full" else 5.0)
+
+
+class TransformerBlock(nn.Module):
+    """A pre-norm transformer block: x + Attention(Norm(x)), then x + MLP(Norm(x)) with GELU."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.LayerNorm(width, eps=1e-5)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+        self.mlp_norm = nn.LayerNorm(width, eps=1e-5)
+        self.mlp_in = nn.Linear(width, MLP * width)
+        self.mlp_out = nn.Linear(MLP * width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Maps ``[B, L, width]`` to ``[B, L, width]``; a token sees all tokens."""
+        q, k, v = self.qkv(self.norm(tokens)).unflatten(-1, (3, self.heads, -1)).unbind(2)
+        with sdpa_kernel(_FUSED):
+            seen = F.scaled_dot_product_attention(*(x.transpose(1, 2) for x in (q, k, v)))
+        tokens = tokens + self.out(seen.transpose(1, 2).flatten(2))
+        return tokens + self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
+
+
+def reference_transformer(block: TransformerBlock, tokens: Tensor, count: int) -> Tensor:
+    """The first tokens after a transformer block in float64 torch on the CPU, softmax written out.
+
+    Args:
+        block: the block whose weights are used.
+        tokens: ``[B, L, width]`` float64; every one of them is seen.
+        count: how many tokens of the result are wanted.
+
+    Returns:
+        ``[B, count, width]`` float64.
+    """
+    weights = {name: p.detach().double().cpu() for name, p in block.named_parameters()}
+
+    def linear(x: Tensor, name: str) -> Tensor:
+        return F.linear(x, weights[f"{name}.weight"], weights[f"{name}.bias"])
+
+    def norm(x: Tensor, name: str) -> Tensor:
+        centred = x - x.mean(-1, keepdim=True)
+        scaled = centred / (centred.square().mean(-1, keepdim=True) + 1e-5).sqrt()
+        return scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+
+    q, k, v = linear(norm(tokens, "norm"), "qkv").chunk(3, -1)
+    heads = []
+    for q_h, k_h, v_h in zip(*(x.chunk(block.heads, -1) for x in (q[:, :count], k, v))):
+        scores = q_h @ k_h.mT / q_h.shape[-1] ** 0.5
+        heads.append(scores.softmax(-1) @ v_h)
+    x = tokens[:, :count] + linear(torch.cat(heads, -1), "out")
+    hidden = linear(norm(x, "mlp_norm"), "mlp_in")
+    hidden = 0.5 * hidden * (1 + torch.erf(hidden / 2**0.5))
+    return x + linear(hidden, "mlp_out")
+
+
+class Bench:
+    """Both blocks and the tokens, for all lengths."""
+
+    def __init__(self, settings: Settings, sizes: Sizes, dtype: torch.dtype) -> None:
+        self.device, self.sizes, self.dtype = settings.device, sizes, dtype
+        config = replace(PRESETS["paper"], width=sizes.width, depth=1, dt_rank=0, prepend=False)
+        torch.manual_seed(0)
+        mamba = GambaBlock(config, 0, 0).to(self.device)
+        heads = max(1, sizes.width // HEAD)
+        self.blocks: dict[str, nn.Module] = {
+            MAMBA: mamba,
+            ATTENTION: TransformerBlock(sizes.width, heads).to(self.device),
+        }
+        self.tokens = torch.randn(1, sizes.lengths[-1], sizes.width).to(self.device)
+        # A rate of 0 makes every step the same work on the same weights.
+        self.optimizers = {
+            name: torch.optim.AdamW(block.parameters(), lr=0.0, weight_decay=0.0)
+            for name, block in self.blocks.items()
+        }
+
+    def autocast(self) -> AbstractContextManager:
+        """The dtype of the products, as in training."""
+        if self.dtype == torch.float32:
+            return nullcontext()
+        return torch.autocast(self.device.type, self.dtype)
+
+    def apply(self, name: str, tokens: Tensor) -> Tensor:
+        """One block; Mamba as the model runs it: on a CPU without gradients in segments."""
+        block = self.blocks[name]
+        with self.autocast():
+            return run_blocks([block], tokens, [None]) if name == MAMBA else block(tokens)
+
+    @torch.no_grad()
+    def forward(self, name: str, length: int) -> Tensor:
+        """The block without gradients; this is what is timed."""
+        return self.apply(name, self.tokens[:, :length])
+
+    def step(self, name: str, length: int) -> None:
+        """Forward, backward to the tokens and all weights, AdamW; this is timed too."""
+        tokens = self.tokens[:, :length].detach().requires_grad_()
+        self.apply(name, tokens).float().square().mean().backward()
+        self.optimizers[name].step()
+        self.optimizers[name].zero_grad()
+
+    def reference(self, name: str, tokens: Tensor, count: int) -> Tensor:
+        """The first tokens after a block, float64 on the CPU."""
+        block = self.blocks[name]
+        if isinstance(block, TransformerBlock):
+            return reference_transformer(block, tokens, count)
+        assert isinstance(block, GambaBlock)
+        return reference_block(block, tokens[:, :count], None, None)
+
+    def check(self, name: str, length: int) -> Error:
+        """The error of what is added to the first tokens, of which Mamba's see no later one."""
+        count = min(_TOKENS, length)
+        tokens = self.tokens[:, :length].double().cpu()
+        with torch.no_grad():
+            got = self.forward(name, length)[:, :count].double().cpu()
+            want = self.reference(name, tokens, count)
+        first = tokens[:, :count]
+        return compare({"update": got - first}, {"update": want - first})
+
+    def check_step(self, name: str, length: int) -> Error:
+        """The error of the gradient of all tokens, of the first tokens after the block."""
+        count = min(_TOKENS, length)
+        tokens = self.tokens[:, :length].detach().requires_grad_()
+        cotangent = torch.zeros_like(tokens)
+        cotangent[:, :count] = self.tokens[:, :count].flip(1)
+        (got,) = torch.autograd.grad(self.apply(name, tokens), [tokens], cotangent)
+        leaf = self.tokens[:, :length].double().cpu().requires_grad_()
+        out = self.reference(name, leaf, count)
+        (want,) = torch.autograd.grad(out, [leaf], cotangent[:, :count].double().cpu())
+        return compare({"gradient of the tokens": got}, {"gradient of the tokens": want})
+
+
+@dataclass
+class Line:
+    """A block in one direction, from length to length, until a limit ends it.
+
+    Attributes:
+        name: of the block.
+        direction: "forward" or "forward+backward".
+        bench: what is run.
+        seconds: of the fastest call so far, by length.
+        peaks: bytes by length, where they are known.
+    """
+
+    name: str
+    direction: str
+    bench: Bench
+    seconds: dict[int, float] = field(default_factory=dict)
+    peaks: dict[int, int] = field(default_factory=dict)
+    ended: str = ""
+
+    def _call(self, length: int) -> object:
+        training = self.direction == BOTH
+        return (self.bench.step if training else self.bench.forward)(self.name, length)
+
+    def run(self, length: int) -> object:
+        """One call. Raises Stopped where a shorter length was over a limit, or memory lacks."""
+        self._check_limits(length)
+        try:
+            return self._timed(length)
+        except (MemoryError, RuntimeError) as error:
+            if not _is_memory(error):
+                raise
+            self.ended = f"not enough memory at L {length:,}"
+            raise Stopped(self.ended) from error
+
+    def _timed(self, length: int) -> object:
+        started = time.perf_counter()
+        result = self._call(length)
+        synchronize(self.bench.device)
+        spent = time.perf_counter() - started
+        self.seconds[length] = min(spent, self.seconds.get(length, spent))
+        return result
+
+    def _check_limits(self, length: int) -> None:
+        shorter = max((done for done in self.seconds if done < length), default=None)
+        if not self.ended and shorter is not None and length not in self.seconds:
+            limit, free = self.bench.sizes.seconds, free_bytes(self.bench.device)
+            needed = _GROWTH * self.peaks.get(shorter, 0)
+            if self.seconds[shorter] > limit:
+                self.ended = (
+                    f"a call at L {shorter:,} took {self.seconds[shorter]:.1f} s, limit {limit:g} s"
+                )
+            elif free is not None and needed > _SPARE * free:
+                self.ended = (
+                    f"L {length:,} may need {needed / 2**30:.1f} GiB, {free / 2**30:.1f} are free"
+                )
+        if self.ended and length not in self.seconds:
+            raise Stopped(self.ended)
+
+    def check(self, length: int) -> Error:
+        """The error; and the memory of a call, which the next length is judged by."""
+        error = self.bench.check_step if self.direction == BOTH else self.bench.check
+        found = error(self.name, length)
+        # This is the second call: in the first one's time there may be a compilation.
+        peak = peak_bytes(partial(self._timed, length), self.bench.device)
+        if peak is not None:
+            self.peaks[length] = peak
+        return found
+
+    def work(self, length: int) -> dict[str, int]:
+        """The memory of a call: how much it grows, results included, what is kept before not."""
+        return {"peak_bytes": self.peaks[length]} if length in self.peaks else {}
+
+
+def _is_memory(error: BaseException) -> bool:
+    known = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+    return known or "can't allocate memory" in str(error)
+
+
+def free_bytes(device: torch.device) -> int | None:
+    """Memory that a run may take: of the GPU, or of a Linux machine; None elsewhere."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
+        return 1024 * int(next(x for x in lines if x.startswith("MemAvailable")).split()[1])
+    except (OSError, StopIteration, ValueError):
+        return None
+
+
+def cases(settings: Settings) -> list[Case]:
+    """Returns the cases: forward and a step of training; on CUDA each in two dtypes."""
+    sizes = sizes_of(settings)
+    dtypes = [torch.float32, torch.bfloat16][: 2 if settings.device.type == "cuda" else 1]
+    names = {"forward": "forward", BOTH: "training step"}
+    text = (
+        f"A Mamba block and a transformer block (pre-norm, fused attention over all tokens, heads "
+        f"of {HEAD} channels, GELU MLP of {MLP} times the width) of width {sizes.width}, one "
+        f"sequence. A series ends after the first length at which a call takes over "
+        f"{sizes.seconds:g} s, and where memory would not do. Memory: growth of "
+        f"{_memory_word(settings)} while a call runs, its results included; weights, tokens and "
+        f"AdamW's moments are there before. L*: where the lines cross, on logarithmic axes."
+    )
+    extra = {
+        "forward": " Without gradients; Mamba in segments on a CPU, as the model runs it there.",
+        BOTH: " Forward, backward to the tokens and all weights, and a step of AdamW.",
+    }
+    return [
+        Case(
+            op=OP,
+            name=f"{name}, {_name(dtype)}",
+            text=text + extra[direction],
+            build=partial(lines, settings, sizes, direction, dtype),
+            axis="lengths",
+        )
+        for dtype in dtypes
+        for direction, name in names.items()
+    ]
+
+
+def _memory_word(settings: Settings) -> str:
+    cuda = settings.device.type == "cuda"
+    return "what torch has allocated on the GPU" if cuda else "the process's resident memory"
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def lines(settings: Settings, sizes: Sizes, direction: str, dtype: torch.dtype) -> list[Variant]:
+    """Returns the variants of one direction: both blocks at every length, short ones first."""
+    bench = Bench(settings, sizes, dtype)
+    both = [Line(name, direction, bench) for name in bench.blocks]
+    full = dtype == torch.float32
+    limit = {"forward": LIMIT, BOTH: BACKWARD_LIMIT}[direction] if full else HALF_LIMITS[direction]
+    what = "gradient of all tokens, of the" if direction == BOTH else "the"
+    return [
+        _variant(line, length, limit, f"float64, {what} first {_TOKENS} tokens")
+        for length in sizes.lengths
+        for line in both
+    ]
+
+
+def _variant(line: Line, length: int, limit: float, oracle: str) -> Variant:
+    weights = sum(p.numel() for p in line.bench.blocks[line.name].parameters())
+    width = line.bench.sizes.width
+    made = Variant(
+        name=f"{line.name}, L {length:,}",
+        run=lambda: None,
+        check=partial(line.check, length),
+        limit=limit,
+        oracle=oracle,
+        direction=line.direction,
+        dtype=_name(line.bench.dtype),
+        parameters={"L": length, "D": width, "series": line.name, "weights": weights},
+        work=partial(line.work, length),
+    )
+
+    def run() -> object:
+        result = line.run(length)
+        # Of what takes seconds three rounds are enough.
+        made.rounds = 3 if line.seconds[length] > 0.1 * line.bench.sizes.seconds else None
+        return result
+
+    made.run = run
+    return made
+
+
+def targets(settings: Settings) -> list[Target]:
+    """Returns no targets: what is asked for is where the lines cross."""
+    return []

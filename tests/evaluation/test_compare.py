@@ -1,0 +1,219 @@
+"""``gamba compare``: several methods' reports in one table."""
+
+import copy
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gamba_warp.cli import run
+from gamba_warp.eval.averages import bootstrap
+from gamba_warp.eval.paper import TABLE_1
+
+ROOT = Path(__file__).parents[2]
+UIDS = ("a", "b", "c", "d")
+
+
+def views_report(offset=0.0, kind="pictures", uids=UIDS):
+    """As eval-views writes it, of what is read of it."""
+    objects = [
+        {
+            **{"name": uid, "status": "ok", "truth_sha256": f"{uid}0", "views": [0, 1]},
+            **{"psnr": 20.0 + offset + i * (1 + offset), "ssim": 0.8, "lpips": None},
+            **{"mask_iou": 0.5, "seconds": {"predict": 0.1 + 9 * (i == 0)}},
+        }
+        for i, uid in enumerate(UIDS)
+        if uid in uids
+    ]
+    protocol = {"max_psnr": 100.0, "reference": 0, "split": "test", "lpips": None}
+    return {"protocol": protocol | {"source": {"kind": kind}}, "objects": objects}
+
+
+def shapes_report(offset=0.0, kind="mesh", voxels=128):
+    objects = [
+        {
+            **{"name": uid, "status": "ok", "gt_sha256": f"{uid}1", "kind": kind},
+            **{"chamfer": 0.05 + 0.01 * offset, "iou": None if i == 0 else 0.4 + 0.1 * i},
+        }
+        for i, uid in enumerate(UIDS)
+    ]
+    protocol = {"occupancy": "solid", "frame": "gt", "surface": {"voxels": voxels}}
+    return {"protocol": protocol, "objects": objects}
+
+
+class Files:
+    """Writes reports, and runs the command on them."""
+
+    def __init__(self, folder, capsys):
+        self.folder, self.capsys = folder, capsys
+
+    def add(self, name, report):
+        path = self.folder / f"{name}.json"
+        path.write_text(json.dumps(report))
+        return path
+
+    def run(self, *words):
+        code = run("compare", [*map(str, words), "--out", str(self.folder / "out")])
+        said = self.capsys.readouterr()
+        path = self.folder / "out" / "compare.json"
+        return code, said, json.loads(path.read_text()) if path.exists() else None
+
+
+@pytest.fixture
+def files(tmp_path, capsys):
+    return Files(tmp_path, capsys)
+
+
+def test_means_intervals_and_paired_differences(files):
+    words = [
+        f"ours={files.add('one', views_report(kind='checkpoint'))}",
+        f"ours={files.add('two', shapes_report())}",
+        f"theirs={files.add('three', views_report(1.0))}",
+        "--seconds",
+        "theirs=60",
+    ]
+    code, said, joined = files.run(*words)
+    assert code == 0
+    ours, theirs = joined["rows"]
+    assert ours["psnr"]["mean"] == 21.5 and theirs["psnr"]["mean"] == 24
+    known = bootstrap(np.array([20.0, 21, 22, 23]), lambda drawn: drawn.mean(-1))
+    assert ours["psnr"]["interval"] == known
+    assert theirs["lpips"] is None and theirs["chamfer"] is None
+    (difference,) = joined["differences"]
+    assert difference["name"] == "theirs - ours"
+    assert difference["psnr"]["mean"] == 2.5 and difference["psnr"]["interval"][0] > 1
+    # the first object's time holds the compilation
+    assert (ours["seconds"], ours["seconds_from"]) == (0.1, "measured")
+    assert (theirs["seconds"], theirs["seconds_from"]) == (60, "stated")
+    assert joined["common"]["iou"] == ["b", "c", "d"] and len(joined["common"]["chamfer"]) == 4
+    lines = {line.split("|")[1].strip(): line for line in said.out.splitlines() if "|" in line}
+    assert "24.00 [" in lines["theirs"] and lines["theirs"].count(" - ") == 3
+    assert "Volume IoU: 3 objects" in said.out
+    assert said.out == (files.folder / "out" / "compare.md").read_text()
+    page = (files.folder / "out" / "compare.html").read_text()
+    assert "<td>24.00<br><span>[" in page and "http" not in page
+
+
+def test_what_a_method_lacks_counts_for_none_and_is_named(files):
+    lacking = views_report(1.0, uids=("a", "b", "c"))
+    lacking["objects"].append({"name": "d", "status": "failed", "reason": "no picture of view 3"})
+    first = files.add("one", views_report(uids=("b", "c", "d")))
+    code, said, joined = files.run(f"x={first}", f"y={files.add('two', lacking)}")
+    assert code == 0 and joined["common"]["psnr"] == ["b", "c"]
+    assert joined["rows"][0]["psnr"]["mean"] == 21.5
+    assert joined["missing"]["eval-views"] == {
+        "x": {"a": "not in its report"},
+        "y": {"d": "no picture of view 3"},
+    }
+    assert "y lacks 1 object (d: no picture of view 3)" in said.out
+
+
+def change(report, **values):
+    changed = copy.deepcopy(report)
+    changed["protocol"] |= values
+    return changed
+
+
+def other_truth(report):
+    changed = copy.deepcopy(report)
+    changed["objects"][1] |= {"truth_sha256": "other", "gt_sha256": "other"}
+    return changed
+
+
+V, S = views_report(), shapes_report()
+
+
+@pytest.mark.parametrize(
+    "one, other, said",
+    [
+        (V, change(V, reference=2), "reference is 2, not 0"),
+        (V, change(V, size=64), "size is 64, not absent"),
+        (change(V, lpips="A"), change(V, lpips="B"), "lpips is B, not A"),
+        (V, other_truth(V), "b was compared with another truth"),
+        (S, change(S, occupancy="parity"), "occupancy is parity, not solid"),
+        (S, other_truth(S), "b was compared with another truth"),
+        (shapes_report(kind="gaussians"), shapes_report(0, "gaussians", 64), "surface.voxels"),
+        (V, views_report(uids=()), "no object was evaluated for all methods"),
+        (V, {"protocol": {}, "objects": []}, "no report of gamba eval-views"),
+        (V, {"objects": []}, "protocol"),
+        (V, change(V) | {"objects": [{"name": "a", "status": "ok"}]}, "truth_sha256"),
+        (V, change(V) | {"objects": V["objects"] * 2}, "that of another one"),
+        (V, [], "two.json"),
+    ],
+)
+def test_what_cannot_stand_in_one_table_is_refused(files, one, other, said):
+    first, second = files.add("one", one), files.add("two", other)
+    code, streams, joined = files.run(f"x={first}", f"y={second}")
+    assert code == 2 and joined is None
+    assert said in streams.err and streams.err.count("\n") == 1, streams.err
+
+
+def test_what_only_places_a_methods_files_may_differ(files):
+    gaussians = change(shapes_report(kind="gaussians", voxels=64), frame="reference")
+    views = change(change(V, lpips="VGG16"), split="all", distance=2.0)
+    code, said, joined = files.run(
+        *(f"{name}={files.add(name + kind, report)}"
+          for name, kind, report in (
+              ("x", "views", V), ("x", "shapes", S), ("y", "views", views),
+              ("y", "shapes", gaussians),
+          ))
+    )  # fmt: skip
+    assert code == 0
+    assert "eval-geometry: frame is gt (x); reference (y)." in joined["notes"][-1] + "."
+    assert any(
+        note.startswith("eval-views: split is test (x); all (y)") for note in joined["notes"]
+    )
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["x"], "x: give NAME="),
+        (["=report.json"], "give NAME="),
+        (["a|b=report.json"], "no '|'"),
+        (["x=nowhere.json"], "nowhere.json"),
+        (["x={0}", "x={0}"], "x has a report of eval-views already"),
+        (["x={0}", "--against", "z"], "--against z: the methods are x"),
+        (["x={0}", "--seconds", "z=1"], "there is no report of z"),
+        (["x={0}", "--seconds", "x=nan"], "not a number of seconds"),
+        ([f"x{i}={{0}}" for i in range(51)], "at most 50"),
+        ([], "NAME=REPORT"),
+    ],
+)
+def test_bad_arguments_are_one_line(files, words, said):
+    path = files.add("one", V)
+    code, streams, joined = files.run(*(word.format(path) for word in words))
+    assert code == 2 and joined is None
+    assert said in streams.err and streams.err.count("\n") == 1
+
+
+def test_the_papers_figures_stand_apart(files):
+    code, said, joined = files.run(f"x={files.add('one', V)}", "--paper", "--json")
+    assert code == 0 and json.loads(said.out) == joined
+    assert joined["paper"]["table_1"]["Gamba"] == list(TABLE_1["Gamba"])
+    text = (files.folder / "out" / "compare.md").read_text()
+    assert text.index("cannot be compared") < text.index("24.74") and "x" in text
+
+
+def test_the_worked_example(tmp_path, capsys):
+    """docs/examples/compare_methods.py, with one object, three views and coarse shapes."""
+    if not (ROOT / "starter" / "data").is_dir():
+        pytest.skip("the starter set is in a checkout alone")
+    example = runpy.run_path(str(ROOT / "docs/examples/compare_methods.py"))
+    words = f"--out {tmp_path} --objects 1 --views 3 --points 1000 --voxels 24 --no-lpips"
+    example["main"](words.split())
+    joined = json.loads((tmp_path / "compare.json").read_text())
+    rows = {row["name"]: row for row in joined["rows"]}
+    assert list(rows) == ["shipped", "retrieval", "billboard", "hull"]
+    assert all(row["psnr"]["mean"] > 10 for row in rows.values())
+    assert rows["billboard"]["chamfer"] is None and rows["hull"]["iou"]["mean"] > 0.1
+    # The baselines' files give what the evaluation of the model said of the baselines themselves.
+    report = json.loads((tmp_path / "shipped" / "report.json").read_text())
+    for name in ("retrieval", "billboard"):
+        expected = report["baselines"][name]["psnr"]
+        assert abs(rows[name]["psnr"]["mean"] - expected) < 0.01  # roundings to 8 bits
+    hull = json.loads((tmp_path / "hull-views" / "report.json").read_text())
+    assert hull["objects"][0]["pictures"]["matched_by"] == "camera"
+    capsys.readouterr()

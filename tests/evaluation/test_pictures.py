@@ -1,0 +1,252 @@
+"""Folders of pictures that any method rendered: what is matched, refused and said."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from helpers.micro import to_opengl
+from PIL import Image
+
+from gamba_warp.cameras import intrinsics, orbit
+from gamba_warp.cli import run
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+from gamba_warp.eval.views.pictures import PicturePredictions, save_pictures
+
+SIZE, VIEWS = 24, 4
+UIDS = ("a", "group/b")
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def rgba(seed, alpha=True):
+    """A noisy blob on nothing; without alpha on white."""
+    rng = np.random.default_rng(seed)
+    picture = np.zeros((SIZE, SIZE, 4), np.uint8)
+    top, left = rng.integers(2, 8, 2)
+    picture[top : top + 12, left : left + 13, :3] = rng.integers(0, 200, (12, 13, 3))
+    picture[top : top + 12, left : left + 13, 3] = 255
+    if alpha:
+        return picture
+    empty = picture[..., 3] == 0
+    picture[empty] = 255
+    return picture[..., :3]
+
+
+def transforms(names, azimuths, size=SIZE):
+    poses = to_opengl(orbit(azimuths, 20.0, 2.0).double()).tolist()
+    focal = float(intrinsics(size, size)[0, 0])
+    frames = [{"file_path": n, "transform_matrix": p} for n, p in zip(names, poses)]
+    return json.dumps({"w": size, "h": size, "fl_x": focal, "fl_y": focal, "frames": frames})
+
+
+AZIMUTHS = torch.arange(VIEWS) * 60.0
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Two objects of four views in data/, and copies of their pictures in pred/."""
+    for number, uid in enumerate(UIDS):
+        folder = tmp_path / "data" / uid
+        folder.mkdir(parents=True)
+        names = [f"view{v}.png" for v in range(VIEWS)]
+        (folder / "transforms.json").write_text(transforms(names, AZIMUTHS))
+        for v, name in enumerate(names):
+            Image.fromarray(rgba(10 * number + v)).save(folder / name)
+        shutil.copytree(folder, tmp_path / "pred" / uid)
+        (tmp_path / "pred" / uid / "transforms.json").unlink()
+    return tmp_path
+
+
+def evaluate(folder, *options):
+    arguments = ["--predictions", folder / "pred", "--data", folder / "data", "--split", "all"]
+    arguments += ["--out", folder / "out", "--no-lpips", "--no-baselines", "--device", "cpu"]
+    code = run("eval-views", [*map(str, arguments), *options])
+    path = folder / "out" / "report.json"
+    return code, json.loads(path.read_text()) if path.exists() else None
+
+
+def test_by_name_by_number_and_by_camera_is_the_same(data):
+    code, named = evaluate(data)
+    assert code == 0 and named["num_ok"] == 2
+    assert all(record["psnr"] == 100 and record["mask_iou"] == 1 for record in named["objects"])
+    assert named["objects"][0]["pictures"]["matched_by"] == "name"
+    for uid in UIDS:
+        folder = data / "pred" / uid
+        for v in range(VIEWS):
+            (folder / f"view{v}.png").rename(folder / f"{v:04d}.png")
+    assert evaluate(data)[1]["objects"][1]["pictures"]["matched_by"] == "number"
+    # In another order, with a picture more, and cameras rounded as a text holds them.
+    for uid in UIDS:
+        folder = data / "pred" / uid
+        shutil.copy(folder / "0001.png", folder / "extra.png")
+        names = ["extra.png", "0002.png", "0000.png", "0003.png", "0001.png"]
+        azimuths = torch.tensor([75.0, 120, 0, 180, 60]) + 0.01
+        (folder / "transforms.json").write_text(transforms(names, azimuths))
+    code, found = evaluate(data)
+    assert code == 0
+    assert found["objects"][0]["pictures"] == {
+        **{"matched_by": "camera", "unused": 1, "resized": 0, "alpha": True},
+    }
+    assert found["mean"]["psnr"] == named["mean"]["psnr"] == 100
+
+
+def test_pictures_without_alpha_have_no_mask(data):
+    for number, uid in enumerate(UIDS):
+        for v in range(VIEWS):
+            picture = Image.fromarray(rgba(10 * number + v, alpha=False))
+            picture.save(data / "pred" / uid / f"view{v}.png")
+    code, report = evaluate(data)
+    assert code == 0
+    assert report["mean"]["psnr"] == 100 and report["mean"]["mask_iou"] is None
+    assert "absent" in (data / "out" / "table.md").read_text()
+    # An alpha that is 1 everywhere says nothing either.
+    Image.open(data / "pred" / "a" / "view1.png").convert("RGBA").save(
+        data / "pred" / "a" / "view1.png"
+    )
+    assert "view0.png: has no alpha" in evaluate(data)[1]["failures"][0]["reason"]
+
+
+def test_the_input_need_not_be_there(data):
+    (data / "pred" / "a" / "view0.png").unlink()
+    code, report = evaluate(data)
+    assert code == 0
+    record = report["objects"][0]
+    assert record["psnr"] == 100 and record["input"]["psnr"] is None
+    rows = {(row["views"], row["objects"]) for row in report["table"]}
+    assert rows == {("novel", 2), ("input", 1)}
+
+
+def lose_a_view(folder):
+    (folder / "view2.png").unlink()
+
+
+def double_a_view(folder):
+    shutil.copy(folder / "view2.png", folder / "view2.webp")
+
+
+def double_a_number(folder):
+    for path in folder.glob("view*.png"):
+        path.rename(folder / path.name.removeprefix("view"))
+    shutil.copy(folder / "1.png", folder / "01.png")
+
+
+def shrink(folder):
+    Image.open(folder / "view3.png").resize((12, 12)).save(folder / "view3.png")
+
+
+def on_black(folder):
+    for path in folder.glob("*.png"):
+        picture = np.array(Image.open(path))
+        Image.fromarray(picture[..., :3] * (picture[..., 3:] > 0)).save(path)
+
+
+def turned_cameras(folder):
+    names = [f"view{v}.png" for v in range(VIEWS)]
+    (folder / "transforms.json").write_text(transforms(names, AZIMUTHS + 3))
+
+
+def other_lens(folder):
+    names = [f"view{v}.png" for v in range(VIEWS)]
+    text = transforms(names, AZIMUTHS).replace('"fl_x": ', '"fl_x": 1')
+    (folder / "transforms.json").write_text(text)
+
+
+def two_at_one_camera(folder):
+    names = [f"view{v}.png" for v in (0, 1, 2, 3)]
+    azimuths = torch.tensor([0.0, 60, 120, 120])
+    (folder / "transforms.json").write_text(transforms(names, azimuths))
+
+
+def no_picture(folder):
+    (folder / "view1.png").write_bytes(b"")
+
+
+def folder_gone(folder):
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize(
+    "spoil, said",
+    [
+        (lose_a_view, "no picture of the name of view 2 (1 of the 4 compared)"),
+        (double_a_view, "view2.png has the same name"),
+        (double_a_number, "has the same number"),
+        (shrink, "is 12x12, the pictures compared are 24x24"),
+        (on_black, "background rgb(0, 0, 0)"),
+        (turned_cameras, "turned by 3 degrees"),
+        (other_lens, "its lens differs by"),
+        (two_at_one_camera, "view2.png and view3.png are both at the camera of view 2"),
+        (no_picture, "view1.png: the file is empty"),
+        (folder_gone, "no such folder"),
+    ],
+)
+def test_a_bad_object_is_named_and_the_other_is_evaluated(data, spoil, said):
+    spoil(data / "pred" / "a")
+    code, report = evaluate(data)
+    assert code == 1 and report["num_ok"] == 1 and report["objects"][1]["psnr"] == 100
+    (failed,) = report["failures"]
+    assert failed["name"] == "a" and said in failed["reason"], failed["reason"]
+
+
+def test_resizing_is_asked_for_and_stated(data):
+    for path in (data / "pred").rglob("*.png"):
+        Image.open(path).resize((48, 48), Image.Resampling.NEAREST).save(path)
+    assert evaluate(data)[1]["num_failed"] == 2
+    code, report = evaluate(data, "--resize-pictures")
+    assert code == 0 and report["mean"]["psnr"] > 50  # an area average of four equal pixels
+    assert report["protocol"]["resize_pictures"] is True
+    assert report["objects"][0]["pictures"]["resized"] == VIEWS
+    Image.fromarray(np.zeros((20, 48, 4), np.uint8)).save(data / "pred" / "a" / "view1.png")
+    reason = evaluate(data, "--resize-pictures")[1]["failures"][0]["reason"]
+    assert "48x20 has not the shape of 24x24" in reason
+
+
+def test_pictures_of_the_files_size_are_resized_as_the_truth_is(data):
+    code, report = evaluate(data, "--size", "16")
+    assert code == 0 and report["mean"]["psnr"] == 100
+
+
+@pytest.mark.parametrize(
+    "case, said",
+    [
+        ("none", "pictures for none of the 2 objects"),
+        ("gaussians", "--save-gaussians"),
+        ("over", "would be overwritten"),
+    ],
+)
+def test_what_cannot_start(data, case, said, capsys):
+    options = []
+    if case == "none":
+        (data / "pred" / "a").rename(data / "pred" / "x")
+        (data / "pred" / "group").rename(data / "pred" / "y")
+    if case == "gaussians":
+        options = ["--save-gaussians"]
+    if case == "over":
+        (data / "out").mkdir()
+        (data / "pred").rename(data / "out" / "pictures")
+        (data / "pred").symlink_to(data / "out" / "pictures")
+        options = ["--save-pictures"]
+    code, report = evaluate(data, *options)
+    assert code == 2 and report is None
+    said_there = capsys.readouterr().err
+    assert said in said_there and said_there.count("\n") == 1
+
+
+def test_what_is_written_is_read_as_it_was(data, tmp_path):
+    """Colour to a rounding of 8 bits (twice one, where alpha is a half), masks exactly."""
+    dataset = open_dataset(data / "data")
+    protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
+    truth = load_truth(dataset, "a", protocol, "cpu")
+    generator = torch.Generator().manual_seed(0)
+    mask = torch.rand(VIEWS, SIZE, SIZE, generator=generator) > 0.4
+    rgb = torch.rand(VIEWS, SIZE, SIZE, 3, generator=generator)
+    rgb[~mask] = 0.51 + 0.49 * rgb[~mask]  # what alpha under a half leaves of white
+    rgb[:, :4] = 1.0
+    mask[:, :4] = False
+    save_pictures(tmp_path / "saved" / "a", dataset.files("a"), truth.views, (rgb, mask))
+    found = PicturePredictions(tmp_path / "saved", 1.5, "cpu").pictures(dataset, truth)
+    assert found.mask is not None and torch.equal(found.mask, mask)
+    assert (found.rgb - rgb).abs().max() <= 1 / 255
