@@ -25,6 +25,7 @@ COMMANDS = {
     "data render": "Meshes to posed views.",
     "eval-views": "PSNR, SSIM, LPIPS of views.",
     "eval-geometry": "Chamfer, IoU, F-score.",
+    "ablate": "Train and compare variants of a model.",
     "export": "Gaussians to meshes, splats and pages.",
     "view": "Gaussians in the browser.",
     "bench": "Run time against error, on this machine.",
@@ -40,6 +41,7 @@ MODULES = {
     "data furniture": "gamba_warp.train.data.furniture_command",
     "data primitives": "gamba_warp.train.data.primitives_command",
     "data render": "gamba_warp.train.data.render_command",
+    "ablate": "gamba_warp.ablation.command",
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",
 }

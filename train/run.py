@@ -138,7 +138,10 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
 def _report(trainer: Trainer, log: RunLog, code: int) -> int:
     """Says at the end what went wrong on the way; returns the exit code."""
     failures = trainer.failures
-    log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures)
+    memory = {}
+    if trainer.world.device.type == "cuda":
+        memory = {"device_memory": torch.cuda.max_memory_allocated(trainer.world.device)}
+    log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures, **memory)
     log.page()
     if trainer.skipped:
         say(f"{trainer.skipped} of {trainer.step} steps were skipped: not finite")
