@@ -123,25 +123,23 @@ def _settings(
 
 
 def _check_inputs(plan: Plan, settings: Settings, rows: list[Row]) -> None:
-    """Opens what the commands will read: dataset, meshes, weights; and the folder's own plan."""
-    from ..data.dataset import open_dataset
-    from ..devices import pick_device
-    from ..vision.weights import FETCH, lpips_available
+    """Checks what the commands will read, in a child: see ``run.open_inputs``."""
+    from ..untrusted.children import Failed, end_idle, run_each
     from .jobs import train_config
+    from .run import open_inputs
 
-    pick_device(settings.device)
-    for split in ("train", settings.evaluation.split):
-        if not open_dataset(settings.data, split).uids:
-            raise UserError(f"{settings.data}: its part {split} has no objects")
-    if settings.meshes is not None and not settings.meshes.is_dir():
-        raise UserError(f"--meshes {settings.meshes}: no such folder")
+    weights = []
     for row in rows:
-        if row.kind == "fit" or lpips_available():
-            continue
-        config = train_config(plan, row, settings)
-        model = config.model_config()
-        if (model.encoder == "vgg16" and model.prepend) or config.loss.lpips == "on":
-            raise UserError(f"row {row.name}: needs the weights of VGG16; fetch them with: {FETCH}")
+        config = train_config(plan, row, settings) if row.kind == "train" else None
+        model = config and config.model_config()
+        if model and (model.encoder == "vgg16" and model.prepend):
+            weights.append(row.name)
+        elif config and config.loss.lpips == "on":
+            weights.append(row.name)
+    for _, answer in run_each(open_inputs, [(settings, weights)]):
+        if isinstance(answer, Failed):
+            raise UserError(answer.reason)
+    end_idle()
 
 
 def _tasks(
@@ -211,8 +209,8 @@ def _run(
 
     from ..batch import check_not_read
     from ..files import only_process, output_folder
-    from .run import run_tasks
-    from .write import keep_plan, row_line, write_results
+    from .plan import keep_plan
+    from .run import row_line, run_tasks
 
     check_not_read([settings.out / "table.json"], [settings.data, settings.meshes])
     out = output_folder(settings.out)
@@ -237,6 +235,8 @@ def _run(
         if code:
             print("stopped; the same command goes on from here")
             return code
+        from .write import write_results  # not before: see ``run.open_inputs``
+
         bad = write_results(plan, settings, out)
         print(f"wrote {out / 'table.md'}, table.json and index.html")
         unfinished = [task for task in tasks if task.record.status != "ok"]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from ..errors import UserError
+from ..files import write_json
 from ..fitting.config import Count, FitConfig, RasterizeMode, Steps, Strategy
-from ..untrusted.documents import parse_document, read_bytes
+from ..untrusted.documents import parse_document, read_bytes, read_document
 from ..untrusted.names import plain_name
 from ..untrusted.ranges import Seed
 
@@ -219,3 +220,19 @@ def _check_values(where: str, *groups: Values) -> None:
                     raise UserError(f"{where}: {name} is {item}")
                 if isinstance(item, str) and item.startswith("-"):
                     raise UserError(f"{where}: {name}: {item!r} is no value of an option")
+
+
+def keep_plan(plan: Plan, out: Path) -> None:
+    """Writes the plan into the folder, which belongs to it from then on.
+
+    Raises:
+        UserError: the folder belongs to another plan, or cannot be written.
+    """
+    path = out / "plan.json"
+    if path.exists():
+        name = read_document(path, dict[str, Any], MAX_PLAN).get("name")
+        if name != plan.name:
+            raise UserError(
+                f"{out}: holds the ablation {name}, not {plan.name}; give another --out"
+            )
+    write_json(path, msgspec.to_builtins(plan))

@@ -12,8 +12,9 @@ from pathlib import Path
 
 from ..errors import UserError, one_line
 from ..files import atomic_folder, output_folder
-from .figures import read_facts
-from .jobs import ROW, Stage
+from .figures import read_facts, read_result
+from .jobs import ROW, Settings, Stage
+from .plan import Plan
 from .processes import Child, End, stop_requests, why
 from .record import Ended, Record, add_part, write_record
 
@@ -180,6 +181,25 @@ def _log(task: Task, stage: Stage) -> Path:
     return task.folder / f"{stage.name}.log"
 
 
+def row_line(plan: Plan, task: Task) -> str:
+    """One line about a row that has ended, with one seed."""
+    record = task.record
+    if record.status == "failed":
+        return f"{task.name}: failed: {record.reason}"
+    try:
+        found = read_result(plan.row(record.row), task.folder, record)
+    except UserError as error:
+        return f"{task.name}: {error}"
+    values = [v["psnr"] for v in found.objects.values() if "psnr" in v]
+    parts = [f"PSNR {sum(values) / len(values):.2f} dB" if values else "no view could be compared"]
+    if found.facts.step_seconds is not None:
+        parts.append(f"{found.facts.step_seconds:.3g} s a step")
+    if found.missing:
+        parts.append(f"{len(found.missing)} objects lack")
+    spent = sum(part.seconds for part in record.ended.values())
+    return f"{task.name}: {', '.join(parts)}, {spent / 60:.1f} minutes"
+
+
 def choose(folder: Path, stage: Stage, count: int) -> None:
     """Copies the Gaussians of some objects, evenly spaced by name, into a folder of their own.
 
@@ -206,3 +226,30 @@ def choose(folder: Path, stage: Stage, count: int) -> None:
                 shutil.copyfile(path, temporary / path.name)
     except OSError as error:
         raise UserError(f"cannot write {target}: {error.strerror}") from error
+
+
+def open_inputs(given: tuple[Settings, list[str]]) -> None:
+    """Opens what the commands of an ablation will read.
+
+    It is called in a process of its own. What a command's process held before it became that
+    command counts as its memory, so the process that starts commands must not load torch.
+
+    Args:
+        given: what is the same for every row, and the names of the rows that need VGG16.
+
+    Raises:
+        UserError: something is not there.
+    """
+    from ..data.dataset import open_dataset
+    from ..devices import pick_device
+    from ..vision.weights import FETCH, lpips_available
+
+    settings, weights = given
+    pick_device(settings.device)
+    for split in ("train", settings.evaluation.split):
+        if not open_dataset(settings.data, split).uids:
+            raise UserError(f"{settings.data}: its part {split} has no objects")
+    if settings.meshes is not None and not settings.meshes.is_dir():
+        raise UserError(f"--meshes {settings.meshes}: no such folder")
+    if weights and not lpips_available():
+        raise UserError(f"row {weights[0]}: needs the weights of VGG16; fetch them with: {FETCH}")

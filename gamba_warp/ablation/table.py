@@ -199,15 +199,19 @@ def about(table: dict[str, Any]) -> str:
     what, (budget, value) = table["evaluation"], *table["budget"].items()
     size = f"at {what['size']} pixels" if what["size"] else "at their own size"
     share = 100 * table["bootstrap"]["level"]
+    order = "the same samples" if budget == "steps" else "samples in the same order"
     text = (
-        f"Every row has {value:g} {budget} of training on the same samples of {table['data']}. "
+        f"Every row has {value:g} {budget} of training, on {order} of {table['data']}. "
         f"Means over seeds and objects with {share:g} % bootstrap intervals over objects: the "
         f"novel ones of {what['views']} views, {size}, of {what['objects']} objects of the part "
         f"{what['split']}. An interval tells how far a mean depends on the choice of objects, and "
         "the spread between seeds how far it depends on chance in training."
     )
     if any(row["kind"] == "fit" for row in table["rows"]):
-        text += " Fits have the views that were held out from them, and their time is that of all."
+        text += (
+            " Fits are compared with the views that were held out from them, and a step of theirs "
+            "is one of the fit of one object."
+        )
     return text
 
 
@@ -322,11 +326,11 @@ def remarks(table: dict[str, Any]) -> list[str]:
     lonely = [row["title"] for row in table["rows"] if len(row["seeds"]) == 1]
     if lonely:
         found.append(f"One seed alone, so no spread is known: {', '.join(lonely)}.")
-    cost = "Memory is the most that the process held, the libraries in it included (about 400 MB)."
+    cost = "Memory is the most that the process of the training held, the libraries in it included."
     threads = sorted({(t, j) for row in table["rows"] for t in row["threads"] for j in row["jobs"]})
     if threads:
-        shown = " or ".join(f"{t} threads, {j} rows at once" for t, j in threads)
-        cost += f" Times are of {shown}."
+        shown = " or ".join(f"{t} threads with {j} rows at once" for t, j in threads)
+        cost += f" Times are those of {shown}."
     if any(row["peak_memory_of"] == "GPU" for row in table["rows"]):
         cost = "Memory is what torch held on the GPU at most."
     return [*found, cost]

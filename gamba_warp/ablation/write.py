@@ -1,4 +1,4 @@
-"""What an ablation writes: its table, its page with curves and pictures, a line for each row."""
+"""What an ablation writes: its table, and its page with curves and pictures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from ..errors import UserError
@@ -15,11 +14,9 @@ from ..images import load_rgba
 from ..pages.curves import Chart, draw_charts
 from ..pages.page import Section, demo_page, svg_chart
 from ..pages.run_log import read_run_log
-from ..untrusted.documents import read_document
-from .figures import RowResult, SeedResult, collect, empty_psnr, read_result
+from .figures import RowResult, SeedResult, collect, empty_psnr
 from .jobs import STRIPS, Settings
-from .plan import MAX_PLAN, Plan
-from .run import Task
+from .plan import Plan
 from .series import DEFINITION
 from .table import about, extra_tables, main_lines, make_table, needed_sentences, page, remarks
 
@@ -144,41 +141,6 @@ def _panels(paths: Mapping[str, Path], kind: str) -> dict[str, np.ndarray]:
         found.setdefault("Truth", cells[truth])
         found[label] = cells[shown]
     return found
-
-
-def keep_plan(plan: Plan, out: Path) -> None:
-    """Writes the plan into the folder, which belongs to it from then on.
-
-    Raises:
-        UserError: the folder belongs to another plan, or cannot be written.
-    """
-    path = out / "plan.json"
-    if path.exists():
-        name = read_document(path, dict[str, Any], MAX_PLAN).get("name")
-        if name != plan.name:
-            raise UserError(
-                f"{out}: holds the ablation {name}, not {plan.name}; give another --out"
-            )
-    write_json(path, msgspec.to_builtins(plan))
-
-
-def row_line(plan: Plan, task: Task) -> str:
-    """One line about a row that has ended, with one seed."""
-    record = task.record
-    if record.status == "failed":
-        return f"{task.name}: failed: {record.reason}"
-    try:
-        found = read_result(plan.row(record.row), task.folder, record)
-    except UserError as error:
-        return f"{task.name}: {error}"
-    values = [v["psnr"] for v in found.objects.values() if "psnr" in v]
-    parts = [f"PSNR {sum(values) / len(values):.2f} dB" if values else "no view could be compared"]
-    if found.facts.step_seconds is not None:
-        parts.append(f"{found.facts.step_seconds:.3g} s a step")
-    if found.missing:
-        parts.append(f"{len(found.missing)} objects lack")
-    spent = sum(part.seconds for part in record.ended.values())
-    return f"{task.name}: {', '.join(parts)}, {spent / 60:.1f} minutes"
 
 
 def write_results(plan: Plan, settings: Settings, out: Path) -> bool:
