@@ -42,6 +42,7 @@ EXTRA_OF = {
     "trimesh": "mesh",
 }
 OWN = {
+    "ablate": "all",
     "demo": "all",
     "data primitives": "mesh",
     "data render": "mesh",
@@ -65,6 +66,7 @@ HOLDS = {
 }
 # What a command cannot begin without; what only some of its options need is found missing then.
 NEEDS = {
+    "ablate": ("kornia",),
     "data primitives": ("trimesh",),
     "data render": ("trimesh", "open3d"),
     "demo": _SHAPES,

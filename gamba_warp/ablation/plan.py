@@ -181,6 +181,9 @@ def read_plan(path: str | Path) -> Plan:
 def _check(plan: Plan) -> None:
     plain_name(plan.name, "name")
     known: set[str] = set()
+    for text in (plan.title, plan.note, *(t for row in plan.rows for t in (row.title, row.note))):
+        if not text.isprintable():  # a table has lines
+            raise UserError(f"{text[:80]!r}: a title or a note has a letter that does not print")
     for row in plan.rows:
         plain_name(row.name, "row")
         if row.name in known:
@@ -218,7 +221,7 @@ def _check_values(where: str, *groups: Values) -> None:
             for item in value if isinstance(value, list) else [value]:
                 if isinstance(item, float) and not math.isfinite(item):
                     raise UserError(f"{where}: {name} is {item}")
-                if isinstance(item, str) and item.startswith("-"):
+                if isinstance(item, str) and (item.startswith("-") or not item.isprintable()):
                     raise UserError(f"{where}: {name}: {item!r} is no value of an option")
 
 

@@ -228,7 +228,7 @@ def main_lines(table: dict[str, Any]) -> list[list[str]]:
 
 def _label(row: dict[str, Any]) -> str:
     seeds = len(row["seeds"])
-    return row["title"] + (f" ({seeds} seed{'' if seeds == 1 else 's'})" if seeds != 2 else "")
+    return row["title"] + {0: "", 1: " (1 seed)", 2: ""}.get(seeds, f" ({seeds} seeds)")
 
 
 def _mean_cell(figure: dict[str, Any] | None, metric: str, signed: bool = False) -> str:
@@ -329,8 +329,8 @@ def remarks(table: dict[str, Any]) -> list[str]:
     cost = "Memory is the most that the process of the training held, the libraries in it included."
     threads = sorted({(t, j) for row in table["rows"] for t in row["threads"] for j in row["jobs"]})
     if threads:
-        shown = " or ".join(f"{t} threads with {j} rows at once" for t, j in threads)
-        cost += f" Times are those of {shown}."
+        shown = " or ".join(f"{j} at once with {t} CPU threads each" for t, j in threads)
+        cost += f" Rows ran {shown}, and their times are those."
     if any(row["peak_memory_of"] == "GPU" for row in table["rows"]):
         cost = "Memory is what torch held on the GPU at most."
     return [*found, cost]

@@ -69,6 +69,8 @@ FIT = {"name": "b", "kind": "fit"}
         ),
         (["a", {"name": "b", "options": {"steps": 9}}], {}, "row b: steps: the budget is the same"),
         (["a", {"name": "b", "options": {"lr": "--x"}}], {}, "row b: lr: '--x' is no value"),
+        (["a", {"name": "b", "options": {"lr": "a\0"}}], {}, "row b: lr: 'a\\x00' is no value"),
+        (["a", {"name": "b", "note": "a\nb"}], {}, "a title or a note has a letter that"),
         (["a", {"name": "b", "seeds": [1, 1]}], {}, "row b: a seed is there twice"),
         (["a", {"name": "b", "paper": {"speed": 1}}], {}, "row b: paper: no metric speed"),
         (["a", {"name": "../b"}], {}, "$.rows[1].name"),
