@@ -43,6 +43,7 @@ EXTRA_OF = {
     "webdataset": "train",
 }
 OWN = {
+    "ablate": "all",
     "demo": "all",
     "data pack": "train",
     "data primitives": "mesh",
@@ -68,6 +69,7 @@ HOLDS = {
 }
 # What a command cannot begin without; what only some of its options need is found missing then.
 NEEDS = {
+    "ablate": ("kornia",),
     "data primitives": ("trimesh",),
     "data render": ("trimesh", "open3d"),
     "data gso": ("trimesh", "open3d"),

@@ -233,7 +233,10 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
 
 def _report(trainer: Trainer, log: RunLog, code: int, failures: dict[str, str]) -> None:
     """Says at the end what went wrong on the way, on any process."""
-    log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures)
+    memory = {}
+    if trainer.world.device.type == "cuda":
+        memory = {"device_memory": torch.cuda.max_memory_allocated(trainer.world.device)}
+    log.write("end", trainer.step, code=code, skipped=trainer.skipped, failures=failures, **memory)
     log.page()
     if trainer.skipped:
         say(f"{trainer.skipped} of {trainer.step} steps were skipped: not finite")

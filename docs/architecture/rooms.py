@@ -86,7 +86,7 @@ ROOMS = {
     "hostile": Room(
         "hostile files for every reader",
         (*_RESULTS, "kernels.stress"),
-        ("measure", *_BENCH, *_STRESS, *_TRAIN, *_EVAL),
+        ("measure", "ablation", *_BENCH, *_STRESS, *_TRAIN, *_EVAL),
     ),
     "train.data": Room("furniture, rendering of meshes, starter set", _LIBRARY),
     "train.sources": Room("published datasets, packs of views", (*_LIBRARY, "train.data")),

@@ -83,6 +83,11 @@ def draw_curves(record: RunRecord) -> str:
     if len(terms) > 1:
         names = {n.removeprefix("train.loss_").replace("_", " "): n for n in terms[:_COLOURS]}
         charts.insert(5, Chart("Terms of the training loss, unweighted", names, True))
+    return draw_charts(charts, record)
+
+
+def draw_charts(charts: Sequence[Chart], record: RunRecord) -> str:
+    """Draws charts of one's own choice; the arguments and the rest are as for ``draw_curves``."""
     drawn = [_draw(chart, record) for chart in charts]
     if not any(drawn):
         return "<p>The log holds no figures yet.</p>"

@@ -218,6 +218,11 @@ NONSENSE = {
     },
     "reconstruct PICTURE": {"size": "8 100000", "frames": "1 1000000000", "min-opacity": "nan -1"},
     "view FILE": {"port": "-1 65536"},
+    "ablate ours DATA": {
+        "steps": "0 -1", "minutes": "0 nan inf", "objects": "0 -1", "views": "1 1000000",
+        "size": "15 100000", "geometry-objects": "0", "jobs": "0 1000", "threads": "0 1000000",
+        "seeds": "-1 4294967296",
+    },
     "demo": {"minutes": "0 -1 nan inf"},
     "gpu-check": {"minutes": "0 -1 nan inf"},
     "bench scan": {"threads": "0 -1 1000000"},

@@ -140,6 +140,24 @@ def protocols() -> dict[str, Files]:
     }
 
 
+def plans() -> dict[str, Files]:
+    """Plans of an ablation: a shipped one, and one with each kind of value."""
+    from ...ablation.plan import PLANS
+
+    fit = {"name": "fit", "kind": "fit", "options": {"gaussians": 50}, "series": "n", "seeds": [3]}
+    options = {"minutes": 2.5, "lr": 0.1, "radial_mask": False, "extra": ["more"], "clip": None}
+    plan = {
+        **{"name": "mixed", "title": "Each kind of value", "seeds": [0, 7]},
+        "base": {"preset": "tiny", "set": {"norm": "rms"}, "options": options, "fit": {"steps": 9}},
+        "evaluation": {"split": "val", "objects": 3, "views": 2, "size": 32},
+        "rows": [{"name": "a", "paper": {"psnr": 1.5}}, fit],
+    }
+    return {
+        "shipped": {"plan.json": (PLANS / "paper-table2.json").read_bytes()},
+        "plan": {"plan.json": json.dumps(plan).encode()},
+    }
+
+
 def results() -> dict[str, Files]:
     """A small bench.json."""
     from ...kernels.bench.core.measure import FORMAT

@@ -1,0 +1,241 @@
+"""The plan of an ablation: a JSON document, one of the shipped ones by its name, or a file."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from ..errors import UserError
+from ..files import write_json
+from ..fitting.config import Count, FitConfig, RasterizeMode, Steps, Strategy
+from ..untrusted.documents import parse_document, read_bytes, read_document
+from ..untrusted.names import plain_name
+from ..untrusted.ranges import Seed
+
+PLANS = Path(__file__).parent / "plans"
+MAX_PLAN = 1 << 20  # bytes; ours have 5,000
+METRICS = ("psnr", "ssim", "lpips", "mask_iou", "chamfer", "iou")
+
+Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}\Z")]
+Text = Annotated[str, Meta(max_length=1000)]
+Word = Annotated[str, Meta(min_length=1, max_length=200)]
+_Scalar = bool | int | float | Annotated[str, Meta(max_length=200)]
+Value = _Scalar | Annotated[list[_Scalar], Meta(max_length=100)] | None
+Values = Annotated[dict[Word, Value], Meta(max_length=200)]
+
+
+class FitOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of ``gamba fit`` that a plan may set; they mean what they mean there."""
+
+    gaussians: Count = FitConfig.gaussians
+    steps: Steps = FitConfig.steps
+    strategy: Strategy = FitConfig.strategy
+    rasterize_mode: RasterizeMode = "classic"
+    held_out: Annotated[int, Meta(ge=2, le=100_000)] = 6
+    size: Annotated[int, Meta(ge=8, le=4096)] | None = None
+    limit: Annotated[int, Meta(ge=1, le=1_000_000)] = 12
+
+
+class Evaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What every row is evaluated on.
+
+    Attributes:
+        split: part of the dataset.
+        objects: so many of it, evenly spaced in the order of names.
+        views: of an object, the input included, evenly spaced.
+        size: height of the pictures compared, pixels; None: the files' own.
+        geometry_objects: so many of the objects have their shapes evaluated; None: all.
+    """
+
+    split: Literal["val", "test"] = "test"
+    objects: Annotated[int, Meta(ge=1, le=1_000_000)] = 27
+    views: Annotated[int, Meta(ge=2, le=100_000)] = 4
+    size: Annotated[int, Meta(ge=16, le=4096)] | None = None
+    geometry_objects: Annotated[int, Meta(ge=1, le=1_000_000)] | None = None
+
+
+class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What all rows have.
+
+    Attributes:
+        preset: of ``gamba train``.
+        set: fields of ``GambaConfig``.
+        options: of ``gamba train``; one of ``steps`` and ``minutes`` is the budget of every row.
+        fit: options of ``gamba fit``, for rows of that kind.
+    """
+
+    preset: Word = "tiny"
+    set: Values = {}
+    options: Values = {}
+    fit: Values = {}
+
+
+class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One row of the table.
+
+    Attributes:
+        name: of its folder.
+        title: in the table; the name, if empty.
+        kind: "train" trains and evaluates a model, "fit" fits objects one by one.
+        set: fields of ``GambaConfig`` that differ from the base's.
+        options: of ``gamba train``, or of ``gamba fit``, that differ; null takes one of the base's
+            away.
+        seeds: in place of the plan's.
+        compare_with: name of the row that this one is compared with, in place of the plan's.
+        series: name of the series of numbers of Gaussians that the row belongs to.
+        paper: figures that the paper states, by the metric's name.
+        note: a sentence below the table.
+    """
+
+    name: Name
+    title: Text = ""
+    kind: Literal["train", "fit"] = "train"
+    set: Values = {}
+    options: Values = {}
+    seeds: Annotated[list[Seed], Meta(min_length=1, max_length=100)] | None = None
+    compare_with: Name | None = None
+    series: Name | None = None
+    paper: Annotated[dict[Word, float], Meta(max_length=10)] = {}
+    note: Text = ""
+
+    @property
+    def label(self) -> str:
+        """What the table calls it."""
+        return self.title or self.name
+
+
+class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An ablation: rows that are trained and evaluated alike.
+
+    Attributes:
+        name: of the plan.
+        title: of its page.
+        rows: of the table, in its order.
+        note: sentences at the head of the page.
+        seeds: every row is run with each.
+        base: what all rows have.
+        evaluation: what they are evaluated on.
+        compare_with: name of the row that the others are compared with; None: with none.
+    """
+
+    name: Name
+    title: Text
+    rows: Annotated[list[Row], Meta(min_length=1, max_length=200)]
+    note: Text = ""
+    seeds: Annotated[list[Seed], Meta(min_length=1, max_length=100)] = msgspec.field(
+        default_factory=lambda: [0, 1]
+    )
+    base: Base = Base()
+    evaluation: Evaluation = Evaluation()
+    compare_with: Name | None = None
+
+    def row(self, name: str) -> Row:
+        """The row of a name. Raises UserError, naming those there are, where there is none."""
+        for row in self.rows:
+            if row.name == name:
+                return row
+        names = ", ".join(row.name for row in self.rows)
+        raise UserError(f"plan {self.name} has no row {name}; it has {names}")
+
+    def seeds_of(self, row: Row) -> list[int]:
+        """The seeds of a row."""
+        return list(self.seeds if row.seeds is None else row.seeds)
+
+
+def shipped() -> list[str]:
+    """Names of the plans that come with the package."""
+    return sorted(path.stem for path in PLANS.glob("*.json"))
+
+
+def open_plan(text: str) -> Plan:
+    """Reads the shipped plan of a name, or that of a file.
+
+    Raises:
+        UserError: there is neither, or the document is no sound plan.
+    """
+    if text in shipped():
+        return read_plan(PLANS / f"{text}.json")
+    if not Path(text).exists():
+        raise UserError(f"{text}: no such plan; give {', '.join(shipped())}, or a file")
+    return read_plan(text)
+
+
+def read_plan(path: str | Path) -> Plan:
+    """Reads a plan and checks what can be told from it alone; ``jobs.check`` does the rest.
+
+    Raises:
+        UserError: the file cannot be read, or is no sound plan; names the row.
+    """
+    plan = parse_document(read_bytes(path, MAX_PLAN), Plan, str(path))
+    try:
+        _check(plan)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    return plan
+
+
+def _check(plan: Plan) -> None:
+    plain_name(plan.name, "name")
+    known: set[str] = set()
+    for text in (plan.title, plan.note, *(t for row in plan.rows for t in (row.title, row.note))):
+        if not text.isprintable():  # a table has lines
+            raise UserError(f"{text[:80]!r}: a title or a note has a letter that does not print")
+    for row in plan.rows:
+        plain_name(row.name, "row")
+        if row.name in known:
+            raise UserError(f"row {row.name}: there are two of this name")
+        known.add(row.name)
+        if row.kind == "fit" and row.set:
+            raise UserError(f"row {row.name}: a fit has no model, so it has no set")
+        unknown = [name for name in row.paper if name not in METRICS]
+        if unknown or not all(map(math.isfinite, row.paper.values())):
+            what = f"no metric {unknown[0]}" if unknown else "not a number"
+            raise UserError(f"row {row.name}: paper: {what}; there are {', '.join(METRICS)}")
+        _check_values(f"row {row.name}", row.set, row.options)
+        _check_seeds(f"row {row.name}", plan.seeds_of(row))
+    _check_values("base", plan.base.set, plan.base.options, plan.base.fit)
+    for name in {plan.compare_with, *(row.compare_with for row in plan.rows)} - {None}:
+        if plan.row(name).kind != "train":
+            raise UserError(f"compare_with {name}: rows can be compared with a model only")
+    for name in {row.series for row in plan.rows} - {None}:
+        kinds = {row.kind for row in plan.rows if row.series == name}
+        if len(kinds) > 1:
+            raise UserError(f"series {name}: it mixes models and fits")
+
+
+def _check_seeds(where: str, seeds: list[int]) -> None:
+    if len({*seeds}) != len(seeds):
+        raise UserError(f"{where}: a seed is there twice")
+
+
+def _check_values(where: str, *groups: Values) -> None:
+    """Numbers that are finite, and no lists in a model's fields."""
+    for group in groups:
+        for name, value in group.items():
+            if not name.replace("_", "").replace("-", "").isalnum() or not name[0].isalpha():
+                raise UserError(f"{where}: {name!r} is no name of an option or a field")
+            for item in value if isinstance(value, list) else [value]:
+                if isinstance(item, float) and not math.isfinite(item):
+                    raise UserError(f"{where}: {name} is {item}")
+                if isinstance(item, str) and (item.startswith("-") or not item.isprintable()):
+                    raise UserError(f"{where}: {name}: {item!r} is no value of an option")
+
+
+def keep_plan(plan: Plan, out: Path) -> None:
+    """Writes the plan into the folder, which belongs to it from then on.
+
+    Raises:
+        UserError: the folder belongs to another plan, or cannot be written.
+    """
+    path = out / "plan.json"
+    if path.exists():
+        name = read_document(path, dict[str, Any], MAX_PLAN).get("name")
+        if name != plan.name:
+            raise UserError(
+                f"{out}: holds the ablation {name}, not {plan.name}; give another --out"
+            )
+    write_json(path, msgspec.to_builtins(plan))

@@ -1,0 +1,192 @@
+"""Plans: what is wrong with one is told in one line, which names the row, before anything runs."""
+
+import dataclasses
+import inspect
+import json
+
+import msgspec
+import pytest
+from helpers.ablation import plan, write_plan
+
+from gamba_warp import cli
+from gamba_warp.ablation import jobs
+from gamba_warp.ablation.plan import PLANS, FitOptions, open_plan, read_plan, shipped
+from gamba_warp.commands.fit import fit_command
+from gamba_warp.errors import UserError
+from gamba_warp.model.config import GambaConfig
+
+# Fields of the paper's questions that another branch adds. This test is to be whole when they are
+# there: LATER must then be empty, and the test below says so.
+LATER = {"mixer", "attention_mlp", "image_tokens", "mixed_tokens"}
+LATER |= {"triplane_size", "triplane_features"}
+
+
+def settings(tmp_path, chosen, budget=("steps", 4), **more):
+    values = {"evaluation": chosen.evaluation, "meshes": None, "device": "cpu", **more}
+    return jobs.Settings(data=tmp_path / "data", out=tmp_path / "out", budget=budget, **values)
+
+
+def told(path, tmp_path):
+    with pytest.raises(UserError) as caught:
+        chosen = read_plan(path)
+        jobs.budget_of(chosen, None, None)
+        jobs.check(chosen, settings(tmp_path, chosen), chosen.rows)
+    return str(caught.value)
+
+
+FIT = {"name": "b", "kind": "fit"}
+
+
+@pytest.mark.parametrize(
+    "rows, more, reason",
+    [
+        (["a", "a"], {}, "row a: there are two"),
+        (["a", {"name": "b", "sett": {}}], {}, "unknown field `sett`"),
+        (["a", {"name": "b", "set": {"widht": 4}}], {}, "row b: set: GambaConfig has no field wid"),
+        (["a", {"name": "b", "set": {"width": 0}}], {}, "row b: --set: config: width is 0"),
+        (["a", {"name": "b", "set": {"patch_size": 5}}], {}, "row b: --set: config: image_size"),
+        (
+            ["a", {"name": "b", "options": {"clap": 4}}],
+            {},
+            "row b: options: gamba train has no --c",
+        ),
+        (["a", {"name": "b", "options": {"lr": -1}}], {}, "row b: --lr -1"),
+        (
+            ["a", {"name": "b", "options": {"lr": "fast"}}],
+            {},
+            "row b: gamba train does not take --l",
+        ),
+        (["a", {"name": "b", "options": {"radial_mask": 3}}], {}, "does not take --radial-mask 3"),
+        (
+            ["a", {"name": "b", "options": {"seed": 3}}],
+            {},
+            "row b: options: seed is not for a plan",
+        ),
+        (
+            ["a", {"name": "b", "options": {"out": "x"}}],
+            {},
+            "row b: options: out is not for a plan",
+        ),
+        (["a", {"name": "b", "options": {"steps": 9}}], {}, "row b: steps: the budget is the same"),
+        (["a", {"name": "b", "options": {"lr": "--x"}}], {}, "row b: lr: '--x' is no value"),
+        (["a", {"name": "b", "options": {"lr": "a\0"}}], {}, "row b: lr: 'a\\x00' is no value"),
+        (["a", {"name": "b", "note": "a\nb"}], {}, "a title or a note has a letter that"),
+        (["a", {"name": "b", "seeds": [1, 1]}], {}, "row b: a seed is there twice"),
+        (["a", {"name": "b", "paper": {"speed": 1}}], {}, "row b: paper: no metric speed"),
+        (["a", {"name": "../b"}], {}, "$.rows[1].name"),
+        (["a"], {"compare_with": "c"}, "plan trial has no row c; it has a"),
+        (["a", FIT], {"compare_with": "b"}, "compare_with b: rows can be compared with a model"),
+        (["a", {**FIT, "set": {"width": 8}}], {}, "row b: a fit has no model"),
+        (["a", {**FIT, "options": {"gaussians": 1}}], {}, "row b: gamba fit: Expected `int` >= 2"),
+        (["a", {**FIT, "options": {"views": 1}}], {}, "row b: gamba fit: Object contains unknown"),
+        (
+            [{"name": "a", "series": "n"}, {**FIT, "series": "n"}],
+            {},
+            "series n: it mixes models and fits",
+        ),
+        (
+            [{"name": "a", "series": "n"}, {"name": "b", "series": "n"}],
+            {},
+            "series n: two of its rows have the same number",
+        ),
+        (["a"], {"base": {"options": {}}}, "the budget of a row: expected steps or minutes"),
+        (["a"], {"base": {"options": {"steps": 1, "minutes": 1}}}, "expected steps or minutes"),
+        (["a"], {"base": {"preset": "huge"}}, "row a: no preset huge"),
+        ([], {}, "$.rows"),
+    ],
+)
+def test_what_is_wrong_is_told_with_the_rows_name(rows, more, reason, tmp_path):
+    text = told(write_plan(tmp_path, *rows, **more), tmp_path)
+    assert reason in text and "\n" not in text and len(text) < 300
+
+
+def test_what_is_wrong_ends_the_command_before_it_writes(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = write_plan(tmp_path, "a", {"name": "b", "options": {"clap": 1}})
+    assert cli.run("ablate", [str(path), str(tmp_path)]) == 2
+    assert cli.run("ablate", ["tabel2", str(tmp_path)]) == 2
+    path = write_plan(tmp_path, "a")
+    assert cli.run("ablate", [str(path), str(tmp_path), "--rows", "z"]) == 2
+    assert cli.run("ablate", [str(path), str(tmp_path), "--steps", "1", "--minutes", "1"]) == 2
+    assert cli.run("ablate", [str(path), str(tmp_path / "none"), "--dry-run"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 5
+    assert "row b" in lines[0] and "no such plan; give ours, paper-table2, questions" in lines[1]
+    assert "has no row z; it has a" in lines[2] and "give one of them" in lines[3]
+    assert "none" in lines[4]
+    assert [path.name for path in tmp_path.iterdir()] == ["trial.json"]
+
+
+def test_the_row_changes_the_base(tmp_path):
+    row = {"name": "b", "set": {"depth": 2}, "options": {"lr": None, "radial-mask": False}}
+    base = {"options": {"minutes": 3, "lr": 0.5, "clip": 2, "extra": ["x", "y"]}}
+    chosen = read_plan(write_plan(tmp_path, "a", row, base=base))
+    given = settings(tmp_path, chosen, ("minutes", 1.5))
+    first, second = (jobs.stages(chosen, r, 7, given)[0].words_in(tmp_path) for r in chosen.rows)
+    assert first[2:6] == ["--preset", "tiny", "--set", "width=16"]
+    assert "--lr" in first and "--lr" not in second and "--no-radial-mask" in second
+    assert second[second.index("--set") :][1:3] == ["width=16", "depth=2"]
+    assert second[second.index("--minutes") + 1] == "1.5" and second.count("--minutes") == 1
+    assert second[second.index("--extra") :][1:3] == ["x", "y"]
+    assert second[second.index("--seed") + 1] == "7"
+    assert second[-2:] == ["--out", str(tmp_path / "run")]
+
+
+@pytest.mark.parametrize("name", ["paper-table2", "questions", "ours"])
+def test_the_shipped_plans_are_sound(name, tmp_path):
+    chosen = open_plan(name)
+    assert chosen.name == name and len(chosen.seeds) >= 2
+    given = settings(tmp_path, chosen, jobs.budget_of(chosen, None, None), meshes=tmp_path)
+    for row in chosen.rows:
+        if {*row.set} & (LATER - {f.name for f in dataclasses.fields(GambaConfig)}):
+            continue
+        assert jobs.stages(chosen, row, 0, given)
+    rows = [row for row in chosen.rows if not {*row.set} & LATER]
+    jobs.check(chosen, given, rows)
+    numbers = {r.name: jobs.gaussians_of(chosen, r, given) for r in rows if r.series}
+    if name == "questions":
+        want = {"1k": 1024, "2k": 2304, "4k": 4096, "9k": 9216, "16k": 16384}
+        assert {n[10:]: v for n, v in numbers.items() if n.startswith("gau")} == want
+
+
+def test_the_list_of_later_fields_is_not_outlived():
+    """When the first of them is there, all must be, and LATER goes."""
+    there = LATER & {field.name for field in dataclasses.fields(GambaConfig)}
+    assert not there, f"take {', '.join(sorted(there))} out of LATER"
+
+
+def test_every_file_of_the_folder_is_a_shipped_plan():
+    assert shipped() == ["ours", "paper-table2", "questions"]
+    for path in PLANS.iterdir():
+        assert read_plan(path).name == path.stem
+
+
+def test_a_fits_options_are_those_of_the_command():
+    theirs = inspect.signature(fit_command).parameters
+    for field in msgspec.structs.fields(FitOptions):
+        assert field.name in theirs
+        if field.name not in ("limit", "held_out"):
+            assert field.default == theirs[field.name].default, field.name
+
+
+def test_a_plan_is_kept_as_it_is(tmp_path):
+    path = write_plan(tmp_path, "a", {"name": "b", "paper": {"psnr": 12.72}, "seeds": [3]})
+    built = msgspec.to_builtins(read_plan(path))
+    again = tmp_path / "again.json"
+    again.write_text(json.dumps(built))
+    assert msgspec.to_builtins(read_plan(again)) == built
+    assert plan("a")["name"] == "trial"
+
+
+def test_the_difference_of_two_commands_is_named():
+    old = {"train": ["train", "D", "--set", "a=1", "b=2", "--lr", "1"], "views": ["eval-views"]}
+    same = {name: list(words) for name, words in old.items()}
+    assert jobs.difference(old, same) is None and jobs.digest(old) == jobs.digest(same)
+    same["train"][3] = "a=3"
+    assert jobs.difference(old, same) == "--set a: 1 then, 3 now"
+    assert jobs.digest(old) != jobs.digest(same)
+    fewer = {"train": ["train", "D", "--set", "a=1", "b=2"], "views": ["eval-views"]}
+    assert jobs.difference(old, fewer) == "--lr: 1 then, not given now"
+    more = {**old, "shapes": ["eval-geometry", "P"]}
+    assert "eval-geometry was not part" in jobs.difference(old, more)
+    assert "eval-geometry is no part" in jobs.difference(more, old)

@@ -1,0 +1,111 @@
+"""A ``gamba`` whose commands write small reports at once, and plans for it."""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+OBJECTS = {"apple": 20.0, "bench": 24.0, "chair": 22.0}  # PSNR at learning rate 0 and seed 0, dB
+
+
+def plan(*rows, **more):
+    """A plan of one base; rows are names or dictionaries."""
+    rows = [{"name": row} if isinstance(row, str) else row for row in rows]
+    base = {"preset": "tiny", "set": {"width": 16}, "options": {"steps": 4}}
+    base |= more.pop("base", {})
+    return {"name": "trial", "title": "A trial", "seeds": [0], "base": base, "rows": rows, **more}
+
+
+def write_plan(folder, *rows, **more):
+    path = folder / "trial.json"
+    path.write_text(json.dumps(plan(*rows, **more)))
+    return path
+
+
+def option(words, name, default=None):
+    return words[words.index(name) + 1] if name in words else default
+
+
+def train(words, out):
+    """``--clip`` says what happens: 6 waits for a signal, 7 to 9 are failures."""
+    clip = option(words, "--clip")
+    lines = [{"event": "start", "step": 0, "parameters": 1234, "device": "cpu"}]
+    for step in range(1, 5):
+        loss = None if clip == "7" else 1.0 / step
+        line = {"event": "train", "step": step, "minutes": step / 60, "loss": loss, "psnr": 10.0}
+        lines.append({**line, "seconds": 0.1 * step, "skipped": 0})
+    lines.append({"event": "val", "step": 4, "minutes": 4 / 60, "loss": 0.5, "psnr_novel": 15.0})
+    (out / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    if clip == "8":
+        print("gamba: 20 steps in a row were not finite (step 20); lower --lr")
+        return 2
+    if clip == "9":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if clip == "6" and not (out / "saved").exists():
+
+        def save(number, frame):
+            (out / "saved").write_text("x")
+            sys.exit(128 + number)
+
+        signal.signal(signal.SIGTERM, save)
+        (out / "waits").write_text("x")
+        time.sleep(60)
+        return 1
+    rate, seed = float(option(words, "--lr", 0)), int(option(words, "--seed"))
+    (out / "model.safetensors").write_text(json.dumps([rate, seed]))
+    return 0
+
+
+def views(words, out):
+    """PSNR is that of ``OBJECTS``, 100 dB more for each unit of the learning rate, 1 by seed."""
+    rate, seed = json.loads(Path(option(words, "--checkpoint")).read_text())
+    objects = [
+        {
+            **{"name": name, "status": "ok", "views": [0, 1, 2], "psnr": psnr + 100 * rate + seed},
+            **{"ssim": 0.5, "lpips": None, "mask_iou": 0.25},
+        }
+        for name, psnr in OBJECTS.items()
+    ]
+    report = {"protocol": {"size": None}, "objects": objects, "failures": []}
+    (out / "report.json").write_text(json.dumps(report))
+    if "--save-gaussians" in words:
+        (out / "gaussians").mkdir()
+        for name in OBJECTS:
+            (out / "gaussians" / f"{name}.ply").write_text(name)
+    return 0
+
+
+def shapes(words, out):
+    found = sorted(path.stem for path in Path(words[1]).iterdir())
+    objects = [{"name": n, "status": "ok", "chamfer": 0.01 * len(n), "iou": 0.5} for n in found]
+    (out / "report.json").write_text(json.dumps({"objects": objects, "failures": []}))
+    return 1  # some of the true meshes have no prediction
+
+
+def fit(words, out):
+    number = int(option(words, "--gaussians"))
+    objects = [
+        {
+            **{"name": name, "psnr_held_out": psnr + number / 100, "ssim_held_out": None},
+            **{"seconds": 10.0, "steps": 5, "views_held_out": [5]},
+        }
+        for name, psnr in OBJECTS.items()
+    ]
+    report = {"protocol": {"size": None}, "objects": objects, "failures": []}
+    (out / "report.json").write_text(json.dumps(report))
+    return 0
+
+
+def main(words):
+    with open(os.environ["FAKE_CALLS"], "a") as file:
+        file.write(" ".join(words) + "\n")
+    out = Path(option(words, "--out"))
+    out.mkdir(parents=True, exist_ok=True)
+    commands = {"train": train, "eval-views": views, "eval-geometry": shapes, "fit": fit}
+    return commands[words[0]](words, out)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
