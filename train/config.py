@@ -266,7 +266,7 @@ _MUST_STAY = {"run.seed"}
 _TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
 # The processes of one run may have these apart from one another; of files their contents count.
 _OF_A_MACHINE = {"views.extra", "views.workers", "views.cache"} | {
-    f"run.{name}"
+    ".".join(("run", name))
     for name in (
         *("out", "config", "resume", "init", "encoder_weights", "device", "threads", "keep"),
         *("log", "tensorboard"),
