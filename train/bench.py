@@ -26,8 +26,9 @@ from gamba_warp.render import render
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from .batches import Batch, BatchSource
+from .batches import BatchSource
 from .config import DataConfig, OptimConfig
+from .data.samples import Batch
 from .optim import Ema, build_optimizer
 from .step import compute_gradients
 
@@ -127,7 +128,7 @@ class _MadeUp(ViewDataset):
         color = interpolate(noise, size=(size, size), mode="bilinear").permute(0, 2, 3, 1)
         drawn = [_ellipse(share, size, 0.7 + 0.2 * i) for i, share in enumerate(shares)]
         alphas = torch.stack(drawn)[:, None].expand(-1, self.views, -1, -1, -1)
-        self.pictures = torch.cat([color.unflatten(0, alphas.shape[:2]), alphas], -1)
+        self.drawn = torch.cat([color.unflatten(0, alphas.shape[:2]), alphas], -1)
 
     def num_views(self, index: int | str) -> int:
         """The number of views of each object."""
@@ -139,7 +140,7 @@ class _MadeUp(ViewDataset):
     ) -> ObjectViews:  # fmt: skip
         """Views of one object, as ``ViewDataset.load`` gives them; ``size`` is that of all."""
         chosen = list(range(self.views) if views is None else views)
-        images = self.pictures[int(index), chosen].clone()
+        images = self.drawn[int(index), chosen].clone()
         side = images.shape[1]
         viewmats = orbit(360 * torch.tensor(chosen) / self.views, distance=2.5)
         K = intrinsics(side, side, 40.0).expand(len(chosen), 3, 3)

@@ -20,9 +20,10 @@ from gamba_warp.kernels.runtime.system import end_signals
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
-from .batches import Batch, BatchQueue, BatchSource, TrainingData, fixed_batches
+from .batches import BatchQueue, BatchSource, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_length, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
+from .data.samples import Batch
 from .ddp import World
 from .log import Quiet, RunLog, say
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views, radial_weight
@@ -251,8 +252,7 @@ class Trainer:
             disable=not self.world.main,
             file=Quiet(sys.stderr),
         )
-        began, before = time.monotonic(), self.elapsed
-        stop = 0.0
+        began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
         try:
             with stop_signals() as received:

@@ -16,7 +16,7 @@ from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 
-from .batches import Batch
+from .data.samples import Batch
 from .objective.losses import depth_loss, rendered_psnr, total_loss, view_losses
 from .objective.radial_mask import NEAR, contour_distances, project_means, radial_mask_loss
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from gamba_warp.batch import check_not_read
 from gamba_warp.data import gso
@@ -107,7 +108,7 @@ def open_job(options: ViewsOptions) -> Job:
         options.encoder_weights,
         options.resize_pictures,
     )
-    rendered: dict[str, str] = {}
+    rendered: dict[str, Any] = {}
     if isinstance(predictions, PicturePredictions):
         if options.save_gaussians:
             raise UserError(f"--save-gaussians: {options.checkpoint} holds pictures")

@@ -125,7 +125,7 @@ class PicturePredictions:
         for row, view in enumerate(truth.views):
             if view in found:
                 picture, alphas[view] = _read(found[view])
-                fitted = self._fitted(found[view], picture, (width, height), files.images[view])
+                fitted = self._fitted(found[view], picture, (width, height), files, view)
                 resized += fitted is not picture
                 rgba[row] = torch.from_numpy(fitted.astype(np.float32) / 255)
         if len(set(alphas.values())) > 1:
@@ -144,13 +144,18 @@ class PicturePredictions:
         return Pictures(rgb, None if opaque else mask, truth.views[0] in found, record)
 
     def _fitted(
-        self, path: Path, picture: np.ndarray, size: tuple[int, int], true_file: Path
+        self,
+        path: Path,
+        picture: np.ndarray,
+        size: tuple[int, int],
+        files: ObjectFiles,
+        view: int,
     ) -> np.ndarray:
         """The picture at the size compared: as it is, or resized as the true picture is."""
         height, width = picture.shape[:2]
         if (width, height) == size:
             return picture
-        if not self.resize and (width, height) != _size(true_file):
+        if not self.resize and (width, height) != _size(files, view):
             raise UserError(
                 f"{path}: is {width}x{height}, the pictures compared are {size[0]}x{size[1]}; "
                 "render it at this size, or give --resize-pictures"
@@ -265,8 +270,12 @@ def _read(path: Path) -> tuple[np.ndarray, bool]:
     return load_rgba8(path), alpha
 
 
-def _size(path: Path) -> tuple[int, int]:
-    with open_picture(path) as image:
+def _size(files: ObjectFiles, view: int) -> tuple[int, int] | None:
+    """Width and height of a true picture; None of one in a pack that does not say it."""
+    picture = files.images[view]
+    if files.sizes[view] is not None or not isinstance(picture, Path):
+        return files.sizes[view]
+    with open_picture(picture) as image:
         return image.size
 
 

@@ -44,7 +44,13 @@ PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
 class Stored:
-    """A picture that is decoded already and lies in a larger file (``packs.py``)."""
+    """A picture that is decoded already and lies in a larger file (``packs.py``).
+
+    Attributes:
+        stem: as of a path; it has no name of its own.
+    """
+
+    stem = ""
 
     def read(self) -> np.ndarray:
         """Its pixels: RGBA ``[H, W, 4]`` uint8, or depth ``[H, W]`` float32 in steps.

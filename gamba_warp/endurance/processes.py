@@ -141,9 +141,7 @@ def _nodes(
 
 def _root() -> Path:
     """Where Python finds the package."""
-    import gamba_warp
-
-    return Path(str(gamba_warp.__file__)).resolve().parents[1]
+    return Path(__file__).resolve().parents[2]
 
 
 def _end(agent: subprocess.Popen) -> None:

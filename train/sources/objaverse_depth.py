@@ -70,7 +70,7 @@ def _convert(files: Sequence[DepthFile]) -> None:
 
 
 def _read(path: Path) -> np.ndarray:
-    import OpenEXR
+    import OpenEXR  # pyright: ignore[reportMissingImports]: optional
 
     try:
         header = OpenEXR.File(str(path), separate_channels=True, header_only=True).header()

@@ -184,6 +184,7 @@ def _add_depth(files: ObjectFiles, target: Path, path: Path) -> None:
         distances = np.linalg.norm(files.camera_to_world[:, :3, 3], axis=1).tolist()
         wanted = []
         for image, distance in zip(files.images, distances):
+            assert isinstance(image, Path)  # of this layout they all are
             source = inside(raw, f"{image.stem}/{image.stem}{SUFFIX}", str(path))
             wanted.append(DepthFile(source, target / f"{image.stem}.png", distance))
         try:

@@ -228,7 +228,7 @@ def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> _Blo
         views=views,
         width=width,
         height=height,
-        crc=zlib.crc32(cameras),
+        crc=zlib.crc32(cameras.tobytes()),
         cameras=0,
         images=0,
         depth_type="uint16" if whole else "float32",
@@ -301,7 +301,7 @@ def _write_arrays(path: Path, blocks: Iterator[_Block], number: int) -> list[Ent
 
 def _write_tar(path: Path, blocks: Iterator[_Block], number: int) -> list[Entry]:
     """Writes a shard as a WebDataset: of each object ``NUMBER.json`` and a ``.npy`` an array."""
-    from webdataset import TarWriter
+    from webdataset import TarWriter  # pyright: ignore[reportAttributeAccessIssue]: made late
 
     entries: dict[str, Entry] = {}
     starts: dict[str, dict[str, int]] = {}

@@ -87,11 +87,12 @@ def packs() -> dict[str, Files]:
     depths = rng.integers(0, 9000, (2, _SIZE, _SIZE)).astype("<u2")
     K = [9.0, 0, 4, 0, 9, 4, 0, 0, 1]
     pose = [*np.ravel(_POSE), 0, 0, 0, 1]
-    rows = [[*pose, *K, zlib.crc32(i), zlib.crc32(d), 0] for i, d in zip(images, depths)]
+    sums = [[zlib.crc32(p.tobytes()) for p in pair] for pair in zip(images, depths)]
+    rows = [[*pose, *K, *pair, 0] for pair in sums]
     cameras = np.array(rows, "<f8")
     shard = cameras.tobytes() + images.tobytes() + depths.tobytes()
     values = {"shard": "shard-00000.bin", "views": 2, "width": _SIZE, "height": _SIZE}
-    values |= {"crc": zlib.crc32(cameras), "cameras": 0, "images": cameras.nbytes}
+    values |= {"crc": zlib.crc32(cameras.tobytes()), "cameras": 0, "images": cameras.nbytes}
     values |= {"name": "A chair", "attribution": {"creator": "Jay"}, "depth_unit": 1e-4}
     chair = {"uid": "chair", "split": "train", "depths": cameras.nbytes + images.nbytes}
     stool = {"uid": "b/stool", "split": "val"}
