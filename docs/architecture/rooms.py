@@ -41,7 +41,9 @@ _MODEL = ("model.config", "model.parts", "model")
 _LIBRARY = (*_READERS, "data", "formats", "vision", *_MODEL)
 _RESULTS = (*_LIBRARY, "surfaces", "fitting", "pages")
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
-_TRAIN = ("train.config", "train.objective", "train", "train.data", "train.sources")
+_TRAIN = (
+    *("train.config", "train.objective", "train", "train.data", "train.sources", "train.bench"),
+)
 _EVAL = ("eval", "eval.views", "eval.shapes")
 
 ROOMS = {
@@ -94,9 +96,10 @@ ROOMS = {
     "train.objective": Room("the losses", (*_LIBRARY, "train.config")),
     "train": Room(
         "batches, loop, checkpoints",
-        (*_LIBRARY, *_BENCH, "train.config", "train.objective", "train.data", "train.sources"),
+        (*_LIBRARY, "train.config", "train.objective", "train.data", "train.sources"),
         ("pages",),
     ),
+    "train.bench": Room("benchmarks of a step and of the loader", (*_LIBRARY, *_BENCH, *_TRAIN)),
     "eval": Room("the report that both evaluations share", _READERS),
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
     "eval.shapes": Room("Chamfer, IoU, F-score", (*_RESULTS, "eval")),

@@ -24,8 +24,8 @@ SUITES = {
     "block": "gamba_warp.measure.blocks",
     "model": "gamba_warp.measure.blocks",
     "lengths": "gamba_warp.measure.lengths",
-    "train-step": "gamba_warp.train.bench",
-    "loader": "gamba_warp.train.bench_loader",
+    "train-step": "gamba_warp.train.bench.step",
+    "loader": "gamba_warp.train.bench.loader",
 }
 
 

@@ -1,24 +1,17 @@
 """Plans: what is wrong with one is told in one line, which names the row, before anything runs."""
 
-import dataclasses
 import inspect
 import json
 
 import msgspec
 import pytest
-from helpers.ablation import plan, write_plan
+from helpers.runs.ablation import plan, write_plan
 
 from gamba_warp import cli
 from gamba_warp.ablation import jobs
 from gamba_warp.ablation.plan import PLANS, FitOptions, open_plan, read_plan, shipped
 from gamba_warp.commands.fit import fit_command
 from gamba_warp.errors import UserError
-from gamba_warp.model.config import GambaConfig
-
-# Fields of the paper's questions that another branch adds. This test is to be whole when they are
-# there: LATER must then be empty, and the test below says so.
-LATER = {"mixer", "attention_mlp", "image_tokens", "mixed_tokens"}
-LATER |= {"triplane_size", "triplane_features"}
 
 
 def settings(tmp_path, chosen, budget=("steps", 4), **more):
@@ -138,21 +131,13 @@ def test_the_shipped_plans_are_sound(name, tmp_path):
     assert chosen.name == name and len(chosen.seeds) >= 2
     given = settings(tmp_path, chosen, jobs.budget_of(chosen, None, None), meshes=tmp_path)
     for row in chosen.rows:
-        if {*row.set} & (LATER - {f.name for f in dataclasses.fields(GambaConfig)}):
-            continue
         assert jobs.stages(chosen, row, 0, given)
-    rows = [row for row in chosen.rows if not {*row.set} & LATER]
+    rows = chosen.rows
     jobs.check(chosen, given, rows)
     numbers = {r.name: jobs.gaussians_of(chosen, r, given) for r in rows if r.series}
     if name == "questions":
         want = {"1k": 1024, "2k": 2304, "4k": 4096, "9k": 9216, "16k": 16384}
         assert {n[10:]: v for n, v in numbers.items() if n.startswith("gau")} == want
-
-
-def test_the_list_of_later_fields_is_not_outlived():
-    """When the first of them is there, all must be, and LATER goes."""
-    there = LATER & {field.name for field in dataclasses.fields(GambaConfig)}
-    assert not there, f"take {', '.join(sorted(there))} out of LATER"
 
 
 def test_every_file_of_the_folder_is_a_shipped_plan():

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from helpers import ablation
-from helpers.ablation import write_plan
+from helpers.runs.ablation import write_plan
 
 from gamba_warp import cli
 from gamba_warp.ablation import processes

@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import micro
 from helpers.micro import lines
-from helpers.processes import run_all, train_all, words
+from helpers.runs.processes import run_all, train_all, words
 from safetensors.torch import load_file
 
 from gamba_warp import versions

@@ -26,11 +26,11 @@ from gamba_warp.render import render
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from .batches import BatchSource
-from .config import DataConfig, OptimConfig
-from .data.samples import Batch
-from .optim import Ema, build_optimizer
-from .step import compute_gradients
+from ..batches import BatchSource
+from ..config import DataConfig, OptimConfig
+from ..data.samples import Batch
+from ..optim import Ema, build_optimizer
+from ..step import compute_gradients
 
 OP, BOTH = "train-step", "forward+backward"
 _BATCH, _NOVEL, _SIZE, _CROP = 4, 3, 128, 64
@@ -351,9 +351,8 @@ class _Covered:
 
     def work(self, margin: int, whole: int, run: Callable[[], object]) -> dict[str, float]:
         """Counts tokens and memory, and the PSNR to the pictures of all patches, in dB."""
-        patches = foreground_patches(
-            self.batch.inputs[..., 3], self.model.config.patch_size, margin
-        )
+        alpha = self.batch.inputs[..., 3]
+        patches = foreground_patches(alpha, self.model.config.patch_size, margin)
         groups = patches.groups() if self.device.type == "cpu" else [range(len(patches.index))]
         tokens = sum(4 * patches.of(list(group)).index.numel() for group in groups)
         counts: dict[str, float] = {"tokens": tokens}

@@ -18,10 +18,10 @@ from gamba_warp.images import save_image
 from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
 from gamba_warp.model.config import PRESETS
 
-from .batches import BatchQueue, BatchSource
-from .config import DataConfig
-from .ddp import World
-from .sources.pack import PackSettings, write_pack
+from ..batches import BatchQueue, BatchSource
+from ..config import DataConfig
+from ..ddp import World
+from ..sources.pack import PackSettings, write_pack
 
 OP = "loader"
 _BATCH, _NOVEL, _SIZE = 4, 3, 128  # as in the cases of a step
@@ -146,4 +146,4 @@ def _write_object(folder: Path, seed: int) -> None:
         pose[:, 1:3] *= -1  # OpenCV to OpenGL
         frames.append({"file_path": f"{view}.webp", "transform_matrix": pose.tolist()})
     values = {"w": _SIZE, "h": _SIZE, "fl_x": 1.1 * _SIZE, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(values))
+    (folder / "transforms.json").write_text(json.dumps(values), encoding="utf-8")

@@ -1,0 +1,1 @@
+"""Benchmark cases of the training: a step by parts, and the loader."""
