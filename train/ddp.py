@@ -296,7 +296,8 @@ def world(device: str = "auto") -> Iterator[World]:
         yield World(rank, size, chosen)
     except RuntimeError as error:
         text = re.sub(r"\[[^][]*\.(cc|cpp):\d+\] ", "", first_line(error))
-        if not _GONE.search(str(error)):
+        network = isinstance(error, (dist.DistNetworkError, dist.DistStoreError))
+        if not network and not _GONE.search(str(error)):
             raise
         raise UserError(
             f"process {rank} on {socket.gethostname()} has lost the others: one of them has ended, "

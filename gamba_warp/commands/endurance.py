@@ -16,11 +16,11 @@ def endurance_command(
 ) -> int:
     """Kills every writing command at random moments and fills the disk under it, and counts.
 
-    Training is killed 100 times and must come to the same bits as if nothing had happened; every
-    other command 20 times; each meets a full disk (no file may grow beyond a random byte) 10
-    times. Counted are older files lost, runs that did not go on, ends that were not told in one
-    line, and debris. Writes endurance.json and endurance.md. Works in a temporary folder. Runs on
-    Linux only.
+    Training is killed 100 times and must come to the same bits as if nothing had happened, and so
+    must two processes of which one is killed 10 times; every other command is killed 20 times;
+    each meets a full disk (no file may grow beyond a random byte) 10 times. Counted are older files
+    lost, runs that did not go on, ends that were not told in one line, and debris. Writes
+    endurance.json and endurance.md. Works in a temporary folder. Runs on Linux only.
 
     Args:
         quick: A few of each, which takes seconds.
@@ -45,7 +45,7 @@ def endurance_command(
         raise UserError(f"--seed {seed}: must be 0 or more, below 2^63")
     folder = output_folder(out)
     chosen = commands or (("reconstruct",) if quick else ())
-    plan = Plan(4, 2, 2, chosen, seed) if quick else Plan(100, 20, 10, chosen, seed)
+    plan = Plan(4, 2, 2, chosen, seed) if quick else Plan(100, 20, 10, chosen, seed, 10)
     with tempfile.TemporaryDirectory(prefix="gamba-endurance-") as world:
         result = endurance(Path(world), plan)
     write_json(folder / "endurance.json", result)

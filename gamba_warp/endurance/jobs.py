@@ -48,20 +48,15 @@ def command(*words: object) -> Callable[[], int]:
 
 def training(world: Path, out: Path, steps: int) -> Callable[[], int]:
     """What a child runs that trains a tiny model, or goes on."""
-    words: list[object] = [
-        "train",
-        world / "data",
-        "--out",
-        out,
-        "--preset",
-        "tiny",
-        "--set",
-        *MODEL,
-    ]
-    words += ["--steps", steps, "--batch-size", 2, "--size", 16, "--lpips", "off"]
-    words += ["--views-last", 2, "--save-every", 3, "--val-every", 10, "--log-every", 1]
-    words += ["--device", "cpu", "--workers", 1, "--no-tensorboard"]
-    return command(*words)
+    words = [*training_words(world), "--batch-size", 2, "--out", out, "--steps", steps]
+    return command("train", *words, "--save-every", 3, "--log-every", 1)
+
+
+def training_words(world: Path) -> list[object]:
+    """Options of a training of a tiny model, but for its batch, folder, length and log."""
+    words: list[object] = [world / "data", "--preset", "tiny", "--set", *MODEL]
+    words += ["--size", 16, "--lpips", "off", "--views-last", 2, "--val-every", 10]
+    return [*words, "--device", "cpu", "--workers", 1, "--no-tensorboard"]
 
 
 def make_world(folder: Path) -> None:

@@ -30,7 +30,7 @@ class Killed:
         resumed: how often the training went on from a checkpoint.
         steps: the last step.
         seconds: of all of it.
-        said: the end of what the processes wrote.
+        said: what the processes wrote.
     """
 
     main: int
@@ -67,7 +67,7 @@ def kill_one_of_two(words: list[str], out: Path, kills: int, rng: random.Random)
         resumed=sum(bool(line["resumed_from"]) for line in _lines(reaper.log, "start")),
         steps=_lines(reaper.log, "end")[-1]["step"],
         seconds=round(time.monotonic() - started, 1),
-        said=said[-4000:],
+        said=said,
     )
 
 

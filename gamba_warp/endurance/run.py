@@ -14,7 +14,8 @@ from tqdm import tqdm
 from ..files import remove_folder
 from .child import End, run_child
 from .folders import age, contents, leftovers, lost
-from .jobs import Job, command, jobs, make_world, training
+from .jobs import Job, command, jobs, make_world, training, training_words
+from .processes import kill_one_of_two, steps_for
 
 _MODEL = "model.safetensors"
 
@@ -63,6 +64,7 @@ class Plan:
         full: full disks, of each command.
         commands: names of the commands besides training; empty for all.
         seed: of the random moments.
+        processes: kills of one of two processes that train together.
     """
 
     kills: int
@@ -70,6 +72,7 @@ class Plan:
     full: int
     commands: tuple[str, ...]
     seed: int
+    processes: int = 0
 
 
 def endurance(folder: Path, plan: Plan) -> dict:
@@ -91,7 +94,7 @@ def endurance(folder: Path, plan: Plan) -> dict:
     chosen = [job for job in jobs(folder) if not plan.commands or job.name in plan.commands]
     if any(job.name == "bench" for job in chosen):
         _make_bench(folder)
-    total = plan.kills + plan.full + len(chosen) * (plan.command_kills + plan.full)
+    total = plan.kills + plan.processes + plan.full + len(chosen) * (plan.command_kills + plan.full)
     rng, counts = random.Random(plan.seed), []
     tqdm.monitor_interval = 0  # its thread could hold a lock at the moment of a fork
     with tqdm(total=total, unit="fault", disable=None) as bar:
@@ -105,6 +108,8 @@ def _counts(
     folder: Path, plan: Plan, chosen: list[Job], rng: random.Random, bar: tqdm
 ) -> Iterator[Count]:
     yield kill_training(folder, plan.kills, rng, bar)
+    if plan.processes:
+        yield kill_processes(folder, plan.processes, rng, bar)
     yield fill_training(folder, plan.full, rng, bar)
     for job in chosen:
         out = folder / f"out-{job.name.replace(' ', '-')}"
@@ -175,6 +180,28 @@ def kill_training(folder: Path, kills: int, rng: random.Random, bar: tqdm) -> Co
             count.lost += 1
             count.notes.append(f"train: step {newest} is gone, {found} is the newest")
         newest = found
+    return count
+
+
+def kill_processes(folder: Path, kills: int, rng: random.Random, bar: tqdm) -> Count:
+    """Kills one of two training processes again and again; the end has one process's bits."""
+    count, words = Count("train, 2 processes", "SIGKILL", kills, kills), training_words(folder)
+    quiet, out, steps = folder / "quiet-2", folder / "killed-2", steps_for(kills)
+    halves = ["--batch-size", 1, "--accumulate", 2, "--steps", steps, "--out", quiet]
+    _undisturbed(run_child(command("train", *words, *halves)), "train")
+    try:
+        found = kill_one_of_two([*map(str, words), "--batch-size", "1"], out, kills, rng)
+    except RuntimeError as error:
+        count.not_resumed += 1
+        count.notes.append(str(error))
+        return count
+    finally:
+        bar.update(kills)
+    count.untold += "Traceback" in found.said
+    if found.steps != steps or _weights(out / _MODEL) != _weights(quiet / _MODEL):
+        count.lost += 1
+        count.notes.append("train, 2 processes: the weights differ from those of one")
+    count.debris = len(leftovers(out))
     return count
 
 

@@ -1,0 +1,64 @@
+"""What docs/sixteen-gpus.md hands out: the Slurm script, and the count of operations."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.processes import environment
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = ROOT / "docs" / "examples" / "slurm.sh"
+PAGE = (ROOT / "docs" / "sixteen-gpus.md").read_text(encoding="utf-8")
+
+
+def slurm(folder, *arguments):
+    """Runs the script where scontrol and srun only say what they were asked."""
+    for name, text in (("scontrol", "printf 'node7\\nnode8\\n'"), ("srun", 'printf "%s\\n" "$@"')):
+        (folder / name).write_text(f"#!/bin/bash\n{text}\n")
+        (folder / name).chmod(0o755)
+    place = {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_JOB_ID": "41234"}
+    place |= {"SLURM_JOB_NODELIST": "node[7-8]", "SLURM_NNODES": "2"}
+    command = ["bash", str(SCRIPT), *arguments]
+    return subprocess.run(command, env=place, capture_output=True, text=True, timeout=60)
+
+
+def test_the_slurm_script_starts_torchrun_on_each_machine(tmp_path):
+    done = slurm(tmp_path, "my data", "my run", "--lr", "0.002")
+    assert done.returncode == 0, done.stderr
+    words = done.stdout.splitlines()
+    assert words[:2] == ["--kill-on-bad-exit=1", "torchrun"] and words[-2:] == ["--lr", "0.002"]
+    own = words[words.index("gamba_warp.train") + 1 :]
+    assert own[:3] == ["my data", "--out", "my run"]
+    for name, value in (("--nnodes", "2"), ("--rdzv-endpoint", "node7:21234")):
+        assert words[words.index(name) + 1] == value
+    # The page's own command has the same options.
+    shown = re.search(r"torchrun --nnodes 2.*?```", PAGE, re.DOTALL)
+    assert shown
+    for word in own[3:-2]:
+        assert word in shown[0].split(), word
+    missing = slurm(tmp_path, "my data")
+    assert missing.returncode == 2 and missing.stderr.startswith("usage:")
+
+
+@pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
+def test_the_slurm_script_is_clean():
+    subprocess.run(["shellcheck", str(SCRIPT)], check=True, timeout=60)
+
+
+@pytest.mark.slow
+def test_the_count_of_operations_runs():
+    program = ROOT / "docs" / "examples" / "step_cost.py"
+    command = [sys.executable, str(program), "tiny"]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    kept, block, lean = re.findall(r"^  (?:all|of it|--rec).*$", done.stdout, re.MULTILINE)
+    forward, backward, size = map(float, kept.split()[-3:])
+    # A block's two large products alone: 4,096 tokens, 128 to 512 and 256 to 128 channels.
+    products = 6 * 2 * 4096 * (128 * 512 + 256 * 128) / 1e9
+    assert products < forward < 2 * products and 1.8 < backward / forward < 2.2
+    assert float(lean.split()[-1]) < size / 3 and float(block.split()[-1]) < size / 5
+    assert "1.4 M parameters" in done.stdout
