@@ -63,6 +63,8 @@ def is_whole(name: str, data: bytes) -> bool:
         return _is_picture(data)
     if suffix == ".glb":
         return data[:4] == b"glTF" and int.from_bytes(data[8:12], "little") == len(data)
+    if suffix == ".safetensors":
+        return _safetensors_size(data) == len(data)
     if suffix == ".ply":
         return b"end_header\n" in data and _ply_size(data) == len(data)
     return data.endswith(b"\n") if suffix in (".md", ".csv") else bool(data)
@@ -84,6 +86,17 @@ def _is_picture(data: bytes) -> bool:
     except (OSError, ValueError, SyntaxError):
         return False
     return True
+
+
+def _safetensors_size(data: bytes) -> int:
+    """The size that a safetensors header promises, bytes; -1 where the header is not whole."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    try:
+        entries = json.loads(data[8:start])
+    except ValueError:
+        return -1
+    ends = (entry["data_offsets"][1] for name, entry in entries.items() if name != "__metadata__")
+    return start + max(ends, default=0)
 
 
 def _ply_size(data: bytes) -> int:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .child import run_child
+from .released import make_released
 
 MODEL = ("image_size=16", "patch_size=4", "width=16", "depth=1", "state_size=4", "scale_init=0.06")
 
@@ -94,6 +95,7 @@ def _make_inputs(folder: Path) -> int:
     (folder / "gaussians").mkdir()
     save_ply(folder / "gaussians" / "ball.ply", _ball())
     _make_library(folder / "libraries", folder / "pictures" / "a.png")
+    make_released(folder / "released")
     return code
 
 
@@ -190,6 +192,14 @@ def jobs(world: Path) -> list[Job]:
 def _other_jobs(world: Path) -> list[Job]:
     """The commands that neither render nor evaluate."""
     return [
+        Job(
+            "import-released",
+            lambda out: [
+                *(world / "released" / "theirs.pth", "--out", out),
+                *("--encoder-weights", world / "released" / "vit.safetensors"),
+            ],
+            (),
+        ),
         Job("data furniture", lambda out: ["--tree", world / "libraries", "--out", out], ()),
         Job(
             "view",

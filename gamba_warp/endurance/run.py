@@ -119,13 +119,14 @@ def _counts(
 
 def _import_all() -> None:
     """Imports once what every child needs; nothing may be computed here, see ``run_child``."""
+    import timm  # noqa: F401
     import trimesh  # noqa: F401
 
     from ..eval.shapes import pairs  # noqa: F401
     from ..eval.views import evaluate  # noqa: F401
     from ..fitting import objects  # noqa: F401
     from ..measure import suites  # noqa: F401
-    from ..model import predict  # noqa: F401
+    from ..model import predict, pretrained, released  # noqa: F401
     from ..pages import export, outputs  # noqa: F401
     from ..train import run  # noqa: F401
     from ..train.data import render  # noqa: F401

@@ -8,6 +8,7 @@ within its time; both files are written after every item, and say what was not d
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 import json
 import os
@@ -237,7 +238,7 @@ def new_part() -> dict:
 def run_python(
     arguments: list[str], seconds: float, look: Callable[[], None], cwd: Path | None = None
 ) -> tuple[int | None, str]:
-    """Runs Python in a process group of its own, and ends the group when its time is up.
+    """Runs Python, and ends it with all that it started when its time is up.
 
     Args:
         arguments: of Python.
@@ -264,15 +265,31 @@ def run_python(
             code = process.poll()
         finally:
             if process.poll() is None:
-                if hasattr(os, "killpg"):
-                    os.killpg(process.pid, signal.SIGKILL)
-                else:  # Windows: what the process started itself goes on
-                    process.kill()
-                process.wait()
+                end_tree(process)
         look()
         said.seek(0)
         lines = said.read().decode(errors="replace").strip().splitlines()
     return code, lines[-1] if lines else "nothing was printed"
+
+
+def end_tree(process: subprocess.Popen) -> None:
+    """Ends a process, and what it started itself; waits until the process is gone.
+
+    Args:
+        process: made with ``start_new_session``, which makes it a group where there are groups.
+    """
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)
+    elif sys.platform == "win32":
+        # By its whole path: Windows would look in the working directory before its own folders.
+        root = os.environ.get("SystemRoot", "C:\\Windows")
+        taskkill = os.path.join(root, "System32", "taskkill.exe")
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            subprocess.run(
+                [taskkill, "/F", "/T", "/PID", str(process.pid)], capture_output=True, timeout=30
+            )
+    process.kill()  # does nothing if it is gone; else at least the process itself ends
+    process.wait()
 
 
 def gpu_test_files(folder: Path) -> list[Path]:

@@ -7,11 +7,15 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from helpers.gaussians import some
+from safetensors.torch import save_file
 
 from gamba_warp.cli import run
 from gamba_warp.endurance.child import End, run_child
 from gamba_warp.endurance.folders import age, contents, is_whole, leftovers, lost
+from gamba_warp.endurance.jobs import jobs
+from gamba_warp.endurance.released import SIZES, make_released
 from gamba_warp.files import PART, output_folder
 from gamba_warp.formats.glb import save_glb
 from gamba_warp.formats.ply import save_ply
@@ -21,6 +25,7 @@ from gamba_warp.images import save_image
 def test_files_cut_short_are_not_whole(tmp_path):
     save_ply(tmp_path / "a.ply", some(9))
     save_glb(tmp_path / "a.glb", some(9))
+    save_file({"a": torch.rand(3), "b": torch.rand(2, 2)}, tmp_path / "a.safetensors")
     save_image(tmp_path / "a.png", np.random.default_rng(0).random((9, 9, 3)))
     (tmp_path / "a.html").write_text("<p></p>\n</html>\n")
     (tmp_path / "a.json").write_text('{"a": 1}\n')
@@ -82,6 +87,14 @@ def test_children_end_as_they_are_told(tmp_path):
 def test_unknown_commands_are_refused(tmp_path, capsys):
     assert run("endurance", ["--commands", "none", "--out", str(tmp_path / "out")]) == 2
     assert "--commands none: there are reconstruct, " in capsys.readouterr().err
+
+
+def test_a_made_up_released_file_is_imported(tmp_path):
+    make_released(tmp_path / "released")
+    (job,) = [job for job in jobs(tmp_path) if job.name == "import-released"]
+    assert run(job.name, [*map(str, job.words(tmp_path / "out"))]) == 0
+    config = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert {name: config[name] for name in SIZES} == SIZES
 
 
 @pytest.mark.slow
