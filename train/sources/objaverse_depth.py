@@ -5,6 +5,7 @@ The package OpenEXR reads them, a native library, so in a child process that may
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -70,8 +71,7 @@ def _convert(files: Sequence[DepthFile]) -> None:
 
 
 def _read(path: Path) -> np.ndarray:
-    import OpenEXR
-
+    OpenEXR = importlib.import_module("OpenEXR")  # optional, so that types are not known here
     try:
         header = OpenEXR.File(str(path), separate_channels=True, header_only=True).header()
         low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
