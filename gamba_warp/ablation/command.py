@@ -74,20 +74,20 @@ def ablate_command(
     """
     from ..kernels.runtime.system import cores
     from .jobs import budget_of, check
-    from .plan import open_plan
+    from .plan import named, open_plan
 
     chosen = open_plan(plan)
     if steps is not None and minutes is not None:
         raise UserError("--steps and --minutes: give one of them")
     changes: dict[str, Any] = {"split": split, "objects": objects, "views": views, "size": size}
     changes["geometry_objects"] = geometry_objects
-    settings = _settings(
-        chosen, data, out, budget_of(chosen, steps, minutes), meshes, device, changes
-    )
+    with named(plan):
+        budget = budget_of(chosen, steps, minutes)
+        settings = _settings(chosen, data, out, budget, meshes, device, changes)
+        check(chosen, settings, chosen.rows)
     wanted = [chosen.row(name) for name in dict.fromkeys(rows)] or chosen.rows
     if len({*seeds}) != len(seeds):
         raise UserError("--seeds: one is there twice")
-    check(chosen, settings, chosen.rows)
     _check_inputs(chosen, settings, wanted)
     if threads is None:
         threads = max(1, cores() // jobs)

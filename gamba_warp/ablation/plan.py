@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -171,11 +173,18 @@ def read_plan(path: str | Path) -> Plan:
         UserError: the file cannot be read, or is no sound plan; names the row.
     """
     plan = parse_document(read_bytes(path, MAX_PLAN), Plan, str(path))
-    try:
+    with named(path):
         _check(plan)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
     return plan
+
+
+@contextmanager
+def named(source: str | Path) -> Iterator[None]:
+    """Puts the plan's name before the message of a UserError."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from error
 
 
 def _check(plan: Plan) -> None:

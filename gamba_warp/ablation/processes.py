@@ -148,7 +148,9 @@ def why(code: int, log: Path) -> str:
             text = file.read().decode(errors="replace")
     except OSError:
         text = ""
-    text = text.rpartition("\n$ gamba ")[2]  # of its own run alone
+    mark = "\n$ gamba "
+    if mark in f"\n{text}":  # of its own run alone
+        text = f"\n{text}".rpartition(mark)[2].partition("\n")[2]
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
     told = [line for line in lines if line.startswith(("gamba: ", "failed: "))]
     if code > 128:

@@ -222,12 +222,13 @@ def _protocol(path: Path, out: Path) -> Any:
 
 def _plan(path: Path, out: Path) -> Any:
     from ..ablation import jobs
-    from ..ablation.plan import read_plan
+    from ..ablation.plan import named, read_plan
 
     plan = read_plan(path)
-    budget = jobs.budget_of(plan, None, None)
-    settings = jobs.Settings(path.parent, out, plan.evaluation, budget, None, "cpu")
-    jobs.check(plan, settings, plan.rows)
+    with named(path):
+        budget = jobs.budget_of(plan, None, None)
+        settings = jobs.Settings(path.parent, out, plan.evaluation, budget, None, "cpu")
+        jobs.check(plan, settings, plan.rows)
     return plan, [jobs.stages(plan, row, 0, settings) for row in plan.rows]
 
 
@@ -355,7 +356,7 @@ READERS: dict[str, Reader] = {
         Reader("config", _config, sound.config, _only(models.configurations, "config")),
         Reader("set", _set, sound.config, _only(models.configurations, "set"), 4),
         Reader("protocol", _protocol, sound.protocol, models.protocols),
-        Reader("plan", _plan, sound.plan, models.plans, 4),
+        Reader("plan", _plan, sound.plan, models.plans, 2),
         Reader("bench", _bench, sound.pages, models.results, 4),
         Reader("stress", _numeric, sound.nothing, _only(models.stress_cases, "numeric"), 2),
         Reader("stress-files", _hostile, sound.hostile_case, _only(models.stress_cases, "files"),
