@@ -18,3 +18,4 @@ def test_the_loader_is_measured(tmp_path, given):
     names = [r["variant"] for r in records]
     assert names == ["files", "files, --cache", "pack", "pack, --cache-device"]
     assert all(r["work"]["samples"] == 8 for r in records)
+    assert all(r["work"]["cpu_ms_per_sample"] > 0 for r in records)
