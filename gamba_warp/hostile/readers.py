@@ -220,6 +220,32 @@ def _protocol(path: Path, out: Path) -> Any:
     return checked(read_protocol(str(path)), str(path))
 
 
+def _compare(path: Path, out: Path) -> Any:
+    import json
+
+    from gamba_warp.eval.joined import join
+    from gamba_warp.eval.joined_page import html_page, markdown_page
+    from gamba_warp.eval.methods import read_methods
+
+    methods, notes = read_methods((f"a={path}", f"b={path}"), ())
+    joined = join(methods, None, notes)
+    json.dumps(joined, allow_nan=False)
+    return [markdown_page(joined, True), html_page(joined, True)]
+
+
+def _shown(path: Path, out: Path) -> Any:
+    from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+    from gamba_warp.eval.views.pictures import PicturePredictions
+
+    from ..data.dataset import open_dataset
+
+    dataset, given = open_dataset(path / "data"), PicturePredictions(path / "seen", 1.5, "cpu")
+    protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
+    truths = [_each(load_truth, dataset, uid, protocol, "cpu") for uid in dataset.uids]
+    good = [truth for truth in truths if not isinstance(truth, UserError)]
+    return [_each(given.pictures, dataset, truth) for truth in good]
+
+
 def _bench(path: Path, out: Path) -> Any:
     from ..measure.suites import read_document, write_pages
 
@@ -328,6 +354,7 @@ READERS: dict[str, Reader] = {
         Reader("shape", _shape, sound.shape, _shapes, 12),
         Reader("evaluation", _evaluation, sound.report, _shapes, 1),
         Reader("dataset", _dataset, sound.views, datasets.datasets, 8, True),
+        Reader("shown", _shown, sound.each(sound.shown), datasets.shown, 3, True),
         Reader("split", _split, sound.nothing, _only(datasets.datasets, "transforms"), 2, True),
         Reader("catalogue", _catalogue, sound.catalogue, _catalogued, 4, True),
         Reader("render", _render, sound.rendered, _catalogued, 1, True),
@@ -340,6 +367,7 @@ READERS: dict[str, Reader] = {
         Reader("config", _config, sound.config, _only(models.configurations, "config")),
         Reader("set", _set, sound.config, _only(models.configurations, "set"), 4),
         Reader("protocol", _protocol, sound.protocol, models.protocols),
+        Reader("compare", _compare, sound.pages, models.reports, 4),
         Reader("bench", _bench, sound.pages, models.results, 4),
         Reader("stress", _numeric, sound.nothing, _only(models.stress_cases, "numeric"), 2),
         Reader("stress-files", _hostile, sound.hostile_case, _only(models.stress_cases, "files"),
