@@ -108,7 +108,10 @@ def _check_common(reports: dict[str, Any], common: dict[str, list[str]], kind: s
     empty = not all(report.records for report in reports.values())
     if reports and (empty or not common[METRICS[kind][0]]):
         counts = ", ".join(f"{name} {len(r.records)}" for name, r in reports.items())
-        raise UserError(f"no object was evaluated for all methods by {kind}: {counts}")
+        fewest = min(reports.values(), key=lambda report: len(report.records))
+        raise UserError(
+            f"{fewest.path}: no object was evaluated for all methods by {kind}: {counts}"
+        )
 
 
 def _gains(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import html
 from typing import Any
 
+from gamba_warp.errors import one_line
+
 from .averages import LEVEL
 from .paper import CAVEAT, TABLE_1
 from .tables import cell, markdown
@@ -62,7 +64,7 @@ def _texts(joined: dict[str, Any]) -> tuple[str, list[str]]:
     for kind, methods in joined["missing"].items():
         for name, missing in methods.items():
             if missing:
-                some = "; ".join(f"{u}: {r}" for u, r in list(missing.items())[:_NAMED])
+                some = "; ".join(one_line(f"{u}: {r}") for u, r in list(missing.items())[:_NAMED])
                 more = "; ..." if len(missing) > _NAMED else ""
                 lines.append(f"{kind}: {name} lacks {_count(len(missing))} ({some}{more}).")
     return note, lines + [f"{note}." for note in joined["notes"]]

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from gamba_warp.errors import UserError
+from gamba_warp.errors import UserError, one_line
 from gamba_warp.untrusted.documents import parse_document, read_bytes
 
 from .report import OK, flat
@@ -254,5 +254,4 @@ def _differences(one: dict[str, Any], other: dict[str, Any]) -> Iterator[tuple[s
 
 
 def _shown(value: Any) -> str:
-    text = "absent" if value is None else str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return "absent" if value is None else one_line(str(value), 60)

@@ -220,6 +220,7 @@ def _protocol(path: Path, out: Path) -> Any:
     return checked(read_protocol(str(path)), str(path))
 
 
+<<<<<<< HEAD
 def _plan(path: Path, out: Path) -> Any:
     from ..ablation import jobs
     from ..ablation.plan import named, read_plan
@@ -230,6 +231,32 @@ def _plan(path: Path, out: Path) -> Any:
         settings = jobs.Settings(path.parent, out, plan.evaluation, budget, None, "cpu")
         jobs.check(plan, settings, plan.rows)
     return plan, [jobs.stages(plan, row, 0, settings) for row in plan.rows]
+=======
+def _compare(path: Path, out: Path) -> Any:
+    import json
+
+    from gamba_warp.eval.joined import join
+    from gamba_warp.eval.joined_page import html_page, markdown_page
+    from gamba_warp.eval.methods import read_methods
+
+    methods, notes = read_methods((f"a={path}", f"b={path}"), ())
+    joined = join(methods, None, notes)
+    json.dumps(joined, allow_nan=False)
+    return [markdown_page(joined, True), html_page(joined, True)]
+
+
+def _shown(path: Path, out: Path) -> Any:
+    from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+    from gamba_warp.eval.views.pictures import PicturePredictions
+
+    from ..data.dataset import open_dataset
+
+    dataset, given = open_dataset(path / "data"), PicturePredictions(path / "seen", 1.5, "cpu")
+    protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
+    truths = [_each(load_truth, dataset, uid, protocol, "cpu") for uid in dataset.uids]
+    good = [truth for truth in truths if not isinstance(truth, UserError)]
+    return [_each(given.pictures, dataset, truth) for truth in good]
+>>>>>>> others
 
 
 def _bench(path: Path, out: Path) -> Any:
@@ -340,7 +367,11 @@ READERS: dict[str, Reader] = {
         Reader("shape", _shape, sound.shape, _shapes, 12),
         Reader("evaluation", _evaluation, sound.report, _shapes, 1),
         Reader("dataset", _dataset, sound.views, datasets.datasets, 8, True),
+<<<<<<< HEAD
         Reader("pack", _dataset, sound.views, datasets.packs, 6, True),
+=======
+        Reader("shown", _shown, sound.each(sound.shown), datasets.shown, 3, True),
+>>>>>>> others
         Reader("split", _split, sound.nothing, _only(datasets.datasets, "transforms"), 2, True),
         Reader("catalogue", _catalogue, sound.catalogue, _catalogued, 4, True),
         Reader("render", _render, sound.rendered, _catalogued, 1, True),
@@ -356,7 +387,11 @@ READERS: dict[str, Reader] = {
         Reader("config", _config, sound.config, _only(models.configurations, "config")),
         Reader("set", _set, sound.config, _only(models.configurations, "set"), 4),
         Reader("protocol", _protocol, sound.protocol, models.protocols),
+<<<<<<< HEAD
         Reader("plan", _plan, sound.plan, models.plans, 2),
+=======
+        Reader("compare", _compare, sound.pages, models.reports, 4),
+>>>>>>> others
         Reader("bench", _bench, sound.pages, models.results, 4),
         Reader("stress", _numeric, sound.nothing, _only(models.stress_cases, "numeric"), 2),
         Reader("stress-files", _hostile, sound.hostile_case, _only(models.stress_cases, "files"),

@@ -216,6 +216,14 @@ def _object(item: Any, path: Path, out: Path) -> str | None:
     return None
 
 
+def shown(result: Any, path: Path, out: Path) -> str | None:
+    """Pictures in place of true views: colours in [0, 1], and masks of their size or none."""
+    rgb, mask = result.rgb, result.mask
+    if not (rgb.isfinite().all() and rgb.min() >= 0 and rgb.max() <= 1):
+        return "a colour outside of [0, 1]"
+    return "masks of another size" if mask is not None and mask.shape != rgb.shape[:3] else None
+
+
 def catalogue(result: Any, path: Path, out: Path) -> str | None:
     """Meshes whose uids are names of one folder, and whose values JSON can hold."""
     for item in result:

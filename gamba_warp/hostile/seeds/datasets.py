@@ -60,6 +60,21 @@ def transforms(uid: str, depth: bool = False) -> Files:
     return {f"{uid}/transforms.json": json.dumps(values).encode(), **files}
 
 
+def shown() -> dict[str, Files]:
+    """True views of an object beside what a method shows: by name, and with cameras of its own."""
+    true = transforms("chair")
+    named = {name: content for name, content in true.items() if name.endswith(".png")}
+    with_cameras = {name: content for name, content in true.items() if "000" not in name}
+    cameras = json.loads(true["chair/transforms.json"])
+    cameras["frames"] = cameras["frames"][1:]
+    with_cameras["chair/transforms.json"] = json.dumps(cameras).encode()
+    data = {f"data/{name}": content for name, content in true.items()}
+    return {
+        kind: data | {f"seen/{name}": content for name, content in files.items()}
+        for kind, files in (("by-name", named), ("by-camera", with_cameras))
+    }
+
+
 def datasets() -> dict[str, Files]:
     """Datasets by name of the layout."""
     split = {"version": 1, "train": ["chair"], "val": ["stool"], "test": []}

@@ -140,6 +140,7 @@ def protocols() -> dict[str, Files]:
     }
 
 
+<<<<<<< HEAD
 def plans() -> dict[str, Files]:
     """Plans of an ablation: a shipped one, and one with each kind of value."""
     from ...ablation.plan import PLANS
@@ -156,6 +157,24 @@ def plans() -> dict[str, Files]:
         "shipped": {"plan.json": (PLANS / "paper-table2.json").read_bytes()},
         "plan": {"plan.json": json.dumps(plan).encode()},
     }
+=======
+def reports() -> dict[str, Files]:
+    """Small reports of ``eval-views`` and of ``eval-geometry``."""
+    common = {"status": "ok", "seconds": {"predict": 0.5}}
+    views = {"truth_sha256": "0f", "views": [0, 1], "psnr": 20.5, "ssim": 0.8, "mask_iou": None}
+    shapes = {"gt_sha256": "1f", "kind": "mesh", "chamfer": 0.05, "iou": 0.4}
+    protocols = {
+        "views": {"max_psnr": 100.0, "reference": 0, "source": {"kind": "checkpoint"}},
+        "shapes": {"occupancy": "solid", "frame": "gt", "surface": {"voxels": 128}},
+    }
+    files = {}
+    for name, record in (("views", views), ("shapes", shapes)):
+        objects = [{"name": uid, **common, **record} for uid in ("chair", "a/stool")]
+        objects.append({"name": "lamp", "status": "failed", "reason": "no such folder"})
+        report = {"protocol": protocols[name], "objects": objects, "versions": {"torch": "2"}}
+        files[name] = {"report.json": json.dumps(report).encode()}
+    return files
+>>>>>>> others
 
 
 def results() -> dict[str, Files]:

@@ -48,7 +48,8 @@ class Crossing(NamedTuple):
         where = f"{self.direction}, {self.dtype}, {self.figure}"
         low, high = (f"{length:,.0f}" for length in self.lengths)
         if self.at is None:
-            return f"{where}: {self.cheaper} costs less at every L from {low} to {high}."
+            measured = f"every L from {low} to {high}" if low != high else f"L {low}"
+            return f"{where}: {self.cheaper} costs less at {measured}."
         return (
             f"{where}: L* = {self.at:,.0f}; beyond it {self.cheaper} costs less than "
             f"{self.first if self.cheaper == self.second else self.second} (L {low} to {high})."
@@ -74,7 +75,7 @@ def series_of(records: Sequence[dict], figure: str) -> dict[str, dict[float, flo
     factor, result = FIGURES[figure][2], {}
     for r in records:
         value, length = r.get(figure) or r["work"].get(figure), r["parameters"].get("L")
-        if value and type(length) in (int, float) and length > 0:
+        if value and value > 0 and type(length) in (int, float) and length > 0:
             name = str(r["parameters"].get("series", r["variant"]))
             result.setdefault(name, {})[length] = factor * value
     return result
@@ -88,7 +89,7 @@ def _crossing(key: tuple[str, ...], records: Sequence[dict], figure: str) -> Cro
     both = sorted(a.keys() & b.keys())
     if not both:
         return None
-    gap = [math.log(b[x] / a[x]) for x in both]
+    gap = [math.log(b[x]) - math.log(a[x]) for x in both]
     cheaper = first if gap[-1] > 0 else second
     op, case, direction, dtype = key
     common: dict[str, Any] = dict(op=op, case=case, direction=direction, dtype=dtype)
@@ -97,7 +98,12 @@ def _crossing(key: tuple[str, ...], records: Sequence[dict], figure: str) -> Cro
     for i in reversed(range(len(both) - 1)):
         if (gap[i] > 0) != (gap[i + 1] > 0):
             share = gap[i] / (gap[i] - gap[i + 1])
-            at = both[i] * (both[i + 1] / both[i]) ** share
-            value = a[both[i]] * (a[both[i + 1]] / a[both[i]]) ** share
-            return Crossing(**common, at=at, value=value)
+            low, high = both[i], both[i + 1]
+            at = _between(low, high, share)
+            return Crossing(**common, at=at, value=_between(a[low], a[high], share))
     return Crossing(**common, at=None, value=None)
+
+
+def _between(low: float, high: float, share: float) -> float:
+    """The number that lies between two others, at a share of the way on a logarithmic axis."""
+    return math.exp(math.log(low) + share * (math.log(high) - math.log(low)))
