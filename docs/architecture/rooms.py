@@ -99,7 +99,10 @@ ROOMS = {
         (*_LIBRARY, "train.config", "train.objective", "train.data", "train.sources"),
         ("pages",),
     ),
-    "train.bench": Room("benchmarks of a step and of the loader", (*_LIBRARY, *_BENCH, *_TRAIN)),
+    "train.bench": Room(
+        "benchmarks of a step and of the loader",
+        (*_LIBRARY, *_BENCH, *(room for room in _TRAIN if room != "train.bench")),
+    ),
     "eval": Room("the report that both evaluations share", _READERS),
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
     "eval.shapes": Room("Chamfer, IoU, F-score", (*_RESULTS, "eval")),

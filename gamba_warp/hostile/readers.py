@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
-from . import published, sound
+from . import comparing, published, sound
 from .seeds import datasets, models, pictures, shapes
 from .seeds.pictures import Files
 
@@ -53,15 +53,7 @@ def _pictures(path: Path, out: Path) -> Any:
     found, failures = find_pictures([path])
     if not found:
         raise UserError("; ".join(f"{name}: {reason}" for name, reason in failures))
-    return [_each(load_rgba, name) for name in found]
-
-
-def _each(read: Callable, *arguments: Any) -> Any:
-    """What is read, or the error: one bad file of many is told, and the others are read."""
-    try:
-        return read(*arguments)
-    except UserError as error:
-        return error
+    return [comparing.attempt(load_rgba, name) for name in found]
 
 
 def _prepare(path: Path, out: Path) -> Any:
@@ -91,7 +83,7 @@ def _predictions(path: Path, out: Path) -> Any:
 
     opened: Any = open_predictions(path, 1.5, "cpu")
     names = [p.relative_to(path).with_suffix("").as_posix() for p in sorted(path.rglob("*.ply"))]
-    return [_each(opened.gaussians, None, name, 0) for name in names]
+    return [comparing.attempt(opened.gaussians, None, name, 0) for name in names]
 
 
 def _mesh(path: Path, out: Path) -> Any:
@@ -124,7 +116,7 @@ def _dataset(path: Path, out: Path) -> Any:
 
     dataset = open_dataset(path)
     bad = dataset.check()
-    return [_each(dataset.load, uid) for uid in dataset.uids], list(bad.values())
+    return [comparing.attempt(dataset.load, uid) for uid in dataset.uids], list(bad.values())
 
 
 def _split(path: Path, out: Path) -> Any:
@@ -145,7 +137,7 @@ def _render(path: Path, out: Path) -> Any:
     from ..formats.catalogue import find_meshes
 
     settings = Settings(1, 8, 49.1, 0, True, "png", "auto")
-    return [_each(render_object, mesh, out, settings) for mesh in find_meshes(path)[:2]]
+    return [comparing.attempt(render_object, mesh, out, settings) for mesh in find_meshes(path)[:2]]
 
 
 def _furniture(path: Path, out: Path) -> Any:
@@ -218,45 +210,6 @@ def _protocol(path: Path, out: Path) -> Any:
     from gamba_warp.eval.shapes.protocol import checked, read_protocol
 
     return checked(read_protocol(str(path)), str(path))
-
-
-<<<<<<< HEAD
-def _plan(path: Path, out: Path) -> Any:
-    from ..ablation import jobs
-    from ..ablation.plan import named, read_plan
-
-    plan = read_plan(path)
-    with named(path):
-        budget = jobs.budget_of(plan, None, None)
-        settings = jobs.Settings(path.parent, out, plan.evaluation, budget, None, "cpu")
-        jobs.check(plan, settings, plan.rows)
-    return plan, [jobs.stages(plan, row, 0, settings) for row in plan.rows]
-=======
-def _compare(path: Path, out: Path) -> Any:
-    import json
-
-    from gamba_warp.eval.joined import join
-    from gamba_warp.eval.joined_page import html_page, markdown_page
-    from gamba_warp.eval.methods import read_methods
-
-    methods, notes = read_methods((f"a={path}", f"b={path}"), ())
-    joined = join(methods, None, notes)
-    json.dumps(joined, allow_nan=False)
-    return [markdown_page(joined, True), html_page(joined, True)]
-
-
-def _shown(path: Path, out: Path) -> Any:
-    from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
-    from gamba_warp.eval.views.pictures import PicturePredictions
-
-    from ..data.dataset import open_dataset
-
-    dataset, given = open_dataset(path / "data"), PicturePredictions(path / "seen", 1.5, "cpu")
-    protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
-    truths = [_each(load_truth, dataset, uid, protocol, "cpu") for uid in dataset.uids]
-    good = [truth for truth in truths if not isinstance(truth, UserError)]
-    return [_each(given.pictures, dataset, truth) for truth in good]
->>>>>>> others
 
 
 def _bench(path: Path, out: Path) -> Any:
@@ -367,11 +320,8 @@ READERS: dict[str, Reader] = {
         Reader("shape", _shape, sound.shape, _shapes, 12),
         Reader("evaluation", _evaluation, sound.report, _shapes, 1),
         Reader("dataset", _dataset, sound.views, datasets.datasets, 8, True),
-<<<<<<< HEAD
         Reader("pack", _dataset, sound.views, datasets.packs, 6, True),
-=======
-        Reader("shown", _shown, sound.each(sound.shown), datasets.shown, 3, True),
->>>>>>> others
+        Reader("shown", comparing.shown, sound.each(comparing.sound_shown), datasets.shown, 3, True),
         Reader("split", _split, sound.nothing, _only(datasets.datasets, "transforms"), 2, True),
         Reader("catalogue", _catalogue, sound.catalogue, _catalogued, 4, True),
         Reader("render", _render, sound.rendered, _catalogued, 1, True),
@@ -387,11 +337,8 @@ READERS: dict[str, Reader] = {
         Reader("config", _config, sound.config, _only(models.configurations, "config")),
         Reader("set", _set, sound.config, _only(models.configurations, "set"), 4),
         Reader("protocol", _protocol, sound.protocol, models.protocols),
-<<<<<<< HEAD
-        Reader("plan", _plan, sound.plan, models.plans, 2),
-=======
-        Reader("compare", _compare, sound.pages, models.reports, 4),
->>>>>>> others
+        Reader("plan", comparing.plan, comparing.sound_plan, models.plans, 2),
+        Reader("compare", comparing.reports, sound.pages, models.reports, 4),
         Reader("bench", _bench, sound.pages, models.results, 4),
         Reader("stress", _numeric, sound.nothing, _only(models.stress_cases, "numeric"), 2),
         Reader("stress-files", _hostile, sound.hostile_case, _only(models.stress_cases, "files"),

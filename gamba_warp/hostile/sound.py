@@ -18,7 +18,6 @@ from .counts import points_in, vertices_stated
 _PIXELS = 64 << 20
 _UNPACKED = 256 << 20  # bytes that the small archives of the seeds may become
 _PARAMETERS = 1 << 30
-_FOLDER = re.compile(r"[a-z0-9][a-z0-9_-]*")
 _CODE = re.compile(r"<script>alert|onerror='alert")
 
 Check = Callable[[Any, Path, Path], str | None]
@@ -216,14 +215,6 @@ def _object(item: Any, path: Path, out: Path) -> str | None:
     return None
 
 
-def shown(result: Any, path: Path, out: Path) -> str | None:
-    """Pictures in place of true views: colours in [0, 1], and masks of their size or none."""
-    rgb, mask = result.rgb, result.mask
-    if not (rgb.isfinite().all() and rgb.min() >= 0 and rgb.max() <= 1):
-        return "a colour outside of [0, 1]"
-    return "masks of another size" if mask is not None and mask.shape != rgb.shape[:3] else None
-
-
 def catalogue(result: Any, path: Path, out: Path) -> str | None:
     """Meshes whose uids are names of one folder, and whose values JSON can hold."""
     for item in result:
@@ -356,21 +347,6 @@ def protocol(result: Any, path: Path, out: Path) -> str | None:
         json.dumps(result.to_json(), allow_nan=False)
     except ValueError as problem:
         return f"a protocol that no report can hold ({problem})"
-    return None
-
-
-def plan(result: Any, path: Path, out: Path) -> str | None:
-    """A plan whose folders stay inside the ablation's, and whose words are no other options."""
-    found, commands = result
-    for row, stages in zip(found.rows, commands):
-        if not _FOLDER.fullmatch(row.name):
-            return f"the name {row.name[:40]!r} is no folder's"
-        for stage in stages:
-            if any("\0" in word for word in stage.words):
-                return "a word with a NUL, with which no process can be started"
-            outs = [i for i, word in enumerate(stage.words) if word.startswith("--out")]
-            if len(outs) != 1 or not stage.words[outs[0] + 1].startswith("ROW/"):
-                return "a command that writes elsewhere"
     return None
 
 

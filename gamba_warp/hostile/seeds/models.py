@@ -140,7 +140,6 @@ def protocols() -> dict[str, Files]:
     }
 
 
-<<<<<<< HEAD
 def plans() -> dict[str, Files]:
     """Plans of an ablation: a shipped one, and one with each kind of value."""
     from ...ablation.plan import PLANS
@@ -157,7 +156,8 @@ def plans() -> dict[str, Files]:
         "shipped": {"plan.json": (PLANS / "paper-table2.json").read_bytes()},
         "plan": {"plan.json": json.dumps(plan).encode()},
     }
-=======
+
+
 def reports() -> dict[str, Files]:
     """Small reports of ``eval-views`` and of ``eval-geometry``."""
     common = {"status": "ok", "seconds": {"predict": 0.5}}
@@ -174,7 +174,6 @@ def reports() -> dict[str, Files]:
         report = {"protocol": protocols[name], "objects": objects, "versions": {"torch": "2"}}
         files[name] = {"report.json": json.dumps(report).encode()}
     return files
->>>>>>> others
 
 
 def results() -> dict[str, Files]:
