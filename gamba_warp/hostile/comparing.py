@@ -75,7 +75,7 @@ def shown(path: Path, out: Path) -> Any:
     return [attempt(given.pictures, dataset, truth) for truth in good]
 
 
-def sound_shown(result: Any, path: Path, out: Path) -> str | None:
+def seen(result: Any, path: Path, out: Path) -> str | None:
     """Pictures in place of true views: colours in [0, 1], and masks of their size or none."""
     rgb, mask = result.rgb, result.mask
     if not (rgb.isfinite().all() and rgb.min() >= 0 and rgb.max() <= 1):

@@ -321,7 +321,7 @@ READERS: dict[str, Reader] = {
         Reader("evaluation", _evaluation, sound.report, _shapes, 1),
         Reader("dataset", _dataset, sound.views, datasets.datasets, 8, True),
         Reader("pack", _dataset, sound.views, datasets.packs, 6, True),
-        Reader("shown", comparing.shown, sound.each(comparing.sound_shown), datasets.shown, 3, True),
+        Reader("shown", comparing.shown, sound.each(comparing.seen), datasets.shown, 3, True),
         Reader("split", _split, sound.nothing, _only(datasets.datasets, "transforms"), 2, True),
         Reader("catalogue", _catalogue, sound.catalogue, _catalogued, 4, True),
         Reader("render", _render, sound.rendered, _catalogued, 1, True),
