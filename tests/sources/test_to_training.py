@@ -9,7 +9,7 @@ from gamba_warp.cli import run
 from gamba_warp.data.dataset import split_of
 
 
-def test_a_copy_of_gobjaverse_trains(tmp_path, monkeypatch):
+def test_a_copy_of_gobjaverse_trains(tmp_path):
     names = [f"0/{number}" for number in range(10010, 10040)]
     chosen = [n for n in names if split_of(n) == "train"][:2]
     chosen += [n for n in names if split_of(n) == "val"][:1]
@@ -17,14 +17,13 @@ def test_a_copy_of_gobjaverse_trains(tmp_path, monkeypatch):
         write_object(tmp_path / "set" / name, layout)
     words = [tmp_path / "data", "--source", tmp_path / "set"]
     assert run("data objaverse", [str(word) for word in words]) == 0
-    monkeypatch.setenv("WORLD_SIZE", "1")
     words = [tmp_path / "data", "--recipe", "paper", "--accumulate", 128]
     # A small model in place of the paper's, without the weights that are fetched.
     words += ["--preset", "tiny", "--set", *MODEL, "--size", 16, "--lpips", "off", "--steps", 1]
     words += ["--precision", "float32", "--device", "cpu", "--no-tensorboard", "--log-every", 1]
     assert run("train", [str(word) for word in [*words, "--out", tmp_path / "run"]]) == 0
     record = lines(tmp_path / "run", "train")[-1]
-    assert record["views"] == 2 and record["loss_rdist"] > 0
+    assert record["loss_rdist"] > 0 and record["loss"] > 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["views"]["batch_size"] * config["views"]["accumulate"] == 256
     assert config["run"]["recipe"] == "paper"
