@@ -35,4 +35,5 @@ def make_released(folder: Path) -> None:
     state["model.decoder.coords"] = points.expand(3, -1).clone()
     folder.mkdir()
     torch.save({"model": state}, folder / "theirs.pth")
+    assert model.encoder is not None
     save_file(model.encoder.weights(), folder / "vit.safetensors")
