@@ -265,12 +265,10 @@ _MAY_CHANGE |= {"views.cache", "views.cache_device"}
 _MUST_STAY = {"run.seed"}
 _TELLING = {"data", "length.steps", "length.epochs", "length.minutes"}
 # The processes of one run may have these apart from one another; of files their contents count.
-_OF_A_MACHINE = {"views.extra", "views.workers", "views.cache"} | {
-    ".".join(("run", name))
-    for name in (
-        *("out", "config", "resume", "init", "encoder_weights", "device", "threads", "keep"),
-        *("log", "tensorboard"),
-    )
+_OF_A_MACHINE = {
+    *("views.extra", "views.workers", "views.cache", "run.out", "run.config", "run.resume"),
+    *("run.init", "run.encoder_weights", "run.device", "run.threads", "run.keep", "run.log"),
+    *("run.tensorboard", "views.cache_device"),
 }
 # The groups of options in a run's config.json; "model" follows from the preset and --set.
 GROUPS = {

@@ -117,7 +117,8 @@ def _nodes(
     command += ["--nproc-per-node", "1", "--max-restarts", str(restarts), "--rdzv-id", "gamba"]
     command += ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}"]
     command += ["--local-addr", "127.0.0.1", "-m", "gamba_warp.train", *words]
-    path = os.pathsep.join(filter(None, [str(_root()), os.environ.get("PYTHONPATH")]))
+    root = str(Path(__file__).resolve().parents[2])  # where Python finds the package
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
     place = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
     agents: list[subprocess.Popen[Any]] = []
     limit = time.monotonic() + _LONGEST
@@ -137,11 +138,6 @@ def _nodes(
     if codes := [agent.returncode for agent in agents if agent.returncode]:
         raise RuntimeError(f"torchrun ended with code {codes[0]}: {_tail(notes)}")
     return notes.read_text(encoding="utf-8", errors="replace")
-
-
-def _root() -> Path:
-    """Where Python finds the package."""
-    return Path(__file__).resolve().parents[2]
 
 
 def _end(agent: subprocess.Popen) -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import micro
 from helpers.micro import lines, run
-from helpers.runs.processes import train_all, words
+from helpers.nodes.processes import train_all, words
 from safetensors.torch import load_file
 
 from gamba_warp.train.checkpoint import list_checkpoints

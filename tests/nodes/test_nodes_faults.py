@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import micro
 from helpers.micro import lines
-from helpers.runs.processes import run_all, train_all, words
+from helpers.nodes.processes import run_all, train_all, words
 from safetensors.torch import load_file
 
 from gamba_warp import versions
@@ -62,7 +62,7 @@ def ends(data, tmp_path_factory):
     step("newer", "far", 7, outs=(root / "far", root / "later"))
     step("spoilt", "spoilt", 6, data=(data, spoilt), more=FIVE)
     (root / "plan.json").write_text(json.dumps(plan))
-    command = [sys.executable, "-m", "helpers.nodes_worker", root / "plan.json", root / "end"]
+    command = [sys.executable, "-m", "helpers.nodes.worker", root / "plan.json", root / "end"]
     done = run_all([[*map(str, command)]] * 2)
     assert [end.code for end in done] == [0, 0], done
     found = [json.loads((root / f"end{rank}").read_text()) for rank in (0, 1)]

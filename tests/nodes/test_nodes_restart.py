@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import micro
 from helpers.micro import lines, run
-from helpers.runs.processes import words
+from helpers.nodes.processes import words
 from safetensors.torch import load_file
 
 from gamba_warp.endurance.processes import kill_one_of_two, steps_for

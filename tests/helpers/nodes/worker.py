@@ -1,6 +1,6 @@
 """One process of several: trains again and again, as a plan says, and notes how it ends.
 
-Run as ``python -m helpers.nodes_worker PLAN RESULT``. The plan is a JSON list of ``["copy", from,
+Run as ``python -m helpers.nodes.worker PLAN RESULT``. The plan is a JSON list of ``["copy", from,
 to]``, which the first process does, and of ``[name, arguments by rank, most bytes of a file by rank
 or null]``; the result, RESULT with the rank behind it, is an object of ``[code, line]`` by name.
 """
