@@ -78,14 +78,14 @@ BOXES = {
     "train": Box(3.6, 7, "train", "train", ("batches, losses, loop;", "data/: rendering")),
     "eval": Box(4.7, 6, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
     "gpu_check": Box(1, 7, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
-    "hostile": Box(3.4, 8, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
+    "hostile": Box(3.4, 9, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
     "endurance": Box(
         4.7, 8, "gamba_warp", "endurance", ("kills and full disks", "in every command")
     ),
     "ablation": Box(2.1, 8, "gamba_warp", "ablation", ("rows trained and", "evaluated alike")),
-    "commands": Box(2.2, 9, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
-    "cli": Box(2.8, 10, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
-    "public": Box(0.2, 10, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
+    "commands": Box(2.2, 10, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
+    "cli": Box(2.8, 11, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
+    "public": Box(0.2, 11, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
 }
 FLOORS = 1 + max(box.floor for box in BOXES.values())
 
