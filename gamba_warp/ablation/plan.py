@@ -207,7 +207,8 @@ def _check(plan: Plan) -> None:
         _check_values(f"row {row.name}", row.set, row.options)
         _check_seeds(f"row {row.name}", plan.seeds_of(row))
     _check_values("base", plan.base.set, plan.base.options, plan.base.fit)
-    for name in filter(None, {plan.compare_with, *(row.compare_with for row in plan.rows)}):
+    others = {plan.compare_with, *(row.compare_with for row in plan.rows)}
+    for name in filter(None, others):
         if plan.row(name).kind != "train":
             raise UserError(f"compare_with {name}: rows can be compared with a model only")
     for name in {row.series for row in plan.rows} - {None}:

@@ -103,19 +103,19 @@ class Child:
         seconds = time.monotonic() - self._started
         return End(code if code >= 0 else 128 - code, seconds, memory)
 
-    def send(self, number: int) -> None:
-        """Sends a signal to it and to all processes that it started."""
+    def ask(self, at_once: bool = False) -> None:
+        """Asks it, and all processes that it started, to end; ``at_once``: leaves it no choice."""
         with contextlib.suppress(OSError):
             if hasattr(os, "killpg"):
-                os.killpg(self._process.pid, number)
-            elif number == signal.SIGTERM:
-                self._process.terminate()
-            else:
+                os.killpg(self._process.pid, signal.SIGKILL if at_once else signal.SIGTERM)
+            elif at_once:
                 self._process.kill()
+            else:
+                self._process.terminate()
 
     def kill(self) -> None:
         """Ends it at once, and waits until it is gone."""
-        self.send(getattr(signal, "SIGKILL", signal.SIGTERM))
+        self.ask(at_once=True)
         while self._process.returncode is None and self.poll() is None:
             time.sleep(0.02)
 

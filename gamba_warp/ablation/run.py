@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -88,9 +87,9 @@ def run_tasks(
                 if len(received) > told:
                     late = told > 0
                     told, asked = len(received), asked or time.monotonic()
-                    _ask(running, signal.SIGKILL if late else signal.SIGTERM)
+                    _ask(running, at_once=late)
                 if asked and time.monotonic() - asked > _PATIENCE:
-                    _ask(running, signal.SIGKILL)
+                    _ask(running, at_once=True)
                 for task in list(running):
                     _look(task, jobs, threads, bool(received))
                     if task.child is None:
@@ -105,10 +104,10 @@ def run_tasks(
     return 128 + received[0] if received else 0
 
 
-def _ask(running: list[Task], number: int) -> None:
+def _ask(running: list[Task], at_once: bool) -> None:
     for task in running:
         if task.child is not None:
-            task.child.send(number)
+            task.child.ask(at_once)
 
 
 def _look(task: Task, jobs: int, threads: int, stopping: bool) -> None:

@@ -5,7 +5,7 @@ import json
 
 import msgspec
 import pytest
-from helpers.runs.ablation import plan, write_plan
+from ablation.fake import plan, write_plan
 
 from gamba_warp import cli
 from gamba_warp.ablation import jobs

@@ -9,14 +9,14 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers import ablation
-from helpers.runs.ablation import write_plan
+from ablation import fake
+from ablation.fake import write_plan
 
 from gamba_warp import cli
 from gamba_warp.ablation import processes
 from gamba_warp.files import PART
 
-FAKE = [sys.executable, ablation.__file__]
+FAKE = [sys.executable, fake.__file__]
 # Runs ``gamba ablate`` with the fake commands, in a process that can be killed.
 DRIVER = """
 import sys
