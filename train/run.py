@@ -13,7 +13,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import only_process, output_folder, sweep, write_json
 from gamba_warp.model.gamba import Gamba
 
-from .batches import TrainingData, open_data
+from .batches import TrainingData, kept_on, open_data
 from .checkpoint import (
     find_checkpoint,
     find_initial,
@@ -41,7 +41,7 @@ def train(config: TrainConfig, world: World) -> int:
     Raises:
         UserError: bad data, options or run folder.
     """
-    data = open_data(config, world.device)
+    data = kept_on(world.device, config, open_data(config))
     with contextlib.ExitStack() as held:
         return _train(config, world, data, held)
 
