@@ -260,16 +260,12 @@ class TrainingData:
         return hashlib.sha256(os.fsencode(names)).hexdigest()[:16]
 
 
-def open_data(config: TrainConfig, device: torch.device | None = None) -> TrainingData:
+def open_data(config: TrainConfig) -> TrainingData:
     """Opens the dataset as the options say.
 
-    Args:
-        config: the options.
-        device: where ``--cache-device`` keeps the pictures; None: it is ignored.
-
     Raises:
-        UserError: the folder or the object of ``--overfit`` does not exist, no object can be read,
-            or the device has no room for the pictures.
+        UserError: the folder or the object of ``--overfit`` does not exist, or no object can be
+            read.
     """
     one = config.views.overfit
     data = _open_all(config) if one is None else _open_one(config, one)
@@ -279,11 +275,20 @@ def open_data(config: TrainConfig, device: torch.device | None = None) -> Traini
         data.notes.append(
             f"{config.data} is packed at {packed} pixels; its pictures are enlarged to {max(sizes)}"
         )
-    if not config.views.cache_device or device is None:
+    return data
+
+
+def kept_on(device: torch.device, config: TrainConfig, data: TrainingData) -> TrainingData:
+    """The data with the pictures to train on kept on a device, if ``--cache-device`` asks for it.
+
+    Raises:
+        UserError: the device has no room for them.
+    """
+    if not config.views.cache_device:
         return data
-    train, objects = data.train, sorted(set(data.objects))
-    kept = ResidentViews(train, objects, sorted(sizes), device, config.views.workers)
-    return replace(data, train=kept)
+    sizes = sorted({config.views.size, config.model_config().image_size})
+    objects, workers = sorted(set(data.objects)), config.views.workers
+    return replace(data, train=ResidentViews(data.train, objects, sizes, device, workers))
 
 
 def _open_all(config: TrainConfig) -> TrainingData:

@@ -18,7 +18,7 @@ from gamba_warp.files import only_process, output_folder, sha256, sweep, write_j
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.versions import installed
 
-from .batches import TrainingData, open_data
+from .batches import TrainingData, kept_on, open_data
 from .boards import check_boards
 from .checkpoint import (
     find_checkpoint,
@@ -54,7 +54,7 @@ def train(config: TrainConfig, world: World) -> int:
     """
     with contextlib.ExitStack() as held:
         with world.together():
-            data = open_data(config, world.device)
+            data = kept_on(world.device, config, open_data(config))
         return _train(config, world, data, held)
 
 

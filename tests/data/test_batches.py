@@ -197,7 +197,7 @@ def test_kept_pictures_need_no_file_any_more(tmp_path):
     config = micro.options(root, root, views={"cache_device": True, "size": 12})
     before = open_dataset(root, "train")
     want = before.load("cloudb", [3, 1], 12)
-    kept = batches.open_data(config, torch.device("cpu")).train
+    kept = batches.kept_on(torch.device("cpu"), config, batches.open_data(config)).train
     for path in root.rglob("*.png"):
         path.unlink()
     got = kept.load("cloudb", [3, 1], 12)
@@ -218,7 +218,7 @@ def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
         torch, "tensor", lambda *a, device=None, real=torch.tensor, **k: real(*a, **k)
     )
     with pytest.raises(UserError, match=r"^--cache-device: 30 views take 0.0 GB"):
-        batches.open_data(config, torch.device("cuda", 0))
+        batches.kept_on(torch.device("cuda", 0), config, batches.open_data(config))
 
 
 def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):
