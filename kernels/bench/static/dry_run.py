@@ -47,6 +47,16 @@ class _Inside(TorchDispatchMode):
             return body._init_fn(*args, **(kwargs or {}))
 
 
+def can_dry_run() -> bool:
+    """Whether torch cuts tensors of the device cuda without a GPU; its older versions do not."""
+    with FakeTensorMode():
+        try:
+            torch.empty(1, device="cuda")[:]
+        except RuntimeError:  # the guard of the device asks the driver
+            return False
+    return True
+
+
 @contextmanager
 def dry_run() -> Iterator[list[Launch]]:
     """Inside, tensors made with the device cuda are fake, and launches on it are only noted.

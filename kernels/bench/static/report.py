@@ -23,13 +23,13 @@ from ...causal_conv1d import causal_conv1d
 from ...rasterize import depth_quantile, rasterization
 from ...selective_scan import selective_scan, selective_scan_state
 from .cubin import RESERVED, Resources, read_cubin
-from .dry_run import Launch, launches_of
+from .dry_run import Launch, can_dry_run, launches_of
 
 FORMAT = "gamba_warp.static.1"
 
 
 class NoCompiler(Exception):
-    """This build of Warp cannot compile for CUDA."""
+    """The CUDA kernels cannot be found or compiled here."""
 
 
 @dataclass(frozen=True)
@@ -233,11 +233,13 @@ def static_report(say: Callable[[str], None] = lambda kernel: None) -> dict:
         and the fields of ``Occupancy``.
 
     Raises:
-        NoCompiler: this build of Warp cannot compile for CUDA.
+        NoCompiler: this build of Warp cannot compile for CUDA, or this torch needs a GPU.
     """
     toolkit = wp.get_cuda_toolkit_version()
     if toolkit is None:
         raise NoCompiler("this build of warp-lang cannot compile for CUDA")
+    if not can_dry_run():
+        raise NoCompiler(f"torch {torch.__version__} needs a GPU for it; torch 2.11 does not")
     rows = []
     for entry in find_kernels():
         say(f"{entry.op}: {entry.name}")

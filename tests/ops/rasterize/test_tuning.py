@@ -5,7 +5,7 @@ import torch
 from helpers import assert_rel_rms
 from helpers.raster import NAMES, leaves, make
 
-from gamba_warp.kernels.bench.static.dry_run import dry_run
+from gamba_warp.kernels.bench.static.dry_run import can_dry_run, dry_run
 from gamba_warp.kernels.rasterize import depth_quantile, ops, rasterization
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
 from gamba_warp.kernels.rasterize.tiles import Limits, Size
@@ -96,7 +96,9 @@ def test_a_compiled_call_runs_on_the_tuning_in_force():
         rest = {k: scene[k] for k in ("viewmats", "Ks", "width", "height")}
         return rasterization(**dict(zip(names, gaussians)), **rest, render_mode="RGB+ED")[:2]
 
-    compiled = torch.compile(call, fullgraph=True, backend="aot_eager")
+    # torch 2.6 cuts the graph at the lists, whose length is not known before, and at ``Meta``.
+    whole = torch.__version__ >= "2.10"
+    compiled = torch.compile(call, fullgraph=whole, backend="aot_eager")
     for tuning in (Tuning(), SMALL):
         results = []
         for function in (call, compiled):
@@ -108,6 +110,7 @@ def test_a_compiled_call_runs_on_the_tuning_in_force():
         assert all(torch.equal(a, b) for a, b in zip(*results))
 
 
+@pytest.mark.skipif(not can_dry_run(), reason="this torch lists no kernels without a GPU")
 def test_cuda_has_one_tuning():
     def call():
         tensors = {
