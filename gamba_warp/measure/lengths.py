@@ -21,13 +21,12 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from ..kernels.bench import Case, Error, Settings, Stopped, Target, Variant, compare
 from ..kernels.bench.core.measure import peak_bytes, synchronize
 from ..model.config import PRESETS
+from ..model.parts.attention import AttentionBlock
 from ..model.parts.block import GambaBlock, run_blocks
 from .blocks import BACKWARD_LIMIT, BOTH, LIMIT, reference_block
 
 OP = "lengths"
 MAMBA, ATTENTION = "Mamba block", "transformer block"
-HEAD = 64  # channels of a head
-MLP = 4  # hidden channels of the MLP per channel of a token
 HALF_LIMITS = {"forward": 0.02, BOTH: 0.1}  # of bfloat16: 8 bits of a number, through a few sums
 _TOKENS = 64  # first tokens that are compared with the oracle
 _SPARE = 0.8  # share of the free memory that a run may take
@@ -62,33 +61,11 @@ def sizes_of(settings: Settings) -> Sizes:
     return Sizes(powers, width, 300.0 if settings.level == "full" else 5.0)
 
 
-class TransformerBlock(nn.Module):
-    """A pre-norm transformer block: x + Attention(Norm(x)), then x + MLP(Norm(x)) with GELU."""
-
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.norm = nn.LayerNorm(width, eps=1e-5)
-        self.qkv = nn.Linear(width, 3 * width)
-        self.out = nn.Linear(width, width)
-        self.mlp_norm = nn.LayerNorm(width, eps=1e-5)
-        self.mlp_in = nn.Linear(width, MLP * width)
-        self.mlp_out = nn.Linear(MLP * width, width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Maps ``[B, L, width]`` to ``[B, L, width]``; a token sees all tokens."""
-        q, k, v = self.qkv(self.norm(tokens)).unflatten(-1, (3, self.heads, -1)).unbind(2)
-        with sdpa_kernel(_FUSED):
-            seen = F.scaled_dot_product_attention(*(x.transpose(1, 2) for x in (q, k, v)))
-        tokens = tokens + self.out(seen.transpose(1, 2).flatten(2))
-        return tokens + self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
-
-
-def reference_transformer(block: TransformerBlock, tokens: Tensor, count: int) -> Tensor:
+def reference_transformer(block: AttentionBlock, tokens: Tensor, count: int) -> Tensor:
     """The first tokens after a transformer block in float64 torch on the CPU, softmax written out.
 
     Args:
-        block: the block whose weights are used.
+        block: the block whose weights are used; it has no prefix.
         tokens: ``[B, L, width]`` float64; every one of them is seen.
         count: how many tokens of the result are wanted.
 
@@ -105,15 +82,15 @@ def reference_transformer(block: TransformerBlock, tokens: Tensor, count: int) -
         scaled = centred / (centred.square().mean(-1, keepdim=True) + 1e-5).sqrt()
         return scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
 
-    q, k, v = linear(norm(tokens, "norm"), "qkv").chunk(3, -1)
+    k, v, q = linear(norm(tokens, "norm"), "kvq_proj").chunk(3, -1)
     heads = []
     for q_h, k_h, v_h in zip(*(x.chunk(block.heads, -1) for x in (q[:, :count], k, v))):
         scores = q_h @ k_h.mT / q_h.shape[-1] ** 0.5
         heads.append(scores.softmax(-1) @ v_h)
-    x = tokens[:, :count] + linear(torch.cat(heads, -1), "out")
-    hidden = linear(norm(x, "mlp_norm"), "mlp_in")
+    x = tokens[:, :count] + linear(torch.cat(heads, -1), "out_proj")
+    hidden = linear(norm(x, "mlp_norm"), "mlp.0")
     hidden = 0.5 * hidden * (1 + torch.erf(hidden / 2**0.5))
-    return x + linear(hidden, "mlp_out")
+    return x + linear(hidden, "mlp.2")
 
 
 class Bench:
@@ -123,11 +100,10 @@ class Bench:
         self.device, self.sizes, self.dtype = settings.device, sizes, dtype
         config = replace(PRESETS["paper"], width=sizes.width, depth=1, dt_rank=0, prepend=False)
         torch.manual_seed(0)
-        mamba = GambaBlock(config, 0, 0).to(self.device)
-        heads = max(1, sizes.width // HEAD)
+        other = replace(config, mixer="attention")
         self.blocks: dict[str, nn.Module] = {
-            MAMBA: mamba,
-            ATTENTION: TransformerBlock(sizes.width, heads).to(self.device),
+            MAMBA: GambaBlock(config, 0, 0).to(self.device),
+            ATTENTION: AttentionBlock(other, 0, 0).to(self.device),
         }
         self.tokens = torch.randn(1, sizes.lengths[-1], sizes.width).to(self.device)
         # A rate of 0 makes every step the same work on the same weights.
@@ -143,10 +119,9 @@ class Bench:
         return torch.autocast(self.device.type, self.dtype)
 
     def apply(self, name: str, tokens: Tensor) -> Tensor:
-        """One block; Mamba as the model runs it: on a CPU without gradients in segments."""
-        block = self.blocks[name]
-        with self.autocast():
-            return run_blocks([block], tokens, [None]) if name == MAMBA else block(tokens)
+        """One block as the model runs it: Mamba's on a CPU without gradients in segments."""
+        with self.autocast(), sdpa_kernel(_FUSED):
+            return run_blocks([self.blocks[name]], tokens, [None])
 
     @torch.no_grad()
     def forward(self, name: str, length: int) -> Tensor:
@@ -163,7 +138,7 @@ class Bench:
     def reference(self, name: str, tokens: Tensor, count: int) -> Tensor:
         """The first tokens after a block, float64 on the CPU."""
         block = self.blocks[name]
-        if isinstance(block, TransformerBlock):
+        if isinstance(block, AttentionBlock):
             return reference_transformer(block, tokens, count)
         assert isinstance(block, GambaBlock)
         return reference_block(block, tokens[:, :count], None, None)
@@ -287,8 +262,8 @@ def cases(settings: Settings) -> list[Case]:
     names = {"forward": "forward", BOTH: "training step"}
     text = (
         f"A Mamba block and a transformer block (pre-norm, fused attention over all tokens, heads "
-        f"of {HEAD} channels, GELU MLP of {MLP} times the width) of width {sizes.width}, one "
-        f"sequence. A series ends after the first length at which a call takes over "
+        f"of 64 channels, GELU MLP of 4 times the width) of width {sizes.width}, one sequence. "
+        f"A series ends after the first length at which a call takes over "
         f"{sizes.seconds:g} s, and where memory would not do. Memory: growth of "
         f"{_memory_word(settings)} while a call runs, its results included; weights, tokens and "
         f"AdamW's moments are there before. L*: where the lines cross, on logarithmic axes."
