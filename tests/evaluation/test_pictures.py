@@ -14,6 +14,7 @@ from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
 from gamba_warp.eval.views.pictures import PicturePredictions, save_pictures
+from gamba_warp.train.sources.pack import PackSettings, write_pack
 
 SIZE, VIEWS = 24, 4
 UIDS = ("a", "group/b")
@@ -91,6 +92,27 @@ def test_by_name_by_number_and_by_camera_is_the_same(data):
         **{"matched_by": "camera", "unused": 1, "resized": 0, "alpha": True},
     }
     assert found["mean"]["psnr"] == named["mean"]["psnr"] == 100
+
+
+def test_a_pack_has_no_names_so_pictures_of_it_go_by_number(data):
+    write_pack(data / "data", data / "pack", PackSettings(size=None), workers=1)
+    (data / "data").rename(data / "files")
+    (data / "pack").rename(data / "data")
+    assert evaluate(data)[0] == 1  # of names that a pack does not keep
+    for uid in UIDS:
+        for v in range(VIEWS):
+            path = data / "pred" / uid / f"view{v}.png"
+            Image.open(path).resize((2 * SIZE, 2 * SIZE), 0).save(path.with_name(f"{v:03d}.png"))
+            path.unlink()
+    assert "is 48x48" in evaluate(data)[1]["failures"][0]["reason"]
+    code, report = evaluate(data, "--resize-pictures")
+    assert code == 0 and report["objects"][1]["pictures"]["matched_by"] == "number"
+    assert report["mean"]["psnr"] == 100
+    dataset = open_dataset(data / "data")
+    one = Image.open(data / "files" / "a" / "view0.png")
+    rgb = torch.from_numpy(np.asarray(one)[..., :3] / np.float32(255))[None]
+    save_pictures(data / "saved", dataset.files("a"), [2], (rgb, torch.ones(1, SIZE, SIZE) > 0))
+    assert [path.name for path in (data / "saved").iterdir()] == ["2.png"]
 
 
 def test_pictures_without_alpha_have_no_mask(data):
