@@ -12,7 +12,7 @@ from typing import Any
 from helpers import micro
 
 ROOT = Path(micro.__file__).resolve().parents[2]
-LONGEST = 120  # seconds, after which processes that wait for one another are killed
+LONGEST = 300  # seconds, after which processes that wait for one another are killed
 
 
 @dataclass(frozen=True)
