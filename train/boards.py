@@ -94,7 +94,7 @@ class Wandb:
 
     def __init__(self, run: Path) -> None:
         """Begins a run, or goes on with the one that ``RUN/wandb.json`` names."""
-        import wandb
+        import wandb  # pyright: ignore[reportMissingImports] (an extra of its own)
 
         path = run / "wandb.json"
         try:

@@ -25,6 +25,11 @@ from typing import Any, BinaryIO
 import torch
 import torch.distributed as dist
 from torch import Tensor
+from torch.distributed import (
+    PrefixStore,  # pyright: ignore[reportPrivateImportUsage]
+    Store,  # pyright: ignore[reportPrivateImportUsage]
+    TCPStore,  # pyright: ignore[reportPrivateImportUsage]
+)
 from torch.nn import Module
 from torch.nn.parallel import DistributedDataParallel
 
@@ -307,7 +312,7 @@ def world(device: str = "auto") -> Iterator[World]:
             dist.destroy_process_group()
 
 
-def _meet(rank: int, size: int) -> dist.Store:
+def _meet(rank: int, size: int) -> Store:
     """Joins the processes that were started with this one, and gives them a store of their own.
 
     torchrun's store outlives the processes that it starts anew, and holds addresses of dead ones.
@@ -317,7 +322,7 @@ def _meet(rank: int, size: int) -> dist.Store:
     """
     host, port = os.environ.get("MASTER_ADDR", "127.0.0.1"), os.environ.get("MASTER_PORT", "29500")
     held = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # by torchrun itself
-    store = dist.TCPStore(
+    store = TCPStore(
         host, int(port), None, rank == 0 and not held, timeout=_MEETING, wait_for_workers=False
     )
     mine = secrets.token_hex(8)
@@ -325,7 +330,7 @@ def _meet(rank: int, size: int) -> dist.Store:
     if rank:
         group = store.get(f"gamba/group-of/{mine}").decode()
         store.set(f"gamba/{group}/knows/{rank}", "")
-        return dist.PrefixStore(f"gamba/{group}", store)
+        return PrefixStore(f"gamba/{group}", store)
     told: dict[int, bytes] = {}
     limit, missing = time.monotonic() + _MEETING.total_seconds(), set(range(1, size))
     while missing:
@@ -340,4 +345,4 @@ def _meet(rank: int, size: int) -> dist.Store:
         if time.monotonic() > limit:
             raise UserError(f"processes {sorted(missing)} of {size} have not come to {host}:{port}")
         time.sleep(0.02)
-    return dist.PrefixStore(f"gamba/{mine}", store)
+    return PrefixStore(f"gamba/{mine}", store)

@@ -7,7 +7,7 @@ import hashlib
 import importlib
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -128,7 +128,7 @@ def _open_log(
 
 def _facts(
     config: TrainConfig, data: TrainingData, world: World, lpips: bool
-) -> dict[str, dict[str, object]]:
+) -> Mapping[str, Mapping[str, object]]:
     """What all processes must have in common, see ``World.agree``."""
     options = options_of_all(config.to_dict())
     known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
