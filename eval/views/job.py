@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gamba_warp.batch import check_not_read
@@ -101,12 +101,10 @@ def open_job(options: ViewsOptions) -> Job:
         options.encoder_weights,
         options.resize_pictures,
     )
-    rendered: dict[str, str] = {}
     if isinstance(predictions, PicturePredictions):
         if options.save_gaussians:
             raise UserError(f"--save-gaussians: {options.checkpoint} holds pictures")
         predictions.check(uids)
-        rendered = {"rendering": "pictures of 8 bits", "pictures": PICTURES}
     elif options.resize_pictures:
         raise UserError(f"--resize-pictures: {options.checkpoint} holds no pictures")
     network, reason = _lpips_or_reason(options.lpips, device)
@@ -120,8 +118,9 @@ def open_job(options: ViewsOptions) -> Job:
         lpips_reason=reason,
         distance=predictions.distance,
         resize_pictures=options.resize_pictures,
-        **rendered,
     )
+    if isinstance(predictions, PicturePredictions):
+        protocol = replace(protocol, rendering="pictures of 8 bits", pictures=PICTURES)
     job = Job(predictions, dataset, uids, protocol, network, device)
     folder = None if options.out is None else output_folder(options.out)
     ceiling = None
