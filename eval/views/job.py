@@ -107,6 +107,7 @@ def open_job(options: ViewsOptions) -> Job:
         device,
         options.encoder_weights,
         options.resize_pictures,
+        options.background_margin,
     )
     rendered: dict[str, Any] = {}
     if isinstance(predictions, PicturePredictions):

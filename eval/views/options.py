@@ -69,6 +69,9 @@ class ViewsOptions:
     """Pictures under test may have another size than those compared, and are resized to it."""
     distance: Annotated[float, Meta(ge=0.01, le=1000)] = DEFAULT_DISTANCE
     """Distance of the input camera, for .ply files; a checkpoint states its own."""
+    background_margin: Annotated[int, Meta(ge=0, le=4096)] | None = None
+    """Of a model: drop the 3DGS tokens of plain background, but for those within so many patches of
+    the object. It was not trained for that, unless its decoder is "rays", which does it always."""
     encoder_weights: Path | None = None
     """The image encoder's file, for a checkpoint that does not hold it."""
     device: DeviceChoice = "auto"

@@ -68,11 +68,16 @@ class PlyPredictions(Predictions):
 class ModelPredictions(Predictions):
     """A checkpoint, shown the reference view alone."""
 
-    def __init__(self, path: Path, device: str, encoder_weights: Path | None) -> None:
+    def __init__(
+        self, path: Path, device: str, encoder_weights: Path | None, margin: int | None = None
+    ) -> None:
         self.model, self.device = load_model(path, device, encoder_weights), device
+        self.margin = margin
         self.distance = self.model.config.distance
         file = path / FILE_NAME if path.is_dir() else path
         self.source = {"kind": "checkpoint", "path": path.name, "sha256": sha256(file)}
+        if margin is not None:
+            self.source["background_margin"] = str(margin)
 
     @torch.no_grad()
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
@@ -80,7 +85,8 @@ class ModelPredictions(Predictions):
         config = self.model.config
         views = dataset.load(uid, views=[reference], size=config.image_size)
         images, cameras = posed_input(views, config)
-        return self.model(images.to(self.device), cameras.to(self.device))[0]
+        images, cameras = images.to(self.device), cameras.to(self.device)
+        return self.model(images, cameras, background_margin=self.margin)[0]
 
 
 def open_predictions(
@@ -89,6 +95,7 @@ def open_predictions(
     device: str,
     encoder_weights: Path | None = None,
     resize: bool = False,
+    margin: int | None = None,
 ) -> Predictions | PicturePredictions:
     """Opens a folder with ``.ply`` files or with pictures, else a checkpoint.
 
@@ -98,18 +105,24 @@ def open_predictions(
         device: torch device.
         encoder_weights: as for ``load_model``.
         resize: whether pictures of another size are resized.
+        margin: ``background_margin`` of a model, see ``Gamba.forward``.
 
     Raises:
-        UserError: there is nothing, or the checkpoint cannot be read.
+        UserError: there is nothing, the checkpoint cannot be read, or there is a margin and no
+            model.
     """
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint, folder of .ply files or of pictures")
     if path.is_dir() and next(visible(path, "*.ply"), None) is not None:
-        return PlyPredictions(path, distance, device)
-    if path.is_dir() and next(path.glob("*.safetensors"), None) is None:
+        found = PlyPredictions(path, distance, device)
+    elif path.is_dir() and next(path.glob("*.safetensors"), None) is None:
         if not holds_pictures(path):
             raise UserError(
                 f"{path}: holds neither .ply files nor folders of pictures nor a checkpoint"
             )
-        return PicturePredictions(path, distance, device, resize)
-    return ModelPredictions(path, device, encoder_weights)
+        found = PicturePredictions(path, distance, device, resize)
+    else:
+        return ModelPredictions(path, device, encoder_weights, margin)
+    if margin is not None:
+        raise UserError(f"--background-margin: {path} holds no model")
+    return found

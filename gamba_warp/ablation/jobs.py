@@ -109,6 +109,8 @@ def stages(plan: Plan, row: Row, seed: int, settings: Settings) -> list[Stage]:
     views += ["--views", what.views, *(["--size", what.size] if what.size else [])]
     views += ["--strips", STRIPS, "--sheet", 0, "--no-baselines", "--device", settings.device]
     views += ["--save-gaussians"] if settings.meshes else []
+    if row.background_margin is not None:
+        views += ["--background-margin", row.background_margin]
     made = [
         _stage("train", [*train_words(plan, row, settings), *_run_words(seed, settings)], _MODEL),
         _stage("views", [*views, "--out", f"{ROW}/views"], "views/report.json"),

@@ -89,6 +89,8 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         seeds: in place of the plan's.
         compare_with: name of the row that this one is compared with, in place of the plan's.
         series: name of the series of numbers of Gaussians that the row belongs to.
+        background_margin: the model is evaluated without its tokens of plain background, but for
+            those within so many patches of the object; None: with all.
         paper: figures that the paper states, by the metric's name.
         note: a sentence below the table.
     """
@@ -101,6 +103,7 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seeds: Annotated[list[Seed], Meta(min_length=1, max_length=100)] | None = None
     compare_with: Name | None = None
     series: Name | None = None
+    background_margin: Annotated[int, Meta(ge=0, le=4096)] | None = None
     paper: Annotated[dict[Word, float], Meta(max_length=10)] = {}
     note: Text = ""
 
@@ -200,6 +203,8 @@ def _check(plan: Plan) -> None:
         known.add(row.name)
         if row.kind == "fit" and row.set:
             raise UserError(f"row {row.name}: a fit has no model, so it has no set")
+        if row.kind == "fit" and row.background_margin is not None:
+            raise UserError(f"row {row.name}: a fit has no model, so it has no background_margin")
         unknown = [name for name in row.paper if name not in METRICS]
         if unknown or not all(map(math.isfinite, row.paper.values())):
             what = f"no metric {unknown[0]}" if unknown else "not a number"

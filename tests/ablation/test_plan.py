@@ -34,6 +34,12 @@ FIT = {"name": "b", "kind": "fit"}
     "rows, more, reason",
     [
         (["a", "a"], {}, "row a: there are two"),
+        (
+            ["a", {**FIT, "background_margin": 0}],
+            {},
+            "row b: a fit has no model, so it has no back",
+        ),
+        (["a", {"name": "b", "background_margin": -1}], {}, "background_margin"),
         (["a", {"name": "b", "sett": {}}], {}, "unknown field `sett`"),
         (["a", {"name": "b", "set": {"widht": 4}}], {}, "row b: set: GambaConfig has no field wid"),
         (["a", {"name": "b", "set": {"width": 0}}], {}, "row b: --set: config: width is 0"),
@@ -108,6 +114,15 @@ def test_what_is_wrong_ends_the_command_before_it_writes(tmp_path, capsys, monke
     assert "has no row z; it has a" in lines[2] and "give one of them" in lines[3]
     assert "none" in lines[4]
     assert [path.name for path in tmp_path.iterdir()] == ["trial.json"]
+
+
+def test_a_row_is_evaluated_without_its_background(tmp_path):
+    chosen = read_plan(write_plan(tmp_path, "a", {"name": "b", "background_margin": 0}))
+    given = settings(tmp_path, chosen)
+    (_, with_all), (_, dropped) = (jobs.stages(chosen, row, 0, given) for row in chosen.rows)
+    assert "--background-margin" not in with_all.words
+    at = dropped.words.index("--background-margin")
+    assert dropped.words[at + 1] == "0"
 
 
 def test_the_row_changes_the_base(tmp_path):

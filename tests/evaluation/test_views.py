@@ -264,7 +264,7 @@ def test_gaussians_rendered_and_rendered_again(tmp_path, rasterizer):
     assert report["baselines"]["input_copy"]["psnr"] < 40
 
 
-def test_checkpoint(data, rasterizer):
+def test_checkpoint(data, rasterizer, capsys):
     from gamba_warp.model.checkpoint import save_model
     from gamba_warp.model.gamba import Gamba
 
@@ -277,6 +277,12 @@ def test_checkpoint(data, rasterizer):
     assert code == 0
     assert report["protocol"]["source"]["kind"] == "checkpoint"
     assert report["objects"][0]["gaussians"] == config.num_gaussians
+    few = [*"--no-lpips --limit 1 --views 2 --background-margin 0".split()]
+    code, report = evaluate(data, *few, pred="model")
+    assert code == 0 and 0 < report["objects"][0]["gaussians"] < config.num_gaussians
+    assert report["protocol"]["source"]["background_margin"] == "0"
+    assert evaluate(data, *few)[0] == 2  # Gaussians that are there already
+    assert "--background-margin: " in capsys.readouterr().err
 
 
 def test_saved_gaussians_evaluate_to_the_same(data, painted):
