@@ -123,7 +123,7 @@ def _open_log(
         held.enter_context(lock)
         if list_checkpoints(run.out):
             raise UserError(f"{run.out}: another process trained here meanwhile; start again")
-    for folder in (run.out, run.out / "samples"):
+    for folder in (run.out, run.out / "samples", run.out / "checkpoints"):
         sweep(folder, age=0)
     return RunLog(run.out, run.boards)
 

@@ -345,7 +345,7 @@ def test_protocol_files(tmp_path):
         ('{"surface": 3}', "surface is 3"),
         ('{"version": 1}', "version 1"),
         ('{"definitions": {"chamfer": "mine"}}', "definitions"),
-        (None, "neither default, syncdreamer nor a file"),
+        (None, "neither default, syncdreamer, gso nor a file"),
     ],
 )
 def test_bad_protocol_files(tmp_path, text, reason, capsys):

@@ -97,6 +97,8 @@ def take_views(
 
 
 def _take(path: Path, target: Path, least: int, copy: bool, depth: bool) -> None:
+    if not (path.is_dir() or path.is_file()):
+        raise UserError(f"{path}: is neither a folder nor a file")
     if (target / GOBJAVERSE).exists():  # without depth, which is then all that is added
         files = _checked(target, path, least)
         with atomic_folder(target / GOBJAVERSE_DEPTH) as part:
