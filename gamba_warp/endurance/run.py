@@ -163,9 +163,12 @@ def kill_training(folder: Path, kills: int, rng: random.Random, bar: tqdm) -> Co
         count.hit += end.killed
         bar.update()
         if end.code == 0 or (count.runs == kills):
-            if end.code and run_child(training(folder, out, steps)).code:
+            if end.code:
+                end = run_child(training(folder, out, steps))
+            if end.code:
                 count.not_resumed += 1
-            if _weights(out / _MODEL) != model or _checkpoint(out) != saved:
+                _note(count, "train did not go on", end)
+            elif _weights(out / _MODEL) != model or _checkpoint(out) != saved:
                 count.lost += 1
                 count.notes.append(f"train: after {count.runs} kills the weights differ")
             count.debris += len(leftovers(out))
