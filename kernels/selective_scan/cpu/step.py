@@ -249,7 +249,7 @@ def scan_step(
 
 
 def _fit(rows: list[tuple], whole: list[tuple]) -> bool:
-    """Whether all are plain float32 tensors in memory, of their shapes, with dense rows or whole."""
+    """Whether all are float32 tensors in memory, of their shapes, with dense rows, or whole."""
     if torch.compiler.is_compiling():
         return False
     for x, shape in rows + whole:
