@@ -4,7 +4,7 @@ After an operator torch's OpenMP threads wait for the next one by spinning, for 
 threads would share the cores with them; the same team starts within microseconds. Where torch has
 another runtime than GNU's or one with its interface, and in a forked child, there is no team, and
 ``launch.parallel_launch`` takes threads of Python. It does so too with a Warp whose recorded launch
-has other attributes than those of 1.19, which are not public.
+has other attributes than those of 1.18 and 1.19, which are not public.
 """
 
 import ctypes
