@@ -178,7 +178,7 @@ def _layer(problem: ScanProblem) -> tuple[Callable[..., Tensor], list[Tensor]]:
 
     def layer(u: Tensor, weight: Tensor) -> Tensor:
         u = causal_conv1d(u, weight, activation="silu")
-        return problem.call(inputs | {"u": u})
+        return problem.call({**inputs, "u": u})  # torch 2.6 compiles no "|" of two dicts
 
     return layer, [inputs["u"], weight.view(-1, 4)]
 

@@ -6,21 +6,22 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import PathDistribution, distribution
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = ("gamba_warp", "kernels", "train", "eval", "starter")
 FILES = ("setup.cfg", "pyproject.toml", "README.md", "LICENSE", "THIRD_PARTY.md")
-# Where everything of ours comes from, and then the command itself.
-RUN = """
-import sys
+# Where everything of ours comes from.
+WHERE = """
 import gamba_warp
 from gamba_warp.files import STARTER
 from gamba_warp import cli
-print(gamba_warp.__file__, STARTER, flush=True)
-cli.main(sys.argv[1:])
+print(gamba_warp.__file__, STARTER)
 """
 
 
@@ -39,17 +40,48 @@ def wheel(tmp_path_factory):
     return found
 
 
-@pytest.mark.slow
-def test_an_installed_wheel_reconstructs_its_own_picture(wheel, tmp_path):
-    site = tmp_path / "site"
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index"]
-    subprocess.run([*command, "--target", str(site), str(wheel)], check=True, timeout=300)
-    picture = site / "gamba_warp" / "starter" / "icons" / "scopia-toaster.png"
-    environment = os.environ | {"PYTHONPATH": str(site)}
+def add(requirement: Requirement, found: dict) -> None:
+    """Adds what a requirement means here, and all that this requires, by name and extras."""
+    name = canonicalize_name(requirement.name), *sorted(requirement.extras)
+    if name in found:
+        return
+    found[name] = one = distribution(requirement.name)
+    for line in map(Requirement, one.requires or []):
+        extras = "", *requirement.extras
+        if line.marker is None or any(line.marker.evaluate({"extra": e}) for e in extras):
+            add(line, found)
 
-    def gamba(*arguments):
+
+@pytest.fixture(scope="module")
+def fresh(wheel, tmp_path_factory):
+    """An environment of its own: the wheel, and of what is here only what the wheel requires."""
+    folder = tmp_path_factory.mktemp("fresh")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
+    python = folder / "bin" / "python"
+    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet"]
+    subprocess.run([*command, "--no-deps", "--no-index", str(wheel)], check=True, timeout=300)
+    (site,) = folder.glob("lib/python*/site-packages")
+    (metadata,) = site.glob("gamba_warp-*.dist-info")
+    found: dict = {}
+    for requirement in map(Requirement, PathDistribution(metadata).requires or []):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            add(requirement, found)
+    for one in found.values():
+        for top in {file.parts[0] for file in one.files or []} - {"..", "__pycache__"}:
+            if not (site / top).exists():
+                (site / top).symlink_to(Path(str(one.locate_file(top))).resolve())
+    return folder, site
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_reconstructs_its_own_picture(fresh, tmp_path):
+    folder, site = fresh
+    picture = site / "gamba_warp" / "starter" / "icons" / "scopia-toaster.png"
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+
+    def run(*words):
         return subprocess.run(
-            [sys.executable, "-c", RUN, *map(str, arguments)],
+            [str(folder / "bin" / words[0]), *map(str, words[1:])],
             capture_output=True,
             text=True,
             cwd=tmp_path,
@@ -57,16 +89,37 @@ def test_an_installed_wheel_reconstructs_its_own_picture(wheel, tmp_path):
             timeout=300,
         )
 
+    names = ("trimesh", "kornia", "open3d", "timm", "scipy", "skimage", "pytest")
+    look = f"from importlib.util import find_spec; print([n for n in {names} if find_spec(n)])"
+    assert run("python", "-c", look).stdout == "[]\n"
+    where = run("python", "-c", WHERE)
+    assert where.returncode == 0, where.stderr
+    assert all(Path(place).is_relative_to(site) for place in where.stdout.split())
     quick = ("--size", 32, "--frames", 3, "--out", tmp_path / "out")
-    done = gamba("reconstruct", picture, *quick)
+    done = run("gamba", "reconstruct", picture, *quick)
     assert done.returncode == 0, done.stderr
-    places = done.stdout.splitlines()[0].split()
-    assert all(Path(place).is_relative_to(site) for place in places)
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names >= {f"scopia-toaster.{end}" for end in ("ply", "gif", "html")}
-    none = gamba("reconstruct")
+    none = run("gamba", "reconstruct")
     assert none.returncode == 2 and f"such as {site}" in none.stderr
-    demo = gamba("demo")
+    mesh = run("gamba", "reconstruct", picture, "--mesh", "obj", *quick)
+    assert mesh.returncode == 2 and "pip install 'gamba-warp[" in mesh.stderr, mesh.stderr
+    demo = run("gamba", "demo")
+    assert demo.returncode == 2 and demo.stderr.count("\n") == 1
+    assert "pip install 'gamba-warp[all]'" in demo.stderr
+
+
+@pytest.mark.slow
+def test_the_demo_of_an_installed_wheel_asks_for_a_checkout(fresh, tmp_path):
+    _, site = fresh  # and all extras, which are where this test runs
+    demo = subprocess.run(
+        [sys.executable, "-c", "from gamba_warp import cli; cli.main(['demo'])"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(site)},
+        timeout=300,
+    )
     assert demo.returncode == 2 and demo.stderr.count("\n") == 1
     assert f"{site}/gamba_warp/starter/data: no such folder; make" in demo.stderr
 

@@ -215,7 +215,11 @@ def test_a_file_that_is_gone_is_damage(tmp_path, two):
 def test_older_checkpoints_without_checksums(tmp_path, two):
     (two[1] / "checksums.json").unlink()
     assert find_checkpoint(tmp_path, "auto") == two[1]
-    flip(two[1] / "state.pt", 0.5)
+    # In the pickle: between the files of the archive are bytes that no one reads, and that no sum
+    # of theirs covers. Where they lie depends on the version of torch.
+    data = bytearray((two[1] / "state.pt").read_bytes())
+    data[data.index(b"\x80\x02") + 4] ^= 1
+    (two[1] / "state.pt").write_bytes(data)
     assert find_checkpoint(tmp_path, "auto", [].append) == two[0]
 
 

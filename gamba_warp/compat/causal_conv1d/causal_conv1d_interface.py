@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...kernels.causal_conv1d import causal_conv1d_fn
+from ...kernels.selective_scan.cpu.step import conv_step
 from ..states import (
     check_dtype,
     check_indices,
@@ -52,6 +53,10 @@ def causal_conv1d_update(
         TypeError: an argument is not a tensor or has another dtype.
         ValueError: a shape or ``activation`` is not one of the above.
     """
+    if cache_seqlens is None and conv_state_indices is None and activation in ACTIVATIONS:
+        out = conv_step(x, weight, bias, conv_state, activation is not None)
+        if out is not None:  # None, and nothing done, also where an argument is wrong
+            return out
     state = _check(x, conv_state, weight, bias, activation, cache_seqlens, conv_state_indices)
     tokens = x[..., None] if x.dim() == 2 else x
     if cache_seqlens is None:

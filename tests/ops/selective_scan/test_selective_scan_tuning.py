@@ -49,7 +49,7 @@ def test_a_compiled_scan_has_the_tuning_of_its_call(tuning):
     inputs = make(1, 150, 17, 3)
 
     def layer(u):
-        return selective_scan(**inputs | {"u": u}, delta_softplus=True)
+        return selective_scan(**{**inputs, "u": u}, delta_softplus=True)
 
     compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
     for context in (contextlib.nullcontext(), use_tuning(tuning), contextlib.nullcontext()):

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from .....kernels.selective_scan.cpu.step import scan_step
 from ....states import (
     check_dtype,
     check_indices,
@@ -57,6 +58,10 @@ def selective_state_update(
         TypeError: an argument is not a tensor or has another dtype (complex and float64 too).
         ValueError: a shape is not one of the above.
     """
+    if state_batch_indices is None:
+        done = scan_step(state, x, dt, A, B, C, D, z, dt_bias, dt_softplus)
+        if done is not None:  # None, and nothing done, also where an argument is wrong
+            return done
     B, C = _matrix(B, state), _matrix(C, state)
     groups = _check(state, x, dt, A, B, C, D, z, dt_bias, state_batch_indices)
     rows = state if state_batch_indices is None else take_rows(state, state_batch_indices)
