@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Who may call what; ``vision.weights`` opens a wheel whose digest pip has compared, ``pack`` the tar
+# Who may call what; ``vision.weights`` opens a wheel whose digest pip has compared, ``pack`` a tar
 # that it has just written.
 DOORS = {
     "Image.open": {"gamba_warp/images.py"},
