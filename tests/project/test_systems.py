@@ -6,6 +6,7 @@ Nothing here runs on macOS or Windows: what these lack is taken away on the mach
 import ast
 import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -105,6 +106,7 @@ def windows(monkeypatch, no_users):
         raise TypeError("LoadLibrary() argument 1 must be str, not None")
 
     monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(shutil, "_use_fd_functions", False)  # rmtree opens no folders there
     monkeypatch.setattr(os, "open", open_file)
     monkeypatch.setattr(os, "fsync", sync)
     monkeypatch.setattr(Path, "rename", rename)

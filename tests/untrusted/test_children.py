@@ -61,7 +61,7 @@ def test_a_caller_that_stops_leaves_nothing_at_work():
 
 
 def test_what_cannot_be_sent_is_the_callers_error():
-    with pytest.raises(Exception, match="pickle"):
+    with pytest.raises(Exception, match="pickle|local object"):  # by the version of Python
         list(run_each(lambda item: item, [1]))
 
 
