@@ -76,7 +76,12 @@ def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypat
     predictions = ModelPredictions(tmp_path / "model", "cpu", None)
     seen = []
     run = predictions.model.forward
-    monkeypatch.setattr(predictions.model, "forward", lambda *x: seen.append(x) or run(*x))
+
+    def noted(*inputs, **options):
+        seen.append(inputs)
+        return run(*inputs, **options)
+
+    monkeypatch.setattr(predictions.model, "forward", noted)
     predictions.gaussians(dataset, uid, 4)
     assert torch.equal(seen[0][0], want[0]) and torch.equal(seen[0][1].Ks, want[1].Ks)
     assert torch.equal(seen[0][1].viewmats, want[1].viewmats)
