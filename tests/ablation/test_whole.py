@@ -42,7 +42,7 @@ def test_the_commands_do_what_the_table_says(tmp_path):
     data = micro.write_dataset(tmp_path / "data")
     (tmp_path / "plan.json").write_text(json.dumps(PLAN))
     words = [tmp_path / "plan.json", data, "--out", tmp_path / "out", "--device", "cpu"]
-    words += ["--rows", "a", "no-prepend", "fit"]
+    words += ["--rows", "a", "no-prepend", "fit", "--jobs", 2]
     assert cli.run("ablate", [str(word) for word in words]) == 0
     made = json.loads((tmp_path / "out" / "table.json").read_text())
     rows = {row["name"]: row for row in made["rows"]}
