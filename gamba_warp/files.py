@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
@@ -265,6 +265,21 @@ def only_process(folder: Path, what: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def sha256_of_all(paths: Iterable[Path], folder: Path) -> str:
+    """The SHA-256 of the names of files in a folder and of their own SHA-256s, sorted by path.
+
+    A file that cannot be read counts as that: it stops none of the others.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        try:
+            content = sha256(path)
+        except UserError:
+            content = "unreadable"
+        digest.update(os.fsencode(f"{path.relative_to(folder).as_posix()} {content}\n"))
+    return digest.hexdigest()
 
 
 def sha256(path: str | Path) -> str:

@@ -6,7 +6,9 @@ alpha into a ``.ply``, a turntable and a page. Everything else comes with ``gamb
 
 from __future__ import annotations
 
+import sys
 from importlib.util import find_spec
+from types import ModuleType
 
 __version__ = "0.1.0"
 _USED = (
@@ -135,3 +137,23 @@ def advice(library: str, command: str) -> str | None:
     if name not in HOLDS.get(extra, ()):
         extra = EXTRA_OF[name]
     return f"{command} needs {name}, which is not installed: pip install 'gamba-warp[{extra}]'"
+
+
+def import_open3d() -> ModuleType:
+    """Returns the ``open3d`` module; it is imported nowhere else.
+
+    Its Linux wheel wants ``libusb-1.0.so.0`` from the system; ``libusb-package`` carries the
+    library, and loading it first satisfies the linker without root.
+    """
+    import ctypes
+
+    if "open3d" not in sys.modules and sys.platform == "linux":
+        try:
+            import libusb_package
+
+            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+        except (ImportError, OSError):
+            pass  # the system's own library may be there; else the import says what is missing
+    import open3d
+
+    return open3d

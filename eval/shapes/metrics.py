@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 from .shape import Points
 

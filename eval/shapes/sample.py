@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gamba_warp.errors import UserError
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 from .shape import Mesh, Points
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias, overload
 
 import numpy as np
 
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 if TYPE_CHECKING:
     from gamba_warp.gaussians import Gaussians

@@ -12,8 +12,6 @@ No picture is moved, turned or cropped.
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +25,7 @@ from torch import Tensor
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.data.layouts import LAYOUTS, PICTURES, ObjectFiles
 from gamba_warp.errors import UserError
-from gamba_warp.files import sha256, visible
+from gamba_warp.files import sha256_of_all, visible
 from gamba_warp.images import load_rgba8, open_picture, save_image
 
 from .compare import WHITE, Shown, Truth, shown
@@ -80,14 +78,8 @@ class PicturePredictions:
             resize: whether pictures of another size than those compared are resized to it.
         """
         self.folder, self.distance, self.device, self.resize = folder, distance, device, resize
-        digest = hashlib.sha256()
-        for path in sorted(p for p in visible(folder, "*") if _is_ours(p)):
-            try:
-                content = sha256(path)
-            except UserError:  # its object fails by itself, the others are evaluated
-                content = "unreadable"
-            digest.update(os.fsencode(f"{path.relative_to(folder).as_posix()} {content}\n"))
-        self.source = {"kind": "pictures", "path": folder.name, "sha256": digest.hexdigest()}
+        content = sha256_of_all(filter(_is_ours, visible(folder, "*")), folder)
+        self.source = {"kind": "pictures", "path": folder.name, "sha256": content}
 
     def check(self, uids: Sequence[str]) -> None:
         """Raises UserError where not one of the objects has a folder, so that nothing begins."""

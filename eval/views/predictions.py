@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import torch
 
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
-from gamba_warp.files import sha256, visible
+from gamba_warp.files import sha256, sha256_of_all, visible
 from gamba_warp.formats.ply import load_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.checkpoint import FILE_NAME, load_model
@@ -51,14 +49,8 @@ class PlyPredictions(Predictions):
 
     def __init__(self, folder: Path, distance: float, device: str) -> None:
         self.folder, self.distance, self.device = folder, distance, device
-        digest = hashlib.sha256()
-        for path in sorted(visible(folder, "*.ply")):
-            try:
-                content = sha256(path)
-            except UserError:  # its object fails by itself, the others are evaluated
-                content = "unreadable"
-            digest.update(os.fsencode(f"{path.relative_to(folder).as_posix()} {content}\n"))
-        self.source = {"kind": "ply", "path": folder.name, "sha256": digest.hexdigest()}
+        content = sha256_of_all(visible(folder, "*.ply"), folder)
+        self.source = {"kind": "ply", "path": folder.name, "sha256": content}
 
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
         """Reads the file."""

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
-from ..untrusted.documents import parse_document, read_document
+from ..pages.run_log import read_lines
+from ..untrusted.documents import read_document
 from .jobs import Settings, gaussians_of, stages
 from .plan import Plan, Row
 from .record import Record, changed, new_record, read_record, row_folder
 
 VIEW_METRICS = ("psnr", "ssim", "lpips", "mask_iou")
 SHAPE_METRICS = ("chamfer", "iou")
-_LONGEST = 1 << 20  # bytes of a log's line; ours have a few hundred
 Objects = dict[str, dict[str, float]]  # metrics by object
 
 
@@ -254,23 +254,16 @@ def read_facts(path: Path) -> Facts:
     """Reads a run's log; lines that are damaged are passed over, and so is a log that lacks."""
     facts, seconds = Facts(), []
     try:
-        with open(path, "rb") as file:
-            while data := file.readline(_LONGEST):
-                try:
-                    line = parse_document(data, dict[str, Any], str(path))
-                except UserError:
-                    continue
-                _add_line(facts, seconds, line)
-    except OSError:
+        for line in read_lines(path):
+            _add_line(facts, seconds, line)
+    except UserError:
         return facts
     facts.step_seconds = statistics.median(seconds) if seconds else None
     return facts
 
 
 def _add_line(facts: Facts, seconds: list[float], line: dict[str, Any]) -> None:
-    event = line.get("event")
-    step = _whole(line.get("step"))
-    facts.steps = facts.steps if step is None else step
+    event, facts.steps = line["event"], line["step"]
     memory = _whole(line.get("device_memory"))
     if memory is not None:
         facts.device_memory = max(memory, facts.device_memory or 0)

@@ -14,9 +14,8 @@ from ..errors import first_line
 from ..gaussians import Gaussians
 from ..kernels.selective_scan import selective_scan
 from ..model.checkpoint import DEFAULT_CHECKPOINT
-from ..open3d import import_open3d
 from ..render import render
-from ..versions import EXTRA_OF
+from ..versions import EXTRA_OF, import_open3d
 from ..vision.fetch import cache_folder
 from ..vision.weights import FETCH, lpips_available
 

@@ -87,7 +87,7 @@ def read_run_log(path: Path) -> RunRecord:
     """
     record = RunRecord()
     began, before = 0.0, 0.0  # the clock of this part, seconds, and the minutes of those before
-    for line in _lines(path):
+    for line in read_lines(path):
         step, clock = line["step"], _number(line.get("time"))
         event = line["event"]
         if event == "start":
@@ -108,7 +108,12 @@ def read_run_log(path: Path) -> RunRecord:
     return record
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
+def read_lines(path: Path) -> Iterator[dict[str, Any]]:
+    """The lines of a log that are whole, with their ``event`` and ``step``; others are passed over.
+
+    Raises:
+        UserError: as ``read_run_log``.
+    """
     if not path.is_file():
         raise UserError(f"{path}: {'not a plain file' if path.exists() else 'no such file'}")
     try:

@@ -13,8 +13,8 @@ from ..cameras import Cameras, fibonacci_sphere, intrinsics
 from ..errors import UserError
 from ..gaussians import Gaussians
 from ..kernels.rasterize import depth_quantile
-from ..open3d import import_open3d
 from ..render import render
+from ..versions import import_open3d
 
 CLEAR = 1e5  # depth of a ray that meets nothing
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch

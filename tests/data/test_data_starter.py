@@ -9,8 +9,8 @@ import trimesh
 from gamba_warp.data.dataset import SPLITS, open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.images import load_rgba
-from gamba_warp.open3d import import_open3d
 from gamba_warp.train.data.starter import starter
+from gamba_warp.versions import import_open3d
 
 STARTER = Path(__file__).resolve().parents[2] / "starter"
 HELD_OUT = sorted(path.stem for path in (STARTER / "meshes").glob("*.ply"))

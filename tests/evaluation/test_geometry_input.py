@@ -19,7 +19,7 @@ from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
 from gamba_warp.eval.shapes.shape import Mesh
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 MANY = 10**12
 

@@ -19,7 +19,7 @@ from gamba_warp.eval.report import (
 from gamba_warp.eval.shapes.metrics import surface_metrics, volume_iou
 from gamba_warp.eval.shapes.shape import Points
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 
 @pytest.mark.parametrize("shift", [0.5, 0.1, 0.001])

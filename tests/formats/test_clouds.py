@@ -8,7 +8,7 @@ import pytest
 from gamba_warp.errors import UserError
 from gamba_warp.formats.clouds import read_cloud
 from gamba_warp.formats.ply_data import PlyList, read_ply, triangles
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 COUNT = 2500
 POINTS = np.random.default_rng(0).normal(size=(COUNT, 3)).astype(np.float32)

@@ -7,7 +7,7 @@ from helpers.gaussians import some
 
 from gamba_warp.errors import UserError
 from gamba_warp.formats.ply import SH_C0, load_ply, save_ply
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 

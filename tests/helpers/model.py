@@ -6,7 +6,11 @@ from timm.models.vision_transformer import _create_vision_transformer
 
 from gamba_warp import cli
 from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+
+FIELDS = ("means", "scales", "opacities", "colors")
 
 
 @timm.models.register_model
@@ -36,6 +40,30 @@ def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
     viewmats = orbit(torch.linspace(-30, 200, batch), 11.0)
     cameras = Cameras(viewmats, intrinsics(size, size).expand(batch, 3, 3), size, size)
     return torch.rand(batch, size, size, 3), cameras
+
+
+def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, patches) -> Gaussians:
+    """A batch on rays gives each picture's Gaussians, whose patches are known; returns them all."""
+    together = model(rgba, cameras)
+    for index, count in enumerate(patches):
+        alone = model(rgba[index : index + 1], cameras[[index]])
+        assert alone.num == count * 4 * 3
+        for name in FIELDS:
+            got = getattr(together, name)[index, : alone.num]
+            # The same sums in products of other shapes: a few roundings.
+            torch.testing.assert_close(got, getattr(alone, name)[0], rtol=2e-5, atol=2e-6)
+    return together
+
+
+def assert_recomputed_alike(model: Gamba, images: torch.Tensor, cameras: Cameras) -> None:
+    """``recompute`` changes no bit of any gradient."""
+    cotangent, grads = torch.randn(len(images), 36, 3), []
+    for model.recompute in (False, True):
+        model.zero_grad()
+        (model(images, cameras).means * cotangent).sum().backward()
+        grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
+    for name, grad in grads[0].items():
+        assert torch.equal(grads[1][name], grad), name
 
 
 def run_reconstruct(*arguments) -> int:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from gamba_warp.formats.materials import to_linear
 from gamba_warp.formats.meshes import TexturedMesh, to_display
-from gamba_warp.open3d import import_open3d
+from gamba_warp.versions import import_open3d
 
 SAMPLES = 3  # rays along each side of a pixel; odd, so that one goes through the pixel's centre
 LAYERS = 8  # number of surfaces that a ray may pass through

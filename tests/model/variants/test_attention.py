@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.model import inputs, micro
+from helpers.model import FIELDS, assert_each_alone, assert_recomputed_alike, inputs, micro
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.errors import UserError
@@ -11,8 +11,6 @@ from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.gamba import make_blocks as blocks_of
 from gamba_warp.model.parts.block import prefix_states, run_blocks
-
-FIELDS = ("means", "scales", "opacities", "colors")
 
 
 def make_blocks(depth: int, camera: int, image: int, **changes) -> torch.nn.ModuleList:
@@ -144,29 +142,16 @@ def test_a_batch_on_rays_is_each_picture_alone(gradients):
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
     rgba, cameras = cut_outs()
     with torch.set_grad_enabled(gradients):
-        together = model(rgba, cameras)
+        together = assert_each_alone(model, rgba, cameras, (4, 1, 6, 0))
         if gradients:
             sum(getattr(together, name).sum() for name in FIELDS).backward()
             assert all(p.grad.isfinite().all() for p in model.parameters())
-        for index, patches in enumerate((4, 1, 6, 0)):
-            alone = model(rgba[index : index + 1], cameras[[index]])
-            assert alone.num == patches * 4 * 3
-            for name in FIELDS:
-                got = getattr(together, name)[index, : alone.num]
-                # The same sums in products of other shapes: a few roundings.
-                torch.testing.assert_close(got, getattr(alone, name)[0], rtol=2e-5, atol=2e-6)
 
 
 def test_recomputation_and_segments_change_nothing():
     model = Gamba(micro(mixer="attention", attention_heads=4), "random")
     images, cameras = inputs(2)
-    cotangent, grads = torch.randn(2, 36, 3), []
-    for model.recompute in (False, True):
-        model.zero_grad()
-        (model(images, cameras).means * cotangent).sum().backward()
-        grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
-    for name, grad in grads[0].items():
-        assert torch.equal(grads[1][name], grad), name
+    assert_recomputed_alike(model, images, cameras)
     kept = model(images, cameras, background_margin=0)  # noise: every patch is the object's
     with torch.no_grad():
         condition = model.condition(images, cameras)

@@ -3,14 +3,12 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.model import inputs, micro
+from helpers.model import assert_each_alone, assert_recomputed_alike, inputs, micro
 
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba, make_blocks
 from gamba_warp.model.parts.block import prefix_states, run_blocks
 from gamba_warp.model.parts.mixed import mixed_places
-
-FIELDS = ("means", "scales", "opacities", "colors")
 
 
 def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:
@@ -92,26 +90,13 @@ def test_a_batch_on_rays_is_each_picture_alone():
     images, cameras = inputs(4)
     rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
     rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
-    together = model(rgba, cameras)
-    for index, patches in enumerate((4, 1, 6, 0)):
-        alone = model(rgba[index : index + 1], cameras[[index]])
-        assert alone.num == patches * 4 * 3
-        for name in FIELDS:
-            got = getattr(together, name)[index, : alone.num]
-            # The same sums in products of other shapes: a few roundings.
-            torch.testing.assert_close(got, getattr(alone, name)[0], rtol=2e-5, atol=2e-6)
+    assert_each_alone(model, rgba, cameras, (4, 1, 6, 0))
 
 
 def test_condition_recomputation_and_autocast():
     model = Gamba(micro(image_tokens="mixed"), "random")
     images, cameras = inputs(2)
-    cotangent, grads = torch.randn(2, 36, 3), []
-    for model.recompute in (False, True):
-        model.zero_grad()
-        (model(images, cameras).means * cotangent).sum().backward()
-        grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
-    for name, grad in grads[0].items():
-        assert torch.equal(grads[1][name], grad), name
+    assert_recomputed_alike(model, images, cameras)
     with torch.no_grad():
         want = model(images, cameras).means
         condition = model.condition(images, cameras)

@@ -3,14 +3,13 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.model import inputs, micro
+from helpers.model import FIELDS, inputs, micro
 
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.block import run_blocks
 from gamba_warp.model.parts.triplane import TriplaneDecoder, query_planes
 
-FIELDS = ("means", "scales", "opacities", "colors")
 PLANES = {"decoder": "triplane", "triplane_size": 3, "triplane_features": 5}
 
 

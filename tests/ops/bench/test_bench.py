@@ -31,7 +31,7 @@ from gamba_warp.kernels.bench.cases import scan as scan_suite
 from gamba_warp.kernels.bench.cases.raster_variants import make_scene
 from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs
 from gamba_warp.kernels.bench.cases.scan_variants import make_variant
-from gamba_warp.kernels.bench.core.case import LEVELS, Level, NotInstalled
+from gamba_warp.kernels.bench.core.case import NotInstalled
 from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart, pareto
 from gamba_warp.kernels.bench.core.measure import peak_bytes, saved_bytes
 from gamba_warp.kernels.bench.core.page import charts_of, page
@@ -47,15 +47,6 @@ SCHEMA = set(
     "peer peer_ms work".split()
 )
 TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
-
-
-@pytest.fixture(autouse=True)
-def short(monkeypatch):
-    """Three rounds of everything; torch's threads as before."""
-    monkeypatch.setitem(LEVELS, "quick", Level(0.0, 3, 3))
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
 
 
 def variant(name="ours", run=lambda: None, error=1e-8, **options):

@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gamba_warp.kernels.bench import LEVELS, Case, Settings
-from gamba_warp.kernels.bench.core.case import Level
+from gamba_warp.kernels.bench import Case, Settings
 from gamba_warp.kernels.bench.core.crossing import crossings
 from gamba_warp.kernels.bench.core.document import check_document
 from gamba_warp.kernels.bench.core.page import charts_of, page
@@ -19,14 +18,6 @@ from gamba_warp.measure.lengths import ATTENTION, BOTH, MAMBA, Bench, Line, Size
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 SIZES = Sizes((40, 97), 64, 60.0)  # 97 is no whole number of chunks or segments
-
-
-@pytest.fixture(autouse=True)
-def short(monkeypatch):
-    monkeypatch.setitem(LEVELS, "quick", Level(0.0, 3, 3))
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
 
 
 def record(series, length, ms, peak=None, **more):
