@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from .kernels.rasterize.harmonics import harmonics_basis
+
+SH_C0 = 0.28209479177387814  # value of the degree-0 spherical harmonic
 
 
 @dataclass
@@ -20,6 +25,9 @@ class Gaussians:
         scales: ``[.., N, 3]`` standard deviations, > 0, object units.
         opacities: ``[.., N]`` in (0, 1).
         colors: ``[.., N, 3]`` RGB in [0, 1].
+        harmonics: ``[.., N, K, 3]``, K of 3, 8 or 15: coefficients of the spherical harmonics of
+            degrees 1 to 1, 2 or 3 in the order and signs of 3DGS, which a direction of view adds
+            to ``colors`` (Kerbl et al. 2023); None: the colour is the same from all sides.
     """
 
     means: Tensor
@@ -27,6 +35,7 @@ class Gaussians:
     scales: Tensor
     opacities: Tensor
     colors: Tensor
+    harmonics: Tensor | None = None
 
     def __post_init__(self) -> None:
         lead = tuple(self.opacities.shape)
@@ -35,6 +44,15 @@ class Gaussians:
             value = getattr(self, name)
             if value is not None and tuple(value.shape) != (*lead, size):
                 raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {(*lead, size)}")
+        if self.harmonics is not None:
+            found = tuple(self.harmonics.shape)
+            if found not in [(*lead, K, 3) for K in (3, 8, 15)]:
+                raise ValueError(f"harmonics has shape {found}, expected {(*lead, '3|8|15', 3)}")
+
+    @property
+    def degree(self) -> int:
+        """The highest degree of the spherical harmonics, 0 to 3."""
+        return 0 if self.harmonics is None else {3: 1, 8: 2, 15: 3}[self.harmonics.shape[-2]]
 
     @property
     def num(self) -> int:
@@ -82,7 +100,29 @@ class Gaussians:
             scales=scale * self.scales,
             opacities=self.opacities,
             colors=self.colors,
+            harmonics=None if self.harmonics is None else turn_harmonics(self.harmonics, rotation),
         )
+
+
+def turn_harmonics(harmonics: Tensor, rotation: Tensor) -> Tensor:
+    """The coefficients after what they colour has been turned, ``Y(R d) c' = Y(d) c`` for all d.
+
+    The matrix between them is the solution of this equation at more directions than coefficients,
+    in float64, which is exact up to rounding.
+
+    Args:
+        harmonics: ``[.., K, 3]``, K of 3, 8 or 15, degrees 1 and above.
+        rotation: ``[3, 3]``, a proper rotation.
+    """
+    degree = {3: 1, 8: 2, 15: 3}[harmonics.shape[-2]]
+    steps = torch.arange(64, dtype=torch.float64, device=rotation.device) + 0.5
+    z, angle = 1 - steps / 32, steps * (math.pi * (3 - math.sqrt(5)))  # a spiral over the sphere
+    radius = (1 - z * z).sqrt()
+    directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], -1)
+    before = harmonics_basis(degree, directions)[:, 1:]
+    after = harmonics_basis(degree, directions @ rotation.double().mT)[:, 1:]
+    matrix = torch.linalg.pinv(after) @ before
+    return matrix.to(harmonics) @ harmonics
 
 
 def quat_multiply(p: Tensor, q: Tensor) -> Tensor:

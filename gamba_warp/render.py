@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 from torch.profiler import record_function
 
 from .cameras import Cameras
-from .gaussians import Gaussians
+from .gaussians import SH_C0, Gaussians
 from .kernels.rasterize import rasterization
 from .kernels.rasterize.meta import Meta
 
@@ -46,13 +47,15 @@ def render(
     """
     if background is not None:
         background = background.expand(*cameras.viewmats.shape[:-2], 3)
+    if gaussians.harmonics is not None:
+        options["sh_degree"] = gaussians.degree
     with record_function("rasterizer"):
         pictures, alpha, meta = rasterization(
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.scales,
             opacities=gaussians.opacities,
-            colors=gaussians.colors,
+            colors=gaussians.colors if gaussians.harmonics is None else _coefficients(gaussians),
             viewmats=cameras.viewmats,
             Ks=cameras.Ks,
             width=cameras.width,
@@ -62,3 +65,10 @@ def render(
             **options,
         )
     return Rendering(pictures[..., :3], alpha, pictures[..., 3:] if depth else None, meta)
+
+
+def _coefficients(gaussians: Gaussians) -> Tensor:
+    """All coefficients ``[.., N, (degree + 1)², 3]``, the colours as that of degree 0."""
+    assert gaussians.harmonics is not None
+    constant = (gaussians.colors - 0.5) / SH_C0
+    return torch.cat([constant[..., None, :], gaussians.harmonics], -2)

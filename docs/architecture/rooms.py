@@ -39,7 +39,10 @@ _WORDS = (*_KERNELS, "words")
 _READERS = (*_WORDS, "untrusted")
 _MODEL = ("model.config", "model.parts", "model")
 _LIBRARY = (*_READERS, "data", "formats", "vision", *_MODEL)
-_RESULTS = (*_LIBRARY, "surfaces", "fitting", "pages")
+_RESULTS = (
+    *(*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
+    "pages",
+)
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
 _TRAIN = (
     *("train.config", "train.objective", "train", "train.data", "train.sources", "train.bench"),
@@ -81,9 +84,15 @@ ROOMS = {
         "the network, its encoders and its files",
         (*_READERS, "data", "formats", "vision", "model.config", "model.parts"),
     ),
-    "surfaces": Room("Gaussians to meshes", _LIBRARY),
+    "photo": Room("any photograph to a cut-out object", (*_READERS, "data", "vision")),
+    "trajectories": Room("paths of cameras, and their files", _READERS),
+    "surfaces": Room("Gaussians to meshes", (*_LIBRARY, "trajectories")),
+    "viewer": Room("the 3D viewer and its pages", (*_READERS, "formats")),
     "fitting": Room("one object by optimisation", (*_LIBRARY, "compat")),
-    "pages": Room("pages, turntables, the viewer", (*_LIBRARY, "surfaces", "fitting")),
+    "pages": Room(
+        "pages, turntables",
+        (*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
+    ),
     "measure": Room("benchmark and stress cases that need the model", _MEASURES),
     "hostile": Room(
         "hostile files for every reader",
@@ -122,10 +131,11 @@ ROOMS = {
         (*_MEASURES, "measure", "hostile", "endurance", "ablation", "gpu_check"),
         (*_TRAIN, *_EVAL),
     ),
+    "app": Room("the local web app", _RESULTS),
     "cli": Room(
         "finds the command, parses, calls",
         ("versions", "words"),
-        ("commands", "gpu_check", "ablation", *_TRAIN, *_EVAL),
+        ("commands", "app", "gpu_check", "ablation", *_TRAIN, *_EVAL),
     ),
     "public": Room("import gamba_warp: names loaded when used", ("versions", "kernels"), _RESULTS),
 }

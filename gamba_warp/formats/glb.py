@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ..files import atomic_path
-from ..gaussians import Gaussians
+from ..gaussians import SH_C0, Gaussians
 from ..versions import __version__
-from .ply import SH_C0, export_arrays
+from .ply import export_arrays
 
 _EXTENSION = "KHR_gaussian_splatting"
 _FLOAT = 5126

@@ -16,12 +16,10 @@ import torch
 from ..conventions import Axes
 from ..errors import UserError
 from ..files import atomic_path
-from ..gaussians import Gaussians
+from ..gaussians import SH_C0, Gaussians
 from ..versions import __version__
 from .headers import open_shape
 from .ply_header import ORDERS, PlyElement, read_ply_header
-
-SH_C0 = 0.28209479177387814  # value of the degree-0 spherical harmonic
 
 _OPENGL_COMMENT = "frame opengl"
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)

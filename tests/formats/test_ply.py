@@ -6,7 +6,8 @@ import torch
 from helpers.gaussians import some
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.ply import SH_C0, load_ply, save_ply
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.gaussians import SH_C0
 from gamba_warp.versions import import_open3d
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")

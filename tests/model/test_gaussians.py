@@ -7,7 +7,9 @@ import torch
 from helpers.gaussians import some
 from torch.testing import assert_close
 
+from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.gaussians import Gaussians, matrix_to_quat, quat_multiply
+from gamba_warp.render import render
 
 
 def to_matrix(quat):
@@ -112,3 +114,28 @@ def test_rigid_motion_of_a_batch_with_gradients():
     (gradient,) = torch.autograd.grad((moved.means * cotangent).sum(), gaussians.means)
     assert_close(gradient, cotangent @ rotation)
     assert moved.quats.shape == (2, 3, 5, 4)
+
+
+@pytest.mark.parametrize("count", [3, 8, 15])
+def test_an_object_that_turns_with_the_camera_keeps_its_picture(count):
+    """The harmonics turn with the object; without that, the colours would be another side's."""
+    torch.manual_seed(3)
+    gaussians = some(7)
+    gaussians.harmonics = 0.3 * torch.randn(7, count, 3)
+    turn = to_matrix(torch.tensor([0.7, -0.2, 0.5, 0.4], dtype=torch.float64)).float()
+    shift = torch.tensor([0.1, -0.2, 0.05])
+    motion = torch.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn, shift
+    cameras = Cameras(orbit(torch.tensor([35.0]), 20.0), intrinsics(33, 33)[None], 33, 33)
+    moved = Cameras(cameras.viewmats @ motion.inverse(), cameras.Ks, 33, 33)
+    still = render(gaussians, cameras).rgb
+    turned = gaussians.transformed(turn, shift)
+    assert turned.degree == gaussians.degree == {3: 1, 8: 2, 15: 3}[count]
+    assert_close(render(turned, moved).rgb, still, atol=2e-5, rtol=0)  # float32 of the rotation
+    flat = render(Gaussians(**{**vars(gaussians), "harmonics": None}), cameras).rgb
+    assert (flat - still).abs().max() > 0.05
+
+
+def test_harmonics_of_no_whole_degree_are_refused():
+    with pytest.raises(ValueError, match=r"harmonics has shape \(5, 4, 3\)"):
+        Gaussians(**{**vars(batch()), "harmonics": torch.zeros(5, 4, 3)})

@@ -1,0 +1,1 @@
+"""Files of Gaussians in all formats: one reader, one writer."""

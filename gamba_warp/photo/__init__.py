@@ -1,0 +1,1 @@
+"""From any photograph to a cut-out object: mattes, masks, formats of cameras."""

@@ -1,0 +1,1 @@
+"""Paths of cameras: turntables, spirals, files of other programs."""
