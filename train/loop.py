@@ -316,29 +316,29 @@ class Trainer:
         if self._validated == self.step or not self.config.run.val_every:
             return
         self._validated = self.step
-        if self.log is not None and self.data.held_out:
-            model = self.ema.model if self.ema else self.model
-            held_out = fixed_batches(
-                self.data.validation,
-                self.model.config,
-                self.data.held_out,
-                self.data.val_views,
-                self.config.views.size,
-                self._unread,
-            )
-            weights, device = self.weights(constant=True), self.world.device
-            figures, rows = validate(model, held_out, weights, self.lpips, device)
-            self._name_failures()
-            if rows:
-                self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
-                text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
-                say(f"step {self.step}: validation {text}")
-                name = f"step_{self.step:06d}.png"
-                self.log.sample(self.step, self.config.run.out / "samples" / name, rows)
-                self.log.page()
-            else:
-                self.log.warn(self.step, "no validation: none of its objects can be read")
-        self.world.barrier()
+        with self.world.together():
+            if self.log is not None and self.data.held_out:
+                model = self.ema.model if self.ema else self.model
+                held_out = fixed_batches(
+                    self.data.validation,
+                    self.model.config,
+                    self.data.held_out,
+                    self.data.val_views,
+                    self.config.views.size,
+                    self._unread,
+                )
+                weights, device = self.weights(constant=True), self.world.device
+                figures, rows = validate(model, held_out, weights, self.lpips, device)
+                self._name_failures()
+                if rows:
+                    self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
+                    text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+                    say(f"step {self.step}: validation {text}")
+                    name = f"step_{self.step:06d}.png"
+                    self.log.sample(self.step, self.config.run.out / "samples" / name, rows)
+                    self.log.page()
+                else:
+                    self.log.warn(self.step, "no validation: none of its objects can be read")
 
     def save(self) -> None:
         """Writes a checkpoint on the main process, once per step; the others wait."""

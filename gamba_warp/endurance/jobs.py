@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..files import remove_folder, write_json
 from .child import run_child
 from .released import make_released
 
@@ -22,11 +23,14 @@ class Job:
         name: of the command.
         words: its arguments by the folder of the results.
         other: further arguments that change what it writes, so that older results can be told.
+        undo: removes a part of the results from their folder, where a command does not do again
+            what is done.
     """
 
     name: str
     words: Callable[[Path], list[object]]
     other: tuple[object, ...]
+    undo: Callable[[Path], None] | None = None
 
     def function(self, out: Path, other: bool = False) -> Callable[[], int]:
         """What a child runs; with ``other``, under the further arguments."""
@@ -89,14 +93,38 @@ def _make_inputs(folder: Path) -> int:
     code = command("data", "render", folder / "meshes", *options)()
     rgba = np.zeros((20, 30, 4))
     rgba[4:16, 8:24] = (0.8, 0.3, 0.1, 1)
+    parts = {"version": 1, "train": ["ball", "box"], "val": ["cone"], "test": []}
+    write_json(folder / "data" / "split.json", parts)
     (folder / "pictures").mkdir()
     for name in ("a", "b"):
         save_image(folder / "pictures" / f"{name}.png", rgba)
     (folder / "gaussians").mkdir()
     save_ply(folder / "gaussians" / "ball.ply", _ball())
+    write_json(folder / "plan.json", _plan())
     _make_library(folder / "libraries", folder / "pictures" / "a.png")
     make_released(folder / "released")
     return code
+
+
+def _without_one_object(out: Path) -> None:
+    """Removes one rendered object."""
+    found = sorted(out.glob("*/transforms.json"))
+    if found:
+        remove_folder(found[-1].parent)
+
+
+def _plan() -> dict:
+    """An ablation of one fit of a few steps."""
+    fit = {"steps": 3, "limit": 1, "held_out": 3, "size": 16}
+    return {
+        "name": "small",
+        "title": "One fit",
+        "seeds": [0],
+        "base": {"preset": "tiny", "options": {"steps": 2, "batch_size": 2}, "fit": fit},
+        "evaluation": {"split": "val", "objects": 1, "views": 3, "size": 16},
+        "compare_with": "model",
+        "rows": [{"name": "model"}, {"name": "fit", "kind": "fit", "options": {"gaussians": 20}}],
+    }
 
 
 def _make_library(folder: Path, icon: Path) -> None:
@@ -171,6 +199,7 @@ def jobs(world: Path) -> list[Job]:
                 1,
             ],
             (),
+            _without_one_object,
         ),
         Job(
             "eval-views",
@@ -199,6 +228,21 @@ def _other_jobs(world: Path) -> list[Job]:
                 *("--encoder-weights", world / "released" / "vit.safetensors"),
             ],
             (),
+        ),
+        Job(
+            "data pack",
+            lambda out: [world / "data", out, "--size", 16, "--workers", 1],
+            (),
+            remove_folder,
+        ),
+        Job(
+            "ablate",
+            lambda out: [
+                *(world / "plan.json", world / "data", "--out", out),
+                *("--rows", "fit", "--device", "cpu"),
+            ],
+            (),
+            lambda out: remove_folder(out / "rows"),
         ),
         Job("data furniture", lambda out: ["--tree", world / "libraries", "--out", out], ()),
         Job(

@@ -271,8 +271,9 @@ def disturb(job: Job, out: Path, fault: str, times: int, rng: random.Random, bar
     """
     count = Count(job.name, fault)
     first = run_child(job.function(out))
-    if job.name == "data render":  # it never renders an object again: one is missing each time
-        first = run_child(job.function(_without_one(out)))
+    if job.undo is not None and not first.code:  # what is done is not done again
+        job.undo(out)
+        first = run_child(job.function(out))
     if first.code:
         count.not_resumed += 1
         _note(count, f"{job.name} fails though nothing disturbs it", first)
@@ -280,8 +281,8 @@ def disturb(job: Job, out: Path, fault: str, times: int, rng: random.Random, bar
     whole = contents(out)
     largest = max(len(data) for data in whole.values())
     for turn in range(times):
-        if job.name == "data render":
-            _without_one(out)
+        if job.undo is not None:
+            job.undo(out)
         before = contents(out)
         function = job.function(out, other=turn % 2 == 0)
         if fault == "SIGKILL":
@@ -306,11 +307,3 @@ def disturb(job: Job, out: Path, fault: str, times: int, rng: random.Random, bar
         _note(count, f"{job.name} did not run again", end)
     count.debris = len(leftovers(out))
     return count
-
-
-def _without_one(out: Path) -> Path:
-    """Removes one rendered object."""
-    found = sorted(out.glob("*/transforms.json"))
-    if found:
-        shutil.rmtree(found[-1].parent)
-    return out

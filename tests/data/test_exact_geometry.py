@@ -3,6 +3,8 @@
 Without a GPU: every matrix product that runs is noted, with the precision that it would have there.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import micro
@@ -16,6 +18,7 @@ from gamba_warp.cameras import (
 from gamba_warp.data.dataset import ObjectViews
 from gamba_warp.devices import full_products
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.model.parts.decoder import GaussianDecoder
 from gamba_warp.model.posing import posed_input, relative_cameras
 from gamba_warp.render import render
 from gamba_warp.train.objective.losses import depth_loss, structure
@@ -150,3 +153,14 @@ def test_the_product_is_the_product():
     cotangent = torch.randn_like(want)
     for a, b in zip(*(torch.autograd.grad(v, (rows, matrix), cotangent) for v in (got, want))):
         torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("weights", ["unit", "softmax"])
+def test_the_decoder_places_gaussians_with_all_digits(weights):
+    """Its layers are the network's; the sum over the bins that gives a centre is geometry."""
+    config = micro.options(".", ".").model_config()
+    decoder = GaussianDecoder(replace(config, position_weights=weights))
+    hidden = torch.randn(2, 5, config.decoder_width or config.width, requires_grad=True)
+    with Products() as seen:
+        sum(x.sum() for x in decoder.shapes(hidden).values() if x is not None).backward()
+    assert seen.rounded and not {"mv", "addmv", "bmm", "matmul"} & set(seen.rounded)

@@ -98,7 +98,7 @@ class GaussianDecoder(nn.Module):
             unit = self.config.position_weights == "unit"
             weights = F.normalize(logits, dim=-1) if unit else logits.softmax(-1)
             return {
-                "means": weights @ self.points,
+                "means": (weights * self.points).sum(-1),  # as a product, a GPU might round it
                 "quats": None if self.rotation is None else self.rotation(hidden),
                 "scales": self.config.scale_factor * F.softplus(self.scale(hidden)) + MIN_SCALE,
                 "opacities": self.opacity(hidden)[..., 0].sigmoid(),
