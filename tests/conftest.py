@@ -13,6 +13,8 @@ import torch
 # This must come before the first import of helpers, so that a failing assert in them shows values.
 pytest.register_assert_rewrite("helpers")
 
+from helpers.browser import browser, browser_page  # noqa: E402, F401
+
 # Minutes of the run; GAMBA_STRESS_MINUTES asks for a longer one.
 MINUTES = float(os.environ.get("GAMBA_STRESS_MINUTES", "2"))
 

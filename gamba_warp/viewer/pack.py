@@ -1,0 +1,152 @@
+"""What the viewer's page holds of an object: packed records that go to the graphics card as is.
+
+One Gaussian is 32 bytes, as in ``.splat``, and finer: three float32 of the mean, seven float16
+(opacity, colour, scales) and three 16-bit numbers of the rotation. The rotation is the vector part
+of the quaternion over 1 + w (modified Rodrigues parameters), which has no singular place for w >= 0.
+The Gaussians that cover most come first, so that the viewer can leave out the last ones while it
+moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..errors import UserError
+from ..gaussians import Gaussians
+from ..images import to_uint8
+
+VISIBLE = 1 / 255  # opacity from which the rasterizer draws a Gaussian
+_COUNTS = 0.05  # opacity from which a Gaussian counts for the object's extent
+_MOST = 6e4  # float16 ends at 65504
+
+RECORD = np.dtype(
+    [("means", "<f4", 3), ("look", "<f2", 4), ("scales", "<f2", 3), ("turns", "<i2", 3)]
+)
+
+
+@dataclass
+class Frame:
+    """Where the viewer's own frame lies: it is the object's, moved and scaled.
+
+    Attributes:
+        center: ``[3]`` float64, the point that becomes the origin.
+        size: the length that becomes 1.
+    """
+
+    center: np.ndarray
+    size: float
+
+
+def own_frame(gaussians: Gaussians, name: str) -> Frame:
+    """A frame in which an object of any size anywhere is about the origin with a longest side of 1.
+
+    Half a percent of the centres at each end of each axis does not count, so that what floats far
+    from the object does not make it small.
+
+    Raises:
+        UserError: the object has no extent.
+    """
+    opacities = gaussians.opacities.detach().cpu().numpy()
+    means = gaussians.means.detach().double().cpu().numpy()[opacities >= min(_COUNTS, opacities.max())]
+    low, high = np.percentile(means, [0.5, 99.5], axis=0)
+    reach = 4 * float(gaussians.scales.detach().double().median())
+    size = max(float((high - low).max()), reach)
+    if not 0 < size < np.inf:
+        raise UserError(f"{name}: all Gaussians are at one point, so there is nothing to look at")
+    return Frame((low + high) / 2, size)
+
+
+def visible(gaussians: Gaussians, name: str) -> Gaussians:
+    """One object's Gaussians that can be seen, those that cover most first, on the CPU.
+
+    Args:
+        gaussians: ``[N]``.
+        name: named in errors.
+
+    Raises:
+        UserError: a value is not finite, or nothing can be seen.
+        ValueError: there is a batch dimension.
+    """
+    if gaussians.opacities.dim() != 1:
+        raise ValueError(
+            f"one object expected, got leading shape {tuple(gaussians.opacities.shape[:-1])}"
+        )
+    gaussians = gaussians.detach().to("cpu", torch.float32)
+    bad = torch.zeros(gaussians.num, dtype=torch.bool)
+    for value in vars(gaussians).values():
+        if value is not None:
+            bad |= ~value.reshape(gaussians.num, -1).isfinite().all(1)
+    if bad.any():
+        count = int(bad.sum())
+        raise UserError(f"{name}: {count} of {gaussians.num} Gaussians are not finite")
+    gaussians = gaussians.select(gaussians.opacities >= VISIBLE)
+    if gaussians.num == 0:
+        raise UserError(f"{name}: no Gaussian has an opacity of 1/255 or more")
+    widest = gaussians.scales.sort(-1).values
+    cover = gaussians.opacities * widest[:, 1] * widest[:, 2]
+    return gaussians.select(cover.argsort(descending=True, stable=True))
+
+
+def pack_gaussians(gaussians: Gaussians, frame: Frame) -> tuple[bytes, bytes]:
+    """The records, and the coefficients of the harmonics.
+
+    Args:
+        gaussians: ``[N]``, finite, on the CPU.
+        frame: the viewer's frame.
+
+    Returns:
+        32 bytes a Gaussian; and float16 ``[N, K * 3]``, each row filled up with zeros to a multiple
+        of 8 numbers, or nothing.
+    """
+    records = np.empty(gaussians.num, RECORD)
+    records["means"] = (gaussians.means.double().numpy() - frame.center) / frame.size
+    look = torch.cat([gaussians.opacities[:, None], gaussians.colors], 1).numpy()
+    records["look"] = look.clip(-_MOST, _MOST)
+    records["scales"] = (gaussians.scales.double().numpy() / frame.size).clip(0, _MOST)
+    records["turns"] = np.rint(32767 * _rodrigues(gaussians))
+    if gaussians.harmonics is None:
+        return records.tobytes(), b""
+    rows = gaussians.harmonics.reshape(gaussians.num, -1).numpy().clip(-_MOST, _MOST)
+    padded = np.zeros((len(rows), -(-rows.shape[1] // 8) * 8), "<f2")
+    padded[:, : rows.shape[1]] = rows
+    return records.tobytes(), padded.tobytes()
+
+
+def _rodrigues(gaussians: Gaussians) -> np.ndarray:
+    if gaussians.quats is None:
+        return np.zeros((gaussians.num, 3))
+    quats = gaussians.quats.double().numpy()
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    quats = np.where(norms > 0, quats / norms.clip(1e-300), [1.0, 0, 0, 0])
+    quats = np.where(quats[:, :1] < 0, -quats, quats)  # the same rotation
+    return quats[:, 1:] / (1 + quats[:, :1])
+
+
+def pack_mesh(mesh: Any, frame: Frame, name: str) -> tuple[bytes, int, int]:
+    """A mesh as float32 vertices, 8-bit RGBA of the vertices, and 32-bit corners of the faces.
+
+    Args:
+        mesh: has ``vertices [V, 3]``, ``faces [F, 3]`` and ``colors [V, 3]`` in [0, 1] or None.
+        frame: the viewer's frame.
+        name: named in errors.
+
+    Returns:
+        The bytes, V and F.
+
+    Raises:
+        UserError: a vertex is not finite, there are no faces, or a face names no vertex.
+    """
+    vertices = (np.asarray(mesh.vertices, np.float64) - frame.center) / frame.size
+    faces = np.asarray(mesh.faces, np.int64)
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise UserError(f"{name}: the mesh has no faces, or vertices that are not finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise UserError(f"{name}: a face names vertex {faces.max()} of {len(vertices)}")
+    rgba = np.full((len(vertices), 4), 255, np.uint8)
+    rgba[:, :3] = 190 if mesh.colors is None else to_uint8(np.asarray(mesh.colors)[:, :3])
+    parts = vertices.astype("<f4"), rgba, faces.astype("<u4")
+    return b"".join(part.tobytes() for part in parts), len(vertices), len(faces)

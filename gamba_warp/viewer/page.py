@@ -1,0 +1,148 @@
+"""The viewer's page: one HTML document that fills the window and loads nothing."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
+from ..files import write_text
+from ..gaussians import Gaussians
+from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
+
+_PROGRAM = Path(__file__).parent / "program"
+_SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "ui", "main")  # as they need each other
+# The page may load only what is inlined in it. The worker that sorts is made of a text of the page.
+POLICY = (
+    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline'; worker-src blob:"
+)
+
+
+@dataclass
+class ViewerParts:
+    """What differs between two viewers, as texts that stand in HTML as they are.
+
+    Attributes:
+        object: JSON about the object and its cameras.
+        gaussians: the records of ``pack_gaussians``, base64.
+        harmonics: the coefficients, base64, or nothing.
+        mesh: ``pack_mesh``, base64, or nothing.
+    """
+
+    object: str
+    gaussians: str
+    harmonics: str
+    mesh: str
+
+
+def viewer_page(
+    title: str,
+    gaussians: Gaussians,
+    *,
+    mesh: Any = None,
+    camera: tuple[float, float, float] | None = None,
+    note: str = "",
+) -> str:
+    """The viewer of one object as a whole document, for a file or for the ``srcdoc`` of a frame.
+
+    Args:
+        title: name of the object.
+        gaussians: ``[N]`` with OpenCV's axes, in the frame of the reference camera.
+        mesh: the object's surface in the same frame, with ``vertices [V, 3]``, ``faces [F, 3]`` and
+            ``colors [V, 3]`` in [0, 1] or None; or no mesh.
+        camera: distance from the origin in object units, vertical field of view in degrees, and
+            elevation in degrees (by how much it looked down) of the input's camera, which is the
+            first view, and shown as lines. None: the object, of any size and anywhere, is looked at
+            from the front.
+        note: a few words below the title.
+
+    Raises:
+        UserError: a value is not finite, nothing can be seen, or the object has no extent.
+        ValueError: there is a batch dimension.
+    """
+    parts = viewer_parts(title, gaussians, mesh=mesh, camera=camera, note=note)
+    texts = {field.name: getattr(parts, field.name) for field in fields(parts)}
+    return _filled(program_page(title), texts)
+
+
+def write_viewer(path: str | Path, title: str, gaussians: Gaussians, **options: Any) -> None:
+    """Writes ``viewer_page`` to a file, atomically; arguments and errors as there.
+
+    Raises:
+        UserError: also where the file cannot be written.
+    """
+    write_text(path, viewer_page(title, gaussians, **options))
+
+
+def program_page(title: str = "") -> str:
+    """The document without an object: ``{{object}}`` and the like stand where its parts go."""
+    texts = {
+        "policy": POLICY,
+        "title": html.escape(title),
+        "style": (_PROGRAM / "viewer.css").read_text(encoding="utf-8"),
+        "script": "".join(
+            (_PROGRAM / f"{name}.js").read_text(encoding="utf-8") for name in _SCRIPTS
+        ),
+    }
+    return _filled((_PROGRAM / "viewer.html").read_text(encoding="utf-8"), texts)
+
+
+def viewer_parts(
+    title: str,
+    gaussians: Gaussians,
+    *,
+    mesh: Any = None,
+    camera: tuple[float, float, float] | None = None,
+    note: str = "",
+) -> ViewerParts:
+    """What fills the slots of ``program_page``; arguments and errors as for ``viewer_page``."""
+    seen = visible(gaussians, title)
+    frame = own_frame(seen, title) if camera is None else Frame(np.zeros(3), 1.0)
+    distance, fov, elevation = camera or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
+    home = {
+        "azimuth": 0.0,
+        "elevation": math.radians(elevation),
+        "distance": distance,
+        "target": [0.0, 0.0, 0.0],
+        "fov": fov,
+    }
+    records, harmonics = pack_gaussians(seen, frame)
+    surface, vertices, faces = (b"", 0, 0) if mesh is None else pack_mesh(mesh, frame, title)
+    about = {
+        "title": title,
+        "note": note,
+        "total": gaussians.num,
+        "count": seen.num,
+        "degree": seen.degree,
+        "vertices": vertices,
+        "faces": faces,
+        "home": home,
+        "input": None if camera is None else home,
+        "frame": {"center": frame.center.tolist(), "size": frame.size},
+    }
+    return ViewerParts(json_text(about), *map(_base64, (records, harmonics, surface)))
+
+
+def json_text(value: Any) -> str:
+    """JSON that can stand in a script element: no ``<`` ends it."""
+    return json.dumps(value).replace("<", "\\u003c")
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
+
+
+def _filled(template: str, texts: Mapping[str, str]) -> str:
+    """The slots filled at once, so that what looks like one in a text stays as it is."""
+    names = "|".join(texts)
+    return re.sub(r"\{\{(" + names + r")\}\}", lambda match: texts[match[1]], template)

@@ -1,0 +1,84 @@
+// Where one looks from: an orbit about a target, in the axes of cameras.py's orbit() (x right, y
+// down, z forward; azimuth and elevation 0 is the input's camera where it was level). If the input's
+// camera looked down by some degrees, the object's upright axis leans in its frame; `level` turns it
+// upright, so that the object turns about its own axis and the home view is still the input's.
+
+function axesOf(azimuth, elevation) {
+  const [sa, ca] = [Math.sin(azimuth), Math.cos(azimuth)];
+  const [se, ce] = [Math.sin(elevation), Math.cos(elevation)];
+  return [[ca, 0, sa], [se * sa, ce, -se * ca], [-sa * ce, se, ca * ce]];
+}
+
+class OrbitCamera {
+  constructor(home, fov) {
+    this.home = home;
+    this.half = Math.tan((fov * Math.PI) / 360);
+    this.level = axesOf(0, home.elevation);
+    this.goal = null;
+    Object.assign(this, this.copyOf(home));
+  }
+
+  copyOf({ azimuth, elevation, distance, target }) {
+    return { azimuth, elevation, distance, target: [...target] };
+  }
+
+  // Rows: the camera's right, down and forward, in the object's frame.
+  rotation(azimuth = this.azimuth, elevation = this.elevation) {
+    return axesOf(azimuth, elevation).map((row) =>
+      this.level.map((axis) => row[0] * axis[0] + row[1] * axis[1] + row[2] * axis[2]));
+  }
+
+  // The focal length in pixels; the field of view is that of the shorter side.
+  focal(width, height) {
+    return Math.min(width, height) / 2 / this.half;
+  }
+
+  position() {
+    const forward = this.rotation()[2];
+    return this.target.map((value, k) => value - this.distance * forward[k]);
+  }
+
+  // The unit ray through a point of the picture, in pixels from its middle.
+  ray(x, y, focal) {
+    const [right, down, forward] = this.rotation(), norm = Math.hypot(x, y, focal);
+    return [0, 1, 2].map((k) => (x * right[k] + y * down[k] + focal * forward[k]) / norm);
+  }
+
+  turn(dx, dy) {
+    this.goal = null;
+    this.azimuth -= dx;
+    this.elevation = Math.max(-1.55, Math.min(1.55, this.elevation + dy));
+  }
+
+  // By pixels of a picture of this focal length: what is at the target follows the pointer.
+  pan(dx, dy, focal) {
+    this.goal = null;
+    const [right, down] = this.rotation(), unit = this.distance / focal;
+    this.target = this.target.map((value, k) => value - unit * (dx * right[k] + dy * down[k]));
+  }
+
+  zoom(factor) {
+    this.goal = null;
+    this.distance = Math.max(0.02, Math.min(40, this.distance * factor));
+  }
+
+  // Goes there within `time` milliseconds; angles take the shorter way round.
+  go(where, now, time) {
+    const from = this.copyOf(this), to = this.copyOf({ ...from, ...where });
+    const turn = 2 * Math.PI;
+    from.azimuth = to.azimuth + ((((from.azimuth - to.azimuth + Math.PI) % turn) + turn) % turn) - Math.PI;
+    this.goal = { from, to, start: now, time };
+  }
+
+  // Moves on along the way; says whether anything moved.
+  step(now) {
+    if (!this.goal) return false;
+    const { from, to, start, time } = this.goal;
+    const t = time > 0 ? Math.max(0, Math.min(1, (now - start) / time)) : 1, s = t * t * (3 - 2 * t);
+    for (const name of ["azimuth", "elevation"]) this[name] = from[name] + s * (to[name] - from[name]);
+    this.distance = from.distance * (to.distance / from.distance) ** s;
+    this.target = from.target.map((value, k) => value + s * (to.target[k] - value));
+    if (t === 1) this.goal = null;
+    return true;
+  }
+}

@@ -1,0 +1,209 @@
+// Drawing: the object into a picture of any size, and that picture onto the canvas. A picture that
+// is drawn in several pieces, over several frames, does not show until it is complete.
+
+const ROW = 1024; // Gaussians in a row of the texture: pack.py's records, two texels each
+const TEXELS = [0, 2, 3, 6]; // of the harmonics, by degree
+
+function glProgram(gl, vertex, fragment, attributes = []) {
+  const program = gl.createProgram();
+  for (const [type, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  attributes.forEach((name, place) => gl.bindAttribLocation(program, place, name));
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
+    const logs = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader));
+    throw new Error([gl.getProgramInfoLog(program), ...logs].join("\n"));
+  }
+  const places = {};
+  const set = (name, kind, ...values) => {
+    if (!(name in places)) places[name] = gl.getUniformLocation(program, name);
+    gl[`uniform${kind}`](places[name], ...values);
+  };
+  return { program, set };
+}
+
+class Renderer {
+  constructor(gl, count, degree) {
+    Object.assign(this, { gl, count, degree, ordered: 0, width: 0, height: 0 });
+    this.splats = glProgram(gl, SPLAT_VERTEX, SPLAT_FRAGMENT, ["corner", "index"]);
+    this.points = glProgram(gl, POINT_VERTEX, POINT_FRAGMENT);
+    this.surface = glProgram(gl, MESH_VERTEX, MESH_FRAGMENT, ["vertex", "normal", "paint"]);
+    this.shown = glProgram(gl, PRESENT_VERTEX, PRESENT_FRAGMENT);
+    this.rows = Math.ceil(count / ROW);
+    this.harmonicRows = Math.ceil((count * TEXELS[degree]) / 2048);
+    this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.records = this.table(0, this.rows);
+    this.harmonics = this.table(1, this.harmonicRows);
+    this.empty = gl.createVertexArray();
+    this.makeSplats();
+    this.makeTarget();
+  }
+
+  fits() {
+    return Math.max(this.rows, this.harmonicRows) <= this.most;
+  }
+
+  table(unit, rows) {
+    const { gl } = this, texture = gl.createTexture();
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2048, Math.max(1, Math.min(rows, this.most)));
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+      gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    return texture;
+  }
+
+  makeSplats() {
+    const { gl } = this;
+    this.quads = gl.createVertexArray();
+    gl.bindVertexArray(this.quads);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+    this.order = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribDivisor(1, 1);
+    gl.bindVertexArray(null);
+  }
+
+  makeTarget() {
+    const { gl } = this;
+    this.frame = gl.createFramebuffer();
+    this.depth = gl.createRenderbuffer();
+    this.picture = gl.createTexture();
+    gl.activeTexture(gl.TEXTURE2);
+    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+      gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T])
+      gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+  }
+
+  // Some rows of a table of words, of `unit` 0 the records, 1 the harmonics; the last row is filled up.
+  upload(unit, words, first, rows) {
+    const { gl } = this, size = 2048 * 4;
+    let part = words.subarray(first * size, (first + rows) * size);
+    if (part.length < rows * size) {
+      const filled = new Uint32Array(rows * size);
+      filled.set(part);
+      part = filled;
+    }
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, 2048, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, part);
+  }
+
+  setOrder(order) {
+    const { gl } = this;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
+    this.ordered = order.length;
+  }
+
+  setMesh({ vertices, normals, colours, faces }) {
+    const { gl } = this;
+    this.meshArray = gl.createVertexArray();
+    gl.bindVertexArray(this.meshArray);
+    for (const [place, values, size] of [[0, vertices, 3], [1, normals, 3], [2, colours, 4]]) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(place);
+      const bytes = values instanceof Uint8Array;
+      gl.vertexAttribPointer(place, size, bytes ? gl.UNSIGNED_BYTE : gl.FLOAT, bytes, 0, 0);
+    }
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    this.corners = faces.length;
+  }
+
+  // The picture has the canvas's size; a part of it is used while it is drawn smaller.
+  resize(width, height) {
+    if (width === this.width && height === this.height) return;
+    const { gl } = this;
+    Object.assign(this, { width, height });
+    gl.activeTexture(gl.TEXTURE2);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+    gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
+  }
+
+  // Draws one piece: Gaussians `from` to `to` of the order, or all of the centres or of the mesh.
+  draw(mode, camera, scale, from, to) {
+    const { gl } = this;
+    const width = Math.max(1, Math.round(this.width * scale)), height = Math.max(1, Math.round(this.height * scale));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
+    gl.viewport(0, 0, width, height);
+    if (from === 0) {
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    }
+    const { program, set } = { gaussians: this.splats, centres: this.points, mesh: this.surface }[mode];
+    gl.useProgram(program);
+    const rows = camera.rotation();
+    set("view", "Matrix3fv", false, [0, 1, 2].flatMap((k) => rows.map((row) => row[k])));
+    set("eye", "3fv", camera.position());
+    set("size", "2f", width, height);
+    set("focal", "1f", camera.focal(width, height));
+    if (mode !== "mesh") {
+      set("records", "1i", 0);
+      set("harmonics", "1i", 1);
+      set("degree", "1i", this.degree);
+    }
+    if (mode === "gaussians") this.drawSplats(from, to);
+    else this.drawSolid(mode, set, height);
+    this.part = [width / this.width, height / this.height];
+  }
+
+  drawSplats(from, to) {
+    const { gl } = this;
+    gl.disable(gl.DEPTH_TEST);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.quads);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 4 * from);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, to - from);
+    gl.bindVertexArray(null);
+    gl.disable(gl.BLEND);
+  }
+
+  drawSolid(mode, set, height) {
+    const { gl } = this;
+    gl.enable(gl.DEPTH_TEST);
+    if (mode === "mesh") {
+      gl.bindVertexArray(this.meshArray);
+      gl.drawElements(gl.TRIANGLES, this.corners, gl.UNSIGNED_INT, 0);
+    } else {
+      set("dot_size", "1f", Math.max(1.5, height / 260));
+      gl.bindVertexArray(this.empty);
+      gl.drawArrays(gl.POINTS, 0, this.count);
+    }
+    gl.bindVertexArray(null);
+    gl.disable(gl.DEPTH_TEST);
+  }
+
+  // Puts the picture onto the canvas.
+  present(background) {
+    const { gl } = this, { program, set } = this.shown;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.width, this.height);
+    gl.useProgram(program);
+    set("picture", "1i", 2);
+    set("part", "2fv", this.part);
+    set("limit", "2f", this.part[0] - 0.5 / this.width, this.part[1] - 0.5 / this.height);
+    set("background", "3fv", background);
+    gl.bindVertexArray(this.empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindVertexArray(null);
+  }
+}

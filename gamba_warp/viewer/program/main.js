@@ -1,0 +1,280 @@
+// The viewer: loads the object, and draws when something has changed. While it moves, it draws as
+// sharply and as completely as a frame's time allows; once it rests, everything at full size.
+
+const SETTLE = 160; // milliseconds after the last motion
+const TARGET = 26; // milliseconds that a frame may take while it moves
+const PIECE = 131072; // Gaussians that are drawn at once at rest
+const LEAST = { scale: 0.3, count: 40000 };
+
+class Viewer {
+  constructor(canvas, about) {
+    Object.assign(this, { canvas, about, mode: "gaussians", showInput: true });
+    this.camera = new OrbitCamera(about.home, about.home.fov);
+    this.sharp = 1; // share of the canvas's size, while it moves
+    this.some = about.count; // Gaussians that are drawn while it moves
+    this.changed = this.asked = -Infinity;
+    this.sortedFor = this.askedFor = null;
+    this.waiting = [];
+    this.picks = new Map();
+    this.stats = { frames: 0, sorts: 0, cost: 0 };
+    this.act = {
+      turn: (dx, dy) => this.moving(() => this.camera.turn(...[dx, dy].map((d) => d * this.perPixel()))),
+      pan: (dx, dy) => this.moving(() => this.camera.pan(dx, dy, this.camera.focal(...this.shownSize()))),
+      zoom: (factor) => this.moving(() => this.camera.zoom(factor)),
+      focus: (x, y) => this.focus(x, y),
+    };
+    this.act.keys = startButtons(this, about);
+    this.send = startSorter((message) => this[message.kind](message));
+  }
+
+  perPixel() {
+    return Math.PI / Math.max(240, Math.min(...this.shownSize()));
+  }
+
+  shownSize() {
+    return [this.canvas.clientWidth || 1, this.canvas.clientHeight || 1];
+  }
+
+  start() {
+    const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" });
+    if (!gl) return say("It needs WebGL2 to show the object in 3D.", "This browser cannot show it");
+    this.gl = gl;
+    this.renderer = new Renderer(gl, this.about.count, this.about.degree);
+    if (!this.renderer.fits()) return say("It has more Gaussians than this graphics card takes.", "Too many");
+    const text = (name) => {
+      const element = byId(name), found = element ? element.textContent.trim() : "";
+      element?.remove(); // the text may be large, and is not needed any more
+      return found;
+    };
+    const { vertices, faces } = this.about;
+    this.send({ kind: "load", gaussians: text("gaussians"), harmonics: text("harmonics"), mesh: text("mesh"), vertices, faces });
+    takeHands(this.canvas, this.act);
+    this.canvas.addEventListener("webglcontextlost", () => {
+      this.renderer = null;
+      say("The graphics card was needed elsewhere. Load the page again to go on.", "Stopped");
+    });
+    new ResizeObserver(() => this.redraw()).observe(this.canvas);
+  }
+
+  // Words from the sorter: everything is unpacked. It goes to the card in pieces, one a frame.
+  loaded({ records, harmonics, mesh }) {
+    const { renderer } = this, parts = [];
+    const cut = (unit, words, rows) => {
+      for (let row = 0; row < rows; row += 128)
+        parts.push(() => renderer.upload(unit, words, row, Math.min(128, rows - row)));
+    };
+    cut(0, new Uint32Array(records), renderer.rows);
+    if (this.about.degree) cut(1, new Uint32Array(harmonics), renderer.harmonicRows);
+    if (mesh) parts.push(() => renderer.setMesh(mesh));
+    const next = () => {
+      parts.shift()();
+      if (parts.length) return requestAnimationFrame(next);
+      this.ready = true;
+      this.redraw();
+    };
+    next();
+  }
+
+  sorted({ buffer, used, id }) {
+    if (!this.renderer) return;
+    this.renderer.setOrder(new Uint32Array(buffer, 0, used));
+    this.spare = buffer;
+    this.sortedFor = id;
+    this.askedFor = null;
+    this.stats.sorts++;
+    this.finished = false;
+    this.progress = 0;
+    this.schedule();
+  }
+
+  picked({ depth, id }) {
+    this.picks.get(id)(depth);
+    this.picks.delete(id);
+  }
+
+  moving(change) {
+    change();
+    this.redraw();
+  }
+
+  redraw() {
+    this.changed = performance.now();
+    this.finished = false;
+    this.progress = 0;
+    this.schedule();
+  }
+
+  schedule() {
+    if (this.scheduled) return;
+    this.scheduled = true;
+    requestAnimationFrame((now) => {
+      this.scheduled = false;
+      if (this.ready && this.renderer) this.frame(now);
+    });
+  }
+
+  // Whether the card has drawn what it was last asked to draw.
+  idle(now) {
+    if (!this.fence) return true;
+    const { gl } = this, state = gl.clientWaitSync(this.fence, 0, 0);
+    if (state === gl.TIMEOUT_EXPIRED && now - this.asked < 4000) return false;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    this.stats.cost = now - this.asked;
+    if (this.fast) this.adapt(this.stats.cost);
+    return true;
+  }
+
+  ask(now, fast) {
+    this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.gl.flush();
+    this.asked = now;
+    this.fast = fast;
+  }
+
+  // First fewer pixels, then fewer Gaussians (those that cover least are last); back the other way.
+  adapt(cost) {
+    const step = Math.max(0.7, Math.min(1.12, Math.sqrt(TARGET / cost)));
+    const { count } = this.about;
+    if (step < 0.98) {
+      if (this.sharp > LEAST.scale) this.sharp = Math.max(LEAST.scale, this.sharp * step);
+      else if (cost > 2 * TARGET) this.some = Math.max(Math.min(count, LEAST.count), Math.round(this.some * step));
+    } else if (step > 1.02) {
+      if (this.some < count) this.some = Math.min(count, Math.round(this.some * 1.2));
+      else this.sharp = Math.min(1, this.sharp * 1.08);
+    }
+  }
+
+  frame(now) {
+    if (!this.idle(now)) return this.schedule();
+    if (this.camera.step(now)) this.changed = now;
+    const ratio = Math.min(2, window.devicePixelRatio || 1);
+    const [width, height] = this.shownSize().map((side) => Math.round(side * ratio));
+    const { canvas, renderer } = this;
+    if (canvas.width !== width || canvas.height !== height) {
+      Object.assign(canvas, { width, height });
+      renderer.resize(width, height);
+      this.progress = 0;
+      this.changed = now;
+    }
+    const fast = now - this.changed < SETTLE && this.shownOnce;
+    const ordered = this.sortNow(fast ? this.some : this.about.count);
+    if (fast) {
+      if (renderer.ordered || this.mode !== "gaussians") {
+        renderer.draw(this.mode, this.camera, this.sharp, 0, Math.min(this.some, renderer.ordered));
+        this.show(now, true);
+      }
+      this.finished = false;
+      this.progress = 0;
+    } else if (!this.finished && ordered) this.drawRest(now);
+    if (fast || (!this.finished && ordered)) this.schedule();
+  }
+
+  // One more piece of the picture at full size.
+  drawRest(now) {
+    const { renderer } = this, all = this.mode === "gaussians" ? renderer.ordered : 1;
+    const to = Math.min(all, this.progress + PIECE);
+    renderer.draw(this.mode, this.camera, 1, this.progress, to);
+    this.progress = to;
+    if (to < all) return this.ask(now, false);
+    this.show(now, false);
+    this.finished = true;
+    if (!this.shownOnce) say("");
+    this.shownOnce = true;
+    for (const resolve of this.waiting.splice(0)) resolve();
+  }
+
+  show(now, fast) {
+    this.renderer.present(background());
+    this.ask(now, fast);
+    this.stats.frames++;
+    const { input } = this.about, visible = input && this.showInput;
+    byId("lines").firstElementChild.setAttribute("d", visible ? inputLines(input, this.camera, ...this.shownSize()) : "");
+  }
+
+  // Asks for the order that belongs to the camera; says whether it is there already.
+  sortNow(wanted) {
+    if (this.mode !== "gaussians") return true;
+    const forward = this.camera.rotation()[2], id = [...forward, wanted].join();
+    if (this.sortedFor === id) return true;
+    if (this.askedFor === null) {
+      this.askedFor = id;
+      const buffer = this.spare;
+      this.spare = null;
+      this.send({ kind: "sort", forward, wanted, buffer, id }, buffer ? [buffer] : []);
+    }
+    return false;
+  }
+
+  setMode(mode) {
+    if (mode === "mesh" && !this.about.faces) return;
+    this.mode = mode;
+    for (const button of document.querySelectorAll("[data-mode]"))
+      button.setAttribute("aria-pressed", button.dataset.mode === mode);
+    this.redraw();
+  }
+
+  toggleInput() {
+    if (!this.about.input) return;
+    this.showInput = !this.showInput;
+    byId("do-input").setAttribute("aria-pressed", this.showInput);
+    this.redraw();
+  }
+
+  travel(where) {
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.camera.go(where, performance.now(), still ? 0 : 320);
+    this.redraw();
+  }
+
+  goHome() {
+    this.travel(this.about.home);
+  }
+
+  // The point below comes to the middle, and a little nearer.
+  async focus(x, y) {
+    const [width, height] = this.shownSize(), { camera } = this, focal = camera.focal(width, height);
+    const origin = camera.position(), ray = camera.ray(x - width / 2, y - height / 2, focal);
+    const id = Math.random();
+    const depth = await new Promise((resolve) => {
+      this.picks.set(id, resolve);
+      this.send({ kind: "pick", origin, ray, mode: this.mode, width: 4 / focal, id });
+    });
+    if (depth === null) return;
+    this.travel({ target: origin.map((value, k) => value + depth * ray[k]), distance: Math.max(0.1, 0.8 * camera.distance) });
+  }
+
+  // Resolves when the picture of the camera as it is now is complete.
+  rest() {
+    this.schedule();
+    return new Promise((resolve) => {
+      if (this.finished && !this.camera.goal && this.ready) resolve();
+      else this.waiting.push(resolve);
+    });
+  }
+
+  async save() {
+    await this.rest();
+    this.renderer.present(background());
+    savePicture(this.canvas, this.about.title);
+  }
+
+  // For programs: a picture of the canvas, as an address.
+  async png() {
+    await this.rest();
+    this.renderer.present(background());
+    return this.canvas.toDataURL("image/png");
+  }
+
+  // For programs: azimuth and elevation in radians, distance, target; those left out stay.
+  setCamera(where) {
+    this.camera.go(where, 0, 0);
+    this.camera.step(1);
+    this.redraw();
+  }
+}
+
+const about = JSON.parse(byId("object").textContent);
+dressPage(about);
+window.gambaViewer = new Viewer(byId("canvas"), about);
+window.gambaViewer.start();

@@ -1,0 +1,112 @@
+// What is around the picture: buttons, the help, the input's camera as lines, messages.
+
+const STEP = 26; // pixels of a drag that an arrow key is worth
+
+const byId = (name) => document.getElementById(name);
+
+function dressPage(about) {
+  document.title = about.title;
+  byId("name").textContent = about.title;
+  const parts = [`${about.total.toLocaleString("en")} Gaussian${about.total === 1 ? "" : "s"}`];
+  if (about.faces) parts.push(`${about.faces.toLocaleString("en")} faces`);
+  if (about.note) parts.push(about.note);
+  byId("about").textContent = parts.join(" · ");
+  document.querySelector("[data-mode=mesh]").hidden = !about.faces;
+  byId("do-input").hidden = !about.input;
+  byId("do-full").hidden = !document.fullscreenEnabled;
+}
+
+function say(text, title = "") {
+  byId("message").hidden = !text;
+  byId("message-title").textContent = title;
+  byId("message-text").textContent = text;
+}
+
+// Light or dark: what the system says, until somebody chooses.
+function startTheme(changed) {
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  const set = (dark) => {
+    document.documentElement.dataset.theme = dark ? "dark" : "light";
+    changed();
+  };
+  set(system.matches);
+  system.addEventListener("change", () => set(system.matches));
+  return () => set(document.documentElement.dataset.theme !== "dark");
+}
+
+function background() {
+  const text = getComputedStyle(document.documentElement).getPropertyValue("--stage").trim();
+  return [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16) / 255);
+}
+
+function toggleFull() {
+  const done = document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen();
+  done.catch(() => say("This browser does not let the page fill the screen."));
+}
+
+function toggleHelp() {
+  const help = byId("help");
+  if (help.open) help.close();
+  else help.showModal();
+}
+
+// The input's camera: its eye, and the rectangle through which it saw, as a path of an SVG.
+function inputLines(input, camera, width, height) {
+  const rows = axesOf(0, 0), half = Math.tan((input.fov * Math.PI) / 360), depth = 0.3 * input.distance;
+  const eye = [0, 1, 2].map((k) => input.target[k] - input.distance * rows[2][k]);
+  const corner = (x, y, z) => [0, 1, 2].map((k) => eye[k] + z * (half * (x * rows[0][k] + y * rows[1][k]) + rows[2][k]));
+  const [a, b, c, d] = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) => corner(x, y, depth));
+  const up = [corner(-0.35, -1.08, depth), corner(0, -1.5, depth), corner(0.35, -1.08, depth)];
+  const lines = [[eye, a], [eye, b], [eye, c], [eye, d], [a, b], [b, c], [c, d], [d, a],
+    [up[0], up[1]], [up[1], up[2]], [up[2], up[0]]];
+  return lines.map(([p, q]) => projectedLine(p, q, camera, width, height)).join("");
+}
+
+function projectedLine(p, q, camera, width, height) {
+  const rows = camera.rotation(), eye = camera.position(), near = 0.02, focal = camera.focal(width, height);
+  let [m, n] = [p, q].map((point) => rows.map((row) =>
+    row.reduce((sum, value, k) => sum + value * (point[k] - eye[k]), 0)));
+  if (m[2] < near && n[2] < near) return "";
+  const cut = (from, to) => from.map((value, k) => value + ((near - from[2]) / (to[2] - from[2])) * (to[k] - value));
+  if (m[2] < near) m = cut(m, n);
+  if (n[2] < near) n = cut(n, m);
+  const [a, b] = [m, n].map((v) =>
+    `${(width / 2 + (focal * v[0]) / v[2]).toFixed(1)} ${(height / 2 + (focal * v[1]) / v[2]).toFixed(1)}`);
+  return `M${a}L${b}`;
+}
+
+function savePicture(canvas, name) {
+  canvas.toBlob((blob) => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(blob);
+    link.download = `${name.replace(/[^\p{L}\p{N}._-]+/gu, "-") || "view"}.png`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+  }, "image/png");
+}
+
+// Buttons and keys; `viewer` does what they ask for.
+function startButtons(viewer, about) {
+  const toggleTheme = startTheme(() => viewer.redraw());
+  const press = {
+    home: () => viewer.goHome(), input: () => viewer.toggleInput(), theme: toggleTheme,
+    picture: () => viewer.save(), help: toggleHelp, full: toggleFull,
+  };
+  for (const [name, action] of Object.entries(press)) byId(`do-${name}`).onclick = action;
+  const modes = [...document.querySelectorAll("[data-mode]")];
+  for (const button of modes) button.onclick = () => viewer.setMode(button.dataset.mode);
+  byId("help").onclick = (event) => event.target === byId("help") && byId("help").close();
+  byId("help-close").onclick = () => byId("help").close();
+  const turn = (x, y) => () => viewer.act.turn(x * STEP, y * STEP);
+  const pan = (x, y) => () => viewer.act.pan(x * STEP, y * STEP);
+  const zoom = (factor) => () => viewer.act.zoom(factor);
+  return {
+    ArrowLeft: turn(-1, 0), ArrowRight: turn(1, 0), ArrowUp: turn(0, -1), ArrowDown: turn(0, 1),
+    "Shift+ArrowLeft": pan(-1, 0), "Shift+ArrowRight": pan(1, 0),
+    "Shift+ArrowUp": pan(0, -1), "Shift+ArrowDown": pan(0, 1),
+    "+": zoom(0.9), "=": zoom(0.9), "-": zoom(1 / 0.9), _: zoom(1 / 0.9),
+    1: () => viewer.setMode("gaussians"), 2: () => viewer.setMode("centres"), 3: () => viewer.setMode("mesh"),
+    r: press.home, Home: press.home, c: press.input, l: press.theme, s: press.picture,
+    f: () => document.fullscreenEnabled && toggleFull(), h: toggleHelp, "?": toggleHelp,
+  };
+}

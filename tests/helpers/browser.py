@@ -1,0 +1,90 @@
+"""Pages in a headless Chromium, driven by Playwright, with WebGL in software.
+
+Tests that open a page take the fixture ``browser_page``; where Chromium or Playwright is missing,
+they are skipped, and the reason names what is.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# A page must look the same on every machine: SwiftShader draws it, and nothing asks the network.
+FLAGS = (
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+
+@dataclass
+class Opened:
+    """A page and what it complained of.
+
+    Attributes:
+        page: Playwright's page.
+        messages: warnings and errors of its console, and errors that nothing caught.
+    """
+
+    page: Any
+    messages: list[str] = field(default_factory=list)
+
+    def fingers(self, kind: str, *points: tuple[float, float]) -> None:
+        """Sends one touch event, ``touchStart``, ``touchMove`` or ``touchEnd``, of all fingers."""
+        if not hasattr(self, "_devtools"):
+            self._devtools = self.page.context.new_cdp_session(self.page)
+        places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        self._devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A headless Chromium for the tests of one file."""
+    program = next(filter(None, map(shutil.which, NAMES)), None)
+    if program is None:
+        pytest.skip(f"needs a browser: none of {', '.join(NAMES)} is installed")
+    library = pytest.importorskip("playwright.sync_api", reason="needs playwright, which is missing")
+    with library.sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=program, args=list(FLAGS))
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def browser_page(browser) -> Iterator[Callable[..., Opened]]:
+    """Opens pages: ``browser_page(file or address, width=640, height=480, **options)``.
+
+    The options are those of Playwright's ``new_context``, such as ``has_touch`` and
+    ``color_scheme``. All pages are closed after the test.
+    """
+    contexts = []
+
+    def opened(place: Path | str, width: int = 640, height: int = 480, **options: Any) -> Opened:
+        context = browser.new_context(viewport={"width": width, "height": height}, **options)
+        contexts.append(context)
+        context.set_default_timeout(30_000)
+        result = Opened(context.new_page())
+        result.page.on(
+            "console",
+            lambda message: (
+                message.type in ("warning", "error") and result.messages.append(message.text)
+            ),
+        )
+        result.page.on("pageerror", lambda error: result.messages.append(str(error)))
+        result.page.goto(place.resolve().as_uri() if isinstance(place, Path) else place)
+        return result
+
+    yield opened
+    for context in contexts:
+        context.close()
