@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import atomic_path
-from ..gaussians import Gaussians
-from ..images import to_uint8
-from .ply import export_arrays
+from ...files import atomic_path
+from ...gaussians import Gaussians
+from ...images import to_uint8
+from ..ply import export_arrays
 
 RECORD = np.dtype(
     [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import atomic_path
-from ..gaussians import SH_C0, Gaussians
-from ..versions import __version__
-from .ply import export_arrays
+from ...files import atomic_path
+from ...gaussians import SH_C0, Gaussians
+from ...versions import __version__
+from ..ply import export_arrays
 
 _EXTENSION = "KHR_gaussian_splatting"
 _FLOAT = 5126
