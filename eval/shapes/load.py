@@ -17,6 +17,7 @@ from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind
 from gamba_warp.formats.headers import open_shape
 from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
 from gamba_warp.formats.meshes import Y_TO_Z_UP, default_up, load_mesh
+from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.formats.ply_header import read_ply_header
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import extract_surface
@@ -27,8 +28,7 @@ from .protocol import GeometryProtocol
 from .shape import Mesh, Points, Shape, Similarity
 
 CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
-SPLAT_SUFFIXES = (".splat", ".spz")  # a .ply and a .glb may hold Gaussians, too
-SUFFIXES = (*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)
+SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)))
 HUGE = 1e18  # the squares of larger coordinates overflow float32
 ROUNDED = 1e-3  # how far the rotations of a catalogue, texts of few digits, may be from one
 FAR = 1e6  # units of the truth's longest side; farther out float32 holds nothing of a shape
@@ -168,9 +168,8 @@ def load_shape(path: Path) -> Shape:
         raise UserError(f"{path}: not one of {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
-    mixed = suffix in (".ply", ".glb")
     shape: Shape
-    if suffix in SPLAT_SUFFIXES or (mixed and splat_kind(path) is not None):
+    if suffix in SPLAT_SUFFIXES and splat_kind(path) is not None:
         shape = read_gaussians(path)
     elif suffix in CLOUD_SUFFIXES or (suffix == ".ply" and not _has_faces(path)):
         shape = _load_points(path)
