@@ -13,10 +13,11 @@ import numpy as np
 
 from gamba_warp.errors import UserError
 from gamba_warp.formats.clouds import read_cloud
+from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind
 from gamba_warp.formats.headers import open_shape
 from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
 from gamba_warp.formats.meshes import Y_TO_Z_UP, default_up, load_mesh
-from gamba_warp.formats.ply import load_ply
+from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.formats.ply_header import read_ply_header
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import extract_surface
@@ -27,7 +28,7 @@ from .protocol import GeometryProtocol
 from .shape import Mesh, Points, Shape, Similarity
 
 CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
-SUFFIXES = (*MESH_SUFFIXES, *CLOUD_SUFFIXES)
+SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)))
 HUGE = 1e18  # the squares of larger coordinates overflow float32
 ROUNDED = 1e-3  # how far the rotations of a catalogue, texts of few digits, may be from one
 FAR = 1e6  # units of the truth's longest side; farther out float32 holds nothing of a shape
@@ -153,7 +154,7 @@ def _evaluated(
 
 
 def load_shape(path: Path) -> Shape:
-    """Reads Gaussians (3DGS ``.ply``), a mesh, or a point cloud, by what the file holds.
+    """Reads Gaussians, a mesh, or a point cloud, by what the file holds.
 
     The counts that the file's header states are compared with its size first, so that a false
     header costs no memory; no native library sees the file's bytes.
@@ -167,11 +168,10 @@ def load_shape(path: Path) -> Shape:
         raise UserError(f"{path}: not one of {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
-    kind = _ply_kind(path) if suffix == ".ply" else "mesh"
     shape: Shape
-    if kind == "gaussians":
-        shape = load_ply(path)
-    elif kind == "points" or suffix in CLOUD_SUFFIXES:
+    if suffix in SPLAT_SUFFIXES and splat_kind(path) is not None:
+        shape = read_gaussians(path)
+    elif suffix in CLOUD_SUFFIXES or (suffix == ".ply" and not _has_faces(path)):
         shape = _load_points(path)
     else:
         mesh = load_mesh(path)
@@ -182,15 +182,11 @@ def load_shape(path: Path) -> Shape:
     return shape
 
 
-def _ply_kind(path: Path) -> str:
-    """What a ``.ply`` holds, by its header: "gaussians", "mesh" or "points"."""
+def _has_faces(path: Path) -> bool:
+    """Whether a ``.ply`` says in its header that it has faces."""
     with open_shape(path) as (file, _):
         elements = read_ply_header(path, file).elements
-    if any(element.name == "face" and element.count for element in elements):
-        return "mesh"
-    properties = {item.name for element in elements for item in element.properties}
-    # One is enough, so that a file that lacks the others is not taken for a point cloud.
-    return "gaussians" if {"opacity", "scale_0", "rot_0", "f_dc_0"} & properties else "points"
+    return any(element.name == "face" and element.count for element in elements)
 
 
 def _load_points(path: Path) -> Points:

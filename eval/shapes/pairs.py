@@ -23,6 +23,7 @@ from gamba_warp.files import output_folder, sha256, visible, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
 from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
 from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
+from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.versions import __version__, installed
 
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
     from .shape import Similarity
 
-SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES)))
+SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)))
 PAIR_SECONDS = 3600.0  # a pair takes seconds, the slowest protocol on a huge shape minutes
 PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch")
 # entries of the records that have no meaningful mean

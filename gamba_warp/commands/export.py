@@ -12,7 +12,7 @@ from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
-from ..formats.names import ExportFormat, MeshFormat
+from ..formats.names import MeshFormat, SplatFormat
 from ..surfaces.options import (
     Faces,
     Holes,
@@ -32,7 +32,9 @@ def export_command(
     /,
     out: Path = Path("out"),
     mesh: tuple[MeshFormat, ...] = ("glb",),
-    formats: tuple[ExportFormat, ...] = (),
+    splats: tuple[SplatFormat, ...] = (),
+    page: bool = False,
+    turntable: Literal["gif", "mp4", "none"] = "none",
     surface: Literal["tsdf", "density"] = "tsdf",
     voxels: Voxels = 128,
     views: Views = 64,
@@ -51,14 +53,16 @@ def export_command(
 ) -> int:
     """Turns files of Gaussians into meshes, other splat formats, pages and turntables.
 
-    Meshes are NAME-mesh.FORMAT, all else is NAME.FORMAT; files of that name are
-    replaced, but never one that is read.
+    Meshes are NAME-mesh.FORMAT, splats NAME.FORMAT (compressed-ply: NAME.compressed.ply); files
+    of that name are replaced, but never one that is read.
 
     Args:
-        inputs: Gaussians (.ply in the 3DGS layout), or folders of them.
+        inputs: Gaussians (.ply, .splat, .spz, .glb), or folders of them.
         out: Folder for the results.
         mesh: Files of the surface; give it without a value for none.
-        formats: Files of the Gaussians, a page with a 3D viewer, moving pictures of one turn.
+        splats: Files of the Gaussians.
+        page: Write an HTML page with a 3D viewer.
+        turntable: Moving picture of one turn.
         surface: Method: tsdf (fused depth of many views) or density (level set; fattens thin
             parts).
         voxels: Number of voxels along the object's longest side.
@@ -70,7 +74,7 @@ def export_command(
         min_component: Remove parts with a smaller share of the faces.
         largest: Keep the largest part only.
         smooth: Number of smoothing steps.
-        frame: Axes of all but .splat and .glb; opengl is y up, opencv y down as in the input.
+        frame: Axes of .ply, .obj and .stl files; opengl is y up, opencv y down as in the input.
         min_opacity: Leave out Gaussians fainter than this.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
@@ -80,8 +84,8 @@ def export_command(
 
     from ..pages.export import ExportJob, export, find_gaussians
 
-    if not mesh and not formats:
-        raise UserError("nothing to write: give --mesh or --formats")
+    if not mesh and not splats and not page and turntable == "none":
+        raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
     options = SurfaceOptions(
         method=surface,
         voxels=voxels,
@@ -98,7 +102,19 @@ def export_command(
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     chosen = pick_device(device)
-    job = ExportJob(out, mesh, formats, options, frame, min_opacity, size, frames, chosen)
+    job = ExportJob(
+        folder=out,
+        mesh=mesh,
+        splats=splats,
+        page=page,
+        turntable=turntable,
+        surface=options,
+        axes=frame,
+        min_opacity=min_opacity,
+        size=size,
+        frames=frames,
+        device=chosen,
+    )
     names = plan_outputs(files, job.suffixes(), out)
     output_folder(out)
 

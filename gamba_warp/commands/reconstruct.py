@@ -13,7 +13,7 @@ from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
-from ..formats.names import GaussianFormat, MeshFormat
+from ..formats.names import MeshFormat, SplatFormat
 from ..untrusted.ranges import Frames, Opacity, Side, ranged
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def reconstruct_command(
     checkpoint: Path | None = None,
     encoder_weights: Path | None = None,
     out: Path = Path("out"),
-    formats: tuple[GaussianFormat, ...] = ("ply",),
+    splats: tuple[SplatFormat, ...] = ("ply",),
     mesh: tuple[MeshFormat, ...] = (),
     turntable: Literal["gif", "mp4", "none"] = "gif",
     size: Side = 256,
@@ -47,7 +47,7 @@ def reconstruct_command(
         checkpoint: Trained model (.safetensors); the starter model if not given.
         encoder_weights: The image encoder's weights, where the model has a pretrained one.
         out: Folder for the results.
-        formats: Files of Gaussians to write.
+        splats: Files of Gaussians to write.
         mesh: Also files of a coloured mesh (gamba export has its options).
         turntable: Moving picture of one turn.
         size: Side of the turntable's frames in pixels.
@@ -72,7 +72,7 @@ def reconstruct_command(
     file = _file_of(checkpoint)
     outputs = Outputs(
         folder=out,
-        formats=formats,
+        splats=splats,
         mesh=mesh,
         turntable=turntable,
         size=size,

@@ -22,10 +22,10 @@ def view_command(
     port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
 ) -> None:
-    """Shows Gaussians (.ply) or a training run in a browser, as one HTML page without a network.
+    """Shows Gaussians or a training run in a browser, as one HTML page without a network.
 
     Args:
-        file: Gaussians in the 3DGS layout, or the folder of a training run.
+        file: Gaussians (.ply, .splat, .spz, .glb), or the folder of a training run.
         out: File for the page; a temporary file if not given.
         serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
         port: Port of --serve; 0 picks a free one.
@@ -34,13 +34,13 @@ def view_command(
     import tempfile
     import webbrowser
 
-    from ..formats.ply import load_ply
+    from ..formats.gaussians.files import read_gaussians
     from ..pages.export import write_page
     from ..pages.run import write_run_page
     from ..pages.serve import page_server
 
     check_not_read([] if out is None else [out], [file])
-    gaussians = None if file.is_dir() else load_ply(file)
+    gaussians = None if file.is_dir() else read_gaussians(file)
     if out is not None:
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"

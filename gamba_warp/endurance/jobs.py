@@ -167,7 +167,7 @@ def jobs(world: Path) -> list[Job]:
             "reconstruct",
             lambda out: [
                 *(world / "pictures", "--checkpoint", model, "--out", out, *small),
-                *("--formats", "ply", "splat", "glb", "--device", "cpu"),
+                *("--splats", "ply", "splat", "glb", "--device", "cpu"),
             ],
             ("--ply-frame", "opengl"),
         ),
@@ -175,8 +175,8 @@ def jobs(world: Path) -> list[Job]:
             "export",
             lambda out: [
                 *(world / "gaussians", "--out", out, "--voxels", 24, "--views", 8, "--pixels", 32),
-                *("--mesh", "glb", "ply", "--formats", "ply", "html", "gif", *small),
-                *("--device", "cpu"),
+                *("--mesh", "glb", "ply", "--splats", "ply", "--page", *small),
+                *("--turntable", "gif", "--device", "cpu"),
             ],
             ("--frame", "opencv"),
         ),

@@ -28,20 +28,25 @@ class _Buffer(msgspec.Struct):
     uri: str | None = None
 
 
-class _View(msgspec.Struct):
+class View(msgspec.Struct):
+    """A part of a buffer of a glTF document."""
+
     buffer: Count
     byteLength: Count
     byteOffset: Count = 0
     byteStride: Annotated[int, msgspec.Meta(ge=1, le=252)] | None = None
 
 
-class _Accessor(msgspec.Struct):
+class Accessor(msgspec.Struct):
+    """The numbers in a view of a glTF document."""
+
     count: Count
     componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
     bufferView: Count | None = None
     byteOffset: Count = 0
     sparse: Any = None
+    normalized: bool = False
 
     def row_bytes(self) -> int:
         """Bytes of one value."""
@@ -54,8 +59,8 @@ class _Gltf(msgspec.Struct):
     """The parts of a glTF document that say how many bytes are where."""
 
     buffers: list[_Buffer] = []
-    bufferViews: list[_View] = []
-    accessors: list[_Accessor] = []
+    bufferViews: list[View] = []
+    accessors: list[Accessor] = []
 
 
 @contextmanager
@@ -167,7 +172,18 @@ def _check_off(path: Path, file: BinaryIO, size: int) -> None:
         raise UserError(f"{path}: truncated or false header, {says}, but {found} lines follow")
 
 
-def _check_glb(path: Path, file: BinaryIO, size: int) -> None:
+def check_glb(path: Path, file: BinaryIO, size: int) -> None:
+    """Compares what a .glb file says it holds with its size.
+
+    Args:
+        path: named in errors.
+        file: at its start.
+        size: of the file, bytes.
+
+    Raises:
+        UserError: the file holds less or more than it says, or its header is broken.
+        struct.error, IndexError: likewise.
+    """
     magic, version, length = struct.unpack("<4sII", file.read(GLB_START))
     if magic != b"glTF":
         raise UserError(f"{path}: not a .glb file")
@@ -226,4 +242,4 @@ def _check_accessors(path: Path, tree: _Gltf) -> None:
         raise UserError(f"{path}: its accessors take {total >> 20} MB, over {MAX_FILE >> 20}")
 
 
-_CHECKS = {".stl": _check_stl, ".off": _check_off, ".glb": _check_glb, ".gltf": _check_gltf}
+_CHECKS = {".stl": _check_stl, ".off": _check_off, ".glb": check_glb, ".gltf": _check_gltf}

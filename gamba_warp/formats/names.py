@@ -1,8 +1,15 @@
-"""Names of the formats that are written: the suffixes of their files."""
+"""Names of the formats that are written, and the suffixes of their files."""
 
 from typing import Literal, get_args
 
-GaussianFormat = Literal["ply", "splat", "glb"]
+SplatFormat = Literal["ply", "splat", "spz", "glb", "compressed-ply"]
 MeshFormat = Literal["obj", "glb", "ply", "stl"]
-ExportFormat = Literal["ply", "splat", "glb", "html", "gif", "mp4"]  # with a page and turntables
+SPLAT_FORMATS: tuple[str, ...] = get_args(SplatFormat)
 MESH_FORMATS: tuple[str, ...] = get_args(MeshFormat)
+# What may hold Gaussians; .ply and .glb may hold a mesh as well.
+SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".glb")
+
+
+def splat_suffix(kind: str) -> str:
+    """What follows the name of a file of Gaussians: ``.ply``, or ``.compressed.ply``."""
+    return "." + kind.replace("-", ".")

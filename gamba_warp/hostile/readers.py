@@ -64,17 +64,17 @@ def _prepare(path: Path, out: Path) -> Any:
 
 
 def _gaussians(path: Path, out: Path) -> Any:
-    from ..formats.ply import load_ply
+    from ..formats.gaussians.files import read_gaussians
 
-    return load_ply(path)
+    return read_gaussians(path)
 
 
 def _view(path: Path, out: Path) -> Any:
-    from ..formats.ply import load_ply
+    from ..formats.gaussians.files import read_gaussians
     from ..pages.export import write_page
 
     page = out / "page.html"
-    write_page(page, path.stem, load_ply(path))
+    write_page(page, path.stem, read_gaussians(path))
     return page.read_text(encoding="utf-8")
 
 
@@ -276,12 +276,8 @@ def _only(seeds: Seeds, *names: str) -> Seeds:
     return lambda: {name: files for name, files in seeds().items() if name in names}
 
 
-def _gaussian_files() -> dict[str, Files]:
-    return {"gaussians": {"object.ply": shapes.gaussians_ply()}}
-
-
 def _folder_of_gaussians() -> dict[str, Files]:
-    data = shapes.gaussians_ply()
+    data = shapes.gaussians()
     return {"gaussians": {"a.ply": data, "b/c.ply": data}}
 
 
@@ -291,7 +287,7 @@ def _folder_of_pictures() -> dict[str, Files]:
 
 
 def _shapes() -> dict[str, Files]:
-    made = {**shapes.clouds(), **shapes.meshes(), **_gaussian_files()}
+    made = {**shapes.clouds(), **shapes.meshes(), **shapes.splats()}
     return {name: {file: data} for name, files in made.items() for file, data in _first(files)}
 
 
@@ -312,10 +308,10 @@ READERS: dict[str, Reader] = {
         Reader("picture-folder", _pictures, sound.each(sound.picture), _folder_of_pictures, 3,
                True),
         Reader("cut-out", _prepare, sound.cut_out, pictures.masked_pictures, 4),
-        Reader("gaussians", _gaussians, sound.gaussians, _gaussian_files),
+        Reader("gaussians", _gaussians, sound.gaussians, shapes.splats),
         Reader("gaussians-folder", _predictions, sound.each(sound.gaussians), _folder_of_gaussians,
                3, True),
-        Reader("view", _view, sound.page, _gaussian_files, 2),
+        Reader("view", _view, sound.page, shapes.splats, 2),
         Reader("mesh", _mesh, sound.mesh, shapes.meshes),
         Reader("shape", _shape, sound.shape, _shapes, 12),
         Reader("evaluation", _evaluation, sound.report, _shapes, 1),

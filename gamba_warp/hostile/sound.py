@@ -87,7 +87,8 @@ def cut_out(result: Any, path: Path, out: Path) -> str | None:
 
 def gaussians(result: Any, path: Path, out: Path) -> str | None:
     """Finite Gaussians with unit rotations and positive scales, as many as the file has."""
-    tensors = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
+    named = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
+    tensors = {name: value for name, value in named.items() if value is not None}
     for name, value in tensors.items():
         if not bool(value.isfinite().all()):
             return f"{name} are not finite"
@@ -95,7 +96,7 @@ def gaussians(result: Any, path: Path, out: Path) -> str | None:
         return "rotations of another length than 1"
     if not bool((result.scales >= 0).all()):
         return "negative scales"
-    for name in ("opacities", "colors"):
+    for name in ("opacities",) if "harmonics" in tensors else ("opacities", "colors"):
         if not bool(((tensors[name] >= 0) & (tensors[name] <= 1)).all()):
             return f"{name} outside [0, 1]"
     stated = re.search(rb"element\s+vertex\s+(\d+)", path.read_bytes()) if path.is_file() else None

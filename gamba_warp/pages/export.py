@@ -12,10 +12,8 @@ import torch
 
 from ..conventions import Axes
 from ..errors import UserError
-from ..formats.glb import save_glb
-from ..formats.names import ExportFormat, MeshFormat
-from ..formats.ply import load_ply, save_ply
-from ..formats.splat import save_splat
+from ..formats.gaussians.files import read_gaussians, write_gaussians
+from ..formats.names import SPLAT_SUFFIXES, MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..surfaces.extract import moved_to_unit, unit_frame
 from ..surfaces.files import write_meshes
@@ -31,7 +29,9 @@ class ExportJob:
     Attributes:
         folder: folder of the results.
         mesh: formats of the mesh.
-        formats: formats of the Gaussians, of pages and of turntables.
+        splats: formats of the Gaussians.
+        page: whether a page with a 3D viewer is written.
+        turntable: ``gif``, ``mp4`` or ``none``.
         surface: how the mesh is made.
         axes: axes of ``.ply, .obj, .stl``.
         min_opacity: fainter Gaussians are left out.
@@ -42,7 +42,9 @@ class ExportJob:
 
     folder: Path
     mesh: tuple[MeshFormat, ...]
-    formats: tuple[ExportFormat, ...]
+    splats: tuple[SplatFormat, ...]
+    page: bool
+    turntable: str
     surface: SurfaceOptions
     axes: Axes
     min_opacity: float
@@ -52,11 +54,14 @@ class ExportJob:
 
     def suffixes(self) -> list[str]:
         """What follows the name of an input in each of its files."""
-        return [f"-mesh.{kind}" for kind in self.mesh] + [f".{kind}" for kind in self.formats]
+        found = [f"-mesh.{kind}" for kind in self.mesh]
+        found += [splat_suffix(kind) for kind in self.splats]
+        found += [f".{self.turntable}"] if self.turntable != "none" else []
+        return found + ([".html"] if self.page else [])
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
-    """Files as they are given, each once; of a folder, the .ply files in it, sorted.
+    """Files as they are given, each once; of a folder, what may hold Gaussians in it, sorted.
 
     Names that begin with a dot are passed over: other programs hide files by it, and it marks what
     a killed command left unfinished.
@@ -70,7 +75,7 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
     files: dict[Path, None] = {}
     failures = []
     if not inputs:
-        raise UserError("give at least one .ply file or folder")
+        raise UserError("give at least one file of Gaussians (.ply, .splat, .spz, .glb) or folder")
     for path in inputs:
         if not path.is_dir():
             if path.exists():
@@ -78,10 +83,10 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
             else:
                 failures.append((path, "no such file"))
             continue
-        inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() == ".ply")
+        inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() in SPLAT_SUFFIXES)
         files.update(dict.fromkeys(inside))
         if not inside:
-            failures.append((path, "the folder holds no .ply files"))
+            failures.append((path, "the folder holds no .ply, .splat, .spz or .glb files"))
     return list(files), failures
 
 
@@ -99,39 +104,35 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     Raises:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
     """
-    gaussians = load_ply(path)
+    gaussians = read_gaussians(path)
     gaussians = gaussians.select(gaussians.opacities >= job.min_opacity)
     if gaussians.num == 0:
         raise UserError(f"no Gaussian has an opacity of {job.min_opacity:g} or more")
-    for kind in job.formats:
-        target = job.folder / f"{name}.{kind}"
-        if kind == "ply":
-            save_ply(target, gaussians, axes=job.axes)
-        elif kind in ("splat", "glb"):
-            {"splat": save_splat, "glb": save_glb}[kind](target, gaussians)
+    lost = []
+    for kind in job.splats:
+        target = job.folder / (name + splat_suffix(kind))
+        lost += [write_gaussians(target, gaussians, kind, axes=job.axes)]
     _write_pictures(name, gaussians, job)
     if not job.mesh:
-        return f"{name}: {gaussians.num:,} Gaussians"
+        return " ".join([f"{name}: {gaussians.num:,} Gaussians.", *filter(None, lost)])
     start = time.perf_counter()
     found = write_meshes(job.folder / name, gaussians, job.mesh, job.surface, job.axes, job.device)
     closed = "closed" if found.is_watertight() else "open"
     counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
-    return f"{name}: {counts}, {time.perf_counter() - start:.1f} s"
+    seconds = time.perf_counter() - start
+    return " ".join([f"{name}: {counts}, {seconds:.1f} s.", *filter(None, lost)])
 
 
 def _write_pictures(name: str, gaussians: Gaussians, job: ExportJob) -> None:
     """The page and the turntables, of the object at the origin with longest side 1."""
-    kinds = [kind for kind in job.formats if kind in ("html", "gif", "mp4")]
-    if not kinds:
+    if not job.page and job.turntable == "none":
         return
     moved = moved_to_unit(gaussians, *unit_frame(gaussians)).to(job.device)
     turn = turntable_frames(moved, size=job.size, frames=job.frames)
-    for kind in kinds:
-        target = job.folder / f"{name}.{kind}"
-        if kind == "html":
-            write_page(target, name, gaussians, turn)
-        else:
-            save_turntable(target, turn)
+    if job.turntable != "none":
+        save_turntable(job.folder / f"{name}.{job.turntable}", turn)
+    if job.page:
+        write_page(job.folder / f"{name}.html", name, gaussians, turn)
 
 
 def write_page(

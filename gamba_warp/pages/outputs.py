@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..conventions import Axes
-from ..formats.glb import save_glb
-from ..formats.names import GaussianFormat, MeshFormat
-from ..formats.ply import save_ply
-from ..formats.splat import save_splat
+from ..formats.gaussians.files import write_gaussians
+from ..formats.names import MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..model.config import GambaConfig
 from ..surfaces.files import write_meshes
@@ -28,7 +26,7 @@ class Outputs:
 
     Attributes:
         folder: folder of the results.
-        formats: formats of the Gaussians.
+        splats: formats of the Gaussians.
         mesh: formats of a mesh of the surface.
         turntable: ``gif``, ``mp4`` or ``none``.
         size: side of the turntable's frames, pixels.
@@ -42,7 +40,7 @@ class Outputs:
     """
 
     folder: Path
-    formats: tuple[GaussianFormat, ...]
+    splats: tuple[SplatFormat, ...]
     mesh: tuple[MeshFormat, ...]
     turntable: str
     size: int
@@ -56,7 +54,8 @@ class Outputs:
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
-        found = [f".{kind}" for kind in self.formats] + [f"-mesh.{kind}" for kind in self.mesh]
+        found = [splat_suffix(kind) for kind in self.splats]
+        found += [f"-mesh.{kind}" for kind in self.mesh]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
         return found + ([".html"] if self.page else [])
 
@@ -117,11 +116,9 @@ def write_outputs(
 
 
 def _write_gaussians(base: Path, gaussians: Gaussians, outputs: Outputs) -> None:
-    for kind in outputs.formats:
-        path, least = base.with_name(f"{base.name}.{kind}"), outputs.min_opacity
-        if kind == "ply":
-            note = f"from {base.name} by {outputs.checkpoint.name}"
-            save_ply(path, gaussians, axes=outputs.axes, min_opacity=least, comments=[note])
-        else:
-            save = {"splat": save_splat, "glb": save_glb}[kind]
-            save(path, gaussians, min_opacity=least)
+    comments = [f"from {base.name} by {outputs.checkpoint.name}"]
+    for kind in outputs.splats:
+        path, least = base.with_name(base.name + splat_suffix(kind)), outputs.min_opacity
+        write_gaussians(
+            path, gaussians, kind, axes=outputs.axes, min_opacity=least, comments=comments
+        )

@@ -15,7 +15,7 @@ from PIL import Image
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..files import write_text
-from ..formats.splat import splat_bytes
+from ..formats.gaussians.splat import splat_bytes
 from ..gaussians import Gaussians
 from ..images import to_uint8
 from .turntable import SECONDS

@@ -17,7 +17,7 @@ from gamba_warp.endurance.folders import age, contents, is_whole, leftovers, los
 from gamba_warp.endurance.jobs import jobs
 from gamba_warp.endurance.released import SIZES, make_released
 from gamba_warp.files import PART, output_folder
-from gamba_warp.formats.glb import save_glb
+from gamba_warp.formats.gaussians.glb import save_glb
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 

@@ -78,8 +78,9 @@ def test_frame_faces_and_colors_follow_the_options(ball, tmp_path):
 
 def test_formats_of_gaussians(ball, tmp_path, capsys):
     out = tmp_path / "out"
-    kinds = ["ply", "splat", "glb", "html", "gif", "mp4"]
-    options = ["--mesh", "--formats", *kinds, "--size", "32", "--frames", "3"]
+    splats, kinds = ["ply", "splat", "glb"], ["ply", "splat", "glb", "html", "gif"]
+    options = ["--mesh", "--splats", *splats, "--page", "--turntable", "gif"]
+    options += ["--size", "32", "--frames", "3"]
     assert export(ball, "--out", out, *options) == 0
     assert sorted(p.name for p in out.iterdir()) == sorted(f"egg.{kind}" for kind in kinds)
     again, before = load_ply(out / "egg.ply"), load_ply(ball)
@@ -111,7 +112,7 @@ def test_a_folder_and_failures(ball, tmp_path, capsys):
     "options, reason",
     [
         (["--voxels", "3"], "--voxels"),
-        (["--mesh"], "--mesh or --formats"),
+        (["--mesh"], "--mesh, --splats"),
         (["--min-component", "2"], "--min-component"),
         (["--size", "3"], "--size"),
         (["--close-holes", "-1"], "--close-holes"),
@@ -131,7 +132,7 @@ def test_missing_inputs(tmp_path, capsys):
 
 def test_the_input_is_not_overwritten(ball, tmp_path, capsys):
     before = ball.read_bytes()
-    code = export(ball, "--out", tmp_path, "--mesh", "--formats", "ply")
+    code = export(ball, "--out", tmp_path, "--mesh", "--splats", "ply")
     assert code == 2 and ball.read_bytes() == before
     assert "would be overwritten" in capsys.readouterr().err
 

@@ -153,7 +153,7 @@ def test_turntables_that_cannot_be_written(tmp_path):
 def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     out = tmp_path / "deep" / "out"
     arguments = [picture, "--checkpoint", checkpoint, "--out", out, "--size", 32, "--frames", 4]
-    assert run_reconstruct(*arguments, "--formats", "ply", "splat", "glb") == 0
+    assert run_reconstruct(*arguments, "--splats", "ply", "splat", "glb") == 0
     files = {path.name: path.stat().st_size for path in out.iterdir()}
     names = ["thing.gif", "thing.glb", "thing.html", "thing.ply", "thing.splat"]
     assert sorted(files) == names and all(files.values())
@@ -340,7 +340,7 @@ def test_the_help_names_every_option(capsys):
         run_reconstruct("--help")
     assert caught.value.code == 0
     out = capsys.readouterr().out
-    for option in ("--checkpoint", "--formats", "--turntable", "--mask", "--sam", "--no-page"):
+    for option in ("--checkpoint", "--splats", "--turntable", "--mask", "--sam", "--no-page"):
         assert option in out
 
 

@@ -8,9 +8,9 @@ import trimesh
 from helpers.gaussians import some
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.glb import save_glb
+from gamba_warp.formats.gaussians.glb import save_glb
+from gamba_warp.formats.gaussians.splat import save_splat
 from gamba_warp.formats.ply import SH_C0
-from gamba_warp.formats.splat import save_splat
 
 
 def read_glb(path):

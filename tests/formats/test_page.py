@@ -10,7 +10,7 @@ from helpers.gaussians import some
 from PIL import Image, features
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.splat import splat_bytes
+from gamba_warp.formats.gaussians.splat import splat_bytes
 from gamba_warp.pages.page import Section, demo_page, reconstruction_page, svg_chart
 
 

@@ -1,1 +1,1 @@
-"""Files of Gaussians in all formats: one reader, one writer."""
+"""Files of Gaussians: one module a format, and ``files`` over them all."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gzip
 import io
 import json
 import pickle
@@ -337,7 +338,32 @@ def pickle_values(data: bytes, rng: Random) -> bytes:
     return pickle.dumps({"VGG16_0": {"Conv_0": {"kernel": rng.choice(arrays)}}}, protocol=4)
 
 
+def gzip_inside(data: bytes, rng: Random) -> bytes:
+    """Changes what a gzip stream holds, or makes it hold far more; its checksum then fits."""
+    try:
+        inner = gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise Unfit from error
+    if rng.random() < 0.1:
+        return gzip.compress(inner + bytes(_BOMB // 4), 9)
+    if rng.random() < 0.3 and len(inner) >= 16:  # an .spz's version, count, degree, bits, flags
+        kind, at, values = rng.choice(
+            (
+                ("<I", 4, (0, 1, 2, 3, 4, 2**32 - 1)),
+                ("<I", 8, (0, 1, 11, 13, 10**7, 10**7 + 1, 2**32 - 1)),
+                ("B", 12, (0, 1, 2, 3, 4, 255)),
+                ("B", 13, (0, 12, 24, 31, 255)),
+                ("B", 14, (0, 1, 2, 3, 255)),
+            )
+        )
+        out = bytearray(inner)
+        struct.pack_into(kind, out, at, rng.choice(values))
+        return gzip.compress(bytes(out))
+    return gzip.compress(_any(inner, rng))
+
+
 BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
+    ".spz": (gzip_inside,),
     ".safetensors": (safetensors_header, safetensors_header, safetensors_values),
     ".glb": (glb_tree,),
     ".npy": (npy_header,),

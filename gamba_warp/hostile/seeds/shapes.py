@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...formats.names import SplatFormat
 from .pictures import Files, png
 
 _PLY_TYPES = {"<f4": "float", "<f8": "double", "u1": "uchar", "<i4": "int"}
@@ -37,25 +38,51 @@ def ball(rings: int = 4, around: int = 6) -> tuple[np.ndarray, np.ndarray]:
     return vertices.round(4), np.array(faces)
 
 
-def gaussians_ply(count: int = 12) -> bytes:
-    """A binary 3DGS ``.ply``."""
+def gaussians(count: int = 12, kind: SplatFormat = "ply", degree: int = 0) -> bytes:
+    """A file of Gaussians of one of the formats, with harmonics of a degree."""
     import torch
 
-    from ...formats.ply import save_ply
+    from ...formats.gaussians.files import write_gaussians
+    from ...formats.names import splat_suffix
     from ...gaussians import Gaussians
 
     rng = torch.Generator().manual_seed(1)
+    K = (degree + 1) ** 2 - 1
     some = Gaussians(
         means=torch.rand(count, 3, generator=rng) - 0.5,
         quats=torch.randn(count, 4, generator=rng),
         scales=torch.rand(count, 3, generator=rng) * 0.1 + 0.01,
         opacities=torch.rand(count, generator=rng) * 0.9 + 0.05,
         colors=torch.rand(count, 3, generator=rng),
+        harmonics=torch.rand(count, K, 3, generator=rng) - 0.5 if K else None,
     )
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "object.ply"
-        save_ply(path, some)
+        path = Path(folder) / ("object" + splat_suffix(kind))
+        write_gaussians(path, some, kind)
         return path.read_bytes()
+
+
+def splats() -> dict[str, Files]:
+    """Gaussians in every format that is read, some with harmonics."""
+    seeds: dict[str, Files] = {
+        "gaussians": {"object.ply": gaussians()},
+        "gaussians-text": {"object.ply": _as_text(gaussians(degree=1))},
+        "gaussians-harmonics": {"object.ply": gaussians(degree=3)},
+    }
+    for kind in ("compressed-ply", "splat", "spz", "glb"):
+        name = "object." + ("ply" if kind == "compressed-ply" else kind)
+        seeds[f"gaussians-{kind}"] = {name: gaussians(300 if "ply" in kind else 12, kind, 1)}
+    return seeds
+
+
+def _as_text(data: bytes) -> bytes:
+    """A binary ``.ply`` of float32 as text."""
+    header, _, body = data.partition(b"end_header\n")
+    columns = header.count(b"property float")
+    rows = np.frombuffer(body, "<f4").reshape(-1, columns)
+    lines = [" ".join(f"{value:.9g}" for value in row) for row in rows]
+    header = header.replace(b"binary_little_endian", b"ascii")
+    return header + b"end_header\n" + "\n".join([*lines, ""]).encode()
 
 
 def ply(

@@ -1,7 +1,8 @@
 """Gaussians as binary glTF with the Khronos extension ``KHR_gaussian_splatting``.
 
 Scales are linear (early drafts of the extension stored logarithms), quaternions xyzw, axes +y up.
-``COLOR_0`` lets a viewer without the extension show coloured points.
+Colours are those of a display, as the extension's ``srgb_rec709_display`` says; ``COLOR_0``, which
+lets a viewer without the extension show coloured points, is linear light, as glTF has it.
 """
 
 from __future__ import annotations
@@ -12,16 +13,27 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import atomic_path
-from ..gaussians import SH_C0, Gaussians
-from ..versions import __version__
-from .ply import export_arrays
+from ...files import atomic_path
+from ...gaussians import SH_C0, Gaussians
+from ...versions import __version__
+from ..materials import to_linear
+from .arrays import DEGREES, export_arrays
 
-_EXTENSION = "KHR_gaussian_splatting"
-_FLOAT = 5126
-_POINTS = 0
+EXTENSION = "KHR_gaussian_splatting"
+COLOR_SPACE = "srgb_rec709_display"
+FLOAT = 5126
+POINTS = 0
 _ARRAY_BUFFER = 34962
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+def harmonic_names(degree: int) -> list[str]:
+    """Names of the attributes of the harmonics of degrees 1 to ``degree``, in their order."""
+    return [
+        f"{EXTENSION}:SH_DEGREE_{l}_COEF_{n}"
+        for l in range(1, degree + 1)
+        for n in range(2 * l + 1)
+    ]
 
 
 def save_glb(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0) -> None:
@@ -37,16 +49,19 @@ def save_glb(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0
         ValueError: there is a batch dimension.
     """
     arrays = export_arrays(path, gaussians, "opengl", min_opacity)
-    rgb = arrays["colors"].clip(0, 1)
+    harmonics = arrays["harmonics"]
+    rgb = arrays["colors"] if harmonics.shape[1] else arrays["colors"].clip(0, 1)
     opacities = arrays["opacities"].clip(0, 1)[:, None]
     attributes = {
         "POSITION": arrays["means"],
-        "COLOR_0": np.hstack([rgb, opacities]),
-        f"{_EXTENSION}:ROTATION": np.roll(arrays["quats"], -1, axis=1),
-        f"{_EXTENSION}:SCALE": arrays["scales"],
-        f"{_EXTENSION}:OPACITY": opacities,
-        f"{_EXTENSION}:SH_DEGREE_0_COEF_0": (rgb - 0.5) / SH_C0,
+        "COLOR_0": np.hstack([to_linear(rgb.clip(0, 1)), opacities]),
+        f"{EXTENSION}:ROTATION": np.roll(arrays["quats"], -1, axis=1),
+        f"{EXTENSION}:SCALE": arrays["scales"],
+        f"{EXTENSION}:OPACITY": opacities,
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (rgb - 0.5) / SH_C0,
     }
+    names = harmonic_names(DEGREES[harmonics.shape[1]])
+    attributes |= {name: harmonics[:, i] for i, name in enumerate(names)}
     views, accessors, parts, offset = [], [], [], 0
     for value in attributes.values():
         part = value.astype("<f4")
@@ -56,7 +71,7 @@ def save_glb(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0
         accessors.append(
             {
                 "bufferView": len(accessors),
-                "componentType": _FLOAT,
+                "componentType": FLOAT,
                 "count": len(part),
                 "type": _TYPES[part.shape[1]],
             }
@@ -67,13 +82,13 @@ def save_glb(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0
     means = attributes["POSITION"].astype("<f4")
     accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
     primitive = {
-        "mode": _POINTS,
+        "mode": POINTS,
         "attributes": {name: index for index, name in enumerate(attributes)},
-        "extensions": {_EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": COLOR_SPACE}},
     }
     document = {
         "asset": {"version": "2.0", "generator": f"gamba_warp {__version__}"},
-        "extensionsUsed": [_EXTENSION],
+        "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": Path(path).stem}],

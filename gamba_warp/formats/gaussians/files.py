@@ -1,0 +1,139 @@
+"""Gaussians in any format: read by what the file holds, written by the format's name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from ...conventions import Axes
+from ...errors import UserError
+from ...files import atomic_path
+from ...gaussians import Gaussians
+from ..headers import open_shape
+from ..names import SPLAT_FORMATS, SPLAT_SUFFIXES, SplatFormat
+from ..ply import MAX_FILE, ended_header, header_lines, load_ply, save_ply
+from ..ply_header import read_ply_header
+from .arrays import export_arrays
+from .compressed import WORDS, is_compressed, packed
+from .glb import save_glb
+from .glb_reader import holds_gaussians, load_glb
+from .splat import load_splat, save_splat
+from .spz import GZIP, ZSTD_HEADER, load_spz, save_spz
+
+# One is enough, so that a file that lacks the others is not taken for a point cloud.
+_OF_GAUSSIANS = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
+
+
+def splat_kind(path: str | Path) -> SplatFormat | None:
+    """Which format of Gaussians a file is in, by its content; None for a mesh, a cloud or another.
+
+    Of a file that is damaged, the kind that it seems to be; ``.splat`` goes by its name, because it
+    has no header.
+
+    Raises:
+        UserError: the file is missing, empty or cannot be read, or is a ``.ply`` with a header that
+            is not understood.
+    """
+    path = Path(path)
+    with open_shape(path, MAX_FILE) as (file, size):
+        start = file.read(4)
+        file.seek(0)
+        if start.startswith(b"ply"):
+            header = read_ply_header(path, file)
+            if any(element.name == "face" and element.count for element in header.elements):
+                return None
+            names = {item.name for element in header.elements for item in element.properties}
+            if not _OF_GAUSSIANS & names:
+                return None
+            return "compressed-ply" if is_compressed(header) else "ply"
+        if start == b"glTF":
+            return "glb" if holds_gaussians(path, file, size) else None
+    if start.startswith(GZIP) or start == ZSTD_HEADER:
+        return "spz"
+    return {".splat": "splat", ".spz": "spz"}.get(path.suffix.lower())  # type: ignore[return-value]
+
+
+def read_gaussians(path: str | Path) -> Gaussians:
+    """Reads one object's Gaussians by what the file holds, and then by its name.
+
+    ``.ply`` (binary, text or compressed), ``.splat``, ``.spz`` and ``.glb`` with
+    ``KHR_gaussian_splatting`` are read, from this or another program.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Float32 Gaussians on the CPU in OpenCV's axes (y down), ``quats`` normalised; without
+        harmonics colours are in [0, 1].
+
+    Raises:
+        UserError: missing, of another kind, truncated, longer than it says, or values that are not
+            those of Gaussians.
+    """
+    path = Path(path)
+    with open_shape(path, MAX_FILE) as (file, _):
+        start = file.read(4)
+    if start.startswith(b"ply"):
+        return load_ply(path)
+    if start == b"glTF":
+        return load_glb(path)
+    if start.startswith(GZIP) or start == ZSTD_HEADER:
+        return load_spz(path)
+    suffix = path.suffix.lower()
+    if suffix in SPLAT_SUFFIXES:  # the reader of that name says what is wrong
+        readers = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz, ".glb": load_glb}
+        return readers[suffix](path)
+    raise UserError(f"{path}: not Gaussians ({', '.join(SPLAT_SUFFIXES)})")
+
+
+def write_gaussians(
+    path: str | Path,
+    gaussians: Gaussians,
+    kind: SplatFormat,
+    *,
+    axes: Axes = "opencv",
+    min_opacity: float = 0.0,
+    comments: Iterable[str] = (),
+) -> str | None:
+    """Writes one object's Gaussians, atomically.
+
+    Args:
+        path: file to write.
+        gaussians: one object, no batch dimension, OpenCV's axes.
+        kind: the format.
+        axes: of ``ply`` and ``compressed-ply``; the other formats have axes of their own.
+        min_opacity: Gaussians below it are left out.
+        comments: lines for the header of a ``.ply``.
+
+    Returns:
+        A sentence about what the format cannot hold, or None.
+
+    Raises:
+        UserError: a value is not finite, nothing is left, or the file cannot be written.
+        ValueError: there is a batch dimension, or the format is not known.
+    """
+    if kind not in SPLAT_FORMATS:
+        raise ValueError(f"the format is {kind!r}, expected one of {', '.join(SPLAT_FORMATS)}")
+    if kind == "ply":
+        save_ply(path, gaussians, axes=axes, min_opacity=min_opacity, comments=comments)
+        return None
+    if kind == "compressed-ply":
+        return _save_compressed(path, gaussians, axes, min_opacity, comments)
+    if kind == "glb":
+        save_glb(path, gaussians, min_opacity=min_opacity)
+        return None
+    save = {"splat": save_splat, "spz": save_spz}[kind]
+    return save(path, gaussians, min_opacity=min_opacity)
+
+
+def _save_compressed(
+    path: str | Path,
+    gaussians: Gaussians,
+    axes: Axes,
+    min_opacity: float,
+    comments: Iterable[str],
+) -> str | None:
+    lines, body, clipped = packed(export_arrays(path, gaussians, axes, min_opacity))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(ended_header([*header_lines(axes, comments), *lines]) + body)
+    return f"{path}: the format clips harmonics to ±4." if clipped else None
