@@ -32,6 +32,7 @@ COMMANDS = {
     "ablate": "Train and compare variants of a model.",
     "export": "Gaussians to meshes, splats and pages.",
     "view": "Gaussians in the browser.",
+    "app": "Pictures to 3D on a page of this machine.",
     "bench": "Run time against error, on this machine.",
     "stress": "Random hostile cases against float64.",
     "gpu-check": "Test and measure on a CUDA machine.",
@@ -41,6 +42,7 @@ COMMANDS = {
     "doctor": "Say what this machine can run.",
 }
 MODULES = {
+    "app": "gamba_warp.app.app_command",
     "train": "gamba_warp.train.command",
     "data furniture": "gamba_warp.train.data.furniture_command",
     "data primitives": "gamba_warp.train.data.primitives_command",

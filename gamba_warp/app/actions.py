@@ -1,0 +1,149 @@
+"""What the page's events do: our functions, with gradio's updates for answers. It needs gradio."""
+
+from __future__ import annotations
+
+import functools
+import html
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gradio as gr
+
+from ..errors import UserError, first_line
+from . import work
+from .cutting import Cut, cut_picture, editor_picture, mended, restarted
+from .examples import examples
+
+if TYPE_CHECKING:
+    from ..model.gamba import Gamba
+    from .cutter import Ways
+
+_FRAME = (
+    '<iframe class="stage" title="3D view of {name}" sandbox="allow-scripts allow-downloads" '
+    'allow="fullscreen" srcdoc="{document}"></iframe>'
+)
+
+
+def plainly(function: Callable) -> Callable:
+    """A function whose bad input is one line in the page; what else it raises is our defect."""
+
+    @functools.wraps(function)
+    def careful(*args: Any) -> Any:
+        try:
+            return function(*args)
+        except (UserError, MemoryError, ModuleNotFoundError) as error:
+            raise _error(error) from None
+        except RuntimeError as error:  # torch's errors of memory have no type of their own
+            if "memory" not in str(error):
+                raise
+            raise _error(MemoryError("there is not enough memory for this")) from None
+
+    return careful
+
+
+def _error(error: Exception) -> gr.Error:
+    # The page takes the text for HTML, and names of strangers' files stand in it.
+    text = html.escape(first_line(error))
+    return gr.Error(text, title="This did not work", print_exception=False)
+
+
+class Actions:
+    """What the page's events do.
+
+    Args:
+        model: the network.
+        ways: how objects may be cut out.
+        folder: for files; it is gradio's own cache, from which they go when they are old.
+        device: device that renders.
+    """
+
+    def __init__(self, model: Gamba, ways: Ways, folder: Path, device: str) -> None:
+        self._model = model
+        self._ways = ways
+        self._folder = folder
+        self._device = device
+        for name in ("take", "example", "mend", "restart", "make"):
+            setattr(self, name, plainly(getattr(self, name)))
+
+    def take(self, given: dict[str, Any] | None) -> tuple:
+        """A picture that was dropped or pasted; None where it was taken away."""
+        if not given or not given.get("path"):
+            return None, gr.update(visible=False), None, "", gr.skip()
+        name = given.get("orig_name") or "picture"
+        try:
+            cut = cut_picture(Path(given["path"]), name, self._ways)
+        except UserError as error:
+            gr.Warning(html.escape(str(error)), title="This is no picture for us")
+            return None, gr.update(visible=False), None, "", None
+        return *_shown(cut), gr.skip()
+
+    def example(self, event: gr.SelectData) -> tuple:
+        """A picture of the gallery."""
+        path, title = examples()[int(event.index)]
+        return *_shown(cut_picture(path, title, self._ways)), str(path)
+
+    def mend(self, cut: Cut | None, painted: dict[str, Any] | None) -> tuple:
+        """The strokes become part of the mask."""
+        cut = mended(_given(cut), _layers(painted))
+        return cut, editor_picture(cut)
+
+    def restart(self, cut: Cut | None) -> tuple:
+        """The mask as it was found, without strokes."""
+        cut = restarted(_given(cut))
+        return cut, editor_picture(cut)
+
+    def make(
+        self,
+        cut: Cut | None,
+        painted: dict[str, Any] | None,
+        progress: gr.Progress = gr.Progress(),  # noqa: B008
+    ) -> tuple:
+        """The object in 3D, and its viewer; strokes that nobody applied count, too."""
+        before = _given(cut)
+        after = mended(before, _layers(painted))
+        progress(0.1, "The network looks at the picture")
+        made = work.solve(self._model, after)
+        progress(0.8, "The viewer is made")
+        document = html.escape(work.viewer(made), quote=True)
+        frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
+        editor = gr.skip() if after is before else editor_picture(after)
+        files = gr.update(value=None, visible=False)
+        return after, editor, made, frame, gr.update(visible=True), files
+
+    def writer(self, kind: str) -> Callable:
+        """The function that writes files of one kind, and adds them to those that are there."""
+
+        def write(
+            made: work.Made | None,
+            files: list[dict[str, Any]] | None,
+            progress: gr.Progress = gr.Progress(),  # noqa: B008
+        ) -> Any:
+            if made is None:
+                raise UserError("make the object first; it may have been kept for too long")
+            progress(0.2, f"Writing {work.KINDS[kind][1]}")
+            folder = Path(tempfile.mkdtemp(dir=self._folder))
+            path, note = work.write(made, kind, folder, self._device)
+            if note:
+                gr.Info(html.escape(note.removeprefix(f"{path}: ")))
+            older = [file["path"] for file in files or ()]
+            kept = [name for name in older if Path(name).name != path.name and Path(name).is_file()]
+            return gr.update(value=[*kept, str(path)], visible=True)
+
+        return plainly(write)
+
+
+def _given(cut: Cut | None) -> Cut:
+    if cut is None:
+        raise UserError("give a picture first; the last one may have been kept for too long")
+    return cut
+
+
+def _layers(painted: dict[str, Any] | None) -> list:
+    return [] if painted is None else painted["layers"]
+
+
+def _shown(cut: Cut) -> tuple:
+    note = f"<p>{html.escape(cut.note)}</p>"
+    return cut, gr.update(visible=True), editor_picture(cut), note

@@ -1,0 +1,50 @@
+"""``gamba app``: one picture to a 3D object, in the browser, on this machine alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
+
+from ..conventions import DeviceChoice
+from ..untrusted.ranges import ranged
+
+
+@ranged
+def app_command(
+    *,
+    checkpoint: Path | None = None,
+    encoder_weights: Path | None = None,
+    matte_model: Path | None = None,
+    port: Annotated[int, Meta(ge=0, le=65535)] = 7860,
+    open_browser: bool = True,
+    max_upload_mb: Annotated[int, Meta(ge=1, le=1024)] = 30,
+    device: DeviceChoice = "auto",
+) -> None:
+    """Serves a page that makes 3D objects of pictures, for this machine alone, until Ctrl-C.
+
+    Args:
+        checkpoint: Trained model (.safetensors); the starter model if not given.
+        encoder_weights: The image encoder's weights, where the model has a pretrained one.
+        matte_model: Model that cuts objects out of busy pictures.
+        port: Port of 127.0.0.1; 0 picks a free one.
+        open_browser: Open the browser; the address is printed in any case.
+        max_upload_mb: Largest picture file, MB.
+        device: Device that computes; auto is the GPU if there is one.
+    """
+    from ..devices import pick_device
+    from ..model.checkpoint import load_model
+    from .cutter import Ways
+    from .server import free_port, quiet, serve, work_folder
+
+    chosen, port = pick_device(device), free_port(port)
+    model = load_model(checkpoint, chosen, encoder_weights)
+    ways = Ways(matte_model=matte_model, device=str(chosen))
+    with work_folder() as folder:
+        quiet(folder)
+        from .actions import Actions
+        from .interface import build
+
+        page = build(Actions(model, ways, folder, str(chosen)))
+        serve(page, port, max_upload_mb, open_browser)

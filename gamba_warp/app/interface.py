@@ -1,0 +1,180 @@
+"""The page: what stands where, and which action each button calls. It needs gradio throughout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gradio as gr
+
+from . import work
+from .actions import Actions
+from .cutting import KEEP, REMOVE, SIDE, STROKE
+from .examples import examples
+
+KEPT = 3600  # seconds that pictures and results of a page are kept, once nothing is done with them
+WAITING = 16  # requests that wait for their turn; further ones are told to come back
+_TITLE = """<h1>Gamba</h1>
+<p>One picture becomes a 3D object. All of it is computed on this machine; nothing is sent out.</p>"""
+_EMPTY = """<div class="stage empty"><p>The object will stand here.<br>Give a picture, look at its
+cut-out, and make it 3D.</p></div>"""
+_HINT = f"""<p class="hint">Only what stands on the checkerboard's top becomes 3D. Paint with
+<b style="color: {KEEP}">blue</b> over what is missing and with
+<b style="color: {REMOVE}">orange</b> over what is too much.</p>"""
+# A download that the page itself starts, once the file is there.
+_FETCH = """(files) => {
+  const file = Array.isArray(files) ? files.at(-1) : files;
+  if (!file || !file.url) return;
+  const link = document.createElement("a");
+  link.href = file.url;
+  link.download = file.orig_name || "";
+  link.click();
+}"""
+
+
+def build(actions: Actions) -> gr.Blocks:
+    """Makes the page; ``server.serve`` serves it."""
+    page = gr.Blocks(
+        title="Gamba", analytics_enabled=False, delete_cache=(KEPT // 6, KEPT), fill_width=True
+    )
+    with page:
+        gr.HTML(_TITLE, elem_id="title")
+        states = gr.State(None, time_to_live=KEPT), gr.State(None, time_to_live=KEPT)
+        with gr.Row(elem_id="bench"):
+            with gr.Column(scale=4, min_width=300):
+                picture, gallery = _picture_part()
+                parts = _cut_part()
+            with gr.Column(scale=6, min_width=300, elem_id="right"):
+                stage = gr.HTML(_EMPTY, elem_id="stage")
+                files_part = _files_part()
+        _connect(actions, states, picture, gallery, parts, stage, files_part)
+    page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
+    return page
+
+
+def _picture_part() -> tuple[gr.Image, gr.Gallery]:
+    picture = gr.Image(
+        label="Picture",
+        sources=["upload", "clipboard"],
+        type="filepath",
+        image_mode=None,
+        height=260,
+        buttons=[],
+        placeholder="Drop a picture here\nor click to choose one",
+        elem_id="picture",
+    )
+    gallery = gr.Gallery(
+        [(str(path), title) for path, title in examples()],
+        label="Or take an example",
+        columns=6,
+        height="auto",
+        allow_preview=False,
+        object_fit="contain",
+        buttons=[],
+        interactive=False,
+        elem_id="examples",
+    )
+    return picture, gallery
+
+
+@dataclass
+class _CutPart:
+    group: gr.Column
+    editor: gr.ImageEditor
+    note: gr.HTML
+    mend: gr.Button
+    restart: gr.Button
+    make: gr.Button
+
+
+def _cut_part() -> _CutPart:
+    with gr.Column(visible=False, elem_id="cut") as group:
+        note = gr.HTML(elem_id="note")
+        editor = gr.ImageEditor(
+            label="Cut-out",
+            type="numpy",
+            image_mode="RGBA",
+            format="png",
+            sources=(),
+            transforms=(),
+            layers=False,
+            brush=gr.Brush(
+                colors=[(KEEP, STROKE), (REMOVE, STROKE)],
+                default_color=(KEEP, STROKE),
+                default_size=SIDE // 24,
+                color_mode="fixed",
+            ),
+            eraser=gr.Eraser(default_size=SIDE // 24),
+            canvas_size=(SIDE, SIDE),
+            buttons=[],
+            elem_id="editor",
+        )
+        gr.HTML(_HINT)
+        with gr.Row():
+            mend = gr.Button("Mend the cut-out", size="md", min_width=120)
+            restart = gr.Button("Start over", size="md", min_width=120)
+        make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
+    return _CutPart(group, editor, note, mend, restart, make)
+
+
+@dataclass
+class _FilesPart:
+    group: gr.Column
+    buttons: dict[str, gr.Button]
+    files: gr.File
+
+
+def _files_part() -> _FilesPart:
+    titles = {"Gaussians": work.GAUSSIANS, "Mesh": work.MESHES, "To show": work.SHOWS}
+    buttons: dict[str, gr.Button] = {}
+    with gr.Column(visible=False, elem_id="files") as group:
+        for title, kinds in titles.items():
+            with gr.Row(elem_classes="kinds"):
+                gr.HTML(f"<span>{title}</span>", elem_classes="kinds-title")
+                for kind, (label, _) in kinds.items():
+                    options = {"size": "sm", "min_width": 70, "elem_id": f"file-{kind}"}
+                    buttons[kind] = gr.Button(label, **options)
+        files = gr.File(
+            label="Files", file_count="multiple", interactive=False, visible=False, elem_id="made"
+        )
+    return _FilesPart(group, buttons, files)
+
+
+def _connect(
+    actions: Actions,
+    states: tuple[gr.State, gr.State],
+    picture: gr.Image,
+    gallery: gr.Gallery,
+    parts: _CutPart,
+    stage: gr.HTML,
+    files_part: _FilesPart,
+) -> None:
+    """Which action each event calls; one at a time over all pages, for they share the device."""
+    cut, made = states
+    one: dict[str, Any] = {
+        "concurrency_id": "gamba",
+        "concurrency_limit": 1,
+        "api_visibility": "private",
+    }
+    shown = [cut, parts.group, parts.editor, parts.note, picture]
+    # gradio would decode the picture itself, and differently: the file is read by us alone.
+    picture.input(actions.take, picture, shown, preprocess=False, **one)
+    gallery.select(actions.example, None, shown, **one)
+    parts.mend.click(actions.mend, [cut, parts.editor], [cut, parts.editor], **one)
+    parts.restart.click(actions.restart, cut, [cut, parts.editor], **one)
+    parts.make.click(
+        actions.make,
+        [cut, parts.editor],
+        [cut, parts.editor, made, stage, files_part.group, files_part.files],
+        show_progress_on=stage,
+        **one,
+    )
+    for kind, button in files_part.buttons.items():
+        button.click(
+            actions.writer(kind),
+            [made, files_part.files],
+            files_part.files,
+            show_progress_on=files_part.files,
+            preprocess=False,
+            **one,
+        ).success(None, files_part.files, None, js=_FETCH, api_visibility="private")

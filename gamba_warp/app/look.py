@@ -1,0 +1,31 @@
+"""How the page looks: calm, by the system's own fonts, light or dark as the system is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gradio as gr
+
+LOOK = Path(__file__).parent / "look.css"
+
+
+def theme() -> gr.themes.Base:
+    """Colours, corners and fonts; fonts by their names in the system, so that none is fetched."""
+    return gr.themes.Base(
+        primary_hue=gr.themes.colors.blue,
+        neutral_hue=gr.themes.colors.gray,
+        radius_size=gr.themes.sizes.radius_lg,
+        font=["system-ui", "sans-serif"],
+        font_mono=["ui-monospace", "monospace"],
+    ).set(
+        body_background_fill="#fbfbfa",
+        body_background_fill_dark="#111316",
+        block_background_fill="#ffffff",
+        block_background_fill_dark="#1a1d21",
+        block_border_width="1px",
+        block_label_background_fill="transparent",
+        block_label_background_fill_dark="transparent",
+        button_primary_background_fill="#1a63d8",
+        button_primary_background_fill_hover="#1553b8",
+        button_primary_text_color="#ffffff",
+    )

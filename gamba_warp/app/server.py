@@ -1,0 +1,145 @@
+"""Serves the page on 127.0.0.1 until Ctrl-C, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import UserError
+from ..files import only_process
+
+if TYPE_CHECKING:
+    import gradio as gr
+
+HOST = "127.0.0.1"
+PREFIX = "gamba-app-"
+_PAGES = 8  # whose pictures and results are kept at once
+
+
+@contextmanager
+def work_folder() -> Iterator[Path]:
+    """A temporary folder for all that the page makes; it goes in the end.
+
+    Those of processes that were killed go at the start: nobody holds their locks.
+    """
+    place = Path(tempfile.gettempdir())
+    for old in place.glob(f"{PREFIX}*"):
+        _remove_unheld(old)
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX)).resolve()
+    try:
+        with only_process(folder, "serves"):
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_unheld(folder: Path) -> None:
+    if folder.is_symlink() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        return
+    if not (folder / ".lock").is_file():  # another process makes it just now, or it is not ours
+        return
+    try:
+        with only_process(folder, "serves"):
+            shutil.rmtree(folder, ignore_errors=True)
+    except UserError:  # it is in use
+        return
+
+
+def quiet(folder: Path) -> None:
+    """Tells gradio, before it is imported, to ask no other machine and where to put its files."""
+    os.environ |= {
+        "GRADIO_TEMP_DIR": str(folder),
+        "GRADIO_ANALYTICS_ENABLED": "False",
+        "GRADIO_SHARE": "False",
+        "HF_HUB_DISABLE_TELEMETRY": "1",
+        # gradio asks its own server whether it is there, and must not ask a proxy.
+        "NO_PROXY": ",".join(filter(None, (os.environ.get("NO_PROXY"), HOST, "localhost"))),
+    }
+    for name in ("GRADIO_ALLOWED_PATHS", "GRADIO_ROOT_PATH", "GRADIO_WATCH_DIRS"):
+        os.environ.pop(name, None)
+
+
+def free_port(port: int) -> int:
+    """The port, or a free one for 0.
+
+    Raises:
+        UserError: it is taken or not allowed.
+    """
+    with socket.socket() as probe:
+        if os.name == "posix":  # elsewhere it would let two servers have one port
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise UserError(f"--port {port}: {error.strerror}") from error
+        return probe.getsockname()[1]
+
+
+def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool) -> None:
+    """Serves the page until Ctrl-C or SIGTERM.
+
+    Args:
+        page: of ``interface.build``.
+        port: a free one.
+        max_mb: largest upload, MB.
+        open_browser: whether the browser is opened; where there is none, the address is printed.
+
+    Raises:
+        UserError: another process has taken the port meanwhile.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    import webbrowser
+
+    from starlette.middleware import Middleware
+
+    from .examples import FOLDER
+    from .guard import Guard
+    from .look import LOOK, theme
+
+    try:
+        page.launch(
+            server_name=HOST,
+            server_port=port,
+            share=False,
+            inbrowser=False,
+            prevent_thread_lock=True,
+            quiet=True,
+            show_error=False,
+            max_threads=4,
+            max_file_size=max_mb << 20,
+            allowed_paths=[str(FOLDER)],
+            state_session_capacity=_PAGES,
+            footer_links=[],
+            run_history=False,
+            enable_monitoring=False,
+            ssr_mode=False,
+            pwa=False,
+            mcp_server=False,
+            strict_cors=True,
+            app_kwargs={"middleware": [Middleware(Guard)], "docs_url": None, "redoc_url": None},
+            theme=theme(),
+            css_paths=LOOK,
+        )
+    except OSError as error:
+        raise UserError(f"--port {port}: Address already in use") from error
+    address = f"http://{HOST}:{port}/"
+    print(f"{address} (Ctrl-C ends it)", flush=True)
+    signal.signal(signal.SIGTERM, _end)
+    try:
+        if open_browser:
+            webbrowser.open(address)
+        threading.Event().wait()
+    finally:
+        page.close(verbose=False)
+
+
+def _end(number: int, _frame: object) -> None:
+    raise SystemExit(128 + number)

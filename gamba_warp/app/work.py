@@ -1,0 +1,122 @@
+"""What the page does with a cut-out object: 3D Gaussians, the viewer, files. No web in here."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import UserError
+from ..formats.names import MESH_FORMATS, SPLAT_FORMATS, splat_suffix
+from .cutting import Cut, model_picture
+
+if TYPE_CHECKING:
+    from ..gaussians import Gaussians
+    from ..model.gamba import Gamba
+
+FRAMES, SIZE = 48, 320  # views of the turntable, and their side in pixels
+# Each kind of file: what its button says, and what follows the object's name.
+GAUSSIANS = {kind: (f".{kind.replace('-', ' ')}", splat_suffix(kind)) for kind in SPLAT_FORMATS}
+MESHES = {f"mesh-{kind}": (f".{kind}", f"-mesh.{kind}") for kind in MESH_FORMATS}
+SHOWS = {"gif": ("Turntable .gif", ".gif"), "html": ("Viewer .html", ".html")}
+KINDS = {**GAUSSIANS, **MESHES, **SHOWS}
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """One reconstruction.
+
+    Attributes:
+        name: stem of its files.
+        gaussians: ``[N]`` on the CPU, in the reference camera's frame, OpenCV's axes.
+        camera: distance (object units), field of view and elevation (degrees) of the input's.
+        seconds: how long the model took.
+    """
+
+    name: str
+    gaussians: Gaussians
+    camera: tuple[float, float, float]
+    seconds: float
+
+
+def solve(model: Gamba, cut: Cut) -> Made:
+    """One forward pass.
+
+    Args:
+        model: on any device.
+        cut: the object.
+
+    Raises:
+        UserError: the mask is empty.
+    """
+    from ..model.predict import reconstruct
+
+    rgba = model_picture(cut)
+    started = time.perf_counter()
+    gaussians = reconstruct(model, rgba).to("cpu")
+    seconds = time.perf_counter() - started
+    return Made(cut.name, gaussians, (model.config.distance, model.config.fov, 0.0), seconds)
+
+
+def viewer(made: Made) -> str:
+    """The viewer of a reconstruction, a whole HTML document.
+
+    Raises:
+        UserError: nothing of the object can be seen.
+    """
+    from ..viewer.page import viewer_page
+
+    return viewer_page(made.name, made.gaussians, camera=made.camera)
+
+
+def write(made: Made, kind: str, folder: Path, device: str = "cpu") -> tuple[Path, str | None]:
+    """Writes one file of a reconstruction.
+
+    Args:
+        made: the reconstruction.
+        kind: one of ``KINDS``.
+        folder: it is there.
+        device: device that renders.
+
+    Returns:
+        The file, and a sentence about what the format cannot hold, or None.
+
+    Raises:
+        UserError: the kind is not known, the object has no surface, a library is missing, or the
+            file cannot be written.
+    """
+    if kind not in KINDS:
+        raise UserError(f"no such kind of file: {kind}")
+    path, note = folder / f"{made.name}{KINDS[kind][1]}", None
+    if kind in GAUSSIANS:
+        from ..formats.gaussians.files import write_gaussians
+
+        note = write_gaussians(path, made.gaussians, kind)  # type: ignore[arg-type]
+    elif kind in MESHES:
+        _write_mesh(path, made, device)
+    elif kind == "gif":
+        from ..pages.turntable import save_turntable, turntable_frames
+
+        distance, fov, _ = made.camera
+        gaussians = made.gaussians.to(device)
+        save_turntable(
+            path,
+            turntable_frames(gaussians, size=SIZE, frames=FRAMES, distance=distance, fov=fov),
+        )
+    else:
+        from ..viewer.page import write_viewer
+
+        write_viewer(path, made.name, made.gaussians, camera=made.camera)
+    return path, note
+
+
+def _write_mesh(path: Path, made: Made, device: str) -> None:
+    import torch
+
+    from ..surfaces.extract import surface_of
+    from ..surfaces.files import save_mesh
+    from ..surfaces.options import SurfaceOptions
+
+    options, chosen = SurfaceOptions(colors=True), torch.device(device)
+    save_mesh(path, surface_of(made.gaussians.to(chosen), options, chosen))
