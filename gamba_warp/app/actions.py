@@ -15,6 +15,7 @@ from ..errors import UserError, first_line
 from . import work
 from .cutting import Cut, cut_picture, editor_picture, mended, restarted
 from .examples import examples
+from .turns import MainThread
 
 if TYPE_CHECKING:
     from ..model.gamba import Gamba
@@ -57,9 +58,13 @@ class Actions:
         ways: how objects may be cut out.
         folder: for files; it is gradio's own cache, from which they go when they are old.
         device: device that renders.
+        turns: who computes.
     """
 
-    def __init__(self, model: Gamba, ways: Ways, folder: Path, device: str) -> None:
+    def __init__(
+        self, model: Gamba, ways: Ways, folder: Path, device: str, turns: MainThread
+    ) -> None:
+        self._turns = turns
         self._model = model
         self._ways = ways
         self._folder = folder
@@ -73,7 +78,7 @@ class Actions:
             return None, gr.update(visible=False), None, "", gr.skip()
         name = given.get("orig_name") or "picture"
         try:
-            cut = cut_picture(Path(given["path"]), name, self._ways)
+            cut = self._turns.call(cut_picture, Path(given["path"]), name, self._ways)
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This is no picture for us")
             return None, gr.update(visible=False), None, "", None
@@ -82,7 +87,8 @@ class Actions:
     def example(self, event: gr.SelectData) -> tuple:
         """A picture of the gallery."""
         path, title = examples()[int(event.index)]
-        return *_shown(cut_picture(path, title, self._ways)), str(path)
+        cut = self._turns.call(cut_picture, path, title, self._ways)
+        return *_shown(cut), str(path)
 
     def mend(self, cut: Cut | None, painted: dict[str, Any] | None) -> tuple:
         """The strokes become part of the mask."""
@@ -104,7 +110,7 @@ class Actions:
         before = _given(cut)
         after = mended(before, _layers(painted))
         progress(0.1, "The network looks at the picture")
-        made = work.solve(self._model, after)
+        made = self._turns.call(work.solve, self._model, after)
         progress(0.8, "The viewer is made")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
@@ -124,7 +130,7 @@ class Actions:
                 raise UserError("make the object first; it may have been kept for too long")
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
             folder = Path(tempfile.mkdtemp(dir=self._folder))
-            path, note = work.write(made, kind, folder, self._device)
+            path, note = self._turns.call(work.write, made, kind, folder, self._device)
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
             older = [file["path"] for file in files or ()]

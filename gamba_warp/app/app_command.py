@@ -45,6 +45,8 @@ def app_command(
         quiet(folder)
         from .actions import Actions
         from .interface import build
+        from .turns import MainThread
 
-        page = build(Actions(model, ways, folder, str(chosen)))
-        serve(page, port, max_upload_mb, open_browser)
+        turns = MainThread()
+        page = build(Actions(model, ways, folder, str(chosen), turns))
+        serve(page, port, max_upload_mb, open_browser, turns)

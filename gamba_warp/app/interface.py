@@ -15,12 +15,16 @@ from .examples import examples
 KEPT = 3600  # seconds that pictures and results of a page are kept, once nothing is done with them
 WAITING = 16  # requests that wait for their turn; further ones are told to come back
 _TITLE = """<h1>Gamba</h1>
-<p>One picture becomes a 3D object. All of it is computed on this machine; nothing is sent out.</p>"""
+<p>One picture becomes a 3D object. All of it is computed on this machine, and nothing is sent
+out.</p>"""
 _EMPTY = """<div class="stage empty"><p>The object will stand here.<br>Give a picture, look at its
 cut-out, and make it 3D.</p></div>"""
-_HINT = f"""<p class="hint">Only what stands on the checkerboard's top becomes 3D. Paint with
-<b style="color: {KEEP}">blue</b> over what is missing and with
-<b style="color: {REMOVE}">orange</b> over what is too much.</p>"""
+_BRUSHES = {"Paint what to keep": KEEP, "Paint what to remove": REMOVE}
+# On a phone the object stands below the window.
+_SHOW = """() => {
+  const stage = document.querySelector("#stage").getBoundingClientRect();
+  if (stage.top < 0 || stage.top > innerHeight / 2) scrollBy({top: stage.top, behavior: "smooth"});
+}"""
 # A download that the page itself starts, once the file is there.
 _FETCH = """(files) => {
   const file = Array.isArray(files) ? files.at(-1) : files;
@@ -41,10 +45,10 @@ def build(actions: Actions) -> gr.Blocks:
         gr.HTML(_TITLE, elem_id="title")
         states = gr.State(None, time_to_live=KEPT), gr.State(None, time_to_live=KEPT)
         with gr.Row(elem_id="bench"):
-            with gr.Column(scale=4, min_width=300):
+            with gr.Column(scale=5, min_width=300):
                 picture, gallery = _picture_part()
                 parts = _cut_part()
-            with gr.Column(scale=6, min_width=300, elem_id="right"):
+            with gr.Column(scale=8, min_width=300, elem_id="right"):
                 stage = gr.HTML(_EMPTY, elem_id="stage")
                 files_part = _files_part()
         _connect(actions, states, picture, gallery, parts, stage, files_part)
@@ -58,7 +62,7 @@ def _picture_part() -> tuple[gr.Image, gr.Gallery]:
         sources=["upload", "clipboard"],
         type="filepath",
         image_mode=None,
-        height=260,
+        height=220,
         buttons=[],
         placeholder="Drop a picture here\nor click to choose one",
         elem_id="picture",
@@ -82,14 +86,24 @@ class _CutPart:
     group: gr.Column
     editor: gr.ImageEditor
     note: gr.HTML
+    brush: gr.Radio
     mend: gr.Button
     restart: gr.Button
     make: gr.Button
 
 
+def _brush(color: str) -> gr.Brush:
+    size = SIDE // 20
+    return gr.Brush(
+        colors=[(KEEP, STROKE), (REMOVE, STROKE)],
+        default_color=(color, STROKE),
+        default_size=size,
+        color_mode="fixed",
+    )
+
+
 def _cut_part() -> _CutPart:
     with gr.Column(visible=False, elem_id="cut") as group:
-        note = gr.HTML(elem_id="note")
         editor = gr.ImageEditor(
             label="Cut-out",
             type="numpy",
@@ -98,23 +112,26 @@ def _cut_part() -> _CutPart:
             sources=(),
             transforms=(),
             layers=False,
-            brush=gr.Brush(
-                colors=[(KEEP, STROKE), (REMOVE, STROKE)],
-                default_color=(KEEP, STROKE),
-                default_size=SIDE // 24,
-                color_mode="fixed",
-            ),
+            brush=_brush(KEEP),
             eraser=gr.Eraser(default_size=SIDE // 24),
             canvas_size=(SIDE, SIDE),
+            height=430,
             buttons=[],
             elem_id="editor",
         )
-        gr.HTML(_HINT)
+        note = gr.HTML(elem_id="note")
+        brush = gr.Radio(
+            list(_BRUSHES),
+            value=next(iter(_BRUSHES)),
+            show_label=False,
+            container=False,
+            elem_id="brush",
+        )
         with gr.Row():
             mend = gr.Button("Mend the cut-out", size="md", min_width=120)
             restart = gr.Button("Start over", size="md", min_width=120)
         make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
-    return _CutPart(group, editor, note, mend, restart, make)
+    return _CutPart(group, editor, note, brush, mend, restart, make)
 
 
 @dataclass
@@ -160,6 +177,14 @@ def _connect(
     # gradio would decode the picture itself, and differently: the file is read by us alone.
     picture.input(actions.take, picture, shown, preprocess=False, **one)
     gallery.select(actions.example, None, shown, **one)
+    parts.brush.change(
+        lambda choice: gr.update(brush=_brush(_BRUSHES[choice])),
+        parts.brush,
+        parts.editor,
+        api_visibility="private",
+        queue=False,
+        show_progress="hidden",
+    )
     parts.mend.click(actions.mend, [cut, parts.editor], [cut, parts.editor], **one)
     parts.restart.click(actions.restart, cut, [cut, parts.editor], **one)
     parts.make.click(
@@ -169,6 +194,7 @@ def _connect(
         show_progress_on=stage,
         **one,
     )
+    parts.make.click(None, js=_SHOW, api_visibility="private")
     for kind, button in files_part.buttons.items():
         button.click(
             actions.writer(kind),

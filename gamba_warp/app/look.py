@@ -20,6 +20,8 @@ def theme() -> gr.themes.Base:
     ).set(
         body_background_fill="#fbfbfa",
         body_background_fill_dark="#111316",
+        body_text_color_subdued="#5d636d",
+        body_text_color_subdued_dark="#a2a8b2",
         block_background_fill="#ffffff",
         block_background_fill_dark="#1a1d21",
         block_border_width="1px",

@@ -7,7 +7,6 @@ import shutil
 import signal
 import socket
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import UserError
 from ..files import only_process
+from .turns import MainThread
 
 if TYPE_CHECKING:
     import gradio as gr
@@ -83,7 +83,7 @@ def free_port(port: int) -> int:
         return probe.getsockname()[1]
 
 
-def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool) -> None:
+def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool, turns: MainThread) -> None:
     """Serves the page until Ctrl-C or SIGTERM.
 
     Args:
@@ -91,6 +91,7 @@ def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool) -> None:
         port: a free one.
         max_mb: largest upload, MB.
         open_browser: whether the browser is opened; where there is none, the address is printed.
+        turns: what this thread does meanwhile.
 
     Raises:
         UserError: another process has taken the port meanwhile.
@@ -136,7 +137,7 @@ def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool) -> None:
     try:
         if open_browser:
             webbrowser.open(address)
-        threading.Event().wait()
+        turns.work()
     finally:
         page.close(verbose=False)
 
