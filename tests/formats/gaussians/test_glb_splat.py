@@ -139,7 +139,7 @@ def test_the_validator_of_khronos_accepts_it(tmp_path, degree):
     path.write_bytes(renamed(path.read_bytes()))
     assert issues() == []
     data = path.read_bytes()
-    path.write_bytes(data.replace(b'"max":[', b'"max":[9', 1))  # what is wrong is seen
+    path.write_bytes(data.replace(b'"max": [', b'"max": [9', 1))  # what is wrong is seen
     assert issues()
 
 
