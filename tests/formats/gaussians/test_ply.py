@@ -95,8 +95,8 @@ def test_opengl_axes_turn_y_up():
 
 
 def test_files_of_other_programs_are_read(tmp_path):
-    """Big-endian doubles, another order, f_rest, a colour out of range, a second element."""
-    properties = ["opacity", *PROPERTIES[:3], "f_rest_0", "red", *PROPERTIES[3:6], *PROPERTIES[7:]]
+    """Big-endian doubles, another order, a colour out of range, a second element."""
+    properties = ["opacity", *PROPERTIES[:3], "nx", "red", *PROPERTIES[3:6], *PROPERTIES[7:]]
     values = np.array([[0, 1, 2, 3, 9, 9, 0, 5, -5, *[math.log(0.5)] * 3, 0, 0, 2, 0]], ">f8")
     lines = [*header(1, "double", properties, "binary_big_endian")]
     lines += ["element extra 1", "property list uchar int things"]
@@ -152,7 +152,8 @@ BAD_FILES = {
     "no end": (b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n", "has no end"),
     "endless": (b"ply\n" + b"comment x\n" * 10000 + b"end_header\n", "has no end"),
     "no format": (["element vertex 2", "property float x"], "format is none"),
-    "ascii": (header(2, form="ascii"), "format is ascii"),
+    "ascii": (header(2, form="ascii"), "vertex"),
+    "odd format": (header(2, form="binary"), "format is binary"),
     "no vertices": (["format binary_little_endian 1.0"], "element vertex COUNT"),
     "faces first": ([header(2)[0], "element face 2", *header(2)[1:]], "element vertex COUNT"),
     "negative": (header(-1), "element vertex COUNT"),

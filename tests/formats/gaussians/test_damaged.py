@@ -1,0 +1,227 @@
+"""Files of Gaussians that are cut short, or lie: one line each, whatever the format."""
+
+import gzip
+import json
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from helpers.gaussians import some
+from helpers.splats import check
+
+from gamba_warp.errors import UserError
+from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
+from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
+from gamba_warp.hostile.seeds.shapes import glb
+
+
+def refused(path, *words):
+    with pytest.raises(UserError) as caught:
+        read_gaussians(path)
+    text = str(caught.value)
+    assert str(path) in text and "\n" not in text and all(word in text for word in words), text
+
+
+@pytest.fixture
+def sound(tmp_path):
+    def make(kind, count=300, degree=1):
+        path = tmp_path / f"a{splat_suffix(kind)}"
+        write_gaussians(path, some(count, degree=degree), kind)
+        return path, path.read_bytes()
+
+    return make
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+@pytest.mark.parametrize("share", [0.999, 0.5, 0.02])
+def test_cut_short(sound, kind, share):
+    path, data = sound(kind)
+    path.write_bytes(data[: int(len(data) * share) | 1])  # a .splat of whole records is whole
+    refused(path)
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_too_long(sound, kind):
+    path, data = sound(kind)
+    path.write_bytes(data + b"\1" * 33)
+    if kind != "spz":  # what follows a gzip stream is not of it
+        refused(path)
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_empty_missing_and_a_folder(tmp_path, kind):
+    path = tmp_path / f"a{splat_suffix(kind)}"
+    refused(path, "No such file")
+    path.write_bytes(b"")
+    refused(path, "empty")
+    path.unlink()
+    path.mkdir()
+    refused(path)
+
+
+def test_another_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"some text")
+    refused(path, "not Gaussians")
+    assert splat_kind(path) is None
+
+
+@pytest.mark.parametrize("wrong", [299, 301, 10_000_000, 2**32 - 1])
+def test_an_spz_that_lies_about_its_count(sound, wrong):
+    path, data = sound("spz")
+    inner = bytearray(gzip.decompress(data))
+    struct.pack_into("<I", inner, 8, wrong)
+    path.write_bytes(gzip.compress(bytes(inner)))
+    tracemalloc.start()
+    refused(path)
+    assert tracemalloc.get_traced_memory()[1] < 5e6  # nothing was made room for
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "at, value, word",
+    [(4, 4, "version 4"), (4, 0, "version 0"), (12, 4, "degree 4"), (12, 0, "more follows")],
+)
+def test_an_spz_with_a_false_header(sound, at, value, word):
+    path, data = sound("spz")
+    inner = bytearray(gzip.decompress(data))
+    inner[at] = value
+    path.write_bytes(gzip.compress(bytes(inner)))
+    refused(path, word)
+
+
+def test_an_spz_bomb_and_a_damaged_stream(sound):
+    path, data = sound("spz")
+    path.write_bytes(gzip.compress(gzip.decompress(data) + bytes(1 << 26), 9))
+    tracemalloc.start()
+    refused(path, "more follows")
+    assert tracemalloc.get_traced_memory()[1] < 5e6
+    tracemalloc.stop()
+    path.write_bytes(data[:-8] + b"\0\0\0\0" + data[-4:])
+    refused(path, "damaged")
+    path.write_bytes(b"NGSP" + bytes(60))
+    refused(path, "version 4")
+
+
+def test_an_spz_with_extensions_is_read(sound, tmp_path):
+    path, data = sound("spz")
+    want = read_gaussians(path)
+    inner = bytearray(gzip.decompress(data))
+    inner[14] |= 2
+    path.write_bytes(gzip.compress(bytes(inner) + b"an extension"))
+    torch.testing.assert_close(read_gaussians(path).means, want.means)
+
+
+@pytest.mark.parametrize(
+    "old, new, word",
+    [
+        (b"element chunk 2", b"element chunk 1", "false header"),
+        (b"element vertex 300", b"element vertex 900", "truncated or false header"),
+        (b"element sh 300", b"element sh 299", "false header"),
+        (b"uint packed_scale", b"int packed_scales", "packed_scale"),
+        (b"float max_scale_y", b"float max_scale_q", "max_scale_y"),
+        (b"uchar f_rest_8", b"uchar f_rest_9", "f_rest_8"),
+    ],
+)
+def test_a_compressed_ply_that_lies(sound, old, new, word):
+    path, data = sound("compressed-ply")
+    assert old in data
+    path.write_bytes(data.replace(old, new, 1))
+    refused(path, word)
+
+
+def test_a_compressed_ply_with_bounds_that_are_not_finite(sound):
+    path, data = sound("compressed-ply")
+    start = data.index(b"end_header\n") + 11
+    path.write_bytes(data[:start] + struct.pack("<f", float("nan")) + data[start + 4 :])
+    refused(path, "not finite")
+
+
+@pytest.mark.parametrize("count", [1, 8, 10, 72])
+def test_an_odd_number_of_harmonics(tmp_path, count):
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    names += [f"f_rest_{i}" for i in range(count)]
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    lines += [*(f"property float {name}" for name in names), "end_header", ""]
+    body = np.ones((2, len(names)), "<f4").tobytes()
+    (tmp_path / "a.ply").write_bytes("\n".join(lines).encode() + body)
+    refused(tmp_path / "a.ply", f"{count} properties f_rest_*")
+
+
+def taken_apart(data):
+    size = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def changed(path, data, change):
+    tree, binary = taken_apart(data)
+    change(tree, tree["meshes"][0]["primitives"][0])
+    path.write_bytes(glb(json.dumps(tree).encode(), binary))
+
+
+NAME = "KHR_gaussian_splatting"
+CHANGES = {
+    "no rotation": (lambda t, p: p["attributes"].pop(f"{NAME}:ROTATION"), "ROTATION"),
+    "not there": (lambda t, p: p["attributes"].update({f"{NAME}:SCALE": 99}), "broken header"),
+    "wrong type": (lambda t, p: p["attributes"].update({f"{NAME}:SCALE": 2}), "VEC4"),
+    "half a degree": (lambda t, p: p["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_2"), "COEF_2"),
+    "packed": (lambda t, p: p["extensions"][NAME].update({"extensions": {"X_y": {}}}), "X_y"),
+    "linear": (lambda t, p: p["extensions"][NAME].update({"colorSpace": "lin"}), "lin"),
+    "triangles": (lambda t, p: p.update({"mode": 4}), "mode 4"),
+    "other counts": (lambda t, p: t["accessors"][3].update({"count": 9}), "false header"),
+    "too many": (lambda t, p: t["accessors"][0].update({"count": 9999}), "truncated or false"),
+    "circle": (lambda t, p: t["nodes"][0].update({"children": [0]}), "circle"),
+    "stretched": (lambda t, p: t["nodes"][0].update({"scale": [1, 2, 1]}), "stretches"),
+    "mirrored": (lambda t, p: t["nodes"][0].update({"scale": [1, -1, 1]}), "stretches"),
+    "no extension": (lambda t, p: p.pop("extensions"), "no Gaussians in it"),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_a_glb_that_is_false_or_of_another_kind(sound, case):
+    path, data = sound("glb")
+    change, word = CHANGES[case]
+    changed(path, data, change)
+    refused(path, word)
+
+
+def test_a_glb_of_a_draft_with_logarithms(sound):
+    path, data = sound("glb")
+    tree, binary = taken_apart(data)
+    view = tree["bufferViews"][3]
+    start, end = view["byteOffset"], view["byteOffset"] + view["byteLength"]
+    logs = np.log(np.frombuffer(binary[start:end], "<f4")).astype("<f4").tobytes()
+    path.write_bytes(glb(json.dumps(tree).encode(), binary[:start] + logs + binary[end:]))
+    refused(path, "logarithms")
+
+
+def test_a_glb_is_moved_by_its_nodes(sound, tmp_path):
+    path, data = sound("glb")
+    want = read_gaussians(path)
+    s = 0.5**0.5
+
+    def move(tree, primitive):
+        tree["nodes"] = [
+            {"children": [1], "translation": [1, 2, 3]},
+            {"mesh": 0, "rotation": [0, s, 0, s], "scale": [2, 2, 2]},
+        ]
+
+    changed(path, data, move)
+    # In glTF's axes: doubled, turned by 90 degrees about y, moved. Ours have y and z negated.
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    turn = flip @ torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) @ flip
+    moved = want.transformed(turn, flip @ torch.tensor([1.0, 2, 3]), 2.0)
+    # float32 twice through a rotation
+    check("compressed-ply", moved, read_gaussians(path))
+
+
+def test_meshes_are_no_gaussians(tmp_path):
+    box = trimesh.creation.box()
+    for suffix in ("glb", "ply", "stl", "obj"):
+        box.export(tmp_path / f"box.{suffix}")
+        assert splat_kind(tmp_path / f"box.{suffix}") is None
+        refused(tmp_path / f"box.{suffix}")

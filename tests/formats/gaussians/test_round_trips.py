@@ -1,0 +1,184 @@
+"""Every format of Gaussians, written and read by us; what it cannot hold is said."""
+
+import numpy as np
+import pytest
+import torch
+from helpers.gaussians import some
+from helpers.splats import check, differences
+
+from gamba_warp.errors import UserError
+from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
+from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.gaussians import Gaussians
+
+HOLD_HARMONICS = [kind for kind in SPLAT_FORMATS if kind != "splat"]
+
+
+def written(folder, gaussians, kind, **options):
+    path = folder / f"a{splat_suffix(kind)}"
+    return path, write_gaussians(path, gaussians, kind, **options)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_what_is_written_is_read(tmp_path, kind, degree):
+    gaussians = some(601, degree=degree)  # three chunks, the last one not full
+    path, lost = written(tmp_path, gaussians, kind)
+    assert splat_kind(path) == kind
+    loaded = read_gaussians(path)
+    if kind == "splat" and degree:
+        assert loaded.degree == 0 and "harmonics are lost" in lost and str(path) in lost
+        gaussians.colors.clamp_(0, 1)
+    else:
+        assert lost is None and loaded.degree == degree
+    check(kind, gaussians, loaded)
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_one_gaussian_without_rotation(tmp_path, kind):
+    gaussians = some(1, rotated=False)
+    path, _ = written(tmp_path, gaussians, kind)
+    gaussians.quats = torch.tensor([[1.0, 0, 0, 0]])
+    check(kind, gaussians, read_gaussians(path))
+
+
+@pytest.mark.parametrize("kind", ["ply", "compressed-ply"])
+def test_axes_are_turned_and_turned_back(tmp_path, kind):
+    gaussians = some(300, degree=2)
+    path, _ = written(tmp_path, gaussians, kind, axes="opengl", comments=["two\nlines"])
+    head = path.read_bytes()[:900]
+    assert b"comment frame opengl" in head and b"comment two lines" in head
+    check(kind, gaussians, read_gaussians(path))
+
+
+@pytest.mark.parametrize("kind", HOLD_HARMONICS)
+def test_harmonics_show_the_same_colours_after_a_turn(tmp_path, kind):
+    """.spz and .glb have other axes than ours: the coefficients are turned with the object."""
+    from gamba_warp.kernels.rasterize.harmonics import harmonics_basis
+
+    gaussians = some(40, degree=3)
+    path, _ = written(tmp_path, gaussians, kind)
+    loaded = read_gaussians(path)
+    order = torch.cdist(gaussians.means, loaded.means).argmin(1)
+    directions = torch.nn.functional.normalize(torch.randn(40, 3), dim=1)
+    basis = harmonics_basis(3, directions)[:, 1:, None]
+    want = (basis * gaussians.harmonics).sum(1)
+    got = (basis * loaded.harmonics[order]).sum(1)
+    # 15 coefficients, each half a step of up to 1/32 off, at harmonics of size about 0.7
+    assert (want - got).abs().max() < 15 * 0.7 / 64
+
+
+def test_conversions_keep_harmonics_all_around(tmp_path):
+    gaussians = some(50, degree=3)
+    path, _ = written(tmp_path, gaussians, "glb")
+    for kind in ("spz", "ply", "compressed-ply", "glb"):
+        path, lost = written(tmp_path, read_gaussians(path), kind)
+        assert lost is None
+    found = differences(gaussians, read_gaussians(path))
+    assert found["harmonics"] < 0.501 / 128 + 4.01 / 256 and found["means"] < 1e-3
+
+
+@pytest.mark.parametrize("kind, most", [("spz", "±1"), ("compressed-ply", "±4")])
+def test_harmonics_out_of_range_are_clipped_and_that_is_said(tmp_path, kind, most):
+    gaussians = some(9, degree=1)
+    gaussians.harmonics[4, 1, 2] = 5.0
+    path, lost = written(tmp_path, gaussians, kind)
+    assert most in lost and "\n" not in lost
+    assert read_gaussians(path).harmonics.abs().max() < 4.02
+
+
+def test_spz_far_and_wide(tmp_path):
+    gaussians = some(50)
+    gaussians.means *= 1e4
+    gaussians.scales[3] = 1e4
+    path, lost = written(tmp_path, gaussians, "spz")
+    assert "scales of 1 Gaussians" in lost
+    found = differences(gaussians, read_gaussians(path))
+    assert found["means"] <= 0.9 / 2**10  # 5,000 leaves ten bits behind the point
+    gaussians.means *= 1e4
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="an .spz holds"):
+        written(tmp_path, gaussians, "spz")
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_refusals(tmp_path, kind):
+    gaussians = some(degree=1)
+    path, _ = written(tmp_path, gaussians, kind, min_opacity=0.5)
+    keep = gaussians.opacities >= 0.5
+    assert read_gaussians(path).num == int(keep.sum())
+    before = path.read_bytes()
+    with pytest.raises(UserError, match="no Gaussian has an opacity"):
+        written(tmp_path, gaussians, kind, min_opacity=2)
+    gaussians.harmonics[1, 1] = float("inf")
+    with pytest.raises(UserError, match="not written, 1 of 37"):
+        written(tmp_path, gaussians, kind)
+    with pytest.raises(UserError, match="cannot write /dev/null/a"):
+        write_gaussians(f"/dev/null/a{splat_suffix(kind)}", some(), kind)
+    assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_unknown_format(tmp_path):
+    with pytest.raises(ValueError, match="ksplat"):
+        write_gaussians(tmp_path / "a", some(), "ksplat")
+
+
+def as_text(data):
+    header, _, body = data.partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(-1, header.count(b"property float"))
+    lines = [" ".join(f"{value:.9g}" for value in row) for row in rows]
+    return header.replace(b"binary_little_endian", b"ascii") + (
+        "\n".join(["end_header", *lines, ""]).encode()
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_text_is_read(tmp_path, degree):
+    gaussians = some(degree=degree)
+    save_ply(tmp_path / "a.ply", gaussians, axes="opengl")
+    (tmp_path / "b.ply").write_bytes(as_text((tmp_path / "a.ply").read_bytes()))
+    check("ply", load_ply(tmp_path / "a.ply"), read_gaussians(tmp_path / "b.ply"))
+    assert splat_kind(tmp_path / "b.ply") == "ply"
+
+
+def test_the_content_decides_and_not_the_name(tmp_path):
+    gaussians = some()
+    for kind in ("ply", "spz", "glb", "compressed-ply"):
+        path, _ = written(tmp_path, gaussians, kind)
+        path = path.rename(tmp_path / "a.splat")
+        assert splat_kind(path) == kind
+        check(kind, gaussians, read_gaussians(path))
+
+
+def test_harmonics_are_channel_major_in_a_ply(tmp_path):
+    gaussians = some(3, degree=2)
+    save_ply(tmp_path / "a.ply", gaussians)
+    from plyfile import PlyData
+
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    for channel in range(3):
+        for k in range(8):
+            want = gaussians.harmonics[:, k, channel]
+            np.testing.assert_array_equal(vertex[f"f_rest_{8 * channel + k}"], want)
+    assert np.abs(vertex["f_dc_0"]).max() > 0
+
+
+def test_version_1_and_2_of_spz(tmp_path):
+    """Made by hand by the published layout; the values are exact in it."""
+    import gzip
+    import struct
+
+    head = [struct.pack("<4sIIBBBB", b"NGSP", version, 2, 0, 12, 0, 0) for version in (1, 2)]
+    halves = np.array([[1.5, -2, 0.25], [0, 1, 2]], "<f2").tobytes()
+    fixed = np.array([[6144, -8192, 1024], [0, 4096, 8192]], "<i4")
+    low = fixed[:, :, None].view(np.uint8)[..., :3].tobytes()
+    rest = bytes([255, 51]) + bytes([0, 128, 255] * 2) + bytes([160, 144, 128] * 2)
+    rest += bytes([255, 128, 128, 128, 128, 128])  # 1 about x, then none nearly
+    for start, positions in zip(head, (halves, low)):
+        (tmp_path / "a.spz").write_bytes(gzip.compress(start + positions + rest))
+        got: Gaussians = read_gaussians(tmp_path / "a.spz")
+        assert got.means.tolist() == [[1.5, 2, -0.25], [0, -1, -2]]  # turned to ours
+        torch.testing.assert_close(got.opacities, torch.tensor([1.0, 0.2]))
+        torch.testing.assert_close(got.scales[0].log(), torch.tensor([0.0, -1.0, -2.0]))
