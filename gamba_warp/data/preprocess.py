@@ -22,6 +22,12 @@ from ..images import load_rgba, picture_size
 BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
 WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model sees more
 
+SAM_FILES = (
+    "published are sam_vit_b_01ec64.pth (375 MB; ViT-L and ViT-H are larger) at "
+    "https://github.com/facebookresearch/segment-anything, and mobile_sam.pt (40 MB) at "
+    "https://github.com/ChaoningZhang/MobileSAM"
+)
+
 _TRANSPARENT = 0.5  # a picture with any alpha below this has a cut-out object
 _PRESENT = 0.05  # alpha from which a pixel counts for the object's bounds
 _PLAIN_TOLERANCE = 0.07  # largest colour difference within a plain background
@@ -52,10 +58,10 @@ def prepare(
     """
     rgba = load_rgba(path, longest=WORKING_SIZE)
     if mask is not None:
-        rgba[..., 3] = _read_mask(mask, path)
-    has_alpha = mask is not None or rgba[..., 3].min() < _TRANSPARENT
+        rgba[..., 3] = read_mask(mask, path)
+    cut = mask is not None or has_alpha(rgba)
     rgba = shrink(rgba, WORKING_SIZE)
-    if not has_alpha:
+    if not cut:
         rgba = _cut_out(path, rgba[..., :3], segmenter)
     try:
         return recenter(rgba)
@@ -63,7 +69,17 @@ def prepare(
         raise UserError(f"{mask or path}: {error}") from error
 
 
-def _read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
+def has_alpha(rgba: np.ndarray) -> bool:
+    """Whether a picture ``[H, W, 4]`` has an object cut out: some of it is transparent."""
+    return bool(rgba[..., 3].min() < _TRANSPARENT)
+
+
+def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
+    """Alpha ``[H, W]`` in [0, 1] of a mask's file, reduced as ``load_rgba`` reduces the picture.
+
+    Raises:
+        UserError: the mask, or the picture's size, cannot be read, or they differ in size.
+    """
     sizes = [picture_size(file) for file in (mask, path)]
     if sizes[0] != sizes[1]:
         stated = [f"{width}x{height}" for width, height in sizes]
@@ -213,7 +229,7 @@ class SamSegmenter:
     def __init__(self, checkpoint: str | Path, device: str | torch.device = "cpu") -> None:
         path = Path(checkpoint)
         if not path.is_file():
-            raise UserError(f"--sam {path}: no such file")
+            raise UserError(f"--sam {path}: no such file; {SAM_FILES}")
         try:
             from kornia.contrib.visual_prompter import VisualPrompter
             from kornia.models.sam.model import SamConfig

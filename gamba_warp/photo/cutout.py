@@ -1,0 +1,243 @@
+"""Any photograph to one object, cut out and centred: each way in its order, and what it says.
+
+What the user gives (a mask, the picture's own transparency) is taken as it is. What is found (a
+plain background, the matte of a network, GrabCut) is judged, and the next way is tried where it
+cannot be an object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from ..data.preprocess import (
+    WORKING_SIZE,
+    SamSegmenter,
+    has_alpha,
+    plain_matte,
+    read_mask,
+    recenter,
+    shrink,
+)
+from ..errors import UserError
+from ..images import load_rgba
+from .grabcut import grabcut
+from .matte import Matte, NoMatte, to_stderr
+
+Method = Literal["alpha", "mask", "plain", "matte", "sam", "grabcut"]
+
+MEND = (
+    "If it is wrong: gamba reconstruct --save-inputs writes the cut-out as NAME-input.png; erase or "
+    "restore parts of it in a picture editor and give that file, or give --mask FILE."
+)
+_HOW: dict[str, str] = {
+    "alpha": "The picture's own transparency is the cut-out.",
+    "mask": "The mask {mask} cut the object out.",
+    "plain": "The plain background was taken away.",
+    "matte": "The matting model {model} cut the object out.",
+    "sam": "Segment Anything cut the object out, which it expects in the middle.",
+    "grabcut": "Colours alone (GrabCut) cut the object out, which they expect in the middle{why}.",
+}
+_LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the picture that an object covers
+_MOST_EDGE = 0.75  # share of the picture's border that an object may cover
+_UNSURE = 0.4  # largest share of an alpha's sum in pixels that are neither object nor background
+
+
+@dataclass
+class Ways:
+    """How an object may be found; one is made for all pictures of a command.
+
+    Attributes:
+        mask: picture of the same size, white (or opaque) on the object.
+        matte_model: an ISNet or U2-Net in ONNX; if None, one of rembg's that is kept, or fetched.
+        sam: a checkpoint of Segment Anything, used in place of the matting model.
+        device: device of Segment Anything; the matting model runs on the CPU.
+        fetch: whether a matting model may be fetched.
+        say: gets a line before anything is fetched.
+    """
+
+    mask: str | Path | None = None
+    matte_model: str | Path | None = None
+    sam: str | Path | None = None
+    device: str | torch.device = "cpu"
+    fetch: bool = True
+    say: Callable[[str], None] = to_stderr
+    _segmenter: SamSegmenter | None = field(default=None, init=False, repr=False)
+    _matte: Matte | None = field(default=None, init=False, repr=False)
+    _no_matte: str = field(default="", init=False, repr=False)
+
+    def check(self) -> None:
+        """Opens what was given, so that a bad file is told before any picture is read.
+
+        Raises:
+            UserError: a file is missing, or of another kind.
+            ModuleNotFoundError: a library that it needs is not installed.
+        """
+        if self.sam is not None:
+            self.segmenter()
+        if self.matte_model is not None:
+            self.matte()
+
+    def segmenter(self) -> SamSegmenter | None:
+        """Segment Anything, opened once; None where it is not wanted."""
+        if self._segmenter is None and self.sam is not None:
+            self._segmenter = SamSegmenter(self.sam, self.device)
+        return self._segmenter
+
+    def matte(self) -> Matte | None:
+        """The matting model, opened once; None where there is none, and ``why_no_matte`` why."""
+        if self._matte is None and not self._no_matte:
+            try:
+                self._matte = Matte(self.matte_model, self.fetch, self.say)
+            except NoMatte as error:
+                self._no_matte = str(error)
+        return self._matte
+
+    def why_no_matte(self) -> str:
+        """Why there is no matting model, or ""."""
+        return self._no_matte
+
+
+@dataclass(frozen=True)
+class CutOut:
+    """An object that was cut out of a picture.
+
+    Attributes:
+        rgba: ``[S, S, 4]`` float32 in [0, 1]: the object in the middle, its longer side ``0.8 · S``.
+        method: the way in which it was found.
+        note: how it was cut, and how to mend it.
+        source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels a side.
+        mask: alpha of the object in it, ``[H, W]`` float32 in [0, 1].
+    """
+
+    rgba: np.ndarray
+    method: Method
+    note: str
+    source_rgb: np.ndarray
+    mask: np.ndarray
+
+    def editable(self) -> np.ndarray:
+        """``[H, W, 4]``: the whole picture, of which the transparent parts keep their colours.
+
+        As a PNG it can be given again, and an editor can bring back what was cut away wrongly.
+        """
+        return np.dstack([self.source_rgb, self.mask])
+
+
+def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
+    """Reads a picture and cuts its object out.
+
+    A mask that is given wins over all; then come the picture's own transparency, a plain
+    background, Segment Anything if given, the matting model, and GrabCut.
+
+    Args:
+        path: any picture that ``load_rgba`` reads.
+        ways: what may be used.
+
+    Raises:
+        UserError: the picture or a file of ``ways`` cannot be read, or no way finds an object.
+        ModuleNotFoundError: a library that a file of ``ways`` needs is not installed.
+    """
+    ways = Ways() if ways is None else ways
+    rgba, why = load_rgba(path, longest=WORKING_SIZE), ""
+    if ways.mask is not None:
+        rgba[..., 3] = read_mask(ways.mask, path)
+        method: Method = "mask"
+        rgba = shrink(rgba, WORKING_SIZE)
+    elif has_alpha(rgba):
+        method, rgba = "alpha", shrink(rgba, WORKING_SIZE)
+    else:
+        rgba = shrink(rgba, WORKING_SIZE)
+    source = rgba[..., :3].copy()
+    if ways.mask is None and not has_alpha(rgba):
+        method, rgba, why = _found(path, source, ways)
+    try:
+        centred = recenter(rgba)
+    except ValueError as error:
+        raise UserError(f"{ways.mask or path}: {error}") from error
+    model = ways.matte() if method == "matte" else None
+    how = _HOW[method].format(
+        mask=Path(ways.mask or "").name, model=model and model.path.name, why=why
+    )
+    return CutOut(centred, method, f"{how} {MEND}", source, rgba[..., 3])
+
+
+def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.ndarray, str]:
+    """The way that finds an object, its ``[H, W, 4]``, and why no better one did."""
+    if find_spec("skimage") is not None:
+        rgba = plain_matte(rgb)
+        if rgba is not None:
+            return "plain", rgba, ""
+    reasons = []
+    segmenter = ways.segmenter()
+    if segmenter is not None:
+        alpha = segmenter(rgb)
+        fault = fault_of(alpha)
+        if fault is None:
+            return "sam", _blended(rgb, alpha), ""
+        reasons.append(f"Segment Anything: {fault}")
+    try:
+        matte = ways.matte()
+        alpha = None if matte is None else matte(rgb)
+        fault = ways.why_no_matte() if alpha is None else fault_of(alpha)
+    except NoMatte as error:
+        alpha, fault = None, str(error)
+    if alpha is not None and fault is None:
+        return "matte", _blended(rgb, alpha), ""
+    reasons.append(f"matting model: {fault}")
+    alpha = grabcut(rgb)
+    fault = fault_of(alpha)
+    if fault is None:
+        return "grabcut", _blended(rgb, alpha), f" ({'; '.join(reasons)})"
+    reasons.append(f"GrabCut: {fault}")
+    raise UserError(
+        f"{path}: cannot tell object from background ({'; '.join(reasons)}); give a picture with a "
+        "transparent or plain background, --mask FILE, --matte-model FILE or --sam FILE"
+    )
+
+
+def fault_of(alpha: np.ndarray) -> str | None:
+    """Why a mask cannot be that of one object that is wholly in the picture; None if it can.
+
+    Args:
+        alpha: ``[H, W]`` in [0, 1].
+    """
+    inside = alpha > 0.5
+    share = inside.mean()
+    edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
+    if share < _LEAST_SHARE:
+        return "nothing stands out"
+    if share > _MOST_SHARE:
+        return "all of the picture would be the object"
+    if edge.mean() > _MOST_EDGE:
+        return f"it would touch {edge.mean():.0%} of the picture's border"
+    if alpha[(alpha > 0.1) & (alpha < 0.9)].sum() > _UNSURE * alpha.sum():
+        return "it has no clear border"
+    return None
+
+
+def _blended(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """``[H, W, 4]``, with the background's share taken out of the colours along the border.
+
+    Colours of object and background are estimated as means around, weighted by alpha (the fusion of
+    blurs of Forte 2021), so that no fringe is left on another background.
+    """
+    picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
+    share = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
+    size = 2 * max(2, max(rgb.shape[:2]) // 64) + 1
+
+    def around(weight: torch.Tensor) -> torch.Tensor:
+        planes = torch.cat([picture * weight, weight], 1)
+        mean = torch.nn.functional.avg_pool2d(planes, size, 1, size // 2)
+        return mean[:, :3] / mean[:, 3:].clamp(min=1e-5)
+
+    ours, theirs = around(share), around(1 - share)
+    colors = ours + share * (picture - share * ours - (1 - share) * theirs)
+    colors = torch.where(share > 0.99, picture, colors).clamp(0, 1)
+    return np.dstack([colors[0].permute(1, 2, 0).numpy(), alpha]).astype(np.float32)

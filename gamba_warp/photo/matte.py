@@ -1,0 +1,111 @@
+"""The matte of a trained network: which file, run in a child process, and how it is to be had."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..data.preprocess import resize_rgba
+from ..errors import UserError
+from ..images import to_uint8
+from ..untrusted.children import Failed, run_each
+from . import models, network
+
+MAX_MODEL = 2 << 30  # bytes of a model's file; the largest that rembg publishes has 1.1 GB
+_SECONDS = 300.0  # for one picture; it takes about six on two cores
+_MEMORY = 8 << 30  # bytes; ISNet takes two gigabytes
+
+
+class NoMatte(Exception):
+    """There is no matting model, or it failed; the text says why, in one line."""
+
+
+class Matte:
+    """A matting network.
+
+    Args:
+        file: an ISNet or U2-Net in ONNX; if None, one of rembg's that is kept on this machine, or
+            else is fetched.
+        fetch: whether the network may be asked.
+        say: gets a line before anything is fetched.
+
+    Raises:
+        UserError: ``file`` is missing, or no matting model.
+        ModuleNotFoundError: ``file`` is given, and onnxruntime is not installed.
+        NoMatte: nothing is given, and there is no model, or no onnxruntime.
+    """
+
+    def __init__(
+        self, file: str | Path | None = None, fetch: bool = True, say: Callable[[str], None] = print
+    ) -> None:
+        if find_spec("onnxruntime") is None:
+            if file is not None:
+                raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
+            raise NoMatte("onnxruntime is not installed: pip install 'gamba-warp[photo]'")
+        self._given = file is not None
+        self.path = Path(file) if file is not None else _published(fetch, say)
+        self._version = _version_of(self.path) if self._given else (0, 0)
+        if self._given:
+            self._run(None)
+
+    def __call__(self, rgb: np.ndarray) -> np.ndarray:
+        """Alpha ``[H, W]`` float32 in [0, 1] from RGB ``[H, W, 3]`` in [0, 1].
+
+        Raises:
+            UserError: a file that was given fails.
+            NoMatte: a file of rembg's fails.
+        """
+        alpha = self._run(to_uint8(rgb))
+        assert alpha is not None
+        # resize_rgba weights colours by alpha, and here there is only the alpha.
+        planes = np.dstack([np.zeros((*alpha.shape, 3), np.float32), alpha])
+        return resize_rgba(planes, *rgb.shape[:2])[..., 3]
+
+    def _run(self, rgb: np.ndarray | None) -> np.ndarray | None:
+        task = (str(self.path.absolute()), self._version, rgb, torch.get_num_threads())
+        ((_, value),) = run_each(network.alpha_of, [task], seconds=_SECONDS, memory=_MEMORY)
+        if not isinstance(value, Failed):
+            return value
+        reason = value.reason.removeprefix(f"{task[0]}: ")
+        if self._given:
+            raise UserError(f"--matte-model {self.path}: {reason}")
+        raise NoMatte(f"{self.path}: {reason}")
+
+
+def _version_of(path: Path) -> tuple[int, int]:
+    """Size and time of change of a file that was given. Raises UserError if it is no plain file."""
+    if not path.is_file():
+        reason = "not a plain file" if path.exists() else "no such file"
+        raise UserError(f"--matte-model {path}: {reason}")
+    found = os.stat(path)
+    if found.st_size > MAX_MODEL:
+        raise UserError(f"--matte-model {path}: is over {MAX_MODEL >> 30} GB")
+    return found.st_size, found.st_mtime_ns
+
+
+def _published(fetch: bool, say: Callable[[str], None]) -> Path:
+    path = models.kept()
+    if path is not None:
+        return path
+    model = models.PUBLISHED[0]
+    how = f"no matting model is here; give --matte-model FILE, such as {model.address}"
+    if not fetch or not models.may_fetch():
+        raise NoMatte(how)
+    if find_spec("pooch") is None:
+        raise NoMatte("pooch, which fetches it, is not installed: pip install 'gamba-warp[photo]'")
+    say(f"fetching a matting model once, {model.megabytes} MB, from {model.address}")
+    try:
+        return models.fetch()
+    except models.NotFetched as error:
+        raise NoMatte(f"{how} ({error})") from error
+
+
+def to_stderr(line: str) -> None:
+    """Says a line on stderr, as the commands do."""
+    print(f"gamba: {line}", file=sys.stderr, flush=True)

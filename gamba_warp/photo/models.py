@@ -1,0 +1,109 @@
+"""rembg's published matting models: where a copy of them may lie, and how one is fetched.
+
+The files and their places are those of rembg, so that who has rembg needs nothing more. rembg
+itself is not used: its first import compiles numba functions for minutes (docs/photo.md).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from ..errors import first_line
+
+_FROM = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
+_SECONDS = 20  # without an answer, after which the network counts as not there
+
+
+class Published(NamedTuple):
+    """A model that rembg publishes.
+
+    Attributes:
+        name: of the model; its file is ``NAME.onnx``.
+        md5: of the file, as rembg states it.
+        megabytes: size of the file.
+        licence: of the weights.
+    """
+
+    name: str
+    md5: str
+    megabytes: int
+    licence: str
+
+    @property
+    def address(self) -> str:
+        """Where it is published."""
+        return f"{_FROM}/{self.name}.onnx"
+
+
+# The first is the one that is fetched; of those that are there, the first is used.
+PUBLISHED = (
+    Published("isnet-general-use", "fc16ebd8b0c10d971d3513d564d01e29", 179, "Apache 2.0"),
+    Published("u2net", "60024c5c889badc19c04ad937298a77b", 176, "Apache 2.0"),
+    Published("silueta", "55e59e0d8062d2f5d013f4725ee84782", 44, "Apache 2.0"),
+    Published("u2netp", "8e83ca70e441ab06c318d82300c84806", 5, "Apache 2.0"),
+)
+
+
+class NotFetched(Exception):
+    """The model could not be fetched; the text says why, in one line."""
+
+
+def _homes() -> tuple[Path, Path]:
+    """rembg's folder, and the one that it had before: both are looked into, as it does itself."""
+    chosen, data = os.environ.get("U2NET_HOME"), os.environ.get("XDG_DATA_HOME")
+    if chosen:
+        return Path(chosen).expanduser(), Path(chosen).expanduser()
+    new = os.environ.get("REMBG_HOME") or (f"{data}/rembg" if data else "~/.rembg")
+    return Path(os.path.expanduser(new)), Path(os.path.expanduser(f"{data or '~'}/.u2net"))
+
+
+def kept() -> Path | None:
+    """A published model that lies in rembg's folders, the best that is there; None if none is."""
+    home, former = _homes()
+    for model in PUBLISHED:
+        file = f"{model.name}.onnx"
+        for path in (home / "models" / model.name / file, former / file):
+            if path.is_file():
+                return path
+    return None
+
+
+def may_fetch() -> bool:
+    """Whether the network may be asked: not where ``GAMBA_OFFLINE`` is set."""
+    return os.environ.get("GAMBA_OFFLINE", "0") in ("", "0")
+
+
+def fetch() -> Path:
+    """Fetches the first of ``PUBLISHED`` into rembg's folder, with its progress on stderr.
+
+    The file has its name only when all of it is there and its digest is right.
+
+    Raises:
+        ModuleNotFoundError: pooch is not installed.
+        NotFetched: there is no network, the file is not what it should be, or cannot be written.
+    """
+    import pooch
+
+    model = PUBLISHED[0]
+    pooch.get_logger().setLevel("ERROR")
+    try:
+        found = pooch.retrieve(
+            model.address,
+            known_hash=f"md5:{model.md5}",
+            fname=f"{model.name}.onnx",
+            path=_homes()[0] / "models" / model.name,
+            downloader=pooch.HTTPDownloader(progressbar=True, timeout=_SECONDS),
+        )
+    except Exception as error:  # of requests, of urllib3, of the disk, and a ValueError of pooch
+        raise NotFetched(_short(error)) from error
+    return Path(found)
+
+
+def _short(error: Exception) -> str:
+    """Why it could not be fetched; requests puts several errors into one another."""
+    names = {type(error).__name__, type(error.__context__).__name__}
+    if names & {"ConnectionError", "ConnectTimeout", "ReadTimeout", "ProxyError", "SSLError"}:
+        return "github.com cannot be reached"
+    return first_line(error)[:200]
