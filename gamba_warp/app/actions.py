@@ -19,7 +19,7 @@ from .turns import MainThread
 
 if TYPE_CHECKING:
     from ..model.gamba import Gamba
-    from .cutter import Ways
+    from ..photo.cutout import Ways
 
 _FRAME = (
     '<iframe class="stage" title="3D view of {name}" sandbox="allow-scripts allow-downloads" '
@@ -72,11 +72,16 @@ class Actions:
         for name in ("take", "example", "mend", "restart", "make"):
             setattr(self, name, plainly(getattr(self, name)))
 
-    def take(self, given: dict[str, Any] | None) -> tuple:
+    def take(
+        self,
+        given: dict[str, Any] | None,
+        progress: gr.Progress = gr.Progress(),  # noqa: B008
+    ) -> tuple:
         """A picture that was dropped or pasted; None where it was taken away."""
         if not given or not given.get("path"):
             return None, gr.update(visible=False), None, "", gr.skip()
         name = given.get("orig_name") or "picture"
+        progress(0.2, "Looking for the object")
         try:
             cut = self._turns.call(cut_picture, Path(given["path"]), name, self._ways)
         except UserError as error:

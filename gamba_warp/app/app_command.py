@@ -27,7 +27,8 @@ def app_command(
     Args:
         checkpoint: Trained model (.safetensors); the starter model if not given.
         encoder_weights: The image encoder's weights, where the model has a pretrained one.
-        matte_model: Model that cuts objects out of busy pictures.
+        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out; if not given, one that
+            rembg keeps on this machine, or it is fetched once (179 MB).
         port: Port of 127.0.0.1; 0 picks a free one.
         open_browser: Open the browser; the address is printed in any case.
         max_upload_mb: Largest picture file, MB.
@@ -35,12 +36,13 @@ def app_command(
     """
     from ..devices import pick_device
     from ..model.checkpoint import load_model
-    from .cutter import Ways
+    from ..photo.cutout import Ways
     from .server import free_port, quiet, serve, work_folder
 
     chosen, port = pick_device(device), free_port(port)
     model = load_model(checkpoint, chosen, encoder_weights)
-    ways = Ways(matte_model=matte_model, device=str(chosen))
+    ways = Ways(matte_model=matte_model, device=chosen)
+    ways.check()
     with work_folder() as folder:
         quiet(folder)
         from .actions import Actions

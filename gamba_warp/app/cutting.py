@@ -14,7 +14,7 @@ from ..conventions import over_background
 from ..errors import UserError
 
 if TYPE_CHECKING:
-    from .cutter import Ways
+    from ..photo.cutout import Ways
 
 SIDE = 720  # longer side of the picture that is painted on, pixels
 KEEP, REMOVE = "#2f6fed", "#e8590c"  # colours of the brush: blue and orange, told apart by all eyes
@@ -62,7 +62,7 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
     """
     from ..data.preprocess import WORKING_SIZE, shrink
     from ..images import load_rgba
-    from .cutter import cut_out
+    from ..photo.cutout import MEND, cut_out
 
     try:
         rgba = shrink(load_rgba(path, longest=WORKING_SIZE), WORKING_SIZE)
@@ -76,7 +76,24 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
         note = f"No object was found ({reason}). Paint over the object with the blue brush."
         return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note)
     ghost = cut.method != "alpha"  # what a file holds where it is transparent is no picture
-    return Cut(stem(name), cut.source_rgb, cut.mask, cut.mask, cut.rgba, ghost, cut.note)
+    note = cut.note.removesuffix(MEND).strip()  # that is for the command line
+    rgb = _clean_edge(cut.source_rgb, cut.mask, cut.rgba)
+    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, note)
+
+
+def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """The picture with the found object's own colours, so that a mended one has no fringe."""
+    from ..data.preprocess import PRESENT
+
+    present = mask > PRESENT
+    rows, columns = np.flatnonzero(present.any(1)), np.flatnonzero(present.any(0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    top, left = ((found.shape[0] - size) // 2 for size in mask[box].shape)
+    height, width = mask[box].shape
+    inner = found[top : top + height, left : left + width]
+    out = rgb.copy()
+    out[box] = np.where(present[box][..., None], inner[..., :3], rgb[box])
+    return out
 
 
 def stem(name: str) -> str:

@@ -62,7 +62,7 @@ def _picture_part() -> tuple[gr.Image, gr.Gallery]:
         sources=["upload", "clipboard"],
         type="filepath",
         image_mode=None,
-        height=220,
+        height=190,
         buttons=[],
         placeholder="Drop a picture here\nor click to choose one",
         elem_id="picture",
@@ -115,7 +115,7 @@ def _cut_part() -> _CutPart:
             brush=_brush(KEEP),
             eraser=gr.Eraser(default_size=SIDE // 24),
             canvas_size=(SIDE, SIDE),
-            height=430,
+            height=420,
             buttons=[],
             elem_id="editor",
         )

@@ -29,5 +29,12 @@ def theme() -> gr.themes.Base:
         block_label_background_fill_dark="transparent",
         button_primary_background_fill="#1a63d8",
         button_primary_background_fill_hover="#1553b8",
+        button_primary_background_fill_dark="#2563eb",
+        button_primary_background_fill_hover_dark="#3b76f0",
         button_primary_text_color="#ffffff",
+        button_secondary_background_fill="#ecedef",
+        button_secondary_background_fill_hover="#e0e2e5",
+        button_secondary_background_fill_dark="#2b2f36",
+        button_secondary_background_fill_hover_dark="#383d46",
+        button_secondary_text_color_dark="#e8e9eb",
     )

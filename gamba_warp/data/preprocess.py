@@ -29,7 +29,7 @@ SAM_FILES = (
 )
 
 _TRANSPARENT = 0.5  # a picture with any alpha below this has a cut-out object
-_PRESENT = 0.05  # alpha from which a pixel counts for the object's bounds
+PRESENT = 0.05  # alpha from which a pixel counts for the object's bounds
 _PLAIN_TOLERANCE = 0.07  # largest colour difference within a plain background
 _PLAIN_SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
 _MIN_OBJECT = 16  # least size of an object, pixels
@@ -159,7 +159,7 @@ def recenter(rgba: np.ndarray, border_ratio: float = BORDER_RATIO) -> np.ndarray
     Raises:
         ValueError: hardly any pixel is opaque.
     """
-    present = rgba[..., 3] > _PRESENT
+    present = rgba[..., 3] > PRESENT
     count = np.count_nonzero(present)
     if count < _MIN_OBJECT:
         raise ValueError(
