@@ -14,6 +14,7 @@ All say where the cameras are in the frame of the Gaussians, as their file holds
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from torch import Tensor
 from ..cameras import Cameras, from_opengl
 from ..data.layouts import read_cameras
 from ..errors import UserError
-from ..files import write_json
+from ..files import write_text
 from ..untrusted.documents import parse_document, read_bytes
 
 FORMAT = "gamba-cameras"
@@ -143,14 +144,15 @@ def save_path(
     Raises:
         UserError: the file cannot be written.
     """
-    document: dict[str, Any] = {"format": FORMAT, "version": 1}
-    document |= {"width": cameras.width, "height": cameras.height}
-    document |= {} if fps is None else {"fps": fps}
+    head: dict[str, Any] = {"format": FORMAT, "version": 1}
+    head |= {"width": cameras.width, "height": cameras.height}
+    head |= {} if fps is None else {"fps": fps}
     rows = zip(cameras.viewmats.double().tolist(), cameras.Ks.double().tolist(), strict=True)
     frames = [{"viewmat": viewmat, "K": K} for viewmat, K in rows]
     for frame, more in zip(frames, extra):
         frame |= more
-    write_json(file, document | {"frames": frames})
+    lines = ",\n".join("  " + json.dumps(frame, allow_nan=False) for frame in frames)
+    write_text(file, f'{json.dumps(head)[:-1]},\n "frames": [\n{lines}\n]}}\n')
 
 
 def _unknown(source: str) -> UserError:

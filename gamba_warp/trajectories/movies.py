@@ -6,7 +6,7 @@ import itertools
 import re
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -71,7 +71,11 @@ def _known_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
 
 
 def save_movie(
-    path: str | Path, frames: Iterable[np.ndarray], rate: float, sample: np.ndarray
+    path: str | Path,
+    frames: Iterable[np.ndarray],
+    rate: float,
+    sample: np.ndarray,
+    background: tuple[int, int, int] = (255, 255, 255),
 ) -> None:
     """Writes frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
 
@@ -81,6 +85,7 @@ def save_movie(
             is odd, since H.264 needs even sizes.
         rate: frames a second.
         sample: ``[K, H, W, 3]`` some of the frames, from which a GIF takes its colours.
+        background: RGB that a GIF keeps exactly.
 
     Raises:
         UserError: the suffix is another one, or the file cannot be written.
@@ -90,7 +95,7 @@ def save_movie(
         raise UserError(f"{path}: a turntable is a .gif or an .mp4")
     with atomic_path(path) as temporary:
         if suffix == ".gif":
-            _write_gif(temporary, frames, rate, sample)
+            _write_gif(temporary, frames, rate, sample, background)
         else:
             _write_mp4(temporary, frames, rate)
 
@@ -108,14 +113,20 @@ def check_gif(width: int, height: int, frames: int) -> None:
         )
 
 
-def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float, sample: np.ndarray) -> None:
-    palette = _palette(sample)
+def _write_gif(
+    path: Path,
+    frames: Iterable[np.ndarray],
+    rate: float,
+    sample: np.ndarray,
+    background: tuple[int, int, int],
+) -> None:
+    palette = _palette(sample, background)
 
     def pictures() -> Iterator[Image.Image]:
         for frame in frames:
             picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
             # Pillow looks colours up so coarsely that white may become a neighbour of white.
-            picture.paste(0, mask=Image.fromarray((frame == 255).all(-1)))
+            picture.paste(0, mask=Image.fromarray((frame == background).all(-1)))
             yield picture
 
     rest = pictures()
@@ -126,15 +137,15 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float, sample: np
     )
 
 
-def _palette(frames: np.ndarray) -> Image.Image:
-    """Makes one palette of white and 255 others for all frames, so that colours do not flicker."""
+def _palette(frames: np.ndarray, background: tuple[int, int, int]) -> Image.Image:
+    """One palette of the background and 255 others for all frames: colours do not flicker."""
     pixels = frames.reshape(-1, 3)
-    pixels = pixels[(pixels < 255).any(1)]
+    pixels = pixels[(pixels != background).any(1)]
     if len(pixels) == 0:
         pixels = frames.reshape(-1, 3)[:1]
     colours = Image.fromarray(pixels[None]).quantize(255, kmeans=1).getpalette() or []
     palette = Image.new("P", (1, 1))
-    palette.putpalette([255, 255, 255, *colours[: 3 * 255]])
+    palette.putpalette([*background, *colours[: 3 * 255]])
     return palette
 
 
@@ -220,10 +231,3 @@ def save_pictures(
                 fields |= {"depth": f"{name}-depth.png", "depth_unit": unit}
             extra.append(fields)
         save_path(temporary / CAMERAS, cameras, rate, extra)
-
-
-def counted(frames: Iterable, tell: Callable[[int], object]) -> Iterator:
-    """The same frames; ``tell(1)`` is called after each, as a progress bar wants it."""
-    for frame in frames:
-        yield frame
-        tell(1)
