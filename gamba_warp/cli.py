@@ -32,6 +32,7 @@ COMMANDS = {
     "ablate": "Train and compare variants of a model.",
     "export": "Gaussians to meshes, splats and pages.",
     "view": "Gaussians in the browser.",
+    "render": "Gaussians to pictures and movies along a path.",
     "app": "Pictures to 3D on a page of this machine.",
     "bench": "Run time against error, on this machine.",
     "stress": "Random hostile cases against float64.",

@@ -85,7 +85,7 @@ ROOMS = {
         (*_READERS, "data", "formats", "vision", "model.config", "model.parts"),
     ),
     "photo": Room("any photograph to a cut-out object", (*_READERS, "data", "vision")),
-    "trajectories": Room("paths of cameras, and their files", _READERS),
+    "trajectories": Room("paths of cameras, their files, movies", (*_READERS, "data")),
     "surfaces": Room("Gaussians to meshes", (*_LIBRARY, "trajectories")),
     "viewer": Room("the 3D viewer and its pages", (*_READERS, "formats")),
     "fitting": Room("one object by optimisation", (*_LIBRARY, "compat")),

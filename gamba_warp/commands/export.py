@@ -23,7 +23,7 @@ from ..surfaces.options import (
     Views,
     Voxels,
 )
-from ..untrusted.ranges import Frames, Opacity, Side, ranged
+from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, ranged
 
 
 @ranged
@@ -49,6 +49,9 @@ def export_command(
     min_opacity: Opacity = 0.0,
     size: Side = 256,
     frames: Frames = 48,
+    elevation: Elevation = 0.0,
+    fov: Fov | None = None,
+    distance: Distance | None = None,
     device: DeviceChoice = "auto",
 ) -> int:
     """Turns files of Gaussians into meshes, other splat formats, pages and turntables.
@@ -78,11 +81,17 @@ def export_command(
         min_opacity: Leave out Gaussians fainter than this.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
+        elevation: Degrees by which the camera of turntable and 3D viewer stands above the object.
+        fov: Its field of view, degrees; 49.1 if not given. Without --distance the object stays as
+            large.
+        distance: Its distance from the object's centre, in units of the longest side; 1.5 if not
+            given.
         device: Device that renders; auto is the GPU if there is one.
     """
     from tqdm import tqdm
 
     from ..pages.export import ExportJob, export, find_gaussians
+    from ..trajectories.paths import Viewpoint
 
     if not mesh and not splats and not page and turntable == "none":
         raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
@@ -114,6 +123,7 @@ def export_command(
         size=size,
         frames=frames,
         device=chosen,
+        view=Viewpoint().changed(elevation, distance, fov),
     )
     names = plan_outputs(files, job.suffixes(), out)
     output_folder(out)

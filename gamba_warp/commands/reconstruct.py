@@ -14,7 +14,7 @@ from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
 from ..formats.names import MeshFormat, SplatFormat
-from ..untrusted.ranges import Frames, Opacity, Side, ranged
+from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, ranged
 
 if TYPE_CHECKING:
     from ..pages.sheet import Sheet
@@ -32,6 +32,9 @@ def reconstruct_command(
     turntable: Literal["gif", "mp4", "none"] = "gif",
     size: Side = 256,
     frames: Frames = 48,
+    elevation: Elevation = 0.0,
+    fov: Fov | None = None,
+    distance: Distance | None = None,
     page: bool = True,
     sheet: Path | None = None,
     mask: Path | None = None,
@@ -52,6 +55,11 @@ def reconstruct_command(
         turntable: Moving picture of one turn.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
+        elevation: Degrees by which the camera of the picture stood above the object, looking down;
+            all results are turned so that the object stands upright.
+        fov: Field of view of turntable, sheet and 3D viewer, degrees; the model's (49.1) if not
+            given. Without --distance the object stays as large.
+        distance: Distance of their camera, object units; the model's (1.5) if not given.
         page: Write an HTML page with the input, the turntable and a 3D viewer.
         sheet: Also one picture of all results: each input, and five views around it (.png, .webp,
             .jpg).
@@ -82,6 +90,9 @@ def reconstruct_command(
         min_opacity=min_opacity,
         checkpoint=checkpoint,
         about=about_model(file),
+        elevation=elevation,
+        distance=distance,
+        fov=fov,
     )
     reads = (mask, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)

@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from ..batch import check_not_read
 from ..files import output_folder
-from ..untrusted.ranges import ranged
+from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 
 
 @ranged
@@ -21,6 +21,9 @@ def view_command(
     serve: bool = False,
     port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
+    elevation: Elevation = 0.0,
+    fov: Fov | None = None,
+    distance: Distance | None = None,
 ) -> None:
     """Shows Gaussians or a training run in a browser, as one HTML page without a network.
 
@@ -30,6 +33,11 @@ def view_command(
         serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
         port: Port of --serve; 0 picks a free one.
         open_browser: Open the browser.
+        elevation: Degrees by which the camera stands above the object at the start.
+        fov: Field of view, degrees; 49.1 if not given. Without --distance the object stays as
+            large.
+        distance: Distance of the camera from the object's centre at the start, in units of its
+            longest side; 1.5 if not given.
     """
     import tempfile
     import webbrowser
@@ -38,6 +46,7 @@ def view_command(
     from ..pages.export import write_page
     from ..pages.run import write_run_page
     from ..pages.serve import page_server
+    from ..trajectories.paths import Viewpoint
 
     check_not_read([] if out is None else [out], [file])
     gaussians = None if file.is_dir() else read_gaussians(file)
@@ -47,7 +56,8 @@ def view_command(
     if gaussians is None:
         write_run_page(file, page)
     else:
-        write_page(page, file.stem, gaussians)
+        view = Viewpoint().changed(elevation, distance, fov)
+        write_page(page, file.stem, gaussians, view=view)
     if not serve:
         print(page)
         if open_browser:

@@ -211,23 +211,47 @@ def _picture(folder: Path, name: object, source: str) -> Path:
     return next((p for p in found if p.exists()), found[1])
 
 
-def _read_transforms(folder: Path) -> ObjectFiles:
-    path = folder / "transforms.json"
+Sizes = list[tuple[int, int] | None]
+
+
+def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
+    """The cameras of a file in the form of ``transforms.json``, whatever its pictures are.
+
+    Returns:
+        ``camera_to_world [V, 4, 4]`` float64 (OpenGL), ``Ks [V, 3, 3]`` float64 and the V sizes,
+        as ``ObjectFiles`` has them.
+
+    Raises:
+        UserError: the file is bad; one line says where.
+    """
+    return _posed_frames(path)[2:]
+
+
+def _posed_frames(path: Path) -> tuple[dict, list[dict], np.ndarray, np.ndarray, Sizes]:
     top = _read_json(path)
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: no frames")
     _check_count(len(frames), path)
-    images, depths, backs, poses, Ks, sizes = [], [], [], [], [], []
+    poses, Ks, sizes = [], [], []
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
             raise UserError(f"{source}: no transform_matrix")
-        images.append(_picture(folder, frame.get("file_path"), source))
         poses.append(_pose(frame["transform_matrix"], source))
         K, size = _intrinsics(frame, top, source)
         Ks.append(K)
         sizes.append(size)
+    return top, frames, np.stack(poses), np.stack(Ks), sizes
+
+
+def _read_transforms(folder: Path) -> ObjectFiles:
+    path = folder / "transforms.json"
+    top, frames, poses, Ks, sizes = _posed_frames(path)
+    images, depths, backs = [], [], []
+    for i, frame in enumerate(frames):
+        source = f"{path}: frame {i}"
+        images.append(_picture(folder, frame.get("file_path"), source))
         for key, paths in (("depth_file_path", depths), ("back_file_path", backs)):
             if frame.get(key):
                 paths.append(inside(folder, frame[key], source))
@@ -242,8 +266,8 @@ def _read_transforms(folder: Path) -> ObjectFiles:
         attribution = {"text": attribution}
     return ObjectFiles(
         images=images,
-        camera_to_world=np.stack(poses),
-        Ks=np.stack(Ks),
+        camera_to_world=poses,
+        Ks=Ks,
         sizes=sizes,
         depths=depths if len(depths) == len(frames) else None,
         backs=backs if len(backs) == len(frames) else None,

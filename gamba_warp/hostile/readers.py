@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import UserError
 from . import comparing, published, sound
-from .seeds import datasets, models, pictures, shapes
+from .seeds import cameras, datasets, models, pictures, shapes
 from .seeds.pictures import Files
 
 Seeds = Callable[[], dict[str, Files]]
@@ -312,6 +312,7 @@ READERS: dict[str, Reader] = {
         Reader("gaussians-folder", _predictions, sound.each(sound.gaussians), _folder_of_gaussians,
                3, True),
         Reader("view", _view, sound.page, shapes.splats, 2),
+        Reader("cameras", cameras.read, cameras.sound, cameras.camera_files),
         Reader("mesh", _mesh, sound.mesh, shapes.meshes),
         Reader("shape", _shape, sound.shape, _shapes, 12),
         Reader("evaluation", _evaluation, sound.report, _shapes, 1),

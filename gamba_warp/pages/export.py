@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from ..gaussians import Gaussians
 from ..surfaces.extract import moved_to_unit, unit_frame
 from ..surfaces.files import write_meshes
 from ..surfaces.options import SurfaceOptions
+from ..trajectories.paths import Viewpoint
 from .page import Section, reconstruction_page
 from .turntable import save_turntable, turntable_frames
 
@@ -38,6 +39,7 @@ class ExportJob:
         size: side of the turntable's frames, pixels.
         frames: views of one turn.
         device: device that renders.
+        view: from where turntables and pages look, in units of the object's longest side.
     """
 
     folder: Path
@@ -51,6 +53,7 @@ class ExportJob:
     size: int
     frames: int
     device: torch.device
+    view: Viewpoint = Viewpoint()
 
     def suffixes(self) -> list[str]:
         """What follows the name of an input in each of its files."""
@@ -128,15 +131,19 @@ def _write_pictures(name: str, gaussians: Gaussians, job: ExportJob) -> None:
     if not job.page and job.turntable == "none":
         return
     moved = moved_to_unit(gaussians, *unit_frame(gaussians)).to(job.device)
-    turn = turntable_frames(moved, size=job.size, frames=job.frames)
+    turn = turntable_frames(moved, size=job.size, frames=job.frames, **asdict(job.view))
     if job.turntable != "none":
         save_turntable(job.folder / f"{name}.{job.turntable}", turn)
     if job.page:
-        write_page(job.folder / f"{name}.html", name, gaussians, turn)
+        write_page(job.folder / f"{name}.html", name, gaussians, turn, job.view)
 
 
 def write_page(
-    path: Path, title: str, gaussians: Gaussians, turntable: np.ndarray | None = None
+    path: Path,
+    title: str,
+    gaussians: Gaussians,
+    turntable: np.ndarray | None = None,
+    view: Viewpoint | None = None,
 ) -> None:
     """Writes a page with a 3D viewer, of an object of any size anywhere.
 
@@ -145,11 +152,13 @@ def write_page(
         title: heading of the page.
         gaussians: one object.
         turntable: frames ``[T, S, S, 3]`` uint8 of one turn, or None.
+        view: where the viewer starts, in units of the object's longest side.
 
     Raises:
         UserError: the object has no extent, or the file cannot be written.
     """
     moved = moved_to_unit(gaussians, *unit_frame(gaussians))
     table = [("Gaussians", f"{gaussians.num:,}")]
-    section = Section(title, turntable=turntable, gaussians=moved, table=table)
+    camera = asdict(view or Viewpoint())
+    section = Section(title, turntable=turntable, gaussians=moved, table=table, **camera)
     reconstruction_page(path, section)

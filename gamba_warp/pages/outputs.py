@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ..conventions import Axes
 from ..formats.gaussians.files import write_gaussians
@@ -15,6 +17,7 @@ from ..gaussians import Gaussians
 from ..model.config import GambaConfig
 from ..surfaces.files import write_meshes
 from ..surfaces.options import SurfaceOptions
+from ..trajectories.paths import Viewpoint, upright
 from .page import Section, reconstruction_page
 from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
@@ -37,6 +40,9 @@ class Outputs:
         checkpoint: the model's file, named in the ``.ply``.
         about: labels and texts for the page, of the model.
         sheet: gets a row of each picture, or None.
+        elevation: of the input's camera above the object, degrees; what is written stands upright.
+        distance: of the camera of turntable, sheet and viewer; None is the model's.
+        fov: its field of view, degrees; None is the model's.
     """
 
     folder: Path
@@ -51,6 +57,9 @@ class Outputs:
     checkpoint: Path
     about: Sequence[tuple[str, str]] = ()
     sheet: Sheet | None = None
+    elevation: float = 0.0
+    distance: float | None = None
+    fov: float | None = None
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
@@ -58,6 +67,11 @@ class Outputs:
         found += [f"-mesh.{kind}" for kind in self.mesh]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
         return found + ([".html"] if self.page else [])
+
+    def view(self, config: GambaConfig) -> Viewpoint:
+        """From where turntable, sheet and viewer look; that of the input, but for the options."""
+        input_view = Viewpoint(self.elevation, config.distance, config.fov)
+        return input_view.changed(distance=self.distance, fov=self.fov)
 
 
 def write_outputs(
@@ -81,19 +95,21 @@ def write_outputs(
     Raises:
         UserError: a file cannot be written, or no Gaussian can be.
     """
-    base = outputs.folder / name
+    base, view = outputs.folder / name, outputs.view(config)
+    if outputs.elevation:
+        turn = upright(outputs.elevation).to(gaussians.means)
+        gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
     _write_gaussians(base, gaussians, outputs)
     if outputs.mesh:
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         options, device = SurfaceOptions(colors=True), gaussians.means.device
         write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
     if outputs.sheet is not None:
-        outputs.sheet.add(name, rgba, gaussians, config)
+        outputs.sheet.add(name, rgba, gaussians, view)
     if outputs.turntable == "none" and not outputs.page:
         return
-    distance, fov = config.distance, config.fov
     turn = turntable_frames(
-        gaussians, size=outputs.size, frames=outputs.frames, distance=distance, fov=fov
+        gaussians, size=outputs.size, frames=outputs.frames, **dataclasses.asdict(view)
     )
     if outputs.turntable != "none":
         save_turntable(base.with_name(f"{name}.{outputs.turntable}"), turn)
@@ -109,8 +125,7 @@ def write_outputs(
             turntable=turn,
             gaussians=gaussians,
             table=table,
-            distance=distance,
-            fov=fov,
+            **dataclasses.asdict(view),
         )
         reconstruction_page(base.with_name(f"{name}.html"), section)
 

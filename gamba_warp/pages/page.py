@@ -48,6 +48,7 @@ class Section:
         fragment: HTML that is set as it is, such as that of ``curves.draw_curves``.
         distance: distance of the viewer's camera from the origin, object units.
         fov: vertical field of view of the viewer's camera, degrees.
+        elevation: of the viewer's camera at the start, degrees.
     """
 
     title: str
@@ -63,6 +64,7 @@ class Section:
     fragment: str = ""
     distance: float = DEFAULT_DISTANCE
     fov: float = DEFAULT_FOV
+    elevation: float = 0.0
 
 
 def reconstruction_page(path: str | Path, section: Section) -> None:
@@ -170,7 +172,8 @@ def _viewer(section: Section, gaussians: Gaussians, name: str, auto: bool, poste
     splats = base64.b64encode(splat_bytes(gaussians, name=section.title)).decode()
     return (
         f'<div class="viewer" data-splat="{name}" data-distance="{section.distance:g}" '
-        f'data-fov="{section.fov:g}"{" data-auto" if auto else ""}>{poster}'
+        f'data-fov="{section.fov:g}" data-elevation="{section.elevation:g}"'
+        f"{' data-auto' if auto else ''}>{poster}"
         '<button type="button">3D</button></div>'
         f'<script type="text/plain" id="{name}">{splats}</script>'
     )

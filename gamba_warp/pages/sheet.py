@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..errors import UserError
 from ..files import atomic_path
 from ..gaussians import Gaussians
 from ..images import to_uint8
-from ..model.config import GambaConfig
+from ..trajectories.paths import Viewpoint
 from .turntable import turntable_frames
 
 SUFFIXES = (".png", ".webp", ".jpg", ".jpeg")
@@ -40,18 +41,17 @@ class Sheet:
         self.path = path
         self._rows: list[tuple[str, np.ndarray]] = []
 
-    def add(self, name: str, rgba: np.ndarray, gaussians: Gaussians, config: GambaConfig) -> None:
+    def add(self, name: str, rgba: np.ndarray, gaussians: Gaussians, view: Viewpoint) -> None:
         """Adds a row.
 
         Args:
             name: stands above the row.
             rgba: ``[S, S, 4]`` in [0, 1], what was reconstructed.
             gaussians: ``[N]``, on the device that renders.
-            config: of the model, for the camera.
+            view: from where the object is looked at.
         """
         flat = over_background(resize_rgba(rgba, _TILE, _TILE), 1.0)
-        camera = {"distance": config.distance, "fov": config.fov}
-        turn = turntable_frames(gaussians, size=_TILE, frames=VIEWS, **camera)
+        turn = turntable_frames(gaussians, size=_TILE, frames=VIEWS, **asdict(view))
         self._rows.append((name, np.concatenate([to_uint8(flat), *turn], axis=1)))
 
     def write(self) -> None:

@@ -135,7 +135,8 @@ function start(viewer) {
   const order = new Uint32Array(splats.count), shader = program(gl);
   upload(gl, splats, order);
   const uniform = (name) => gl.getUniformLocation(shader, name);
-  const home = { azimuth: 0, elevation: 0, distance: Number(viewer.dataset.distance) };
+  const elevation = (Number(viewer.dataset.elevation) * Math.PI) / 180;
+  const home = { azimuth: 0, elevation, distance: Number(viewer.dataset.distance) };
   const camera = { ...home }, half = Math.tan((Number(viewer.dataset.fov) * Math.PI) / 360);
   let waiting = false;
 

@@ -1,1 +1,1 @@
-"""Paths of cameras: turntables, spirals, files of other programs."""
+"""Paths of cameras: turntables, spirals, files of other programs; and the movies along them."""

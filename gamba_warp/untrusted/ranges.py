@@ -40,6 +40,10 @@ Minutes = Annotated[float, Meta(gt=0, le=1e6)]
 Frames = Annotated[int, Meta(ge=2, le=10_000)]
 Side = Annotated[int, Meta(ge=16, le=4096)]
 Opacity = Annotated[float, Meta(ge=0, le=1)]
+Elevation = Annotated[float, Meta(ge=-90, le=90)]  # degrees
+Fov = Annotated[float, Meta(ge=1, le=160)]  # degrees
+Distance = Annotated[float, Meta(ge=0.05, le=1000)]  # object units
+Rate = Annotated[float, Meta(gt=0, le=1000)]  # pictures a second
 
 
 def wrong(value: float, limits: Meta) -> str | None:

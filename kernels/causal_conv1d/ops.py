@@ -9,6 +9,7 @@ from ..runtime import rows as cpu_values
 from ..runtime import scalars as cuda_values
 from ..runtime.launch import cuda_launch, parallel_launch
 from ..runtime.memory import empty
+from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, backward_kernel, forward_kernel
 
@@ -46,6 +47,7 @@ def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list
         cuda_launch(kernel, dim, [0, *inputs], outputs, device=x.device, block_dim=128)
 
 
+@without_compiler
 @torch.library.custom_op("gamba_warp::causal_conv1d", mutates_args=())
 def conv(
     x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None, silu: bool
@@ -65,6 +67,7 @@ def _(x, weight, bias, state, silu):
     return torch.empty_like(x, memory_format=torch.contiguous_format)
 
 
+@without_compiler
 @torch.library.custom_op("gamba_warp::causal_conv1d_backward", mutates_args=())
 def _conv_backward(
     dout: Tensor,

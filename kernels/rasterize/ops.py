@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ..runtime.start import without_compiler
 from ..runtime.views import vectors
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
@@ -30,6 +31,7 @@ def _compositor(device: torch.device):
     return composite_cpu if device.type == "cpu" else composite_cuda
 
 
+@without_compiler
 @torch.library.custom_op(_OP + "project", mutates_args=())
 def project(
     means: Tensor,
@@ -55,6 +57,7 @@ def _(means, quats, scales, opacities, colors, viewmats, Ks, lens):
     return *floats, means.new_empty(shape, dtype=torch.int32)
 
 
+@without_compiler
 @torch.library.custom_op(_OP + "project_vjp", mutates_args=())
 def _project_vjp(
     means: Tensor,
@@ -170,6 +173,7 @@ def _refuse_too_many(pairs: int) -> None:
         )
 
 
+@without_compiler
 @torch.library.custom_op(_OP + "bin", mutates_args=())
 def bin_op(
     means2d: Tensor,
@@ -211,6 +215,7 @@ def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min
     )
 
 
+@without_compiler
 @torch.library.custom_op(_OP + "composite", mutates_args=())
 def composite(
     means2d: Tensor,
@@ -264,6 +269,7 @@ def _(means2d, conics, view_opacities, colors, bins, size, limits, tuning, skipp
     return renders, colors.new_empty(images, height, width, 1), *walk
 
 
+@without_compiler
 @torch.library.custom_op(_OP + "composite_vjp", mutates_args=())
 def _composite_vjp(
     means2d: Tensor,

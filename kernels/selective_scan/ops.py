@@ -5,6 +5,7 @@ from typing import List
 import torch
 from torch import Tensor
 
+from ..runtime.start import without_compiler
 from .cpu import launch as cpu
 from .cpu import tuning as cpu_tuning
 from .cuda import tuning as cuda_tuning
@@ -46,6 +47,7 @@ def _need_saved(ctx) -> None:
         raise RuntimeError("selective_scan: this call kept nothing for a gradient")
 
 
+@without_compiler
 @torch.library.custom_op("gamba_warp::selective_scan", mutates_args=())
 def scan(
     u: Tensor,
@@ -79,6 +81,7 @@ def _(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretizati
     return out, last, A.new_empty(_implementation(u).saved_shape(u, A, B, save, tuning))
 
 
+@without_compiler
 @torch.library.custom_op("gamba_warp::selective_scan_backward", mutates_args=())
 def _scan_backward(
     dout: Tensor,
@@ -143,6 +146,7 @@ scan.register_autograd(_gradient, setup_context=_setup_context)
 _scan_backward.register_autograd(_no_second_gradient)
 
 
+@without_compiler
 @torch.library.custom_op("gamba_warp::selective_scan_state", mutates_args=())
 def state(
     u: Tensor,
@@ -167,6 +171,7 @@ def _(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save,
     return A.new_empty(u.shape[0], *A.shape), A.new_empty(saved)
 
 
+@without_compiler
 @torch.library.custom_op("gamba_warp::selective_scan_state_backward", mutates_args=())
 def _state_backward(
     dlast: Tensor,

@@ -89,7 +89,7 @@ def test_turntable_begins_at_the_reference_view_and_turns():
 def test_turntable_chunks_make_no_difference(monkeypatch):
     gaussians = some(40)
     whole = turntable_frames(gaussians, size=20, frames=7, elevation=20.0)
-    monkeypatch.setattr("gamba_warp.pages.turntable._CHUNK_PIXELS", 2 * 20 * 20)
+    monkeypatch.setattr("gamba_warp.trajectories.movies._CHUNK_PIXELS", 2 * 20 * 20)
     np.testing.assert_array_equal(
         turntable_frames(gaussians, size=20, frames=7, elevation=20.0), whole
     )

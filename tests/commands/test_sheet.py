@@ -15,6 +15,7 @@ from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.pages.sheet import VIEWS, Sheet
 from gamba_warp.pages.turntable import turntable_frames
+from gamba_warp.trajectories.paths import Viewpoint
 
 CONFIG = GambaConfig(
     image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
@@ -33,13 +34,13 @@ def test_a_row_is_the_input_and_views_around(tmp_path):
     sheet, gaussians = Sheet(tmp_path / "s.png"), some(40)
     rgba = np.zeros((64, 64, 4), np.float32)
     rgba[16:48, 16:48] = (1, 0, 0, 1)
-    sheet.add("first", rgba, gaussians, CONFIG)
+    sheet.add("first", rgba, gaussians, Viewpoint(20.0, CONFIG.distance, CONFIG.fov))
     sheet.write()
     picture = load_rgba(tmp_path / "s.png")[..., :3]
     assert picture.shape == (18 + 128, 6 * 128, 3)
     tiles = picture[18:].reshape(128, 1 + VIEWS, 128, 3).transpose(1, 0, 2, 3)
     assert np.abs(tiles[0][64, 64] - (1, 0, 0)).max() < 0.01 and tiles[0][4, 4].min() == 1
-    camera = {"distance": CONFIG.distance, "fov": CONFIG.fov}
+    camera = {"elevation": 20.0, "distance": CONFIG.distance, "fov": CONFIG.fov}
     want = turntable_frames(gaussians, size=128, frames=VIEWS, **camera) / 255
     np.testing.assert_array_equal(tiles[1][:, 1:], want[0].astype(np.float32)[:, 1:])  # and a line
     np.testing.assert_array_equal(tiles[2:], want[1:].astype(np.float32))

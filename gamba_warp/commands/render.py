@@ -1,0 +1,127 @@
+"""``gamba render``: files of Gaussians along a path of cameras, to pictures and movies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from msgspec import Meta
+
+from ..batch import check_not_read, for_each, plan_outputs, report
+from ..conventions import DeviceChoice
+from ..devices import pick_device
+from ..errors import UserError
+from ..files import output_folder
+from ..untrusted.ranges import Distance, Elevation, Fov, Rate, ranged
+
+_SUFFIXES = (".gif", ".mp4", ".png")
+
+
+@ranged
+def render_command(
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
+    /,
+    trajectory: Annotated[str, tyro.conf.arg(metavar="turntable|spiral|FILE")] = "turntable",
+    out: Path = Path("out"),
+    kind: Literal["gif", "mp4", "png"] | None = None,
+    size: Annotated[str | None, tyro.conf.arg(metavar="W|WxH")] = None,
+    frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None,
+    fps: Rate | None = None,
+    elevation: Elevation | None = None,
+    fov: Fov | None = None,
+    distance: Distance | None = None,
+    background: str = "white",
+    depth: bool = False,
+    device: DeviceChoice = "auto",
+) -> int:
+    """Renders Gaussians along a path of cameras: to a GIF, a video, or a folder of pictures.
+
+    A turntable and a spiral go around the object's centre, with -y up as in files that gamba
+    writes. The cameras of a file are in the frame of the file of Gaussians.
+
+    Args:
+        inputs: Gaussians (.ply in the 3DGS layout), or folders of them.
+        trajectory: turntable, spiral (two turns, up and down), or a file of cameras: ours
+            (docs/cameras.md), transforms.json, nerfstudio's camera path, 3DGS's cameras.json.
+        out: Folder for the results; of a single input also a .gif, an .mp4, or a .png of one view.
+        kind: What is written; png is a folder of pictures with their cameras.json. By default what
+            --out says, else gif.
+        size: Width of the pictures, or width and height, pixels; 512, or what the file states.
+        frames: Number of pictures of a turntable (48) or spiral (96).
+        fps: Pictures a second; by default a turn takes 3 seconds, and a file says its own.
+        elevation: Degrees by which a turntable's camera stands above the object.
+        fov: Field of view of the picture's shorter side, degrees; 49.1 if not given. Without
+            --distance the object stays as large.
+        distance: Distance of the camera from the object's centre, in units of its longest side.
+        background: white, black, gray, #rrggbb, or none (transparent, png only).
+        depth: Also pictures of depth, 16 bits (png only).
+        device: Device that renders; auto is the GPU if there is one.
+    """
+    from tqdm import tqdm
+
+    from ..formats.ply import load_ply as read_gaussians
+    from ..pages.export import find_gaussians
+    from ..surfaces.extract import unit_frame
+    from ..trajectories.film import Film, parse_background, parse_size, plan_path, shoot
+
+    single = out.suffix.lower() in _SUFFIXES and not out.is_dir()
+    kind = _kind(out, kind, single)
+    if out.suffix.lower() == ".png" and single:
+        frames = 1 if frames is None and trajectory in ("turntable", "spiral") else frames
+    view = {"elevation": elevation, "distance": distance, "fov": fov}
+    plan = plan_path(trajectory, None if size is None else parse_size(size), frames, view)
+    film = Film(*plan, parse_background(background), depth)
+    film.rate = film.rate if fps is None else fps
+    _check_kind(kind, film.background is None, depth)
+    files, failures = find_gaussians(inputs)
+    if not files:
+        raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
+    chosen = pick_device(device)
+    reads = [Path(trajectory)] if film.own else []
+    if single:
+        targets = _single(out, files, reads, len(film.cameras.viewmats), depth)
+    else:
+        suffix = "" if kind == "png" else f".{kind}"
+        names = plan_outputs(files, [suffix], out, reads)
+        targets = {str(out / (name + suffix)): path for name, path in names.items()}
+    output_folder(out.parent if single else out)
+
+    def one(target: str, path: Path) -> None:
+        count = len(film.cameras.viewmats)
+        gaussians = read_gaussians(path)
+        with tqdm(total=count, desc=path.name, unit="view", leave=False, disable=None) as bar:
+            shoot(Path(target), kind, gaussians, unit_frame(gaussians), film, chosen, bar.update)
+
+    for_each(targets, one, "render", "file", failures)
+    return report(len(files), "file", failures, out)
+
+
+def _kind(
+    out: Path, kind: Literal["gif", "mp4", "png"] | None, single: bool
+) -> Literal["gif", "mp4", "png"]:
+    suffix = out.suffix.lower()[1:]
+    if not single:
+        return kind or "gif"
+    if kind is not None and kind != suffix:
+        raise UserError(f"--out {out}: its name says {suffix}, but --kind {kind}")
+    return "gif" if suffix == "gif" else "mp4" if suffix == "mp4" else "png"
+
+
+def _check_kind(kind: str, transparent: bool, depth: bool) -> None:
+    if kind != "png" and (transparent or depth):
+        given = "--depth" if depth else "--background none"
+        raise UserError(f"{given} needs pictures: give --kind png")
+
+
+def _single(
+    out: Path, files: list[Path], reads: list[Path], count: int, depth: bool
+) -> dict[str, Path]:
+    if len(files) != 1:
+        raise UserError(f"--out {out}: {len(files)} files are given; give a folder")
+    if out.suffix.lower() == ".png" and depth:
+        raise UserError(f"--out {out}: --depth makes two pictures of a view; give a folder")
+    if out.suffix.lower() == ".png" and count != 1:
+        raise UserError(f"--out {out}: one picture, but there are {count} views; give a folder")
+    check_not_read([out], [*files, *reads])
+    return {str(out): files[0]}

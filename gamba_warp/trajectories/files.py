@@ -1,0 +1,275 @@
+"""Files of cameras: our own, NeRF's transforms.json, nerfstudio's camera path, 3DGS's cameras.json.
+
+- ours (``gamba-cameras``): ``width, height``, optional ``fps``, and ``frames`` of ``viewmat`` (4x4,
+  world to camera, OpenCV) and ``K`` (3x3, pixels) or ``fov`` (degrees, vertical), which may also
+  stand once for all frames.
+- ``transforms.json``: ``frames`` of ``transform_matrix``, read as by ``data.layouts``.
+- nerfstudio's camera path: ``camera_path`` of ``camera_to_world`` (16 numbers by rows, OpenGL) and
+  ``fov`` (degrees, vertical); ``render_width, render_height, fps, seconds``.
+- 3DGS's ``cameras.json``: a list of ``position, rotation`` (camera to world, OpenCV), ``fx, fy,
+  width, height``.
+
+All say where the cameras are in the frame of the Gaussians, as their file holds them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from msgspec import Meta, Struct
+from torch import Tensor
+
+from ..cameras import Cameras, from_opengl
+from ..data.layouts import read_cameras
+from ..errors import UserError
+from ..files import write_text
+from ..untrusted.documents import parse_document, read_bytes
+
+FORMAT = "gamba-cameras"
+MAX_FRAMES = 10_000
+MAX_SIDE = 16_384  # pixels that a file may state
+DEFAULT_SIDE = 512  # pixels, where neither file nor caller states a size
+_SHORTEST, _LONGEST = 1e-2, 1e3  # focal lengths, in sides of the picture
+
+_Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
+_Triple = Annotated[list[_Number], Meta(min_length=3, max_length=3)]
+_Four = Annotated[list[_Number], Meta(min_length=4, max_length=4)]
+_Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
+_Fov = Annotated[float, Meta(ge=0.1, le=170)]
+_Rate = Annotated[float, Meta(gt=0, le=1000)]
+
+
+class _Frame(Struct):
+    viewmat: Annotated[list[_Four], Meta(min_length=4, max_length=4)]
+    K: Annotated[list[_Triple], Meta(min_length=3, max_length=3)] | None = None
+    fov: _Fov | None = None
+
+
+class _Ours(Struct):
+    width: _Side
+    height: _Side
+    frames: Annotated[list[_Frame], Meta(min_length=1, max_length=MAX_FRAMES)]
+    format: Literal["gamba-cameras"]
+    version: Literal[1] = 1
+    fps: _Rate | None = None
+    fov: _Fov | None = None
+
+
+class _Posed(Struct):
+    camera_to_world: Annotated[list[_Number], Meta(min_length=16, max_length=16)]
+    fov: _Fov
+
+
+class _Nerfstudio(Struct):
+    camera_path: Annotated[list[_Posed], Meta(min_length=1, max_length=MAX_FRAMES)]
+    render_width: Annotated[float, Meta(ge=1, le=MAX_SIDE)]
+    render_height: Annotated[float, Meta(ge=1, le=MAX_SIDE)]
+    camera_type: str = "perspective"
+    fps: _Rate | None = None
+    seconds: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+
+
+class _Seen(Struct):
+    position: _Triple
+    rotation: Annotated[list[_Triple], Meta(min_length=3, max_length=3)]
+    width: _Side
+    height: _Side
+    fx: Annotated[float, Meta(gt=0, le=1e9)]
+    fy: Annotated[float, Meta(gt=0, le=1e9)]
+
+
+_Views = Annotated[list[_Seen], Meta(min_length=1, max_length=MAX_FRAMES)]
+
+
+@dataclass
+class CameraPath:
+    """Cameras one after the other.
+
+    Attributes:
+        cameras: ``[V]`` float64.
+        fps: pictures a second as the file states it, or None.
+    """
+
+    cameras: Cameras
+    fps: float | None = None
+
+
+def load_path(file: str | Path, size: tuple[int, int | None] | None = None) -> CameraPath:
+    """Reads a file of cameras in any of the forms above.
+
+    Args:
+        file: JSON of at most 64 MB.
+        size: width and height of the pictures, or the width alone, which keeps the shape of the
+            picture. Another shape keeps the vertical field of view, and shows more or less at the
+            sides. None is the file's own size.
+
+    Raises:
+        UserError: the file is bad, is of no known form, or its cameras differ in size; one line
+            says where.
+    """
+    source, data = str(file), read_bytes(file)
+    value = parse_document(data, object, source)
+    if isinstance(value, list):
+        path = _of_splatting(parse_document(data, _Views, source), source)
+    elif not isinstance(value, dict):
+        raise _unknown(source)
+    elif "camera_path" in value:
+        path = _of_nerfstudio(parse_document(data, _Nerfstudio, source), source)
+    elif value.get("format") == FORMAT:
+        path = _ours(parse_document(data, _Ours, source), source)
+    elif "frames" in value:
+        path = _of_transforms(Path(file), source)
+    else:
+        raise _unknown(source)
+    _check(path.cameras, source)
+    return path if size is None else CameraPath(_sized(path.cameras, *size), path.fps)
+
+
+def save_path(
+    file: str | Path, cameras: Cameras, fps: float | None = None, extra: Sequence[dict] = ()
+) -> None:
+    """Writes cameras in our own form, atomically.
+
+    Args:
+        file: the ``.json``.
+        cameras: ``[V]``.
+        fps: pictures a second.
+        extra: further fields of each of the V frames, such as the name of its picture.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    head: dict[str, Any] = {"format": FORMAT, "version": 1}
+    head |= {"width": cameras.width, "height": cameras.height}
+    head |= {} if fps is None else {"fps": fps}
+    rows = zip(cameras.viewmats.double().tolist(), cameras.Ks.double().tolist(), strict=True)
+    frames = [{"viewmat": viewmat, "K": K} for viewmat, K in rows]
+    for frame, more in zip(frames, extra):
+        frame |= more
+    lines = ",\n".join("  " + json.dumps(frame, allow_nan=False) for frame in frames)
+    write_text(file, f'{json.dumps(head)[:-1]},\n "frames": [\n{lines}\n]}}\n')
+
+
+def _unknown(source: str) -> UserError:
+    return UserError(
+        f"{source}: no file of cameras that is known: it holds neither frames (ours, "
+        "transforms.json) nor a camera_path (nerfstudio), and is no list of views (3DGS)"
+    )
+
+
+def _ours(path: _Ours, source: str) -> CameraPath:
+    width, height, Ks = path.width, path.height, []
+    for number, frame in enumerate(path.frames):
+        fov = path.fov if frame.fov is None else frame.fov
+        if frame.K is not None:
+            Ks.append(_tensor(frame.K))
+        elif fov is not None:
+            Ks.append(_centred(width, height, fov))
+        else:
+            raise UserError(f"{source}: frame {number} has neither K nor fov")
+    viewmats = _tensor([frame.viewmat for frame in path.frames])
+    return CameraPath(Cameras(viewmats, torch.stack(Ks), width, height), path.fps)
+
+
+def _of_nerfstudio(path: _Nerfstudio, source: str) -> CameraPath:
+    if path.camera_type.lower() not in ("perspective", "pinhole"):
+        kind = repr(path.camera_type)[:40]
+        raise UserError(f"{source}: camera_type is {kind}; only perspective is rendered")
+    width, height = round(path.render_width), round(path.render_height)
+    poses = _tensor([posed.camera_to_world for posed in path.camera_path]).view(-1, 4, 4)
+    Ks = torch.stack([_centred(width, height, posed.fov) for posed in path.camera_path])
+    rate = path.fps
+    if path.seconds is not None:  # as nerfstudio itself: the length counts, not the rate
+        rate = min(1000.0, len(poses) / path.seconds)
+    return CameraPath(Cameras(_to_views(poses, source), Ks, width, height), rate)
+
+
+def _of_transforms(file: Path, source: str) -> CameraPath:
+    poses, Ks, sizes = read_cameras(file)
+    stated = {size or (DEFAULT_SIDE, DEFAULT_SIDE) for size in sizes}
+    width, height = _one_size(stated, source)
+    for K, size in zip(Ks, sizes):
+        if size is None:  # it is in fractions of the picture's side
+            K[:2] *= DEFAULT_SIDE
+    views = from_opengl(torch.from_numpy(poses))
+    return CameraPath(Cameras(views, torch.from_numpy(Ks), width, height))
+
+
+def _of_splatting(views: list[_Seen], source: str) -> CameraPath:
+    width, height = _one_size({(view.width, view.height) for view in views}, source)
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(views), 1, 1)
+    poses[:, :3, :3] = _tensor([view.rotation for view in views])
+    poses[:, :3, 3] = _tensor([view.position for view in views])
+    _check_rotations(poses, source)
+    Ks = torch.zeros(len(views), 3, 3, dtype=torch.float64)
+    Ks[:, 0, 0], Ks[:, 1, 1] = _tensor([[v.fx, v.fy] for v in views]).unbind(-1)
+    Ks[:, 0, 2], Ks[:, 1, 2], Ks[:, 2, 2] = width / 2, height / 2, 1.0
+    return CameraPath(Cameras(torch.linalg.inv(poses), Ks, width, height))
+
+
+def _one_size(sizes: set[tuple[int, int]], source: str) -> tuple[int, int]:
+    if len(sizes) > 1:
+        names = " and ".join(f"{width}x{height}" for width, height in sorted(sizes)[:2])
+        raise UserError(f"{source}: cameras of different sizes ({names}); a path has one size")
+    return next(iter(sizes))
+
+
+def _tensor(values: Any) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _centred(width: int, height: int, fov: float) -> Tensor:
+    focal = 0.5 * height / torch.tan(torch.deg2rad(_tensor(fov)) / 2)
+    return _tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+
+
+def _to_views(poses: Tensor, source: str) -> Tensor:
+    _check_rotations(poses, source)
+    return from_opengl(poses)
+
+
+def _check(cameras: Cameras, source: str) -> None:
+    """Refuses what is no camera that can render."""
+    _check_rotations(cameras.viewmats, source)
+    size = _tensor([cameras.width, cameras.height])
+    for number, K in enumerate(cameras.Ks):
+        focal, center = K.diagonal()[:2] / size, K[:2, 2] / size
+        if not bool(((focal >= _SHORTEST) & (focal <= _LONGEST)).all()):
+            raise UserError(
+                f"{source}: frame {number}: focal lengths of {focal[0]:g} and {focal[1]:g} sides "
+                f"of the picture, expected {_SHORTEST:g} to {_LONGEST:g}"
+            )
+        if not bool(((center >= -1) & (center <= 2)).all()):
+            raise UserError(f"{source}: frame {number}: the principal point is far outside")
+        if K[[0, 1, 2, 2], [1, 0, 0, 1]].any() or K[2, 2] != 1:
+            raise UserError(f"{source}: frame {number}: K has skew, or its last row is not 0 0 1")
+
+
+def _check_rotations(matrices: Tensor, source: str) -> None:
+    """Refuses matrices ``[V, 4, 4]`` that turn other than rigidly."""
+    rotation = matrices[:, :3, :3]
+    unit = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)) < 1e-2
+    last = (matrices[:, 3] - _tensor([0, 0, 0, 1])).abs().amax(1) < 1e-6
+    right = unit & last & (torch.linalg.det(rotation) > 0)
+    if not bool(right.all()):
+        number = int((~right).nonzero()[0])
+        raise UserError(
+            f"{source}: frame {number}: the matrix is not a rotation with a place "
+            "(its last row is 0 0 0 1, and it neither scales nor mirrors)"
+        )
+
+
+def _sized(cameras: Cameras, width: int, height: int | None) -> Cameras:
+    """The same cameras for pictures of another size; their vertical field of view stays."""
+    if height is None:
+        height = max(1, round(cameras.height * width / cameras.width))
+    scale = height / cameras.height
+    Ks = cameras.Ks.clone()
+    Ks[:, :2] *= scale
+    Ks[:, 0, 2] += (width - scale * cameras.width) / 2
+    return Cameras(cameras.viewmats, Ks, width, height)

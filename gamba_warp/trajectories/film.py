@@ -1,0 +1,185 @@
+"""One file of Gaussians along one path of cameras: what ``gamba render`` writes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from msgspec import Meta
+from torch import Tensor
+
+from ..cameras import Cameras
+from ..errors import UserError
+from ..gaussians import Gaussians
+from ..images import save_image
+from ..untrusted.ranges import check_range
+from .files import load_path
+from .movies import check_gif, render_path, save_movie, save_pictures
+from .paths import TURNS, Viewpoint, placed, spiral, to_unit, turntable
+
+Kind = Literal["gif", "mp4", "png"]
+Color = tuple[float, float, float]
+
+FRAMES = 48  # of one turn
+SECONDS = 3.0  # of one turn
+FPS = 24.0  # of a file of cameras that states none
+SIDE = 512  # pixels
+_SIDES = Meta(ge=16, le=4096)
+_NEAR = 0.01  # nearest depth that is drawn
+_SAMPLE = 8  # frames from which a GIF takes its colours
+_NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5)}
+
+
+def parse_size(text: str) -> tuple[int, int | None]:
+    """Width and height of ``WxH``, or the width of ``W`` and None, in pixels.
+
+    Raises:
+        UserError: it is neither, or a side is out of range.
+    """
+    found = re.fullmatch(r"(\d{1,9})(?:[xX](\d{1,9}))?", text.strip())
+    if found is None:
+        raise UserError(f"--size {text[:40]}: give a width such as 512, or WxH such as 640x360")
+    width, height = (side and int(side) for side in found.groups())
+    for side in filter(None, (width, height)):
+        check_range("--size", side, _SIDES)
+    if width == 0 or height == 0:
+        raise UserError(f"--size {text[:40]}: must be at least {_SIDES.ge}")
+    return int(width or 0), height
+
+
+def parse_background(text: str) -> Color | None:
+    """RGB in [0, 1] of a name or of ``#rrggbb``; None for ``none``, which is transparent.
+
+    Raises:
+        UserError: it is none of these.
+    """
+    if text == "none":
+        return None
+    if text in _NAMED:
+        return _NAMED[text]
+    if re.fullmatch("#?[0-9a-fA-F]{6}", text):
+        red, green, blue = (int(text[-6:][i : i + 2], 16) / 255 for i in (0, 2, 4))
+        return red, green, blue
+    raise UserError(
+        f"--background {text[:40]}: one of {', '.join(_NAMED)}, none, or a colour such as #3366ff"
+    )
+
+
+@dataclass
+class Film:
+    """Where the camera goes, and what it takes.
+
+    Attributes:
+        cameras: ``[V]``, in an object's unit frame, or in the file's own frame.
+        own: whether they are in the file's own frame.
+        rate: pictures a second.
+        background: RGB in [0, 1], or None for transparent pictures.
+        depth: whether pictures have their depth beside them.
+    """
+
+    cameras: Cameras
+    own: bool
+    rate: float
+    background: Color | None
+    depth: bool = False
+
+
+def plan_path(
+    trajectory: str,
+    size: tuple[int, int | None] | None,
+    frames: int | None,
+    view: dict[str, float | None],
+) -> tuple[Cameras, bool, float]:
+    """The cameras of the options of ``gamba render``.
+
+    Args:
+        trajectory: turntable, spiral, or a file of cameras.
+        size: as ``parse_size`` gives it.
+        frames: number of pictures of a turntable or spiral.
+        view: elevation, distance and fov of a turntable or spiral; None is the default.
+
+    Returns:
+        The cameras, whether they are in the file's own frame, and the pictures a second.
+
+    Raises:
+        UserError: the file is bad, or an option does not go with it.
+    """
+    if trajectory in ("turntable", "spiral"):
+        width, height = size or (SIDE, None)
+        make, turns = (turntable, 1) if trajectory == "turntable" else (spiral, TURNS)
+        point = Viewpoint().changed(**view)
+        count = frames or turns * FRAMES
+        shape = (width, height or width)
+        cameras = make(count, point.elevation, point.distance, point.fov, shape)
+        return cameras, False, count / (turns * SECONDS)
+    given = [name for name, value in {**view, "frames": frames}.items() if value is not None]
+    if given:
+        raise UserError(f"--{given[0]} goes with a turntable or a spiral, not with a file")
+    path = load_path(trajectory, size)
+    for side in (path.cameras.width, path.cameras.height):
+        if side > int(_SIDES.le or 0) or side < 1:
+            name = f"{path.cameras.width}x{path.cameras.height}"
+            raise UserError(f"{trajectory}: pictures of {name}; give a smaller --size")
+    return path.cameras, True, path.fps or FPS
+
+
+def shoot(
+    target: Path,
+    kind: Kind,
+    gaussians: Gaussians,
+    frame: tuple[Tensor, float],
+    film: Film,
+    device: torch.device,
+    tell=lambda count: None,
+) -> None:
+    """Renders a file of Gaussians along a path, and writes what was asked for, atomically.
+
+    Args:
+        target: the ``.gif`` or ``.mp4``; of ``png`` the folder, or a ``.png`` for a single view.
+        kind: what is written.
+        gaussians: one object of any size anywhere.
+        frame: its centre ``[3]`` and its longest side.
+        film: where the camera goes.
+        device: device that renders.
+        tell: called with the number of pictures that are newly done, as a progress bar wants it.
+
+    Raises:
+        UserError: a file cannot be written, or is too large for its kind.
+    """
+    center, side = frame
+    # At the origin with side 1 float32 has the most digits, whatever the place of the object.
+    means, scales = (gaussians.means - center) / side, gaussians.scales / side
+    moved = replace(gaussians, means=means, scales=scales).to(device)
+    cameras = to_unit(film.cameras, center, side) if film.own else film.cameras
+    own = film.cameras if film.own else placed(film.cameras, center, side)
+    near = {"near_plane": min(_NEAR, _NEAR / side)}
+
+    def views(part: Cameras):
+        for picture, depth in render_path(moved, part, film.background, film.depth, **near):
+            yield picture, None if depth is None else depth * side
+
+    def told():
+        for view in views(cameras):
+            yield view
+            tell(1)
+
+    if kind == "png" and target.suffix.lower() == ".png":
+        save_image(target, next(told())[0] / 255.0)
+        return
+    if kind == "png":
+        save_pictures(target, told(), own, film.rate)
+        return
+    count = len(cameras.viewmats)
+    every = cameras[:: max(1, count // _SAMPLE)]
+    if kind == "gif":
+        check_gif(cameras.width, cameras.height, count)
+        sample = np.stack([picture for picture, _ in views(every)])
+    else:
+        sample = np.zeros((0, 1, 1, 3), np.uint8)
+    red, green, blue = (round(255 * value) for value in film.background or (1.0, 1.0, 1.0))
+    frames = (picture for picture, _ in told())
+    save_movie(target, frames, film.rate, sample, (red, green, blue))

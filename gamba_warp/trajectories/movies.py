@@ -1,0 +1,233 @@
+"""Pictures along a path of cameras, and their files: GIF, MP4, folders of PNG."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from ..cameras import Cameras
+from ..errors import UserError
+from ..files import atomic_folder, atomic_path
+from ..gaussians import Gaussians
+from ..images import to_uint8
+from ..render import render
+from .files import save_path
+
+CAMERAS = "cameras.json"  # in a folder of pictures
+_CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch, which takes a few hundred MB
+_CHUNK_GAUSSIANS = 1 << 22  # Gaussians projected in one launch, over all of its views
+_GIF_BYTES = 512 << 20  # Pillow holds all frames of a GIF, a byte a pixel
+_OURS = re.compile(rf"\d{{4,}}(-depth)?\.png|{re.escape(CAMERAS)}")
+_DEPTH_STEPS = 65_535
+
+
+@torch.inference_mode()
+def render_path(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: tuple[float, float, float] | None = (1.0, 1.0, 1.0),
+    depth: bool = False,
+    **options,
+) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    """Renders along a path, several views a launch, and yields one picture after the other.
+
+    Args:
+        gaussians: one object without batch dimension, on the device that renders.
+        cameras: ``[V]``.
+        background: RGB in [0, 1]; None makes RGBA pictures with straight alpha.
+        depth: whether the expected depth is rendered too.
+        options: further arguments of ``rasterization``.
+
+    Yields:
+        Of each view its picture ``[H, W, 3|4]`` uint8 and its depth ``[H, W]`` float32 along the
+        camera's axis, 0 where nothing is seen, or None.
+    """
+    cameras = cameras.to(gaussians.means.device, torch.float32)
+    color = None if background is None else gaussians.means.new_tensor(background)
+    pixels = _CHUNK_PIXELS // (cameras.width * cameras.height)
+    chunk = max(1, min(pixels, _CHUNK_GAUSSIANS // max(1, gaussians.num)))
+    for start in range(0, len(cameras.viewmats), chunk):
+        seen = render(gaussians, cameras[start : start + chunk], color, depth, **options)
+        rgb = seen.rgb
+        if background is None:
+            rgb = torch.cat([rgb / seen.alpha.clamp_min(1e-6), seen.alpha], -1)
+        depths = None if seen.depth is None else _known_depth(seen.depth, seen.alpha)
+        for number, picture in enumerate(rgb.cpu().numpy()):
+            yield to_uint8(picture), None if depths is None else depths[number]
+
+
+def _known_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
+    return torch.where(alpha > 0.5, depth, 0.0)[..., 0].cpu().numpy()
+
+
+def save_movie(
+    path: str | Path,
+    frames: Iterable[np.ndarray],
+    rate: float,
+    sample: np.ndarray,
+    background: tuple[int, int, int] = (255, 255, 255),
+) -> None:
+    """Writes frames as an endless ``.gif`` or an ``.mp4`` (H.264), by the suffix, atomically.
+
+    Args:
+        path: ends in ``.gif`` or ``.mp4``.
+        frames: each ``[H, W, 3]`` uint8; for MP4 the last row or column is repeated if their number
+            is odd, since H.264 needs even sizes.
+        rate: frames a second.
+        sample: ``[K, H, W, 3]`` some of the frames, from which a GIF takes its colours.
+        background: RGB that a GIF keeps exactly.
+
+    Raises:
+        UserError: the suffix is another one, or the file cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".gif", ".mp4"):
+        raise UserError(f"{path}: a turntable is a .gif or an .mp4")
+    with atomic_path(path) as temporary:
+        if suffix == ".gif":
+            _write_gif(temporary, frames, rate, sample, background)
+        else:
+            _write_mp4(temporary, frames, rate)
+
+
+def check_gif(width: int, height: int, frames: int) -> None:
+    """Refuses a GIF that would take too much memory, before anything is rendered.
+
+    Raises:
+        UserError: it would; the message says what to do.
+    """
+    if width * height * frames > _GIF_BYTES:
+        raise UserError(
+            f"{frames} frames of {width}x{height} are too many for a .gif; write an .mp4 or "
+            "pictures (--kind png), or give a smaller --size"
+        )
+
+
+def _write_gif(
+    path: Path,
+    frames: Iterable[np.ndarray],
+    rate: float,
+    sample: np.ndarray,
+    background: tuple[int, int, int],
+) -> None:
+    palette = _palette(sample, background)
+
+    def pictures() -> Iterator[Image.Image]:
+        for frame in frames:
+            picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
+            # Pillow looks colours up so coarsely that white may become a neighbour of white.
+            picture.paste(0, mask=Image.fromarray((frame == background).all(-1)))
+            yield picture
+
+    rest = pictures()
+    # GIF counts time in units of 10 ms, and viewers slow down frames under 20 ms.
+    duration = max(20, round(100 / rate) * 10)
+    next(rest).save(
+        path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True
+    )
+
+
+def _palette(frames: np.ndarray, background: tuple[int, int, int]) -> Image.Image:
+    """One palette of the background and 255 others for all frames: colours do not flicker."""
+    pixels = frames.reshape(-1, 3)
+    pixels = pixels[(pixels != background).any(1)]
+    if len(pixels) == 0:
+        pixels = frames.reshape(-1, 3)[:1]
+    colours = Image.fromarray(pixels[None]).quantize(255, kmeans=1).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*background, *colours[: 3 * 255]])
+    return palette
+
+
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    import imageio_ffmpeg
+
+    rest = iter(frames)
+    first = next(rest)
+    height, width = first.shape[:2]
+    odd = ((0, height % 2), (0, width % 2), (0, 0))
+    size = f"{width + width % 2}x{height + height % 2}"
+    # imageio's own writer passes over ffmpeg's exit code, so a full disk would go unnoticed.
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo"]
+    command += ["-pix_fmt", "rgb24", "-s", size, "-r", f"{rate:.6f}", "-i", "-", "-an"]
+    command += ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "10"]
+    command += ["-movflags", "+faststart", f"file:{path}"]
+    with tempfile.TemporaryFile() as told:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=told)
+        assert process.stdin is not None
+        try:
+            with suppress(BrokenPipeError):  # it ended before its input: its exit code says why
+                for frame in itertools.chain([first], rest):
+                    process.stdin.write(np.pad(frame, odd, mode="edge").tobytes())
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+            code = process.wait()
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+        if code:
+            told.seek(0)
+            lines = told.read().decode(errors="replace").strip().splitlines()
+            raise OSError(f"ffmpeg ended with code {code} ({lines[0] if lines else ''})")
+
+
+def check_folder(path: Path) -> None:
+    """Refuses a folder that holds other things than pictures of ours: it would be replaced.
+
+    Raises:
+        UserError: it does, or is no folder.
+    """
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise UserError(f"{path}: is a file; pictures go into a folder")
+    other = next((p.name for p in path.iterdir() if not _OURS.fullmatch(p.name)), None)
+    if other is not None:
+        raise UserError(f"{path}: holds other files ({other}); give another --out")
+
+
+def save_pictures(
+    folder: Path,
+    views: Iterable[tuple[np.ndarray, np.ndarray | None]],
+    cameras: Cameras,
+    rate: float,
+) -> None:
+    """Writes a folder of ``0000.png`` and so on with ``cameras.json``, whole or not at all.
+
+    Depth, where there is one, becomes ``0000-depth.png`` of 16 bits, 0 where it is not known; the
+    length of a step is the frame's ``depth_unit``.
+
+    Args:
+        folder: replaced if it is there; see ``check_folder``.
+        views: as ``render_path`` yields them, with depths in the cameras' own unit.
+        cameras: ``[V]``, in the frame of the file that is shown.
+        rate: pictures a second, for ``cameras.json``.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    check_folder(folder)
+    with atomic_folder(folder, replace=True) as temporary:
+        extra = []
+        for number, (picture, depth) in enumerate(views):
+            name = f"{number:04d}"
+            Image.fromarray(picture).save(temporary / f"{name}.png")
+            fields: dict[str, object] = {"picture": f"{name}.png"}
+            if depth is not None:
+                unit = max(float(depth.max()), 1e-9) / _DEPTH_STEPS
+                steps = (depth / unit).round().astype(np.uint16)
+                Image.fromarray(steps).save(temporary / f"{name}-depth.png")
+                fields |= {"depth": f"{name}-depth.png", "depth_unit": unit}
+            extra.append(fields)
+        save_path(temporary / CAMERAS, cameras, rate, extra)

@@ -1,0 +1,105 @@
+"""--elevation, --fov and --distance of reconstruct, export and view."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from helpers.gaussians import some
+from helpers.images import cut_out
+from helpers.model import run_reconstruct
+from PIL import Image
+
+from gamba_warp.cli import run
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.model.checkpoint import save_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.pages import outputs
+from gamba_warp.pages.turntable import turntable_frames
+from gamba_warp.surfaces.extract import moved_to_unit, unit_frame
+from gamba_warp.trajectories.paths import upright
+
+
+def first_frame(path):
+    with Image.open(path) as movie:
+        return np.asarray(movie.convert("RGB")).astype(float)
+
+
+def camera_of(page):
+    found = re.search(r'data-distance="(\S+)" data-fov="(\S+)" data-elevation="(\S+)"', page)
+    return tuple(map(float, found.groups()))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    config = GambaConfig(
+        image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
+    )
+    path = tmp_path_factory.mktemp("model") / "model.safetensors"
+    save_model(path, Gamba(config))
+    return path
+
+
+def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
+    meshed = []
+    monkeypatch.setattr(
+        outputs, "write_meshes", lambda base, gaussians, *_: meshed.append(gaussians)
+    )
+    picture = cut_out(tmp_path / "thing.png")
+    plain, turned = tmp_path / "plain", tmp_path / "turned"
+    common = [picture, "--checkpoint", model, "--size", 48, "--frames", 4]
+    assert run_reconstruct(*common, "--out", plain) == 0
+    options = ["--elevation", 30, "--mesh", "ply", "--ply-frame", "opencv"]
+    assert run_reconstruct(*common, "--out", turned, *options) == 0
+    before, after = load_ply(plain / "thing.ply"), load_ply(turned / "thing.ply")
+    want = before.transformed(upright(30.0), torch.zeros(3))
+    torch.testing.assert_close(after.means, want.means, rtol=1e-4, atol=1e-5)
+    assert float((after.means - before.means).abs().max()) > 0.05
+    torch.testing.assert_close(meshed[0].means, after.means)  # meshes are made of what is turned
+    # The first view of both turntables is the input's, where the camera stood.
+    straight, above, lying = (
+        turntable_frames(gaussians, size=48, frames=1, elevation=elevation)[0].astype(int)
+        for gaussians, elevation in ((before, 0.0), (after, 30.0), (before, 30.0))
+    )
+    assert np.abs(straight - above).max() <= 3 < np.abs(straight - lying).max()  # rounding
+    for folder in (plain, turned):
+        assert np.abs(first_frame(folder / "thing.gif") - straight).mean() < 1  # 255 colours
+    assert camera_of((turned / "thing.html").read_text()) == (1.5, 49.1, 30)
+
+
+def test_field_of_view_and_distance_are_those_of_what_is_rendered(tmp_path, model):
+    picture = cut_out(tmp_path / "thing.png")
+    common = [picture, "--checkpoint", model, "--size", 48, "--frames", 2]
+    assert run_reconstruct(*common, "--out", tmp_path / "a", "--fov", 20, "--distance", 4) == 0
+    assert run_reconstruct(*common, "--out", tmp_path / "b") == 0
+    same = load_ply(tmp_path / "a" / "thing.ply"), load_ply(tmp_path / "b" / "thing.ply")
+    assert torch.equal(same[0].means, same[1].means)  # the Gaussians do not depend on it
+    assert camera_of((tmp_path / "a" / "thing.html").read_text()) == (4, 20, 0)
+    want = turntable_frames(same[0], size=48, frames=1, distance=4.0, fov=20.0)[0]
+    assert np.abs(first_frame(tmp_path / "a" / "thing.gif") - want).mean() < 1
+
+
+def test_export_and_view_start_from_there(tmp_path, monkeypatch):
+    gaussians = some(60)
+    gaussians.means, gaussians.scales = gaussians.means * 4 + 9, gaussians.scales * 4
+    save_ply(tmp_path / "a.ply", gaussians)
+    view = ["--elevation", "25", "--fov", "30", "--distance", "3"]
+    options = ["--mesh", "--formats", "gif", "html", "--size", "48", "--frames", "2"]
+    out = tmp_path / "out"
+    assert run("export", [str(tmp_path / "a.ply"), "--out", str(out), *options, *view]) == 0
+    moved = moved_to_unit(load_ply(tmp_path / "a.ply"), *unit_frame(gaussians))
+    want = turntable_frames(moved, size=48, frames=1, elevation=25.0, distance=3.0, fov=30.0)[0]
+    assert np.abs(first_frame(out / "a.gif") - want).mean() < 3
+    assert camera_of((out / "a.html").read_text()) == (3, 30, 25)
+    page = tmp_path / "view.html"
+    arguments = [str(tmp_path / "a.ply"), "--out", str(page), "--no-open-browser", *view]
+    assert run("view", arguments) == 0
+    assert camera_of(page.read_text()) == (3, 30, 25)
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "export", "view"])
+@pytest.mark.parametrize("option", ["--elevation 91", "--fov 0", "--distance nan"])
+def test_numbers_out_of_range_are_one_line(tmp_path, command, option, capsys):
+    assert run(command, [str(tmp_path / "a.ply"), *option.split()]) == 2
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith(f"gamba: {option}")
