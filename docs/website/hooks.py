@@ -1,4 +1,4 @@
-"""The hooks of mkdocs.yml: pages of files outside docs/, the notebook, what the navigation lacks."""
+"""The hooks of mkdocs.yml: pages of files outside docs/, the notebook, pages not in the nav."""
 
 from __future__ import annotations
 

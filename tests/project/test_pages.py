@@ -1,10 +1,11 @@
 """What README and pages tell a reader to type is understood, and the short of it runs."""
 
+import contextlib
 import functools
+import io
 import json
 import re
 import shlex
-import shutil
 
 import pytest
 import torch
@@ -13,7 +14,8 @@ from helpers.images import cut_out
 from helpers.pages import PAGES, ROOT, Block, blocks, commands
 
 from gamba_warp import cli
-from gamba_warp.formats.ply import save_ply
+from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.images import load_rgba
 
 README = ROOT / "README.md"
 MAKEFILE = (ROOT / "Makefile").read_text()
@@ -51,7 +53,9 @@ def parsed(monkeypatch):
     monkeypatch.setattr(cli, "load_command", load)
 
     def parse(words, where, capsys):
-        words = [word for word in words if word not in ("…", "...")]
+        if words[-1] == "…":  # and other options
+            words = words[:-1]
+        words = ["DATA" if word == "…" else word for word in words]  # as in the line before
         try:
             code = cli._main(words)
         except SystemExit as end:
@@ -111,9 +115,6 @@ def test_commands_in_sentences_are_understood(path, parsed, capsys):
 @functools.cache
 def options(*names: str) -> str:
     """The help of the first of some names that is a command's."""
-    import contextlib
-    import io
-
     name = next(name for name in names if name in cli.COMMANDS)
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
@@ -127,11 +128,10 @@ def workplace(tmp_path, monkeypatch):
     for name in ("photo.png", "other.png"):
         cut_out(tmp_path / name)
     (tmp_path / "starter").symlink_to(ROOT / "starter")
-    meshes = sorted((ROOT / "starter" / "meshes").glob("*.ply"))[:3]
     for folder in ("my-meshes", "predictions", "truths"):
-        (tmp_path / folder).mkdir()
-        for mesh in meshes:
-            shutil.copy(mesh, tmp_path / folder / mesh.name)
+        for name in ("one", "other"):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            (tmp_path / folder / f"{name}.obj").write_text(TETRAHEDRON)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -156,13 +156,21 @@ def test_marked_commands_run(block, workplace, capsys):
 
 def prepare(block: Block, folder) -> None:
     """Makes what a block's own page has made before."""
+    torch.manual_seed(0)
     if "out/photo.ply" in block.text:
-        torch.manual_seed(0)
         (folder / "out").mkdir()
         save_ply(folder / "out" / "photo.ply", some(60))
     if "truth.obj" in block.text:
         (folder / "truth.obj").write_text(TETRAHEDRON)
-        shutil.copy(next((folder / "predictions").iterdir()), folder / "prediction.ply")
+        save_ply(folder / "prediction.ply", some(60))
+
+
+def assert_alike(found: str, wanted: str) -> None:
+    """The same words; numbers within 2 %, as another processor may round otherwise."""
+    number = re.compile(r"-?\d+\.?\d*")
+    assert number.sub("#", found) == number.sub("#", wanted)
+    numbers = zip(map(float, number.findall(found)), map(float, number.findall(wanted)))
+    assert all(a == pytest.approx(b, rel=0.02, abs=0.01) for a, b in numbers), found
 
 
 README_PYTHON = [b for b in PYTHON if b.runs or b.path == README]
@@ -171,13 +179,14 @@ README_PYTHON = [b for b in PYTHON if b.runs or b.path == README]
 @pytest.mark.parametrize("block", README_PYTHON, ids=str)
 def test_marked_python_runs(block, workplace):
     exec(compile(block.text, str(block), "exec"), {})
+    if "view.png" in block.text:
+        assert load_ply("photo.ply").num > 1000
+        picture = load_rgba("view.png")
+        assert picture.shape == (256, 256, 4) and (picture[..., :3] < 0.9).any()
 
 
 def test_the_notebook_runs(workplace):
     """The code of its cells, one after the other; the figures that it shows are today's."""
-    import contextlib
-    import io
-
     notebook = json.loads((ROOT / "docs" / "examples" / "first-steps.ipynb").read_text())
     names: dict = {}
     for cell in notebook["cells"]:
@@ -187,5 +196,4 @@ def test_the_notebook_runs(workplace):
         with contextlib.redirect_stdout(out):
             exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
         shown = [o for o in cell["outputs"] if o["output_type"] == "stream"]
-        assert out.getvalue() == "".join("".join(o["text"]) for o in shown)
-        assert not any(o["output_type"] == "error" for o in cell["outputs"])
+        assert_alike(out.getvalue(), "".join("".join(o["text"]) for o in shown))
