@@ -17,7 +17,10 @@ from website.links import is_code, page_of, rewritten, targets  # noqa: E402
 
 log = logging.getLogger("mkdocs.hooks.gamba_warp")
 # Markdown outside docs/ that is part of the site even if no page links to it.
-ALWAYS = ("CONTRIBUTING.md", "CHANGELOG.md", "THIRD_PARTY.md", "eval/README.md")
+ALWAYS = (
+    *("CONTRIBUTING.md", "CHANGELOG.md", "THIRD_PARTY.md", "eval/README.md"),
+    *("kernels/rasterize/CUDA.md", "kernels/selective_scan/CUDA.md"),
+)
 # Place on the site -> file of the repository, for pages that do not lie in docs/ under their name.
 _origin: dict[str, str] = {}
 _tree: list[tempfile.TemporaryDirectory] = []

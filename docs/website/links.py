@@ -71,6 +71,8 @@ def page_of(path: str) -> str:
         return str(Path(inside).with_suffix(".md"))
     if inside != path and not is_code(path):
         return inside
+    if path.endswith("/README.md"):  # a page of its own, not the index of a section
+        path = path.removesuffix("/README.md") + ".md"
     return f"code/{path}.md" if is_code(path) else f"repository/{path}"
 
 

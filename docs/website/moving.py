@@ -25,7 +25,7 @@ OBJECTS = (
 )
 COLUMNS = 3
 SIDE = 200  # pixels of the input and of the turntable
-CROP = 20  # of these, left out at each edge, where nothing is
+CROP = 10  # of these, left out at each edge, where nothing is
 FRAMES = 40
 MILLISECONDS = 100  # that a frame stays
 PICTURE = Path(__file__).parents[1] / "pictures" / "turntables.webp"

@@ -51,7 +51,7 @@ def test_the_site_builds_strictly_and_has_every_page(site):
     for path in (ROOT / "docs").rglob("*.md"):
         page = path.relative_to(ROOT / "docs").with_suffix(".html")
         assert (site / page).is_file(), page
-    for page in ("examples/first-steps.html", "repository/kernels/rasterize/index.html"):
+    for page in ("examples/first-steps.html", "repository/kernels/rasterize.html"):
         assert (site / page).is_file(), page
     code = (site / "code/docs/examples/char_mamba.py.html").read_text()
     assert "Mamba" in code
@@ -85,11 +85,11 @@ def test_a_page_loads_nothing_from_elsewhere(site):
 
 def test_links_lead_to_the_pages_of_files():
     assert page_of("docs/rays.md") == "rays.md" and page_of("README.md") == "index.md"
-    assert page_of("kernels/rasterize/README.md") == "repository/kernels/rasterize/README.md"
+    assert page_of("kernels/rasterize/README.md") == "repository/kernels/rasterize.md"
     assert page_of("docs/examples/slurm.sh") == "code/docs/examples/slurm.sh.md"
     text = "[a](../eval/README.md#b) ![p](pictures/x.webp) [c](#d) [e](https://f.org/g.md)\n"
     new = rewritten(text, "docs/rays.md", "rays.md")
-    assert "(repository/eval/README.md#b)" in new and "(pictures/x.webp)" in new
+    assert "(repository/eval.md#b)" in new and "(pictures/x.webp)" in new
     assert "(#d)" in new and "(https://f.org/g.md)" in new
     assert targets(text, "docs/rays.md") == ["eval/README.md", "docs/pictures/x.webp"]
     block = "```text\n[a](../eval/README.md)\n```\n"
