@@ -8,7 +8,7 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test bench lint format architecture constraints clean
+.PHONY: setup demo test bench docs lint format architecture constraints clean
 
 setup: $(STAMP)
 
@@ -32,6 +32,11 @@ test: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench
+
+# The site, in site/: a broken link, anchor or docstring is an error.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "open site/index.html"
 
 # pyright reads what users get: the wheel, unpacked. (build/ goes first: setuptools would take
 # files from it that are gone from the checkout.)
@@ -61,4 +66,4 @@ constraints: $(STAMP)
 	@mv constraints.txt.new constraints.txt
 
 clean:
-	rm -rf $(VENV) out build dist *.egg-info
+	rm -rf $(VENV) out build dist site *.egg-info

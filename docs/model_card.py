@@ -1,4 +1,4 @@
-r"""Puts figures into the card of the shipped model, and writes the tables of docs/model-card.md.
+r"""Puts figures into the card of the shipped model; writes docs/model-card.md and README's table.
 
 After ``gamba eval-views`` and ``gamba eval-geometry`` of the model that ships:
 
@@ -25,6 +25,7 @@ from gamba_warp.pages.card import METRICS, ModelCard, Row, card_path, read_card
 from gamba_warp.untrusted.documents import read_document
 
 PAGE = Path(__file__).with_name("model-card.md")
+README = Path(__file__).parents[1] / "README.md"
 MARK = "<!-- {name}: written by docs/model_card.py -->"
 TITLES = {"novel": "New views", "input": "The input view", "shape": "Shape"}
 
@@ -53,6 +54,7 @@ def main(
     card = msgspec.structs.replace(card, figures=rows)
     write_json(card_path(DEFAULT_CHECKPOINT), msgspec.to_builtins(card))
     write_text(PAGE, page_of(PAGE.read_text(encoding="utf-8"), card))
+    write_text(README, readme_of(README.read_text(encoding="utf-8"), card))
 
 
 def page_of(text: str, card: ModelCard) -> str:
@@ -79,6 +81,38 @@ def page_of(text: str, card: ModelCard) -> str:
         "figures": "\n\n".join([card.measured, *_tables(card)]),
         "limits": "\n".join(f"- {limit}" for limit in card.limits),
     }
+    return _written(text, parts)
+
+
+def readme_of(text: str, card: ModelCard) -> str:
+    """The README with its table of results written from the card: new views beside shapes.
+
+    Args:
+        text: of the README.
+        card: of the model.
+
+    Raises:
+        ValueError: the README lacks the mark.
+    """
+    novel = [row for row in card.figures if row.views == "novel"]
+    shapes = {row.name: row for row in card.figures if row.views == "shape"}
+    of_views, of_shapes = ("psnr", "ssim", "lpips", "mask_iou"), ("chamfer", "iou")
+    heads = [METRICS[key][0] for key in (*of_views, *of_shapes)]
+    lines = [f"| {novel[0].objects} objects | {' | '.join(heads)} |", "| --- " * 7 + "|"]
+    for row in novel:
+        cells = [getattr(row, key) for key in of_views]
+        cells += [getattr(shapes.get(row.name), key, None) for key in of_shapes]
+        texts = [
+            f"{cell.mean:.{METRICS[key][1]}f}" if cell else "–"
+            for key, cell in zip((*of_views, *of_shapes), cells)
+        ]
+        name = "**shipped model**" if row.name == "model" else row.name.replace("_", " ")
+        lines.append(f"| {name} | {' | '.join(texts)} |")
+    return _written(text, {"results": "\n".join(lines)})
+
+
+def _written(text: str, parts: dict[str, str]) -> str:
+    """A page with each part written between its marks."""
     for name, content in parts.items():
         begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
         if begin not in text or end not in text:

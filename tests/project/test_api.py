@@ -12,7 +12,6 @@ import pytest
 import gamba_warp
 from gamba_warp import kernels
 from gamba_warp.cameras import Cameras
-from gamba_warp.formats.ply import load_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.kernels.causal_conv1d.function import causal_conv1d
@@ -24,7 +23,6 @@ from gamba_warp.model.predict import reconstruct
 from gamba_warp.render import render
 
 ROOT = Path(__file__).resolve().parents[2]
-README = (ROOT / "README.md").read_text()
 # Modules and packages that have the name of a function beside them.
 BESIDE = ("gamba_warp.render", "gamba_warp.kernels.selective_scan.reference",
           "gamba_warp.kernels.causal_conv1d.ops", "gamba_warp.kernels.rasterize")  # fmt: skip
@@ -35,12 +33,6 @@ def run(code: str) -> str:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def python_block(heading: str) -> str:
-    """The Python of one section of the README."""
-    section = README.split(f"\n## {heading}\n")[1].split("\n## ")[0]
-    return re.search(r"```python\n(.*?)```", section, re.DOTALL)[1]
 
 
 @pytest.mark.parametrize("package", [gamba_warp, kernels], ids=lambda p: p.__name__)
@@ -94,18 +86,6 @@ def test_a_public_name_can_be_replaced(monkeypatch):
         patch.setattr(gamba_warp, "render", print)
         assert gamba_warp.render is print
     assert gamba_warp.render is render
-
-
-def test_the_readme_runs(tmp_path, monkeypatch):
-    rgba = np.zeros((40, 30, 4))
-    rgba[8:32, 5:25] = (0.8, 0.3, 0.1, 1)
-    save_image(tmp_path / "photo.png", rgba)
-    monkeypatch.chdir(tmp_path)
-    exec(python_block("In Python"), {})
-    assert load_ply(tmp_path / "photo.ply").num > 1000
-    picture = load_rgba(tmp_path / "view.png")
-    assert picture.shape == (256, 256, 4) and (picture[..., :3] < 0.9).any()
-    exec(python_block("The kernels alone"), {})
 
 
 def test_a_picture_may_be_a_file_or_an_array(tmp_path):

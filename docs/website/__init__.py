@@ -1,0 +1,1 @@
+"""What turns the pages of this folder into the site (mkdocs.yml)."""

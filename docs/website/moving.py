@@ -1,0 +1,61 @@
+"""Draws docs/pictures/turntables.webp: objects that the shipped model was not trained on, turning.
+
+    python docs/website/moving.py data/furniture128
+
+Left of each pair is the input, right of it what the shipped model makes of that one picture. The
+objects are of the test split, one of a kind, chosen by eye; docs/pictures/held-out.webp has the
+best, the middle and the worst by PSNR.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from gamba_warp.conventions import over_background
+from gamba_warp.files import atomic_path
+from gamba_warp.images import load_rgba, to_uint8
+
+OBJECTS = (
+    *("blendswap-cc-by-horse", "blendswap-cc-0-teddybear", "scopia-cardboard-box"),
+    *("blendswap-cc-by-mediumindoorplant", "scopia-dog-house", "blendswap-cc-0-caballito"),
+)
+COLUMNS = 3
+SIDE = 200  # pixels of the input and of the turntable
+CROP = 10  # of these, left out at each edge, where nothing is
+FRAMES = 40
+MILLISECONDS = 100  # that a frame stays
+PICTURE = Path(__file__).parents[1] / "pictures" / "turntables.webp"
+
+
+def main(data: Path) -> None:
+    """Writes the picture.
+
+    Args:
+        data: made by `gamba data furniture` and `gamba data render`.
+    """
+    from gamba_warp import load_model, reconstruct
+    from gamba_warp.pages.turntable import turntable_frames
+
+    model = load_model()
+    cells = []
+    for name in OBJECTS:
+        rgba = load_rgba(data / name / "000.webp")
+        seen = Image.fromarray(to_uint8(over_background(rgba, 1.0)))
+        still = np.asarray(seen.resize((SIDE, SIDE), Image.Resampling.BICUBIC))
+        turn = turntable_frames(reconstruct(model, rgba), size=SIDE, frames=FRAMES, elevation=10.0)
+        pair = np.stack([np.broadcast_to(still, turn.shape), turn])[:, :, CROP:-CROP, CROP:-CROP]
+        cells.append(np.concatenate([*pair], 2))
+    rows = [np.concatenate(cells[i : i + COLUMNS], 2) for i in range(0, len(cells), COLUMNS)]
+    frames = [Image.fromarray(frame) for frame in np.concatenate(rows, 1)]
+    with atomic_path(PICTURE) as path:
+        options = {"duration": MILLISECONDS, "loop": 0, "quality": 80, "method": 6}
+        frames[0].save(path, "WEBP", save_all=True, append_images=frames[1:], **options)
+    print(f"{PICTURE}: {PICTURE.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

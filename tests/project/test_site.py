@@ -1,0 +1,149 @@
+"""The site builds without a broken link, and README keeps to what it promises."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import yaml
+from website.links import page_of, rewritten, targets
+
+from gamba_warp.versions import __version__
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+CITATION = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+
+
+class Loaded(HTMLParser):
+    """Collects what a browser fetches to show a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        if tag in ("script", "img", "iframe", "source", "video"):
+            self.found.append(values.get("src") or "")
+        if tag == "link" and values.get("rel") in ("stylesheet", "icon", "preconnect", "preload"):
+            self.found.append(values.get("href") or "")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    pytest.importorskip("mkdocstrings", reason="needs gamba-warp[docs]")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, env=environment, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_the_site_builds_strictly_and_has_every_page(site):
+    for path in (ROOT / "docs").rglob("*.md"):
+        page = path.relative_to(ROOT / "docs").with_suffix(".html")
+        assert (site / page).is_file(), page
+    for page in ("examples/first-steps.html", "repository/kernels/rasterize.html"):
+        assert (site / page).is_file(), page
+    code = (site / "code/docs/examples/char_mamba.py.html").read_text()
+    assert "Mamba" in code
+    assert not list(site.rglob("*.py")) and not list(site.rglob("*.ipynb"))
+
+
+def test_every_page_is_in_the_navigation(site):
+    start = (site / "index.html").read_text()
+    for path in (ROOT / "docs").glob("*.md"):
+        assert f'href="{path.stem}.html"' in start or path.stem == "index", path.name
+
+
+def test_docstrings_are_on_the_api_pages(site):
+    text = (site / "api/kernels.html").read_text()
+    for name in ("selective_scan", "rasterization", "causal_conv1d_fn"):
+        assert f"function.{name}" in text or f"dropin.{name}" in text
+    assert "delta_softplus" in text
+    names = (site / "api/gaussians.html").read_text()
+    assert 'id="gamba_warp.cameras.orbit"' in names and "azimuths" in names
+
+
+def test_a_page_loads_nothing_from_elsewhere(site):
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 30
+    for page in pages:
+        reader = Loaded()
+        reader.feed(page.read_text(encoding="utf-8"))
+        outside = [name for name in reader.found if re.match(r"(https?:)?//", name)]
+        assert not outside, f"{page}: {outside}"
+
+
+def test_links_lead_to_the_pages_of_files():
+    assert page_of("docs/rays.md") == "rays.md" and page_of("README.md") == "index.md"
+    assert page_of("kernels/rasterize/README.md") == "repository/kernels/rasterize.md"
+    assert page_of("docs/examples/slurm.sh") == "code/docs/examples/slurm.sh.md"
+    text = "[a](../eval/README.md#b) ![p](pictures/x.webp) [c](#d) [e](https://f.org/g.md)\n"
+    new = rewritten(text, "docs/rays.md", "rays.md")
+    assert "(repository/eval.md#b)" in new and "(pictures/x.webp)" in new
+    assert "(#d)" in new and "(https://f.org/g.md)" in new
+    assert targets(text, "docs/rays.md") == ["eval/README.md", "docs/pictures/x.webp"]
+    block = "```text\n[a](../eval/README.md)\n```\n"
+    assert rewritten(block, "docs/rays.md", "rays.md") == block
+
+
+def test_the_readme_is_short_and_its_links_lead_somewhere():
+    assert README.count("\n") <= 150
+    first = README[: README.index("\n## ")]
+    moving = re.search(r"!\[[^\]]+\]\((docs/pictures/[^)]+)\)", first)
+    assert moving is not None
+    picture = ROOT / moving[1]
+    assert picture.stat().st_size < 1.5e6
+    for path in targets(README, "README.md"):
+        assert (ROOT / path).exists(), path
+
+
+def test_the_picture_moves():
+    from PIL import Image
+
+    with Image.open(ROOT / "docs" / "pictures" / "turntables.webp") as picture:
+        assert picture.n_frames >= 24
+    text = (ROOT / "THIRD_PARTY.md").read_text()
+    assert "docs/pictures/turntables.webp" in text
+
+
+def test_each_mark_beside_others_has_its_proof():
+    section = README.split("## Beside others\n")[1].split("\n## ")[0]
+    lines = [line for line in section.split("\n") if line.startswith("| ")]
+    named = dict(re.findall(r"^\[(\w+)\]: (https://\S+)$", README, re.MULTILINE))
+    assert len(lines) > 8
+    for line in lines[2:]:
+        title, *cells = line.strip("| ").split(" | ")
+        assert len(cells) == 6, title
+        for cell in cells:
+            links = re.findall(r"\]\(([^)]+)\)", cell)
+            links += [named[name] for name in re.findall(r"\]\[(\w+)\]", cell)]
+            assert links, f"{title}: {cell}"
+
+
+def test_the_citation_is_that_of_the_paper():
+    assert CITATION["cff-version"] == "1.2.0" and CITATION["version"] == __version__
+    assert {"title", "message", "authors", "license"} <= set(CITATION)
+    paper = CITATION["preferred-citation"]
+    names = [f"{a['family-names']}, {a['given-names']}" for a in paper["authors"]]
+    for page in ("README.md", "docs/index.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        bibtex = re.search(r"```bibtex\n(.*?)```", text, re.DOTALL)[1]
+        flat = " ".join(bibtex.split())
+        assert " and ".join(names) in flat and paper["title"] in flat
+        assert f"{{{paper['year']}}}" in flat and "2403.18795" in flat
+
+
+def test_the_notebook_has_its_pictures():
+    notebook = json.loads((ROOT / "docs/examples/first-steps.ipynb").read_text())
+    outputs = [o for cell in notebook["cells"] for o in cell.get("outputs", [])]
+    assert sum("image/png" in o.get("data", {}) for o in outputs) >= 2
