@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.gaussians import some
 from helpers.images import cut_out
-from helpers.pages import PAGES, ROOT, Block, blocks, commands
+from website.blocks import PAGES, ROOT, Block, blocks, commands
 
 from gamba_warp import cli
 from gamba_warp.formats.ply import load_ply, save_ply
