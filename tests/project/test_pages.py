@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.gaussians import some
 from helpers.images import cut_out
-from helpers.pages import PAGES, ROOT, Block, blocks, commands
+from website.blocks import PAGES, ROOT, Block, blocks, commands
 
 from gamba_warp import cli
 from gamba_warp.formats.ply import load_ply, save_ply
@@ -36,6 +36,24 @@ OTHERS = {
 SHELL = blocks("bash")
 PYTHON = blocks("python")
 # `gamba … ` in the middle of a sentence; a name in capitals or an ellipsis stands for something.
+TETRAHEDRON_PLY = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+element face 4
+property list uchar int vertex_indices
+end_header
+0 0 0
+1 0 0
+0 1 0
+0 0 1
+3 0 2 1
+3 0 1 3
+3 1 2 3
+3 0 3 2
+"""
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 INLINE = re.compile(r"`(gamba [a-z][^`]*)`")
 
@@ -129,14 +147,13 @@ def options(*names: str) -> str:
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
-    """A folder with what the pages take for granted: a photo, meshes, predictions, truths."""
+    """A folder with what the pages take for granted: photos, meshes, the starter set."""
     for name in ("photo.png", "other.png"):
         cut_out(tmp_path / name)
     (tmp_path / "starter").symlink_to(ROOT / "starter")
-    for folder in ("my-meshes", "predictions", "truths"):
-        for name in ("one", "other"):
-            (tmp_path / folder).mkdir(exist_ok=True)
-            (tmp_path / folder / f"{name}.obj").write_text(TETRAHEDRON)
+    (tmp_path / "my-meshes").mkdir()
+    for name in ("one", "other"):
+        (tmp_path / "my-meshes" / f"{name}.obj").write_text(TETRAHEDRON)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -154,20 +171,18 @@ def test_marked_commands_run(block, workplace, capsys):
         code = cli._main([*mine, *block.small.get(name.split()[-1], [])])
         said = capsys.readouterr()
         assert code == 0, f"{block}: gamba {shlex.join(mine)}\n{said.err}"
-        if "--json" in mine:
-            (workplace / "again.json").write_text(said.out)
-            assert json.loads(said.out)
 
 
 def prepare(block: Block, folder) -> None:
     """Makes what a block's own page has made before."""
     torch.manual_seed(0)
     if "out/photo.ply" in block.text:
-        (folder / "out").mkdir()
-        save_ply(folder / "out" / "photo.ply", some(60))
+        for name in ("out/photo.ply", "splats/one.ply"):
+            (folder / name).parent.mkdir()
+            save_ply(folder / name, some(60))
     if "truth.obj" in block.text:
         (folder / "truth.obj").write_text(TETRAHEDRON)
-        save_ply(folder / "prediction.ply", some(60))
+        (folder / "prediction.ply").write_text(TETRAHEDRON_PLY)
 
 
 def assert_alike(found: str, wanted: str) -> None:

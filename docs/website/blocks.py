@@ -1,4 +1,6 @@
-"""The blocks of code in the README and in the pages, and the commands in them."""
+"""The blocks of code in README and pages, and the commands in them, for the tests."""
+
+from __future__ import annotations
 
 import re
 import shlex
