@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from ..conventions import Axes
 from ..formats.gaussians.files import write_gaussians
@@ -119,6 +120,8 @@ def _write_gaussians(base: Path, gaussians: Gaussians, outputs: Outputs) -> None
     comments = [f"from {base.name} by {outputs.checkpoint.name}"]
     for kind in outputs.splats:
         path, least = base.with_name(base.name + splat_suffix(kind)), outputs.min_opacity
-        write_gaussians(
+        lost = write_gaussians(
             path, gaussians, kind, axes=outputs.axes, min_opacity=least, comments=comments
         )
+        if lost is not None:
+            tqdm.write(lost)

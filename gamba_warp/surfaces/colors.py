@@ -38,9 +38,9 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def point_colors(
-    positions: np.ndarray, directions: np.ndarray, views: Views, voxels: int, power: int = 2
+    positions: np.ndarray, directions: np.ndarray, views: Views, voxels: int
 ) -> np.ndarray:
-    """The mean colour of places on a surface in the views that see them.
+    """The mean colour of places on a surface in the views that see them; those in front count most.
 
     Args:
         positions: ``[P, 3]``.
@@ -48,7 +48,6 @@ def point_colors(
         views: pictures and depth.
         voxels: number of voxels a unit; a view sees a place if its depth there differs by less
             than four voxels.
-        power: a view counts as this power of the cosine at which it sees the surface.
 
     Returns:
         ``[P, 3]`` float32 in [0, 1]; a place that no view sees has the nearest one's colour.
@@ -63,8 +62,8 @@ def point_colors(
     cameras = views.cameras
     for depth, rgb, viewmat, K in zip(views.depth, views.rgb, cameras.viewmats, cameras.Ks):
         share, color = _seen(points, normals, depth, rgb, viewmat, K, 4.0 / voxels)
-        total += share**power * color
-        weight += share**power
+        total += share**2 * color
+        weight += share**2
     known = weight[:, 0] > 0
     if not known.any():
         raise UserError("no view sees the surface")

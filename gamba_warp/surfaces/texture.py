@@ -11,8 +11,6 @@ from .colors import point_colors, vertex_normals
 from .tsdf import Views
 
 _PADDING = 4  # texels between the pieces of the atlas
-# Many views blended blur what the surface is not exactly at; those straight in front blur least.
-_POWER = 8
 
 
 @dataclass
@@ -54,7 +52,7 @@ def bake_texture(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-12)
     positions = (vertices[faces[owner]] * weights[..., None]).sum(1)
     image = np.zeros((side * side, 3), np.float32)
-    image[texels] = point_colors(positions, directions, views, voxels, _POWER)
+    image[texels] = point_colors(positions, directions, views, voxels)
     known = np.zeros(side * side, bool)
     known[texels] = True
     return Texture(uvs, _spread(image.reshape(side, side, 3), known.reshape(side, side)))
