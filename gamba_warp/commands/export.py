@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -27,6 +27,9 @@ from ..surfaces.options import (
     Voxels,
 )
 from ..untrusted.ranges import Frames, Opacity, Side, ranged
+
+if TYPE_CHECKING:
+    from ..pages.export import ExportJob
 
 
 @ranged
@@ -86,9 +89,7 @@ def export_command(
         frames: Number of views in the turntable.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from tqdm import tqdm
-
-    from ..pages.export import ExportJob, export, find_gaussians
+    from ..pages.export import ExportJob
 
     if not mesh and not splats and not page and turntable == "none":
         raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
@@ -104,10 +105,6 @@ def export_command(
         largest=largest,
         smooth=smooth,
     )
-    files, failures = find_gaussians(inputs)
-    if not files:
-        raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
-    chosen = pick_device(device)
     job = ExportJob(
         folder=out,
         mesh=mesh,
@@ -120,13 +117,25 @@ def export_command(
         min_opacity=min_opacity,
         size=size,
         frames=frames,
-        device=chosen,
+        device=pick_device(device),
     )
-    names = plan_outputs(files, job.suffixes(), out)
-    output_folder(out)
+    return _run(inputs, job)
+
+
+def _run(inputs: tuple[Path, ...], job: ExportJob) -> int:
+    """Writes what the job says for each file, and returns the exit code."""
+    from tqdm import tqdm
+
+    from ..pages.export import export, find_gaussians
+
+    files, failures = find_gaussians(inputs)
+    if not files:
+        raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
+    names = plan_outputs(files, job.suffixes(), job.folder)
+    output_folder(job.folder)
 
     def one(name: str, path: Path) -> None:
         tqdm.write(export(name, path, job))
 
     for_each(names, one, "export", "file", failures)
-    return report(len(files), "file", failures, out)
+    return report(len(files), "file", failures, job.folder)

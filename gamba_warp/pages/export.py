@@ -12,7 +12,7 @@ import torch
 
 from ..conventions import Axes
 from ..errors import UserError
-from ..formats.gaussians.files import read_gaussians, write_gaussians
+from ..formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
 from ..formats.names import SPLAT_SUFFIXES, MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..surfaces.extract import moved_to_unit, unit_frame
@@ -65,7 +65,8 @@ class ExportJob:
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Files as they are given, each once; of a folder, what may hold Gaussians in it, sorted.
 
-    Names that begin with a dot are passed over: other programs hide files by it, and it marks what
+    A .glb that holds a mesh is passed over: the commands put them beside the Gaussians.
+    Names that begin with a dot are passed over, too: other programs hide files by it, and it marks what
     a killed command left unfinished.
 
     Returns:
@@ -86,10 +87,18 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
                 failures.append((path, "no such file"))
             continue
         inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() in SPLAT_SUFFIXES)
+        inside = [p for p in inside if p.suffix.lower() != ".glb" or not _is_mesh(p)]
         files.update(dict.fromkeys(inside))
         if not inside:
             failures.append((path, "the folder holds no .ply, .splat, .spz or .glb files"))
     return list(files), failures
+
+
+def _is_mesh(path: Path) -> bool:
+    try:
+        return splat_kind(path) is None
+    except UserError:  # it is refused with this reason when it is read
+        return False
 
 
 def export(name: str, path: Path, job: ExportJob) -> str:

@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 from helpers.gaussians import some
-from helpers.splats import check
+from helpers.judges.splats import check
 
 from gamba_warp.errors import UserError
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
