@@ -65,9 +65,9 @@ class ExportJob:
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Files as they are given, each once; of a folder, what may hold Gaussians in it, sorted.
 
-    A .glb that holds a mesh is passed over: the commands put them beside the Gaussians.
-    Names that begin with a dot are passed over, too: other programs hide files by it, and it marks what
-    a killed command left unfinished.
+    A .glb that holds a mesh is passed over: the commands put them beside the Gaussians. So are
+    names that begin with a dot: other programs hide files by it, and it marks what a killed command
+    left unfinished.
 
     Returns:
         The files, and the inputs that are missing or hold none, with the reason.
