@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -113,5 +114,6 @@ def _spread(image: np.ndarray, known: np.ndarray) -> np.ndarray:
     """The picture with the nearest known colour at every texel, so that seams do not show."""
     from scipy.ndimage import distance_transform_edt
 
-    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    found = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    rows, columns = cast("tuple[np.ndarray, np.ndarray]", found)
     return image[rows, columns]
