@@ -43,6 +43,7 @@ EXTRA_OF = {
     "timm": "train",
     "trimesh": "mesh",
     "webdataset": "train",
+    "xatlas": "mesh",
 }
 OWN = {
     "ablate": "all",
@@ -64,8 +65,8 @@ _SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
     "photo": {"kornia", "skimage"},
     "train": {"kornia", "tensorboard", "timm", "webdataset"},
-    "mesh": set(_SHAPES),
-    "eval": set(_SHAPES),
+    "mesh": {*_SHAPES, "xatlas"},
+    "eval": {*_SHAPES, "xatlas"},
     "fit": {"gsplat", "kornia"},
     "all": set(EXTRA_OF),
 }

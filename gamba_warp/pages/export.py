@@ -12,11 +12,11 @@ import torch
 
 from ..conventions import Axes
 from ..errors import UserError
-from ..formats.gaussians.files import read_gaussians, write_gaussians
+from ..formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
 from ..formats.names import SPLAT_SUFFIXES, MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..surfaces.extract import moved_to_unit, unit_frame
-from ..surfaces.files import write_meshes
+from ..surfaces.files import mesh_suffixes, write_meshes
 from ..surfaces.options import SurfaceOptions
 from ..trajectories.paths import Viewpoint
 from .page import Section, reconstruction_page
@@ -34,6 +34,7 @@ class ExportJob:
         page: whether a page with a 3D viewer is written.
         turntable: ``gif``, ``mp4`` or ``none``.
         surface: how the mesh is made.
+        texture: side of its texture, pixels; 0: none.
         axes: axes of ``.ply, .obj, .stl``.
         min_opacity: fainter Gaussians are left out.
         size: side of the turntable's frames, pixels.
@@ -48,6 +49,7 @@ class ExportJob:
     page: bool
     turntable: str
     surface: SurfaceOptions
+    texture: int
     axes: Axes
     min_opacity: float
     size: int
@@ -57,7 +59,7 @@ class ExportJob:
 
     def suffixes(self) -> list[str]:
         """What follows the name of an input in each of its files."""
-        found = [f"-mesh.{kind}" for kind in self.mesh]
+        found = mesh_suffixes(self.mesh, self.texture)
         found += [splat_suffix(kind) for kind in self.splats]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
         return found + ([".html"] if self.page else [])
@@ -66,8 +68,9 @@ class ExportJob:
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Files as they are given, each once; of a folder, what may hold Gaussians in it, sorted.
 
-    Names that begin with a dot are passed over: other programs hide files by it, and it marks what
-    a killed command left unfinished.
+    A .glb that holds a mesh is passed over: the commands put them beside the Gaussians. So are
+    names that begin with a dot: other programs hide files by it, and it marks what a killed command
+    left unfinished.
 
     Returns:
         The files, and the inputs that are missing or hold none, with the reason.
@@ -87,10 +90,18 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
                 failures.append((path, "no such file"))
             continue
         inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() in SPLAT_SUFFIXES)
+        inside = [p for p in inside if p.suffix.lower() != ".glb" or not _is_mesh(p)]
         files.update(dict.fromkeys(inside))
         if not inside:
             failures.append((path, "the folder holds no .ply, .splat, .spz or .glb files"))
     return list(files), failures
+
+
+def _is_mesh(path: Path) -> bool:
+    try:
+        return splat_kind(path) is None
+    except UserError:  # it is refused with this reason when it is read
+        return False
 
 
 def export(name: str, path: Path, job: ExportJob) -> str:
@@ -119,7 +130,8 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     if not job.mesh:
         return " ".join([f"{name}: {gaussians.num:,} Gaussians.", *filter(None, lost)])
     start = time.perf_counter()
-    found = write_meshes(job.folder / name, gaussians, job.mesh, job.surface, job.axes, job.device)
+    base, options = job.folder / name, job.surface
+    found = write_meshes(base, gaussians, job.mesh, options, job.axes, job.device, job.texture)
     closed = "closed" if found.is_watertight() else "open"
     counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
     seconds = time.perf_counter() - start

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from ..conventions import Axes
 from ..formats.gaussians.files import write_gaussians
@@ -16,7 +17,7 @@ from ..formats.names import MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..model.config import GambaConfig
 from ..surfaces.files import write_meshes
-from ..surfaces.options import SurfaceOptions
+from ..surfaces.options import BROWSER_FACES, SurfaceOptions
 from ..trajectories.paths import Viewpoint, upright
 from .page import Section, reconstruction_page
 from .sheet import Sheet
@@ -102,7 +103,7 @@ def write_outputs(
     _write_gaussians(base, gaussians, outputs)
     if outputs.mesh:
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
-        options, device = SurfaceOptions(colors=True), gaussians.means.device
+        options, device = SurfaceOptions(colors=True, faces=BROWSER_FACES), gaussians.means.device
         write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
     if outputs.sheet is not None:
         outputs.sheet.add(name, rgba, gaussians, view)
@@ -134,6 +135,8 @@ def _write_gaussians(base: Path, gaussians: Gaussians, outputs: Outputs) -> None
     comments = [f"from {base.name} by {outputs.checkpoint.name}"]
     for kind in outputs.splats:
         path, least = base.with_name(base.name + splat_suffix(kind)), outputs.min_opacity
-        write_gaussians(
+        lost = write_gaussians(
             path, gaussians, kind, axes=outputs.axes, min_opacity=least, comments=comments
         )
+        if lost is not None:
+            tqdm.write(lost)

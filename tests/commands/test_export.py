@@ -12,6 +12,7 @@ from PIL import Image
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.cli import run
+from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.meshes import load_mesh, to_linear
 from gamba_warp.formats.names import MESH_FORMATS
 from gamba_warp.formats.ply import load_ply, save_ply
@@ -98,14 +99,17 @@ def test_a_folder_and_failures(ball, tmp_path, capsys):
     (folder / "a.ply").write_bytes(ball.read_bytes())
     (folder / "bad.ply").write_bytes(b"ply\nnothing")
     trimesh.creation.box().export(folder / "box.ply")
+    trimesh.creation.box().export(folder / "a-mesh.glb")  # beside Gaussians, where we put it
+    write_gaussians(folder / "b.spz", load_ply(ball), "spz")
     (folder / "notes.txt").write_text("no")
     code = export(folder, tmp_path / "gone.ply", "--out", tmp_path / "out", "--mesh", "stl")
     assert code == 1
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["a-mesh.stl"]
+    names = sorted(p.name for p in (tmp_path / "out").iterdir())
+    assert names == ["a-mesh.stl", "b-mesh.stl"]
     captured = capsys.readouterr()
     for name in ("bad.ply", "box.ply", "gone.ply"):
         assert f"{name}: " in captured.err
-    assert "3 files, 3 failures" in captured.out
+    assert "4 files, 3 failures" in captured.out
 
 
 @pytest.mark.parametrize(

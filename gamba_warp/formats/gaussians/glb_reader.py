@@ -18,7 +18,7 @@ from ..headers import GLB_JSON, GLB_START, Accessor, View, check_glb, open_shape
 from .arrays import flip_axes, sound_gaussians
 from .glb import COLOR_SPACE, EXTENSION, POINTS, harmonic_names
 
-_MAX_NODES = 10_000
+MAX_NODES = 10_000
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _STRAIGHT = 1e-4  # how far a node's matrix may be from a rotation times a number
@@ -120,7 +120,7 @@ def _placed(path: Path, document: _Document) -> list[tuple[_Primitive, np.ndarra
         roots = [index for index in range(len(document.nodes)) if index not in inner]
     found: list[tuple[_Primitive, np.ndarray]] = []
     left = [(root, np.eye(4)) for root in roots]
-    for _ in range(_MAX_NODES):
+    for _ in range(MAX_NODES):
         if not left:
             return found
         index, above = left.pop()
@@ -129,7 +129,7 @@ def _placed(path: Path, document: _Document) -> list[tuple[_Primitive, np.ndarra
         left += [(child, matrix) for child in node.children]
         primitives = [] if node.mesh is None else document.meshes[node.mesh].primitives
         found += [(p, matrix) for p in primitives if EXTENSION in p.extensions]
-    raise UserError(f"{path}: over {_MAX_NODES} nodes, or nodes in a circle")
+    raise UserError(f"{path}: over {MAX_NODES} nodes, or nodes in a circle")
 
 
 def _matrix(node: _Node) -> np.ndarray:

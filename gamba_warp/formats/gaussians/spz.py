@@ -32,7 +32,7 @@ from .arrays import (
 GZIP, ZSTD_HEADER = b"\x1f\x8b", b"NGSP"  # versions 1 to 3, and the plain header of version 4
 _HEADER = struct.Struct("<4sIIBBBB")
 _VERSION = 3
-_MAX_POINTS = 10_000_000  # as the reference has it
+MAX_POINTS = 10_000_000  # as the reference has it
 _MAX_RATIO = 1040  # deflate packs at most 1032 to 1
 _MORE = 2  # flag: extensions follow, which are passed over
 _MAX_EXTENSIONS = 1 << 20  # bytes
@@ -147,7 +147,7 @@ def _unzipped(path: Path, content: bytes) -> tuple[bytes, int, int, int, int]:
             raise UserError(f"{path}: .spz of version {version}, only 1 to 3 are read")
         if degree not in _COUNTS:
             raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are read")
-        if bits > 30 or count > _MAX_POINTS:
+        if bits > 30 or count > MAX_POINTS:
             raise UserError(f"{path}: broken header, {count} Gaussians, {bits} bits")
         each = (6 if version == 1 else 9) + 1 + 3 + 3 + (4 if version == 3 else 3)
         wanted = count * (each + 3 * _COUNTS[degree])

@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 from helpers.gaussians import some
-from helpers.splats import check
+from helpers.judges.splats import check
 
 from gamba_warp.errors import UserError
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
@@ -225,3 +225,15 @@ def test_meshes_are_no_gaussians(tmp_path):
         box.export(tmp_path / f"box.{suffix}")
         assert splat_kind(tmp_path / f"box.{suffix}") is None
         refused(tmp_path / f"box.{suffix}")
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_an_evaluation_takes_gaussians_of_any_format_and_meshes_as_meshes(sound, tmp_path, kind):
+    from gamba_warp.eval.shapes.load import load_shape
+    from gamba_warp.gaussians import Gaussians
+
+    path, _ = sound(kind)
+    assert isinstance(load_shape(path), Gaussians)
+    suffix = path.suffix if path.suffix in (".ply", ".glb") else ".ply"
+    trimesh.creation.box().export(tmp_path / f"box{suffix}")
+    assert len(load_shape(tmp_path / f"box{suffix}").faces) == 12

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 from helpers.gaussians import some
-from helpers.npm import npm_package, run_node
+from helpers.judges.npm import npm_package, run_node
 
 from gamba_warp.formats.gaussians.glb import save_glb
 from gamba_warp.formats.gaussians.splat import save_splat

@@ -3,8 +3,8 @@
 import gaussforge
 import pytest
 from helpers.gaussians import some
-from helpers.npm import npm_package, run_node
-from helpers.splats import ALLOWED, check, differences
+from helpers.judges.npm import npm_package, run_node
+from helpers.judges.splats import ALLOWED, check, differences
 
 from gamba_warp.formats.gaussians.files import read_gaussians, write_gaussians
 from gamba_warp.formats.names import splat_suffix

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.gaussians import some
-from helpers.splats import check, differences
+from helpers.judges.splats import check, differences
 
 from gamba_warp.errors import UserError
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
