@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..batch import check_not_read, for_each, plan_outputs, report
+from ..batch import STAGES, check_not_read, for_each, plan_outputs, report
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -42,6 +42,7 @@ def reconstruct_command(
     ply_frame: Axes = "opencv",
     min_opacity: Opacity = 0.0,
     device: DeviceChoice = "auto",
+    times: bool = False,
 ) -> int:
     """Turns pictures of single objects into 3D Gaussians, one forward pass each.
 
@@ -68,6 +69,7 @@ def reconstruct_command(
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Device that computes; auto is the GPU if there is one.
+        times: Print what each stage took.
     """
     from ..data.preprocess import SamSegmenter, prepare
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -97,12 +99,15 @@ def reconstruct_command(
     reads = (mask, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
+    STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     segmenter = None if sam is None else SamSegmenter(sam, chosen)
     output_folder(out)
 
     def one(name: str, path: Path) -> None:
+        STAGES.begin("cutting out")
         rgba = prepare(path, mask=mask, segmenter=segmenter)
+        STAGES.begin("network")
         started = time.perf_counter()
         gaussians = reconstruct(model, rgba).to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
@@ -111,6 +116,8 @@ def reconstruct_command(
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:
         outputs.sheet.write()
+    if times:
+        print(STAGES.table())
     return report(len(pictures), "picture", failures, out)
 
 

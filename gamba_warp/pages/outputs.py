@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..batch import STAGES
 from ..conventions import Axes
 from ..formats.glb import save_glb
 from ..formats.names import GaussianFormat, MeshFormat
@@ -100,26 +101,41 @@ def write_outputs(
     if outputs.elevation:
         turn = upright(outputs.elevation).to(gaussians.means)
         gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
+    STAGES.begin("Gaussians")
     _write_gaussians(base, gaussians, outputs)
-    if outputs.mesh:
+    if outputs.sheet is not None:
+        outputs.sheet.add(name, rgba, gaussians, view)
+    if outputs.turntable != "none" or outputs.page:
+        about = [("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}")]
+        _write_pictures(base, rgba, gaussians, outputs, view, about)
+    if outputs.mesh:  # what takes longest comes last: all else is there to look at
+        STAGES.begin("mesh")
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         options, device = SurfaceOptions(colors=True), gaussians.means.device
         write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
-    if outputs.sheet is not None:
-        outputs.sheet.add(name, rgba, gaussians, view)
-    if outputs.turntable == "none" and not outputs.page:
-        return
+    STAGES.begin("rest")
+
+
+def _write_pictures(
+    base: Path,
+    rgba: np.ndarray,
+    gaussians: Gaussians,
+    outputs: Outputs,
+    view: Viewpoint,
+    about: Sequence[tuple[str, str]],
+) -> None:
+    """The turntable, and the page with it."""
+    name = base.name
+    STAGES.begin("turntable")
     turn = turntable_frames(
         gaussians, size=outputs.size, frames=outputs.frames, **dataclasses.asdict(view)
     )
     if outputs.turntable != "none":
+        STAGES.begin(f"{outputs.turntable} file")
         save_turntable(base.with_name(f"{name}.{outputs.turntable}"), turn)
     if outputs.page:
-        table = [
-            ("Gaussians", f"{gaussians.num:,}"),
-            ("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}"),
-            *outputs.about,
-        ]
+        STAGES.begin("page")
+        table = [("Gaussians", f"{gaussians.num:,}"), *about, *outputs.about]
         section = Section(
             name,
             picture=rgba,
