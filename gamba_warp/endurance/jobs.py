@@ -153,6 +153,14 @@ def jobs(world: Path) -> list[Job]:
             ("--frame", "opencv"),
         ),
         Job(
+            "render",
+            lambda out: [
+                *(world / "gaussians", "--out", out, "--kind", "png", "--size", 32, "--frames", 3),
+                *("--depth", "--device", "cpu"),
+            ],
+            ("--elevation", 20),
+        ),
+        Job(
             "fit",
             lambda out: [data, "--out", out, "--steps", 4, "--gaussians", 60, "--device", "cpu"],
             ("--seed", 1),
