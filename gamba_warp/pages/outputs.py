@@ -43,9 +43,9 @@ class Outputs:
         checkpoint: the model's file, named in the ``.ply``.
         about: labels and texts for the page, of the model.
         sheet: gets a row of each picture, or None.
-        elevation: of the input's camera above the object, degrees; what is written stands upright.
-        distance: of the camera of turntable, sheet and viewer; None is the model's.
-        fov: its field of view, degrees; None is the model's.
+        camera: elevation of the input's camera above the object, degrees (what is written stands
+            upright); distance and field of view, degrees, of the camera of turntable, sheet and
+            viewer, of which None is the model's.
     """
 
     folder: Path
@@ -60,9 +60,7 @@ class Outputs:
     checkpoint: Path
     about: Sequence[tuple[str, str]] = ()
     sheet: Sheet | None = None
-    elevation: float = 0.0
-    distance: float | None = None
-    fov: float | None = None
+    camera: tuple[float, float | None, float | None] = (0.0, None, None)
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
@@ -72,8 +70,7 @@ class Outputs:
 
     def view(self, config: GambaConfig) -> Viewpoint:
         """From where turntable, sheet and viewer look; that of the input, but for the options."""
-        input_view = Viewpoint(self.elevation, config.distance, config.fov)
-        return input_view.changed(distance=self.distance, fov=self.fov)
+        return Viewpoint(0.0, config.distance, config.fov).changed(*self.camera)
 
 
 def write_outputs(
@@ -98,8 +95,8 @@ def write_outputs(
         UserError: a file cannot be written, or no Gaussian can be.
     """
     base, view = outputs.folder / name, outputs.view(config)
-    if outputs.elevation:
-        turn = upright(outputs.elevation).to(gaussians.means)
+    if view.elevation:
+        turn = upright(view.elevation).to(gaussians.means)
         gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
     STAGES.begin("Gaussians")
     _write_gaussians(base, gaussians, outputs)
