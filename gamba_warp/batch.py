@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -38,12 +39,52 @@ def for_each(
     from tqdm import tqdm
 
     failures = [] if failures is None else failures
-    for name, item in tqdm(named.items(), desc=desc, unit=unit, disable=None):
-        try:
-            function(name, item)
-        except EXPECTED as error:
-            failures.append((item, first_line(error).removeprefix(f"{item}: ")))
+    with tqdm(named.items(), desc=desc, unit=unit, disable=None) as bar:
+        STAGES.show = bar.set_postfix_str
+        for name, item in bar:
+            try:
+                function(name, item)
+            except EXPECTED as error:
+                failures.append((item, first_line(error).removeprefix(f"{item}: ")))
+        STAGES.show = None
     return failures
+
+
+class Stages:
+    """What a command is doing: shown behind the bar of ``for_each``, and timed.
+
+    Attributes:
+        show: shows a name; None where there is no bar.
+        seconds: of each stage, over all items: by the clock, and of the processor.
+    """
+
+    def __init__(self) -> None:
+        self.show: Callable[[str], object] | None = None
+        self.seconds: dict[str, list[float]] = {}
+        self._name, self._since = "start", (None, 0.0)
+
+    def begin(self, name: str) -> None:
+        """Ends the stage before, and begins one; the same name may come again for each item."""
+        now = time.perf_counter(), time.process_time()
+        then = self._since[0] or now[0]  # what was before the first stage has no clock
+        spent = self.seconds.setdefault(self._name, [0.0, 0.0])
+        spent[0] += now[0] - then
+        spent[1] += now[1] - self._since[1]
+        self._name, self._since = name, now
+        if self.show is not None and name:
+            self.show(name)
+
+    def table(self) -> str:
+        """Ends the last stage; one line a stage, with the seconds."""
+        self.begin("")
+        rows = [(name, *spent) for name, spent in self.seconds.items() if name]
+        rows.append(("all", *(sum(row[i] for row in rows) for i in (1, 2))))
+        lines = [f"{name:<16} {wall:8.2f} {work:8.2f}" for name, wall, work in rows]
+        lines[0] = f"{rows[0][0]:<16} {'':8} {rows[0][2]:8.2f}"  # no clock ran before the program
+        return "\n".join([f"{'stage':<16} {'clock s':>8} {'CPU s':>8}", *lines])
+
+
+STAGES = Stages()
 
 
 def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: Path) -> int:

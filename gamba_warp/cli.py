@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 
+from .devices import share_cores
 from .errors import UserError
 from .files import DISK_ERRORS
 from .versions import __version__, advice, missing
@@ -42,6 +43,8 @@ COMMANDS = {
     "endurance": "Kill and fill the disk under every command.",
     "doctor": "Say what this machine can run.",
 }
+# Commands that a person waits for; trainings and measurements keep torch's own way of waiting.
+SHARING = {"reconstruct", "export", "view", "render", "app"}
 MODULES = {
     "app": "gamba_warp.app.app_command",
     "train": "gamba_warp.train.command",
@@ -101,6 +104,8 @@ def run(name: str, arguments: list[str]) -> int:
         reason = None if {"-h", "--help"} & {*arguments} else missing(name)
         if reason is not None:
             raise UserError(reason)
+        if name in SHARING:
+            share_cores()
         command = load_command(name)
         expand = getattr(sys.modules.get(command.__module__), "expand", None)
         arguments = expand(arguments) if expand else arguments

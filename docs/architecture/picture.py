@@ -74,7 +74,9 @@ BOXES = {
     "surfaces": Box(4, 5, "gamba_warp", "surfaces", ("Gaussians to meshes:", "TSDF, density")),
     "fitting": Box(2.8, 5, "gamba_warp", "fitting", ("one object", "by optimisation")),
     "photo": Box(0.4, 5, "gamba_warp", "photo", ("any photograph", "to a cut-out object")),
-    "trajectories": Box(5.2, 4, "gamba_warp", "trajectories", ("paths of cameras,", "their files")),
+    "trajectories": Box(
+        6.4, 5, "gamba_warp", "trajectories", ("paths of cameras,", "their files, movies")
+    ),
     "viewer": Box(5.2, 5, "gamba_warp", "viewer", ("the 3D viewer", "and its pages")),
     "app": Box(4, 10, "gamba_warp", "app", ("the local", "web app")),
     "pages": Box(2.2, 6, "gamba_warp", "pages", ("pages, turntables", "")),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..batch import check_not_read, for_each, plan_outputs, report
+from ..batch import STAGES, check_not_read, for_each, plan_outputs, report
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -17,7 +18,25 @@ from ..formats.names import MeshFormat, SplatFormat
 from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, ranged
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from ..gaussians import Gaussians
+    from ..model.gamba import Gamba
     from ..pages.sheet import Sheet
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """From where the picture was taken, and its results are shown."""
+
+    elevation: Elevation = 0.0
+    """Degrees by which the camera of the picture stood above the object, looking down; all results
+    are turned so that the object stands upright."""
+    fov: Fov | None = None
+    """Field of view of turntable, sheet and 3D viewer, degrees; the model's (49.1) if not given.
+    Without --distance the object stays as large."""
+    distance: Distance | None = None
+    """Distance of their camera, object units; the model's (1.5) if not given."""
 
 
 @ranged
@@ -32,9 +51,7 @@ def reconstruct_command(
     turntable: Literal["gif", "mp4", "none"] = "gif",
     size: Side = 256,
     frames: Frames = 48,
-    elevation: Elevation = 0.0,
-    fov: Fov | None = None,
-    distance: Distance | None = None,
+    camera: Annotated[CameraOptions, tyro.conf.OmitArgPrefixes] = CameraOptions(),
     page: bool = True,
     sheet: Path | None = None,
     mask: Path | None = None,
@@ -42,6 +59,7 @@ def reconstruct_command(
     ply_frame: Axes = "opencv",
     min_opacity: Opacity = 0.0,
     device: DeviceChoice = "auto",
+    times: bool = False,
 ) -> int:
     """Turns pictures of single objects into 3D Gaussians, one forward pass each.
 
@@ -55,11 +73,7 @@ def reconstruct_command(
         turntable: Moving picture of one turn.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
-        elevation: Degrees by which the camera of the picture stood above the object, looking down;
-            all results are turned so that the object stands upright.
-        fov: Field of view of turntable, sheet and 3D viewer, degrees; the model's (49.1) if not
-            given. Without --distance the object stays as large.
-        distance: Distance of their camera, object units; the model's (1.5) if not given.
+        camera: From where the picture was taken, and its results are shown.
         page: Write an HTML page with the input, the turntable and a 3D viewer.
         sheet: Also one picture of all results: each input, and five views around it (.png, .webp,
             .jpg).
@@ -68,10 +82,10 @@ def reconstruct_command(
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Device that computes; auto is the GPU if there is one.
+        times: Print what each stage took.
     """
     from ..data.preprocess import SamSegmenter, prepare
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
-    from ..model.predict import reconstruct
     from ..pages.card import about_model
     from ..pages.outputs import Outputs, write_outputs
 
@@ -90,28 +104,43 @@ def reconstruct_command(
         min_opacity=min_opacity,
         checkpoint=checkpoint,
         about=about_model(file),
-        elevation=elevation,
-        distance=distance,
-        fov=fov,
+        camera=(camera.elevation, camera.distance, camera.fov),
     )
     reads = (mask, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
+    STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     segmenter = None if sam is None else SamSegmenter(sam, chosen)
     output_folder(out)
 
     def one(name: str, path: Path) -> None:
+        STAGES.begin("cutting out")
         rgba = prepare(path, mask=mask, segmenter=segmenter)
-        started = time.perf_counter()
-        gaussians = reconstruct(model, rgba).to("cpu")  # waits for the device
-        seconds = time.perf_counter() - started
+        gaussians, seconds = _forward(model, rgba)
         write_outputs(name, rgba, gaussians.to(chosen), outputs, model.config, seconds)
 
     for_each(names, one, "reconstruct", "picture", failures)
-    if outputs.sheet is not None:
-        outputs.sheet.write()
+    _end(outputs.sheet, times)
     return report(len(pictures), "picture", failures, out)
+
+
+def _forward(model: Gamba, rgba: np.ndarray) -> tuple[Gaussians, float]:
+    """The Gaussians of one picture, on the CPU, and the seconds of the forward pass."""
+    from ..model.predict import reconstruct
+
+    STAGES.begin("network")
+    started = time.perf_counter()
+    gaussians = reconstruct(model, rgba).to("cpu")  # waits for the device
+    return gaussians, time.perf_counter() - started
+
+
+def _end(sheet: Sheet | None, times: bool) -> None:
+    """Writes the sheet, and prints what the stages took."""
+    if sheet is not None:
+        sheet.write()
+    if times:
+        print(STAGES.table())
 
 
 def _found(

@@ -158,6 +158,15 @@ def _ball():
     )
 
 
+def _render_job(world: Path) -> Job:
+    small = ("--kind", "png", "--size", 32, "--frames", 3, "--depth", "--device", "cpu")
+    return Job(
+        "render",
+        lambda out: [world / "gaussians", "--out", out, *small],
+        ("--elevation", 20),
+    )
+
+
 def jobs(world: Path) -> list[Job]:
     """The commands that write results, each small."""
     model, data = world / "run" / "model.safetensors", world / "data"
@@ -180,6 +189,7 @@ def jobs(world: Path) -> list[Job]:
             ],
             ("--frame", "opencv"),
         ),
+        _render_job(world),
         Job(
             "fit",
             lambda out: [data, "--out", out, "--steps", 4, "--gaussians", 60, "--device", "cpu"],

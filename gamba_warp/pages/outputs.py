@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from ..batch import STAGES
 from ..conventions import Axes
 from ..formats.gaussians.files import write_gaussians
 from ..formats.names import MeshFormat, SplatFormat, splat_suffix
@@ -41,9 +42,9 @@ class Outputs:
         checkpoint: the model's file, named in the ``.ply``.
         about: labels and texts for the page, of the model.
         sheet: gets a row of each picture, or None.
-        elevation: of the input's camera above the object, degrees; what is written stands upright.
-        distance: of the camera of turntable, sheet and viewer; None is the model's.
-        fov: its field of view, degrees; None is the model's.
+        camera: elevation of the input's camera above the object, degrees (what is written stands
+            upright); distance and field of view, degrees, of the camera of turntable, sheet and
+            viewer, of which None is the model's.
     """
 
     folder: Path
@@ -58,9 +59,7 @@ class Outputs:
     checkpoint: Path
     about: Sequence[tuple[str, str]] = ()
     sheet: Sheet | None = None
-    elevation: float = 0.0
-    distance: float | None = None
-    fov: float | None = None
+    camera: tuple[float, float | None, float | None] = (0.0, None, None)
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
@@ -71,8 +70,7 @@ class Outputs:
 
     def view(self, config: GambaConfig) -> Viewpoint:
         """From where turntable, sheet and viewer look; that of the input, but for the options."""
-        input_view = Viewpoint(self.elevation, config.distance, config.fov)
-        return input_view.changed(distance=self.distance, fov=self.fov)
+        return Viewpoint(0.0, config.distance, config.fov).changed(*self.camera)
 
 
 def write_outputs(
@@ -97,29 +95,44 @@ def write_outputs(
         UserError: a file cannot be written, or no Gaussian can be.
     """
     base, view = outputs.folder / name, outputs.view(config)
-    if outputs.elevation:
-        turn = upright(outputs.elevation).to(gaussians.means)
+    if view.elevation:
+        turn = upright(view.elevation).to(gaussians.means)
         gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
+    STAGES.begin("Gaussians")
     _write_gaussians(base, gaussians, outputs)
-    if outputs.mesh:
+    if outputs.sheet is not None:
+        outputs.sheet.add(name, rgba, gaussians, view)
+    if outputs.turntable != "none" or outputs.page:
+        about = [("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}")]
+        _write_pictures(base, rgba, gaussians, outputs, view, about)
+    if outputs.mesh:  # what takes longest comes last: all else is there to look at
+        STAGES.begin("mesh")
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         options, device = SurfaceOptions(colors=True, faces=BROWSER_FACES), gaussians.means.device
         write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
-    if outputs.sheet is not None:
-        outputs.sheet.add(name, rgba, gaussians, view)
-    if outputs.turntable == "none" and not outputs.page:
-        return
+    STAGES.begin("rest")
+
+
+def _write_pictures(
+    base: Path,
+    rgba: np.ndarray,
+    gaussians: Gaussians,
+    outputs: Outputs,
+    view: Viewpoint,
+    about: Sequence[tuple[str, str]],
+) -> None:
+    """The turntable, and the page with it."""
+    name = base.name
+    STAGES.begin("turntable")
     turn = turntable_frames(
         gaussians, size=outputs.size, frames=outputs.frames, **dataclasses.asdict(view)
     )
     if outputs.turntable != "none":
+        STAGES.begin(f"{outputs.turntable} file")
         save_turntable(base.with_name(f"{name}.{outputs.turntable}"), turn)
     if outputs.page:
-        table = [
-            ("Gaussians", f"{gaussians.num:,}"),
-            ("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}"),
-            *outputs.about,
-        ]
+        STAGES.begin("page")
+        table = [("Gaussians", f"{gaussians.num:,}"), *about, *outputs.about]
         section = Section(
             name,
             picture=rgba,

@@ -107,8 +107,9 @@ def _slope(views: Views, k: int) -> Tensor:
     The plane has least squares over the neighbours that hit something, from their moments. Pixels
     without a plane have the steepness 0.
     """
-    hit = views.hit()[k].float()
-    depth = views.depth[k] * hit
+    depth = views.depth[k]
+    hit = ((depth > 0) & (depth < CLEAR)).float()  # of this view alone: there are many
+    depth = depth * hit
     step = torch.arange(-2.0, 3.0).expand(5, 5)
     x, y, one = step, step.T, torch.ones(5, 5)
     kernels = torch.stack([one, x, y, x * x, y * y, x * y])[:, None]

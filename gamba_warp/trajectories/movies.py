@@ -27,6 +27,7 @@ CAMERAS = "cameras.json"  # in a folder of pictures
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch, which takes a few hundred MB
 _CHUNK_GAUSSIANS = 1 << 22  # Gaussians projected in one launch, over all of its views
 _GIF_BYTES = 512 << 20  # Pillow holds all frames of a GIF, a byte a pixel
+_PALETTE_PIXELS = 1 << 15  # from which 255 colours are found
 _OURS = re.compile(rf"\d{{4,}}(-depth)?\.png|{re.escape(CAMERAS)}")
 _DEPTH_STEPS = 65_535
 
@@ -126,21 +127,21 @@ def _write_gif(
         for frame in frames:
             picture = Image.fromarray(frame).quantize(palette=palette)  # dithered
             # Pillow looks colours up so coarsely that white may become a neighbour of white.
-            picture.paste(0, mask=Image.fromarray((frame == background).all(-1)))
+            red, green, blue = (frame[..., i] == background[i] for i in range(3))
+            picture.paste(0, mask=Image.fromarray(red & green & blue))
             yield picture
 
     rest = pictures()
     # GIF counts time in units of 10 ms, and viewers slow down frames under 20 ms.
     duration = max(20, round(100 / rate) * 10)
-    next(rest).save(
-        path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=True
-    )
+    next(rest).save(path, save_all=True, append_images=rest, duration=duration, loop=0)
 
 
 def _palette(frames: np.ndarray, background: tuple[int, int, int]) -> Image.Image:
     """One palette of the background and 255 others for all frames: colours do not flicker."""
     pixels = frames.reshape(-1, 3)
     pixels = pixels[(pixels != background).any(1)]
+    pixels = pixels[:: 1 + len(pixels) // _PALETTE_PIXELS]
     if len(pixels) == 0:
         pixels = frames.reshape(-1, 3)[:1]
     colours = Image.fromarray(pixels[None]).quantize(255, kmeans=1).getpalette() or []
