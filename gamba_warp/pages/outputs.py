@@ -84,10 +84,11 @@ def write_outputs(
     """
     base = outputs.folder / name
     _write_gaussians(base, gaussians, outputs)
+    mesh = None
     if outputs.mesh:
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         options, device = SurfaceOptions(colors=True), gaussians.means.device
-        write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
+        mesh = write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
     if outputs.sheet is not None:
         outputs.sheet.add(name, rgba, gaussians, config)
     if outputs.turntable == "none" and not outputs.page:
@@ -109,6 +110,7 @@ def write_outputs(
             picture=rgba,
             turntable=turn,
             gaussians=gaussians,
+            mesh=mesh,
             table=table,
             distance=distance,
             fov=fov,

@@ -43,7 +43,7 @@ class Viewer {
     this.renderer = new Renderer(gl, this.about.count, this.about.degree);
     if (!this.renderer.fits()) return say("It has more Gaussians than this graphics card takes.", "Too many");
     const text = (name) => {
-      const element = byId(name), found = element ? element.textContent.trim() : "";
+      const element = byId(name), found = element ? element.textContent : "";
       element?.remove(); // the text may be large, and is not needed any more
       return found;
     };
