@@ -10,7 +10,6 @@ function startViewer(place) {
   const frame = document.createElement("iframe");
   frame.title = "3D view";
   frame.allow = "fullscreen *";
-  frame.allowFullscreen = true;
   frame.srcdoc = program.replace(/\{\{(\w+)\}\}/g, (_, name) => part(`${place.dataset.viewer}-${name}`));
   place.append(frame);
   place.classList.add("running");
