@@ -73,4 +73,6 @@ def _open(address: str) -> None:
     import webbrowser
 
     if not webbrowser.open(address):
-        print("gamba: no browser was found; open the page above in one", file=sys.stderr, flush=True)
+        print(
+            "gamba: no browser was found; open the page above in one", file=sys.stderr, flush=True
+        )

@@ -171,7 +171,13 @@ def _viewer(section: Section, gaussians: Gaussians, name: str, auto: bool, poste
     place = (section.distance, section.fov, section.elevation)
     which = "view" if section.picture is None else "camera"  # a picture is what a camera saw
     return frame_element(
-        name, section.title, gaussians, mesh=section.mesh, poster=poster, auto=auto, **{which: place}
+        name,
+        section.title,
+        gaussians,
+        mesh=section.mesh,
+        poster=poster,
+        auto=auto,
+        **{which: place},
     )
 
 

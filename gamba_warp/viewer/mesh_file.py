@@ -50,7 +50,7 @@ def read_viewed_mesh(path: str | Path) -> ViewedMesh:
 
 
 def _corner_colors(mesh: TexturedMesh, linear: bool) -> np.ndarray:
-    """``[F, 3, 3]`` display values: the material's colour by its texture by the vertices' colour."""
+    """``[F, 3, 3]`` display values: the product of material, texture and vertices' colours."""
     light = mesh.colors[..., :3].astype(np.float32) / 255
     light = light if linear else to_linear(light)
     for i, material in enumerate(mesh.materials):

@@ -98,7 +98,9 @@ def test_the_viewer_gets_the_gaussians_and_the_camera(tmp_path):
         assert ("data-auto" in viewer) == auto
         name = viewer["data-viewer"]
         parts = {
-            part: re.findall(rf'<script type="[^"]*" id="{name}-{part}">(.*?)</script>', page.source)
+            part: re.findall(
+                rf'<script type="[^"]*" id="{name}-{part}">(.*?)</script>', page.source
+            )
             for part in ("object", "gaussians", "harmonics", "mesh")
         }
         (text,), (data,) = parts["object"], parts["gaussians"]
