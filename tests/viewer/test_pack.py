@@ -1,4 +1,4 @@
-"""What the viewer's page holds: packed to the precision that it claims, small, and self-contained."""
+"""What the page of the viewer holds: as exact as it claims, small, and self-contained."""
 
 import json
 import re

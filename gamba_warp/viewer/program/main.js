@@ -136,12 +136,13 @@ class Viewer {
   // First fewer pixels, then fewer Gaussians (those that cover least are last); back the other way,
   // once several frames in a row were quick.
   adapt(cost) {
-    const { count } = this.about, least = Math.min(count, LEAST);
+    const { count } = this.about;
     this.quick = cost < QUICK ? this.quick + 1 : 0;
     if (cost > SLOW) {
-      const down = cost > 3 * SLOW ? 2 : 1;
-      if (this.coarse < SIZES.length - 1) this.coarse = Math.min(SIZES.length - 1, this.coarse + down);
-      else this.some = Math.max(least, Math.round(this.some * Math.max(0.4, SLOW / cost)));
+      const last = SIZES.length - 1, least = Math.min(count, LEAST), far = cost > 8 * SLOW;
+      if (far || this.coarse === last)
+        this.some = Math.max(least, Math.round(this.some * Math.max(0.1, SLOW / cost)));
+      this.coarse = Math.min(last, this.coarse + (far ? last : cost > 3 * SLOW ? 2 : 1));
     } else if (this.quick >= 6) {
       this.quick = 0;
       if (this.some < count) this.some = Math.min(count, Math.round(this.some * 1.3));
@@ -191,7 +192,10 @@ class Viewer {
     this.renderer.present();
     this.ask(now, fast);
     this.stats.frames++;
-    const { input } = this.about, visible = input && this.showInput;
+    // Where frames take long, the browser shall not have to draw lines and a blur above each, too.
+    const slow = fast && this.coarse >= SIZES.length / 2;
+    document.documentElement.classList.toggle("slow", slow);
+    const { input } = this.about, visible = input && this.showInput && !slow;
     byId("lines").firstElementChild.setAttribute("d", visible ? inputLines(input, this.camera, ...this.shownSize()) : "");
   }
 
