@@ -41,6 +41,13 @@ class Opened:
     page: Any
     messages: list[str] = field(default_factory=list)
 
+    def promised(self, expression: str, seconds: float = 30.0) -> Any:
+        """What a promise of JavaScript becomes; one that stays open fails the test."""
+        late = f"setTimeout(() => fail(new Error('no answer')), {1000 * seconds})"
+        return self.page.evaluate(
+            f"() => Promise.race([{expression}, new Promise((_, fail) => {late})])"
+        )
+
     def until(self, expression: str, seconds: float = 30.0) -> None:
         """Waits until an expression of JavaScript is true, whatever the page's policy allows."""
         end = time.monotonic() + seconds

@@ -164,8 +164,9 @@ class Viewer {
     const fast = now - this.changed < SETTLE && this.shownOnce;
     const ordered = this.sortNow(fast ? this.some : this.about.count);
     if (fast) {
-      if (renderer.ordered || this.mode !== "gaussians") {
-        renderer.draw(this.mode, this.camera, background(), SIZES[this.coarse], 0, Math.min(this.some, renderer.ordered));
+      // An order of all would begin with the farthest, so one of as many as are drawn is waited for.
+      if (renderer.ordered === this.some || this.mode !== "gaussians") {
+        renderer.draw(this.mode, this.camera, background(), SIZES[this.coarse], 0, this.some);
         this.show(now, true);
       }
       this.finished = false;
