@@ -2,9 +2,9 @@
 
     python docs/examples/viewer_speed.py 4096 16384
 
-Each object is a bumpy ball that its Gaussians cover about three times. It is turned for some seconds
-until the viewer has found what this machine can do, then for some more, which are measured. Needs
-playwright (in the extra test) and an installed Chromium.
+Each object is a bumpy ball that its Gaussians cover about three times. It is turned for some
+seconds until the viewer has found what this machine can do, then for some more, which are measured.
+Needs playwright (in the extra test) and an installed Chromium.
 """
 
 import argparse
@@ -74,8 +74,8 @@ def measure(browser, n: int, folder: Path, seconds: float) -> None:
     print(
         f"{n:9,} Gaussians: file {path.stat().st_size / 1e6:.2f} MB, first picture after "
         f"{loaded:.1f} s; moving {found['frames']:.1f} frames/s at {found['share']:.2f} of each "
-        f"side and {found['some']:,} Gaussians; complete {sharp:.1f} s after it rests; longest task "
-        f"of the page {found['longest']:.0f} ms",
+        f"side and {found['some']:,} Gaussians; complete {sharp:.1f} s after it rests; longest "
+        f"task of the page {found['longest']:.0f} ms",
         flush=True,
     )
 
