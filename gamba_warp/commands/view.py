@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import tyro
 from msgspec import Meta
 
 from ..batch import check_not_read
+from ..errors import UserError
 from ..files import output_folder
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 
@@ -18,6 +20,7 @@ def view_command(
     file: tyro.conf.Positional[Path],
     /,
     out: Path | None = None,
+    mesh: Path | None = None,
     serve: bool = False,
     port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
@@ -30,6 +33,7 @@ def view_command(
     Args:
         file: Gaussians (.ply, .splat, .spz, .glb), or the folder of a training run.
         out: File for the page; a temporary file if not given.
+        mesh: A mesh of the same object, to be shown too (.glb, .obj, .ply, .stl).
         serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
         port: Port of --serve; 0 picks a free one.
         open_browser: Open the browser.
@@ -40,32 +44,46 @@ def view_command(
             longest side; 1.5 if not given.
     """
     import tempfile
-    import webbrowser
 
     from ..formats.gaussians.files import read_gaussians
-    from ..pages.export import write_page
     from ..pages.run import write_run_page
     from ..pages.serve import page_server
     from ..trajectories.paths import Viewpoint
+    from ..viewer.mesh_file import read_viewed_mesh
+    from ..viewer.page import write_viewer
 
-    check_not_read([] if out is None else [out], [file])
+    check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])
+    if mesh is not None and file.is_dir():
+        raise UserError(f"--mesh {mesh}: a training run has no mesh")
     gaussians = None if file.is_dir() else read_gaussians(file)
+    surface = None if mesh is None else read_viewed_mesh(mesh)
     if out is not None:
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"
     if gaussians is None:
         write_run_page(file, page)
     else:
-        view = Viewpoint().changed(elevation, distance, fov)
-        write_page(page, file.stem, gaussians, view=view)
+        start = Viewpoint().changed(elevation, distance, fov)
+        view = (start.distance, start.fov, start.elevation)
+        write_viewer(page, file.stem, gaussians, mesh=surface, view=view)
     if not serve:
         print(page)
         if open_browser:
-            webbrowser.open(page.resolve().as_uri())
+            _open(page.resolve().as_uri())
         return
     with page_server(page.read_bytes(), port) as server:
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{address} (Ctrl-C ends it)", flush=True)
         if open_browser:
-            webbrowser.open(address)
+            _open(address)
         server.serve_forever()
+
+
+def _open(address: str) -> None:
+    """Opens the address in a browser, or says in one line that there is none."""
+    import webbrowser
+
+    if not webbrowser.open(address):
+        print(
+            "gamba: no browser was found; open the page above in one", file=sys.stderr, flush=True
+        )

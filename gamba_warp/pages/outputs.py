@@ -102,14 +102,18 @@ def write_outputs(
     _write_gaussians(base, gaussians, outputs)
     if outputs.sheet is not None:
         outputs.sheet.add(name, rgba, gaussians, view)
+    section = None
     if outputs.turntable != "none" or outputs.page:
         about = [("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}")]
-        _write_pictures(base, rgba, gaussians, outputs, view, about)
+        section = _write_pictures(base, rgba, gaussians, outputs, view, about)
     if outputs.mesh:  # what takes longest comes last: all else is there to look at
         STAGES.begin("mesh")
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         options, device = SurfaceOptions(colors=True, faces=BROWSER_FACES), gaussians.means.device
-        write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
+        mesh = write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
+        if section is not None:  # the page again, with the mesh in its viewer
+            section.mesh = mesh
+            reconstruction_page(base.with_name(f"{name}.html"), section)
     STAGES.begin("rest")
 
 
@@ -120,8 +124,8 @@ def _write_pictures(
     outputs: Outputs,
     view: Viewpoint,
     about: Sequence[tuple[str, str]],
-) -> None:
-    """The turntable, and the page with it."""
+) -> Section | None:
+    """The turntable, and the page with it, whose content is returned."""
     name = base.name
     STAGES.begin("turntable")
     turn = turntable_frames(
@@ -130,18 +134,20 @@ def _write_pictures(
     if outputs.turntable != "none":
         STAGES.begin(f"{outputs.turntable} file")
         save_turntable(base.with_name(f"{name}.{outputs.turntable}"), turn)
-    if outputs.page:
-        STAGES.begin("page")
-        table = [("Gaussians", f"{gaussians.num:,}"), *about, *outputs.about]
-        section = Section(
-            name,
-            picture=rgba,
-            turntable=turn,
-            gaussians=gaussians,
-            table=table,
-            **dataclasses.asdict(view),
-        )
-        reconstruction_page(base.with_name(f"{name}.html"), section)
+    if not outputs.page:
+        return None
+    STAGES.begin("page")
+    table = [("Gaussians", f"{gaussians.num:,}"), *about, *outputs.about]
+    section = Section(
+        name,
+        picture=rgba,
+        turntable=turn,
+        gaussians=gaussians,
+        table=table,
+        **dataclasses.asdict(view),
+    )
+    reconstruction_page(base.with_name(f"{name}.html"), section)
+    return section
 
 
 def _write_gaussians(base: Path, gaussians: Gaussians, outputs: Outputs) -> None:

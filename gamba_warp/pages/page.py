@@ -9,23 +9,21 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
 from ..files import write_text
-from ..formats.gaussians.splat import splat_bytes
 from ..gaussians import Gaussians
 from ..images import to_uint8
+from ..viewer.page import POLICY, frame_element, frames_script
 from .turntable import SECONDS
 
-# A page may load only what is inlined in it.
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 _VIEWER_CAPTION = (
     '<span class="when-idle">Press 3D to turn it by hand</span>'
-    '<span class="when-running">Drag to turn, wheel to zoom, double-click to reset</span>'
-    '<span class="when-without">This browser has no WebGL2, so no 3D view</span>'
+    '<span class="when-running">Drag to turn, wheel or pinch to zoom, H for help</span>'
 )
 
 
@@ -39,6 +37,7 @@ class Section:
         picture: the input, ``[H, W, 3|4]`` floats in [0, 1].
         turntable: frames ``[F, H, W, 3]`` uint8.
         gaussians: one object ``[N]``, for the 3D viewer.
+        mesh: its surface, with ``vertices``, ``faces`` and ``colors``, for the viewer; or None.
         views: pictures ``[V, H, W, 3]``, floats in [0, 1], by label; each label is a row of views,
             such as "Predicted" above "Truth".
         table: rows of cells; text is set to the left, numbers to the right.
@@ -47,7 +46,7 @@ class Section:
         curves_label: label of the chart's vertical axis.
         fragment: HTML that is set as it is, such as that of ``curves.draw_curves``.
         distance: distance of the viewer's camera from the origin, object units.
-        fov: vertical field of view of the viewer's camera, degrees.
+        fov: field of view of the viewer's camera, degrees.
         elevation: of the viewer's camera at the start, degrees.
     """
 
@@ -56,6 +55,7 @@ class Section:
     picture: np.ndarray | None = None
     turntable: np.ndarray | None = None
     gaussians: Gaussians | None = None
+    mesh: Any = None
     views: Mapping[str, np.ndarray] = field(default_factory=dict)
     table: Sequence[Sequence[str | int | float]] = ()
     header: Sequence[str] = ()
@@ -91,12 +91,13 @@ def _write(
     path: str | Path, title: str, text: str, sections: Sequence[Section], auto: bool
 ) -> None:
     here = Path(__file__).parent
-    body = "\n".join(_section(s, f"splat{i}", auto) for i, s in enumerate(sections))
+    body = "\n".join(_section(s, f"viewer{i}", auto) for i, s in enumerate(sections))
+    script = frames_script() if any(s.gaussians is not None for s in sections) else ""
     document = f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{html.escape(title)}</title>
 <style>
@@ -105,9 +106,7 @@ def _write(
 <body>
 <header><h1>{html.escape(title)}</h1>{_paragraph(text)}</header>
 {body}
-<script>
-{(here / "viewer.js").read_text(encoding="utf-8")}</script>
-</body>
+{script}</body>
 </html>
 """
     write_text(path, document)
@@ -169,13 +168,16 @@ def _animation(frames: np.ndarray) -> str:
 
 
 def _viewer(section: Section, gaussians: Gaussians, name: str, auto: bool, poster: str) -> str:
-    splats = base64.b64encode(splat_bytes(gaussians, name=section.title)).decode()
-    return (
-        f'<div class="viewer" data-splat="{name}" data-distance="{section.distance:g}" '
-        f'data-fov="{section.fov:g}" data-elevation="{section.elevation:g}"'
-        f"{' data-auto' if auto else ''}>{poster}"
-        '<button type="button">3D</button></div>'
-        f'<script type="text/plain" id="{name}">{splats}</script>'
+    place = (section.distance, section.fov, section.elevation)
+    which = "view" if section.picture is None else "camera"  # a picture is what a camera saw
+    return frame_element(
+        name,
+        section.title,
+        gaussians,
+        mesh=section.mesh,
+        poster=poster,
+        auto=auto,
+        **{which: place},
     )
 
 

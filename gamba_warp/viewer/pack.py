@@ -1,8 +1,8 @@
 """What the viewer's page holds of an object: packed records that go to the graphics card as is.
 
 One Gaussian is 32 bytes, as in ``.splat``, and finer: three float32 of the mean, seven float16
-(opacity, colour, scales) and three 16-bit numbers of the rotation. The rotation is the vector part
-of the quaternion over 1 + w (modified Rodrigues parameters), which has no singular place for w >= 0.
+(opacity, colour, scales) and three 16-bit numbers of the rotation. The rotation is the vector
+part of the quaternion over 1 + w (modified Rodrigues parameters): no place with w >= 0 is singular.
 The Gaussians that cover most come first, so that the viewer can leave out the last ones while it
 moves.
 """

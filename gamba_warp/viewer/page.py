@@ -59,26 +59,28 @@ def viewer_page(
     *,
     mesh: Any = None,
     camera: tuple[float, float, float] | None = None,
+    view: tuple[float, float, float] | None = None,
     note: str = "",
 ) -> str:
     """The viewer of one object as a whole document, for a file or for the ``srcdoc`` of a frame.
 
     Args:
         title: name of the object.
-        gaussians: ``[N]`` with OpenCV's axes, in the frame of the reference camera.
-        mesh: the object's surface in the same frame, with ``vertices [V, 3]``, ``faces [F, 3]`` and
+        gaussians: ``[N]`` in the world of ``cameras.orbit``: y down, the input seen from azimuth 0.
+        mesh: the object's surface in the same world, with ``vertices [V, 3]``, ``faces [F, 3]`` and
             ``colors [V, 3]`` in [0, 1] or None; or no mesh.
-        camera: distance from the origin in object units, vertical field of view in degrees, and
-            elevation in degrees (by how much it looked down) of the input's camera, which is the
-            first view, and shown as lines. None: the object, of any size and anywhere, is looked at
-            from the front.
+        camera: distance from the origin in object units, field of view of the shorter side and
+            elevation, both in degrees, of the input's camera: it is the first view, and shown as
+            lines. None: there was no input, and the object may have any size and be anywhere.
+        view: the first view if there is no camera; its distance is that from the object's centre in
+            units of the object's longest side.
         note: a few words below the title.
 
     Raises:
         UserError: a value is not finite, nothing can be seen, or the object has no extent.
         ValueError: there is a batch dimension.
     """
-    parts = viewer_parts(title, gaussians, mesh=mesh, camera=camera, note=note)
+    parts = viewer_parts(title, gaussians, mesh=mesh, camera=camera, view=view, note=note)
     texts = {field.name: getattr(parts, field.name) for field in fields(parts)}
     return _filled(program_page(title), texts)
 
@@ -111,12 +113,13 @@ def viewer_parts(
     *,
     mesh: Any = None,
     camera: tuple[float, float, float] | None = None,
+    view: tuple[float, float, float] | None = None,
     note: str = "",
 ) -> ViewerParts:
     """What fills the slots of ``program_page``; arguments and errors as for ``viewer_page``."""
     seen = visible(gaussians, title)
     frame = own_frame(seen, title) if camera is None else Frame(np.zeros(3), 1.0)
-    distance, fov, elevation = camera or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
+    distance, fov, elevation = camera or view or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
     home = {
         "azimuth": 0.0,
         "elevation": math.radians(elevation),
@@ -139,6 +142,50 @@ def viewer_parts(
         "frame": {"center": frame.center.tolist(), "size": frame.size},
     }
     return ViewerParts(json_text(about), *map(_base64, (records, harmonics, surface)))
+
+
+def frame_element(
+    name: str,
+    title: str,
+    gaussians: Gaussians,
+    *,
+    poster: str = "",
+    auto: bool = False,
+    **options: Any,
+) -> str:
+    """A place of another page in which the viewer runs, in a frame of its own.
+
+    The page also needs ``frames_script()``, once, and ``POLICY`` or a wider policy.
+
+    Args:
+        name: of the place, unlike those of the page's other places: letters and digits.
+        title: as for ``viewer_page``, like ``gaussians``.
+        poster: HTML that stands there until the viewer is started.
+        auto: whether it starts by itself.
+        options: as for ``viewer_page``; errors as there.
+    """
+    parts = viewer_parts(title, gaussians, **options)
+    kinds = {"object": "application/json"}
+    scripts = "".join(
+        f'<script type="{kinds.get(field.name, "text/plain")}" id="{name}-{field.name}">'
+        f"{getattr(parts, field.name)}</script>"
+        for field in fields(parts)
+    )
+    start = " data-auto" if auto else ""
+    return (
+        f'<div class="viewer" data-viewer="{name}"{start}>{poster}'
+        f'<button type="button">3D</button></div>{scripts}'
+    )
+
+
+def frames_script() -> str:
+    """What starts the viewers of a page: the program, once, and a script."""
+    script = (_PROGRAM / "frames.js").read_text(encoding="utf-8")
+    program = json_text(program_page())
+    return (
+        f'<script type="application/json" id="viewer-program">{program}</script>\n'
+        f"<script>\n{script}</script>\n"
+    )
 
 
 def json_text(value: Any) -> str:

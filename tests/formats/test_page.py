@@ -2,6 +2,7 @@
 
 import base64
 import html.parser
+import json
 import re
 
 import numpy as np
@@ -10,7 +11,6 @@ from helpers.gaussians import some
 from PIL import Image, features
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.gaussians.splat import splat_bytes
 from gamba_warp.pages.page import Section, demo_page, reconstruction_page, svg_chart
 
 
@@ -76,9 +76,11 @@ def full(title="A chair", **changes):
 def test_a_page_holds_everything_and_asks_for_nothing(tmp_path):
     demo_page(tmp_path / "a.html", [full(), full("Second")], title="Demo", text="All of it.")
     page = Page(tmp_path / "a.html")
-    addresses = re.findall(r"(?:src|href|url|action)\s*[=(]\s*[\"']?([^\"')\s>]+)", page.source)
+    text = re.sub(r"(?s)<script.*?</script>", "", page.source)  # a policy keeps scripts at home
+    addresses = re.findall(r"(?:src|href|url|action)\s*[=(]\s*[\"']?([^\"')\s>]+)", text)
     assert addresses and all(a.startswith("data:") for a in addresses)
-    assert "http" not in re.sub(r'http-equiv="[^"]*"', "", page.source)
+    assert page.source.count('id="viewer-program"') == 1  # however many viewers
+    assert "http" not in page.source.replace("http-equiv", "")
     assert not [a for a in page.all("script") if "src" in a] and not page.all("link")
     (policy,) = [a["content"] for a in page.all("meta") if "http-equiv" in a]
     assert policy.startswith("default-src 'none'")
@@ -87,17 +89,26 @@ def test_a_page_holds_everything_and_asks_for_nothing(tmp_path):
         assert kind in ("image/png", "image/webp") and len(data) > 50 and image["alt"]
 
 
-def test_the_viewer_gets_the_splat_file_and_the_camera(tmp_path):
-    section = full(distance=2.25, fov=40)
+def test_the_viewer_gets_the_gaussians_and_the_camera(tmp_path):
+    section = full(distance=2.25, fov=40, elevation=30)
     for write, auto in ((demo_page, False), (reconstruction_page, True)):
         write(tmp_path / "a.html", [section] if not auto else section)
         page = Page(tmp_path / "a.html")
         (viewer,) = [a for a in page.all("div") if a.get("class") == "viewer"]
-        assert viewer["data-distance"] == "2.25" and viewer["data-fov"] == "40"
         assert ("data-auto" in viewer) == auto
-        name = viewer["data-splat"]
-        (data,) = re.findall(rf'<script type="text/plain" id="{name}">(.*?)</script>', page.source)
-        assert base64.b64decode(data) == splat_bytes(section.gaussians)
+        name = viewer["data-viewer"]
+        parts = {
+            part: re.findall(
+                rf'<script type="[^"]*" id="{name}-{part}">(.*?)</script>', page.source
+            )
+            for part in ("object", "gaussians", "harmonics", "mesh")
+        }
+        (text,), (data,) = parts["object"], parts["gaussians"]
+        about = json.loads(text)
+        assert about["input"]["distance"] == 2.25 and about["input"]["fov"] == 40
+        assert about["input"]["elevation"] == pytest.approx(np.pi / 6)
+        assert len(base64.b64decode(data)) == 32 * about["count"] == 32 * 11
+        assert parts["harmonics"] == parts["mesh"] == [""]
         # the turntable is there once: beside a running viewer, under a waiting one
         assert page.source.count("image/webp") == 1
 

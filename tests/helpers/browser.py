@@ -7,6 +7,7 @@ they are skipped, and the reason names what is.
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +41,20 @@ class Opened:
     page: Any
     messages: list[str] = field(default_factory=list)
 
+    def promised(self, expression: str, seconds: float = 30.0) -> Any:
+        """What a promise of JavaScript becomes; one that stays open fails the test."""
+        late = f"setTimeout(() => fail(new Error('no answer')), {1000 * seconds})"
+        return self.page.evaluate(
+            f"() => Promise.race([{expression}, new Promise((_, fail) => {late})])"
+        )
+
+    def until(self, expression: str, seconds: float = 30.0) -> None:
+        """Waits until an expression of JavaScript is true, whatever the page's policy allows."""
+        end = time.monotonic() + seconds
+        while not self.page.evaluate(expression):
+            assert time.monotonic() < end, f"{expression} does not become true"
+            self.page.wait_for_timeout(10)
+
     def fingers(self, kind: str, *points: tuple[float, float]) -> None:
         """Sends one touch event, ``touchStart``, ``touchMove`` or ``touchEnd``, of all fingers."""
         if not hasattr(self, "_devtools"):
@@ -54,9 +69,8 @@ def browser() -> Iterator[Any]:
     program = next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip(f"needs a browser: none of {', '.join(NAMES)} is installed")
-    library = pytest.importorskip(
-        "playwright.sync_api", reason="needs playwright, which is missing"
-    )
+    missing = "needs playwright, which is not installed"
+    library = pytest.importorskip("playwright.sync_api", reason=missing)
     with library.sync_playwright() as playwright:
         found = playwright.chromium.launch(executable_path=program, args=list(FLAGS))
         yield found

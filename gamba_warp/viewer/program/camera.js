@@ -1,7 +1,5 @@
 // Where one looks from: an orbit about a target, in the axes of cameras.py's orbit() (x right, y
-// down, z forward; azimuth and elevation 0 is the input's camera where it was level). If the input's
-// camera looked down by some degrees, the object's upright axis leans in its frame; `level` turns it
-// upright, so that the object turns about its own axis and the home view is still the input's.
+// down, z forward; the input's camera has azimuth 0).
 
 function axesOf(azimuth, elevation) {
   const [sa, ca] = [Math.sin(azimuth), Math.cos(azimuth)];
@@ -13,7 +11,6 @@ class OrbitCamera {
   constructor(home, fov) {
     this.home = home;
     this.half = Math.tan((fov * Math.PI) / 360);
-    this.level = axesOf(0, home.elevation);
     this.goal = null;
     Object.assign(this, this.copyOf(home));
   }
@@ -23,9 +20,8 @@ class OrbitCamera {
   }
 
   // Rows: the camera's right, down and forward, in the object's frame.
-  rotation(azimuth = this.azimuth, elevation = this.elevation) {
-    return axesOf(azimuth, elevation).map((row) =>
-      this.level.map((axis) => row[0] * axis[0] + row[1] * axis[1] + row[2] * axis[2]));
+  rotation() {
+    return axesOf(this.azimuth, this.elevation);
   }
 
   // The focal length in pixels; the field of view is that of the shorter side.

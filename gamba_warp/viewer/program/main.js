@@ -2,15 +2,16 @@
 // sharply and as completely as a frame's time allows; once it rests, everything at full size.
 
 const SETTLE = 160; // milliseconds after the last motion
-const TARGET = 26; // milliseconds that a frame may take while it moves
+const SIZES = [1, 0.8, 0.64, 0.5, 0.4, 0.32]; // shares of the canvas's sides, while it moves
+const SLOW = 42, QUICK = 21; // milliseconds of a frame: above, less is drawn; below, more
 const PIECE = 131072; // Gaussians that are drawn at once at rest
-const LEAST = { scale: 0.3, count: 40000 };
+const LEAST = 40000; // Gaussians that are drawn in any case
 
 class Viewer {
   constructor(canvas, about) {
     Object.assign(this, { canvas, about, mode: "gaussians", showInput: true });
     this.camera = new OrbitCamera(about.home, about.home.fov);
-    this.sharp = 1; // share of the canvas's size, while it moves
+    this.coarse = this.quick = 0; // which of SIZES; quick frames in a row
     this.some = about.count; // Gaussians that are drawn while it moves
     this.changed = this.asked = -Infinity;
     this.sortedFor = this.askedFor = null;
@@ -42,7 +43,7 @@ class Viewer {
     this.renderer = new Renderer(gl, this.about.count, this.about.degree);
     if (!this.renderer.fits()) return say("It has more Gaussians than this graphics card takes.", "Too many");
     const text = (name) => {
-      const element = byId(name), found = element ? element.textContent.trim() : "";
+      const element = byId(name), found = element ? element.textContent : "";
       element?.remove(); // the text may be large, and is not needed any more
       return found;
     };
@@ -77,7 +78,7 @@ class Viewer {
 
   sorted({ buffer, used, id }) {
     if (!this.renderer) return;
-    this.renderer.setOrder(new Uint32Array(buffer, 0, used));
+    this.renderer.setOrder(new Uint32Array(buffer), used);
     this.spare = buffer;
     this.sortedFor = id;
     this.askedFor = null;
@@ -132,16 +133,20 @@ class Viewer {
     this.fast = fast;
   }
 
-  // First fewer pixels, then fewer Gaussians (those that cover least are last); back the other way.
+  // First fewer pixels, then fewer Gaussians (those that cover least are last); back the other way,
+  // once several frames in a row were quick.
   adapt(cost) {
-    const step = Math.max(0.7, Math.min(1.12, Math.sqrt(TARGET / cost)));
     const { count } = this.about;
-    if (step < 0.98) {
-      if (this.sharp > LEAST.scale) this.sharp = Math.max(LEAST.scale, this.sharp * step);
-      else if (cost > 2 * TARGET) this.some = Math.max(Math.min(count, LEAST.count), Math.round(this.some * step));
-    } else if (step > 1.02) {
-      if (this.some < count) this.some = Math.min(count, Math.round(this.some * 1.2));
-      else this.sharp = Math.min(1, this.sharp * 1.08);
+    this.quick = cost < QUICK ? this.quick + 1 : 0;
+    if (cost > SLOW) {
+      const last = SIZES.length - 1, least = Math.min(count, LEAST), far = cost > 8 * SLOW;
+      if (far || this.coarse === last)
+        this.some = Math.max(least, Math.round(this.some * Math.max(0.1, SLOW / cost)));
+      this.coarse = Math.min(last, this.coarse + (far ? last : cost > 3 * SLOW ? 2 : 1));
+    } else if (this.quick >= 6) {
+      this.quick = 0;
+      if (this.some < count) this.some = Math.min(count, Math.round(this.some * 1.3));
+      else this.coarse = Math.max(0, this.coarse - 1);
     }
   }
 
@@ -150,18 +155,18 @@ class Viewer {
     if (this.camera.step(now)) this.changed = now;
     const ratio = Math.min(2, window.devicePixelRatio || 1);
     const [width, height] = this.shownSize().map((side) => Math.round(side * ratio));
-    const { canvas, renderer } = this;
-    if (canvas.width !== width || canvas.height !== height) {
-      Object.assign(canvas, { width, height });
-      renderer.resize(width, height);
+    const { renderer } = this;
+    if (renderer.resize(width, height)) {
       this.progress = 0;
+      this.finished = false;
       this.changed = now;
     }
     const fast = now - this.changed < SETTLE && this.shownOnce;
     const ordered = this.sortNow(fast ? this.some : this.about.count);
     if (fast) {
-      if (renderer.ordered || this.mode !== "gaussians") {
-        renderer.draw(this.mode, this.camera, this.sharp, 0, Math.min(this.some, renderer.ordered));
+      // An order of all would begin with the farthest, so one of as many as are drawn is waited for.
+      if (renderer.ordered === this.some || this.mode !== "gaussians") {
+        renderer.draw(this.mode, this.camera, background(), SIZES[this.coarse], 0, this.some);
         this.show(now, true);
       }
       this.finished = false;
@@ -174,7 +179,7 @@ class Viewer {
   drawRest(now) {
     const { renderer } = this, all = this.mode === "gaussians" ? renderer.ordered : 1;
     const to = Math.min(all, this.progress + PIECE);
-    renderer.draw(this.mode, this.camera, 1, this.progress, to);
+    renderer.draw(this.mode, this.camera, background(), 1, this.progress, to);
     this.progress = to;
     if (to < all) return this.ask(now, false);
     this.show(now, false);
@@ -185,10 +190,13 @@ class Viewer {
   }
 
   show(now, fast) {
-    this.renderer.present(background());
+    this.renderer.present();
     this.ask(now, fast);
     this.stats.frames++;
-    const { input } = this.about, visible = input && this.showInput;
+    // Where frames take long, the browser shall not have to draw lines and a blur above each, too.
+    const slow = fast && this.coarse >= SIZES.length / 2;
+    document.documentElement.classList.toggle("slow", slow);
+    const { input } = this.about, visible = input && this.showInput && !slow;
     byId("lines").firstElementChild.setAttribute("d", visible ? inputLines(input, this.camera, ...this.shownSize()) : "");
   }
 
@@ -255,14 +263,14 @@ class Viewer {
 
   async save() {
     await this.rest();
-    this.renderer.present(background());
+    this.renderer.present();
     savePicture(this.canvas, this.about.title);
   }
 
   // For programs: a picture of the canvas, as an address.
   async png() {
     await this.rest();
-    this.renderer.present(background());
+    this.renderer.present();
     return this.canvas.toDataURL("image/png");
   }
 

@@ -52,7 +52,7 @@ function toggleHelp() {
 
 // The input's camera: its eye, and the rectangle through which it saw, as a path of an SVG.
 function inputLines(input, camera, width, height) {
-  const rows = axesOf(0, 0), half = Math.tan((input.fov * Math.PI) / 360), depth = 0.3 * input.distance;
+  const rows = axesOf(input.azimuth, input.elevation), half = Math.tan((input.fov * Math.PI) / 360), depth = 0.3 * input.distance;
   const eye = [0, 1, 2].map((k) => input.target[k] - input.distance * rows[2][k]);
   const corner = (x, y, z) => [0, 1, 2].map((k) => eye[k] + z * (half * (x * rows[0][k] + y * rows[1][k]) + rows[2][k]));
   const [a, b, c, d] = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) => corner(x, y, depth));

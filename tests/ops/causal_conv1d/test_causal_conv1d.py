@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.conv import make
+from helpers.kernels import conv_inputs as make
 from helpers.scan import leaves
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn

@@ -1,0 +1,118 @@
+"""The viewer in frames of other pages, and behind ``gamba view``."""
+
+import socket
+import webbrowser
+
+import numpy as np
+import pytest
+import torch
+from helpers.gaussians import some
+
+from gamba_warp.cli import main
+from gamba_warp.formats.ply import save_ply
+from gamba_warp.pages.page import Section, demo_page, reconstruction_page
+from gamba_warp.surfaces.extract import Surface
+from gamba_warp.surfaces.files import save_mesh
+
+
+def run(arguments) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    return ended.value.code
+
+
+@pytest.fixture
+def ball(tmp_path):
+    save_ply(tmp_path / "ball.ply", some(30))
+    return tmp_path / "ball.ply"
+
+
+def shown(frame) -> float:
+    """The spread of what a frame's canvas shows; 0 is blank."""
+    return frame.evaluate("""async () => {
+      await gambaViewer.rest();
+      gambaViewer.renderer.present();
+      const copy = document.createElement("canvas");
+      copy.width = copy.height = 16;
+      const ink = copy.getContext("2d");
+      ink.drawImage(gambaViewer.canvas, 0, 0, 16, 16);
+      const values = ink.getImageData(0, 0, 16, 16).data.filter((_, i) => i % 4 < 3);
+      return Math.max(...values) - Math.min(...values);
+    }""")
+
+
+def frames(opened, count):
+    opened.until(f"document.querySelectorAll('iframe').length === {count}")
+    found = opened.page.frames[1:]
+    for frame in found:
+        frame.wait_for_load_state()
+    return found
+
+
+def test_viewers_of_a_page_start_when_asked(browser_page, tmp_path):
+    turn = np.zeros((2, 8, 8, 3), np.uint8)
+    sections = [Section(f"Chair {i}", gaussians=some(40), turntable=turn) for i in range(2)]
+    demo_page(tmp_path / "a.html", sections)
+    opened = browser_page(tmp_path / "a.html", 800, 600)
+    assert not opened.page.query_selector("iframe")
+    for button in opened.page.query_selector_all(".viewer button"):
+        button.click()
+    both = frames(opened, 2)
+    assert [frame.evaluate("gambaViewer.about.title") for frame in both] == ["Chair 0", "Chair 1"]
+    assert all(shown(frame) > 100 for frame in both) and not opened.messages
+    assert not any(frame.evaluate("gambaViewer.about.input") for frame in both)
+
+
+def test_the_first_of_many_viewers_goes_back_to_its_picture(browser_page, tmp_path):
+    sections = [Section(f"Chair {i}", gaussians=some(5)) for i in range(7)]
+    demo_page(tmp_path / "a.html", sections)
+    opened = browser_page(tmp_path / "a.html", 800, 600)
+    opened.page.evaluate("document.querySelectorAll('.viewer button').forEach((b) => b.click())")
+    found = opened.page.evaluate(
+        "[...document.querySelectorAll('.viewer')].map((v) => v.children.length)"
+    )
+    assert found == [1, 2, 2, 2, 2, 2, 2] and not opened.messages
+
+
+def test_the_viewer_of_a_reconstruction_starts_by_itself(browser_page, tmp_path):
+    vertices = 0.4 * torch.eye(3).numpy()
+    mesh = Surface(vertices, np.array([[0, 1, 2]]), None)
+    picture = np.ones((9, 9, 4), np.float32)
+    section = Section("A chair", gaussians=some(40), picture=picture, mesh=mesh, elevation=20.0)
+    reconstruction_page(tmp_path / "a.html", section)
+    opened = browser_page(tmp_path / "a.html", 800, 600)
+    (frame,) = frames(opened, 1)
+    assert shown(frame) > 100
+    assert frame.evaluate("gambaViewer.about.input.elevation") == pytest.approx(np.radians(20))
+    assert frame.is_visible("[data-mode=mesh]") and not opened.messages
+    assert frame.evaluate("document.fullscreenEnabled") and frame.is_visible("#do-full")
+
+
+def test_view_shows_a_mesh_too(ball, tmp_path, capsys):
+    save_mesh(tmp_path / "mesh.glb", Surface(np.eye(3), np.array([[0, 1, 2]])))
+    page = tmp_path / "page.html"
+    command = ["view", str(ball), "--mesh", str(tmp_path / "mesh.glb"), "--out", str(page)]
+    assert run([*command, "--no-open-browser"]) == 0
+    assert '"faces": 1' in page.read_text()
+    (tmp_path / "bad.glb").write_bytes(b"no mesh")
+    page.unlink()
+    assert run([*command[:3], str(tmp_path / "bad.glb"), "--out", str(page)]) == 2
+    assert not page.exists()
+
+
+def test_view_without_a_browser_says_so_in_one_line(ball, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(webbrowser, "open", lambda address: False)
+    assert run(["view", str(ball), "--out", str(tmp_path / "page.html")]) == 0
+    out, err = capsys.readouterr()
+    assert out.strip() == str(tmp_path / "page.html")
+    assert err.count("\n") == 1 and "no browser was found" in err
+
+
+def test_view_on_a_port_in_use_says_so_in_one_line(ball, tmp_path, capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        assert run(["view", str(ball), "--serve", "--port", port, "--no-open-browser"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and f"--port {port}: Address already in use" in err

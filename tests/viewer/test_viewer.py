@@ -1,0 +1,290 @@
+"""The viewer in a browser: it shows what our rasterizer shows, follows hands, and says nothing."""
+
+import base64
+import io
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.gaussians import some
+from PIL import Image
+
+from gamba_warp import render
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.surfaces.extract import Surface
+from gamba_warp.viewer.page import write_viewer
+
+CAMERA = (1.5, 49.1, 0.0)
+WIDE, HIGH = 201, 150
+
+
+def colourful(n=400, coefficients=None):
+    """Gaussians of all sizes and turns, most of them small, perhaps with harmonics."""
+    found = some(n)
+    found.scales = 0.005 + 0.06 * torch.rand(n, 3) ** 3
+    if coefficients:
+        found.harmonics = 0.15 * torch.randn(n, coefficients, 3)
+    return found
+
+
+def tetrahedron():
+    vertices = 0.4 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
+    faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+    return Surface(vertices, faces, np.eye(4, 3, dtype=np.float32))
+
+
+@pytest.fixture
+def viewer(browser_page, tmp_path):
+    """Opens the page of some Gaussians, and waits for its first picture."""
+
+    def opened(gaussians, width=WIDE, height=HIGH, mesh=None, camera=CAMERA, **options):
+        path = tmp_path / "view.html"
+        write_viewer(path, "A chair", gaussians, mesh=mesh, camera=camera)
+        options = {"color_scheme": "light", "reduced_motion": "reduce", **options}
+        found = browser_page(path, width, height, **options)
+        found.promised("gambaViewer.rest()")
+        return found
+
+    return opened
+
+
+def canvas(opened) -> np.ndarray:
+    """The canvas at rest, ``[H, W, 3]`` in [0, 1]."""
+    address = opened.promised("gambaViewer.png()")
+    with Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))) as picture:
+        return np.asarray(picture.convert("RGB")) / 255
+
+
+def look_from(page, azimuth, elevation, distance):
+    where = [math.radians(azimuth), math.radians(elevation), distance]
+    page.evaluate(
+        "([azimuth, elevation, distance]) => gambaViewer.setCamera({azimuth, elevation, distance})",
+        where,
+    )
+
+
+def state(page) -> dict:
+    return page.evaluate(
+        "(({azimuth, elevation, distance, target}) => ({azimuth, elevation, distance, target}))"
+        "(gambaViewer.camera)"
+    )
+
+
+def psnr(one, other) -> float:
+    return -10 * math.log10(((one - other) ** 2).mean())
+
+
+@pytest.mark.parametrize("coefficients", [None, 3, 8, 15])
+def test_its_picture_is_that_of_the_rasterizer(viewer, one_thread, coefficients):
+    gaussians = colourful(coefficients=coefficients)
+    opened = viewer(gaussians)
+    for azimuth, elevation, distance in ((0, 0, 1.5), (40, 20, 1.2), (200, -35, 1.9)):
+        look_from(opened.page, azimuth, elevation, distance)
+        poses = orbit(torch.tensor([float(azimuth)]), elevation, distance)
+        cameras = Cameras(poses, intrinsics(WIDE, HIGH, CAMERA[1])[None], WIDE, HIGH)
+        wanted = render(gaussians, cameras, torch.ones(3)).rgb[0].clamp(0, 1).numpy()
+        # 8 bits of colour between any two Gaussians leave 45 dB and more
+        assert psnr(canvas(opened), wanted) > 40
+    assert wanted.std() > 0.1 and not opened.messages
+
+
+def test_hands(viewer):
+    opened = viewer(colourful(), has_touch=True)
+    page, mouse = opened.page, opened.page.mouse
+    first, before = canvas(opened), state(page)
+    assert first.std() > 0.05  # it is not blank
+
+    mouse.move(100, 70)
+    mouse.down()
+    mouse.move(130, 80, steps=3)
+    mouse.up()
+    turned = state(page)
+    assert turned["azimuth"] < before["azimuth"] and turned["elevation"] > before["elevation"]
+    assert np.abs(canvas(opened) - first).mean() > 0.02
+
+    mouse.move(100, 70)
+    mouse.down(button="right")
+    mouse.move(120, 70, steps=2)
+    mouse.up(button="right")
+    panned = state(page)
+    assert panned["azimuth"] == turned["azimuth"] and panned["target"] != turned["target"]
+
+    opened.fingers("touchStart", (80, 70), (120, 70))
+    opened.fingers("touchMove", (60, 70), (140, 70))
+    opened.fingers("touchEnd")
+    opened.until("gambaViewer.camera.distance < 0.76")  # twice as far apart: half as far
+    pinched = state(page)
+    assert pinched["distance"] == pytest.approx(before["distance"] / 2, rel=1e-3)
+    opened.fingers("touchStart", (80, 70))
+    opened.fingers("touchMove", (100, 70))
+    opened.fingers("touchEnd")
+    opened.until(f"gambaViewer.camera.azimuth < {pinched['azimuth']}")
+
+    mouse.wheel(0, 120)
+    opened.until(f"gambaViewer.camera.distance > {pinched['distance']}")
+    page.keyboard.press("r")
+    opened.promised("gambaViewer.rest()")
+    assert state(page) == before
+    assert np.abs(canvas(opened) - first).max() < 0.01 and not opened.messages
+
+
+def ball(x, y, z, colour):
+    """One round, nearly opaque Gaussian."""
+    return Gaussians(
+        means=torch.tensor([[x, y, z]]),
+        quats=None,
+        scales=torch.full((1, 3), 0.03),
+        opacities=torch.tensor([0.95]),
+        colors=torch.tensor([colour]),
+    )
+
+
+@pytest.mark.parametrize("mode", ["1", "2"])
+def test_a_double_click_looks_at_the_point_below(viewer, mode):
+    opened = viewer(ball(0.2, 0.1, -0.1, [0.0, 0.0, 1.0]))
+    opened.page.keyboard.press(mode)
+    focal = HIGH / 2 / math.tan(math.radians(CAMERA[1]) / 2)
+    x, y = (half + focal * at / 1.4 for half, at in ((WIDE / 2, 0.2), (HIGH / 2, 0.1)))
+    opened.page.mouse.dblclick(x, y)
+    opened.until("gambaViewer.camera.target[0] > 0.1")
+    # Along the ray the ball is densest at its centre; half a pixel is 0.005 of the object.
+    assert state(opened.page)["target"] == pytest.approx([0.2, 0.1, -0.1], abs=0.02)
+    opened.page.mouse.dblclick(5, 5)  # nothing is below
+    opened.page.wait_for_timeout(50)
+    assert state(opened.page)["target"][0] > 0.1 and not opened.messages
+
+
+def test_what_it_shows(viewer):
+    opened = viewer(colourful(), mesh=tetrahedron())
+    page = opened.page
+    splats = canvas(opened)
+    page.click("[data-mode=centres]")
+    points = canvas(opened)
+    page.click("[data-mode=mesh]")
+    mesh = canvas(opened)
+    for one, other in ((splats, points), (points, mesh), (mesh, splats)):
+        assert np.abs(one - other).mean() > 0.01
+    covered = (mesh < 0.999).any(-1)
+    assert 0.05 < covered.mean() < 0.6 and covered[HIGH // 2, WIDE // 2]
+    page.keyboard.press("l")
+    dark = canvas(opened)
+    assert dark[0, 0].max() < 0.2 < 0.9 < mesh[0, 0].min()
+    assert np.abs(dark - mesh)[covered].mean() < 0.02  # only the background is another
+    for _ in range(2):
+        page.click("#do-input")
+    assert page.get_attribute("#do-input", "aria-pressed") == "true"
+    opened.promised("gambaViewer.rest()")
+    assert len(page.get_attribute("#lines path", "d")) > 50
+    page.keyboard.press("?")
+    assert page.is_visible("#help") and "Double-click" in page.inner_text("#help")
+    page.keyboard.press("Escape")
+    assert not page.is_visible("#help") and not opened.messages
+
+
+def test_a_picture_is_saved(viewer, tmp_path):
+    opened = viewer(colourful())
+    shown = canvas(opened)
+    with opened.page.expect_download() as download:
+        opened.page.keyboard.press("s")
+    download.value.save_as(tmp_path / "saved.png")
+    assert download.value.suggested_filename == "A-chair.png"
+    with Image.open(tmp_path / "saved.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture.convert("RGB")) / 255, shown)
+
+
+def test_an_object_of_any_size_anywhere(viewer):
+    gaussians = colourful()
+    small = canvas(viewer(gaussians, camera=None))
+    moved = gaussians.transformed(torch.eye(3), torch.tensor([3e4, -2e4, 1e4]), 2e3)
+    # float32 centres at 3e4 are exact to 1e-3, a millionth of the object's size
+    assert psnr(canvas(viewer(moved, camera=None)), small) > 45
+
+
+def test_a_phone_and_a_small_frame_hold_all_buttons(viewer):
+    for width, height in ((390, 700), (300, 300), (640, 300)):
+        page = viewer(colourful(), width, height, mesh=tetrahedron()).page
+        boxes = [button.bounding_box() for button in page.query_selector_all("#bar button")]
+        boxes = [box for box in boxes if box]
+        assert len(boxes) >= 8
+        for box in boxes:
+            assert box["x"] >= 0 and box["x"] + box["width"] <= width
+            assert box["y"] + box["height"] <= height
+            assert box["width"] >= 28 and box["height"] >= 24
+        rows = sorted({round(box["y"]) for box in boxes})
+        for y in rows:  # none lies over its neighbour
+            row = sorted(box["x"] for box in boxes if round(box["y"]) == y)
+            assert all(b - a >= 28 for a, b in zip(row, row[1:]))
+
+
+def test_it_draws_less_while_it_moves_and_all_at_rest(viewer):
+    opened = viewer(colourful(600))
+    page, before = opened.page, canvas(opened)
+    drawn = page.evaluate("""() => new Promise((done) => {
+      const { renderer } = gambaViewer, draw = renderer.draw.bind(renderer);
+      Object.assign(gambaViewer, { adapt() {}, coarse: 3, some: 100 });
+      renderer.draw = (...all) => {
+        renderer.draw = draw;
+        draw(...all);
+        done([renderer.part[0], all[4], all[5], renderer.ordered]);
+      };
+      gambaViewer.act.turn(30, 0);
+      gambaViewer.changed += 1e6;  // it goes on moving, however slow this machine is
+    })""")
+    assert drawn == [(WIDE + 1) // 2, 0, 100, 100]  # the 100 that cover most, in their own order
+    page.evaluate("gambaViewer.goHome()")
+    np.testing.assert_array_equal(canvas(opened), before)
+    assert page.evaluate("gambaViewer.renderer.ordered") == 600 and not opened.messages
+
+
+def test_a_slow_machine_gets_coarser_pictures_and_a_fast_one_sharper(viewer):
+    opened = viewer(colourful(50))
+    found = opened.page.evaluate("""() => {
+      const v = Object.assign(gambaViewer, { coarse: 0, quick: 0, some: 1e6 }), seen = [];
+      v.about = { ...v.about, count: 1e6 };
+      const after = (cost, times) => {
+        for (let i = 0; i < times; i++) v.adapt(cost);
+        seen.push([v.coarse, v.some]);
+      };
+      after(30, 50);
+      after(60, 1);
+      after(60, 20);
+      after(10000, 20);
+      after(16, 1000);
+      after(2000, 1);
+      v.about.count = 50;
+      return seen;
+    }""")
+    steady, once, slow, stopped, fast, jammed = found
+    assert steady == [0, 1e6] and once == [1, 1e6] and fast == [0, 1e6]
+    assert slow[0] == 5 and 40_000 <= slow[1] < 1e6 and stopped == [5, 40_000]
+    assert jammed[0] == 5 and jammed[1] == 1e5
+
+
+def test_a_million_do_not_stop_the_page(browser_page, tmp_path):
+    n = 1_000_000
+    gaussians = Gaussians(
+        means=torch.rand(n, 3) - 0.5,
+        quats=None,
+        scales=torch.full((n, 3), 0.001),
+        opacities=torch.full((n,), 0.5),
+        colors=torch.rand(n, 3),
+    )
+    write_viewer(tmp_path / "million.html", "Many", gaussians, camera=CAMERA)
+    opened = browser_page(tmp_path / "million.html", 160, 120)
+    opened.until("gambaViewer.ready")
+    longest = opened.promised("""new Promise((done) => {
+      let last = performance.now(), longest = 0, sorts = gambaViewer.stats.sorts;
+      const tick = () => {
+        const now = performance.now();
+        longest = Math.max(longest, now - last);
+        last = now;
+        if (gambaViewer.stats.sorts > sorts + 2) return done(longest);
+        gambaViewer.act.turn(3, 0);
+        setTimeout(tick, 5);
+      };
+      tick();
+    })""")
+    # The page's own thread is never held for long, also on a machine that is busy with others.
+    assert longest < 400 and not opened.messages
