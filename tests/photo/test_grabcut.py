@@ -1,4 +1,4 @@
-"""GrabCut: the cut is the cheapest one, it finds objects by colour, and it refuses what has none."""
+"""GrabCut: its cut is the cheapest one, it finds objects by colour, and it refuses all else."""
 
 import numpy as np
 import pytest

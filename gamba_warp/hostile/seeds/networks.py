@@ -49,7 +49,7 @@ def matting_network(
     size: int = 64,
     last: str = "Sigmoid",
 ) -> bytes:
-    """A network that takes pixels for object by their colour alone: ``sigmoid(weights · c + bias)``.
+    """A network that goes by the colour of a pixel alone: ``sigmoid(weights · c + bias)``.
 
     Args:
         weights: of red, green and blue, each 0.5 below its value in [0, 1].
