@@ -58,11 +58,9 @@ def reconstruct_command(
         sheet: Also one picture of all results: each input, and five views around it (.png, .webp,
             .jpg).
         mask: Picture that is white where the object is (for a single image).
-        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out; if not given, one that
-            rembg keeps on this machine, or it is fetched once (179 MB).
-        sam: Segment Anything checkpoint, in place of that: sam_vit_b_01ec64.pth of
-            github.com/facebookresearch/segment-anything, or mobile_sam.pt of
-            github.com/ChaoningZhang/MobileSAM.
+        matte_model: ISNet or U2-Net (.onnx) that cuts objects out; else rembg's is used or fetched.
+        sam: Segment Anything checkpoint in its place: sam_vit_b_01ec64.pth of github.com/
+            facebookresearch/segment-anything, or mobile_sam.pt of ChaoningZhang/MobileSAM.
         save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
@@ -95,8 +93,7 @@ def reconstruct_command(
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
     model = load_model(checkpoint, chosen, encoder_weights)
-    ways = Ways(mask, matte_model, sam, chosen)
-    ways.check()
+    ways = Ways(mask, matte_model, sam, chosen).checked()
     output_folder(out)
 
     def one(name: str, path: Path) -> None:

@@ -75,8 +75,8 @@ class Ways:
     _matte: Matte | None = field(default=None, init=False, repr=False)
     _no_matte: str = field(default="", init=False, repr=False)
 
-    def check(self) -> None:
-        """Opens what was given, so that a bad file is told before any picture is read.
+    def checked(self) -> Ways:
+        """Opens what was given, so that a bad file is told before any picture; returns itself.
 
         Raises:
             UserError: a file is missing, or of another kind.
@@ -86,6 +86,7 @@ class Ways:
             self.segmenter()
         if self.matte_model is not None:
             self.matte()
+        return self
 
     def segmenter(self) -> SamSegmenter | None:
         """Segment Anything, opened once; None where it is not wanted."""

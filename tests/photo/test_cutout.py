@@ -205,4 +205,4 @@ def test_without_the_extra_colours_alone_cut(monkeypatch, busy):
     found = cut_out(busy[0])
     assert found.method == "grabcut" and "pip install 'gamba-warp[photo]'" in found.how
     with pytest.raises(ModuleNotFoundError, match="onnxruntime"):
-        Ways(matte_model="model.onnx").check()
+        Ways(matte_model="model.onnx").checked()
