@@ -17,6 +17,10 @@ from ..formats.names import GaussianFormat, MeshFormat
 from ..untrusted.ranges import Frames, Opacity, Side, ranged
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from ..gaussians import Gaussians
+    from ..model.gamba import Gamba
     from ..pages.sheet import Sheet
 
 
@@ -55,19 +59,16 @@ def reconstruct_command(
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
         page: Write an HTML page with the input, the turntable and a 3D viewer.
-        sheet: Also one picture of all results: each input, and five views around it (.png, .webp,
-            .jpg).
+        sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
         mask: Picture that is white where the object is (for a single image).
         matte_model: ISNet or U2-Net (.onnx) that cuts objects out; else rembg's is used or fetched.
-        sam: Segment Anything checkpoint in its place: sam_vit_b_01ec64.pth of github.com/
-            facebookresearch/segment-anything, or mobile_sam.pt of ChaoningZhang/MobileSAM.
+        sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
         save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Device that computes; auto is the GPU if there is one.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
-    from ..model.predict import reconstruct
     from ..pages.card import about_model
     from ..pages.outputs import Outputs, write_outputs
     from ..photo.cutout import Ways, cut_out
@@ -99,9 +100,7 @@ def reconstruct_command(
     def one(name: str, path: Path) -> None:
         cut = cut_out(path, ways)
         say(f"{path}: {cut.how}")
-        started = time.perf_counter()
-        gaussians = reconstruct(model, cut.rgba).to("cpu")  # waits for the device
-        seconds = time.perf_counter() - started
+        gaussians, seconds = _timed(model, cut.rgba)
         write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
 
     for_each(names, one, "reconstruct", "picture", failures)
@@ -125,6 +124,15 @@ def _found(
     if not pictures:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     return pictures, failures
+
+
+def _timed(model: Gamba, rgba: np.ndarray) -> tuple[Gaussians, float]:
+    """The Gaussians on the CPU, and the seconds that they took."""
+    from ..model.predict import reconstruct
+
+    started = time.perf_counter()
+    gaussians = reconstruct(model, rgba).to("cpu")  # waits for the device
+    return gaussians, time.perf_counter() - started
 
 
 def _file_of(checkpoint: Path) -> Path:
