@@ -103,7 +103,7 @@ def compare(model: Path, folder: Path | None, out: Path) -> list[list[str]]:
             fault = "not plain" if alpha is None else fault_of(alpha)
             alpha = np.zeros(rgb.shape[:2], np.float32) if alpha is None or fault else alpha
             row.append(f"{fault or f'{(alpha > 0.5).mean():.0%}'}, {seconds:.1f} s")
-            magenta = np.float32([1, 0, 1])
+            magenta = np.array([1, 0, 1], np.float32)
             cells.append(cell(rgb * alpha[..., None] + magenta * (1 - alpha[..., None])))
         rows.append(row)
         sheet.append(np.hstack(cells))
@@ -117,7 +117,7 @@ def compare(model: Path, folder: Path | None, out: Path) -> list[list[str]]:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Each way on ordinary photographs.")
     parser.add_argument("--model", type=Path, required=True)
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("ways.png"))

@@ -84,6 +84,8 @@ def test_outputs_that_cannot_be_written(tmp_path, capsys):
     photo().save(tmp_path / "a.png")
     (tmp_path / "file").touch()
     assert reconstruct(tmp_path / "a.png", "--out", tmp_path / "file") == 2
+    if os.path.isdir("/proc/self"):  # where not even root may make a folder
+        assert reconstruct(tmp_path / "a.png", "--out", "/proc/gamba") == 2
     (tmp_path / "out" / "a.ply").mkdir(parents=True)  # a folder where a result is to be
     assert reconstruct(tmp_path / "a.png", "--out", tmp_path / "out") == 1
     assert not any((tmp_path / "out" / "a.ply").iterdir())
