@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 from unicodedata import normalize
 
-from .errors import UserError, first_line
+from .errors import UserError, first_line, one_line
 
 Item = TypeVar("Item")
 # What one bad input may raise: everything else is a defect of the program, and stops it.
@@ -50,6 +50,11 @@ def for_each(
     return failures
 
 
+def say(line: str) -> None:
+    """Prints a line about an item on stdout, above the progress bar of ``for_each``."""
+    from tqdm import tqdm
+
+    tqdm.write(one_line(line))
 class Stages:
     """What a command is doing: shown behind the bar of ``for_each``, and timed.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..batch import STAGES, check_not_read, for_each, plan_outputs, report
+from ..batch import STAGES, check_not_read, for_each, plan_outputs, report, say
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -55,7 +55,9 @@ def reconstruct_command(
     page: bool = True,
     sheet: Path | None = None,
     mask: Path | None = None,
+    matte_model: Path | None = None,
     sam: Path | None = None,
+    save_inputs: bool = False,
     ply_frame: Axes = "opencv",
     min_opacity: Opacity = 0.0,
     device: DeviceChoice = "auto",
@@ -75,19 +77,20 @@ def reconstruct_command(
         frames: Number of views in the turntable.
         camera: From where the picture was taken, and its results are shown.
         page: Write an HTML page with the input, the turntable and a 3D viewer.
-        sheet: Also one picture of all results: each input, and five views around it (.png, .webp,
-            .jpg).
+        sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
         mask: Picture that is white where the object is (for a single image).
-        sam: Segment Anything checkpoint, for pictures with a busy background.
+        matte_model: ISNet or U2-Net (.onnx) that cuts objects out; else rembg's is used or fetched.
+        sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
+        save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Device that computes; auto is the GPU if there is one.
         times: Print what each stage took.
     """
-    from ..data.preprocess import SamSegmenter, prepare
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
     from ..pages.card import about_model
     from ..pages.outputs import Outputs, write_outputs
+    from ..photo.cutout import Ways, cut_out
 
     pictures, failures = _found(images, mask)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
@@ -105,20 +108,22 @@ def reconstruct_command(
         checkpoint=checkpoint,
         about=about_model(file),
         camera=(camera.elevation, camera.distance, camera.fov),
+        inputs=save_inputs,
     )
-    reads = (mask, sam, file, encoder_weights)
+    reads = (mask, matte_model, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
-    segmenter = None if sam is None else SamSegmenter(sam, chosen)
+    ways = Ways(mask, matte_model, sam, chosen).checked()
     output_folder(out)
 
     def one(name: str, path: Path) -> None:
         STAGES.begin("cutting out")
-        rgba = prepare(path, mask=mask, segmenter=segmenter)
-        gaussians, seconds = _forward(model, rgba)
-        write_outputs(name, rgba, gaussians.to(chosen), outputs, model.config, seconds)
+        cut = cut_out(path, ways)
+        say(f"{path}: {cut.how}")
+        gaussians, seconds = _forward(model, cut.rgba)
+        write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
 
     for_each(names, one, "reconstruct", "picture", failures)
     _end(outputs.sheet, times)
@@ -158,6 +163,7 @@ def _found(
     if not pictures:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     return pictures, failures
+
 
 
 def _file_of(checkpoint: Path) -> Path:

@@ -60,7 +60,7 @@ def render_command(
     """
     from tqdm import tqdm
 
-    from ..formats.ply import load_ply as read_gaussians
+    from ..formats.gaussians.files import read_gaussians
     from ..pages.export import find_gaussians
     from ..surfaces.extract import unit_frame
     from ..trajectories.film import Film, parse_background, parse_size, plan_path, shoot

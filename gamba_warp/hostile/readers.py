@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import UserError
 from . import comparing, published, sound
-from .seeds import cameras, datasets, models, pictures, shapes
+from .seeds import cameras, datasets, models, networks, pictures, shapes
 from .seeds.pictures import Files
 
 Seeds = Callable[[], dict[str, Files]]
@@ -254,6 +256,12 @@ def _sam(path: Path, out: Path) -> Any:
     return SamSegmenter(path)
 
 
+def _matte(path: Path, out: Path) -> Any:
+    from ..photo.matte import Matte
+
+    return Matte(path)(pictures.rgba()[..., :3] / np.float32(255))
+
+
 def _pickle(path: Path, out: Path) -> Any:
     from ..vision.fetch import load_numpy_pickle
 
@@ -343,6 +351,7 @@ READERS: dict[str, Reader] = {
         Reader("released", _released, sound.released, models.released, 2),
         Reader("encoder", _encoder, sound.nothing, _only(models.weights, "torch"), 1),
         Reader("sam", _sam, sound.nothing, _only(models.weights, "torch"), 1),
+        Reader("matte", _matte, sound.alpha, networks.networks, 3),
         Reader("pickle", _pickle, sound.arrays, _only(models.weights, "pickle"), 4),
         Reader("archive", _archive, sound.nothing, _only(models.weights, "archive"), 2),
     )

@@ -85,6 +85,15 @@ def cut_out(result: Any, path: Path, out: Path) -> str | None:
     return picture(result, path, out)
 
 
+def alpha(result: Any, path: Path, out: Path) -> str | None:
+    """``[24, 24]`` in [0, 1], for the picture that the reader gives."""
+    if result.shape != (24, 24):
+        return f"an alpha of {result.shape}"
+    if not (result.min() >= 0 and result.max() <= 1):  # also false for NaN
+        return "an alpha outside [0, 1]"
+    return None
+
+
 def gaussians(result: Any, path: Path, out: Path) -> str | None:
     """Finite Gaussians with unit rotations and positive scales, as many as the file has."""
     named = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}

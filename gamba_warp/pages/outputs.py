@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -16,7 +15,9 @@ from ..conventions import Axes
 from ..formats.gaussians.files import write_gaussians
 from ..formats.names import MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
+from ..images import save_image
 from ..model.config import GambaConfig
+from ..photo.cutout import CutOut
 from ..surfaces.files import write_meshes
 from ..surfaces.options import BROWSER_FACES, SurfaceOptions
 from ..trajectories.paths import Viewpoint, upright
@@ -45,6 +46,7 @@ class Outputs:
         camera: elevation of the input's camera above the object, degrees (what is written stands
             upright); distance and field of view, degrees, of the camera of turntable, sheet and
             viewer, of which None is the model's.
+        inputs: whether each cut-out is written, too, as ``NAME-input.png``.
     """
 
     folder: Path
@@ -60,12 +62,14 @@ class Outputs:
     about: Sequence[tuple[str, str]] = ()
     sheet: Sheet | None = None
     camera: tuple[float, float | None, float | None] = (0.0, None, None)
+    inputs: bool = False
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
         found = [splat_suffix(kind) for kind in self.splats]
         found += [f"-mesh.{kind}" for kind in self.mesh]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
+        found += ["-input.png"] if self.inputs else []
         return found + ([".html"] if self.page else [])
 
     def view(self, config: GambaConfig) -> Viewpoint:
@@ -75,7 +79,7 @@ class Outputs:
 
 def write_outputs(
     name: str,
-    rgba: np.ndarray,
+    cut: CutOut,
     gaussians: Gaussians,
     outputs: Outputs,
     config: GambaConfig,
@@ -85,7 +89,7 @@ def write_outputs(
 
     Args:
         name: stem of the files.
-        rgba: ``[S, S, 4]``, what was reconstructed.
+        cut: what was reconstructed, and how it was cut out.
         gaussians: ``[N]``, on the device that is to render the turntable.
         outputs: what to write.
         config: of the model, for the camera.
@@ -98,14 +102,16 @@ def write_outputs(
     if view.elevation:
         turn = upright(view.elevation).to(gaussians.means)
         gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
+    if outputs.inputs:
+        save_image(base.with_name(f"{name}-input.png"), cut.editable)
     STAGES.begin("Gaussians")
     _write_gaussians(base, gaussians, outputs)
     if outputs.sheet is not None:
-        outputs.sheet.add(name, rgba, gaussians, view)
+        outputs.sheet.add(name, cut.rgba, gaussians, view)
     section = None
     if outputs.turntable != "none" or outputs.page:
         about = [("Forward pass", f"{seconds:.2f} s on {gaussians.means.device.type}")]
-        section = _write_pictures(base, rgba, gaussians, outputs, view, about)
+        section = _write_pictures(base, cut, gaussians, outputs, view, about)
     if outputs.mesh:  # what takes longest comes last: all else is there to look at
         STAGES.begin("mesh")
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
@@ -119,7 +125,7 @@ def write_outputs(
 
 def _write_pictures(
     base: Path,
-    rgba: np.ndarray,
+    cut: CutOut,
     gaussians: Gaussians,
     outputs: Outputs,
     view: Viewpoint,
@@ -140,7 +146,8 @@ def _write_pictures(
     table = [("Gaussians", f"{gaussians.num:,}"), *about, *outputs.about]
     section = Section(
         name,
-        picture=rgba,
+        text=cut.note,
+        picture=cut.rgba,
         turntable=turn,
         gaussians=gaussians,
         table=table,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..errors import first_line
 
@@ -51,7 +51,7 @@ class NotFetched(Exception):
 
 
 def _homes() -> tuple[Path, Path]:
-    """rembg's folder, and the one that it had before: both are looked into, as it does itself."""
+    """The folder of rembg, and the one that it had before: it looks into both itself."""
     chosen, data = os.environ.get("U2NET_HOME"), os.environ.get("XDG_DATA_HOME")
     if chosen:
         return Path(chosen).expanduser(), Path(chosen).expanduser()
@@ -88,13 +88,15 @@ def fetch() -> Path:
 
     model = PUBLISHED[0]
     pooch.get_logger().setLevel("ERROR")
+    # Any: pooch's own type of it knows no arguments by name.
+    downloader: Any = pooch.HTTPDownloader(progressbar=True, timeout=_SECONDS)
     try:
         found = pooch.retrieve(
             model.address,
             known_hash=f"md5:{model.md5}",
             fname=f"{model.name}.onnx",
             path=_homes()[0] / "models" / model.name,
-            downloader=pooch.HTTPDownloader(progressbar=True, timeout=_SECONDS),
+            downloader=downloader,
         )
     except Exception as error:  # of requests, of urllib3, of the disk, and a ValueError of pooch
         raise NotFetched(_short(error)) from error

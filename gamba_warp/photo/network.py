@@ -82,7 +82,7 @@ def _input(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     small = Image.fromarray(rgb).resize((size[1], size[0]), Image.Resampling.LANCZOS)
     values = np.asarray(small, np.float32) / max(1, int(np.asarray(small).max()))
     if max(size) <= _U2NET:
-        values = (values - np.float32(_MEAN)) / np.float32(_SPREAD)
+        values = (values - np.array(_MEAN, np.float32)) / np.array(_SPREAD, np.float32)
     else:
         values = values - np.float32(0.5)
     return np.ascontiguousarray(values.transpose(2, 0, 1)[None])

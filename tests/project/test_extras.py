@@ -7,9 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from helpers.images import cut_out
+from helpers.images import cut_out, disc_on_noise
 
 from gamba_warp import cli, versions
 from gamba_warp.images import save_image
@@ -32,6 +31,7 @@ class Refuse:
 
 real = versions.find_spec
 versions.find_spec = lambda name: None if name in versions.EXTRA_OF else real(name)
+importlib.util.find_spec = versions.find_spec
 sys.meta_path.insert(0, Refuse())
 cli.main(sys.argv[1:])
 """
@@ -64,7 +64,7 @@ def declared():
 def test_each_library_is_in_the_extras_that_are_named():
     found = declared()
     distributions = {"skimage": "scikit-image", "imageio_ffmpeg": "imageio-ffmpeg"}
-    distributions["huggingface_hub"] = "huggingface-hub"
+    distributions |= {"huggingface_hub": "huggingface-hub", "pillow_heif": "pillow-heif"}
     for library, extra in versions.EXTRA_OF.items():
         name = distributions.get(library, library)
         holding = {extra} | {e for e, libraries in versions.HOLDS.items() if library in libraries}
@@ -119,14 +119,17 @@ def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):
 
 @pytest.mark.slow
 def test_what_only_an_option_needs(tmp_path):
-    picture, busy = cut_out(tmp_path / "thing.png"), tmp_path / "busy.png"
-    save_image(busy, np.ones((20, 30, 3)) * 0.9)
+    picture = cut_out(tmp_path / "thing.png")
+    save_image(tmp_path / "busy.png", disc_on_noise((60, 80))[0])
     quick = ("--turntable", "none", "--no-page", "--out", tmp_path / "out")
     for options, library, extra in (
         ((picture, "--mesh", "glb"), "open3d", "mesh"),
-        ((busy,), "skimage", "photo"),
+        ((picture, "--matte-model", "model.onnx"), "onnxruntime", "photo"),
     ):
         done = in_the_core("reconstruct", *options, *quick)
         assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].endswith(
             f"needs {library}, which is not installed: pip install 'gamba-warp[{extra}]'"
         ), done.stderr
+    done = in_the_core("reconstruct", tmp_path / "busy.png", *quick)
+    assert done.returncode == 0 and "Colours alone (GrabCut)" in done.stdout, done.stderr
+    assert "pip install 'gamba-warp[photo]'" in done.stdout

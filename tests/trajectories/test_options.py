@@ -85,7 +85,7 @@ def test_export_and_view_start_from_there(tmp_path, monkeypatch):
     gaussians.means, gaussians.scales = gaussians.means * 4 + 9, gaussians.scales * 4
     save_ply(tmp_path / "a.ply", gaussians)
     view = ["--elevation", "25", "--fov", "30", "--distance", "3"]
-    options = ["--mesh", "--formats", "gif", "html", "--size", "48", "--frames", "2"]
+    options = ["--mesh", "--turntable", "gif", "--page", "--size", "48", "--frames", "2"]
     out = tmp_path / "out"
     assert run("export", [str(tmp_path / "a.ply"), "--out", str(out), *options, *view]) == 0
     moved = moved_to_unit(load_ply(tmp_path / "a.ply"), *unit_frame(gaussians))

@@ -1,0 +1,169 @@
+"""What people and their telephones give: a result, or one line and nothing half-written."""
+
+import os
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from helpers.images import disc_on_noise
+from PIL import Image
+
+from gamba_warp import cli
+from gamba_warp import images as pictures
+from gamba_warp.errors import UserError
+from gamba_warp.images import load_rgba, picture_size, save_image, to_uint8
+from gamba_warp.photo.cutout import cut_out
+
+
+def photo(size=(96, 128)):
+    return Image.fromarray(to_uint8(disc_on_noise(size)[0]))
+
+
+def reconstruct(*words):
+    quick = ("--turntable", "none", "--no-page")
+    return cli.run("reconstruct", [str(word) for word in (*words, *quick)])
+
+
+def png_of_size(width, height):
+    """A PNG whose header states a size, with hardly any data."""
+
+    def chunk(kind, data):
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 999)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def bad(folder):
+    """Files by name, each with what its line says."""
+    frames = [photo(), photo().transpose(Image.Transpose.ROTATE_180)]
+    frames[0].save(folder / "animated.gif", save_all=True, append_images=frames[1:])
+    frames[0].save(folder / "animated.webp", save_all=True, append_images=frames[1:])
+    (folder / "huge.png").write_bytes(png_of_size(20_000, 20_000))
+    (folder / "long.png").write_bytes(png_of_size(40_000, 2))
+    (folder / "page.jpg").write_bytes(b"<html><body>404 not found</body></html>")
+    (folder / "empty.jpg").touch()
+    (folder / "half.jpg").write_bytes(b"")
+    photo().save(folder / "half.jpg")
+    (folder / "half.jpg").write_bytes((folder / "half.jpg").read_bytes()[:1500])
+    (folder / "film.heic").write_bytes(b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + b"\0" * 99)
+    save_image(folder / "nothing.png", np.full((50, 60, 3), 0.7))
+    save_image(folder / "everywhere.png", np.random.default_rng(0).random((60, 60, 3)))
+    return {
+        "animated.gif": "animated picture (2 frames)",
+        "animated.webp": "animated picture (2 frames)",
+        "huge.png": "is over 64 megapixels",
+        "long.png": "is over 32768 pixels long",
+        "page.jpg": "not a picture that can be read",
+        "empty.jpg": "the file is empty",
+        "half.jpg": "cannot be decoded",
+        "film.heic": "",
+        "nothing.png": "no object found",
+        "everywhere.png": "cannot tell object from background",
+        "missing.jpg": "no such file",
+    }
+
+
+def test_what_cannot_be_reconstructed_is_one_line(tmp_path, capsys):
+    reasons, out = bad(tmp_path), tmp_path / "out"
+    files = [tmp_path / name for name in reasons]
+    assert reconstruct(*files, "--out", out, "--save-inputs") == 1
+    lines = [s for s in capsys.readouterr().err.splitlines() if s.startswith("gamba: failed: ")]
+    assert len(lines) == len(files)
+    for name, reason in reasons.items():
+        (line,) = (line for line in lines if f"/{name}: " in line)
+        assert f"{tmp_path / name}: " in line and reason in line
+    assert not any(out.iterdir())
+
+
+def test_outputs_that_cannot_be_written(tmp_path, capsys):
+    photo().save(tmp_path / "a.png")
+    (tmp_path / "file").touch()
+    assert reconstruct(tmp_path / "a.png", "--out", tmp_path / "file") == 2
+    if os.path.isdir("/proc/self"):  # where not even root may make a folder
+        assert reconstruct(tmp_path / "a.png", "--out", "/proc/gamba") == 2
+    (tmp_path / "out" / "a.ply").mkdir(parents=True)  # a folder where a result is to be
+    assert reconstruct(tmp_path / "a.png", "--out", tmp_path / "out") == 1
+    assert not any((tmp_path / "out" / "a.ply").iterdir())
+    errors = capsys.readouterr().err
+    assert "cannot write into" in errors and "a.ply" in errors
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.ply"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_folders_without_permission(tmp_path):
+    photo().save(tmp_path / "a.png")
+    (tmp_path / "shut").mkdir(mode=0o500)
+    assert reconstruct(tmp_path / "a.png", "--out", tmp_path / "shut") == 2
+    (tmp_path / "a.png").chmod(0)
+    assert reconstruct(tmp_path / "a.png", "--out", tmp_path / "out") == 1
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "I;16", "RGB", "LAB"])
+def test_other_colours_are_the_same_object(tmp_path, mode):
+    rgb, alpha = disc_on_noise((96, 128))
+    white = Image.fromarray(to_uint8(rgb * alpha[..., None] + 1 - alpha[..., None]))
+    name = {"I;16": "a.png", "CMYK": "a.jpg", "LAB": "a.tif"}.get(mode, "a.webp")
+    if mode == "I;16":
+        white = Image.fromarray(np.asarray(white.convert("L")).astype(np.uint16) * 257)
+    elif mode == "LAB":
+        from PIL import ImageCms
+
+        profiles = ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")
+        white = ImageCms.profileToProfile(white, *profiles, outputMode="LAB")
+    else:
+        white = white.convert(mode)
+    white.save(tmp_path / name)
+    found = cut_out(tmp_path / name)
+    assert found.method == "plain"
+    assert np.minimum(found.mask, alpha).sum() / np.maximum(found.mask, alpha).sum() > 0.93
+
+
+@pytest.mark.parametrize("data", [b"Exif\0\0MM\0\x2a\xff\xff\xff\xff", b"Exif\0\0" + b"\xff" * 60])
+def test_a_broken_exif_is_no_broken_picture(tmp_path, data):
+    photo().save(tmp_path / "a.jpg", exif=data)
+    assert load_rgba(tmp_path / "a.jpg").shape == (96, 128, 4)
+    assert cut_out(tmp_path / "a.jpg").method == "grabcut"
+
+
+def test_pictures_of_telephones(tmp_path):
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    upright = photo((64, 96))
+    turned = upright.transpose(Image.Transpose.ROTATE_90)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    turned.save(tmp_path / "a.heic", exif=exif.tobytes(), quality=95)
+    assert picture_size(tmp_path / "a.heic") == (96, 64)
+    want = np.asarray(upright, np.float32) / 255
+    assert np.abs(load_rgba(tmp_path / "a.heic")[..., :3] - want).mean() < 0.03
+    (tmp_path / "b.jpg").write_bytes((tmp_path / "a.heic").read_bytes())  # by content, not by name
+    assert load_rgba(tmp_path / "b.jpg").shape == (64, 96, 4)
+    found, failures = pictures.find_pictures([tmp_path])
+    assert [p.name for p in found] == ["a.heic", "b.jpg"] and not failures
+    data = (tmp_path / "a.heic").read_bytes()
+    for count in (11, 12, 40, len(data) // 2):
+        (tmp_path / "c.heic").write_bytes(data[:count])
+        with pytest.raises(UserError, match=r"c\.heic: "):
+            load_rgba(tmp_path / "c.heic")
+
+
+def test_avif(tmp_path):
+    if not pictures.features.check("avif"):
+        pytest.skip("this Pillow has no AVIF")
+    photo().save(tmp_path / "a.avif", quality=90)
+    want = np.asarray(photo(), np.float32) / 255
+    assert np.abs(load_rgba(tmp_path / "a.avif")[..., :3] - want).mean() < 0.03
+
+
+def test_a_heic_without_its_reader_says_what_it_needs(tmp_path, monkeypatch):
+    import sys
+
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(UserError, match=r"a\.heic: .*pip install 'gamba-warp\[photo\]'"):
+        load_rgba(tmp_path / "a.heic")
