@@ -31,6 +31,7 @@ _USED = (
 # The extra that brings a library (by the name it is imported by). A command that has an extra of
 # its own names that instead, where it holds the library too.
 EXTRA_OF = {
+    "gradio": "app",
     "gsplat": "fit",
     "huggingface_hub": "hub",
     "imageio_ffmpeg": "video",
@@ -46,6 +47,7 @@ EXTRA_OF = {
 }
 OWN = {
     "ablate": "all",
+    "app": "app",
     "demo": "all",
     "data pack": "train",
     "data primitives": "mesh",
@@ -67,11 +69,13 @@ HOLDS = {
     "mesh": set(_SHAPES),
     "eval": set(_SHAPES),
     "fit": {"gsplat", "kornia"},
+    "app": {"gradio", "imageio_ffmpeg", *_SHAPES},
     "all": set(EXTRA_OF),
 }
 # What a command cannot begin without; what only some of its options need is found missing then.
 NEEDS = {
     "ablate": ("kornia",),
+    "app": ("gradio",),
     "data primitives": ("trimesh",),
     "data render": ("trimesh", "open3d"),
     "data gso": ("trimesh", "open3d"),

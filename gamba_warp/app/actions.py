@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gradio as gr
 
 from ..errors import UserError, first_line
+from ..versions import advice
 from . import work
 from .cutting import Cut, cut_picture, editor_picture, mended, restarted
 from .examples import examples
@@ -34,8 +35,13 @@ def plainly(function: Callable) -> Callable:
     def careful(*args: Any) -> Any:
         try:
             return function(*args)
-        except (UserError, MemoryError, ModuleNotFoundError) as error:
+        except (UserError, MemoryError) as error:
             raise _error(error) from None
+        except ModuleNotFoundError as error:
+            reason = advice(error.name or "", "app")
+            if reason is None:
+                raise
+            raise _error(UserError(reason)) from None
         except RuntimeError as error:  # torch's errors of memory have no type of their own
             if "memory" not in str(error):
                 raise

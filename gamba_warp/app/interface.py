@@ -128,7 +128,7 @@ def _cut_part() -> _CutPart:
             elem_id="brush",
         )
         with gr.Row():
-            mend = gr.Button("Mend the cut-out", size="md", min_width=120)
+            mend = gr.Button("Apply strokes", size="md", min_width=120)
             restart = gr.Button("Start over", size="md", min_width=120)
         make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
     return _CutPart(group, editor, note, brush, mend, restart, make)
