@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 from unicodedata import normalize
 
-from .errors import UserError, first_line
+from .errors import UserError, first_line, one_line
 
 Item = TypeVar("Item")
 # What one bad input may raise: everything else is a defect of the program, and stops it.
@@ -44,6 +44,13 @@ def for_each(
         except EXPECTED as error:
             failures.append((item, first_line(error).removeprefix(f"{item}: ")))
     return failures
+
+
+def say(line: str) -> None:
+    """Prints a line about an item on stdout, above the progress bar of ``for_each``."""
+    from tqdm import tqdm
+
+    tqdm.write(one_line(line))
 
 
 def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: Path) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError, features
 
 from .errors import UserError, first_line
 from .files import atomic_path
@@ -23,7 +23,10 @@ MAX_SIDE = 32_768  # pixels; panoramas are shorter, and what pads to a square st
 # Pillow knows thirty more; one of them (EPS) starts another program, and none is a photo's.
 # JPEG stands for MPO too.
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM")
+# What phones and browsers make; pillow-heif brings the first, most builds of Pillow the second.
+_PHONES = ("HEIF", "AVIF")
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
+PICTURE_SUFFIXES |= {".heic", ".heif", ".avif"}
 
 _COUNTED = 16 << 20  # bytes of a file whose frames are counted, which reads all of it
 _BAND = 1 << 22  # pixels that are converted at once
@@ -122,7 +125,8 @@ def _without_warnings() -> Iterator[None]:
 def load_rgba(path: str | Path, longest: int | None = None) -> np.ndarray:
     """Reads one still picture.
 
-    Grey, palette, RGB and RGBA files of 8 and 16 bits are converted, and EXIF rotation is applied.
+    Grey, palette, RGB, CMYK and RGBA files of 8 and 16 bits are converted, and EXIF rotation is
+    applied. HEIC needs pillow-heif.
 
     Args:
         path: the file.
@@ -159,13 +163,36 @@ def picture_size(path: str | Path) -> tuple[int, int]:
 
 @contextmanager
 def _still(path: str | Path) -> Iterator[Image.Image]:
-    with open_picture(path, max_pixels=MAX_PIXELS) as image:
-        # An MPO is a phone's JPEG, followed by a preview or a depth map.
-        if image.format != "MPO" and getattr(image, "is_animated", False):
+    with open_picture(path, formats=(*FORMATS, *_phones(path))) as image:
+        # An MPO is a phone's JPEG, followed by a preview or a depth map; so is a HEIC.
+        if image.format not in ("MPO", "HEIF") and getattr(image, "is_animated", False):
             small = os.path.getsize(path) <= _COUNTED
             frames = getattr(image, "n_frames", 1) if small else "many"
             raise UserError(f"{path}: animated picture ({frames} frames); give one frame")
         yield image
+
+
+def _phones(path: str | Path) -> tuple[str, ...]:
+    """The formats of phones, if a file is of these. Raises UserError if no reader is installed."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(12) if stat.S_ISREG(os.stat(path).st_mode) else b""
+    except (OSError, ValueError):
+        return ()  # ``open_picture`` says why
+    if head[4:8] != b"ftyp":
+        return ()
+    if head[8:12] in (b"avif", b"avis"):
+        if not features.check("avif"):
+            raise UserError(f"{path}: an AVIF, which this build of Pillow cannot read")
+        return ("AVIF",)
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError as error:
+        raise UserError(
+            f"{path}: if it is a HEIC, it needs pillow-heif: pip install 'gamba-warp[photo]'"
+        ) from error
+    register_heif_opener(thumbnails=False)
+    return ("HEIF",)
 
 
 def _orientation(image: Image.Image) -> int:

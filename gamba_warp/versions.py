@@ -25,6 +25,8 @@ _USED = (
     "open3d-cpu",
     "open3d",
     "imageio-ffmpeg",
+    "onnxruntime",
+    "pillow-heif",
     "gsplat",
     "tyro",
 )
@@ -36,7 +38,10 @@ EXTRA_OF = {
     "huggingface_hub": "hub",
     "imageio_ffmpeg": "video",
     "kornia": "eval",
+    "onnxruntime": "photo",
     "open3d": "mesh",
+    "pillow_heif": "photo",
+    "pooch": "photo",
     "pymeshlab": "mesh",
     "scipy": "mesh",
     "skimage": "mesh",
@@ -64,7 +69,7 @@ OWN = {
 }
 _SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
-    "photo": {"kornia", "skimage"},
+    "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
     "train": {"kornia", "tensorboard", "timm", "webdataset"},
     "mesh": set(_SHAPES),
     "eval": set(_SHAPES),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ..batch import check_not_read, for_each, plan_outputs, report
+from ..batch import check_not_read, for_each, plan_outputs, report, say
 from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -35,7 +35,9 @@ def reconstruct_command(
     page: bool = True,
     sheet: Path | None = None,
     mask: Path | None = None,
+    matte_model: Path | None = None,
     sam: Path | None = None,
+    save_inputs: bool = False,
     ply_frame: Axes = "opencv",
     min_opacity: Opacity = 0.0,
     device: DeviceChoice = "auto",
@@ -56,16 +58,21 @@ def reconstruct_command(
         sheet: Also one picture of all results: each input, and five views around it (.png, .webp,
             .jpg).
         mask: Picture that is white where the object is (for a single image).
-        sam: Segment Anything checkpoint, for pictures with a busy background.
+        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out; if not given, one that
+            rembg keeps on this machine, or it is fetched once (179 MB).
+        sam: Segment Anything checkpoint, in place of that: sam_vit_b_01ec64.pth of
+            github.com/facebookresearch/segment-anything, or mobile_sam.pt of
+            github.com/ChaoningZhang/MobileSAM.
+        save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Device that computes; auto is the GPU if there is one.
     """
-    from ..data.preprocess import SamSegmenter, prepare
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
     from ..model.predict import reconstruct
     from ..pages.card import about_model
     from ..pages.outputs import Outputs, write_outputs
+    from ..photo.cutout import Ways, cut_out
 
     pictures, failures = _found(images, mask)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
@@ -82,20 +89,23 @@ def reconstruct_command(
         min_opacity=min_opacity,
         checkpoint=checkpoint,
         about=about_model(file),
+        inputs=save_inputs,
     )
-    reads = (mask, sam, file, encoder_weights)
+    reads = (mask, matte_model, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
     model = load_model(checkpoint, chosen, encoder_weights)
-    segmenter = None if sam is None else SamSegmenter(sam, chosen)
+    ways = Ways(mask, matte_model, sam, chosen)
+    ways.check()
     output_folder(out)
 
     def one(name: str, path: Path) -> None:
-        rgba = prepare(path, mask=mask, segmenter=segmenter)
+        cut = cut_out(path, ways)
+        say(f"{path}: {cut.how}")
         started = time.perf_counter()
-        gaussians = reconstruct(model, rgba).to("cpu")  # waits for the device
+        gaussians = reconstruct(model, cut.rgba).to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
-        write_outputs(name, rgba, gaussians.to(chosen), outputs, model.config, seconds)
+        write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
 
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:

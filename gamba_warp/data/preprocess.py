@@ -130,14 +130,14 @@ def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
     full = dilation(np.where(background, 0.0, difference), np.ones((5, 5)))
     share = np.clip(difference / np.maximum(full, 1e-6), 0.0, 1.0)
     alpha = np.where(background, 0.0, np.where(rim, share, 1.0))
-    alpha = _without_specks(alpha)
+    alpha = without_specks(alpha)
     weight = np.maximum(alpha, 1e-3)[..., None]
     inside = np.clip((rgb - (1 - weight) * colour) / weight, 0.0, 1.0)
     return np.dstack([inside, alpha]).astype(np.float32)
 
 
-def _without_specks(alpha: np.ndarray) -> np.ndarray:
-    """Clears parts under 1 % of the largest one, since dust would move the object's bounds."""
+def without_specks(alpha: np.ndarray) -> np.ndarray:
+    """Clears parts of ``[H, W]`` under 1 % of the largest: dust would move the object's bounds."""
     from skimage.measure import label
 
     parts = cast(np.ndarray, label(alpha > 0))

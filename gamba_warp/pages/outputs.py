@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from ..conventions import Axes
 from ..formats.gaussians.files import write_gaussians
 from ..formats.names import MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
+from ..images import save_image
 from ..model.config import GambaConfig
+from ..photo.cutout import CutOut
 from ..surfaces.files import write_meshes
 from ..surfaces.options import SurfaceOptions
 from .page import Section, reconstruction_page
@@ -37,6 +37,7 @@ class Outputs:
         checkpoint: the model's file, named in the ``.ply``.
         about: labels and texts for the page, of the model.
         sheet: gets a row of each picture, or None.
+        inputs: whether each cut-out is written, too, as ``NAME-input.png``.
     """
 
     folder: Path
@@ -51,18 +52,20 @@ class Outputs:
     checkpoint: Path
     about: Sequence[tuple[str, str]] = ()
     sheet: Sheet | None = None
+    inputs: bool = False
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
         found = [splat_suffix(kind) for kind in self.splats]
         found += [f"-mesh.{kind}" for kind in self.mesh]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
+        found += ["-input.png"] if self.inputs else []
         return found + ([".html"] if self.page else [])
 
 
 def write_outputs(
     name: str,
-    rgba: np.ndarray,
+    cut: CutOut,
     gaussians: Gaussians,
     outputs: Outputs,
     config: GambaConfig,
@@ -72,7 +75,7 @@ def write_outputs(
 
     Args:
         name: stem of the files.
-        rgba: ``[S, S, 4]``, what was reconstructed.
+        cut: what was reconstructed, and how it was cut out.
         gaussians: ``[N]``, on the device that is to render the turntable.
         outputs: what to write.
         config: of the model, for the camera.
@@ -82,13 +85,15 @@ def write_outputs(
         UserError: a file cannot be written, or no Gaussian can be.
     """
     base = outputs.folder / name
+    if outputs.inputs:
+        save_image(base.with_name(f"{name}-input.png"), cut.editable)
     _write_gaussians(base, gaussians, outputs)
     if outputs.mesh:
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         options, device = SurfaceOptions(colors=True), gaussians.means.device
         write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
     if outputs.sheet is not None:
-        outputs.sheet.add(name, rgba, gaussians, config)
+        outputs.sheet.add(name, cut.rgba, gaussians, config)
     if outputs.turntable == "none" and not outputs.page:
         return
     distance, fov = config.distance, config.fov
@@ -105,7 +110,8 @@ def write_outputs(
         ]
         section = Section(
             name,
-            picture=rgba,
+            text=cut.note,
+            picture=cut.rgba,
             turntable=turn,
             gaussians=gaussians,
             table=table,

@@ -24,6 +24,7 @@ from ..data.preprocess import (
     read_mask,
     recenter,
     shrink,
+    without_specks,
 )
 from ..errors import UserError
 from ..images import load_rgba
@@ -33,8 +34,8 @@ from .matte import Matte, NoMatte, to_stderr
 Method = Literal["alpha", "mask", "plain", "matte", "sam", "grabcut"]
 
 MEND = (
-    "If it is wrong: gamba reconstruct --save-inputs writes the cut-out as NAME-input.png; erase or "
-    "restore parts of it in a picture editor and give that file, or give --mask FILE."
+    "If it is wrong: gamba reconstruct --save-inputs writes the cut-out as NAME-input.png; erase "
+    "or restore parts of it in a picture editor and give that file, or give --mask FILE."
 )
 _HOW: dict[str, str] = {
     "alpha": "The picture's own transparency is the cut-out.",
@@ -45,8 +46,10 @@ _HOW: dict[str, str] = {
     "grabcut": "Colours alone (GrabCut) cut the object out, which they expect in the middle{why}.",
 }
 _LEAST_SHARE, _MOST_SHARE = 0.003, 0.95  # of the picture that an object covers
-_MOST_EDGE = 0.75  # share of the picture's border that an object may cover
+_MOST_EDGE = 0.7  # share of the picture's border that an object may cover
 _UNSURE = 0.4  # largest share of an alpha's sum in pixels that are neither object nor background
+
+_HAZE = 0.1  # a fainter alpha than this is none
 
 
 @dataclass
@@ -109,25 +112,28 @@ class CutOut:
     """An object that was cut out of a picture.
 
     Attributes:
-        rgba: ``[S, S, 4]`` float32 in [0, 1]: the object in the middle, its longer side ``0.8 · S``.
+        rgba: ``[S, S, 4]`` float32 in [0, 1]: the object in the middle, its longer side
+            ``0.8 · S``.
         method: the way in which it was found.
-        note: how it was cut, and how to mend it.
+        how: that in a sentence.
         source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels a side.
         mask: alpha of the object in it, ``[H, W]`` float32 in [0, 1].
+        editable: ``[H, W, 4]`` float32: the whole picture, of which the transparent parts keep
+            their colours. As a PNG it can be given again, and an editor can bring back what was
+            cut away wrongly.
     """
 
     rgba: np.ndarray
     method: Method
-    note: str
+    how: str
     source_rgb: np.ndarray
     mask: np.ndarray
+    editable: np.ndarray
 
-    def editable(self) -> np.ndarray:
-        """``[H, W, 4]``: the whole picture, of which the transparent parts keep their colours.
-
-        As a PNG it can be given again, and an editor can bring back what was cut away wrongly.
-        """
-        return np.dstack([self.source_rgb, self.mask])
+    @property
+    def note(self) -> str:
+        """How it was cut, and how to mend it."""
+        return f"{self.how} {MEND}"
 
 
 def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
@@ -165,7 +171,9 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     how = _HOW[method].format(
         mask=Path(ways.mask or "").name, model=model and model.path.name, why=why
     )
-    return CutOut(centred, method, f"{how} {MEND}", source, rgba[..., 3])
+    colors = np.where(rgba[..., 3:] > 0, rgba[..., :3], source)
+    editable = np.dstack([colors, rgba[..., 3]])
+    return CutOut(centred, method, how, source, rgba[..., 3], editable)
 
 
 def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.ndarray, str]:
@@ -190,7 +198,7 @@ def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.nd
         alpha, fault = None, str(error)
     if alpha is not None and fault is None:
         return "matte", _blended(rgb, alpha), ""
-    reasons.append(f"matting model: {fault}")
+    reasons.append(f"matting model: {fault}" if alpha is not None else str(fault))
     alpha = grabcut(rgb)
     fault = fault_of(alpha)
     if fault is None:
@@ -228,6 +236,8 @@ def _blended(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     Colours of object and background are estimated as means around, weighted by alpha (the fusion of
     blurs of Forte 2021), so that no fringe is left on another background.
     """
+    alpha = np.where(alpha < _HAZE, 0, alpha)  # it would move the object's bounds
+    alpha = without_specks(alpha) if find_spec("skimage") is not None else alpha
     picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
     share = torch.from_numpy(np.ascontiguousarray(alpha, np.float32))[None, None]
     size = 2 * max(2, max(rgb.shape[:2]) // 64) + 1

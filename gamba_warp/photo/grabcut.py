@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 _SIDE = 256  # longer side of the picture in which the cut is made, pixels
+_LEAST = 16  # shorter side of a picture that is cut, pixels
 _ROUNDS = 5  # of mixtures and cut
 _STEPS = 150  # of the primal-dual iteration in each round, which begins where the last one ended
 _PARTS = 5  # Gaussians of a mixture
@@ -40,8 +41,10 @@ def grabcut(rgb: np.ndarray) -> np.ndarray:
         differs from the rest.
     """
     height, width = rgb.shape[:2]
+    if min(height, width) < _LEAST:
+        return np.zeros((height, width), np.float32)
     factor = min(1.0, _SIDE / max(height, width))
-    small = (max(2, round(height * factor)), max(2, round(width * factor)))
+    small = (max(4, round(height * factor)), max(4, round(width * factor)))
     picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
     colors = _resized(picture, small)[0].permute(1, 2, 0).contiguous().numpy()
     inside = torch.from_numpy(_connected(_cut(colors)))
@@ -189,7 +192,7 @@ def _connected(inside: np.ndarray) -> np.ndarray:
 
 def _fitted(alpha: Tensor, picture: Tensor, radius: int) -> Tensor:
     """Lays the border of an alpha that was enlarged on that of the picture (a guided filter)."""
-    size = 2 * radius + 3
+    size = 2 * radius + 1
 
     def mean(planes: Tensor) -> Tensor:
         return functional.avg_pool2d(planes, size, 1, size // 2, count_include_pad=False)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ..data.preprocess import resize_rgba
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..images import to_uint8
 from ..untrusted.children import Failed, run_each
 from . import models, network
@@ -69,7 +69,10 @@ class Matte:
 
     def _run(self, rgb: np.ndarray | None) -> np.ndarray | None:
         task = (str(self.path.absolute()), self._version, rgb, torch.get_num_threads())
-        ((_, value),) = run_each(network.alpha_of, [task], seconds=_SECONDS, memory=_MEMORY)
+        try:
+            ((_, value),) = run_each(network.alpha_of, [task], seconds=_SECONDS, memory=_MEMORY)
+        except RuntimeError as error:  # no child could be started
+            value = Failed(first_line(error))
         if not isinstance(value, Failed):
             return value
         reason = value.reason.removeprefix(f"{task[0]}: ")

@@ -51,7 +51,7 @@ class NotFetched(Exception):
 
 
 def _homes() -> tuple[Path, Path]:
-    """rembg's folder, and the one that it had before: both are looked into, as it does itself."""
+    """The folder of rembg, and the one that it had before: it looks into both itself."""
     chosen, data = os.environ.get("U2NET_HOME"), os.environ.get("XDG_DATA_HOME")
     if chosen:
         return Path(chosen).expanduser(), Path(chosen).expanduser()

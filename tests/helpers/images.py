@@ -48,3 +48,17 @@ def cut_out(path, colour=(0.8, 0.3, 0.1)):
     rgba[4:16, 8:24] = (*colour, 1)
     save_image(path, rgba)
     return path
+
+
+def disc_on_noise(size: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A red disc in the middle of blue and green blocks, ``[H, W, 3]``, and its alpha."""
+    height, width = size
+    rng = np.random.default_rng(seed)
+    blocks = rng.random((height // 8 + 1, width // 8 + 1, 3)) * (0.3, 0.8, 0.9)
+    rgb = np.kron(blocks, np.ones((8, 8, 1)))[:height, :width]
+    y, x = np.mgrid[:height, :width]
+    far = np.hypot(y - height / 2 + 0.5, x - width / 2 + 0.5)
+    alpha = np.clip(0.3 * min(size) + 0.5 - far, 0, 1)[..., None]
+    red = np.array([0.9, 0.15, 0.1]) + rng.normal(0, 0.03, (height, width, 3))
+    picture = alpha * red + (1 - alpha) * rgb
+    return picture.clip(0, 1).astype(np.float32), alpha[..., 0].astype(np.float32)

@@ -65,7 +65,7 @@ def declared():
 def test_each_library_is_in_the_extras_that_are_named():
     found = declared()
     distributions = {"skimage": "scikit-image", "imageio_ffmpeg": "imageio-ffmpeg"}
-    distributions["huggingface_hub"] = "huggingface-hub"
+    distributions |= {"huggingface_hub": "huggingface-hub", "pillow_heif": "pillow-heif"}
     for library, extra in versions.EXTRA_OF.items():
         name = distributions.get(library, library)
         holding = {extra} | {e for e, libraries in versions.HOLDS.items() if library in libraries}

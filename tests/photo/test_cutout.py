@@ -1,0 +1,208 @@
+"""The ways to an object, in their order; each says what it did, and its result can be mended."""
+
+import numpy as np
+import pytest
+from helpers.images import disc_on_noise
+
+from gamba_warp.data.preprocess import recenter
+from gamba_warp.errors import UserError
+from gamba_warp.hostile.seeds.networks import matting_network
+from gamba_warp.images import load_rgba, save_image
+from gamba_warp.photo import cutout, matte, models
+from gamba_warp.photo.cutout import Ways, cut_out, fault_of
+
+SIZE = (140, 211)
+
+
+@pytest.fixture
+def network(tmp_path):
+    """A network that takes red for object."""
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "red.onnx"
+    path.write_bytes(matting_network(size=352))
+    return path
+
+
+@pytest.fixture
+def busy(tmp_path):
+    rgb, alpha = disc_on_noise(SIZE)
+    save_image(tmp_path / "busy.png", rgb)
+    return tmp_path / "busy.png", alpha
+
+
+def iou(a, b):
+    return np.minimum(a, b).sum() / np.maximum(a, b).sum()
+
+
+def test_each_way_in_its_order(tmp_path, network, busy):
+    path, alpha = busy
+    rgb = load_rgba(path)[..., :3]
+    transparent, plain, mask = (tmp_path / f"{n}.png" for n in ("alpha", "plain", "mask"))
+    save_image(transparent, np.dstack([rgb, alpha]))
+    save_image(plain, rgb * alpha[..., None] + 1 - alpha[..., None])
+    half = alpha * (np.arange(SIZE[1]) < SIZE[1] // 2)
+    save_image(mask, half)
+    ways = Ways(matte_model=network)
+    for file, how, want in (
+        (transparent, "alpha", alpha),
+        (plain, "plain", alpha),
+        (path, "matte", alpha),
+    ):
+        found = cut_out(file, ways)
+        assert found.method == how and iou(found.mask, want) > 0.93
+        assert found.source_rgb.shape == (*SIZE, 3) and found.mask.shape == SIZE
+        assert found.rgba.shape[0] == found.rgba.shape[1] and found.rgba.dtype == np.float32
+        assert found.note.startswith(found.how) and "--save-inputs" in found.note
+    assert "red.onnx" in found.how
+    found = cut_out(path)  # conftest.py forbids the network, and no model is kept
+    assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85
+    assert "no matting model is here" in found.how and models.PUBLISHED[0].address in found.how
+    for file in (path, transparent, plain):  # a mask is somebody's word
+        found = cut_out(file, Ways(mask=mask, matte_model=network))
+        assert found.method == "mask" and iou(found.mask, half) > 0.99 and "mask.png" in found.how
+
+
+def test_a_matte_without_an_object_gives_way(tmp_path, busy):
+    pytest.importorskip("onnxruntime")
+    path, alpha = busy
+    for name, options, reason in (
+        ("none", dict(bias=-60.0), "nothing stands out"),
+        ("all", dict(bias=60.0), "all of the picture would be the object"),
+        ("vague", dict(weights=(0.1, 0, 0), bias=0.05), "it has no clear border"),
+    ):
+        file = tmp_path / f"{name}.onnx"
+        file.write_bytes(matting_network(size=352, **options))
+        found = cut_out(path, Ways(matte_model=file))
+        # vague is over one half everywhere
+        assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85, name
+        assert reason in found.how or name == "vague"
+
+
+def test_sam_comes_before_the_matte(network, busy, monkeypatch):
+    path, alpha = busy
+    ways = Ways(matte_model=network, sam="sam.pth")
+    square = np.zeros(SIZE, np.float32)
+    square[40:100, 60:140] = 1
+    monkeypatch.setattr(cutout, "SamSegmenter", lambda *_: lambda rgb: square)
+    found = cut_out(path, ways)
+    assert found.method == "sam" and iou(found.mask, square) == 1
+    square[:] = 0
+    assert cut_out(path, ways).method == "matte"
+
+
+def test_what_no_way_cuts_is_one_line(tmp_path):
+    path = tmp_path / "noise.png"
+    save_image(path, np.random.default_rng(0).random((40, 50, 3)))
+    with pytest.raises(UserError) as caught:
+        cut_out(path)
+    for word in (str(path), "cannot tell object", "GrabCut", "--mask", "--matte-model", "--sam"):
+        assert word in str(caught.value)
+
+
+def test_the_cut_out_can_be_mended_and_given_again(tmp_path, network, busy):
+    path, _ = busy
+    first = cut_out(path, Ways(matte_model=network))
+    assert first.editable.shape == (*SIZE, 4)
+    away = first.mask == 0
+    np.testing.assert_array_equal(first.editable[away][:, :3], first.source_rgb[away])
+    edited = tmp_path / "busy-input.png"
+    save_image(edited, first.editable)
+    again = cut_out(edited)
+    assert again.method == "alpha"
+    # 8 bits, also of the alpha from which the object's bounds are taken
+    np.testing.assert_allclose(again.mask, first.mask, atol=0.51 / 255)
+    pixels = load_rgba(edited)
+    pixels[:, :20, 3] = 1  # brought back by hand: the colours are still there
+    save_image(edited, pixels)
+    mended = cut_out(edited)
+    np.testing.assert_allclose(mended.rgba, recenter(pixels), atol=1e-6)
+    source = load_rgba(path)[:, :20, :3]
+    np.testing.assert_allclose(mended.source_rgb[:, :20], source, atol=0.51 / 255)
+
+
+def test_no_fringe_of_the_background_is_left():
+    alpha = disc_on_noise((80, 80))[1]
+    soft = np.clip(alpha * 1.0, 0, 1)
+    red, green = np.array([0.9, 0.1, 0.1]), np.array([0.0, 0.9, 0.2])
+    rgb = (soft[..., None] * red + (1 - soft[..., None]) * green).astype(np.float32)
+    clean = cutout._blended(rgb, soft)
+    rim = (soft > 0.1) & (soft < 0.9)
+    assert rim.sum() > 30 and np.abs(rgb[rim] - red).max() > 0.5
+    assert np.abs(clean[rim][:, :3] - red).max() < 0.12  # what blurs cannot tell apart
+    np.testing.assert_array_equal(clean[soft == 1][:, :3], rgb[soft == 1])
+
+
+@pytest.mark.parametrize(
+    "box, fault",
+    [
+        ((0, 0, 0, 0), "nothing stands out"),
+        ((0, 100, 0, 100), "all of the picture"),
+        ((0, 92, 0, 100), "touch"),
+        ((0, 100, 0, 40), None),
+        ((40, 47, 40, 47), None),
+    ],
+)
+def test_masks_are_judged(box, fault):
+    alpha = np.zeros((100, 100), np.float32)
+    alpha[box[0] : box[1], box[2] : box[3]] = 1
+    found = fault_of(alpha)
+    assert found is None if fault is None else fault in found
+
+
+def test_models_are_found_where_rembg_keeps_them(tmp_path, monkeypatch):
+    for name in ("U2NET_HOME", "REMBG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert models.kept() is None
+    old = tmp_path / ".u2net" / "u2netp.onnx"
+    new = tmp_path / ".rembg" / "models" / "u2net" / "u2net.onnx"
+    for path in (old, new):
+        path.parent.mkdir(parents=True)
+        path.touch()
+        assert models.kept() == path  # the second is the better one
+    monkeypatch.setenv("U2NET_HOME", str(old.parent))
+    assert models.kept() == old
+    monkeypatch.delenv("U2NET_HOME")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert models.kept() is None
+
+
+def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypatch, busy):
+    pytest.importorskip("onnxruntime")
+    pooch = pytest.importorskip("pooch")
+    path, _ = busy
+    said, asked = [], []
+
+    def retrieve(address, **options):
+        asked.append((address, options["known_hash"], list(said)))
+        raise ConnectionError("no route")
+
+    monkeypatch.setattr(pooch, "retrieve", retrieve)
+    assert cut_out(path, Ways(say=said.append)).method == "grabcut"
+    assert not asked and not said  # GAMBA_OFFLINE
+    monkeypatch.setenv("GAMBA_OFFLINE", "0")
+    assert cut_out(path, Ways(fetch=False, say=said.append)).method == "grabcut" and not asked
+    ways = Ways(say=said.append)
+    for _ in range(2):
+        found = cut_out(path, ways)
+        assert found.method == "grabcut" and "github.com cannot be reached" in found.how
+    ((address, digest, before),) = asked
+    assert address == models.PUBLISHED[0].address and digest.startswith("md5:")
+    assert len(before) == 1 and address in before[0] and "179 MB" in before[0]
+
+
+def test_a_kept_model_that_is_damaged_gives_way(tmp_path, monkeypatch, busy):
+    pytest.importorskip("onnxruntime")
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+    (tmp_path / "u2net.onnx").write_bytes(b"half of a fi")
+    found = cut_out(busy[0])
+    assert found.method == "grabcut" and "not a model in ONNX" in found.how
+
+
+def test_without_the_extra_colours_alone_cut(monkeypatch, busy):
+    for module in (cutout, matte):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    found = cut_out(busy[0])
+    assert found.method == "grabcut" and "pip install 'gamba-warp[photo]'" in found.how
+    with pytest.raises(ModuleNotFoundError, match="onnxruntime"):
+        Ways(matte_model="model.onnx").check()
