@@ -51,9 +51,7 @@ def own_frame(gaussians: Gaussians, name: str) -> Frame:
         UserError: the object has no extent.
     """
     opacities = gaussians.opacities.detach().cpu().numpy()
-    means = (
-        gaussians.means.detach().double().cpu().numpy()[opacities >= min(_COUNTS, opacities.max())]
-    )
+    means = gaussians.means.detach().double().cpu().numpy()[opacities >= min(_COUNTS, opacities.max())]
     low, high = np.percentile(means, [0.5, 99.5], axis=0)
     reach = 4 * float(gaussians.scales.detach().double().median())
     size = max(float((high - low).max()), reach)

@@ -20,15 +20,7 @@ from ..gaussians import Gaussians
 from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
 
 _PROGRAM = Path(__file__).parent / "program"
-_SCRIPTS = (
-    "shaders",
-    "gl",
-    "sorter",
-    "camera",
-    "controls",
-    "ui",
-    "main",
-)  # as they need each other
+_SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "ui", "main")  # as they need each other
 # The page may load only what is inlined in it. The worker that sorts is made of a text of the page.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "

@@ -54,9 +54,7 @@ def browser() -> Iterator[Any]:
     program = next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip(f"needs a browser: none of {', '.join(NAMES)} is installed")
-    library = pytest.importorskip(
-        "playwright.sync_api", reason="needs playwright, which is missing"
-    )
+    library = pytest.importorskip("playwright.sync_api", reason="needs playwright, which is missing")
     with library.sync_playwright() as playwright:
         found = playwright.chromium.launch(executable_path=program, args=list(FLAGS))
         yield found
