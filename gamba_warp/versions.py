@@ -49,6 +49,7 @@ EXTRA_OF = {
     "timm": "train",
     "trimesh": "mesh",
     "webdataset": "train",
+    "xatlas": "mesh",
 }
 OWN = {
     "ablate": "all",
@@ -71,8 +72,8 @@ _SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
     "train": {"kornia", "tensorboard", "timm", "webdataset"},
-    "mesh": set(_SHAPES),
-    "eval": set(_SHAPES),
+    "mesh": {*_SHAPES, "xatlas"},
+    "eval": {*_SHAPES, "xatlas"},
     "fit": {"gsplat", "kornia"},
     "app": {"gradio", "imageio_ffmpeg", *_SHAPES},
     "all": set(EXTRA_OF),

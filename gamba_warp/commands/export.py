@@ -14,12 +14,15 @@ from ..errors import UserError
 from ..files import output_folder
 from ..formats.names import MeshFormat, SplatFormat
 from ..surfaces.options import (
+    BROWSER_FACES,
+    TEXTURED_FACES,
     Faces,
     Holes,
     PartShare,
     Pixels,
     Smoothing,
     SurfaceOptions,
+    Texels,
     Views,
     Voxels,
 )
@@ -39,8 +42,9 @@ def export_command(
     voxels: Voxels = 128,
     views: Views = 64,
     pixels: Pixels = 256,
-    faces: Faces = 0,
+    faces: Faces | None = None,
     colors: bool = True,
+    texture: Texels = 0,
     close_holes: Holes = 30,
     min_component: PartShare = 0.01,
     largest: bool = False,
@@ -68,8 +72,10 @@ def export_command(
         voxels: Number of voxels along the object's longest side.
         views: Number of pictures from all around, for depth and colours.
         pixels: Side of these pictures.
-        faces: Simplify to at most so many; 0 keeps all.
+        faces: Simplify to at most so many; 0 keeps all. 50,000 if not given, 10,000 with --texture.
         colors: Give the vertices colours (.stl has none).
+        texture: Side in pixels of a picture of the colours, in the .glb, and beside the .obj with a
+            .mtl; 0 for none. 1024 is plenty for what the models make.
         close_holes: Close holes with at most so many edges.
         min_component: Remove parts with a smaller share of the faces.
         largest: Keep the largest part only.
@@ -91,7 +97,7 @@ def export_command(
         voxels=voxels,
         views=views,
         pixels=pixels,
-        faces=faces,
+        faces=(TEXTURED_FACES if texture else BROWSER_FACES) if faces is None else faces,
         colors=colors and set(mesh) != {"stl"},
         close_holes=close_holes,
         min_component=min_component,
@@ -109,6 +115,7 @@ def export_command(
         page=page,
         turntable=turntable,
         surface=options,
+        texture=texture,
         axes=frame,
         min_opacity=min_opacity,
         size=size,

@@ -16,7 +16,7 @@ from ..formats.gaussians.files import read_gaussians, write_gaussians
 from ..formats.names import SPLAT_SUFFIXES, MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..surfaces.extract import moved_to_unit, unit_frame
-from ..surfaces.files import write_meshes
+from ..surfaces.files import mesh_suffixes, write_meshes
 from ..surfaces.options import SurfaceOptions
 from .page import Section, reconstruction_page
 from .turntable import save_turntable, turntable_frames
@@ -33,6 +33,7 @@ class ExportJob:
         page: whether a page with a 3D viewer is written.
         turntable: ``gif``, ``mp4`` or ``none``.
         surface: how the mesh is made.
+        texture: side of its texture, pixels; 0: none.
         axes: axes of ``.ply, .obj, .stl``.
         min_opacity: fainter Gaussians are left out.
         size: side of the turntable's frames, pixels.
@@ -46,6 +47,7 @@ class ExportJob:
     page: bool
     turntable: str
     surface: SurfaceOptions
+    texture: int
     axes: Axes
     min_opacity: float
     size: int
@@ -54,7 +56,7 @@ class ExportJob:
 
     def suffixes(self) -> list[str]:
         """What follows the name of an input in each of its files."""
-        found = [f"-mesh.{kind}" for kind in self.mesh]
+        found = mesh_suffixes(self.mesh, self.texture)
         found += [splat_suffix(kind) for kind in self.splats]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
         return found + ([".html"] if self.page else [])
@@ -116,7 +118,8 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     if not job.mesh:
         return " ".join([f"{name}: {gaussians.num:,} Gaussians.", *filter(None, lost)])
     start = time.perf_counter()
-    found = write_meshes(job.folder / name, gaussians, job.mesh, job.surface, job.axes, job.device)
+    base, options = job.folder / name, job.surface
+    found = write_meshes(base, gaussians, job.mesh, options, job.axes, job.device, job.texture)
     closed = "closed" if found.is_watertight() else "open"
     counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
     seconds = time.perf_counter() - start

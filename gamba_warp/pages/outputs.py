@@ -14,7 +14,7 @@ from ..images import save_image
 from ..model.config import GambaConfig
 from ..photo.cutout import CutOut
 from ..surfaces.files import write_meshes
-from ..surfaces.options import SurfaceOptions
+from ..surfaces.options import BROWSER_FACES, SurfaceOptions
 from .page import Section, reconstruction_page
 from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
@@ -90,7 +90,7 @@ def write_outputs(
     _write_gaussians(base, gaussians, outputs)
     if outputs.mesh:
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
-        options, device = SurfaceOptions(colors=True), gaussians.means.device
+        options, device = SurfaceOptions(colors=True, faces=BROWSER_FACES), gaussians.means.device
         write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
     if outputs.sheet is not None:
         outputs.sheet.add(name, cut.rgba, gaussians, config)

@@ -11,9 +11,11 @@ from torch import Tensor
 from ..errors import UserError
 from ..gaussians import Gaussians
 from .cleaning import cleaned_mesh
+from .colors import vertex_colors
 from .density import level_set
 from .options import SurfaceOptions
-from .tsdf import CLEAR, Views, fuse, look_around
+from .texture import Texture, bake_texture
+from .tsdf import fuse, look_around
 
 VISIBLE = 0.05  # opacity from which a Gaussian counts for the object's extent
 
@@ -26,11 +28,13 @@ class Surface:
         vertices: ``[V, 3]`` float64.
         faces: ``[F, 3]`` int64, F > 0.
         colors: ``[V, 3]`` float32 RGB in [0, 1] (display values), or None.
+        texture: the colours as a picture, or None.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
+    texture: Texture | None = None
 
     def is_watertight(self) -> bool:
         """Whether every edge has two faces."""
@@ -39,7 +43,7 @@ class Surface:
         return bool(trimesh.Trimesh(self.vertices, self.faces, process=False).is_watertight)
 
 
-def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
+def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int = 0) -> Surface:
     """The surface of one object that is about the origin and has a longest side of about 1.
 
     What lies outside [-1, 1]^3 is left out.
@@ -47,6 +51,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
     Args:
         gaussians: one object, on the device that renders.
         options: any method but centers.
+        texture: side of a texture, pixels; 0: none.
 
     Raises:
         UserError: there is no surface, or a value is not finite.
@@ -57,7 +62,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
     options.check()
     gaussians = near_and_visible(gaussians.detach())
     views = None
-    if options.method == "tsdf" or options.colors:
+    if options.method == "tsdf" or options.colors or texture:
         views = look_around(
             gaussians,
             options.views,
@@ -82,11 +87,14 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions) -> Surface:
         smooth=options.smooth,
         max_faces=options.faces,
     )
-    colors = None
+    colors = picture = None
     if options.colors:
         assert views is not None
         colors = vertex_colors(vertices, faces, views, options.voxels)
-    return Surface(vertices, faces, colors)
+    if texture:
+        assert views is not None
+        picture = bake_texture(vertices, faces, views, options.voxels, texture)
+    return Surface(vertices, faces, colors, picture)
 
 
 def near_and_visible(gaussians: Gaussians) -> Gaussians:
@@ -131,68 +139,28 @@ def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
     return torch.from_numpy(ends.mean(0)).to(gaussians.means), side
 
 
-def surface_of(gaussians: Gaussians, options: SurfaceOptions, device: torch.device) -> Surface:
+def surface_of(
+    gaussians: Gaussians, options: SurfaceOptions, device: torch.device, texture: int = 0
+) -> Surface:
     """The surface of an object of any size anywhere, in its own frame.
 
     Args:
         gaussians: one object.
         options: any method but centers.
         device: device that renders.
+        texture: side of a texture, pixels; 0: none.
 
     Raises:
         UserError: there is no surface.
     """
     center, side = unit_frame(gaussians)
-    found = extract_surface(moved_to_unit(gaussians, center, side).to(device), options)
+    moved = moved_to_unit(gaussians, center, side).to(device)
+    found = extract_surface(moved, options, texture)
     vertices = found.vertices * side + center.double().numpy()
-    return Surface(vertices, found.faces, found.colors)
+    return replace(found, vertices=vertices)
 
 
 def moved_to_unit(gaussians: Gaussians, center: Tensor, side: float) -> Gaussians:
     """The same object with ``center [3]`` at the origin and ``side`` as the unit."""
     means, scales = (gaussians.means - center) / side, gaussians.scales / side
     return replace(gaussians, means=means, scales=scales)
-
-
-def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:
-    """The mean colour of each vertex in the views that see it; those in front count most.
-
-    Args:
-        vertices: ``[V, 3]``.
-        faces: ``[F, 3]``.
-        views: pictures and depth.
-        voxels: number of voxels a unit; a view sees a vertex if its depth there differs by less
-            than four voxels.
-
-    Returns:
-        ``[V, 3]`` float32 in [0, 1]; a vertex that no view sees has the nearest one's colour.
-    """
-    import trimesh
-    from scipy.spatial import KDTree
-
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    points = torch.from_numpy(vertices).float()
-    normals = torch.from_numpy(np.array(mesh.vertex_normals)).float()
-    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
-    cameras = views.cameras
-    size = torch.tensor([cameras.width, cameras.height])
-    for depth, rgb, viewmat, K in zip(views.depth, views.rgb, cameras.viewmats, cameras.Ks):
-        seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        facing = -(normals @ viewmat[:3, :3].T * seen).sum(-1) / seen.norm(dim=-1)
-        at = seen[:, :2] / seen[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
-        pixel = at.floor().long()
-        inside = ((pixel >= 0) & (pixel < size)).all(-1)
-        x, y = torch.where(inside[:, None], pixel, 0).unbind(-1)
-        found = depth[y, x]
-        near = (found - seen[:, 2]).abs() < 4.0 / voxels
-        share = torch.where(inside & near & (found < CLEAR), facing.clamp_min(0), 0)[:, None] ** 2
-        total += share * rgb[y, x]
-        weight += share
-    known = weight[:, 0] > 0
-    if not known.any():
-        raise UserError("no view sees the surface")
-    colors = (total / weight.clamp_min(1e-12)).clamp(0, 1).numpy()
-    if not known.all():
-        known = known.numpy()
-        colors[~known] = colors[known][KDTree(vertices[known]).query(vertices[~known])[1]]
-    return colors

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -18,13 +19,16 @@ from ..gaussians import Gaussians
 from ..images import to_uint8
 from .extract import Surface, surface_of
 from .options import SurfaceOptions
+from .texture import Texture
 
 
 def save_mesh(path: str | Path, surface: Surface) -> None:
     """Writes a surface, atomically, with vertex colours where the format has them (not .stl).
 
-    The axes are left as they are, except in ``.glb``: it is turned from OpenCV's (y down) to
-    glTF's (y up), as ``save_glb`` does, and its colours are linear light, as the format asks.
+    A texture is embedded in ``.glb``; beside an ``.obj`` it is NAME.png, which NAME.mtl names; the
+    others have the vertex colours. The axes are left as they are, except in ``.glb``: it is turned
+    from OpenCV's (y down) to glTF's (y up), as ``save_glb`` does, and its vertex colours are linear
+    light, as the format asks.
 
     Args:
         path: ends in .obj, .glb, .ply or .stl.
@@ -43,13 +47,59 @@ def save_mesh(path: str | Path, surface: Surface) -> None:
     if kind == "glb":
         vertices = vertices * [1.0, -1.0, -1.0]
         colors = None if colors is None else to_linear(colors)
+    if surface.texture is not None and kind in ("glb", "obj"):
+        return _save_textured(Path(path), replace(surface, vertices=vertices), surface.texture)
     mesh = trimesh.Trimesh(vertices, surface.faces, process=False)
     if colors is not None and kind != "stl":
         opaque = np.ones((len(colors), 1), np.float32)
         mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(np.hstack([colors, opaque])))
-    content = cast("bytes | str", mesh.export(file_type=kind))  # a dict is of other kinds
+    _write(Path(path), cast("bytes | str", mesh.export(file_type=kind)))  # a dict: other kinds
+
+
+def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
+    """Writes a .glb that holds its texture, or an .obj after the files that it names."""
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    vertices, uvs, faces = _split_at_seams(surface, texture)
+    image = Image.fromarray(to_uint8(texture.image))
+    if path.suffix.lower() == ".glb":
+        material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+        visual = cast(Any, TextureVisuals(uv=uvs, material=material))
+        mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+        _write(path, cast(bytes, mesh.export(file_type="glb")))
+        return
+    with atomic_path(path.with_suffix(".png")) as temporary:
+        image.save(temporary)
+    lines = ["newmtl surface", "Kd 1 1 1", "Ks 0 0 0", f"map_Kd {path.stem}.png", ""]
+    _write(path.with_suffix(".mtl"), "\n".join(lines))
+    lines = [f"mtllib {path.stem}.mtl", "usemtl surface"]
+    lines += [f"v {x:.8g} {y:.8g} {z:.8g}" for x, y, z in vertices]
+    lines += [f"vt {u:.7f} {v:.7f}" for u, v in uvs]
+    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in faces + 1]
+    _write(path, "\n".join([*lines, ""]))
+
+
+def _split_at_seams(
+    surface: Surface, texture: Texture
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices ``[W, 3]``, their UVs ``[W, 2]`` and faces; a vertex at a seam is there twice."""
+    corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
+    found, faces = np.unique(corners, axis=0, return_inverse=True)
+    return surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:], faces.reshape(-1, 3)
+
+
+def _write(path: Path, content: bytes | str) -> None:
     with atomic_path(path) as temporary:
         temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def mesh_suffixes(formats: Sequence[MeshFormat], texture: int) -> list[str]:
+    """What follows NAME in each file that ``write_meshes`` writes."""
+    found = [f"-mesh.{kind}" for kind in formats]
+    return found + (["-mesh.mtl", "-mesh.png"] if texture and "obj" in formats else [])
 
 
 def write_meshes(
@@ -59,6 +109,7 @@ def write_meshes(
     options: SurfaceOptions,
     axes: Axes,
     device: torch.device,
+    texture: int = 0,
 ) -> Surface:
     """Makes an object's surface and writes it as ``NAME-mesh.FORMAT``.
 
@@ -69,6 +120,7 @@ def write_meshes(
         options: how the surface is made.
         axes: axes of all but .glb, which is y up in any case.
         device: device that renders.
+        texture: side of a texture, pixels; 0: none.
 
     Returns:
         The surface in the Gaussians' own frame.
@@ -76,10 +128,10 @@ def write_meshes(
     Raises:
         UserError: there is no surface, or a file cannot be written.
     """
-    found = surface_of(gaussians, options, device)
+    found = surface_of(gaussians, options, device, texture)
     for kind in formats:
         turned = found
         if axes == "opengl" and kind != "glb":
-            turned = Surface(found.vertices * [1.0, -1.0, -1.0], found.faces, found.colors)
+            turned = replace(found, vertices=found.vertices * [1.0, -1.0, -1.0])
         save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), turned)
     return found

@@ -14,6 +14,9 @@ Voxels = Annotated[int, Meta(ge=8, le=1024)]
 Views = Annotated[int, Meta(ge=8, le=1000)]
 Pixels = Annotated[int, Meta(ge=8, le=4096)]
 Faces = Annotated[int, Meta(ge=0, le=2**31 - 1)]
+# What a browser turns without a stutter and loads at once (docs/formats.md has the sizes).
+BROWSER_FACES, TEXTURED_FACES = 50_000, 10_000
+Texels = Annotated[int, Meta(ge=0, le=8192)]
 Holes = Annotated[int, Meta(ge=0, le=10_000)]
 Smoothing = Annotated[int, Meta(ge=0, le=1000)]
 Share = Annotated[float, Meta(ge=0, le=1)]
