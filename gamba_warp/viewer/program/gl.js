@@ -29,15 +29,16 @@ function glProgram(gl, vertex, fragment, attributes = []) {
 class Renderer {
   constructor(gl, count, degree) {
     Object.assign(this, { gl, count, degree, ordered: 0, width: 0, height: 0 });
-    this.splats = glProgram(gl, SPLAT_VERTEX, SPLAT_FRAGMENT, ["corner", "index"]);
+    this.splats = glProgram(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.points = glProgram(gl, POINT_VERTEX, POINT_FRAGMENT);
     this.surface = glProgram(gl, MESH_VERTEX, MESH_FRAGMENT, ["vertex", "normal", "paint"]);
     this.shown = glProgram(gl, PRESENT_VERTEX, PRESENT_FRAGMENT);
     this.rows = Math.ceil(count / ROW);
     this.harmonicRows = Math.ceil((count * TEXELS[degree]) / 2048);
     this.most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    this.records = this.table(0, this.rows);
-    this.harmonics = this.table(1, this.harmonicRows);
+    this.records = this.table(0, this.rows, gl.RGBA32UI);
+    this.harmonics = this.table(1, this.harmonicRows, gl.RGBA32UI);
+    this.order = this.table(2, Math.ceil(count / 2048), gl.R32UI);
     this.empty = gl.createVertexArray();
     this.makeSplats();
     this.makeTarget();
@@ -47,29 +48,24 @@ class Renderer {
     return Math.max(this.rows, this.harmonicRows) <= this.most;
   }
 
-  table(unit, rows) {
+  table(unit, rows, format) {
     const { gl } = this, texture = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2048, Math.max(1, Math.min(rows, this.most)));
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, 2048, Math.max(1, Math.min(rows, this.most)));
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
       gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
     return texture;
   }
 
+  // The corners of a batch of rectangles; their Gaussians are looked up in the order.
   makeSplats() {
-    const { gl } = this;
+    const { gl } = this, corners = new Uint16Array(6 * BATCH);
+    for (let i = 0; i < BATCH; i++) corners.set([0, 1, 2, 2, 1, 3].map((k) => 4 * i + k), 6 * i);
     this.quads = gl.createVertexArray();
     gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
-    this.order = gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(1);
-    gl.vertexAttribDivisor(1, 1);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
   }
 
@@ -78,12 +74,10 @@ class Renderer {
     this.frame = gl.createFramebuffer();
     this.depth = gl.createRenderbuffer();
     this.picture = gl.createTexture();
-    gl.activeTexture(gl.TEXTURE2);
+    gl.activeTexture(gl.TEXTURE3);
     gl.bindTexture(gl.TEXTURE_2D, this.picture);
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
-      gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
-    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T])
-      gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+      gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
   }
 
   // Some rows of a table of words, of `unit` 0 the records, 1 the harmonics; the last row is filled up.
@@ -99,11 +93,12 @@ class Renderer {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, 2048, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, part);
   }
 
-  setOrder(order) {
-    const { gl } = this;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
-    this.ordered = order.length;
+  // `order` has `used` places, and as many more as fill the last row of 2048.
+  setOrder(order, used) {
+    const { gl } = this, rows = Math.ceil(used / 2048);
+    gl.activeTexture(gl.TEXTURE2);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 2048, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    this.ordered = used;
   }
 
   setMesh({ vertices, normals, colours, faces }) {
@@ -123,28 +118,29 @@ class Renderer {
     this.corners = faces.length;
   }
 
-  // The picture has the canvas's size; a part of it is used while it is drawn smaller.
+  // The largest picture; a part of it is used while it is drawn smaller. Says whether that is new.
   resize(width, height) {
-    if (width === this.width && height === this.height) return;
+    if (width === this.width && height === this.height) return false;
     const { gl } = this;
     Object.assign(this, { width, height });
-    gl.activeTexture(gl.TEXTURE2);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
+    gl.activeTexture(gl.TEXTURE3);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
     gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
     gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
+    return true;
   }
 
   // Draws one piece: Gaussians `from` to `to` of the order, or all of the centres or of the mesh.
-  draw(mode, camera, scale, from, to) {
+  draw(mode, camera, background, scale, from, to) {
     const { gl } = this;
     const width = Math.max(1, Math.round(this.width * scale)), height = Math.max(1, Math.round(this.height * scale));
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
     gl.viewport(0, 0, width, height);
     if (from === 0) {
-      gl.clearColor(0, 0, 0, 0);
+      gl.clearColor(...background, 1);
       gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     }
     const { program, set } = { gaussians: this.splats, centres: this.points, mesh: this.surface }[mode];
@@ -159,20 +155,22 @@ class Renderer {
       set("harmonics", "1i", 1);
       set("degree", "1i", this.degree);
     }
-    if (mode === "gaussians") this.drawSplats(from, to);
+    if (mode === "gaussians") this.drawSplats(set, from, to);
     else this.drawSolid(mode, set, height);
-    this.part = [width / this.width, height / this.height];
+    this.part = [width, height];
   }
 
-  drawSplats(from, to) {
+  drawSplats(set, from, to) {
     const { gl } = this;
+    set("order", "1i", 2);
+    set("first", "1ui", from);
+    set("last", "1ui", to);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 4 * from);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, to - from);
+    const batches = Math.ceil((to - from) / BATCH);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, batches);
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
   }
@@ -192,16 +190,14 @@ class Renderer {
     gl.disable(gl.DEPTH_TEST);
   }
 
-  // Puts the picture onto the canvas.
-  present(background) {
-    const { gl } = this, { program, set } = this.shown;
+  // Puts the picture onto the canvas, which takes the picture's size; the page stretches it.
+  present() {
+    const { gl } = this, { canvas } = gl, [width, height] = this.part;
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, this.width, this.height);
-    gl.useProgram(program);
-    set("picture", "1i", 2);
-    set("part", "2fv", this.part);
-    set("limit", "2f", this.part[0] - 0.5 / this.width, this.part[1] - 0.5 / this.height);
-    set("background", "3fv", background);
+    gl.viewport(0, 0, width, height);
+    gl.useProgram(this.shown.program);
+    this.shown.set("picture", "1i", 3);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);

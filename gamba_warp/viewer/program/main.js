@@ -2,15 +2,16 @@
 // sharply and as completely as a frame's time allows; once it rests, everything at full size.
 
 const SETTLE = 160; // milliseconds after the last motion
-const TARGET = 26; // milliseconds that a frame may take while it moves
+const SIZES = [1, 0.8, 0.64, 0.5, 0.4, 0.32]; // shares of the canvas's sides, while it moves
+const SLOW = 42, QUICK = 21; // milliseconds of a frame: above, less is drawn; below, more
 const PIECE = 131072; // Gaussians that are drawn at once at rest
-const LEAST = { scale: 0.3, count: 40000 };
+const LEAST = 40000; // Gaussians that are drawn in any case
 
 class Viewer {
   constructor(canvas, about) {
     Object.assign(this, { canvas, about, mode: "gaussians", showInput: true });
     this.camera = new OrbitCamera(about.home, about.home.fov);
-    this.sharp = 1; // share of the canvas's size, while it moves
+    this.coarse = this.quick = 0; // which of SIZES; quick frames in a row
     this.some = about.count; // Gaussians that are drawn while it moves
     this.changed = this.asked = -Infinity;
     this.sortedFor = this.askedFor = null;
@@ -77,7 +78,7 @@ class Viewer {
 
   sorted({ buffer, used, id }) {
     if (!this.renderer) return;
-    this.renderer.setOrder(new Uint32Array(buffer, 0, used));
+    this.renderer.setOrder(new Uint32Array(buffer), used);
     this.spare = buffer;
     this.sortedFor = id;
     this.askedFor = null;
@@ -132,16 +133,19 @@ class Viewer {
     this.fast = fast;
   }
 
-  // First fewer pixels, then fewer Gaussians (those that cover least are last); back the other way.
+  // First fewer pixels, then fewer Gaussians (those that cover least are last); back the other way,
+  // once several frames in a row were quick.
   adapt(cost) {
-    const step = Math.max(0.7, Math.min(1.12, Math.sqrt(TARGET / cost)));
-    const { count } = this.about;
-    if (step < 0.98) {
-      if (this.sharp > LEAST.scale) this.sharp = Math.max(LEAST.scale, this.sharp * step);
-      else if (cost > 2 * TARGET) this.some = Math.max(Math.min(count, LEAST.count), Math.round(this.some * step));
-    } else if (step > 1.02) {
-      if (this.some < count) this.some = Math.min(count, Math.round(this.some * 1.2));
-      else this.sharp = Math.min(1, this.sharp * 1.08);
+    const { count } = this.about, least = Math.min(count, LEAST);
+    this.quick = cost < QUICK ? this.quick + 1 : 0;
+    if (cost > SLOW) {
+      const down = cost > 3 * SLOW ? 2 : 1;
+      if (this.coarse < SIZES.length - 1) this.coarse = Math.min(SIZES.length - 1, this.coarse + down);
+      else this.some = Math.max(least, Math.round(this.some * Math.max(0.4, SLOW / cost)));
+    } else if (this.quick >= 6) {
+      this.quick = 0;
+      if (this.some < count) this.some = Math.min(count, Math.round(this.some * 1.3));
+      else this.coarse = Math.max(0, this.coarse - 1);
     }
   }
 
@@ -150,18 +154,17 @@ class Viewer {
     if (this.camera.step(now)) this.changed = now;
     const ratio = Math.min(2, window.devicePixelRatio || 1);
     const [width, height] = this.shownSize().map((side) => Math.round(side * ratio));
-    const { canvas, renderer } = this;
-    if (canvas.width !== width || canvas.height !== height) {
-      Object.assign(canvas, { width, height });
-      renderer.resize(width, height);
+    const { renderer } = this;
+    if (renderer.resize(width, height)) {
       this.progress = 0;
+      this.finished = false;
       this.changed = now;
     }
     const fast = now - this.changed < SETTLE && this.shownOnce;
     const ordered = this.sortNow(fast ? this.some : this.about.count);
     if (fast) {
       if (renderer.ordered || this.mode !== "gaussians") {
-        renderer.draw(this.mode, this.camera, this.sharp, 0, Math.min(this.some, renderer.ordered));
+        renderer.draw(this.mode, this.camera, background(), SIZES[this.coarse], 0, Math.min(this.some, renderer.ordered));
         this.show(now, true);
       }
       this.finished = false;
@@ -174,7 +177,7 @@ class Viewer {
   drawRest(now) {
     const { renderer } = this, all = this.mode === "gaussians" ? renderer.ordered : 1;
     const to = Math.min(all, this.progress + PIECE);
-    renderer.draw(this.mode, this.camera, 1, this.progress, to);
+    renderer.draw(this.mode, this.camera, background(), 1, this.progress, to);
     this.progress = to;
     if (to < all) return this.ask(now, false);
     this.show(now, false);
@@ -185,7 +188,7 @@ class Viewer {
   }
 
   show(now, fast) {
-    this.renderer.present(background());
+    this.renderer.present();
     this.ask(now, fast);
     this.stats.frames++;
     const { input } = this.about, visible = input && this.showInput;
@@ -255,14 +258,14 @@ class Viewer {
 
   async save() {
     await this.rest();
-    this.renderer.present(background());
+    this.renderer.present();
     savePicture(this.canvas, this.about.title);
   }
 
   // For programs: a picture of the canvas, as an address.
   async png() {
     await this.rest();
-    this.renderer.present(background());
+    this.renderer.present();
     return this.canvas.toDataURL("image/png");
   }
 

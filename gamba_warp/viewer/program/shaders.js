@@ -1,5 +1,9 @@
 // What runs on the graphics card. A Gaussian is two texels of 4 words: pack.py says what is in them.
 
+// Gaussians of one instance. Software draws every instance by itself, which costs more than what is
+// in it, so that an instance for each Gaussian would be fifty times as slow.
+const BATCH = 256;
+
 const SHADER_HEAD = `#version 300 es
 precision highp float;
 precision highp int;
@@ -59,18 +63,21 @@ vec3 colour_of(uint index, vec3 mean, vec3 rgb) {
 
 // Each Gaussian is a rectangle along the axes of its ellipse, as far as an alpha of 1/255 reaches.
 const SPLAT_VERTEX = `${SHADER_GAUSSIAN}
-in uint index;
-in vec2 corner;
+uniform usampler2D order;
+uniform uint first, last;
 out vec2 at;
 out vec4 colour;
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  uint place = first + uint(gl_InstanceID) * ${BATCH}u + uint(gl_VertexID >> 2);
+  if (place >= last) return;
+  uint index = texelFetch(order, ivec2(int(place & 2047u), int(place >> 11)), 0).x;
+  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   fetch(index);
   vec3 mean = uintBitsToFloat(near_words.xyz), m = view * (mean - eye);
   vec4 opacity_rgb = look();
   if (m.z < 0.01 || opacity_rgb.x < 1.0 / 255.0) return;
-  vec2 last = unpackHalf2x16(far_words.z & 0xffffu);
-  vec3 scales = vec3(unpackHalf2x16(far_words.y), last.x);
+  vec3 scales = vec3(unpackHalf2x16(far_words.y), unpackHalf2x16(far_words.z).x);
   vec3 p = vec3(unpackSnorm2x16(far_words.z).y, unpackSnorm2x16(far_words.w));
   float k = 2.0 / (1.0 + dot(p, p)), w = k - 1.0, f = focal / m.z;
   vec3 q = k * p;
@@ -156,23 +163,16 @@ void main() {
   result = vec4(min(vec3(1.0), colour.rgb * light), 1.0);
 }`;
 
-// The picture, which may be smaller than the canvas, over the background.
+// The picture onto the canvas, pixel by pixel. (Software browsers sometimes show black after a
+// blitFramebuffer onto a canvas.)
 const PRESENT_VERTEX = `${SHADER_HEAD}
-uniform vec2 part;
-out vec2 at;
 void main() {
-  vec2 corner = vec2(float((gl_VertexID & 1) << 2), float((gl_VertexID & 2) << 1)) - 1.0;
-  at = (0.5 * corner + 0.5) * part;
-  gl_Position = vec4(corner, 0.0, 1.0);
+  gl_Position = vec4(vec2(ivec2(gl_VertexID & 1, gl_VertexID >> 1) * 4 - 1), 0.0, 1.0);
 }`;
 
 const PRESENT_FRAGMENT = `${SHADER_HEAD}
 uniform sampler2D picture;
-uniform vec2 limit;
-uniform vec3 background;
-in vec2 at;
 out vec4 result;
 void main() {
-  vec4 found = texture(picture, min(at, limit));
-  result = vec4(found.rgb + (1.0 - found.a) * background, 1.0);
+  result = vec4(texelFetch(picture, ivec2(gl_FragCoord.xy), 0).rgb, 1.0);
 }`;

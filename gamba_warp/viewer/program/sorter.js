@@ -68,8 +68,7 @@ function sorterProgram(post) {
   // where the camera is, but only on where it looks to.
   function sort({ forward: [x, y, z], wanted, buffer, id }) {
     const used = Math.min(wanted, count);
-    const order = buffer && buffer.byteLength === 4 * count
-      ? new Uint32Array(buffer) : new Uint32Array(count);
+    const order = buffer ? new Uint32Array(buffer) : new Uint32Array(2048 * Math.ceil(count / 2048));
     let low = Infinity, high = -Infinity;
     for (let i = 0, j = 0; i < used; i++, j += 3) {
       const depth = x * means[j] + y * means[j + 1] + z * means[j + 2];
