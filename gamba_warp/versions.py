@@ -75,7 +75,7 @@ HOLDS = {
     "mesh": {*_SHAPES, "xatlas"},
     "eval": {*_SHAPES, "xatlas"},
     "fit": {"gsplat", "kornia"},
-    "app": {"gradio", "imageio_ffmpeg", *_SHAPES},
+    "app": {"gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", *_SHAPES},
     "all": set(EXTRA_OF),
 }
 # What a command cannot begin without; what only some of its options need is found missing then.
