@@ -75,7 +75,7 @@ class Actions:
         self._ways = ways
         self._folder = folder
         self._device = device
-        for name in ("take", "example", "mend", "restart", "make"):
+        for name in ("take", "leave", "example", "mend", "restart", "make"):
             setattr(self, name, plainly(getattr(self, name)))
 
     def take(
@@ -83,17 +83,21 @@ class Actions:
         given: dict[str, Any] | None,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """A picture that was dropped or pasted; None where it was taken away."""
+        """A picture that was dropped or pasted."""
         if not given or not given.get("path"):
-            return None, gr.update(visible=False), None, "", gr.skip()
+            return self.leave()
         name = given.get("orig_name") or "picture"
         progress(0.2, "Looking for the object")
         try:
             cut = self._turns.call(cut_picture, Path(given["path"]), name, self._ways)
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This is no picture for us")
-            return None, gr.update(visible=False), None, "", None
+            return self.leave()
         return *_shown(cut), gr.skip()
+
+    def leave(self) -> tuple:
+        """The picture was taken away; what was made of it stays."""
+        return None, gr.update(visible=False), None, "", None
 
     def example(self, event: gr.SelectData) -> tuple:
         """A picture of the gallery."""

@@ -183,7 +183,7 @@ def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
     page.wait_for_selector("#editor canvas")
     page.wait_for_selector("#note:has-text('transparency')")
     save_image(tmp_path / "even.png", np.full((50, 60, 3), 0.5))
-    page.locator("#picture button[aria-label='Remove Image'], #picture .icon-button").first.click()
+    page.locator("#picture").get_by_label("Remove Image").click()
     page.wait_for_selector("#cut", state="hidden")
     give(page, tmp_path / "even.png")
     page.wait_for_selector("#note:has-text('No object was found')")
