@@ -33,6 +33,7 @@ _USED = (
 # The extra that brings a library (by the name it is imported by). A command that has an extra of
 # its own names that instead, where it holds the library too.
 EXTRA_OF = {
+    "gradio": "app",
     "gsplat": "fit",
     "huggingface_hub": "hub",
     "imageio_ffmpeg": "video",
@@ -52,6 +53,7 @@ EXTRA_OF = {
 }
 OWN = {
     "ablate": "all",
+    "app": "app",
     "demo": "all",
     "data pack": "train",
     "data primitives": "mesh",
@@ -73,11 +75,13 @@ HOLDS = {
     "mesh": {*_SHAPES, "xatlas"},
     "eval": {*_SHAPES, "xatlas"},
     "fit": {"gsplat", "kornia"},
+    "app": {"gradio", "imageio_ffmpeg", "onnxruntime", "pillow_heif", "pooch", *_SHAPES},
     "all": set(EXTRA_OF),
 }
 # What a command cannot begin without; what only some of its options need is found missing then.
 NEEDS = {
     "ablate": ("kornia",),
+    "app": ("gradio",),
     "data primitives": ("trimesh",),
     "data render": ("trimesh", "open3d"),
     "data gso": ("trimesh", "open3d"),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gradio as gr
 
 from ..errors import UserError, first_line
+from ..versions import advice
 from . import work
 from .cutting import Cut, cut_picture, editor_picture, mended, restarted
 from .examples import examples
@@ -34,8 +35,13 @@ def plainly(function: Callable) -> Callable:
     def careful(*args: Any) -> Any:
         try:
             return function(*args)
-        except (UserError, MemoryError, ModuleNotFoundError) as error:
+        except (UserError, MemoryError) as error:
             raise _error(error) from None
+        except ModuleNotFoundError as error:
+            reason = advice(error.name or "", "app")
+            if reason is None:
+                raise
+            raise _error(UserError(reason)) from None
         except RuntimeError as error:  # torch's errors of memory have no type of their own
             if "memory" not in str(error):
                 raise
@@ -69,7 +75,7 @@ class Actions:
         self._ways = ways
         self._folder = folder
         self._device = device
-        for name in ("take", "example", "mend", "restart", "make"):
+        for name in ("take", "leave", "example", "mend", "restart", "make"):
             setattr(self, name, plainly(getattr(self, name)))
 
     def take(
@@ -77,17 +83,21 @@ class Actions:
         given: dict[str, Any] | None,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """A picture that was dropped or pasted; None where it was taken away."""
+        """A picture that was dropped or pasted."""
         if not given or not given.get("path"):
-            return None, gr.update(visible=False), None, "", gr.skip()
+            return self.leave()
         name = given.get("orig_name") or "picture"
         progress(0.2, "Looking for the object")
         try:
             cut = self._turns.call(cut_picture, Path(given["path"]), name, self._ways)
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This is no picture for us")
-            return None, gr.update(visible=False), None, "", None
+            return self.leave()
         return *_shown(cut), gr.skip()
+
+    def leave(self) -> tuple:
+        """The picture was taken away; what was made of it stays."""
+        return None, gr.update(visible=False), None, "", None
 
     def example(self, event: gr.SelectData) -> tuple:
         """A picture of the gallery."""

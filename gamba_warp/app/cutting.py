@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -62,7 +62,7 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
     """
     from ..data.preprocess import WORKING_SIZE, shrink
     from ..images import load_rgba
-    from ..photo.cutout import MEND, cut_out
+    from ..photo.cutout import cut_out
 
     try:
         rgba = shrink(load_rgba(path, longest=WORKING_SIZE), WORKING_SIZE)
@@ -76,9 +76,8 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
         note = f"No object was found ({reason}). Paint over the object with the blue brush."
         return Cut(stem(name), rgba[..., :3], mask, mask, None, True, note)
     ghost = cut.method != "alpha"  # what a file holds where it is transparent is no picture
-    note = cut.note.removesuffix(MEND).strip()  # that is for the command line
     rgb = _clean_edge(cut.source_rgb, cut.mask, cut.rgba)
-    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, note)
+    return Cut(stem(name), rgb, cut.mask, cut.mask, cut.rgba, ghost, cut.how)
 
 
 def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndarray:
@@ -178,11 +177,13 @@ def model_picture(cut: Cut) -> np.ndarray:
 
 
 def _resized(values: np.ndarray, height: int, width: int) -> np.ndarray:
-    """``[H, W]`` or ``[H, W, C]`` float32, smoothed where it becomes smaller."""
+    """``[H, W]`` or ``[H, W, C]`` float32 at another size."""
     from PIL import Image
 
     planes = values[..., None] if values.ndim == 2 else values
-    kind: Any = Image.Resampling.BILINEAR
+    smaller = height < planes.shape[0]
+    # A mean over what a new pixel covers: a wider filter would smear a stroke over its border.
+    kind = Image.Resampling.BOX if smaller else Image.Resampling.BILINEAR
     out = [
         np.asarray(Image.fromarray(plane).resize((width, height), kind))
         for plane in np.moveaxis(np.ascontiguousarray(planes, np.float32), -1, 0)

@@ -102,6 +102,10 @@ def _brush(color: str) -> gr.Brush:
     )
 
 
+def _painting(choice: str) -> Any:
+    return gr.update(brush=_brush(_BRUSHES[choice]))
+
+
 def _cut_part() -> _CutPart:
     with gr.Column(visible=False, elem_id="cut") as group:
         editor = gr.ImageEditor(
@@ -128,7 +132,7 @@ def _cut_part() -> _CutPart:
             elem_id="brush",
         )
         with gr.Row():
-            mend = gr.Button("Mend the cut-out", size="md", min_width=120)
+            mend = gr.Button("Apply strokes", size="md", min_width=120)
             restart = gr.Button("Start over", size="md", min_width=120)
         make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
     return _CutPart(group, editor, note, brush, mend, restart, make)
@@ -173,20 +177,19 @@ def _connect(
         "concurrency_limit": 1,
         "api_visibility": "private",
     }
+    # On the editor the sign that something is going on would stay: gradio shows it once more when
+    # the editor has taken its new picture.
+    quick = {**one, "show_progress": "hidden"}
+    taking = {**one, "show_progress_on": picture}
     shown = [cut, parts.group, parts.editor, parts.note, picture]
     # gradio would decode the picture itself, and differently: the file is read by us alone.
-    picture.input(actions.take, picture, shown, preprocess=False, **one)
-    gallery.select(actions.example, None, shown, **one)
-    parts.brush.change(
-        lambda choice: gr.update(brush=_brush(_BRUSHES[choice])),
-        parts.brush,
-        parts.editor,
-        api_visibility="private",
-        queue=False,
-        show_progress="hidden",
-    )
-    parts.mend.click(actions.mend, [cut, parts.editor], [cut, parts.editor], **one)
-    parts.restart.click(actions.restart, cut, [cut, parts.editor], **one)
+    picture.input(actions.take, picture, shown, preprocess=False, **taking)
+    picture.clear(actions.leave, None, shown, **quick)
+    gallery.select(actions.example, None, shown, **taking)
+    mask = [cut, parts.editor]
+    parts.brush.change(_painting, parts.brush, parts.editor, queue=False, **quick)
+    parts.mend.click(actions.mend, mask, mask, **quick)
+    parts.restart.click(actions.restart, cut, mask, **quick)
     parts.make.click(
         actions.make,
         [cut, parts.editor],

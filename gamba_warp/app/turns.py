@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from typing import Any, TypeVar
+
+from ..errors import UserError
 
 Result = TypeVar("Result")
 
@@ -23,12 +25,19 @@ class MainThread:
         self._over = False
 
     def call(self, function: Callable[..., Result], *args: Any) -> Result:
-        """Has the main thread call the function, and waits; what it raises is raised here."""
+        """Has the main thread call the function, and waits; what it raises is raised here.
+
+        Raises:
+            UserError: the main thread has ended.
+        """
         future: Future[Result] = Future()
         self._jobs.put((future, function, args))
         if self._over:
             future.cancel()
-        return future.result()
+        try:
+            return future.result()
+        except CancelledError:
+            raise UserError("gamba app was ended; start it again") from None
 
     def work(self) -> None:
         """Does jobs until something that is no error of a job, such as Ctrl-C, ends it."""

@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ALL_OF_IT = {
     ROOT / "train" / "data" / "primitives.py",
     ROOT / "gamba_warp" / "compat" / "gsplat" / "strategy.py",
+    *(ROOT / "gamba_warp" / "app" / f"{name}.py" for name in ("actions", "interface", "look")),
 }
 # Refuses each library of the extras as if it were not installed, and runs a command.
 WITHOUT = """
@@ -107,6 +108,7 @@ def test_a_picture_becomes_gaussians_and_a_page_with_the_core_alone(tmp_path):
         (["data", "render", "meshes", "--out", "out"], "trimesh", "mesh"),
         (["eval-views", "--checkpoint", "m", "--data", "d"], "kornia", "eval"),
         (["demo"], "kornia", "all"),
+        (["app"], "gradio", "app"),
     ],
 )
 def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):

@@ -1,0 +1,268 @@
+"""The whole way in a browser, and what the page does with bad input."""
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gamba_warp.files import STARTER
+from gamba_warp.formats.gaussians.files import read_gaussians
+from gamba_warp.images import save_image
+
+MEGABYTES = 1  # the limit on uploads here
+PATIENCE = 90  # seconds, on a machine that does much else
+RED = (0.8, 0.1, 0.1)
+
+
+@dataclass
+class Served:
+    """A running ``gamba app``."""
+
+    process: subprocess.Popen
+    address: str
+    temporary: Path
+
+    def folders(self) -> list[str]:
+        return sorted(p.name for p in self.temporary.glob("gamba-app-*"))
+
+
+def command(*options):
+    shared = ["--no-open-browser", "--checkpoint", str(STARTER / "tiny.safetensors")]
+    return [sys.executable, "-m", "gamba_warp", "app", *shared, *map(str, options)]
+
+
+@pytest.fixture(scope="module")
+def served(browser, tmp_path_factory):
+    """The command as users start it, in a folder for temporary files of its own."""
+    pytest.importorskip("gradio", reason="needs gradio: pip install 'gamba-warp[app]'")
+    temporary = tmp_path_factory.mktemp("tmp")
+    environment = {**os.environ, "TMPDIR": str(temporary), "HTTP_PROXY": "http://127.0.0.1:9"}
+    process = subprocess.Popen(
+        command("--port", 0, "--max-upload-mb", MEGABYTES, "--device", "cpu"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    line = process.stdout.readline()
+    match = re.match(r"(http://127\.0\.0\.1:\d+/) \(Ctrl-C ends it\)$", line)
+    assert match, line + process.communicate(timeout=10)[1]
+    yield Served(process, match[1], temporary)
+    process.kill()
+    process.communicate()
+
+
+@dataclass
+class Open:
+    """The page, every address that it asked for, and what its console complains of."""
+
+    page: Any
+    asked: list[str] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+
+    def hear(self, message) -> None:
+        # gradio's own scripts warn of their own libraries; their errors count.
+        theirs = "/assets/" in message.location.get("url", "")
+        if message.type == "error" or (message.type == "warning" and not theirs):
+            self.complaints.append(f"{message.text} ({message.location})")
+
+
+@pytest.fixture
+def opened(served, browser_page):
+    view = browser_page("about:blank", width=1280, height=1000)
+    found = Open(view.page)
+    found.page.context.set_default_timeout(1000 * PATIENCE)
+    found.page.on("request", lambda request: found.asked.append(request.url))
+    found.page.on("console", found.hear)
+    found.page.on("pageerror", lambda error: found.complaints.append(str(error)))
+    found.page.goto(served.address)
+    found.page.wait_for_selector("#picture input[type=file]", state="attached")
+    yield found
+    here = (served.address, "data:", "blob:")
+    assert not [url for url in found.asked if not url.startswith(here)], "all stays on this machine"
+    assert not found.complaints
+
+
+def give(page, path):
+    page.locator("#picture input[type=file]").set_input_files(str(path))
+
+
+def toast(page):
+    page.wait_for_selector(".toast-body")
+    return page.locator(".toast-body").inner_text()
+
+
+def middle(page):
+    """The colour in the middle of what is painted on, 0 to 255."""
+    shot = Image.open(io.BytesIO(page.locator("#editor canvas").first.screenshot()))
+    x, y = shot.width // 2, shot.height // 2
+    return np.asarray(shot.convert("RGB"))[y - 2 : y + 3, x - 2 : x + 3].mean((0, 1))
+
+
+def until(found, what):
+    """Waits for what has no event of its own."""
+    deadline = time.monotonic() + PATIENCE
+    while not found():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.1)
+
+
+def red_square(folder):
+    picture = np.ones((200, 200, 3))
+    picture[40:160, 40:160] = RED
+    save_image(folder / "my square.png", picture)
+    return folder / "my square.png"
+
+
+def test_the_whole_way(opened, served, tmp_path):
+    page = opened.page
+    give(page, red_square(tmp_path))
+    page.wait_for_selector("#editor canvas")
+    until(lambda: middle(page)[1] < 60, "the cut-out is seen, red in the middle")
+    assert "plain background" in page.locator("#note").inner_text()
+
+    page.get_by_text("Paint what to remove").click()
+    page.wait_for_selector("#brush label.selected:has-text('remove')")
+    canvas = page.locator("#editor canvas").first
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    def paint():
+        page.mouse.move(x - 30, y)
+        page.mouse.down()
+        page.mouse.move(x + 30, y, steps=8)
+        page.mouse.up()
+        page.wait_for_timeout(300)
+        return middle(page)[2] < middle(page)[0] - 100 and middle(page)[1] > 45
+
+    until(paint, "a stroke is seen")
+    page.get_by_role("button", name="Apply strokes").click()
+    # A little of what is cut away still shows; a picture that loads is white, or nearly.
+    until(lambda: 150 < middle(page)[1] < 220 < middle(page)[0] + 10, "the middle is cut away")
+    page.get_by_role("button", name="Start over").click()
+    until(lambda: middle(page)[1] < 60, "the middle is back")
+
+    page.locator("#make").click()
+    frame = page.wait_for_selector("iframe.stage")
+    viewer = frame.content_frame()
+    viewer.wait_for_selector("#message", state="hidden")
+    assert viewer.locator("#name").inner_text() == "my-square"
+
+    def drawn():
+        shot = Image.open(io.BytesIO(page.locator("iframe.stage").screenshot())).convert("RGB")
+        pixels = np.asarray(shot).astype(int)
+        return (pixels[..., 0] - pixels[..., 1] > 60).mean() > 0.02
+
+    until(drawn, "the viewer shows something red")
+    for kind, name in (("ply", "my-square.ply"), ("spz", "my-square.spz")):
+        with page.expect_download() as download:
+            page.locator(f"#file-{kind}").click()
+        assert download.value.suggested_filename == name
+        download.value.save_as(tmp_path / name)
+        assert read_gaussians(tmp_path / name).num > 100
+    made = page.locator("#made")
+    assert all(name in made.inner_text() for name in ("my-square.ply", "my-square.spz"))
+
+
+def test_an_example_and_an_object_that_is_not_there(opened, tmp_path):
+    page = opened.page
+    page.locator("#examples button").last.click()
+    page.wait_for_selector("#editor canvas")
+    page.wait_for_selector("#note:has-text('transparency')")
+    save_image(tmp_path / "even.png", np.full((50, 60, 3), 0.5))
+    page.locator("#picture").get_by_label("Remove Image").click()
+    page.wait_for_selector("#cut", state="hidden")
+    give(page, tmp_path / "even.png")
+    page.wait_for_selector("#note:has-text('No object was found')")
+    page.wait_for_selector("#editor canvas")
+    page.locator("#make").click()
+    assert "no object found" in toast(page) and "paint over the object" in toast(page)
+    assert page.locator("iframe.stage").count() == 0
+
+
+def test_no_picture_is_one_line(opened, tmp_path):
+    page = opened.page
+    bad = tmp_path / "<b>no.png"
+    bad.write_bytes(b"nothing of a picture")
+    give(page, bad)
+    assert "<b>no.png: not a picture that can be read" in toast(page)
+    assert page.locator("#cut").count() == 0 or page.locator("#cut").is_hidden()
+
+
+def test_too_large_an_upload_is_refused(opened, served, tmp_path):
+    page = opened.page
+    big = tmp_path / "big.png"
+    big.write_bytes(b"\x89PNG" + bytes((MEGABYTES << 20) + 1))
+    give(page, big)
+    assert "exceed the maximum allowed size" in toast(page)
+    opened.complaints.clear()  # gradio's page logs that it has no picture to show
+    # The server itself refuses it, too.
+    edge = "edge"
+    head = f'--{edge}\r\nContent-Disposition: form-data; name="files"; filename="b.png"\r\n\r\n'
+    body = head.encode() + big.read_bytes() + f"\r\n--{edge}--\r\n".encode()
+    kind = {"Content-Type": f"multipart/form-data; boundary={edge}"}
+    assert status(served, "gradio_api/upload", body, kind) == 413
+    left = [p for p in served.temporary.rglob("*") if p.is_file() and p.stat().st_size > 1 << 20]
+    assert not left, "nothing of it is kept"
+
+
+def status(served, place, body=None, headers=None):
+    """The status of an answer, asked for without a browser and without a proxy."""
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    request = urllib.request.Request(served.address + place, body, headers or {})
+    try:
+        with opener.open(request, timeout=20) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_what_is_closed(served):
+    assert status(served, "") == 200
+    assert status(served, "", headers={"Host": "evil.example"}) == 421
+    assert status(served, "gradio_api/file=/etc/passwd") == 403
+    assert status(served, f"gradio_api/file={Path(__file__).resolve()}") == 403
+    for place in ("docs", "redoc", "monitoring/summary", "gradio_api/call/take"):
+        assert status(served, place) in (403, 404, 405), place
+
+
+def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):
+    port = served.address.rstrip("/").rpartition(":")[2]
+    before = served.folders()
+    for options, reason in (
+        (["--port", port], f"gamba: --port {port}: Address already in use\n"),
+        (["--port", 0, "--matte-model", tmp_path / "none.onnx"], None),
+    ):
+        done = subprocess.run(
+            command(*options),
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env={**os.environ, "TMPDIR": str(served.temporary)},
+        )
+        assert done.returncode == 2 and done.stdout == ""
+        assert done.stderr.count("\n") == 1 and done.stderr.startswith("gamba: "), done.stderr
+        assert reason in (None, done.stderr)
+    assert served.folders() == before
+
+
+def test_ctrl_c_leaves_nothing(served):
+    """The last one: it ends the server of this file."""
+    assert len(served.folders()) == 1
+    served.process.send_signal(signal.SIGINT)
+    out, err = served.process.communicate(timeout=30)
+    assert (served.process.returncode, out, err) == (130, "", "gamba: interrupted\n")
+    assert served.folders() == []

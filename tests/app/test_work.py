@@ -1,0 +1,199 @@
+"""From a picture to files, without the page."""
+
+import html.parser
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.images import bad_files, cut_out
+from PIL import Image
+
+from gamba_warp.app import cutting, work
+from gamba_warp.app.examples import examples
+from gamba_warp.errors import UserError
+from gamba_warp.files import STARTER
+from gamba_warp.formats.gaussians.files import read_gaussians
+from gamba_warp.images import save_image
+from gamba_warp.model.checkpoint import load_model
+from gamba_warp.photo.cutout import Ways
+from gamba_warp.surfaces import extract
+
+RED, GREEN = (0.8, 0.1, 0.1), (0.1, 0.6, 0.2)
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """A picture of a red square and a green one beside it, on white."""
+    picture = np.ones((60, 100, 3))
+    picture[20:40, 15:35] = RED
+    picture[20:40, 60:80] = GREEN
+    path = tmp_path_factory.mktemp("two") / "two.png"
+    save_image(path, picture)
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    picture = cut_out(tmp_path_factory.mktemp("made") / "thing.png")
+    cut = cutting.cut_picture(picture, "My  thing.v2.png", Ways())
+    return work.solve(load_model(STARTER / "tiny.safetensors"), cut)
+
+
+def stroke(shape, box, color):
+    """A layer with one painted box (top, left, bottom, right, as shares), as the brush paints."""
+    layer = np.zeros((*shape, 4), np.uint8)
+    top, left, bottom, right = (round(s * shape[i % 2]) for i, s in enumerate(box))
+    value = [int(color[i : i + 2], 16) for i in (1, 3, 5)]
+    layer[top:bottom, left:right] = [*value, round(255 * cutting.STROKE)]
+    return layer
+
+
+def test_a_plain_picture_is_cut_out(two):
+    cut = cutting.cut_picture(two, "two.png", Ways())
+    assert cut.mask.shape == (60, 100) and cut.name == "two"
+    assert cut.mask[30, 25] == 1 and cut.mask[30, 70] == 1 and cut.mask[5, 5] == 0
+    assert "plain background" in cut.note
+    assert cutting.model_picture(cut) is cut.found
+
+
+@pytest.mark.parametrize("size", [(60, 100), (432, 720), (31, 57)])
+def test_strokes_keep_and_remove(two, size):
+    cut = cutting.cut_picture(two, "two.png", Ways())
+    without = cutting.mended(cut, [stroke(size, (0.2, 0.5, 0.8, 1.0), cutting.REMOVE)])
+    assert without.mask[30, 25] == 1 and without.mask[30, 70] == 0
+    side = cutting.model_picture(without).shape[0]
+    assert side == 25  # 20 pixels are four fifths of it
+    assert cut.mask[30, 70] == 1, "the first one is as it was"
+    again = cutting.mended(without, [stroke(size, (0.2, 0.5, 0.8, 0.9), cutting.KEEP)])
+    assert again.mask[30, 70] == 1 and again.mask[5, 70] == 0
+    np.testing.assert_array_equal(cutting.restarted(again).mask, cut.mask)
+    assert cutting.mended(cut, [np.zeros((*size, 4), np.uint8)]) is cut
+
+
+def test_a_mended_object_has_no_fringe(tmp_path):
+    """Along a smoothed edge the picture mixes object and background; the found colours do not."""
+    picture = Image.new("RGB", (400, 400), "white")
+    picture.paste((200, 20, 20), (100, 120, 300, 280))
+    picture = picture.rotate(20, Image.Resampling.BICUBIC, fillcolor="white")
+    picture.resize((100, 100), Image.Resampling.LANCZOS).save(tmp_path / "a.png")
+    cut = cutting.cut_picture(tmp_path / "a.png", "a.png", Ways())
+    mended = cutting.mended(cut, [stroke((50, 50), (0.4, 0.4, 0.6, 0.6), cutting.REMOVE)])
+    rgba = cutting.model_picture(mended)
+    edge = rgba[(rgba[..., 3] > 0.3) & (rgba[..., 3] < 0.95)]
+    # White would have a green of 1; what the flood leaves of it is within its tolerance.
+    assert len(edge) > 20 and np.quantile(edge[:, 1], 0.9) < 0.4
+
+
+def test_what_is_painted_on(two):
+    cut = cutting.cut_picture(two, "two.png", Ways())
+    shown = cutting.editor_picture(cut)
+    assert shown.shape == (432, 720, 3) and shown.dtype == np.uint8
+    np.testing.assert_allclose(shown[216, 180], np.multiply(RED, 255), atol=2)
+    corner = {tuple(shown[y, x]) for y in (5, 17) for x in (5, 17)}
+    assert len(corner) == 2, "a checkerboard"
+    gone = replace(cut, mask=np.zeros_like(cut.mask))
+    faint = cutting.editor_picture(gone)[216, 180].astype(int)
+    assert faint[0] > faint[1] + 20, "what is cut away still shows, faintly"
+    bare = cutting.editor_picture(replace(gone, ghost=False))[216, 180]
+    assert len(set(bare.tolist())) == 1
+
+
+def test_without_an_object_it_can_be_painted(tmp_path):
+    """An even picture holds nothing; what is painted is cut out."""
+    save_image(tmp_path / "even.png", np.full((40, 50, 3), 0.5))
+    cut = cutting.cut_picture(tmp_path / "even.png", "even.png", Ways())
+    assert not cut.mask.any() and cut.note.startswith("No object was found (")
+    assert str(tmp_path) not in cut.note
+    with pytest.raises(UserError, match="no object found.*paint over the object"):
+        cutting.model_picture(cut)
+    painted = cutting.mended(cut, [stroke((80, 100), (0.25, 0.2, 0.75, 0.8), cutting.KEEP)])
+    assert cutting.model_picture(painted).shape == (38, 38, 4)  # 30 pixels over 0.8
+    removed = cutting.mended(painted, [stroke((8, 10), (0, 0, 1, 1), cutting.REMOVE)])
+    with pytest.raises(UserError, match="no object found"):
+        cutting.model_picture(removed)
+
+
+def test_no_pictures(tmp_path):
+    for name, path, reason in bad_files(tmp_path):
+        with pytest.raises(UserError, match=re.escape(reason) or None) as caught:
+            cutting.cut_picture(path, "given.png", Ways())
+        assert str(caught.value).startswith("given.png: "), name
+        assert str(tmp_path) not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name, stem",
+    [
+        ("chair.png", "chair"),
+        ("my old chair (2).JPG", "my-old-chair-2"),
+        ("../../etc/passwd", "passwd"),
+        ("<img src=x>.png", "img-src-x"),
+        ("Stühle.webp", "Stühle"),
+        ("...", "object"),
+        ("", "object"),
+        ("x" * 300 + ".png", "x" * 60),
+    ],
+)
+def test_names_of_strangers(name, stem):
+    assert cutting.stem(name) == stem
+
+
+def test_every_kind_of_file(made, tmp_path):
+    suffixes = {kind: suffix for kind, (_, suffix) in work.KINDS.items()}
+    assert len(set(suffixes.values())) == len(suffixes), "no two files have one name"
+    assert {"ply", "splat", "spz", "glb", "compressed-ply", "gif", "html"} < set(suffixes)
+    for kind in work.GAUSSIANS:
+        path, _ = work.write(made, kind, tmp_path)
+        assert path.name == "My-thing-v2" + suffixes[kind]
+        assert 0 < read_gaussians(path).num <= made.gaussians.num
+    path, _ = work.write(made, "html", tmp_path)
+    assert "<canvas" in path.read_text(encoding="utf-8")
+    with pytest.raises(UserError, match="no such kind of file: exe"):
+        work.write(made, "exe", tmp_path)
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
+def test_the_turntable(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(work, "FRAMES", 3)
+    path, _ = work.write(made, "gif", tmp_path)
+    with Image.open(path) as picture:
+        assert picture.n_frames == 3 and picture.size == (work.SIZE, work.SIZE)
+
+
+def test_a_mesh(made, tmp_path, monkeypatch):
+    """The surface itself takes half a minute, and has tests of its own."""
+    trimesh = pytest.importorskip("trimesh")
+    asked = []
+
+    def surface_of(gaussians, options, device):
+        asked.append((gaussians.num, options.colors, str(device)))
+        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+        faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+        return extract.Surface(corners, faces, np.full((4, 3), 0.5, np.float32))
+
+    monkeypatch.setattr(extract, "surface_of", surface_of)
+    for kind, suffix in (("mesh-stl", ".stl"), ("mesh-glb", ".glb")):
+        path, _ = work.write(made, kind, tmp_path)
+        assert path.name == f"My-thing-v2-mesh{suffix}"
+        assert len(trimesh.load(path, force="mesh").faces) == 4
+    assert asked == [(made.gaussians.num, True, "cpu")] * 2
+
+
+def test_the_viewer_is_a_whole_document(made):
+    class Counter(html.parser.HTMLParser):
+        found: list[str] = []
+
+        def handle_starttag(self, tag, attrs):
+            self.found.append(tag)
+            assert not {"src", "href"} & {name for name, _ in attrs}, "it loads nothing"
+
+    counter = Counter()
+    counter.feed(work.viewer(made))
+    assert counter.found.count("html") == 1 and "canvas" in counter.found
+
+
+def test_examples_are_pictures():
+    found = examples()
+    assert {"toaster", "fire hydrant"} <= {title for _, title in found}
+    assert all(path.is_file() for path, _ in found)
