@@ -81,6 +81,7 @@ def measure(browser, n: int, folder: Path, seconds: float) -> None:
 
 
 def main() -> None:
+    """Measures each number of Gaussians that was asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("numbers", type=int, nargs="+")
     parser.add_argument("--seconds", type=float, default=4.0)
