@@ -55,6 +55,8 @@ def say(line: str) -> None:
     from tqdm import tqdm
 
     tqdm.write(one_line(line))
+
+
 class Stages:
     """What a command is doing: shown behind the bar of ``for_each``, and timed.
 

@@ -14,6 +14,7 @@ import torch
 pytest.register_assert_rewrite("helpers")
 
 from helpers.browser import browser, browser_page  # noqa: E402, F401
+
 # No test fetches a matting model, or uses one that rembg keeps on this machine.
 os.environ["GAMBA_OFFLINE"] = "1"
 os.environ["U2NET_HOME"] = os.devnull

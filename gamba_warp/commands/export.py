@@ -100,8 +100,6 @@ def export_command(
     from ..pages.export import ExportJob
     from ..trajectories.paths import Viewpoint
 
-    if not mesh and not splats and not page and turntable == "none":
-        raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
     options = SurfaceOptions(
         method=surface,
         voxels=voxels,
@@ -138,6 +136,8 @@ def _run(inputs: tuple[Path, ...], job: ExportJob) -> int:
 
     from ..pages.export import export, find_gaussians
 
+    if not job.suffixes():
+        raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
     files, failures = find_gaussians(inputs)
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,10 +20,13 @@ from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, 
 
 if TYPE_CHECKING:
     import numpy as np
+    import torch
 
     from ..gaussians import Gaussians
     from ..model.gamba import Gamba
+    from ..pages.outputs import Outputs
     from ..pages.sheet import Sheet
+    from ..photo.cutout import Ways
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,8 @@ def reconstruct_command(
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
     from ..pages.card import about_model
-    from ..pages.outputs import Outputs, write_outputs
-    from ..photo.cutout import Ways, cut_out
+    from ..pages.outputs import Outputs
+    from ..photo.cutout import Ways
 
     pictures, failures = _found(images, mask)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
@@ -118,16 +122,24 @@ def reconstruct_command(
     ways = Ways(mask, matte_model, sam, chosen).checked()
     output_folder(out)
 
-    def one(name: str, path: Path) -> None:
-        STAGES.begin("cutting out")
-        cut = cut_out(path, ways)
-        say(f"{path}: {cut.how}")
-        gaussians, seconds = _forward(model, cut.rgba)
-        write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
-
+    one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen)
     for_each(names, one, "reconstruct", "picture", failures)
     _end(outputs.sheet, times)
     return report(len(pictures), "picture", failures, out)
+
+
+def _one(
+    name: str, path: Path, *, model: Gamba, ways: Ways, outputs: Outputs, device: torch.device
+) -> None:
+    """Reconstructs one picture, and writes what was asked for."""
+    from ..pages.outputs import write_outputs
+    from ..photo.cutout import cut_out
+
+    STAGES.begin("cutting out")
+    cut = cut_out(path, ways)
+    say(f"{path}: {cut.how}")
+    gaussians, seconds = _forward(model, cut.rgba)
+    write_outputs(name, cut, gaussians.to(device), outputs, model.config, seconds)
 
 
 def _forward(model: Gamba, rgba: np.ndarray) -> tuple[Gaussians, float]:
@@ -163,7 +175,6 @@ def _found(
     if not pictures:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     return pictures, failures
-
 
 
 def _file_of(checkpoint: Path) -> Path:

@@ -44,7 +44,7 @@ SIGNALS = ("SIGHUP", "SIGKILL", "SIGXFSZ", "SIGALRM", "SIGUSR1")
 BARE = f"""
 import importlib, os, signal, sys
 import filelock, msgspec, numpy, PIL.Image, safetensors.torch, torch, tqdm, trimesh, tyro, warp
-import torch.nn.parallel, torch.utils.tensorboard
+import gradio, torch.nn.parallel, torch.utils.tensorboard
 for name in {MODULES}:
     sys.modules[name] = None
 for place, names in ((os, {NAMES}), (signal, {SIGNALS})):

@@ -1,5 +1,7 @@
 """--elevation, --fov and --distance of reconstruct, export and view."""
 
+import json
+import math
 import re
 
 import numpy as np
@@ -27,8 +29,8 @@ def first_frame(path):
 
 
 def camera_of(page):
-    found = re.search(r'data-distance="(\S+)" data-fov="(\S+)" data-elevation="(\S+)"', page)
-    return tuple(map(float, found.groups()))
+    home = json.loads(re.search(r'"home": (\{[^}]*\})', page)[1])
+    return home["distance"], home["fov"], pytest.approx(math.degrees(home["elevation"]))
 
 
 @pytest.fixture(scope="module")
