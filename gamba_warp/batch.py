@@ -84,10 +84,11 @@ class Stages:
     def table(self) -> str:
         """Ends the last stage; one line a stage, with the seconds."""
         self.begin("")
-        rows = [(name, *spent) for name, spent in self.seconds.items() if name]
-        rows.append(("all", *(sum(row[i] for row in rows) for i in (1, 2))))
-        lines = [f"{name:<16} {wall:8.2f} {work:8.2f}" for name, wall, work in rows]
-        lines[0] = f"{rows[0][0]:<16} {'':8} {rows[0][2]:8.2f}"  # no clock ran before the program
+        rows = {name: spent for name, spent in self.seconds.items() if name}
+        rows["all"] = [sum(spent[i] for spent in rows.values()) for i in (0, 1)]
+        lines = [f"{name:<16} {wall:8.2f} {work:8.2f}" for name, (wall, work) in rows.items()]
+        start, (_, work) = next(iter(rows.items()))
+        lines[0] = f"{start:<16} {'':8} {work:8.2f}"  # no clock ran before the program
         return "\n".join([f"{'stage':<16} {'clock s':>8} {'CPU s':>8}", *lines])
 
 

@@ -41,8 +41,7 @@ def app_command(
 
     chosen, port = pick_device(device), free_port(port)
     model = load_model(checkpoint, chosen, encoder_weights)
-    ways = Ways(matte_model=matte_model, device=chosen)
-    ways.check()
+    ways = Ways(matte_model=matte_model, device=chosen).checked()
     with work_folder() as folder:
         quiet(folder)
         from .actions import Actions

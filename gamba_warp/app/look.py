@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import gradio as gr
+from gradio import themes
 
 LOOK = Path(__file__).parent / "look.css"
 
 
-def theme() -> gr.themes.Base:
+def theme() -> themes.Base:
     """Colours, corners and fonts; fonts by their names in the system, so that none is fetched."""
-    return gr.themes.Base(
-        primary_hue=gr.themes.colors.blue,
-        neutral_hue=gr.themes.colors.gray,
-        radius_size=gr.themes.sizes.radius_lg,
+    return themes.Base(
+        primary_hue=themes.colors.blue,
+        neutral_hue=themes.colors.gray,
+        radius_size=themes.sizes.radius_lg,
         font=["system-ui", "sans-serif"],
         font_mono=["ui-monospace", "monospace"],
     ).set(

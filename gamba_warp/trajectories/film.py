@@ -43,12 +43,10 @@ def parse_size(text: str) -> tuple[int, int | None]:
     found = re.fullmatch(r"(\d{1,9})(?:[xX](\d{1,9}))?", text.strip())
     if found is None:
         raise UserError(f"--size {text[:40]}: give a width such as 512, or WxH such as 640x360")
-    width, height = (side and int(side) for side in found.groups())
-    for side in filter(None, (width, height)):
+    width, *rest = (int(side) for side in found.groups() if side is not None)
+    for side in (width, *rest):
         check_range("--size", side, _SIDES)
-    if width == 0 or height == 0:
-        raise UserError(f"--size {text[:40]}: must be at least {_SIDES.ge}")
-    return int(width or 0), height
+    return width, rest[0] if rest else None
 
 
 def parse_background(text: str) -> Color | None:
