@@ -40,8 +40,8 @@ def app_command(
     from .server import free_port, quiet, serve, work_folder
 
     chosen, port = pick_device(device), free_port(port)
-    model = load_model(checkpoint, chosen, encoder_weights)
     ways = Ways(matte_model=matte_model, device=chosen).checked()
+    model = load_model(checkpoint, chosen, encoder_weights)
     with work_folder() as folder:
         quiet(folder)
         from .actions import Actions

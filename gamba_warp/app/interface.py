@@ -62,7 +62,7 @@ def _picture_part() -> tuple[gr.Image, gr.Gallery]:
         sources=["upload", "clipboard"],
         type="filepath",
         image_mode=None,
-        height=190,
+        height=170,
         buttons=[],
         placeholder="Drop a picture here\nor click to choose one",
         elem_id="picture",
@@ -119,7 +119,7 @@ def _cut_part() -> _CutPart:
             brush=_brush(KEEP),
             eraser=gr.Eraser(default_size=SIDE // 24),
             canvas_size=(SIDE, SIDE),
-            height=420,
+            height=380,
             buttons=[],
             elem_id="editor",
         )
