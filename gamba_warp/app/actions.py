@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gradio as gr
 
 from ..errors import UserError, first_line
+from ..images import save_image
 from ..versions import advice
 from . import work
 from .cutting import Cut, cut_picture, editor_picture, mended, restarted
@@ -93,7 +94,7 @@ class Actions:
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This is no picture for us")
             return self.leave()
-        return *_shown(cut), gr.skip()
+        return *self._shown(cut), gr.skip()
 
     def leave(self) -> tuple:
         """The picture was taken away; what was made of it stays."""
@@ -103,17 +104,17 @@ class Actions:
         """A picture of the gallery."""
         path, title = examples()[int(event.index)]
         cut = self._turns.call(cut_picture, path, title, self._ways)
-        return *_shown(cut), str(path)
+        return *self._shown(cut), str(path)
 
     def mend(self, cut: Cut | None, painted: dict[str, Any] | None) -> tuple:
         """The strokes become part of the mask."""
         cut = mended(_given(cut), _layers(painted))
-        return cut, editor_picture(cut)
+        return cut, self._editor(cut)
 
     def restart(self, cut: Cut | None) -> tuple:
         """The mask as it was found, without strokes."""
         cut = restarted(_given(cut))
-        return cut, editor_picture(cut)
+        return cut, self._editor(cut)
 
     def make(
         self,
@@ -129,7 +130,7 @@ class Actions:
         progress(0.8, "The viewer is made")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
-        editor = gr.skip() if after is before else editor_picture(after)
+        editor = gr.skip() if after is before else self._editor(after)
         files = gr.update(value=None, visible=False)
         return after, editor, made, frame, gr.update(visible=True), files
 
@@ -154,6 +155,18 @@ class Actions:
 
         return plainly(write)
 
+    def _shown(self, cut: Cut) -> tuple:
+        note = f"<p>{html.escape(cut.note)}</p>"
+        return cut, gr.update(visible=True), self._editor(cut), note
+
+    def _editor(self, cut: Cut) -> dict[str, Any]:
+        """The editor's value. gradio would write the same picture to the same file once more, in
+        the middle of the browser's reading it; each of ours is a new one.
+        """
+        path = Path(tempfile.mkdtemp(dir=self._folder)) / "cut-out.png"
+        save_image(path, editor_picture(cut) / 255.0)
+        return {"background": str(path), "layers": [], "composite": str(path)}
+
 
 def _given(cut: Cut | None) -> Cut:
     if cut is None:
@@ -163,8 +176,3 @@ def _given(cut: Cut | None) -> Cut:
 
 def _layers(painted: dict[str, Any] | None) -> list:
     return [] if painted is None else painted["layers"]
-
-
-def _shown(cut: Cut) -> tuple:
-    note = f"<p>{html.escape(cut.note)}</p>"
-    return cut, gr.update(visible=True), editor_picture(cut), note

@@ -182,8 +182,9 @@ def _connect(
     quick = {**one, "show_progress": "hidden"}
     taking = {**one, "show_progress_on": picture}
     shown = [cut, parts.group, parts.editor, parts.note, picture]
-    # gradio would decode the picture itself, and differently: the file is read by us alone.
-    picture.input(actions.take, picture, shown, preprocess=False, **taking)
+    # gradio would decode the picture itself, and differently: the file is read by us alone. (Its
+    # event ``input`` comes with the old picture when that is taken away.)
+    picture.upload(actions.take, picture, shown, preprocess=False, **taking)
     picture.clear(actions.leave, None, shown, **quick)
     gallery.select(actions.example, None, shown, **taking)
     mask = [cut, parts.editor]
