@@ -23,8 +23,6 @@ MAX_SIDE = 32_768  # pixels; panoramas are shorter, and what pads to a square st
 # Pillow knows thirty more; one of them (EPS) starts another program, and none is a photo's.
 # JPEG stands for MPO too.
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "PPM")
-# What phones and browsers make; pillow-heif brings the first, most builds of Pillow the second.
-_PHONES = ("HEIF", "AVIF")
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".gif"}
 PICTURE_SUFFIXES |= {".heic", ".heif", ".avif"}
 
@@ -163,7 +161,9 @@ def picture_size(path: str | Path) -> tuple[int, int]:
 
 @contextmanager
 def _still(path: str | Path) -> Iterator[Image.Image]:
-    with open_picture(path, formats=(*FORMATS, *_phones(path))) as image:
+    _check_file(path, path)  # to open a pipe would wait for whoever writes into it
+    formats = (*FORMATS, *_phones(path))
+    with open_picture(path, max_pixels=MAX_PIXELS, formats=formats) as image:
         # An MPO is a phone's JPEG, followed by a preview or a depth map; so is a HEIC.
         if image.format not in ("MPO", "HEIF") and getattr(image, "is_animated", False):
             small = os.path.getsize(path) <= _COUNTED
@@ -176,8 +176,8 @@ def _phones(path: str | Path) -> tuple[str, ...]:
     """The formats of phones, if a file is of these. Raises UserError if no reader is installed."""
     try:
         with open(path, "rb") as file:
-            head = file.read(12) if stat.S_ISREG(os.stat(path).st_mode) else b""
-    except (OSError, ValueError):
+            head = file.read(12)
+    except OSError:
         return ()  # ``open_picture`` says why
     if head[4:8] != b"ftyp":
         return ()
