@@ -70,7 +70,7 @@ BOXES = {
     "data": Box(2.5, 4, "gamba_warp", "data", ("datasets,", "preprocessing")),
     "formats": Box(4, 4, "gamba_warp", "formats", (".ply .splat .glb,", "meshes, their headers")),
     "vision": Box(1.4, 4, "gamba_warp", "vision", ("VGG16, LPIPS:", "weights to fetch")),
-    "model": Box(1.6, 5, "gamba_warp", "model", ("posing, tokens, blocks,", "decoder")),
+    "model": Box(1.6, 6, "gamba_warp", "model", ("posing, tokens, blocks,", "decoder")),
     "surfaces": Box(4, 5, "gamba_warp", "surfaces", ("Gaussians to meshes:", "TSDF, density")),
     "fitting": Box(2.8, 5, "gamba_warp", "fitting", ("one object", "by optimisation")),
     "photo": Box(0.4, 5, "gamba_warp", "photo", ("any photograph", "to a cut-out object")),
@@ -78,20 +78,20 @@ BOXES = {
         6.4, 5, "gamba_warp", "trajectories", ("paths of cameras,", "their files, movies")
     ),
     "viewer": Box(5.2, 5, "gamba_warp", "viewer", ("the 3D viewer", "and its pages")),
-    "app": Box(4, 10, "gamba_warp", "app", ("the local", "web app")),
-    "pages": Box(2.2, 6, "gamba_warp", "pages", ("pages, turntables", "")),
-    "measure": Box(0.6, 6, "gamba_warp", "measure", ("bench and stress cases", "with the model")),
-    "train": Box(3.6, 7, "train", "train", ("batches, losses, loop;", "data/: rendering")),
-    "eval": Box(4.7, 6, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
-    "gpu_check": Box(1, 7, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
-    "hostile": Box(3.4, 9, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
+    "app": Box(4, 11, "gamba_warp", "app", ("the local", "web app")),
+    "pages": Box(2.2, 7, "gamba_warp", "pages", ("pages, turntables", "")),
+    "measure": Box(0.6, 7, "gamba_warp", "measure", ("bench and stress cases", "with the model")),
+    "train": Box(3.6, 8, "train", "train", ("batches, losses, loop;", "data/: rendering")),
+    "eval": Box(4.7, 7, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
+    "gpu_check": Box(1, 8, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
+    "hostile": Box(3.4, 10, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
     "endurance": Box(
-        4.7, 8, "gamba_warp", "endurance", ("kills and full disks", "in every command")
+        4.7, 9, "gamba_warp", "endurance", ("kills and full disks", "in every command")
     ),
-    "ablation": Box(2.1, 8, "gamba_warp", "ablation", ("rows trained and", "evaluated alike")),
-    "commands": Box(2.2, 10, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
-    "cli": Box(2.8, 11, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
-    "public": Box(0.2, 11, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
+    "ablation": Box(2.1, 9, "gamba_warp", "ablation", ("rows trained and", "evaluated alike")),
+    "commands": Box(2.2, 11, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
+    "cli": Box(2.8, 12, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
+    "public": Box(0.2, 12, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
 }
 FLOORS = 1 + max(box.floor for box in BOXES.values())
 

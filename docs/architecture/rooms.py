@@ -83,6 +83,7 @@ ROOMS = {
     "model": Room(
         "the network, its encoders and its files",
         (*_READERS, "data", "formats", "vision", "model.config", "model.parts"),
+        ("photo",),
     ),
     "photo": Room("any photograph to a cut-out object", (*_READERS, "data", "vision")),
     "trajectories": Room("paths of cameras, their files, movies", (*_READERS, "data")),

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..data.preprocess import composite, prepare, resize_rgba
+from ..data.preprocess import composite, resize_rgba
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .posing import reference_cameras
@@ -24,8 +24,9 @@ def reconstruct(model: Gamba, picture: str | Path | np.ndarray) -> Gaussians:
 
     Args:
         model: on any device, in evaluation mode.
-        picture: a file, which ``preprocess.prepare`` cuts out and centres; or what that returns,
-            RGBA ``[S, S, 4]`` in [0, 1] with the object in the middle.
+        picture: a file, whose object ``photo.cutout.cut_out`` cuts out and centres, with nothing
+            fetched; or the ``rgba`` of what that returns, ``[S, S, 4]`` in [0, 1] with the object
+            in the middle.
 
     Returns:
         Gaussians ``[N]`` on the model's device, in the reference camera's frame.
@@ -34,13 +35,19 @@ def reconstruct(model: Gamba, picture: str | Path | np.ndarray) -> Gaussians:
         UserError: the file cannot be read, or its object cannot be told from the background.
         ValueError: the array has another shape.
     """
-    rgba = picture if isinstance(picture, np.ndarray) else prepare(picture)
+    rgba = picture if isinstance(picture, np.ndarray) else _cut_out(picture)
     if rgba.ndim != 3 or rgba.shape[0] != rgba.shape[1] or rgba.shape[2] != 4:
         raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config
     device = next(model.parameters()).device
     images = model_input(rgba, config).to(device)
     return model(images, reference_cameras(config, 1).to(device))[0]
+
+
+def _cut_out(picture: str | Path) -> np.ndarray:
+    from ..photo.cutout import Ways, cut_out
+
+    return cut_out(picture, Ways(fetch=False)).rgba
 
 
 def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:
