@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import signal
@@ -131,6 +132,7 @@ def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool, turns: Ma
         )
     except OSError as error:
         raise UserError(f"--port {port}: Address already in use") from error
+    logging.getLogger("uvicorn.error").addFilter(_is_ours)
     address = f"http://{HOST}:{port}/"
     print(f"{address} (Ctrl-C ends it)", flush=True)
     signal.signal(signal.SIGTERM, _end)
@@ -140,6 +142,12 @@ def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool, turns: Ma
         turns.work()
     finally:
         page.close(verbose=False)
+
+
+def _is_ours(record: logging.LogRecord) -> bool:
+    """Whether a logged error may be our defect: a browser that leaves in the middle is none."""
+    error = record.exc_info[1] if record.exc_info else None
+    return type(error).__name__ not in ("ClientDisconnect", "LocalProtocolError")
 
 
 def _end(number: int, _frame: object) -> None:

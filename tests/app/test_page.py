@@ -264,6 +264,5 @@ def test_ctrl_c_leaves_nothing(served):
     assert len(served.folders()) == 1
     served.process.send_signal(signal.SIGINT)
     out, err = served.process.communicate(timeout=30)
-    print(err)
     assert (served.process.returncode, out, err) == (130, "", "gamba: interrupted\n")
     assert served.folders() == []

@@ -1,6 +1,7 @@
 """What the page's server lets in, leaves behind, and computes on."""
 
 import asyncio
+import logging
 import os
 import threading
 import time
@@ -88,6 +89,17 @@ def test_a_port_in_use_is_one_line():
         with pytest.raises(UserError, match=f"--port {port}: Address already in use"):
             server.free_port(port)
     assert 0 < server.free_port(0) < 65536
+
+
+def test_a_browser_that_leaves_is_no_error():
+    def logged(error):
+        info = (type(error), error, None)
+        return server._is_ours(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), info))
+
+    requests = pytest.importorskip("starlette.requests", reason="needs gradio")
+    assert not logged(requests.ClientDisconnect())
+    assert logged(ZeroDivisionError())
+    assert server._is_ours(logging.LogRecord("uvicorn.error", 40, "", 1, "x", (), None))
 
 
 def test_jobs_are_done_by_the_one_that_works():
