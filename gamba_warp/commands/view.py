@@ -10,6 +10,7 @@ import tyro
 from msgspec import Meta
 
 from ..batch import check_not_read
+from ..conventions import Axes
 from ..errors import UserError
 from ..files import output_folder
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
@@ -21,6 +22,7 @@ def view_command(
     /,
     out: Path | None = None,
     mesh: Path | None = None,
+    mesh_frame: Axes | None = None,
     serve: bool = False,
     port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
@@ -34,6 +36,8 @@ def view_command(
         file: Gaussians (.ply, .splat, .spz, .glb), or the folder of a training run.
         out: File for the page; a temporary file if not given.
         mesh: A mesh of the same object, to be shown too (.glb, .obj, .ply, .stl).
+        mesh_frame: Axes of the mesh; if not given, opengl (y up) of .glb and .gltf, and opencv of
+            others. The .obj, .ply and .stl of gamba export are opengl unless asked for otherwise.
         serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
         port: Port of --serve; 0 picks a free one.
         open_browser: Open the browser.
@@ -56,7 +60,7 @@ def view_command(
     if mesh is not None and file.is_dir():
         raise UserError(f"--mesh {mesh}: a training run has no mesh")
     gaussians = None if file.is_dir() else read_gaussians(file)
-    surface = None if mesh is None else read_viewed_mesh(mesh)
+    surface = None if mesh is None else read_viewed_mesh(mesh, mesh_frame)
     if out is not None:
         output_folder(out.parent)
     page = out or Path(tempfile.mkdtemp(prefix="gamba-")) / f"{file.stem}.html"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..conventions import Axes
 from ..formats.materials import to_linear
 from ..formats.meshes import TexturedMesh, load_mesh, to_display
 
@@ -28,19 +29,23 @@ class ViewedMesh:
     colors: np.ndarray
 
 
-def read_viewed_mesh(path: str | Path) -> ViewedMesh:
-    """Reads a mesh file for the viewer.
+def read_viewed_mesh(path: str | Path, axes: Axes | None = None) -> ViewedMesh:
+    """Reads a mesh file for the viewer, which shows OpenCV's axes (y down).
 
-    ``.glb`` and ``.gltf`` are turned from their axes (y up) to OpenCV's; the others are taken to
-    have the axes of the Gaussians, as those have that ``gamba reconstruct`` and ``export`` write.
     A texture is seen as its colours at the corners.
+
+    Args:
+        path: the file.
+        axes: those of the file. None: OpenGL's (y up) of a ``.glb`` or ``.gltf``, as the format
+            says, and OpenCV's of others, as ``gamba reconstruct`` writes them.
 
     Raises:
         UserError: as ``load_mesh``.
     """
     mesh = load_mesh(path)
     linear = Path(path).suffix.lower() in _LINEAR
-    vertices = mesh.vertices * ([1.0, -1.0, -1.0] if linear else 1.0)
+    is_up = linear if axes is None else axes == "opengl"
+    vertices = mesh.vertices * ([1.0, -1.0, -1.0] if is_up else 1.0)
     paint = (255 * _corner_colors(mesh, linear) + 0.5).astype(np.int64)
     # A vertex that has several colours becomes several.
     keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]
