@@ -33,6 +33,7 @@ _USED = (
 # The extra that brings a library (by the name it is imported by). A command that has an extra of
 # its own names that instead, where it holds the library too.
 EXTRA_OF = {
+    "backports.zstd": "spz",
     "gradio": "app",
     "gsplat": "fit",
     "huggingface_hub": "hub",
@@ -140,7 +141,7 @@ def advice(library: str, command: str) -> str | None:
         library: what could not be imported; also one of its modules, as ``scipy.spatial``.
         command: the command that needs it.
     """
-    name = library.partition(".")[0]
+    name = library if library in EXTRA_OF else library.partition(".")[0]
     if name not in EXTRA_OF:
         return None
     extra = OWN.get(command, "")

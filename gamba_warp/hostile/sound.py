@@ -108,10 +108,19 @@ def gaussians(result: Any, path: Path, out: Path) -> str | None:
     for name in ("opacities",) if "harmonics" in tensors else ("opacities", "colors"):
         if not bool(((tensors[name] >= 0) & (tensors[name] <= 1)).all()):
             return f"{name} outside [0, 1]"
-    stated = re.search(rb"element\s+vertex\s+(\d+)", path.read_bytes()) if path.is_file() else None
-    if stated and int(stated[1]) != result.num:
-        return f"{result.num} Gaussians, the file states {int(stated[1])}"
+    stated = _gaussians_stated(path.read_bytes()) if path.is_file() else None
+    if stated not in (None, result.num):
+        return f"{result.num} Gaussians, the file states {stated}"
     return None
+
+
+def _gaussians_stated(data: bytes) -> int | None:
+    """The number of Gaussians in the header of a .ply or of an .spz of version 4."""
+    if data.startswith(b"NGSP") and len(data) >= 12:
+        return int.from_bytes(data[8:12], "little")
+    # Another kind of file may have a .ply behind its own end.
+    found = re.search(rb"element\s+vertex\s+(\d+)", data) if data.startswith(b"ply") else None
+    return int(found[1]) if found else None
 
 
 def mesh(result: Any, path: Path, out: Path) -> str | None:

@@ -285,7 +285,7 @@ def open_tar(file: BinaryIO, source: object, scratch: Path) -> Iterator[Iterator
 
     Raises:
         UserError: it is damaged or too large, or a name leaves the folder; also while the members
-            are walked through.
+            are walked through and read.
     """
     with tempfile.TemporaryFile(dir=scratch) as plain:
         with _one_line(source):
@@ -299,7 +299,10 @@ def open_tar(file: BinaryIO, source: object, scratch: Path) -> Iterator[Iterator
             plain.seek(0)
             tar = tarfile.open(fileobj=cast(BinaryIO, _ShortReads(plain)), mode="r:")
         with tar:
-            yield _walk(tar, total, source)
+            try:
+                yield _walk(tar, total, source)
+            except tarfile.TarError as error:  # a member ends early, when it is read
+                raise UserError(f"{source}: cannot be unpacked ({first_line(error)})") from error
 
 
 def _walk(tar: tarfile.TarFile, total: int, source: object) -> Iterator[Member]:

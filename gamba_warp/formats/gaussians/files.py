@@ -18,7 +18,8 @@ from .compressed import WORDS, is_compressed, packed
 from .glb import save_glb
 from .glb_reader import holds_gaussians, load_glb
 from .splat import load_splat, save_splat
-from .spz import GZIP, ZSTD_HEADER, load_spz, save_spz
+from .spz import load_spz, save_spz
+from .spz_container import GZIP, MAGIC
 
 # One is enough, so that a file that lacks the others is not taken for a point cloud.
 _OF_GAUSSIANS = {"opacity", "scale_0", "rot_0", "f_dc_0", *WORDS}
@@ -48,7 +49,7 @@ def splat_kind(path: str | Path) -> SplatFormat | None:
             return "compressed-ply" if is_compressed(header) else "ply"
         if start == b"glTF":
             return "glb" if holds_gaussians(path, file, size) else None
-    if start.startswith(GZIP) or start == ZSTD_HEADER:
+    if start.startswith(GZIP) or start == MAGIC:
         return "spz"
     return {".splat": "splat", ".spz": "spz"}.get(path.suffix.lower())  # type: ignore[return-value]
 
@@ -77,7 +78,7 @@ def read_gaussians(path: str | Path) -> Gaussians:
         return load_ply(path)
     if start == b"glTF":
         return load_glb(path)
-    if start.startswith(GZIP) or start == ZSTD_HEADER:
+    if start.startswith(GZIP) or start == MAGIC:
         return load_spz(path)
     suffix = path.suffix.lower()
     if suffix in SPLAT_SUFFIXES:  # the reader of that name says what is wrong

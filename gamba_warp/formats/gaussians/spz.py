@@ -1,16 +1,15 @@
 """Gaussians as ``.spz``, Niantic's packed format: a tenth of a ``.ply``, read by most viewers.
 
-After a header of 16 bytes come, each for all Gaussians: positions as 24-bit fixed point, opacities
-and colours with 8 bits, logarithms of the scales with 8 bits, rotations, harmonics with 8 bits; all
-of it in one gzip stream. Versions 1 (positions of 16-bit floats), 2 and 3 (other rotations) are
-read, version 3 is written: every reader that is looked after takes it. Axes are OpenGL's.
+After a header come, each for all Gaussians: positions as 24-bit fixed point, opacities and colours
+with 8 bits, logarithms of the scales with 8 bits, rotations, harmonics with 8 bits. Version 1 has
+positions of 16-bit floats, versions 1 and 2 other rotations; version 4 has the numbers of version 3
+in another container (``spz_container.py``). All four are read. Version 3 is written: every reader
+that is looked after takes it. Axes are OpenGL's.
 """
 
 from __future__ import annotations
 
 import gzip
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from ...errors import UserError
 from ...files import atomic_path
 from ...gaussians import SH_C0, Gaussians
-from ..headers import compare_sizes, open_shape
+from ..headers import open_shape
 from .arrays import (
     DEGREES,
     MIN_SCALE,
@@ -28,18 +27,12 @@ from .arrays import (
     smallest_three,
     sound_gaussians,
 )
+from .spz_container import COUNTS, HEADER, MAGIC, unpacked
 
-GZIP, ZSTD_HEADER = b"\x1f\x8b", b"NGSP"  # versions 1 to 3, and the plain header of version 4
-_HEADER = struct.Struct("<4sIIBBBB")
 _VERSION = 3
-MAX_POINTS = 10_000_000  # as the reference has it
-_MAX_RATIO = 1040  # deflate packs at most 1032 to 1
-_MORE = 2  # flag: extensions follow, which are passed over
-_MAX_EXTENSIONS = 1 << 20  # bytes
 _FRACTION = 16  # most bits behind the point: steps of 1.5e-5
 _COLOR = 0.15  # of a degree-0 coefficient, so that colours outside [0, 1] have a place
 _HALF = 511  # largest of the 9 bits of a rotation's number
-_COUNTS = {degree: count for count, degree in DEGREES.items()}
 
 
 def save_spz(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0) -> str | None:
@@ -68,7 +61,7 @@ def save_spz(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0
     logs = np.log(arrays["scales"].clip(MIN_SCALE).astype(np.float64))
     coefficients = (arrays["colors"] - 0.5) / SH_C0
     parts = [
-        _HEADER.pack(b"NGSP", _VERSION, count, DEGREES[harmonics.shape[1]], bits, 0, 0),
+        HEADER.pack(MAGIC, _VERSION, count, DEGREES[harmonics.shape[1]], bits, 0, 0),
         fixed[:, :, None].view(np.uint8)[..., :3].tobytes(),
         _bytes(arrays["opacities"] * 255.0),
         _bytes((coefficients * _COLOR + 0.5) * 255.0),
@@ -86,36 +79,35 @@ def save_spz(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0
 
 
 def load_spz(path: str | Path) -> Gaussians:
-    """Reads an ``.spz`` file of version 1, 2 or 3, from this or another program, as one object.
+    """Reads an ``.spz`` file of version 1 to 4, from this or another program, as one object.
 
     Raises:
         UserError: not a file, not ``.spz``, of another version, truncated or longer than it says,
-            or values that are not those of Gaussians.
+            or values that are not those of Gaussians; or version 4, and ``backports.zstd`` is
+            missing where Python has no ZSTD of its own.
     """
     path = Path(path)
     with open_shape(path) as (file, _):
         content = file.read()
-    if content.startswith(ZSTD_HEADER):
-        raise UserError(f"{path}: .spz of version 4, only 1 to 3 are read; save it as version 3")
-    data, degree, version, bits, count = _unzipped(path, content)
-    K, at = _COUNTS[degree], 0
+    found = unpacked(path, content)
+    count, K, at = found.count, COUNTS[found.degree], 0
 
     def take(kind: str, *shape: int) -> np.ndarray:
         nonlocal at
-        found = np.frombuffer(data, kind, int(np.prod((count, *shape))), at)
-        at += found.nbytes
-        return found.reshape(count, *shape)
+        values = np.frombuffer(found.body, kind, int(np.prod((count, *shape))), at)
+        at += values.nbytes
+        return values.reshape(count, *shape)
 
-    if version == 1:
+    if found.version == 1:
         means = take("<f2", 3).astype(np.float64)
     else:
         low = take("u1", 3, 3).astype(np.int32)
         fixed = low[..., 0] | low[..., 1] << 8 | low[..., 2] << 16
-        means = (fixed - ((fixed & 0x800000) << 1)) / 2.0**bits
+        means = (fixed - ((fixed & 0x800000) << 1)) / 2.0**found.bits
     opacities = take("u1") / 255
     colors = (take("u1", 3) / 255 - 0.5) / _COLOR * SH_C0 + 0.5
     scales = np.exp(take("u1", 3) / 16 - 10)
-    quats = _smallest(take("<u4")) if version == 3 else _first_three(take("u1", 3))
+    quats = _smallest(take("<u4")) if found.version > 2 else _first_three(take("u1", 3))
     harmonics = (take("u1", K, 3).astype(np.float64) - 128) / 128
     arrays = {
         "means": means,
@@ -126,43 +118,6 @@ def load_spz(path: str | Path) -> Gaussians:
         "harmonics": harmonics,
     }
     return flip_axes(sound_gaussians(path, arrays))
-
-
-def _unzipped(path: Path, content: bytes) -> tuple[bytes, int, int, int, int]:
-    """What follows the header, and the header's degree, version, bits and count.
-
-    No more is unpacked than the header says, and the header may not say more than a gzip stream of
-    this length can hold.
-
-    Raises:
-        UserError: damaged, truncated, or the header is false or of another kind.
-    """
-    stream = zlib.decompressobj(31)  # 31: with gzip's header and checksum
-    try:
-        head = stream.decompress(content, _HEADER.size)
-        if len(head) < _HEADER.size or not head.startswith(b"NGSP"):
-            raise UserError(f"{path}: not an .spz file")
-        _, version, count, degree, bits, flags, _ = _HEADER.unpack(head)
-        if version not in (1, 2, 3):
-            raise UserError(f"{path}: .spz of version {version}, only 1 to 3 are read")
-        if degree not in _COUNTS:
-            raise UserError(f"{path}: harmonics of degree {degree}, only 0 to 3 are read")
-        if bits > 30 or count > MAX_POINTS:
-            raise UserError(f"{path}: broken header, {count} Gaussians, {bits} bits")
-        each = (6 if version == 1 else 9) + 1 + 3 + 3 + (4 if version == 3 else 3)
-        wanted = count * (each + 3 * _COUNTS[degree])
-        compare_sizes(path, f"{count} Gaussians", wanted, _MAX_RATIO * len(content), exact=False)
-        body = stream.decompress(stream.unconsumed_tail, wanted + 1)
-        if flags & _MORE and stream.unconsumed_tail:
-            stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS)
-    except zlib.error as error:
-        raise UserError(f"{path}: truncated or damaged ({error})") from error
-    compare_sizes(path, f"{count} Gaussians", wanted, len(body), exact=False)
-    if len(body) > wanted and not flags & _MORE:
-        raise UserError(f"{path}: false header, more follows than {count} Gaussians")
-    if not stream.eof:
-        raise UserError(f"{path}: truncated, the gzip stream has no end")
-    return body[:wanted], degree, version, bits, count
 
 
 def _bytes(values: np.ndarray) -> bytes:

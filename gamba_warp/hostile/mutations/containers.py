@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import functools
-import gzip
 import io
 import json
 import pickle
@@ -20,20 +19,9 @@ import numpy as np
 
 from ..seeds.datasets import ar, npy, tarred, zipped
 from ..seeds.shapes import glb
-from .data import MUTATIONS, Mutation, Unfit
-from .text import NAMES, TEXT, change_json, changed_tree, dump, encode
-
-_BOMB = 300 << 20  # bytes that a bomb unpacks to; it takes a few hundred kB
-
-
-def _any(data: bytes, rng: Random) -> bytes:
-    """One of the plain mutations that fits."""
-    for _ in range(20):
-        try:
-            return rng.choice((*MUTATIONS, *TEXT))(data, rng)
-        except Unfit:
-            continue
-    return data
+from .data import BOMB, Mutation, Unfit
+from .spz import gzip_inside, spz_frame, spz_table
+from .text import NAMES, any_plain, change_json, changed_tree, dump, encode
 
 
 def safetensors_header(data: bytes, rng: Random) -> bytes:
@@ -78,7 +66,7 @@ def glb_tree(data: bytes, rng: Random) -> bytes:
         raise Unfit from error
     binary = data[28 + size :]
     if rng.random() < 0.3:
-        return glb(dump(tree), _any(binary, rng))
+        return glb(dump(tree), any_plain(binary, rng))
     return glb(dump(changed_tree(tree, rng)), binary)
 
 
@@ -139,11 +127,11 @@ def png_chunks(data: bytes, rng: Random) -> bytes:
     elif choice < 0.5:
         kind = rng.choice((b"zTXt", b"iCCP", b"iTXt"))
         start = b"k\0\0" if kind != b"iTXt" else b"k\0\x01\0\0\0"
-        chunks.insert(1, (kind, start + _bomb(_BOMB // 16)))
+        chunks.insert(1, (kind, start + _bomb(BOMB // 16)))
     elif choice < 0.55:
         chunks.insert(1, (b"acTL", struct.pack(">II", rng.choice((2, 2**31 - 1)), 0)))
     elif choice < 0.75:
-        chunks[at] = (chunks[at][0], _any(chunks[at][1], rng))
+        chunks[at] = (chunks[at][0], any_plain(chunks[at][1], rng))
     elif choice < 0.85:
         chunks.insert(at, chunks[rng.randrange(len(chunks))])
     else:
@@ -171,7 +159,7 @@ def _unzip_bomb() -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open(zipfile.ZipInfo("b/chair/chair.obj"), "w") as member:
-            for _ in range(_BOMB >> 20):
+            for _ in range(BOMB >> 20):
                 member.write(bytes(1 << 20))
     return content.getvalue()
 
@@ -187,7 +175,7 @@ def zip_members(data: bytes, rng: Random) -> bytes:
     elif choice < 0.55 and name:
         members[_text_name(rng)] = members.pop(name)
     elif choice < 0.7 and name:
-        members[name] = _any(members[name], rng)
+        members[name] = any_plain(members[name], rng)
     elif choice < 0.8 and name:
         del members[name]
     elif choice < 0.85:
@@ -211,7 +199,7 @@ def _text_name(rng: Random) -> str:
 
 def _hostile_properties(data: bytes, rng: Random) -> bytes:
     if rng.random() < 0.3:
-        return _any(data, rng)
+        return any_plain(data, rng)
     lines = data.split(b"\n")
     at = rng.choice([i for i, line in enumerate(lines) if b"=" in line] or [0])
     key = lines[at].split(b"=")[0]
@@ -254,7 +242,7 @@ def deb_members(data: bytes, rng: Random) -> bytes:
         sizes = (b"-60", b"-61", b"-120", b"0", b"9999999999", b"60", b"x", b"1e3", b"")
         return re.sub(rb"(?<=100644  )\d+ *(?=`)", lambda _: rng.choice(sizes).ljust(10), data)
     if choice < 0.35:
-        members["data.tar.xz"] = _any(inner, rng)
+        members["data.tar.xz"] = any_plain(inner, rng)
         return ar(members)
     try:
         with tarfile.open(fileobj=io.BytesIO(inner)) as tar:
@@ -338,32 +326,8 @@ def pickle_values(data: bytes, rng: Random) -> bytes:
     return pickle.dumps({"VGG16_0": {"Conv_0": {"kernel": rng.choice(arrays)}}}, protocol=4)
 
 
-def gzip_inside(data: bytes, rng: Random) -> bytes:
-    """Changes what a gzip stream holds, or makes it hold far more; its checksum then fits."""
-    try:
-        inner = gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise Unfit from error
-    if rng.random() < 0.1:
-        return gzip.compress(inner + bytes(_BOMB // 4), 9)
-    if rng.random() < 0.3 and len(inner) >= 16:  # an .spz's version, count, degree, bits, flags
-        kind, at, values = rng.choice(
-            (
-                ("<I", 4, (0, 1, 2, 3, 4, 2**32 - 1)),
-                ("<I", 8, (0, 1, 11, 13, 10**7, 10**7 + 1, 2**32 - 1)),
-                ("B", 12, (0, 1, 2, 3, 4, 255)),
-                ("B", 13, (0, 12, 24, 31, 255)),
-                ("B", 14, (0, 1, 2, 3, 255)),
-            )
-        )
-        out = bytearray(inner)
-        struct.pack_into(kind, out, at, rng.choice(values))
-        return gzip.compress(bytes(out))
-    return gzip.compress(_any(inner, rng))
-
-
 BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
-    ".spz": (gzip_inside,),
+    ".spz": (gzip_inside, spz_table, spz_frame),
     ".safetensors": (safetensors_header, safetensors_header, safetensors_values),
     ".glb": (glb_tree,),
     ".npy": (npy_header,),

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from random import Random
 
 Mutation = Callable[[bytes, Random], bytes]
+BOMB = 300 << 20  # bytes that a bomb unpacks to; it takes a few hundred kB
 MOST_BYTES = 4 << 20  # a mutated file is no larger: what is tested is readers, not their patience
 
 

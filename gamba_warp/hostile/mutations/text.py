@@ -7,7 +7,7 @@ import re
 from random import Random
 from typing import Any
 
-from .data import Mutation, Unfit
+from .data import MUTATIONS, Mutation, Unfit
 
 NUMBERS = (
     "0", "-1", "1", "-60", "2147483647", "2147483648", "-2147483649", "9223372036854775807",
@@ -243,3 +243,13 @@ JSON: tuple[Mutation, ...] = (
     near_number,
     hostile_word,
 )
+
+
+def any_plain(data: bytes, rng: Random) -> bytes:
+    """One of the plain mutations that fits."""
+    for _ in range(20):
+        try:
+            return rng.choice((*MUTATIONS, *TEXT))(data, rng)
+        except Unfit:
+            continue
+    return data

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import struct
 import tempfile
@@ -72,7 +73,34 @@ def splats() -> dict[str, Files]:
     for kind in ("compressed-ply", "splat", "spz", "glb"):
         name = "object." + ("ply" if kind == "compressed-ply" else kind)
         seeds[f"gaussians-{kind}"] = {name: gaussians(300 if "ply" in kind else 12, kind, 1)}
+    seeds["gaussians-spz-4"] = {"object.spz": spz_4(gaussians(12, "spz", 1))}
     return seeds
+
+
+def spz_4(data: bytes) -> bytes:
+    """An ``.spz`` of version 3 in the container of version 4, with an extension.
+
+    Each ZSTD frame holds its bytes as they are, so a mutation reaches the numbers too.
+    """
+    inner = gzip.decompress(data)
+    magic, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", inner)
+    sizes = [count * each for each in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if each]
+    extension = struct.pack("<III", 0xADBE0003, 4, 4)  # the axes are the usual ones
+    table, frames, at = b"", b"", 16
+    for size in sizes:
+        frame = zstd_frame(inner[at : at + size])
+        table += struct.pack("<QQ", len(frame), size)
+        frames += frame
+        at += size
+    head = struct.pack("<4sIIBBBB", magic, 4, count, degree, bits, flags | 2, len(sizes))
+    head += struct.pack("<I12x", 32 + len(extension))
+    return head + extension + table + frames
+
+
+def zstd_frame(data: bytes) -> bytes:
+    """A ZSTD frame of one block that is not packed, of up to 128 kB."""
+    block = struct.pack("<I", len(data) << 3 | 1)[:3]  # the last one, raw
+    return b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(data)) + block + data
 
 
 def _as_text(data: bytes) -> bytes:
