@@ -27,8 +27,10 @@ $(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py $(LOCK)
 demo: $(STAMP)
 	$(BIN)/gamba demo
 
+# Two processes share the tests, a file each at a time. Each computes with the threads that a user's
+# would, so waiting threads must let go of the core (docs/pace.md).
 test: $(STAMP)
-	$(BIN)/python -m pytest tests
+	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile
 
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench
