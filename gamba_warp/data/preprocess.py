@@ -18,6 +18,7 @@ from torch import Tensor
 from ..conventions import over_background
 from ..errors import UserError, first_line
 from ..images import load_rgba, picture_size
+from ..untrusted.torch_files import read_torch
 
 BORDER_RATIO = 0.2  # share of the square left free beside the object's longer side
 WORKING_SIZE = 1024  # pixels; larger pictures are reduced first, since no model sees more
@@ -245,7 +246,7 @@ class SamSegmenter:
             ) from error
 
     def _model_type(self, path: Path) -> str:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = read_torch(path)  # its tensors are as large as it says, before kornia reads it
         positions = state.get("image_encoder.pos_embed")
         if positions is None:
             return "mobile_sam"

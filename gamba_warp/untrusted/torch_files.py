@@ -11,6 +11,7 @@ from ..errors import UserError
 
 MAX_VALUES = 1_000_000  # in all lists and dictionaries together; ours have some thousands
 MAX_DEPTH = 16  # levels of lists and dictionaries; ours have up to 6
+_OLD = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # how files begin that are no zip
 
 
 def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any:
@@ -38,6 +39,10 @@ def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any
         zipped = zipfile.is_zipfile(path)
         if zipped:
             _check_zip(path, size)
+        else:
+            with open(path, "rb") as file:
+                if file.read(len(_OLD)) != _OLD:  # torch would ask for what any bytes say
+                    raise ValueError("it does not begin as torch's files do")
         # Read as a map, a tensor cannot reach beyond the file; torch's other reader believes what
         # the file says of the size of a tensor. Only old files, which are no zip, need that one.
         with warnings.catch_warnings():

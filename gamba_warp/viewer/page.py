@@ -189,8 +189,11 @@ def frames_script() -> str:
 
 
 def json_text(value: Any) -> str:
-    """JSON that can stand in a script element: no ``<`` ends it."""
-    return json.dumps(value).replace("<", "\\u003c")
+    """JSON that can stand in a script element and in an attribute: nothing in it ends either."""
+    text = json.dumps(value)
+    for letter in "<>&'":
+        text = text.replace(letter, f"\\u{ord(letter):04x}")
+    return text
 
 
 def _base64(content: bytes) -> str:
