@@ -69,7 +69,7 @@ def view_command(
     else:
         start = Viewpoint().changed(elevation, distance, fov)
         view = (start.distance, start.fov, start.elevation)
-        write_viewer(page, file.stem, gaussians, mesh=surface, view=view)
+        write_viewer(page, file.name, gaussians, mesh=surface, view=view)
     if not serve:
         print(page)
         if open_browser:

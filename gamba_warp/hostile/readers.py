@@ -73,10 +73,10 @@ def _gaussians(path: Path, out: Path) -> Any:
 
 def _view(path: Path, out: Path) -> Any:
     from ..formats.gaussians.files import read_gaussians
-    from ..pages.export import write_page
+    from ..viewer.page import write_viewer
 
     page = out / "page.html"
-    write_page(page, path.stem, read_gaussians(path))
+    write_viewer(page, path.name, read_gaussians(path), view=(1.5, 49.1, 0.0))
     return page.read_text(encoding="utf-8")
 
 
