@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -80,6 +80,10 @@ class Gaussians:
     def detach(self) -> Gaussians:
         """Returns the same values, detached from the graph."""
         return self.map(torch.Tensor.detach)
+
+    def in_unit(self, center: Tensor, side: float) -> Gaussians:
+        """The same object with ``center [3]`` at the origin and the length ``side`` as the unit."""
+        return replace(self, means=(self.means - center) / side, scales=self.scales / side)
 
     def transformed(self, rotation: Tensor, translation: Tensor, scale: float = 1.0) -> Gaussians:
         """Moves all Gaussians by the same motion, ``x -> scale · rotation · x + translation``.

@@ -15,7 +15,7 @@ from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.render import render
-from gamba_warp.surfaces.extract import Surface, extract_surface, moved_to_unit, unit_frame
+from gamba_warp.surfaces.extract import Surface, extract_surface, unit_frame
 from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.surfaces.tsdf import sphere_cameras
 from gamba_warp.versions import import_open3d
@@ -84,7 +84,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 def main() -> None:
     """Prints a row for each mesh."""
     gaussians = read_gaussians(sys.argv[1]) if len(sys.argv) > 1 else striped_ball()
-    gaussians = moved_to_unit(gaussians, *unit_frame(gaussians))
+    gaussians = gaussians.in_unit(*unit_frame(gaussians))
     cameras = sphere_cameras(VIEWS, 0.9, PIXELS)
     seen = render(gaussians, cameras)
     truth, first = seen.rgb + 1 - seen.alpha, None

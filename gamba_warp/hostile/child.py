@@ -156,6 +156,8 @@ class Child:
                 outcome, text = "outside", found[0]
             elif peak > MOST_MEMORY:
                 outcome, text = "memory", f"{peak >> 20} MB"
+        # Verdicts are kept with the code: they name the files and no folder of a machine.
+        text = text.replace(f"{files}{os.sep}", "").replace(str(self.base), "")
         return Verdict(outcome, text, seconds, peak, os.fstat(1).st_size > printed)
 
 

@@ -15,7 +15,7 @@ from ..errors import UserError
 from ..formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
 from ..formats.names import SPLAT_SUFFIXES, MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
-from ..surfaces.extract import moved_to_unit, unit_frame
+from ..surfaces.extract import unit_frame
 from ..surfaces.files import mesh_suffixes, write_meshes
 from ..surfaces.options import SurfaceOptions
 from ..trajectories.paths import Viewpoint
@@ -142,7 +142,7 @@ def _write_pictures(name: str, gaussians: Gaussians, job: ExportJob) -> None:
     """The page and the turntables, of the object at the origin with longest side 1."""
     if not job.page and job.turntable == "none":
         return
-    moved = moved_to_unit(gaussians, *unit_frame(gaussians)).to(job.device)
+    moved = gaussians.in_unit(*unit_frame(gaussians)).to(job.device)
     turn = turntable_frames(moved, size=job.size, frames=job.frames, **asdict(job.view))
     if job.turntable != "none":
         save_turntable(job.folder / f"{name}.{job.turntable}", turn)
@@ -169,7 +169,7 @@ def write_page(
     Raises:
         UserError: the object has no extent, or the file cannot be written.
     """
-    moved = moved_to_unit(gaussians, *unit_frame(gaussians))
+    moved = gaussians.in_unit(*unit_frame(gaussians))
     table = [("Gaussians", f"{gaussians.num:,}")]
     camera = asdict(view or Viewpoint())
     section = Section(title, turntable=turntable, gaussians=moved, table=table, **camera)

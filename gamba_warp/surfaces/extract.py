@@ -154,13 +154,7 @@ def surface_of(
         UserError: there is no surface.
     """
     center, side = unit_frame(gaussians)
-    moved = moved_to_unit(gaussians, center, side).to(device)
+    moved = gaussians.in_unit(center, side).to(device)
     found = extract_surface(moved, options, texture)
     vertices = found.vertices * side + center.double().numpy()
     return replace(found, vertices=vertices)
-
-
-def moved_to_unit(gaussians: Gaussians, center: Tensor, side: float) -> Gaussians:
-    """The same object with ``center [3]`` at the origin and ``side`` as the unit."""
-    means, scales = (gaussians.means - center) / side, gaussians.scales / side
-    return replace(gaussians, means=means, scales=scales)

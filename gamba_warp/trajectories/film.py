@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -150,8 +150,7 @@ def shoot(
     """
     center, side = frame
     # At the origin with side 1 float32 has the most digits, whatever the place of the object.
-    means, scales = (gaussians.means - center) / side, gaussians.scales / side
-    moved = replace(gaussians, means=means, scales=scales).to(device)
+    moved = gaussians.in_unit(center, side).to(device)
     cameras = to_unit(film.cameras, center, side) if film.own else film.cameras
     own = film.cameras if film.own else placed(film.cameras, center, side)
     near = {"near_plane": min(_NEAR, _NEAR / side)}

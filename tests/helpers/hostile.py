@@ -18,6 +18,8 @@ def faulty(path: Path, out: Path):
         raise KeyError("no such key")
     if what == "lines":
         raise UserError("something is wrong")
+    if what == "tells":
+        raise ValueError(f"{path} and {out} are wrong")
     if what == "opens":
         (out / ".." / ".." / "canary" / "kept.txt").read_text()
     if what == "starts":

@@ -44,6 +44,11 @@ def test_each_fault_is_seen(pool):
     assert pool.run_one(faulty_case("nothing")).outcome == "sound"
 
 
+def test_a_verdict_names_the_file_and_no_folder(pool):
+    text = pool.run_one(faulty_case("tells")).text
+    assert text.endswith(": a.txt and /outer/box/out are wrong")
+
+
 def test_a_hang_is_seen(pool, monkeypatch):
     pool.run_one(faulty_case("nothing"))
     monkeypatch.setattr("gamba_warp.hostile.pool.SECONDS", 0.5)

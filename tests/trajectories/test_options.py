@@ -19,7 +19,7 @@ from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.pages import outputs
 from gamba_warp.pages.turntable import turntable_frames
-from gamba_warp.surfaces.extract import moved_to_unit, unit_frame
+from gamba_warp.surfaces.extract import unit_frame
 from gamba_warp.trajectories.paths import upright
 
 
@@ -90,7 +90,7 @@ def test_export_and_view_start_from_there(tmp_path, monkeypatch):
     options = ["--mesh", "--turntable", "gif", "--page", "--size", "48", "--frames", "2"]
     out = tmp_path / "out"
     assert run("export", [str(tmp_path / "a.ply"), "--out", str(out), *options, *view]) == 0
-    moved = moved_to_unit(load_ply(tmp_path / "a.ply"), *unit_frame(gaussians))
+    moved = load_ply(tmp_path / "a.ply").in_unit(*unit_frame(gaussians))
     want = turntable_frames(moved, size=48, frames=1, elevation=25.0, distance=3.0, fov=30.0)[0]
     assert np.abs(first_frame(out / "a.gif") - want).mean() < 3
     assert camera_of((out / "a.html").read_text()) == (3, 30, 25)

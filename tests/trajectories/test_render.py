@@ -12,7 +12,7 @@ from gamba_warp.cameras import Cameras, intrinsics
 from gamba_warp.cli import run
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.render import render
-from gamba_warp.surfaces.extract import moved_to_unit, unit_frame
+from gamba_warp.surfaces.extract import unit_frame
 from gamba_warp.trajectories.files import load_path, save_path
 from gamba_warp.trajectories.paths import turntable
 
@@ -44,7 +44,7 @@ def test_a_turntable_of_pictures_with_its_cameras(thing, tmp_path, capsys):
     assert shoot(path, "--out", tmp_path / "out", *options) == 0
     assert "1 files, 0 failures" in capsys.readouterr().out
     folder = tmp_path / "out" / "thing"
-    moved = moved_to_unit(gaussians, *unit_frame(gaussians))
+    moved = gaussians.in_unit(*unit_frame(gaussians))
     cameras = turntable(3, 20.0, size=(40, 24))
     seen = render(moved, cameras, torch.ones(3), depth=True)
     made = np.stack(pictures(folder))
