@@ -88,6 +88,8 @@ def test_the_shipped_model_has_a_card_and_the_page_is_made_of_it(tool):
     assert any(row.name == "model" and row.views == "novel" for row in card.figures)
     page = (DOCS / "model-card.md").read_text(encoding="utf-8")
     assert tool.page_of(page, card) == page, "run: python docs/model_card.py"
+    readme = tool.README.read_text(encoding="utf-8")
+    assert tool.readme_of(readme, card) == readme, "run: python docs/model_card.py"
 
 
 def test_reports_become_figures(tool, model, tmp_path, monkeypatch):
@@ -98,6 +100,9 @@ def test_reports_become_figures(tool, model, tmp_path, monkeypatch):
     model.write_bytes(b"weights")
     monkeypatch.setattr(tool, "DEFAULT_CHECKPOINT", model)
     monkeypatch.setattr(tool, "PAGE", page)
+    readme = tmp_path / "README.md"
+    readme.write_text("\n".join(tool.MARK.format(name=f"{end}results") for end in ("", "end of ")))
+    monkeypatch.setattr(tool, "README", readme)
     metrics = {"psnr": {"mean": 21.0, "interval": [20.0, 22.0]}, "lpips": {"mean": None}}
     line = {"views": "novel", "name": "model", "objects": 9, **metrics}
     (tmp_path / "views.json").write_text(json.dumps({"table": [line]}))
@@ -108,6 +113,7 @@ def test_reports_become_figures(tool, model, tmp_path, monkeypatch):
     text = page.read_text()
     assert "| **this model** | 21.00 [20.00, 22.00] |" in text and "LPIPS" not in text
     assert "| **this model** | 0.0500 | 0.400 [0.300, 0.500] |" in text
+    assert "| **shipped model** | 21.00 | – | – | – | 0.0500 | 0.400 |" in readme.read_text()
     assert text.startswith("# Top\n") and text.endswith("\nlast\n") and "seven cubes" in text
     card = read_card(model)
     assert [(row.views, row.objects) for row in card.figures] == [("novel", 9), ("shape", 4)]
