@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from gamba_warp.conventions import over_background
+from gamba_warp.devices import quick_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
 from gamba_warp.model.gamba import Gamba
@@ -157,7 +158,7 @@ def compute_gradients(
         hold = contextlib.nullcontext()
         if number < count - 1 and isinstance(model, DistributedDataParallel):
             hold = model.no_sync()
-        with hold:
+        with hold, quick_products(batch.inputs.device):
             result = forward(model, batch, weights, lpips, precision, lpips_crop)
             (result.loss / count).backward()
         losses.append(result.loss.detach())

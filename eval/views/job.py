@@ -108,6 +108,7 @@ def open_job(options: ViewsOptions) -> Job:
         options.encoder_weights,
         options.resize_pictures,
         options.background_margin,
+        options.precision,
     )
     rendered: dict[str, Any] = {}
     if isinstance(predictions, PicturePredictions):
