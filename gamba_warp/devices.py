@@ -139,6 +139,7 @@ class _Quick:
     lock = threading.Lock()
     count = 0
     before = "highest"
+    off = False
 
 
 @contextmanager
@@ -155,7 +156,8 @@ def quick_products(device: torch.device) -> Iterator[None]:
     """
     import torch
 
-    if device.type != "cpu" or torch.compiler.is_compiling() or not _onednn_is_better():
+    skip = _Quick.off or device.type != "cpu" or torch.compiler.is_compiling()
+    if skip or not _onednn_is_better():
         yield
         return
     with _Quick.lock:
@@ -170,6 +172,16 @@ def quick_products(device: torch.device) -> Iterator[None]:
             _Quick.count -= 1
             if not _Quick.count:
                 torch.set_float32_matmul_precision(_Quick.before)
+
+
+@contextmanager
+def plain_products() -> Iterator[None]:
+    """``quick_products`` changes nothing inside, for a comparison; meant for one thread alone."""
+    before, _Quick.off = _Quick.off, True
+    try:
+        yield
+    finally:
+        _Quick.off = before
 
 
 @functools.cache

@@ -75,7 +75,7 @@ class ViewsOptions:
     encoder_weights: Path | None = None
     """The image encoder's file, for a checkpoint that does not hold it."""
     precision: Precision = "float32"
-    """Precision of a model's products; "auto" is bfloat16 where it is faster, else float32."""
+    """Precision of a model's products; "auto" is bfloat16 where that is faster."""
     device: DeviceChoice = "auto"
     """Device that everything runs on."""
 

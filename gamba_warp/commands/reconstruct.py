@@ -90,7 +90,7 @@ def reconstruct_command(
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Device that computes; auto is the GPU if there is one.
-        precision: That of the network's products; auto is bfloat16 where it is faster, else float32.
+        precision: That of the network's products; auto is bfloat16 where that is faster.
         times: Print what each stage took.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -124,9 +124,7 @@ def reconstruct_command(
     ways = Ways(mask, matte_model, sam, chosen).checked()
     output_folder(out)
 
-    one = partial(
-        _one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision
-    )
+    one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision)
     for_each(names, one, "reconstruct", "picture", failures)
     _end(outputs.sheet, times)
     return report(len(pictures), "picture", failures, out)

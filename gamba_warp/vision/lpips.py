@@ -33,12 +33,15 @@ class LPIPS(nn.Module):
         self.load_state_dict(renamed)
         self.eval()
 
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+    def forward(self, a: Tensor, b: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
         """Computes the distance of picture pairs; gradients reach each input that asks for them.
 
         Args:
             a: ``[.., H, W, 3]`` RGB in [0, 1], H and W at least 16.
             b: the same shape.
+            precision: float32; or bfloat16, for convolutions as ``VGG16Trunk.lower`` has them: the
+                value changes by less than a thousandth, and so does the gradient's direction
+                (one minus the cosine).
 
         Returns:
             ``[..]`` float32, 0 for equal pictures.
@@ -50,16 +53,19 @@ class LPIPS(nn.Module):
             raise ValueError(
                 f"a is {tuple(a.shape)} and b {tuple(b.shape)}; both must be [.., H, W, 3]"
             )
-        return self.distance(self.features(a), self.features(b)).reshape(a.shape[:-3])
+        found = (self.features(x, precision) for x in (a, b))
+        return self.distance(*found).reshape(a.shape[:-3])
 
-    def features(self, pictures: Tensor) -> list[Tensor]:
+    def features(self, pictures: Tensor, precision: torch.dtype = torch.float32) -> list[Tensor]:
         """Computes what ``distance`` compares: five maps ``[B, C, h, w]``, unit length per pixel.
 
         Args:
             pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
+            precision: as for ``forward``.
         """
         x = pictures.reshape(-1, *pictures.shape[-3:]).permute(0, 3, 1, 2)
-        return [_unit(y) for y in self.trunk((2 * x - 1 - self.shift) / self.scale)]
+        trunk = self.trunk if precision == torch.float32 else self.trunk.lower
+        return [_unit(y) for y in trunk((2 * x - 1 - self.shift) / self.scale)]
 
     def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """Computes ``[B]`` from two ``features``, for comparing one picture with many."""

@@ -2,14 +2,40 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from .weights import CONVS, WIDTHS, read_cached, read_torchvision
+
+FULL_BLOCKS = 4  # of the five, which ``VGG16Trunk.lower`` computes in float32
+
+
+class _Convolved(torch.autograd.Function):
+    """A convolution and its ReLU in float32, whose gradient is a convolution in bfloat16.
+
+    The gradient by the picture is the convolution with the turned kernel. The ReLU's mask is that
+    of float32, whose changes are what spoils a gradient when the forward pass is rounded.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, layer: nn.Conv2d, turned: Tensor) -> Tensor:
+        y = F.relu(layer(x))
+        ctx.save_for_backward(y, turned)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None, None]:
+        y, turned = ctx.saved_tensors
+        passed = torch.where(y > 0, cotangents[0], 0.0).to(turned.dtype)
+        return F.conv2d(passed, turned, padding=1).to(y.dtype), None, None
 
 
 class VGG16Trunk(nn.Module):
@@ -17,6 +43,9 @@ class VGG16Trunk(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
+        # Weights in bfloat16 by layer, made when they are first asked for.
+        self._turned: dict[str, Tensor] = {}
+        self._rounded: dict[str, nn.Conv2d] = {}
         self.features = nn.ModuleDict()
         channels = 3
         for layers, width in zip(CONVS, WIDTHS, strict=True):
@@ -40,6 +69,39 @@ class VGG16Trunk(nn.Module):
                 x = F.relu(self.features[str(number)](x))
             outputs.append(x)
         return outputs
+
+    def lower(self, x: Tensor) -> list[Tensor]:
+        """``forward`` with products in bfloat16 where little depends on them.
+
+        These are all of the gradient, and those of block 5; the first four blocks are
+        float32 in the forward pass. (docs/step.md has what each choice gives.)
+        """
+        if not self._turned or next(iter(self._turned.values())).device != x.device:
+            self._lower_weights()
+        outputs = []
+        for block, layers in enumerate(CONVS):
+            x = F.max_pool2d(x, 2) if block else x
+            full = block < FULL_BLOCKS
+            x = x if full else x.bfloat16()
+            for number in map(str, layers):
+                if full:
+                    x = _Convolved.apply(x, self.features[number], self._turned[number])
+                else:
+                    x = F.relu(self._rounded[number](x))
+            outputs.append(x)
+        return outputs
+
+    @torch.no_grad()
+    def _lower_weights(self) -> None:
+        for block, layers in enumerate(CONVS):
+            for number in map(str, layers):
+                layer = self.features[number]
+                assert isinstance(layer, nn.Conv2d)
+                if block >= FULL_BLOCKS:
+                    self._rounded[number] = copy.deepcopy(layer).bfloat16()
+                    continue
+                turned = layer.weight.flip(2, 3).transpose(0, 1).bfloat16()
+                self._turned[number] = turned.contiguous(memory_format=torch.channels_last)
 
 
 class VGG16Features(nn.Module):
