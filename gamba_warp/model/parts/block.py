@@ -30,7 +30,7 @@ from .mixed import Mixed, dropped, merged, mixed_places
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
 # Number of tokens that pass through all blocks together on a CPU that keeps nothing for a gradient.
 # The temporaries of so few are reused at once, instead of being mapped anew each time.
-SEGMENT = 2048
+SEGMENT = 4096
 Blocks = Sequence["Block"] | nn.ModuleList
 
 
