@@ -107,6 +107,7 @@ def _rays_model(settings: Settings) -> Gamba:
 
 
 def background(settings: Settings) -> list[Variant]:
+    """The variants of the case background."""
     model = _rays_model(settings)
     whole = model.config.grid_size  # a margin that takes every patch
     made = []

@@ -33,7 +33,7 @@ LPIPS_TEXT = (
 )
 _CROP = 64
 _SSIM_LIMIT, _LPIPS_LIMIT = 1e-5, 3e-2  # the second is what bfloat16 may do to single values
-OURS, THEIRS = "banded", "kornia"
+OURS, THEIRS = "ours", "kornia"
 
 
 def ssim_targets(settings: Settings) -> list[Target]:
