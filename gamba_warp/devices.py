@@ -93,16 +93,16 @@ def pick_precision(name: Precision, device: torch.device, width: int) -> torch.d
 
     if name != "auto":
         return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
-    faster = _gain_of_bfloat16(device.type, device.index, width, torch.get_num_threads())
+    faster = _gain_of_bfloat16(str(device), width, torch.get_num_threads())
     return torch.bfloat16 if faster >= _FASTER else torch.float32
 
 
 @functools.cache
-def _gain_of_bfloat16(kind: str, index: int | None, width: int, threads: int) -> float:
+def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
     """How many times as fast a product is in bfloat16 as in float32, by the fastest of each."""
     import torch
 
-    device = torch.device(kind, index)
+    device = torch.device(name)
     g = torch.Generator().manual_seed(0)  # the state of torch's own chance belongs to the caller
     full = torch.randn(_TRIAL_ROWS, width, generator=g).to(device)
     matrix = torch.randn(width, 4 * width, generator=g).to(device)
@@ -115,8 +115,8 @@ def _gain_of_bfloat16(kind: str, index: int | None, width: int, threads: int) ->
         ):
             for i, (a, b) in enumerate(pairs):
                 before = time.perf_counter()
-                a @ b
-                if kind == "cuda":
+                torch.matmul(a, b)
+                if device.type == "cuda":
                     torch.cuda.synchronize(device)
                 if rounds:  # the first is slow for other reasons
                     best[i] = min(best[i], time.perf_counter() - before)

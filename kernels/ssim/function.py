@@ -46,7 +46,8 @@ def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tenso
     got, want = got.detach().contiguous(), want.detach().contiguous()
     slopes = torch.zeros_like(got) if slope else None
     size = min(len(got), max(1, _TOGETHER // max(1, got[:1].numel())))
-    most = sum(map(math.prod, _between(size, *got.shape[1:], slope)))
+    height, width, channels = got.shape[1:]
+    most = sum(map(math.prod, _between(size, height, width, channels, slope)))
     scratch = got.new_empty(max(most, got[:size].numel()))
     values = []
     for i in range(0, len(got), max(1, size)):

@@ -13,9 +13,8 @@ from torch.nn.functional import avg_pool2d, cosine_similarity
 
 from gamba_warp.image_metrics import SSIM_WINDOW, ssim
 from gamba_warp.kernels.bench import Error, Key, NotInstalled, Settings, Target, Variant, compare
-from gamba_warp.vision import lpips as module
 from gamba_warp.vision.lpips import LPIPS, load_lpips
-from gamba_warp.vision.weights import lpips_available
+from gamba_warp.vision.weights import lpips_available, read_cached
 
 from ..objective.losses import structure
 from .made_up import BATCH, BOTH, NOVEL, OP, SIZE, views
@@ -148,7 +147,7 @@ def lpips_variants(settings: Settings) -> list[Variant]:
     network = load_lpips().to(settings.device)
     planes = copy.deepcopy(network)
     planes.trunk.to(memory_format=torch.contiguous_format)
-    doubled = _Doubled(module.read_cached()).to(settings.device).double()
+    doubled = _Doubled(read_cached()).to(settings.device).double()
     got, want = (x[:BATCH, :_CROP, :_CROP].contiguous() for x in _pictures(settings, True))
     truth = _Pair(got, want, doubled).run(double=True)
     half = torch.bfloat16

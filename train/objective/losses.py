@@ -66,8 +66,8 @@ class _Structure(torch.autograd.Function):
     def forward(ctx: Any, got: Tensor, want: Tensor) -> Tensor:
         lead, shape = got.shape[:-3], got.shape[-3:]
         if got.device.type == "cpu" and got.dtype == want.dtype == torch.float32:
-            flat = (x.detach().reshape(-1, *shape) for x in (got, want))
-            made, slope = dissimilarity(*flat, ctx.needs_input_grad[0])
+            a, b = (x.detach().reshape(-1, *shape) for x in (got, want))
+            made, slope = dissimilarity(a, b, ctx.needs_input_grad[0])
             if slope is not None:
                 ctx.save_for_backward(slope.view(got.shape))
             return made.reshape(lead)
