@@ -53,19 +53,30 @@ class LPIPS(nn.Module):
             raise ValueError(
                 f"a is {tuple(a.shape)} and b {tuple(b.shape)}; both must be [.., H, W, 3]"
             )
-        found = (self.features(x, precision) for x in (a, b))
-        return self.distance(*found).reshape(a.shape[:-3])
+        if precision == torch.float32:
+            x, y = self.features(a), self.features(b)
+        else:
+            x, y = self._lower(a, b.detach())
+            if b.requires_grad:
+                y = self._lower(b, a.detach())[0]
+        return self.distance(x, y).reshape(a.shape[:-3])
 
-    def features(self, pictures: Tensor, precision: torch.dtype = torch.float32) -> list[Tensor]:
+    def features(self, pictures: Tensor) -> list[Tensor]:
         """Computes what ``distance`` compares: five maps ``[B, C, h, w]``, unit length per pixel.
 
         Args:
             pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
-            precision: as for ``forward``.
         """
+        return [_unit(y) for y in self.trunk(self._normalized(pictures))]
+
+    def _lower(self, a: Tensor, b: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """``features`` of both, by ``VGG16Trunk.lower``."""
+        found = self.trunk.lower(self._normalized(a), self._normalized(b))
+        return [_unit(y) for y in found[0]], [_unit(y) for y in found[1]]
+
+    def _normalized(self, pictures: Tensor) -> Tensor:
         x = pictures.reshape(-1, *pictures.shape[-3:]).permute(0, 3, 1, 2)
-        trunk = self.trunk if precision == torch.float32 else self.trunk.lower
-        return [_unit(y) for y in trunk((2 * x - 1 - self.shift) / self.scale)]
+        return (2 * x - 1 - self.shift) / self.scale
 
     def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """Computes ``[B]`` from two ``features``, for comparing one picture with many."""

@@ -250,3 +250,10 @@ def test_lower_products_keep_the_value_and_the_gradients_direction(state):
     assert 0 < 1 - cosine < 1e-3
     assert (net(want, want, torch.bfloat16) == 0).all()
     assert all(p.grad is None for p in net.parameters()) and len(net.state_dict()) == 31
+    # The gradient of the other picture, and of both at once, by symmetry.
+    got, other = got.detach(), want.clone().requires_grad_()
+    (mirrored,) = torch.autograd.grad(net(other, got, torch.bfloat16).sum(), other)
+    (second,) = torch.autograd.grad(net(got, other, torch.bfloat16).sum(), other)
+    torch.testing.assert_close(second, mirrored, rtol=0, atol=1e-3 * mirrored.abs().max())
+    with pytest.raises(ValueError, match="needs 16x16"):
+        net(torch.rand(15, 20, 3), torch.rand(15, 20, 3), torch.bfloat16)

@@ -134,7 +134,7 @@ def _autocast(network: LPIPS, got: Tensor, want: Tensor) -> Tensor:
 class _Doubled(LPIPS):
     """LPIPS whose features stay float64."""
 
-    def features(self, pictures: Tensor, precision: torch.dtype = torch.float32) -> list[Tensor]:
+    def features(self, pictures: Tensor) -> list[Tensor]:
         x = pictures.movedim(-1, 1)
         found = self.trunk((2 * x - 1 - self.shift) / self.scale)
         return [y / (y.square().sum(1, keepdim=True) + 1e-20).sqrt() for y in found]
