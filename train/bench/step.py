@@ -189,6 +189,7 @@ def _parts(settings: Settings) -> list[Variant]:
                     run=step.step,
                     check=step.check,
                     direction=BOTH,
+                    dtype="bfloat16" if name.endswith(LOWER) else "float32",
                     default=name == "rays" and not lpips,
                     rounds=7,
                     parameters={"B": BATCH, "views": NOVEL + 1, "side": SIZE},
