@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 
-from .devices import share_cores
+from .devices import keep_memory, share_cores
 from .errors import UserError
 from .files import DISK_ERRORS
 from .versions import __version__, advice, missing
@@ -45,6 +45,8 @@ COMMANDS = {
 }
 # Commands that a person waits for; trainings and measurements keep torch's own way of waiting.
 SHARING = {"reconstruct", "export", "view", "render", "app"}
+# Those that run the network or fit, whose tensors are made and freed again and again.
+KEEPING = {"reconstruct", "app", "train", "ablate", "bench", "demo", "fit", "eval-views"}
 MODULES = {
     "app": "gamba_warp.app.app_command",
     "train": "gamba_warp.train.command",
@@ -106,6 +108,8 @@ def run(name: str, arguments: list[str]) -> int:
             raise UserError(reason)
         if name in SHARING:
             share_cores()
+        if name in KEEPING:
+            keep_memory()
         command = load_command(name)
         expand = getattr(sys.modules.get(command.__module__), "expand", None)
         arguments = expand(arguments) if expand else arguments

@@ -15,6 +15,10 @@ Axes = Literal["opencv", "opengl"]
 # Of the option --device: "auto" is the GPU if there is one, else the CPU.
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
+# Of the option --precision: that of the network's products; "auto" is bfloat16 where a trial finds
+# it faster, else float32.
+Precision = Literal["float32", "bfloat16", "auto"]
+
 
 def over_background(rgba, background):
     """Composites straight-alpha RGBA, an array or a tensor, over a colour.

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import os
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from .conventions import DeviceChoice
+from .conventions import DeviceChoice, Precision
 from .errors import UserError
 from .kernels.runtime.system import cores
 
 if TYPE_CHECKING:
     import torch
+
+_TRIAL_SECONDS, _TRIAL_ROWS = 0.05, 2048
+_DOUBT = 4  # a trial that finds no gain takes this many times as long: the cores may be taken
+_FASTER = 1.2  # how much faster bfloat16 must be: a choice on the edge would change from run to run
+_ALL_DIGITS = 1e-6  # relative rms error of a product of float32; rounded factors make it 2e-3
+# Options of glibc's mallopt, and their values: what is kept free, and the size from which a block
+# is mapped by itself.
+_KEEP, _MAPPED = (-1, 1 << 30), (-3, 256 << 20)
 
 
 def pick_device(name: DeviceChoice) -> torch.device:
@@ -45,6 +57,152 @@ def share_cores() -> None:
         return
     if os.getloadavg()[0] > 0.5 * cores():
         os.environ["GOMP_SPINCOUNT"] = "1000"
+
+
+def keep_memory() -> None:
+    """Lets the process keep the memory that it frees, up to 1 GiB, where glibc gives it.
+
+    A block of some MiB is otherwise given back at once, and the system clears each of its pages
+    again at the next use: in a picture's forward pass at the paper's size that was 80,000 pages in
+    two blocks, an eighth of the time. Blocks over 256 MiB are given back as before. It leaves what
+    the user has set by MALLOC_* or GLIBC_TUNABLES as it is.
+    """
+    chosen = [name for name in os.environ if name.startswith("MALLOC_")]
+    if chosen or "GLIBC_TUNABLES" in os.environ or sys.platform != "linux":
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
+    if mallopt is not None:
+        for option, value in (_KEEP, _MAPPED):
+            mallopt(ctypes.c_int(option), ctypes.c_int(value))
+
+
+def pick_precision(name: Precision, device: torch.device, width: int) -> torch.dtype:
+    """The dtype of the option ``--precision``.
+
+    Args:
+        name: ``auto`` is bfloat16 where a product of the model's size is at least 1.2 times as
+            fast in it as in float32 (``quick_products``), else float32. The trial takes about
+            50 ms once a process; a processor without bfloat16 products fails it by far.
+        device: where the model computes.
+        width: channels of the model's tokens.
+
+    Returns:
+        ``torch.float32`` or ``torch.bfloat16``.
+    """
+    import torch
+
+    if name != "auto":
+        return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
+    faster = _gain_of_bfloat16(str(device), width, torch.get_num_threads())
+    return torch.bfloat16 if faster >= _FASTER else torch.float32
+
+
+@functools.cache
+def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
+    """How many times as fast a product is in bfloat16 as in float32, by the fastest of each."""
+    import torch
+
+    device = torch.device(name)
+    g = torch.Generator().manual_seed(0)  # the state of torch's own chance belongs to the caller
+    full = torch.randn(_TRIAL_ROWS, width, generator=g).to(device)
+    matrix = torch.randn(width, 4 * width, generator=g).to(device)
+    pairs = [(full, matrix), (full.bfloat16(), matrix.bfloat16())]
+    best, rounds = [float("inf")] * 2, 0
+    began = time.perf_counter()
+    with torch.no_grad(), quick_products(device):
+        while rounds < 3 or time.perf_counter() - began < _TRIAL_SECONDS * (
+            1 if best[0] >= _FASTER * best[1] else _DOUBT
+        ):
+            for i, (a, b) in enumerate(pairs):
+                before = time.perf_counter()
+                torch.matmul(a, b)
+                if device.type == "cuda":
+                    torch.cuda.synchronize(device)
+                if rounds:  # the first is slow for other reasons
+                    best[i] = min(best[i], time.perf_counter() - before)
+            rounds += 1
+    return best[0] / best[1]
+
+
+@contextmanager
+def lower_products(precision: torch.dtype, device: torch.device) -> Iterator[None]:
+    """Matrix products inside are made in ``precision``, by autocast; float32 changes nothing."""
+    import torch
+
+    with torch.autocast(device.type, precision, enabled=precision != torch.float32):
+        yield
+
+
+class _Quick:
+    """How many threads are inside ``quick_products``, and the setting before the first."""
+
+    lock = threading.Lock()
+    count = 0
+    before = "highest"
+    off = False
+
+
+@contextmanager
+def quick_products(device: torch.device) -> Iterator[None]:
+    """Float32 products of a CPU by oneDNN where that is faster, with all digits as before.
+
+    torch gives them to MKL, which on AMD's processors makes no use of AVX-512. Its setting "medium"
+    allows oneDNN to round the factors to bfloat16; on processors with AVX-512 and without AMX there
+    is nothing to be gained by that, and it computes in float32, twice as fast as MKL on a Zen 5.
+    Once a process a product is compared with float64, and where its error is not float32's, nothing
+    is changed. Nor is it on a GPU, on Intel's processors, or inside torch.compile.
+
+    What autograd computes later is outside, unless ``backward`` is called inside too.
+    """
+    import torch
+
+    skip = _Quick.off or device.type != "cpu" or torch.compiler.is_compiling()
+    if skip or not _onednn_is_better():
+        yield
+        return
+    with _Quick.lock:
+        if not _Quick.count:
+            _Quick.before = torch.get_float32_matmul_precision()
+            torch.set_float32_matmul_precision("medium")
+        _Quick.count += 1
+    try:
+        yield
+    finally:
+        with _Quick.lock:
+            _Quick.count -= 1
+            if not _Quick.count:
+                torch.set_float32_matmul_precision(_Quick.before)
+
+
+@contextmanager
+def plain_products() -> Iterator[None]:
+    """``quick_products`` changes nothing inside, for a comparison; meant for one thread alone."""
+    before, _Quick.off = _Quick.off, True
+    try:
+        yield
+    finally:
+        _Quick.off = before
+
+
+@functools.cache
+def _onednn_is_better() -> bool:
+    """Whether this is such a processor, and oneDNN's products have all digits."""
+    import torch
+
+    known = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.6 does not say
+    amx = any(value for name, value in known.items() if name.startswith("amx"))
+    amd = str(known.get("cpu_name", "")).startswith("AMD")
+    if amx or not (amd and known.get("avx512_f")) or not torch.backends.mkldnn.is_available():
+        return False
+    a, b = torch.randn(2, 128, 128, generator=torch.Generator().manual_seed(0))
+    truth = a.double() @ b.double()
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        error = (a @ b).double() - truth
+    finally:
+        torch.set_float32_matmul_precision(before)
+    return bool(error.norm() <= _ALL_DIGITS * truth.norm())
 
 
 @contextmanager

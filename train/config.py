@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 from msgspec import Meta
 
-from gamba_warp.conventions import DeviceChoice
+from gamba_warp.conventions import DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig, Preset
 from gamba_warp.untrusted.ranges import Minutes, Seed, Threads, check_options, option
@@ -139,8 +139,10 @@ class OptimConfig:
     """Largest norm of the gradient."""
     ema: Annotated[float, Meta(ge=0, lt=1)] = 0.999
     """Decay of the weights' running average, shorter at the start; 0 turns it off."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision in the network, by autocast; parameters, losses and rendering stay float32."""
+    precision: Precision = "float32"
+    """Precision of the products in the network, by autocast; parameters, losses and rendering stay
+    float32. "auto" is bfloat16 where a trial of 50 ms finds it faster, on all processes, else
+    float32; it chooses anew whenever the run goes on."""
     max_skipped: _Count = 20
     """Give up after so many non-finite steps in a row."""
 

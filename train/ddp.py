@@ -29,6 +29,8 @@ from torch.distributed import PrefixStore, Store, TCPStore  # pyright: ignore[re
 from torch.nn import Module
 from torch.nn.parallel import DistributedDataParallel
 
+from gamba_warp.conventions import Precision
+from gamba_warp.devices import pick_precision
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import sha256, why_not_written
 
@@ -69,6 +71,12 @@ class World:
         tensor = torch.tensor(values, dtype=torch.float64)
         dist.all_reduce(tensor)
         return tensor.tolist()
+
+    def precision(self, name: Precision, width: int) -> torch.dtype:
+        """The dtype of ``pick_precision``, and float32 where the processes do not agree."""
+        chosen = pick_precision(name, self.device, width)
+        (lower,) = self.total(float(chosen != torch.float32))
+        return chosen if lower in (0, self.size) else torch.float32
 
     def mean(self, figures: dict[str, float]) -> dict[str, float]:
         """Averages each figure over all processes, which must have the same names of figures."""

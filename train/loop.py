@@ -74,7 +74,7 @@ class Trainer:
         self.ema = Ema(model, config.optim.ema) if config.optim.ema else None
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self.wrapped = world.wrap(model)
-        self.precision = getattr(torch, config.optim.precision)
+        self.precision = world.precision(config.optim.precision, model.config.width)
         self.accumulate = config.views.accumulate
         self.step = self.skipped = self.skipped_in_row = 0
         self.elapsed = 0.0  # seconds of training, resumed parts included

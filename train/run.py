@@ -218,12 +218,14 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
         "parameters": sum(p.numel() for p in trainer.parameters),
         "steps": trainer.total,
         "device": str(trainer.world.device),
+        "precision": str(trainer.precision).removeprefix("torch."),
         "command": command_line(values),
     }
     log.write("start", trainer.step, config=values, resumed_from=str(checkpoint or ""), **facts)
     say(
         f"{facts['objects']} objects, {facts['parameters'] / 1e6:.1f} M parameters, "
-        f"{trainer.schedule}, {facts['device']} -> {config.run.out}"
+        f"{trainer.schedule}, {facts['device']}, products in {facts['precision']} -> "
+        f"{config.run.out}"
     )
     for note in [*data.notes, *notes]:
         log.warn(trainer.step, note)

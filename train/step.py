@@ -5,16 +5,19 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from gamba_warp.conventions import over_background
+from gamba_warp.devices import lower_products, quick_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
+from gamba_warp.vision.lpips import LPIPS
 
 from .data.samples import Batch
 from .objective.losses import depth_loss, rendered_psnr, total_loss, view_losses
@@ -61,12 +64,11 @@ def forward(
             the weight of each novel view against the input view, in all terms that have one value
             per view.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
-        precision: dtype of the products in the network and in LPIPS; all else is float32.
+        precision: dtype of the products in the network, and of those in LPIPS that bear it; all
+            else is float32.
         lpips_crop: as for ``view_losses``.
     """
-    kind = batch.inputs.device.type
-    lower = torch.autocast(kind, precision, enabled=precision != torch.float32)
-    with lower:
+    with lower_products(precision, batch.inputs.device):
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
@@ -76,7 +78,7 @@ def forward(
         rendering.alpha,
         target,
         target_alpha,
-        lower(lpips) if lpips is not None and weights.get("lpips") else None,
+        _in(precision, lpips) if lpips is not None and weights.get("lpips") else None,
         lpips_crop,
         bool(weights.get("ssim")),
     )
@@ -88,6 +90,11 @@ def forward(
         terms["rdist"] = radial_mask_loss(gaussians.means, batch.cameras, contours)
     weighted = weigh_views(terms, weights.get("novel", 1.0), target.shape[1])
     return Forward(total_loss(weighted, weights), terms, gaussians, rendering, target)
+
+
+def _in(precision: torch.dtype, lpips: Callable) -> Callable[[Tensor, Tensor], Tensor]:
+    """LPIPS with the products of a precision; another measure as it is."""
+    return partial(lpips, precision=precision) if isinstance(lpips, LPIPS) else lpips
 
 
 def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str, Tensor]:
@@ -157,7 +164,7 @@ def compute_gradients(
         hold = contextlib.nullcontext()
         if number < count - 1 and isinstance(model, DistributedDataParallel):
             hold = model.no_sync()
-        with hold:
+        with hold, quick_products(batch.inputs.device):
             result = forward(model, batch, weights, lpips, precision, lpips_crop)
             (result.loss / count).backward()
         losses.append(result.loss.detach())

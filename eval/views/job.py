@@ -86,6 +86,19 @@ class Job:
         return result
 
 
+def _opened(options: ViewsOptions, device: str) -> Predictions | PicturePredictions:
+    """What is under test."""
+    return open_predictions(
+        options.checkpoint,
+        options.distance,
+        device,
+        options.encoder_weights,
+        resize=options.resize_pictures,
+        margin=options.background_margin,
+        precision=options.precision,
+    )
+
+
 def open_job(options: ViewsOptions) -> Job:
     """Opens everything that the options name, and makes the folder of the report.
 
@@ -101,14 +114,7 @@ def open_job(options: ViewsOptions) -> Job:
         if not uids:
             raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
     _check_outputs(options, uids)
-    predictions = open_predictions(
-        options.checkpoint,
-        options.distance,
-        device,
-        options.encoder_weights,
-        options.resize_pictures,
-        options.background_margin,
-    )
+    predictions = _opened(options, device)
     rendered: dict[str, Any] = {}
     if isinstance(predictions, PicturePredictions):
         if options.save_gaussians:

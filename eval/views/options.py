@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from msgspec import Meta
 
-from gamba_warp.conventions import DEFAULT_DISTANCE, DeviceChoice
+from gamba_warp.conventions import DEFAULT_DISTANCE, DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.fitting.config import FitConfig, Steps
 from gamba_warp.untrusted.ranges import check_options, option
@@ -74,6 +74,8 @@ class ViewsOptions:
     the object. It was not trained for that, unless its decoder is "rays", which does it always."""
     encoder_weights: Path | None = None
     """The image encoder's file, for a checkpoint that does not hold it."""
+    precision: Precision = "float32"
+    """Precision of a model's products; "auto" is bfloat16 where that is faster."""
     device: DeviceChoice = "auto"
     """Device that everything runs on."""
 

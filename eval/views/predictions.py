@@ -7,7 +7,9 @@ from pathlib import Path
 
 import torch
 
+from gamba_warp.conventions import Precision
 from gamba_warp.data.dataset import ViewDataset
+from gamba_warp.devices import lower_products, pick_precision
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256, sha256_of_all, visible
 from gamba_warp.formats.ply import load_ply
@@ -61,15 +63,24 @@ class ModelPredictions(Predictions):
     """A checkpoint, shown the reference view alone."""
 
     def __init__(
-        self, path: Path, device: str, encoder_weights: Path | None, margin: int | None = None
+        self,
+        path: Path,
+        device: str,
+        encoder_weights: Path | None,
+        margin: int | None = None,
+        precision: Precision = "float32",
     ) -> None:
         self.model, self.device = load_model(path, device, encoder_weights), device
         self.margin = margin
+        kind = torch.device(device)
+        self.precision = pick_precision(precision, kind, self.model.config.width)
         self.distance = self.model.config.distance
         file = path / FILE_NAME if path.is_dir() else path
         self.source = {"kind": "checkpoint", "path": path.name, "sha256": sha256(file)}
         if margin is not None:
             self.source["background_margin"] = str(margin)
+        if self.precision != torch.float32:
+            self.source["precision"] = str(self.precision).removeprefix("torch.")
 
     @torch.no_grad()
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
@@ -78,7 +89,8 @@ class ModelPredictions(Predictions):
         views = dataset.load(uid, views=[reference], size=config.image_size)
         images, cameras = posed_input(views, config)
         images, cameras = images.to(self.device), cameras.to(self.device)
-        return self.model(images, cameras, background_margin=self.margin)[0]
+        with lower_products(self.precision, images.device):
+            return self.model(images, cameras, background_margin=self.margin)[0]
 
 
 def open_predictions(
@@ -88,6 +100,7 @@ def open_predictions(
     encoder_weights: Path | None = None,
     resize: bool = False,
     margin: int | None = None,
+    precision: Precision = "float32",
 ) -> Predictions | PicturePredictions:
     """Opens a folder with ``.ply`` files or with pictures, else a checkpoint.
 
@@ -98,10 +111,11 @@ def open_predictions(
         encoder_weights: as for ``load_model``.
         resize: whether pictures of another size are resized.
         margin: ``background_margin`` of a model, see ``Gamba.forward``.
+        precision: of a model's products, see ``devices.pick_precision``.
 
     Raises:
-        UserError: there is nothing, the checkpoint cannot be read, or there is a margin and no
-            model.
+        UserError: there is nothing, the checkpoint cannot be read, or there is a margin or a
+            precision and no model.
     """
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint, folder of .ply files or of pictures")
@@ -114,7 +128,11 @@ def open_predictions(
             )
         found = PicturePredictions(path, distance, device, resize)
     else:
-        return ModelPredictions(path, device, encoder_weights, margin)
-    if margin is not None:
-        raise UserError(f"--background-margin: {path} holds no model")
+        return ModelPredictions(path, device, encoder_weights, margin, precision)
+    for name, given in (
+        ("--background-margin", margin is not None),
+        ("--precision", precision != "float32"),
+    ):
+        if given:
+            raise UserError(f"{name}: {path} holds no model")
     return found

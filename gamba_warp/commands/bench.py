@@ -24,7 +24,7 @@ SUITES = {
     "block": "gamba_warp.measure.blocks",
     "model": "gamba_warp.measure.blocks",
     "lengths": "gamba_warp.measure.lengths",
-    "train-step": "gamba_warp.train.bench.step",
+    "step": "gamba_warp.train.bench.step",
     "loader": "gamba_warp.train.bench.loader",
 }
 
@@ -53,7 +53,7 @@ def bench_command(
 
     Args:
         what: scan, conv, raster, block, model, lengths (a Mamba block against a transformer block
-            over the number of tokens), train-step, or all.
+            over the number of tokens), step, or all.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes, many rounds, and the torch loop at full length.
@@ -64,7 +64,7 @@ def bench_command(
         render: Measure nothing; make the tables and the page of these JSON files.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
             (registers, stack, shared memory, occupancy) to static.json and static.md.
-        data: Folder of posed views for train-step; made-up views if not given.
+        data: Folder of posed views for step; made-up views if not given.
     """
     from ..measure import suites
 

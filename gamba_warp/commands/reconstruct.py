@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..batch import STAGES, check_not_read, for_each, plan_outputs, report, say
-from ..conventions import Axes, DeviceChoice
+from ..conventions import Axes, DeviceChoice, Precision
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
@@ -65,6 +65,7 @@ def reconstruct_command(
     ply_frame: Axes = "opencv",
     min_opacity: Opacity = 0.0,
     device: DeviceChoice = "auto",
+    precision: Precision = "float32",
     times: bool = False,
 ) -> int:
     """Turns pictures of single objects into 3D Gaussians, one forward pass each.
@@ -89,6 +90,7 @@ def reconstruct_command(
         ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
         min_opacity: Leave out Gaussians fainter than this.
         device: Device that computes; auto is the GPU if there is one.
+        precision: That of the network's products; auto is bfloat16 where that is faster.
         times: Print what each stage took.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -122,14 +124,21 @@ def reconstruct_command(
     ways = Ways(mask, matte_model, sam, chosen).checked()
     output_folder(out)
 
-    one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen)
+    one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision)
     for_each(names, one, "reconstruct", "picture", failures)
     _end(outputs.sheet, times)
     return report(len(pictures), "picture", failures, out)
 
 
 def _one(
-    name: str, path: Path, *, model: Gamba, ways: Ways, outputs: Outputs, device: torch.device
+    name: str,
+    path: Path,
+    *,
+    model: Gamba,
+    ways: Ways,
+    outputs: Outputs,
+    device: torch.device,
+    precision: Precision,
 ) -> None:
     """Reconstructs one picture, and writes what was asked for."""
     from ..pages.outputs import write_outputs
@@ -138,17 +147,17 @@ def _one(
     STAGES.begin("cutting out")
     cut = cut_out(path, ways)
     say(f"{path}: {cut.how}")
-    gaussians, seconds = _forward(model, cut.rgba)
+    gaussians, seconds = _forward(model, cut.rgba, precision)
     write_outputs(name, cut, gaussians.to(device), outputs, model.config, seconds)
 
 
-def _forward(model: Gamba, rgba: np.ndarray) -> tuple[Gaussians, float]:
+def _forward(model: Gamba, rgba: np.ndarray, precision: Precision) -> tuple[Gaussians, float]:
     """The Gaussians of one picture, on the CPU, and the seconds of the forward pass."""
     from ..model.predict import reconstruct
 
     STAGES.begin("network")
     started = time.perf_counter()
-    gaussians = reconstruct(model, rgba).to("cpu")  # waits for the device
+    gaussians = reconstruct(model, rgba, precision).to("cpu")  # waits for the device
     return gaussians, time.perf_counter() - started
 
 

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from ..devices import quick_products
 from ..kernels.bench import Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
@@ -30,6 +31,8 @@ _PRODUCTS = {
 
 def cases(settings: Settings) -> list[Case]:
     """Returns all cases of blocks and models at the level's sizes."""
+    from .precision import precisions  # which needs this module
+
     builders = [
         ("block", "one block", partial(_blocks, depth=1)),
         ("block", "backbone", partial(_blocks, depth=2 if settings.level == "quick" else 14)),
@@ -37,6 +40,7 @@ def cases(settings: Settings) -> list[Case]:
         ("model", "one picture", pictures),
         ("model", "batch", batches),
         ("model", "background tokens", background_tokens),
+        ("model", "precision", precisions),
     ]
     texts = {
         "one block": "A block of the paper's size on one picture's tokens, beside its matrix "
@@ -48,7 +52,7 @@ def cases(settings: Settings) -> list[Case]:
         "their matrix products alone, and with the condition prepended and dropped in each block.",
     }
     axes = {"one block": "error", "backbone": "error", "compiled": "error", "batch": "B"}
-    axes["background tokens"] = "error,skipped"
+    axes |= {"background tokens": "error,skipped", "precision": "error"}
     return [
         Case(
             op=op,
@@ -109,9 +113,10 @@ class Products:
 
     @torch.no_grad()
     def run(self) -> None:
-        """Repeats all products; this is what is timed."""
-        for call in self._calls:
-            call()
+        """Repeats all products, by the library that the model takes; this is what is timed."""
+        with quick_products(self._device):
+            for call in self._calls:
+                call()
 
 
 class _Backbone:
@@ -133,8 +138,9 @@ class _Backbone:
 
     def run(self, tokens: Tensor) -> Tensor:
         """Runs the blocks as ``Gamba.forward`` does: first the prefix states, then the tokens."""
-        states = prefix_states(self.blocks, self.camera, self.image)
-        return run_blocks(self.blocks, tokens, states)
+        with quick_products(self.device):
+            states = prefix_states(self.blocks, self.camera, self.image)
+            return run_blocks(self.blocks, tokens, states)
 
     @torch.no_grad()
     def forward(self) -> Tensor:
@@ -145,11 +151,12 @@ class _Backbone:
     def prepended(self) -> Tensor:
         """Runs the paper's eq. 2 as it reads, prepending and dropping; this is timed too."""
         tokens = self.tokens
-        for block in self.blocks:
-            assert block.project_camera is not None and block.project_image is not None
-            prefix = [block.project_camera(self.camera), block.project_image(self.image)]
-            hidden, _ = block.mamba(block.norm(torch.cat([*prefix, tokens], dim=1)))
-            tokens = tokens + hidden[:, -self.length :]
+        with quick_products(self.device):
+            for block in self.blocks:
+                assert block.project_camera is not None and block.project_image is not None
+                prefix = [block.project_camera(self.camera), block.project_image(self.image)]
+                hidden, _ = block.mamba(block.norm(torch.cat([*prefix, tokens], dim=1)))
+                tokens = tokens + hidden[:, -self.length :]
         return tokens
 
     def backward(self) -> tuple[Tensor, ...]:
@@ -159,7 +166,8 @@ class _Backbone:
         """
         tokens = self.tokens.detach().requires_grad_()
         leaves = [tokens, *(p for block in self.blocks for p in block.parameters())]
-        return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
+        with quick_products(self.device):
+            return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
 
     def check(self, forward: Callable[[], Tensor]) -> Error:
         """Measures the error of what is added to the first tokens, which depend on no later one."""
@@ -354,9 +362,11 @@ def compiled(settings: Settings) -> list[Variant]:
 
 def targets(settings: Settings) -> list[Target]:
     """Returns the targets; there are none at a quick run's sizes."""
+    from .precision import precision_targets  # which needs this module
+
     if settings.level == "quick":
         return []
-    return [
+    blocks = [
         Target(
             text=f"{case}, time over that of its matrix products alone",
             times=(Key("block", case, "default"),),
@@ -365,3 +375,4 @@ def targets(settings: Settings) -> list[Target]:
         )
         for case in ("one block", "backbone")
     ]
+    return [*blocks, *precision_targets(settings)]

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ..cameras import Cameras
 from ..conventions import over_background
+from ..devices import quick_products
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
@@ -83,14 +84,15 @@ class Gamba(nn.Module):
         planes' blocks follow. Arguments and errors are those of ``forward``.
         """
         self._check(images, cameras)
-        camera = self.camera_token(cameras) if self.camera_token else None
-        image = None
-        if self.encoder:
-            if self.config.input_channels == 4:
-                images = over_background(images, self.config.background_color)
-            image = self.encoder(images)
-        branches = [self.blocks, *([self.planes.blocks] if self.planes else [])]
-        return [s for blocks in branches for s in prefix_states(blocks, camera, image)]
+        with quick_products(images.device):
+            camera = self.camera_token(cameras) if self.camera_token else None
+            image = None
+            if self.encoder:
+                if self.config.input_channels == 4:
+                    images = over_background(images, self.config.background_color)
+                image = self.encoder(images)
+            branches = [self.blocks, *([self.planes.blocks] if self.planes else [])]
+            return [s for blocks in branches for s in prefix_states(blocks, camera, image)]
 
     def forward(
         self,
@@ -124,10 +126,17 @@ class Gamba(nn.Module):
             ValueError: a shape that does not fit, or a negative margin.
         """
         self._check(images, cameras)
-        if condition is None:
-            condition = self.condition(images, cameras)
-        if isinstance(self.decoder, RayDecoder):
-            return self._on_rays(images, cameras, condition, background_margin or 0)
+        with quick_products(images.device):
+            if condition is None:
+                condition = self.condition(images, cameras)
+            if isinstance(self.decoder, RayDecoder):
+                return self._on_rays(images, cameras, condition, background_margin or 0)
+            return self._on_all(images, cameras, condition, background_margin)
+
+    def _on_all(
+        self, images: Tensor, cameras: Cameras, condition: list[Any], background_margin: int | None
+    ) -> Gaussians:
+        """What ``forward`` does for the other decoders."""
         tokens = self.tokens(images, cameras)
         if background_margin is not None:
             background = self.config.background_color

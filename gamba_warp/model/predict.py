@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..conventions import Precision
 from ..data.preprocess import composite, resize_rgba
+from ..devices import lower_products, pick_precision
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .posing import reference_cameras
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
 
 
 @torch.inference_mode()
-def reconstruct(model: Gamba, picture: str | Path | np.ndarray) -> Gaussians:
+def reconstruct(
+    model: Gamba, picture: str | Path | np.ndarray, precision: Precision = "float32"
+) -> Gaussians:
     """One forward pass on one picture, seen by the reference camera.
 
     Args:
@@ -27,9 +31,10 @@ def reconstruct(model: Gamba, picture: str | Path | np.ndarray) -> Gaussians:
         picture: a file, whose object ``photo.cutout.cut_out`` cuts out and centres, with nothing
             fetched; or the ``rgba`` of what that returns, ``[S, S, 4]`` in [0, 1] with the object
             in the middle.
+        precision: of the network's products, see ``devices.pick_precision``.
 
     Returns:
-        Gaussians ``[N]`` on the model's device, in the reference camera's frame.
+        Gaussians ``[N]``, float32, on the model's device, in the reference camera's frame.
 
     Raises:
         UserError: the file cannot be read, or its object cannot be told from the background.
@@ -41,7 +46,9 @@ def reconstruct(model: Gamba, picture: str | Path | np.ndarray) -> Gaussians:
     config = model.config
     device = next(model.parameters()).device
     images = model_input(rgba, config).to(device)
-    return model(images, reference_cameras(config, 1).to(device))[0]
+    dtype = pick_precision(precision, device, config.width)
+    with lower_products(dtype, device):
+        return model(images, reference_cameras(config, 1).to(device))[0]
 
 
 def _cut_out(picture: str | Path) -> np.ndarray:

@@ -33,12 +33,15 @@ class LPIPS(nn.Module):
         self.load_state_dict(renamed)
         self.eval()
 
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+    def forward(self, a: Tensor, b: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
         """Computes the distance of picture pairs; gradients reach each input that asks for them.
 
         Args:
             a: ``[.., H, W, 3]`` RGB in [0, 1], H and W at least 16.
             b: the same shape.
+            precision: float32; or bfloat16, for convolutions as ``VGG16Trunk.lower`` has them: the
+                value changes by less than a thousandth, and so does the gradient's direction
+                (one minus the cosine).
 
         Returns:
             ``[..]`` float32, 0 for equal pictures.
@@ -50,7 +53,13 @@ class LPIPS(nn.Module):
             raise ValueError(
                 f"a is {tuple(a.shape)} and b {tuple(b.shape)}; both must be [.., H, W, 3]"
             )
-        return self.distance(self.features(a), self.features(b)).reshape(a.shape[:-3])
+        if precision == torch.float32:
+            x, y = self.features(a), self.features(b)
+        else:
+            x, y = self._lower(a, b.detach())
+            if b.requires_grad:
+                y = self._lower(b, a.detach())[0]
+        return self.distance(x, y).reshape(a.shape[:-3])
 
     def features(self, pictures: Tensor) -> list[Tensor]:
         """Computes what ``distance`` compares: five maps ``[B, C, h, w]``, unit length per pixel.
@@ -58,8 +67,16 @@ class LPIPS(nn.Module):
         Args:
             pictures: ``[.., H, W, 3]`` RGB in [0, 1]; all leading dimensions become B.
         """
+        return [_unit(y) for y in self.trunk(self._normalized(pictures))]
+
+    def _lower(self, a: Tensor, b: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """``features`` of both, by ``VGG16Trunk.lower``."""
+        found = self.trunk.lower(self._normalized(a), self._normalized(b))
+        return [_unit(y) for y in found[0]], [_unit(y) for y in found[1]]
+
+    def _normalized(self, pictures: Tensor) -> Tensor:
         x = pictures.reshape(-1, *pictures.shape[-3:]).permute(0, 3, 1, 2)
-        return [_unit(y) for y in self.trunk((2 * x - 1 - self.shift) / self.scale)]
+        return (2 * x - 1 - self.shift) / self.scale
 
     def distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """Computes ``[B]`` from two ``features``, for comparing one picture with many."""

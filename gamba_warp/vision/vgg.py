@@ -2,14 +2,68 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from ..conventions import IMAGENET_MEAN, IMAGENET_STD
 from .weights import CONVS, WIDTHS, read_cached, read_torchvision
+
+FULL_BLOCKS = 4  # of the five, which ``VGG16Trunk.lower`` computes in float32
+_LAYERS = sum(map(len, CONVS))
+
+
+class _Lower(torch.autograd.Function):
+    """``VGG16Trunk.lower``: both batches in one pass, and the gradient of the first alone.
+
+    The gradient by a layer's input is the convolution with the turned kernel. It is bfloat16 all
+    the way; the ReLUs that it passes are those of the forward pass, whose changes are what spoils
+    a gradient when the first blocks are rounded.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, trunk: VGG16Trunk) -> tuple[Tensor, ...]:
+        x, count = torch.cat([a, b]), len(a)
+        outputs, kept, places = [], [], []
+        for block, layers in enumerate(CONVS):
+            if block:
+                x, place = F.max_pool2d(x, 2, return_indices=True)
+                places.append(place[:count])
+            x = x if block < FULL_BLOCKS else x.bfloat16()
+            for number in map(str, layers):
+                layer = trunk.features[number] if block < FULL_BLOCKS else trunk.rounded[number]
+                x = F.relu_(layer(x))
+                kept.append(x[:count])
+            outputs.append(x)
+        ctx.save_for_backward(*kept, *places)
+        ctx.turned = trunk.turned
+        first, second = ([x[part] for x in outputs] for part in (slice(count), slice(count, None)))
+        ctx.mark_non_differentiable(*second)
+        return (*first, *second)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None, None]:
+        kept, places = list(ctx.saved_tensors[:_LAYERS]), list(ctx.saved_tensors[_LAYERS:])
+        passed = None
+        for block, layers in reversed(list(enumerate(CONVS))):
+            own = cotangents[block].bfloat16()
+            passed = own if passed is None else passed.add_(own)
+            for number in reversed(layers):
+                passed = torch.where(kept.pop() > 0, passed, 0.0)
+                passed = F.conv2d(passed, ctx.turned[str(number)], padding=1)
+            if block:
+                before = kept[-1].to(passed.dtype)
+                square = ([2, 2], [2, 2], [0, 0], [1, 1], False)
+                pool = torch.ops.aten.max_pool2d_with_indices_backward
+                passed = pool(passed, before, *square, places.pop())
+        assert passed is not None
+        return passed.float(), None, None
 
 
 class VGG16Trunk(nn.Module):
@@ -17,6 +71,10 @@ class VGG16Trunk(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
+        # Weights in bfloat16 by layer, made when they are first asked for: turned around for the
+        # gradient, and as they are for the blocks that are rounded.
+        self.turned: dict[str, Tensor] = {}
+        self.rounded: dict[str, nn.Conv2d] = {}
         self.features = nn.ModuleDict()
         channels = 3
         for layers, width in zip(CONVS, WIDTHS, strict=True):
@@ -40,6 +98,35 @@ class VGG16Trunk(nn.Module):
                 x = F.relu(self.features[str(number)](x))
             outputs.append(x)
         return outputs
+
+    def lower(self, a: Tensor, b: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """``forward`` of two batches with products in bfloat16 where little depends on them.
+
+        These are all of the gradient, and those of block 5; the first four blocks are float32 in
+        the forward pass. (docs/step.md has what each choice gives.) The gradient reaches ``a``
+        alone.
+
+        Args:
+            a: ``[B, 3, H, W]``, normalised, H and W at least 16.
+            b: the same shape.
+        """
+        if min(a.shape[-2:]) < 16:
+            raise ValueError(f"pictures are {a.shape[-1]}x{a.shape[-2]}; VGG16 needs 16x16 or more")
+        if not self.turned or next(iter(self.turned.values())).device != a.device:
+            self._lower_weights()
+        made = _Lower.apply(a, b, self)
+        return list(made[: len(CONVS)]), list(made[len(CONVS) :])
+
+    @torch.no_grad()
+    def _lower_weights(self) -> None:
+        for block, layers in enumerate(CONVS):
+            for number in map(str, layers):
+                layer = self.features[number]
+                assert isinstance(layer, nn.Conv2d)
+                if block >= FULL_BLOCKS:
+                    self.rounded[number] = copy.deepcopy(layer).bfloat16()
+                turned = layer.weight.flip(2, 3).transpose(0, 1).bfloat16()
+                self.turned[number] = turned.contiguous(memory_format=torch.channels_last)
 
 
 class VGG16Features(nn.Module):

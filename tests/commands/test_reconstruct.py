@@ -52,7 +52,7 @@ class Recorder(torch.nn.Module):
         self.weight = torch.nn.Parameter(torch.zeros(1))
         color = 1.0 if background == "white" else 0.0
         self.config = SimpleNamespace(
-            image_size=24, distance=2.0, fov=40, background_color=color, input_channels=3
+            image_size=24, distance=2.0, fov=40, background_color=color, input_channels=3, width=1
         )
 
     def forward(self, images, cameras):
@@ -189,6 +189,21 @@ def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeyp
     want = [0.175, -0.05 if frame == "opencv" else 0.05, 0.0]
     assert np.abs(middle - want).max() < 0.02  # half a Gaussian
     assert run_reconstruct(picture, *options, "--min-opacity", 0.95) == 1  # nothing is left
+
+
+def test_the_precision_reaches_the_network(tmp_path, picture, checkpoint, monkeypatch, capsys):
+    monkeypatch.setattr("gamba_warp.devices._gain_of_bfloat16", lambda *_: 2.0)
+    made = {}
+    for precision in ("float32", "bfloat16", "auto"):
+        options = [*quick(checkpoint, tmp_path / precision), "--precision", precision]
+        assert run_reconstruct(picture, *options) == 0
+        made[precision] = load_ply(tmp_path / precision / "thing.ply").means
+    assert torch.equal(made["auto"], made["bfloat16"])
+    gap = (made["bfloat16"] - made["float32"]).abs().max()
+    assert 0 < gap < 0.02  # object units; a bfloat16 has 8 digits
+    with pytest.raises(SystemExit):
+        run_reconstruct(picture, *quick(checkpoint, tmp_path / "no"), "--precision", "float16")
+    assert "precision" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
 def test_options_reach_the_files(tmp_path, picture, checkpoint):

@@ -10,6 +10,7 @@ import torch
 from helpers import micro
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from gamba_warp import devices
 from gamba_warp.cameras import (
     exact_product,
     plucker_rays,
@@ -48,6 +49,7 @@ class Products(TorchDispatchMode):
 
 @pytest.fixture(autouse=True)
 def high():
+    devices._onednn_is_better()  # its own trial, once a process, is a product
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")  # as a training sets it
     yield

@@ -2,12 +2,15 @@
 
 import pytest
 import torch
+from helpers.gaussians import some
 from helpers.micro import write_dataset
 
 from gamba_warp.cameras import intrinsics, reference_viewmat
 from gamba_warp.data.dataset import open_dataset
+from gamba_warp.errors import UserError
 from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
-from gamba_warp.eval.views.predictions import ModelPredictions
+from gamba_warp.eval.views.predictions import ModelPredictions, open_predictions
+from gamba_warp.formats.ply import save_ply
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
@@ -89,3 +92,19 @@ def test_training_and_evaluation_see_the_same_input(dataset, tmp_path, monkeypat
     protocol = ViewsProtocol("all", 4, None, None, None, None, predictions.distance)
     truth = load_truth(dataset, uid, protocol, "cpu")
     assert torch.equal(truth.cameras.viewmats[:1], want[1].viewmats)
+
+
+def test_an_evaluation_states_the_precision_of_its_model(dataset, tmp_path):
+    model = tmp_path / "model.safetensors"
+    save_model(model, Gamba(CONFIG))
+    uid, made = dataset.uids[0], {}
+    for precision in ("float32", "bfloat16"):
+        predictions = open_predictions(model, 1.5, "cpu", precision=precision)
+        made[precision] = predictions.gaussians(dataset, uid, 4).means
+        said = predictions.source.get("precision")
+        assert said == (None if precision == "float32" else precision)
+    assert 0 < (made["bfloat16"] - made["float32"]).abs().max() < 0.02
+    (tmp_path / "plys").mkdir()
+    save_ply(tmp_path / "plys" / "a.ply", some(3))
+    with pytest.raises(UserError, match="--precision: .*plys holds no model"):
+        open_predictions(tmp_path / "plys", 1.5, "cpu", precision="auto")

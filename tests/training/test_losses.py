@@ -96,7 +96,8 @@ def test_windows_without_a_difference_are_left_out_exactly(place):
 
 def test_pictures_taken_together_are_those_taken_alone(monkeypatch):
     torch.manual_seed(2)
-    got, want = torch.rand(5, 14, 40, 3, requires_grad=True), torch.rand(5, 14, 40, 3)
+    got, want = torch.rand(2, 5, 14, 40, 3, dtype=torch.float64).unbind()
+    got.requires_grad_()
     values, slopes = [], []
     for numbers in (1, 2 * 14 * 40 * 3, 1 << 20):  # one picture, two, all
         monkeypatch.setattr(losses, "_CACHED", numbers)

@@ -363,6 +363,16 @@ def test_bfloat16_keeps_float32_weights(data, tmp_path):
     assert all(record["loss"] is not None for record in lines(tmp_path, "train"))
 
 
+@pytest.mark.parametrize(("gain", "chosen"), [(2.0, "bfloat16"), (1.0, "float32")])
+def test_auto_is_the_precision_that_the_trial_finds(data, tmp_path, monkeypatch, gain, chosen):
+    monkeypatch.setattr("gamba_warp.devices._gain_of_bfloat16", lambda *_: gain)
+    for name in ("auto", chosen):
+        options = {"optim": {"precision": name}, "length": {"steps": 2}}
+        assert run(data, tmp_path / name, **options) == 0
+        assert lines(tmp_path / name, "start")[0]["precision"] == chosen
+    assert_same_files(*(tmp_path / name / "model.safetensors" for name in ("auto", chosen)))
+
+
 def test_decay_is_on_matrices_that_are_not_flagged(data):
     model = Gamba(micro.options(data, data).model_config())
     decayed, plain = build_optimizer(model, 0.05, 0.95).param_groups

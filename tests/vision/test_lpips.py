@@ -230,3 +230,30 @@ def test_pickle_builds_arrays_only():
     for bad in (pickle.dumps(print), pickle.dumps({"a": np.arange(3)})[:-20], b"", b"\x00abc"):
         with pytest.raises(UserError, match="x: not a pickle"):
             fetch.load_numpy_pickle(io.BytesIO(bad), "x")
+
+
+def test_lower_products_keep_the_value_and_the_gradients_direction(state):
+    """Kernels of real weights bear rounding better; these bounds are the ones that are stated."""
+    net = LPIPS(ours.read_cached() if ours.lpips_available() else state)
+    g = torch.Generator().manual_seed(0)
+    want = torch.nn.functional.interpolate(torch.rand(3, 3, 12, 12, generator=g), (49, 49))
+    want = want.movedim(1, -1).contiguous()
+    got = (want + 0.1 * torch.randn(want.shape, generator=g)).requires_grad_()
+    found = {}
+    for precision in (torch.float32, torch.bfloat16):
+        value = net(got, want, precision)
+        found[precision] = (value, torch.autograd.grad(value.sum(), got)[0])
+        assert value.dtype == torch.float32
+    (value, gradient), (low, lower) = found[torch.float32], found[torch.bfloat16]
+    assert 0 < ((low - value) / value).abs().max() < 1e-3  # 0 would be float32 again
+    cosine = torch.nn.functional.cosine_similarity(lower.flatten(), gradient.flatten(), 0)
+    assert 0 < 1 - cosine < 1e-3
+    assert (net(want, want, torch.bfloat16) == 0).all()
+    assert all(p.grad is None for p in net.parameters()) and len(net.state_dict()) == 31
+    # The gradient of the other picture, and of both at once, by symmetry.
+    got, other = got.detach(), want.clone().requires_grad_()
+    (mirrored,) = torch.autograd.grad(net(other, got, torch.bfloat16).sum(), other)
+    (second,) = torch.autograd.grad(net(got, other, torch.bfloat16).sum(), other)
+    torch.testing.assert_close(second, mirrored, rtol=0, atol=1e-3 * mirrored.abs().max())
+    with pytest.raises(ValueError, match="needs 16x16"):
+        net(torch.rand(15, 20, 3), torch.rand(15, 20, 3), torch.bfloat16)

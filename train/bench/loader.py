@@ -50,8 +50,8 @@ def targets(settings: Settings) -> list[Target]:
         return []
     return [
         Target(
-            text="samples a second, pack alone over a step of rays (train-step)",
-            times=(Key("train-step", "parts", "rays", "forward+backward"),),
+            text="samples a second, pack alone over a step of rays (step)",
+            times=(Key("step", "parts", "rays", "forward+backward"),),
             over=(Key(OP, "views", _PACK),),
             scale=_BATCHES[settings.level],
             at_least=20.0,

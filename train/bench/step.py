@@ -3,55 +3,42 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import cosine_similarity
 from torch.profiler import record_function
 
-from gamba_warp.cameras import Cameras, intrinsics, orbit
-from gamba_warp.data.dataset import ObjectViews, ViewDataset, open_dataset
+from gamba_warp.cameras import Cameras
+from gamba_warp.devices import plain_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
-from gamba_warp.kernels.bench.core.measure import peak_bytes
 from gamba_warp.kernels.bench.core.parts import measure_parts
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
-from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.parts.patches import foreground_patches
-from gamba_warp.render import render
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from ..batches import BatchSource
-from ..config import DataConfig, OptimConfig
-from ..data.samples import Batch
+from ..config import OptimConfig
 from ..optim import Ema, build_optimizer
 from ..step import compute_gradients
+from . import losses, optimizer
+from .background import background
+from .made_up import BATCH, BOTH, LOWER, NOVEL, OP, SIZE, SLIM, WEIGHTS, step_config, step_source
 
-OP, BOTH = "train-step", "forward+backward"
-_BATCH, _NOVEL, _SIZE, _CROP = 4, 3, 128, 64
-_SLIM = "rays, slim"  # as wide and deep as preset tiny
-_LOWER = "rays, bfloat16"  # products of the network and of LPIPS in bfloat16, as it was trained
-_COMPARED = ("tiny", "rays", _SLIM, _LOWER)
+_CROP = 64
+_COMPARED = ("tiny", f"tiny{LOWER}", "rays", f"rays{LOWER}", SLIM)
 _BATCHES = {"quick": (1,), "normal": (1, 2, 4), "full": (1, 2, 4, 8)}
-_WEIGHTS = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "lpips": 0.0, "rdist": 0.0}
 _WITH_LPIPS = "LPIPS of crops"
-_COVERED = 0.22  # of a made-up view by its object, which then lies in 28 % of the patches of 8²
-_SHARES = {"quick": (0.1,), "normal": (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)}
-_SPREAD = (0.6, 0.85, 1.1, 1.45)  # sizes of the objects of a batch, as they differ in real ones
-_ALONE_LIMIT = 1e-4  # the same sums in products of other shapes
+# Allowed errors of the whole gradient; a bfloat16 has 8 binary digits, and errors add up.
+_ROUNDED = {torch.float32: 1e-3, torch.bfloat16: 0.3}
 # What is a part of its own, by a region of the step: text in an operator's name -> part.
-_PRODUCTS = dict.fromkeys(
-    ("aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm"), "matrix products"
-)
+_PRODUCTS = dict.fromkeys(("aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm"), "products")
 _KINDS = {
     "rest of the network": {
         "selective_scan": "scan",
-        "causal_conv1d": "convolution of tokens",
+        "causal_conv1d": "convolution",
         "onvolution": "convolutions of pictures",
         **_PRODUCTS,
     }
@@ -70,16 +57,22 @@ _REGIONS = (
 def cases(settings: Settings) -> list[Case]:
     """Returns the cases of a training step."""
     parts = (
-        f"One optimizer step on {_BATCH} objects in {_NOVEL + 1} views of {_SIZE}²: data, network, "
+        f"One optimizer step on {BATCH} objects in {NOVEL + 1} views of {SIZE}²: data, network, "
         f"rendering, MSE + mask + 0.2 (1 - SSIM), with and without LPIPS of crops of {_CROP}², "
         "gradients, clipping, AdamW and the running average; fresh weights. Views are those of "
         "--data, or made up: the objects lie in 28 % of the patches of 8² in the mean. Parts are "
         "self times of torch's profiler, whose own cost is the difference of the whole step with "
-        "it and without. Rays, slim: as wide and deep as tiny; rays, bfloat16: products in "
-        "bfloat16, as it was trained. The only check is that the gradient is finite."
+        "it and without. Convolution is that of tokens, before the scan. Rays, slim: as wide and "
+        "deep as tiny; bfloat16: products of the network and of LPIPS, as the shipped model was "
+        "trained. The only check is that the gradient is finite."
     )
     batch = "Cost of that step without LPIPS against the number of objects."
-    background = (
+    precision = (
+        "The gradient of a step without data and optimizer, in both precisions of the products, "
+        "the shipped models' weights where a preset has them. Error: of the whole gradient to "
+        "float32's with MKL's products; and the PSNR of the rendered pictures to its pictures."
+    )
+    text = (
         "Preset rays computes the patches that see the object; here also all patches, against the "
         "share of the picture that the object covers in the mean of a batch of 4. Forward is the "
         "network alone without gradients, forward+backward a step without data and optimizer. "
@@ -91,7 +84,11 @@ def cases(settings: Settings) -> list[Case]:
     builders = {
         "parts": (parts, _parts, "parts"),
         "batch": (batch, _batches, "B"),
-        "background": (background, _background, "share"),
+        "background": (text, background, "share"),
+        "precision": (precision, _precisions, "error"),
+        "SSIM": (losses.SSIM_TEXT, losses.ssim_variants, None),
+        "LPIPS": (losses.LPIPS_TEXT, losses.lpips_variants, "error"),
+        "optimizer": (optimizer.TEXT, optimizer.variants, None),
     }
     return [
         Case(op=OP, name=name, text=text, build=partial(build, settings), axis=axis)
@@ -104,7 +101,7 @@ def targets(settings: Settings) -> list[Target]:
     if settings.level == "quick":
         return []
     ends = ["", *([f", {_WITH_LPIPS}"] if lpips_available() else [])]
-    return [
+    faster = [
         Target(
             text=f"samples a second, {name} over tiny{end}",
             times=(Key(OP, "parts", f"tiny{end}", BOTH),),
@@ -112,93 +109,21 @@ def targets(settings: Settings) -> list[Target]:
             at_least=4.0,
         )
         for end in ends
-        for name in _COMPARED[1:]
+        for name in ("rays", f"rays{LOWER}", SLIM)
     ]
-
-
-class _MadeUp(ViewDataset):
-    """Objects of smooth noise whose silhouette is an ellipse, in views from all around."""
-
-    def __init__(self, shares: Sequence[float], size: int) -> None:
-        """``shares`` are those of a view that each object covers."""
-        super().__init__({}, "made up", cache=False)
-        self.uids = [f"object{number}" for number in range(len(shares))]
-        self.views = _NOVEL + 3
-        noise = torch.rand(len(shares) * self.views, 3, size // 8, size // 8)
-        color = interpolate(noise, size=(size, size), mode="bilinear").permute(0, 2, 3, 1)
-        drawn = [_ellipse(share, size, 0.7 + 0.2 * i) for i, share in enumerate(shares)]
-        alphas = torch.stack(drawn)[:, None].expand(-1, self.views, -1, -1, -1)
-        self.drawn = torch.cat([color.unflatten(0, alphas.shape[:2]), alphas], -1)
-
-    def num_views(self, index: int | str) -> int:
-        """The number of views of each object."""
-        return self.views
-
-    def load(
-        self, index: int | str, views: Sequence[int] | None = None, size: int | None = None,
-        depths: int | None = None,
-    ) -> ObjectViews:  # fmt: skip
-        """Views of one object, as ``ViewDataset.load`` gives them; ``size`` is that of all."""
-        chosen = list(range(self.views) if views is None else views)
-        images = self.drawn[int(index), chosen].clone()
-        side = images.shape[1]
-        viewmats = orbit(360 * torch.tensor(chosen) / self.views, distance=2.5)
-        K = intrinsics(side, side, 40.0).expand(len(chosen), 3, 3)
-        cameras = Cameras(viewmats, K, side, side)
-        return ObjectViews(self.uids[int(index)], "made up", images, cameras, None, {})
-
-
-def _ellipse(share: float, size: int, stretch: float) -> Tensor:
-    """A silhouette in the middle that covers a share of the picture: ``[size, size, 1]``."""
-    if share >= 1:
-        return torch.ones(size, size, 1)
-    x = torch.linspace(-1, 1, size)
-    distance = (x[:, None] / stretch) ** 2 + (x * stretch) ** 2  # of all pixels, the nearest ones
-    limit = distance.flatten().sort().values[max(0, round(share * size**2) - 1)]
-    return (distance <= limit).float()[..., None]
-
-
-def _config(name: str, settings: Settings) -> GambaConfig:
-    tiny, config = PRESETS["tiny"], PRESETS["tiny" if name == "tiny" else "rays"]
-    if name == _SLIM:
-        config = replace(config, width=tiny.width, depth=tiny.depth)
-    if settings.level == "quick":
-        config = replace(config, image_size=32, width=16, depth=1)
-    return config
-
-
-def _source(
-    config: GambaConfig, settings: Settings, batch: int, covered: float = _COVERED
-) -> BatchSource:
-    """Batches of the folder that was given, or of made-up views with the same silhouettes."""
-    spread = (_SPREAD[i % len(_SPREAD)] if covered < 1 else 1.0 for i in range(batch))
-    shares = [min(1.0, covered * factor) for factor in spread]
-    size = min(_SIZE, config.image_size)
-    data = _MadeUp(shares, size)
-    if settings.data is not None:
-        data = open_dataset(settings.data, cache=True)
-    views = DataConfig(size=size, mirror=0.5, recolor=0.3)
-    return BatchSource(
-        data,
-        config,
-        objects=list(range(len(data.uids))),
-        batch_size=batch,
-        reference=None,
-        views=views,
-        seed=0,
-    )
+    return [*faster, *losses.ssim_targets(settings)]
 
 
 class _Step:
     """A model with its optimizer and its data, as a run of training has them."""
 
     def __init__(
-        self, settings: Settings, name: str, batch: int = _BATCH, lpips: bool = False
+        self, settings: Settings, name: str, batch: int = BATCH, lpips: bool = False
     ) -> None:
         torch.manual_seed(0)
-        config = _config(name, settings)
+        config = step_config(name, settings)
         self.device, self.number = settings.device, 0
-        self.precision = torch.bfloat16 if name == _LOWER else torch.float32
+        self.precision = torch.bfloat16 if name.endswith(LOWER) else torch.float32
         self.model = Gamba(config).to(settings.device)
         options = OptimConfig()
         self.clip = options.clip
@@ -207,8 +132,8 @@ class _Step:
             group["lr"] = 1e-6  # the weights hardly move, so every round does the same work
         self.ema = Ema(self.model, options.ema)
         self.lpips = load_lpips().to(settings.device) if lpips else None
-        self.weights = _WEIGHTS | {"lpips": 0.2 if lpips else 0.0}
-        self.source = _source(config, settings, batch)
+        self.weights = WEIGHTS | {"lpips": 0.2 if lpips else 0.0}
+        self.source = step_source(config, settings, batch)
 
     def _network(self, images: Tensor, cameras: Cameras) -> Gaussians:
         with record_function("rest of the network"):
@@ -217,7 +142,7 @@ class _Step:
     def step(self) -> Tensor:
         """Makes the whole step and returns the gradient's norm; this is what is timed."""
         with record_function("data"):
-            batch = self.source.batch(self.number, _NOVEL).to(self.device)
+            batch = self.source.batch(self.number, NOVEL).to(self.device)
         self.number += 1
         made = compute_gradients(
             self._network,
@@ -242,7 +167,7 @@ class _Step:
 
     def work(self, rounds: int) -> dict[str, float]:
         """Counts samples and Gaussians, and on a CPU the milliseconds of each part."""
-        batch = self.source.batch(0, _NOVEL).to(self.device)
+        batch = self.source.batch(0, NOVEL).to(self.device)
         with torch.no_grad():
             opacities = self.model(batch.inputs, batch.input_cameras).opacities
         drawn = int((opacities > 0).sum()) // len(batch.uids)
@@ -264,9 +189,10 @@ def _parts(settings: Settings) -> list[Variant]:
                     run=step.step,
                     check=step.check,
                     direction=BOTH,
+                    dtype="bfloat16" if name.endswith(LOWER) else "float32",
                     default=name == "rays" and not lpips,
                     rounds=7,
-                    parameters={"B": _BATCH, "views": _NOVEL + 1, "side": _SIZE},
+                    parameters={"B": BATCH, "views": NOVEL + 1, "side": SIZE},
                     work=partial(step.work, rounds),
                 )
             )
@@ -285,116 +211,71 @@ def _batches(settings: Settings) -> list[Variant]:
                     check=step.check,
                     direction=BOTH,
                     rounds=5,
-                    parameters={"B": batch, "views": _NOVEL + 1, "side": _SIZE, "series": name},
+                    parameters={"B": batch, "views": NOVEL + 1, "side": SIZE, "series": name},
                 )
             )
     return made
 
 
-class _Covered:
-    """The model of preset rays and a batch whose objects cover a share of the picture."""
+class _Precise:
+    """A model and a batch, whose gradient is made in a precision of the products."""
 
-    def __init__(self, settings: Settings, model: Gamba, share: float) -> None:
-        torch.manual_seed(1)
-        self.model, self.device = model, settings.device
-        source = _source(model.config, replace(settings, data=None), len(_SPREAD), share)
-        self.batch = source.batch(0, _NOVEL).to(settings.device)
-        self.optimizer = torch.optim.SGD(model.parameters(), lr=0.0)
+    def __init__(self, settings: Settings, name: str) -> None:
+        torch.manual_seed(0)
+        shipped = DEFAULT_CHECKPOINT.parent / f"{name}.safetensors"
+        self.trained = shipped.exists() and settings.level != "quick"
+        if self.trained:
+            self.model = load_model(shipped, settings.device).train().requires_grad_()
+        else:
+            self.model = Gamba(step_config(name, settings)).to(settings.device)
+        self.batch = step_source(self.model.config, settings, BATCH).batch(0, NOVEL)
+        self.batch = self.batch.to(settings.device)
+        self.optimizer = torch.optim.SGD(self.model.parameters(), lr=0.0)
+        with plain_products():
+            self.truth = self.gradient(torch.float32)
 
-    def _run(self, margin: int, images: Tensor, cameras: Cameras) -> Gaussians:
-        return self.model(images, cameras, background_margin=margin)
+    def gradient(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Makes the gradient of all weights, and the pictures; this is what is timed."""
+        made = compute_gradients(
+            self.model, self.optimizer, [self.batch], WEIGHTS, clip=math.inf, precision=precision
+        )
+        grads = [p.grad.flatten() for p in self.model.parameters() if p.grad is not None]
+        return torch.cat(grads), made.result.rendering.rgb.detach()
 
-    @torch.no_grad()
-    def forward(self, margin: int) -> Gaussians:
-        """Runs the network; this is what is timed."""
-        return self._run(margin, self.batch.inputs, self.batch.input_cameras)
+    def check(self, precision: torch.dtype) -> Error:
+        """Measures the error of the gradient to the truth."""
+        return compare({"gradient": self.gradient(precision)[0]}, {"gradient": self.truth[0]})
 
-    def gradients(self, margin: int, batch: Batch | None = None) -> dict[str, Tensor]:
-        """Makes the gradients of the weights; this is timed too."""
-        run = partial(self._run, margin)
-        compute_gradients(run, self.optimizer, [batch or self.batch], _WEIGHTS, clip=math.inf)
-        named = self.model.named_parameters()
-        return {name: p.grad for name, p in named if p.grad is not None}
-
-    def _alone(self) -> list[Batch]:
-        """The objects of the batch, each as a batch."""
-        one = (slice(i, i + 1) for i in range(len(self.batch.uids)))
-        fields = {k: v for k, v in vars(self.batch).items() if v is not None}
-        return [Batch(**{k: v[i] for k, v in fields.items()}) for i in one]
-
-    def check(self, margin: int) -> Error:
-        """Measures the error of the batch's Gaussians to those of each object alone."""
-        together, got, want = self.forward(margin), {}, {}
-        for i, one in enumerate(self._alone()):
-            with torch.no_grad():
-                alone = self._run(margin, one.inputs, one.input_cameras)
-            for name, value in vars(alone).items():
-                if value is not None:
-                    want[f"{name} of object {i}"] = value[0]
-                    got[f"{name} of object {i}"] = getattr(together, name)[i, : alone.num]
-        return compare(got, want)
-
-    def check_gradients(self, margin: int) -> Error:
-        """Measures the error of all weights' gradient to the mean of those of each object alone."""
-        got = {name: value.clone() for name, value in self.gradients(margin).items()}
-        sums: dict[str, Tensor] = {}
-        alone = self._alone()
-        for one in alone:
-            for name, value in self.gradients(margin, one).items():
-                sums[name] = sums.get(name, 0.0) + value.double() / len(alone)
-        flat = [torch.cat([v[name].double().flatten() for name in sums]) for v in (got, sums)]
-        return compare({"gradient": flat[0]}, {"gradient": flat[1]})
-
-    @torch.no_grad()
-    def _pictures(self, margin: int) -> Tensor:
-        return render(self.forward(margin), self.batch.cameras, self.batch.background).rgb
-
-    def work(self, margin: int, whole: int, run: Callable[[], object]) -> dict[str, float]:
-        """Counts tokens and memory, and the PSNR to the pictures of all patches, in dB."""
-        alpha = self.batch.inputs[..., 3]
-        patches = foreground_patches(alpha, self.model.config.patch_size, margin)
-        groups = patches.groups() if self.device.type == "cpu" else [range(len(patches.index))]
-        tokens = sum(4 * patches.of(list(group)).index.numel() for group in groups)
-        counts: dict[str, float] = {"tokens": tokens}
-        if margin != whole:
-            error = (self._pictures(margin) - self._pictures(whole)).square().mean()
-            counts["psnr_to_full"] = round(-10 * error.clamp_min(1e-12).log10().item(), 1)
-        peak = peak_bytes(run, self.device)
-        return counts | ({} if peak is None else {"peak_bytes": peak})
+    def work(self, precision: torch.dtype) -> dict[str, float]:
+        """Measures how far the gradient and the pictures are from the truth's."""
+        gradient, pictures = self.gradient(precision)
+        cosine = 1 - cosine_similarity(gradient.double(), self.truth[0].double(), 0)
+        error = (pictures - self.truth[1]).square().mean().clamp_min(1e-12)
+        return {
+            "gradient_angle": float(f"{cosine:.2g}"),
+            "psnr_to_float32": round(-10 * error.log10().item(), 1),
+        }
 
 
-def _rays_model(settings: Settings) -> Gamba:
-    torch.manual_seed(0)
-    if settings.level == "quick" or not DEFAULT_CHECKPOINT.exists():
-        return Gamba(_config("rays", settings)).to(settings.device)
-    return load_model(DEFAULT_CHECKPOINT, settings.device).train().requires_grad_()
-
-
-def _background(settings: Settings) -> list[Variant]:
-    model = _rays_model(settings)
-    whole = model.config.grid_size  # a margin that takes every patch
+def _precisions(settings: Settings) -> list[Variant]:
     made = []
-    for share in _SHARES.get(settings.level, _SHARES["normal"]):
-        covered = _Covered(settings, model, share)
-        for margin, name in ((0, "object's patches"), (whole, "all patches")):
-            percent = round(100 * covered.batch.inputs[..., 3].mean().item())
-            runs = {
-                "forward": (covered.forward, covered.check),
-                BOTH: (covered.gradients, covered.check_gradients),
-            }
-            for direction, (run, check) in runs.items():
-                made.append(
-                    Variant(
-                        name=f"{percent} %, {name}",
-                        run=partial(run, margin),
-                        check=partial(check, margin),
-                        limit=_ALONE_LIMIT,
-                        oracle="each object alone (not float64)",
-                        direction=direction,
-                        rounds=5,
-                        default=margin == 0,
-                        parameters={"B": len(_SPREAD), "share": percent, "series": name},
-                        work=partial(covered.work, margin, whole, partial(run, margin)),
-                    )
+    for name in ("tiny", "rays"):
+        precise = _Precise(settings, name)
+        for precision in (torch.float32, torch.bfloat16):
+            kind = str(precision).removeprefix("torch.")
+            made.append(
+                Variant(
+                    name=f"{name}, {kind}",
+                    run=partial(precise.gradient, precision),
+                    check=partial(precise.check, precision),
+                    limit=_ROUNDED[precision],
+                    oracle="float32",
+                    direction=BOTH,
+                    dtype=kind,
+                    default=precision == torch.float32,
+                    rounds=5,
+                    parameters={"B": BATCH, "weights": "shipped" if precise.trained else "fresh"},
+                    work=partial(precise.work, precision),
                 )
+            )
     return made

@@ -19,6 +19,7 @@ from gamba_warp.cameras import Cameras
 from gamba_warp.devices import full_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
+from gamba_warp.kernels.ssim import dissimilarity
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available
 
@@ -56,12 +57,20 @@ def structure(got: Tensor, want: Tensor) -> Tensor:
 class _Structure(torch.autograd.Function):
     """``structure``, whose gradient is computed with its value.
 
-    A picture's value depends on no other picture, so its gradient is a factor times its slope.
+    A picture's value depends on no other picture, so its gradient is a factor times its slope. On a
+    CPU float32 has a kernel of its own (``kernels/ssim``); the rest of this file's SSIM is for GPUs
+    and other dtypes.
     """
 
     @staticmethod
     def forward(ctx: Any, got: Tensor, want: Tensor) -> Tensor:
         lead, shape = got.shape[:-3], got.shape[-3:]
+        if got.device.type == "cpu" and got.dtype == want.dtype == torch.float32:
+            a, b = (x.detach().reshape(-1, *shape) for x in (got, want))
+            made, slope = dissimilarity(a, b, ctx.needs_input_grad[0])
+            if slope is not None:
+                ctx.save_for_backward(slope.view(got.shape))
+            return made.reshape(lead)
         pictures, truths = (
             x.detach().reshape(-1, *shape).movedim(-1, 1).contiguous() for x in (got, want)
         )

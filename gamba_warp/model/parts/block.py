@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
+from ...devices import quick_products
 from ...kernels.causal_conv1d import causal_conv1d
 from ...kernels.selective_scan import selective_scan, selective_scan_state
 from ..config import GambaConfig
@@ -29,7 +30,7 @@ from .mixed import Mixed, dropped, merged, mixed_places
 STEP_RANGE = (1e-3, 1e-1)  # of the step size δ at the start, log-uniform (Mamba, §3.6)
 # Number of tokens that pass through all blocks together on a CPU that keeps nothing for a gradient.
 # The temporaries of so few are reused at once, instead of being mapped anew each time.
-SEGMENT = 2048
+SEGMENT = 4096
 Blocks = Sequence["Block"] | nn.ModuleList
 
 
@@ -288,10 +289,21 @@ def run_blocks(
         for i, block in enumerate(blocks):
             run = block
             if recompute and gradients:
-                run = partial(checkpoint, block, use_reentrant=False)
+                run = partial(checkpoint, _Quick(block), use_reentrant=False)
             segment, states[i] = run(segment, states[i], layout)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
+
+
+class _Quick:
+    """A block whose products are quick also when a backward pass runs it again."""
+
+    def __init__(self, block: nn.Module) -> None:
+        self._block = block
+
+    def __call__(self, tokens: Tensor, *others: Any) -> tuple[Tensor, Any]:
+        with quick_products(tokens.device):
+            return self._block(tokens, *others)
 
 
 def prefix_states(blocks: Blocks, camera: Tensor | None, image: Tensor | None) -> list[Any]:

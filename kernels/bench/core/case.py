@@ -151,7 +151,7 @@ class Case:
     """Variants that are timed in turn, so that their ratios come from one run.
 
     Attributes:
-        op: scan, conv, raster, block, model or train-step.
+        op: scan, conv, raster, block, model or step.
         name: unique within the op.
         text: one sentence on what is compared.
         build: function that makes the inputs and the variants; they are freed after the case.

@@ -25,6 +25,9 @@ _WORK = {
     "drawn": "Gaussians an object",
     "samples": "",
     "psnr_to_full": "PSNR to the full model's",
+    "psnr_to_float32": "PSNR to float32's",
+    "gradient_error": "gradient off by",
+    "gradient_angle": "its 1 - cosine",
     "flops": "",
 }
 

@@ -443,7 +443,7 @@ def test_raster_cases_run(name):
         assert error["degree 3"] > 10 * error["degree 5"]
 
 
-@pytest.mark.parametrize("op", ["block", "train-step"])
+@pytest.mark.parametrize("op", ["block", "step"])
 def test_model_cases_run(op):
     module = bench.load_suite(op)
     cases = [c for c in module.cases(QUICK) if c.op == op][:1]

@@ -60,7 +60,7 @@ def test_one_rounds_parts_and_the_rest_are_the_whole():
 
 def case(work: dict) -> Case:
     variant = Variant("one & only", lambda: None, None, work=lambda: work)
-    return Case("train-step", "parts", "What takes time.", lambda: [variant], "parts")
+    return Case("step", "parts", "What takes time.", lambda: [variant], "parts")
 
 
 def test_parts_are_a_table_and_a_chart():
@@ -86,19 +86,41 @@ def test_bars_of_nothing_are_no_chart():
 
 
 def test_a_step_has_its_parts():
-    (steps,) = [c for c in bench.load_suite("train-step").cases(QUICK) if c.name == "parts"]
-    tiny, rays, slim, lower = measure([steps], QUICK)["records"]
-    for record in (tiny, rays, slim, lower):
+    (steps,) = [c for c in bench.load_suite("step").cases(QUICK) if c.name == "parts"]
+    records = measure([steps], QUICK)["records"]
+    tiny, lower, rays, _, _ = records
+    assert (tiny["variant"], lower["variant"]) == ("tiny", "tiny, bfloat16")
+    for record in records:
         assert record["status"] == "ok", record
         found = set(parts.parts_of(record))
-        wanted = {"data", "matrix products", "scan", "rasterizer", "SSIM", "optimizer"}
+        wanted = {"data", "products", "scan", "rasterizer", "SSIM", "optimizer"}
         assert wanted <= found, wanted - found
         assert record["work"]["backward: scan"] > 0 and record["work"]["backward: rasterizer"] > 0
     assert rays["work"]["drawn"] > tiny["work"]["drawn"] > 0
 
 
+@pytest.mark.parametrize(("op", "name"), [("step", "precision"), ("model", "precision")])
+def test_lower_products_have_their_error_on_the_chart(op, name):
+    (case,) = [c for c in bench.load_suite(op).cases(QUICK) if c.name == name]
+    records = measure([case], QUICK)["records"]
+    assert [r["status"] for r in records] == ["ok"] * 4
+    for full, lower in zip(records[::2], records[1::2]):
+        assert full["rel_rms_error"] < 1e-5 and lower["rel_rms_error"] > full["rel_rms_error"]
+        assert full["work"]["psnr_to_float32"] > lower["work"]["psnr_to_float32"] > 30
+    assert "bfloat16" in charts_of(name, records)[0]
+
+
+def test_losses_and_optimizer_are_checked_before_they_are_timed():
+    names = ("SSIM", "optimizer")
+    cases = [c for c in bench.load_suite("step").cases(QUICK) if c.name in names]
+    records = measure(cases, QUICK)["records"]
+    assert len(records) == 13 and all(r["status"] == "ok" for r in records), records
+    ours = [r for r in records if r["variant"].startswith("ours")]
+    assert all(r["rel_rms_error"] < 1e-5 and r["peer"].startswith("kornia") for r in ours)
+
+
 def test_dropped_patches_are_exact_and_counted():
-    (case,) = [c for c in bench.load_suite("train-step").cases(QUICK) if c.name == "background"]
+    (case,) = [c for c in bench.load_suite("step").cases(QUICK) if c.name == "background"]
     records = measure([case], QUICK)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4
     assert all(r["rel_rms_error"] < 1e-5 for r in records)
@@ -112,5 +134,5 @@ def test_dropped_patches_are_exact_and_counted():
 
 def test_a_step_on_a_folder_that_is_not_there_is_one_line(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
-        bench.bench_command(("train-step",), quick=True, out=tmp_path, data=tmp_path / "none")
+        bench.bench_command(("step",), quick=True, out=tmp_path, data=tmp_path / "none")
     assert replace(QUICK, data=tmp_path).data == tmp_path

@@ -1,0 +1,148 @@
+"""Benchmark case of inference in both precisions of the products, beside the products alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from ..cameras import Cameras, intrinsics, orbit
+from ..devices import lower_products, plain_products
+from ..gaussians import Gaussians
+from ..kernels.bench import Error, Key, Settings, Target, Variant, compare
+from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
+from ..model.config import PRESETS, Preset
+from ..model.gamba import Gamba
+from ..model.posing import reference_cameras
+from ..render import render
+from .blocks import Products
+
+PAPER, ALONE, PLAIN = "paper, float32", "products alone", "MKL's products alone"
+# Allowed relative rms errors of the Gaussians: roundings that 14 blocks carry on.
+_LIMITS = {torch.float32: 1e-3, torch.bfloat16: 0.1}
+
+
+def precision_targets(settings: Settings) -> list[Target]:
+    """Returns the targets; there are none at a quick run's sizes or on a GPU."""
+    if settings.level == "quick" or settings.device.type != "cpu":
+        return []
+    wanted = ((f"paper, {PLAIN}", 1.08), (f"paper, float32, {ALONE}", 1.3))
+    return [
+        Target(
+            text=f"a picture to Gaussians, paper, float32, over {name.removeprefix('paper, ')}",
+            times=(Key("model", "precision", PAPER),),
+            over=(Key("model", "precision", name),),
+            at_most=most,
+        )
+        for name, most in wanted
+    ]
+
+
+class _Precise:
+    """A model with one picture, and what it gives in float32 by torch's own choice of library."""
+
+    def __init__(self, settings: Settings, preset: Preset) -> None:
+        torch.manual_seed(0)
+        shipped = DEFAULT_CHECKPOINT.parent / f"{preset}.safetensors"
+        self.trained = shipped.exists() and settings.level != "quick"
+        if self.trained:
+            self.model = load_model(shipped, settings.device)
+        else:
+            config = replace(PRESETS[preset], encoder="none")
+            if settings.level == "quick":
+                config = replace(config, image_size=32, width=16, depth=1)
+            self.model = Gamba(config).to(settings.device).eval()
+        config = self.model.config
+        size = config.image_size
+        picture = torch.rand(1, size, size, config.input_channels)
+        if config.input_channels == 4:  # an object in the middle, as the cut-out puts it
+            x = torch.linspace(-1, 1, size)
+            picture[..., 3] = ((x[:, None] ** 2 + x**2) < 0.5).float()
+        self.picture = picture.to(settings.device)
+        self.camera = reference_cameras(config, 1).to(settings.device)
+        viewmats = orbit(torch.tensor([0.0, 90.0, 180.0]), distance=config.distance)
+        K = intrinsics(size, size, config.fov).repeat(3, 1, 1)
+        self.views = Cameras(viewmats, K, size, size).to(settings.device)
+        with plain_products():
+            self.truth = self.run(torch.float32)
+        self.seen = self._render(self.truth)
+
+    @torch.no_grad()
+    def run(self, precision: torch.dtype) -> Gaussians:
+        """Runs the model; this is what is timed."""
+        with lower_products(precision, self.picture.device):
+            return self.model(self.picture, self.camera)
+
+    @torch.no_grad()
+    def _render(self, gaussians: Gaussians) -> Tensor:
+        return render(gaussians[0], self.views).rgb
+
+    def check(self, precision: torch.dtype) -> Error:
+        """Measures the error of the Gaussians."""
+        made, truth = ({k: x for k, x in vars(g).items() if x is not None} for g in
+                       (self.run(precision), self.truth))  # fmt: skip
+        return compare(made, truth)
+
+    def work(self, precision: torch.dtype) -> dict[str, float]:
+        """Measures how far the pictures from three sides are, as a PSNR."""
+        error = (self._render(self.run(precision)) - self.seen).square().mean().clamp_min(1e-12)
+        return {"psnr_to_float32": round(-10 * error.log10().item(), 1)}
+
+
+def precisions(settings: Settings) -> list[Variant]:
+    """A posed picture to Gaussians in both precisions of the network's products, without the image
+    encoder; the shipped models' weights where a preset has them. Beside them, of preset paper, its
+    matrix products alone, repeated on operands of the same shapes into given outputs. The error is
+    that of the Gaussians to float32's with MKL's products; beside it stands the PSNR of pictures
+    from three sides.
+    """
+    made: list[Variant] = []
+    for preset in ("tiny", "rays") if settings.level == "quick" else ("tiny", "rays", "paper"):
+        precise = _Precise(settings, preset)
+        for precision in (torch.float32, torch.bfloat16):
+            kind = str(precision).removeprefix("torch.")
+            run = partial(precise.run, precision)
+            made.append(
+                Variant(
+                    name=f"{preset}, {kind}",
+                    run=run,
+                    check=partial(precise.check, precision),
+                    limit=_LIMITS[precision],
+                    oracle="float32",
+                    dtype=kind,
+                    default=precision == torch.float32,
+                    rounds=5,
+                    parameters={"weights": "shipped" if precise.trained else "fresh"},
+                    work=partial(precise.work, precision),
+                )
+            )
+            if preset == "paper":
+                made += _alone(run, kind, settings)
+    return made
+
+
+def _alone(run: Callable[[], object], kind: str, settings: Settings) -> list[Variant]:
+    """The products of a run alone, by the library that the model takes, and of float32 by MKL."""
+    products = Products(run, settings.device)
+
+    def plain() -> None:
+        with plain_products():
+            products.run()
+
+    runs = {f"paper, {kind}, {ALONE}": products.run}
+    if kind == "float32":
+        runs[f"paper, {PLAIN}"] = plain
+    return [
+        Variant(
+            name=name,
+            run=ran,
+            check=None,
+            dtype=kind,
+            rounds=5,
+            work=lambda: {"products": products.count, "flops": products.flops},
+        )
+        for name, ran in runs.items()
+    ]

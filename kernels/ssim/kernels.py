@@ -1,0 +1,233 @@
+"""1 - SSIM of pictures and its slope, sixteen adjacent numbers of a row at a time (README.md).
+
+Pictures are ``[P, H, E]`` with E = W · C. The maps between two launches have their rows side by
+side: row ``4 y + i`` is map i of row y, and ``3 y + i`` where there are three.
+"""
+
+from typing import no_type_check
+
+import torch
+import warp as wp
+
+from ..runtime.lanes import LANES, VECTORS, W, lanes
+from .reference import C1, C2, SIGMA, WINDOW
+
+EDGE = WINDOW - 1
+STRIP = 8  # rows of windows of a task, whose values are summed before they are stored
+_STRIP, _EDGE = wp.constant(STRIP), wp.constant(EDGE)
+_ROW = wp.array3d(dtype=wp.float32)
+
+
+def _weights() -> str:
+    """The window's eleven weights of a row, as C++ text."""
+    places = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    line = torch.exp(-places.square() / (2 * SIGMA**2))
+    return ", ".join(f"{float(w)!r}f" for w in line / line.sum())
+
+
+# ``at`` is the place of row r of picture b, from number d on; lanes past ``width`` are read as 0.
+_PRELUDE = (
+    VECTORS
+    + f"const float weights[{WINDOW}] = {{{_weights()}}};"
+    + """
+auto fma_ = [&](float a, F b, F c) -> F { return __builtin_elementwise_fma(splat(a), b, c); };
+auto read = [&](const float* p) -> F {
+    if (width >= 16) return *(const F*)p;
+    F v = F{};
+    for (int i = 0; i < width; ++i) v[i] = p[i];
+    return v;
+};
+auto write = [&](float* p, F v) {
+    if (width >= 16) *(F*)p = v;
+    else for (int i = 0; i < width; ++i) p[i] = v[i];
+};
+#define AT(A, r, d) ((float*)((char*)(A).data + (size_t)b * (A).strides[0] \\
+    + (size_t)(r) * (A).strides[1]) + (d))
+"""
+)
+
+_ACROSS = """
+const float *g = AT(got_in, y, d), *w = AT(want_in, y, d);
+F s0 = F{}, s1 = F{}, s2 = F{}, s3 = F{};
+const F m = read(AT(shift_in, 0, d));  // the same for each tap, which has the same channel
+#pragma unroll
+for (int k = 0; k < 11; ++k) {
+    F a = read(g + k * channels), c = read(w + k * channels);
+    F s = a + c - m, q = a - c;
+    s0 = fma_(weights[k], s, s0);
+    s1 = fma_(weights[k], q, s1);
+    s2 = fma_(weights[k], s * s, s2);
+    s3 = fma_(weights[k], q * q, s3);
+}
+write(AT(hor_out, 4 * y, d), s0);
+write(AT(hor_out, 4 * y + 1, d), s1);
+write(AT(hor_out, 4 * y + 2, d), s2);
+write(AT(hor_out, 4 * y + 3, d), s3);
+"""
+_DOWN = f"""
+F s0 = F{{}}, d0 = F{{}}, s2 = F{{}}, d2 = F{{}};
+#pragma unroll
+for (int k = 0; k < 11; ++k) {{
+    s0 = fma_(weights[k], read(AT(hor_in, 4 * (y + k), d)), s0);
+    d0 = fma_(weights[k], read(AT(hor_in, 4 * (y + k) + 1, d)), d0);
+    s2 = fma_(weights[k], read(AT(hor_in, 4 * (y + k) + 2, d)), s2);
+    d2 = fma_(weights[k], read(AT(hor_in, 4 * (y + k) + 3, d)), d2);
+}}
+F s = s0 + read(AT(shift_in, 0, d));
+F bright = s * s + {2 * C1!r}f, dark = d0 * d0;
+F rough = s2 - s0 * s0 + {2 * C2!r}f, odd = d2 - d0 * d0;
+F one = splat(1.0f), p = one / (bright + dark), q = one / (rough + odd);
+// the shares of dark and odd, of which light = 1 - 2 unlit and shape = 1 - 2 unlike
+F unlit = dark * p, unlike = odd * q, light = one - 2.0f * unlit, shape = one - 2.0f * unlike;
+if (by_out.shape[1] > 0) {{
+    F f = light * q * q * (2.0f * scale);
+    F by1 = -f * odd, by2 = f * rough;
+    F by0 = (shape * p * p * (-4.0f * scale)) * (dark * s - bright * d0);
+    write(AT(by_out, 3 * y, d), by0 - 2.0f * (by1 * s0 + by2 * d0));
+    write(AT(by_out, 3 * y + 1, d), by1);
+    write(AT(by_out, 3 * y + 2, d), by2);
+}}
+{LANES} r;
+*(F*)&r = 2.0f * (unlit + unlike - 2.0f * unlit * unlike);
+return r;
+"""
+_UP = """
+const int first = y < 10 ? 0 : y - 10, last = y < rows ? y : rows - 1;
+F v0 = F{}, v1 = F{}, v2 = F{};
+for (int t = first; t <= last; ++t) {
+    const float c = weights[y - t];
+    v0 = fma_(c, read(AT(by_in, 3 * t, d)), v0);
+    v1 = fma_(c, read(AT(by_in, 3 * t + 1, d)), v1);
+    v2 = fma_(c, read(AT(by_in, 3 * t + 2, d)), v2);
+}
+write(AT(col_out, 3 * y, d + edge), v0);
+write(AT(col_out, 3 * y + 1, d + edge), v1);
+write(AT(col_out, 3 * y + 2, d + edge), v2);
+"""
+_BACK = """
+const float *c0 = AT(col_in, 3 * y, d), *c1 = AT(col_in, 3 * y + 1, d);
+const float *c2 = AT(col_in, 3 * y + 2, d);
+F b0 = F{}, b1 = F{}, b2 = F{};
+#pragma unroll
+for (int k = 0; k < 11; ++k) {
+    b0 = fma_(weights[k], read(c0 + k * channels), b0);
+    b1 = fma_(weights[k], read(c1 + k * channels), b1);
+    b2 = fma_(weights[k], read(c2 + k * channels), b2);
+}
+F a = read(AT(got_in, y, d)), c = read(AT(want_in, y, d));
+F s = a + c - read(AT(shift_in, 0, d)), q = a - c;
+write(AT(slope_out, y, d), b0 + 2.0f * (s * b1 + q * b2));
+"""
+
+
+@wp.func_native(_PRELUDE + _ACROSS)
+def _across(
+    got_in: _ROW, want_in: _ROW, shift_in: _ROW, b: int, y: int, d: int, width: int,
+    channels: int, hor_out: _ROW,
+): ...  # fmt: skip
+
+
+@wp.func_native(_PRELUDE + _DOWN)
+def _down(
+    hor_in: _ROW, shift_in: _ROW, b: int, y: int, d: int, width: int, scale: float, by_out: _ROW
+) -> lanes: ...
+
+
+@wp.func_native(_PRELUDE + _UP)
+def _up(by_in: _ROW, b: int, y: int, d: int, width: int, rows: int, edge: int, col_out: _ROW): ...
+
+
+@wp.func_native(_PRELUDE + _BACK)
+def _back(
+    got_in: _ROW, want_in: _ROW, shift_in: _ROW, col_in: _ROW, b: int, y: int, d: int, width: int,
+    channels: int, slope_out: _ROW,
+): ...  # fmt: skip
+
+
+@wp.func_native(_PRELUDE + "write(AT(values_out, y, d), *(const F*)&v);")
+def _store(values_out: _ROW, b: int, y: int, d: int, width: int, v: lanes): ...
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def across(
+    offset: int,
+    # in
+    channels: int,
+    got_in: _ROW,
+    want_in: _ROW,
+    shift_in: _ROW,
+    # out
+    hor_out: _ROW,
+):
+    """The four maps' means along rows: ``hor_out [P, 4 H, E - 10 C]``."""
+    task, k = wp.tid()
+    task = task + offset
+    b, y, d = task / got_in.shape[1], task % got_in.shape[1], k * wp.static(W)
+    width = wp.min(wp.static(W), hor_out.shape[2] - d)
+    _across(got_in, want_in, shift_in, b, y, d, width, channels, hor_out)
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def down(
+    offset: int,
+    # in
+    rows: int,
+    scale: float,
+    hor_in: _ROW,
+    shift_in: _ROW,
+    # out
+    by_out: _ROW,
+    values_out: _ROW,
+):
+    """Values ``[P, strips, E - 10 C]``, sums of ``STRIP`` rows, and what the slope is made of."""
+    task, k = wp.tid()
+    task = task + offset
+    b, strip, d = task / values_out.shape[1], task % values_out.shape[1], k * wp.static(W)
+    width = wp.min(wp.static(W), hor_in.shape[2] - d)
+    total = lanes(0.0)
+    for y in range(strip * _STRIP, wp.min((strip + 1) * _STRIP, rows)):
+        total = total + _down(hor_in, shift_in, b, y, d, width, scale, by_out)
+    _store(values_out, b, strip, d, width, total)
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def up(
+    offset: int,
+    # in
+    rows: int,
+    edge: int,
+    by_in: _ROW,
+    # out
+    col_out: _ROW,
+):
+    """Transposed means along columns: ``col_out [P, 3 H, E + 10 C]``, with room at both sides."""
+    task, k = wp.tid()
+    task = task + offset
+    height = rows + _EDGE
+    b, y, d = task / height, task % height, k * wp.static(W)
+    width = wp.min(wp.static(W), by_in.shape[2] - d)
+    _up(by_in, b, y, d, width, rows, edge, col_out)
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def back(
+    offset: int,
+    # in
+    channels: int,
+    got_in: _ROW,
+    want_in: _ROW,
+    shift_in: _ROW,
+    col_in: _ROW,
+    # out
+    slope_out: _ROW,
+):
+    """The slope ``[P, H, E]``."""
+    task, k = wp.tid()
+    task = task + offset
+    b, y, d = task / got_in.shape[1], task % got_in.shape[1], k * wp.static(W)
+    width = wp.min(wp.static(W), got_in.shape[2] - d)
+    _back(got_in, want_in, shift_in, col_in, b, y, d, width, channels, slope_out)

@@ -1,0 +1,106 @@
+"""1 - SSIM on the CPU against its definition in float64, its gradient against autograd's."""
+
+import pytest
+import torch
+
+from gamba_warp.kernels.ssim import dissimilarity, function
+from gamba_warp.kernels.ssim.reference import dissimilarity_reference
+
+
+def pictures(shape, seed=0):
+    """Noise within a frame of white, and a smoother, noisier copy."""
+    g = torch.Generator().manual_seed(seed)
+    want = torch.ones(shape)
+    want[:, 2:-3, 1:-2] = torch.rand(want[:, 2:-3, 1:-2].shape, generator=g)
+    got = (want + 0.2 * torch.randn(shape, generator=g) * (want < 1)).clamp(0, 1)
+    return got, want
+
+
+def truth(got, want):
+    got = got.double().requires_grad_()
+    value = dissimilarity_reference(got, want.double())
+    return value.detach(), torch.autograd.grad(value.sum(), got)[0]
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 11, 11, 1), (3, 11, 40, 3), (2, 37, 13, 3), (2, 29, 33, 4), (5, 20, 21, 2)]
+)
+@pytest.mark.parametrize("together", [1, 1 << 20])
+def test_value_and_gradient_are_those_of_the_definition(monkeypatch, shape, together):
+    monkeypatch.setattr(function, "_TOGETHER", together)
+    got, want = pictures(shape)
+    value, slope = dissimilarity(got, want, True)
+    wanted, gradient = truth(got, want)
+    torch.testing.assert_close(value.double(), wanted, rtol=0, atol=1e-6)
+    # Variances have 24 bits, and C2 = 9e-4 stands beside them: some digits are lost.
+    error = (slope.double() - gradient).norm() / gradient.norm()
+    assert error < 2e-5, error
+    alone, none = dissimilarity(got, want, False)
+    assert none is None and torch.equal(alone, value)
+
+
+def test_flat_pictures_keep_their_digits():
+    """A variance is the difference of two means; without the corner's colour it would be noise."""
+    g = torch.Generator().manual_seed(2)
+    want = torch.full((1, 24, 24, 3), 0.9)
+    got = want + 1e-3 * torch.randn(want.shape, generator=g)
+    wanted, gradient = truth(got, want)
+    value, slope = dissimilarity(got, want, True)
+    torch.testing.assert_close(value.double(), wanted, rtol=1e-3, atol=0)
+    assert (slope.double() - gradient).norm() < 1e-3 * gradient.norm()
+
+
+@pytest.mark.parametrize("place", [(0, 0), (24, 30), (0, 30), (12, 15)])
+def test_one_differing_pixel_is_found_anywhere(place):
+    torch.manual_seed(1)
+    want = torch.rand(2, 25, 31, 3)
+    got = want.clone()
+    got[1, place[0], place[1]] += 0.5
+    value, slope = dissimilarity(got, want, True)
+    wanted, gradient = truth(got, want)
+    torch.testing.assert_close(value.double(), wanted, rtol=0, atol=1e-6)
+    torch.testing.assert_close(slope.double(), gradient, rtol=1e-3, atol=1e-7)
+    assert value[0] == 0 and slope[0].eq(0).all()
+
+
+def test_threads_and_runs_change_no_bit():
+    got, want = pictures((6, 40, 50, 3))
+    threads, made = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3, 1):
+            torch.set_num_threads(count)
+            made.append(dissimilarity(got, want, True))
+    finally:
+        torch.set_num_threads(threads)
+    for value, slope in made[1:]:
+        assert torch.equal(value, made[0][0]) and torch.equal(slope, made[0][1])
+
+
+def test_nan_stays_in_its_picture():
+    got, want = pictures((3, 20, 20, 3))
+    got[1, 5, 5] = torch.nan
+    value, slope = dissimilarity(got, want, True)
+    assert value[1].isnan() and value[[0, 2]].isfinite().all()
+    assert slope[1].isnan().any() and slope[[0, 2]].isfinite().all()
+
+
+def test_none_and_equal_pictures():
+    got, want = pictures((2, 12, 12, 3))
+    value, slope = dissimilarity(want, want, True)
+    assert value.eq(0).all() and slope.eq(0).all()
+    value, slope = dissimilarity(got[:0], want[:0], True)
+    assert value.shape == (0,) and slope.shape == (0, 12, 12, 3)
+
+
+@pytest.mark.parametrize(
+    ("got", "want", "error"),
+    [
+        (torch.rand(1, 10, 11, 3), torch.rand(1, 10, 11, 3), ValueError),
+        (torch.rand(1, 11, 12, 3), torch.rand(1, 11, 11, 3), ValueError),
+        (torch.rand(11, 11, 3), torch.rand(11, 11, 3), ValueError),
+        (torch.rand(1, 11, 11, 3).double(), torch.rand(1, 11, 11, 3), TypeError),
+    ],
+)
+def test_bad_pictures_are_refused_by_name(got, want, error):
+    with pytest.raises(error, match="got|want"):
+        dissimilarity(got, want, False)

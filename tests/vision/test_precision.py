@@ -1,0 +1,139 @@
+"""The precision of products: the trial of "auto", float32 by another library, and bfloat16."""
+
+import sys
+import threading
+
+import numpy as np
+import pytest
+import torch
+from helpers.model import micro
+
+from gamba_warp import devices
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.predict import reconstruct
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def better(monkeypatch):
+    """As on a processor on which oneDNN is chosen."""
+    monkeypatch.setattr(devices, "_onednn_is_better", lambda: True)
+
+
+def test_quick_products_are_put_back_also_after_an_error_and_inside_one_another(better):
+    before = torch.get_float32_matmul_precision()
+    with pytest.raises(KeyError), devices.quick_products(CPU):
+        with devices.quick_products(CPU), devices.full_products():
+            assert torch.get_float32_matmul_precision() == "highest"
+        assert torch.get_float32_matmul_precision() == "medium"
+        raise KeyError
+    assert torch.get_float32_matmul_precision() == before
+    with devices.plain_products(), devices.quick_products(CPU):
+        assert torch.get_float32_matmul_precision() == before
+    with devices.quick_products(torch.device("meta")):
+        assert torch.get_float32_matmul_precision() == before
+
+
+def test_the_last_thread_puts_the_products_back(better):
+    before = torch.get_float32_matmul_precision()
+    inside, leave = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with devices.quick_products(CPU):
+            inside.set()
+            leave.wait(10)
+
+    thread = threading.Thread(target=other)
+    with devices.quick_products(CPU):
+        thread.start()
+        assert inside.wait(10)
+    assert torch.get_float32_matmul_precision() == "medium"
+    leave.set()
+    thread.join()
+    assert torch.get_float32_matmul_precision() == before
+
+
+def test_quick_products_keep_all_digits():
+    """Whatever this processor is: if oneDNN is chosen here, its products are float32's."""
+    g = torch.Generator().manual_seed(1)
+    a, b = torch.randn(300, 200, generator=g), torch.randn(200, 250, generator=g)
+    truth = a.double() @ b.double()
+    with devices.quick_products(CPU):
+        error = (a @ b).double() - truth
+    assert error.norm() < 1e-6 * truth.norm()  # bfloat16 has 2e-3
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        {},
+        {"cpu_name": "Intel Xeon", "avx512_f": True},
+        {"cpu_name": "AMD EPYC", "avx512_f": True, "amx_bf16": True},
+        {"cpu_name": "AMD EPYC", "avx512_f": False},
+    ],
+)
+def test_other_processors_keep_their_library(monkeypatch, known):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known, raising=False)
+    assert not devices._onednn_is_better.__wrapped__()
+
+
+def test_a_library_that_rounds_is_not_taken(monkeypatch):
+    known = {"cpu_name": "AMD EPYC", "avx512_f": True}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known, raising=False)
+    plain = torch.Tensor.__matmul__
+
+    def rounding(a, b):
+        return plain(a.bfloat16().float(), b) if a.dtype == torch.float32 else plain(a, b)
+
+    monkeypatch.setattr(torch.Tensor, "__matmul__", rounding)
+    assert not devices._onednn_is_better.__wrapped__()
+    assert torch.get_float32_matmul_precision() != "medium"
+
+
+@pytest.mark.parametrize(("gain", "want"), [(1.0, torch.float32), (2.0, torch.bfloat16)])
+def test_auto_takes_what_is_faster(monkeypatch, gain, want):
+    monkeypatch.setattr(devices, "_gain_of_bfloat16", lambda *_: gain)
+    assert devices.pick_precision("auto", CPU, 64) == want
+    assert devices.pick_precision("float32", CPU, 64) == torch.float32
+    assert devices.pick_precision("bfloat16", CPU, 64) == torch.bfloat16
+
+
+def test_the_trial_is_made_once_and_leaves_chance_alone():
+    devices._gain_of_bfloat16.cache_clear()
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    chosen = [devices.pick_precision("auto", CPU, 24) for _ in range(2)]
+    assert chosen[0] == chosen[1] and torch.equal(torch.get_rng_state(), state)
+    info = devices._gain_of_bfloat16.cache_info()
+    assert (info.misses, info.hits) == (1, 1)
+
+
+def test_a_picture_in_bfloat16_is_near_that_in_float32_and_no_more():
+    torch.manual_seed(0)
+    model = Gamba(micro(encoder="none")).eval()
+    size = model.config.image_size
+    picture = np.random.default_rng(0).uniform(size=(size, size, 4)).astype(np.float32)
+    full, again = reconstruct(model, picture), reconstruct(model, picture, "float32")
+    lower = reconstruct(model, picture, "bfloat16")
+    assert torch.equal(full.means, again.means)
+    gap = (lower.means - full.means).norm() / full.means.norm()
+    assert lower.means.dtype == torch.float32 and 0 < gap < 0.02  # 8 digits, a few products
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's mallopt")
+@pytest.mark.parametrize("name", ["", "MALLOC_ARENA_MAX", "GLIBC_TUNABLES"])
+def test_memory_is_kept_unless_the_user_has_a_say(monkeypatch, name):
+    for other in ("MALLOC_ARENA_MAX", "GLIBC_TUNABLES"):
+        monkeypatch.delenv(other, raising=False)
+    if name:
+        monkeypatch.setenv(name, "1")
+    called = []
+
+    class Library:
+        def mallopt(self, *values) -> None:
+            called.append(tuple(value.value for value in values))
+
+    monkeypatch.setattr(devices.ctypes, "CDLL", lambda _: Library())
+    devices.keep_memory()
+    assert called == ([] if name else [devices._KEEP, devices._MAPPED])
