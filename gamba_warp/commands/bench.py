@@ -104,8 +104,8 @@ def _choose_suites(what: tuple[str, ...]) -> list[str]:
     """Those of ``SUITES`` that are named. Raises UserError where a name is not known."""
     unknown = [name for name in what if name not in (*SUITES, *GROUPS)]
     if unknown:
-        known = ", ".join((*SUITES, *GROUPS))
-        raise UserError(f"unknown case '{unknown[0]}'; there are {known}")
+        *known, last = *SUITES, *GROUPS
+        raise UserError(f"unknown case '{unknown[0]}'; there are {', '.join(known)} and {last}")
     named = {part for name in what for part in GROUPS.get(name, (name,))}
     return [name for name in SUITES if name in named]
 

@@ -239,9 +239,9 @@ def errors(problem: Problem, length: int, device: torch.device, backward: bool) 
 def cases(settings: Settings) -> list[Case]:
     """Returns the cases: every kind of inputs in float32 and bfloat16."""
     made = []
-    for dtype in (torch.float32, torch.bfloat16):
-        name = str(dtype).removeprefix("torch.")
-        for kind, text in KINDS.items():
+    for kind, text in KINDS.items():
+        for dtype in (torch.float32, torch.bfloat16):
+            name = str(dtype).removeprefix("torch.")
             note = "; bfloat16 results round by up to 2^-9" if dtype == torch.bfloat16 else ""
             made.append(
                 Case(

@@ -92,7 +92,10 @@ def _scale(values: list[float], axis: Axis, start: float, end: float):
     def place(value: float) -> float:
         return start + (end - start) * (bend(value) - low) / (high - low)
 
-    place.low, place.high = (10**low, 10**high) if axis.logarithmic else (low, high)
+    if axis.logarithmic:  # a stranger's figures may leave no room in the range of numbers
+        place.low, place.high = 10 ** max(low, -300.0), 10 ** min(high, 300.0)
+    else:
+        place.low, place.high = low, high
     return place
 
 

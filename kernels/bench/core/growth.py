@@ -123,9 +123,9 @@ def _growth(key: tuple[str, str, str], records: list[dict], figure: str) -> Grow
     if own is None or of_work is None:
         return None
     *shorter, most = sizes
-    cost = {s: values[s] / work[s] for s in sizes}
+    cost = {s: math.log(values[s]) - math.log(work[s]) for s in sizes}
     cheapest = min(shorter, key=cost.__getitem__)
-    dearer = cost[most] / cost[cheapest]
+    dearer = _exp(cost[most] - cost[cheapest])
     ends = [slope({s: line[s] for s in (cheapest, most)}) or 0.0 for line in (values, work)]
     apart = figure != "ms_p50" or _apart(records, size, cheapest, most, dearer)
     return Growth(
@@ -134,6 +134,11 @@ def _growth(key: tuple[str, str, str], records: list[dict], figure: str) -> Grow
         (ends[0], ends[1]),
         dearer > _DEARER and apart,
     )
+
+
+def _exp(x: float) -> float:
+    """e^x, held where a stranger's figures would leave the range of numbers."""
+    return math.exp(max(-300.0, min(x, 300.0)))
 
 
 def _apart(records: Sequence[dict], size: str, low: float, high: float, dearer: float) -> bool:
@@ -196,7 +201,7 @@ def _guide(records: Sequence[dict], size: str, line: Line, scale: float) -> list
         return []
     gap = sum(math.log(line[s]) - math.log(work[s]) for s in both) / len(both)
     unit = str(records[0]["parameters"].get("unit", "units"))
-    return [_series(unit, work, scale * math.exp(max(-600.0, min(gap, 600.0))), "guide")]
+    return [_series(unit, work, scale * _exp(gap), "guide")]
 
 
 def _series(name: str, line: Line, scale: float, kind: str = "straight") -> Series:
