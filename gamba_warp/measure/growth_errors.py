@@ -28,7 +28,7 @@ EPS = 2.0**-24
 HALF_LIMIT = 3e-2  # of bfloat16: 8 bits of a number
 _CHANNELS, _STATES = 16, 4  # of all problems; the truth of more costs minutes
 _PIECE = 256  # tokens that the truth walks one after the other
-_SEGMENT = 2**16  # tokens whose factors the truth holds at once
+_SEGMENT = 2**14  # tokens whose factors the truth holds at once
 _TINY = 1e-30  # below, float32 has decays held at 2^-126 and numbers that count as 0
 
 
