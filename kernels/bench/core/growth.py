@@ -17,6 +17,7 @@ from .crossing import FIGURES
 GROWTH, ERRORS = "growth ", "growth of error"
 BOUND = "ε"  # names of bounds begin with it
 _DEARER = 1.1  # a unit that costs this much more at the greatest size is told
+_LEAST_BYTES = 2**23  # of less memory, the pages and slack of the heap are a part
 _HEADER = ("direction", "dtype", "figure", "over", "slope", "of its work", "a unit's cost")
 
 Line = Mapping[float, float]
@@ -127,7 +128,10 @@ def _growth(key: tuple[str, str, str], records: list[dict], figure: str) -> Grow
     cheapest = min(shorter, key=cost.__getitem__)
     dearer = _exp(cost[most] - cost[cheapest])
     ends = [slope({s: line[s] for s in (cheapest, most)}) or 0.0 for line in (values, work)]
-    apart = figure != "ms_p50" or _apart(records, size, cheapest, most, dearer)
+    if figure == "ms_p50":
+        apart = _apart(records, size, cheapest, most, dearer)
+    else:
+        apart = values[most] >= _LEAST_BYTES
     return Growth(
         *(direction, dtype, FIGURES[figure][0], size, sizes[0], most, own),
         *(str(records[0]["parameters"].get("unit", "units")), of_work, cheapest, dearer),

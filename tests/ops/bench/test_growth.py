@@ -95,6 +95,10 @@ def test_noise_is_not_growth():
     assert time_.dearer == pytest.approx(1.3) and not time_.faster
     (time_, _) = growths(law(1.0, bend.__getitem__, spread=0.05))
     assert time_.faster
+    # Memory has no spread, but a heap takes more than is asked for: small amounts say nothing.
+    for scale, faster in ((1.0, False), (100.0, True)):
+        bytes_ = [record(size, 1.0, size, scale * size**1.05) for size in SIZES]
+        assert growths(bytes_)[1].faster == faster
     slightly = {1024: 1.0, 4096: 1.0, 16384: 1.0, 65536: 1.05}
     (time_, _) = growths(law(1.0, slightly.__getitem__, spread=0.0))
     assert not time_.faster
