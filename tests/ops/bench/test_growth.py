@@ -1,8 +1,10 @@
 """``gamba bench growth``: slopes, what grows faster than its work, and what the words mean."""
 
+import importlib.util
 import json
 import math
 import xml.etree.ElementTree as ET
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -19,6 +21,7 @@ from gamba_warp.kernels.bench.core.picture import growth_picture
 from gamba_warp.kernels.bench.core.report import markdown
 from gamba_warp.measure import growth, suites
 
+DOCS = Path(__file__).parents[3] / "docs"
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 SIZES = (1024, 4096, 16384, 65536)
 
@@ -193,3 +196,24 @@ def test_the_oracle_of_many_gaussians_sees_all_that_reach_the_crop(monkeypatch):
     few = growth.near_crop(scene, False) & (torch.arange(3000) % 20 != 0)
     monkeypatch.setattr(growth, "near_crop", lambda *arguments: few)
     assert growth.check_near(scene, False).rel_rms > 1e-2
+
+
+@pytest.fixture(scope="module")
+def writer():
+    spec = importlib.util.spec_from_file_location("growth_page", DOCS / "growth_page.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_growth_shows_the_results(writer):
+    document = suites.read_document(writer.RESULTS)
+    text = writer.PAGE.read_text(encoding="utf-8")
+    assert writer.page_of(text, document) == text, "run: python docs/growth_page.py"
+    for name, path in writer.PICTURES.items():
+        picture = growth_picture([writer.split(document)[name]])
+        assert path.read_text(encoding="utf-8") == picture, "run: python docs/growth_page.py"
+    for r in document["records"]:
+        assert r["status"] == "ok", (r["case"], r["variant"], r["status"])
+    with pytest.raises(ValueError, match="no mark"):
+        writer.page_of("", document)
