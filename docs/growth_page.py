@@ -11,12 +11,15 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import torch
+
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
 from gamba_warp.kernels.bench.core.growth import ERRORS, growth_lines, growth_table
 from gamba_warp.kernels.bench.core.picture import growth_picture
 from gamba_warp.kernels.bench.core.report import groups, machine_line
-from gamba_warp.measure.suites import read_document
+from gamba_warp.measure import growth, growth_errors
+from gamba_warp.measure.suites import make_settings, read_document
 
 HERE = Path(__file__).parent
 PAGE = HERE / "growth.md"
@@ -30,7 +33,11 @@ def main() -> None:
     document = read_document(RESULTS)
     write_text(PAGE, page_of(PAGE.read_text(encoding="utf-8"), document))
     for name, path in PICTURES.items():
-        write_text(path, growth_picture([split(document)[name]]))
+        picture = growth_picture([split(document)[name]])
+        if picture:
+            write_text(path, picture)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def split(document: dict) -> dict[str, dict]:
@@ -53,9 +60,10 @@ def page_of(text: str, document: dict) -> str:
     """
     parts = split(document)
     written = {
-        "machine": machine_line(document),
-        "costs": _costs(parts["costs"]),
-        "errors": _errors(parts["errors"]),
+        "machine": "\n\n".join([machine_line(document), *_missing(document)]),
+        "costs": _picture("costs", "Time and memory over every size", parts)
+        + _costs(parts["costs"]),
+        "errors": _picture("errors", "Errors over L", parts) + _errors(parts["errors"]),
     }
     for name, content in written.items():
         begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
@@ -64,6 +72,23 @@ def page_of(text: str, document: dict) -> str:
         head, _, rest = text.partition(begin)
         text = f"{head}{begin}\n\n{content}\n\n{end}{rest.partition(end)[2]}"
     return text
+
+
+def _missing(document: dict) -> list[str]:
+    """A sentence on the cases that the results lack, if there are any."""
+    settings = make_settings(torch.device("cpu"), False, False, False, 1)
+    known = [(c.op, c.name) for c in (*growth.cases(settings), *growth_errors.cases(settings))]
+    measured = {(r["op"], r["case"]) for r in document["records"]}
+    lacking = [
+        f"{op.removeprefix('growth-')} {name}" for op, name in known if (op, name) not in measured
+    ]
+    return [f"Not in these results yet: {'; '.join(lacking)}."] if lacking else []
+
+
+def _picture(name: str, text: str, parts: dict[str, dict]) -> str:
+    """The link to a picture, where there is anything to draw."""
+    file = PICTURES[name]
+    return f"![{text}](pictures/{file.name})\n\n" if growth_picture([parts[name]]) else ""
 
 
 def _costs(document: dict) -> str:
@@ -76,6 +101,8 @@ def _costs(document: dict) -> str:
             said += [f"- {name}, {line}" for line in faster if not line.startswith("Nothing")]
             header, cells = growth_table(records) or ([], [])
             rows += [[f"{name}, {case}", *row] for row in cells]
+    if not rows:
+        return "Not measured yet."
     said = said or ["- Nothing grows faster than its work."]
     return "\n".join([*said, "", *_table(["case", *header], rows)])
 
@@ -87,7 +114,7 @@ def _errors(document: dict) -> str:
         for case, records in cases.items():
             header, rows = growth_table(records) or ([], [])
             blocks.append("\n".join([f"**{case}**", "", *_table(header, rows)]))
-    return "\n\n".join(blocks)
+    return "\n\n".join(blocks) or "Not measured yet."
 
 
 def _table(header: list[str], rows: list[list[str]]) -> list[str]:

@@ -212,7 +212,8 @@ def test_the_page_of_growth_shows_the_results(writer):
     assert writer.page_of(text, document) == text, "run: python docs/growth_page.py"
     for name, path in writer.PICTURES.items():
         picture = growth_picture([writer.split(document)[name]])
-        assert path.read_text(encoding="utf-8") == picture, "run: python docs/growth_page.py"
+        shown = path.read_text(encoding="utf-8") if path.exists() else ""
+        assert shown == picture, "run: python docs/growth_page.py"
     for r in document["records"]:
         assert r["status"] == "ok", (r["case"], r["variant"], r["status"])
     with pytest.raises(ValueError, match="no mark"):
