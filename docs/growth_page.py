@@ -59,11 +59,12 @@ def page_of(text: str, document: dict) -> str:
         ValueError: the page lacks a mark.
     """
     parts = split(document)
+    costs, errors = (_picture(name, parts) for name in PICTURES)
     written = {
         "machine": "\n\n".join([machine_line(document), *_missing(document)]),
         "costs": _picture("costs", "Time and memory over every size", parts)
         + _costs(parts["costs"]),
-        "errors": _picture("errors", "Errors over L", parts) + _errors(parts["errors"]),
+        "errors": errors + _errors(parts["errors"]),
     }
     for name, content in written.items():
         begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
@@ -85,10 +86,10 @@ def _missing(document: dict) -> list[str]:
     return [f"Not in these results yet: {'; '.join(lacking)}."] if lacking else []
 
 
-def _picture(name: str, text: str, parts: dict[str, dict]) -> str:
+def _picture(name: str, parts: dict[str, dict]) -> str:
     """The link to a picture, where there is anything to draw."""
     file = PICTURES[name]
-    return f"![{text}](pictures/{file.name})\n\n" if growth_picture([parts[name]]) else ""
+    return f"![Growth of {name}](pictures/{file.name})\n\n" if growth_picture([parts[name]]) else ""
 
 
 def _costs(document: dict) -> str:
