@@ -62,8 +62,7 @@ def page_of(text: str, document: dict) -> str:
     costs, errors = (_picture(name, parts) for name in PICTURES)
     written = {
         "machine": "\n\n".join([machine_line(document), *_missing(document)]),
-        "costs": _picture("costs", "Time and memory over every size", parts)
-        + _costs(parts["costs"]),
+        "costs": costs + _costs(parts["costs"]),
         "errors": errors + _errors(parts["errors"]),
     }
     for name, content in written.items():
