@@ -8,7 +8,7 @@ view for the rasterizer.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import torch
@@ -146,9 +146,9 @@ def _scene(settings: Settings, gaussians: dict[str, Tensor], side: int, views: i
     return Scene(gaussians, *orbit_cameras(views, side), side, settings.device)
 
 
-def _pairs(scene: Scene, count: Callable[[], dict[str, int]]) -> dict[str, int]:
+def _pairs(scene: Scene, count: Callable[[], Mapping[str, int | float]]) -> dict[str, int | float]:
     """The rasterizer's own counts; every view projects every Gaussian."""
-    counts = count()
+    counts = dict(count())
     views = scene.viewmats.shape[:-2].numel()
     return counts | {"units": counts["pairs"] + views * counts["gaussians"]}
 

@@ -170,7 +170,7 @@ class Problem:
     def forward(self, length: int, device: torch.device) -> tuple[Tensor, Tensor]:
         """Output and last state, without gradients."""
         with torch.no_grad():
-            own = {k: x.to(device) for k, x in self.first(length).items()}
+            own: dict[str, Any] = {k: x.to(device) for k, x in self.first(length).items()}
             return selective_scan(**own, delta_softplus=True, return_last_state=True)
 
     def cotangent(self, length: int) -> Tensor:
@@ -184,7 +184,8 @@ class Problem:
     def gradients(self, length: int, device: torch.device) -> tuple[dict[str, Tensor], Tensor]:
         """The gradients of all inputs, and the output."""
         leaves = {k: x.to(device).requires_grad_() for k, x in self.first(length).items()}
-        out = selective_scan(**leaves, delta_softplus=True)
+        given: dict[str, Any] = dict(leaves)
+        out = selective_scan(**given, delta_softplus=True)
         back = self.cotangent(length).to(device)
         grads = torch.autograd.grad(out, list(leaves.values()), back)
         return dict(zip(leaves, grads)), out.detach()
