@@ -80,16 +80,16 @@ def test_errors_are_of_the_rounded_inputs(dtype):
 
 
 def test_worse_decays_are_seen(monkeypatch):
-    """A kernel whose rates are off by 1e-5 of themselves is off by over 1e-6 in every figure."""
+    """A kernel whose rates are off by 1e-4 of themselves is off by over 5e-6 in every figure."""
     problem = Problem("random", torch.float32, SIZES)
     scan = growth_errors.selective_scan
     monkeypatch.setattr(
         growth_errors,
         "selective_scan",
-        lambda A, **given: scan(A=A * (1 + 1e-5), **given),
+        lambda A, **given: scan(A=A * (1 + 1e-4), **given),
     )
     for name, error in growth_errors.errors(problem, 300, CPU, True).items():
-        assert error.rel_rms > 1e-6, name
+        assert error.rel_rms > 5e-6, name
 
 
 def test_a_run_of_small_sizes():
