@@ -25,8 +25,13 @@ SUITES = {
     "model": "gamba_warp.measure.blocks",
     "lengths": "gamba_warp.measure.lengths",
     "step": "gamba_warp.train.bench.step",
+    "growth-scan": "gamba_warp.measure.growth",
+    "growth-raster": "gamba_warp.measure.growth",
+    "growth-errors": "gamba_warp.measure.growth_errors",
     "loader": "gamba_warp.train.bench.loader",
 }
+# Words for several of them.
+GROUPS = {"growth": ("growth-scan", "growth-raster", "growth-errors"), "all": tuple(SUITES)}
 
 
 @ranged
@@ -45,6 +50,7 @@ def bench_command(
     render: tuple[Path, ...] = (),
     static: bool = False,
     data: Path | None = None,
+    only: tuple[str, ...] = (),
 ) -> int:
     """Measures run time against error, with what is installed beside us.
 
@@ -53,7 +59,8 @@ def bench_command(
 
     Args:
         what: scan, conv, raster, block, model, lengths (a Mamba block against a transformer block
-            over the number of tokens), step, or all.
+            over the number of tokens), growth (time, memory and errors over every size, with
+            slopes; growth-scan, growth-raster and growth-errors are its parts), step, or all.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes, many rounds, and the torch loop at full length.
@@ -61,10 +68,12 @@ def bench_command(
         out: Folder for the results. With --render it may be a .md or .html file.
         threads: Number of CPU threads; torch's own number if not given.
         compare: An older bench.json; prints the ratios of the times.
-        render: Measure nothing; make the tables and the page of these JSON files.
+        render: Measure nothing; make the tables and the page of these JSON files. With an --out
+            that ends in .svg it draws their charts of growth, with .json it joins them.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
             (registers, stack, shared memory, occupancy) to static.json and static.md.
         data: Folder of posed views for step; made-up views if not given.
+        only: Measure only these cases, by their full names, as L or "random, float32".
     """
     from ..measure import suites
 
@@ -81,7 +90,7 @@ def bench_command(
     settings = suites.make_settings(pick_device(device), quick, full, peers, threads, data)
     old = suites.read_document(compare) if compare is not None else None
     folder = output_folder(out)
-    document = suites.run_suites({op: load_suite(op) for op in chosen}, settings)
+    document = suites.run_suites({op: load_suite(op) for op in chosen}, settings, only)
     suites.write_document(document, folder)
     written = f"wrote {folder / 'bench.json'}, bench.md and bench.html"
     print(f"{suites.summary(document, old)}; {written}")
@@ -93,10 +102,12 @@ def bench_command(
 
 def _choose_suites(what: tuple[str, ...]) -> list[str]:
     """Those of ``SUITES`` that are named. Raises UserError where a name is not known."""
-    unknown = [name for name in what if name not in (*SUITES, "all")]
+    unknown = [name for name in what if name not in (*SUITES, *GROUPS)]
     if unknown:
-        raise UserError(f"unknown case '{unknown[0]}'; there are {', '.join(SUITES)} and all")
-    return [name for name in SUITES if name in what or "all" in what]
+        *known, last = *SUITES, *GROUPS
+        raise UserError(f"unknown case '{unknown[0]}'; there are {', '.join(known)} and {last}")
+    named = {part for name in what for part in GROUPS.get(name, (name,))}
+    return [name for name in SUITES if name in named]
 
 
 def load_suite(op: str) -> ModuleType:

@@ -15,8 +15,10 @@ from ..files import atomic_path, output_folder, write_json
 from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.core.crossing import crossings
 from ..kernels.bench.core.document import check_document
+from ..kernels.bench.core.growth import growth_lines
 from ..kernels.bench.core.page import page
-from ..kernels.bench.core.report import judge, markdown, ratio_table
+from ..kernels.bench.core.picture import growth_picture
+from ..kernels.bench.core.report import groups, judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 from ..untrusted import documents
@@ -48,21 +50,32 @@ def make_settings(
     )
 
 
-def run_suites(suites: Mapping[str, ModuleType], settings: Settings) -> dict:
+def run_suites(
+    suites: Mapping[str, ModuleType], settings: Settings, only: Sequence[str] = ()
+) -> dict:
     """Measures the cases of suites, with a progress bar.
 
     Args:
         suites: by operator, the module with its ``cases(settings)`` and ``targets(settings)``.
         settings: of the cases.
+        only: names of the cases to measure; all of them if there is none.
 
     Returns:
         The document of the records, targets and peers; Ctrl-C leaves what was measured in it.
+
+    Raises:
+        UserError: the suites have no case of a name.
     """
     cases: list[Case] = []
     targets: list[Target] = []
     for op, module in suites.items():
         cases += [case for case in module.cases(settings) if case.op == op]
         targets += [t for t in module.targets(settings) if t.times[0].op == op]
+    if only:
+        names = list(dict.fromkeys(case.name for case in cases))
+        if unknown := [name for name in only if name not in names]:
+            raise UserError(f"--only {unknown[0]}: no such case; there are {'; '.join(names)}")
+        cases = [case for case in cases if case.name in only]
     with tqdm(total=len(cases), unit="case", desc="bench", disable=None) as bar:
         document = measure(cases, settings, _progress(bar))
     document["machine"]["peers"] = versions() if settings.peers else {}
@@ -107,15 +120,53 @@ def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
 
     Args:
         documents: as ``read_document`` returns them.
-        out: a .md or .html file, or a folder for bench.md and bench.html.
+        out: a .md or .html file, or a folder for bench.md and bench.html; a .svg file gets the
+            charts of growth, a .json file all records in one document.
 
     Returns:
         The files.
+
+    Raises:
+        UserError: nothing grows in the documents, or they are not of one machine and level.
     """
+    if out.suffix == ".json":
+        write_json(out, join(documents))
+        return [out]
+    if out.suffix == ".svg":
+        picture = growth_picture(documents)
+        if not picture:
+            raise UserError(f"--out {out}: these results have no cases of growth to draw")
+        _write(out, picture)
+        return [out]
     if out.suffix in (".md", ".html"):
         _write(out, markdown(documents) if out.suffix == ".md" else page(documents))
         return [out]
     return _write_pages(documents, output_folder(out))
+
+
+def join(documents: Sequence[dict]) -> dict:
+    """One document of the records of several runs; of the same case the last run counts.
+
+    Raises:
+        UserError: they are not of one machine, level and set of versions.
+    """
+    first, *others = documents
+    for other in others:
+        for name, value in first["machine"].items():
+            if name not in ("date", "peers") and other["machine"].get(name) != value:
+                raise UserError(f"--render: {name} is {value} and {other['machine'].get(name)}")
+        if other.get("settings") != first.get("settings"):
+            raise UserError("--render: results of different levels cannot be joined")
+    cases: dict[tuple[str, str], list[dict]] = {}
+    for document in documents:
+        for op, parts in groups(document).items():
+            cases |= {(op, case): records for case, records in parts.items()}
+    joined = first | {"records": [r for records in cases.values() for r in records]}
+    joined["machine"] = first["machine"] | {"date": documents[-1]["machine"]["date"]}
+    joined["interrupted"] = any(document["interrupted"] for document in documents)
+    joined["targets"] = [t for document in documents for t in document.get("targets", [])]
+    joined["crossings"] = [c._asdict() for c in crossings(joined["records"])]
+    return joined
 
 
 def _write_pages(documents: Sequence[dict], folder: Path) -> list[Path]:
@@ -166,6 +217,8 @@ def summary(document: dict, old: dict | None) -> str:
         value = "" if t["value"] is None else f"{t['value']:.3g}"
         lines.append(f"{word:<12} {value:>8}  ({t['wanted']})  {t['op']}: {t['text']}")
     lines += [f"{c.op}: {c.text()}" for c in crossings(document["records"])]
+    for op, cases in groups(document).items():
+        lines += [f"{op}: {line}" for records in cases.values() for line in growth_lines(records)]
     stopped = (r for r in document["records"] if r["status"].startswith("stopped"))
     lines += [f"{r['op']}: {r['variant']}, {r['direction']}: {r['status']}" for r in stopped]
     if old is not None:

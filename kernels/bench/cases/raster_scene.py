@@ -148,11 +148,11 @@ class Scene:
 
     def oracle(self, backward: bool) -> str:
         """What the check compares with, in words."""
-        width, height = self._crop(backward)[2:]
+        width, height = self.crop(backward)[2:]
         text = f"float64, all Gaussians dense, a crop of {width} x {height} pixels"
         return text + (" without thresholds" if "t_min" in self.exact else "")
 
-    def _crop(self, backward: bool) -> tuple[int, int, int, int]:
+    def crop(self, backward: bool) -> tuple[int, int, int, int]:
         """Left, top, width and height: within the object, off its centre."""
         width, height = _BACKWARD_CROP if backward else _FORWARD_CROP
         left, top = round(0.58 * self.size), round(0.39 * self.size)
@@ -160,7 +160,7 @@ class Scene:
 
     def check(self, backward: bool) -> Error:
         """Error of picture and alpha, and of the gradients asked for, on the crop."""
-        left, top, width, height = self._crop(backward)
+        left, top, width, height = self.crop(backward)
         first = (0,) * (self.viewmats.dim() - 3)  # the first object
         Ks = self.Ks[first][:1].clone()
         Ks[:, 0, 2] -= left

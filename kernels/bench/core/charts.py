@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-_WIDTH, _HEIGHT = 600, 380
+WIDTH, HEIGHT = 600, 380  # of a chart, pixels
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 584, 36, 334
 _CHARACTER, _LINE = 6.4, 13.0  # size of a label's character, pixels
 
@@ -24,7 +24,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one colour; ``line`` is "", "straight" between them, or "steps" without them."""
+    """Points of one colour; ``line`` is "" or "straight"; "steps" and "guide" hide the points."""
 
     name: str
     points: Sequence[Point]
@@ -68,12 +68,12 @@ def chart(series: Sequence[Series], x: Axis, y: Axis) -> str:
     for i, s in enumerate(shown):
         placed = [(place_x(p.x), place_y(p.y)) for p in s.points]
         parts.append(_line(placed, s.line, i))
-        if s.line != "steps":
+        if s.line not in ("steps", "guide"):
             parts += [_mark(at, p, i) for at, p in zip(placed, s.points)]
             named += [(at, p.label) for at, p in zip(placed, s.points) if p.label]
     parts += _labels(named)
     parts += _legend(shown)
-    return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img">{"".join(parts)}</svg>'
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(parts)}</svg>'
 
 
 def _fits(value: float, axis: Axis) -> bool:
@@ -92,7 +92,10 @@ def _scale(values: list[float], axis: Axis, start: float, end: float):
     def place(value: float) -> float:
         return start + (end - start) * (bend(value) - low) / (high - low)
 
-    place.low, place.high = (10**low, 10**high) if axis.logarithmic else (low, high)
+    if axis.logarithmic:  # a stranger's figures may leave no room in the range of numbers
+        place.low, place.high = 10 ** max(low, -300.0), 10 ** min(high, 300.0)
+    else:
+        place.low, place.high = low, high
     return place
 
 
@@ -110,7 +113,7 @@ def _grid(place_x, place_y, x: Axis, y: Axis) -> list[str]:
         parts.append(f"<text {text}>{_number(value)}</text>")
     middle = (_LEFT + _RIGHT) / 2
     parts.append(
-        f'<text class="axis" x="{middle}" y="{_HEIGHT - 8}" text-anchor="middle">'
+        f'<text class="axis" x="{middle}" y="{HEIGHT - 8}" text-anchor="middle">'
         f"{html.escape(x.label)}</text>"
     )
     parts.append(f'<text class="axis" x="{_LEFT - 56}" y="16">{html.escape(y.label)}</text>')
@@ -181,7 +184,7 @@ def _labels(named: list[tuple[tuple[float, float], str]]) -> list[str]:
 
 
 def _free(box: tuple, taken: list[tuple]) -> bool:
-    inside = box[0] >= 2 and box[2] <= _WIDTH and box[1] >= 20 and box[3] <= _BOTTOM
+    inside = box[0] >= 2 and box[2] <= WIDTH and box[1] >= 20 and box[3] <= _BOTTOM
     return inside and not any(
         box[0] < t[2] and t[0] < box[2] and box[1] < t[3] and t[1] < box[3] for t in taken
     )

@@ -10,6 +10,7 @@ from dataclasses import replace
 from .bars import bars
 from .charts import Axis, Point, Series, chart, pareto
 from .crossing import FIGURES, crossings, series_of
+from .growth import ERRORS, GROWTH, error_charts, growth_charts, growth_lines, growth_table
 from .parts import parts_of, parts_table
 from .report import EXPLANATION, TARGET_HEADER, groups, machine_line, oracles, table, target_rows
 
@@ -50,6 +51,10 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
         return _share_charts(case, done)
     if axis == "lengths":
         return _length_charts(done)
+    if axis == ERRORS:
+        return error_charts(done)
+    if axis.startswith(GROWTH):
+        return growth_charts(done)
     return [_line_chart(case, done, axis, "ms_p50", "milliseconds")]
 
 
@@ -199,6 +204,7 @@ svg .axis { fill: var(--soft); font-weight: 600; }
 svg .grid { stroke: var(--line); }
 svg .line { fill: none; stroke-width: 2; stroke-linejoin: round; }
 svg .steps { stroke-dasharray: 5 4; }
+svg .guide { stroke-dasharray: 3 4; }
 svg .ring { fill: none !important; stroke-width: 2; }
 .scroll { overflow-x: auto; margin-top: 1rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
@@ -226,9 +232,10 @@ def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
                 figures = "".join(charts_of(case, records))
                 figures = f'<div class="charts">{figures}</div>' if figures else ""
                 rows = _html_table(*table(records))
-                if split := parts_table(records):
-                    rows += _html_table(*split)
-                lines = "".join(f"<p>{html.escape(c.text())}</p>" for c in crossings(records))
+                for more in (growth_table(records), parts_table(records)):
+                    rows += _html_table(*more) if more else ""
+                said = [*(c.text() for c in crossings(records)), *growth_lines(records)]
+                lines = "".join(f"<p>{html.escape(line)}</p>" for line in said)
                 name = html.escape(f"{op}: {case}")
                 body.append(
                     f"<section><h2>{name}</h2><p>{text}</p>{lines}{figures}{rows}</section>"

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from .case import Key, Target
 from .crossing import crossings
+from .growth import growth_lines, growth_table
 from .parts import parts_table
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
@@ -215,10 +216,10 @@ def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
         for op, cases in groups(document).items():
             for case, records in cases.items():
                 lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
-                lines += [line for c in crossings(records) for line in (c.text(), "")]
-                lines += [*_markdown_table(*table(records)), ""]
-                if split := parts_table(records):
-                    lines += [*_markdown_table(*split), ""]
+                said = [*(c.text() for c in crossings(records)), *growth_lines(records)]
+                lines += [line for text in said for line in (text, "")]
+                for rows in (table(records), growth_table(records), parts_table(records)):
+                    lines += [*_markdown_table(*rows), ""] if rows else []
     return "\n".join(lines)
 
 

@@ -1,0 +1,129 @@
+r"""Writes the tables and pictures of docs/growth.md from docs/benchmarks/cpu-growth.json.
+
+After ``gamba bench growth`` in one run or in parts:
+
+    gamba bench --render out/a/bench.json out/b/bench.json --out docs/benchmarks/cpu-growth.json
+    python docs/growth_page.py
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import torch
+
+from gamba_warp.errors import UserError
+from gamba_warp.files import write_text
+from gamba_warp.kernels.bench.core.growth import ERRORS, growth_lines, growth_table
+from gamba_warp.kernels.bench.core.picture import growth_picture
+from gamba_warp.kernels.bench.core.report import groups, machine_line
+from gamba_warp.measure import growth, growth_errors
+from gamba_warp.measure.suites import make_settings, read_document
+
+HERE = Path(__file__).parent
+PAGE = HERE / "growth.md"
+RESULTS = HERE / "benchmarks" / "cpu-growth.json"
+PICTURES = {"costs": HERE / "pictures" / "growth.svg", "errors": HERE / "pictures" / "errors.svg"}
+MARK = "<!-- {name}: written by docs/growth_page.py -->"
+
+
+def main() -> None:
+    """Writes the page and both pictures again."""
+    document = read_document(RESULTS)
+    write_text(PAGE, page_of(PAGE.read_text(encoding="utf-8"), document))
+    for name, path in PICTURES.items():
+        picture = growth_picture([split(document)[name]])
+        if picture:
+            write_text(path, picture)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def split(document: dict) -> dict[str, dict]:
+    """The document's records of growing costs, and those of growing errors."""
+    found: dict[str, list[dict]] = {"costs": [], "errors": []}
+    for record in document["records"]:
+        found["errors" if record["axis"] == ERRORS else "costs"].append(record)
+    return {name: document | {"records": records} for name, records in found.items()}
+
+
+def page_of(text: str, document: dict) -> str:
+    """The page with the parts between its marks written from the results.
+
+    Args:
+        text: of the page.
+        document: as ``read_document`` returns it.
+
+    Raises:
+        ValueError: the page lacks a mark.
+    """
+    parts = split(document)
+    costs, errors = (_picture(name, parts) for name in PICTURES)
+    written = {
+        "machine": "\n\n".join([machine_line(document), *_missing(document)]),
+        "costs": costs + _costs(parts["costs"]),
+        "errors": errors + _errors(parts["errors"]),
+    }
+    for name, content in written.items():
+        begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
+        if begin not in text or end not in text:
+            raise ValueError(f"no mark {begin}")
+        head, _, rest = text.partition(begin)
+        text = f"{head}{begin}\n\n{content}\n\n{end}{rest.partition(end)[2]}"
+    return text
+
+
+def _missing(document: dict) -> list[str]:
+    """A sentence on the cases that the results lack, if there are any."""
+    settings = make_settings(torch.device("cpu"), False, False, False, 1)
+    known = [(c.op, c.name) for c in (*growth.cases(settings), *growth_errors.cases(settings))]
+    measured = {(r["op"], r["case"]) for r in document["records"]}
+    lacking = [
+        f"{op.removeprefix('growth-')} {name}" for op, name in known if (op, name) not in measured
+    ]
+    return [f"Not in these results yet: {'; '.join(lacking)}."] if lacking else []
+
+
+def _picture(name: str, parts: dict[str, dict]) -> str:
+    """The link to a picture, where there is anything to draw."""
+    file = PICTURES[name]
+    return f"![Growth of {name}](pictures/{file.name})\n\n" if growth_picture([parts[name]]) else ""
+
+
+def _costs(document: dict) -> str:
+    """What grows faster than its work, then one table of all slopes."""
+    said, rows, header = [], [], []
+    for op, cases in groups(document).items():
+        name = op.removeprefix("growth-")
+        for case, records in cases.items():
+            faster = [line for line in growth_lines(records) if "grows faster" in line]
+            said += [f"- {name}, {line}" for line in faster if not line.startswith("Nothing")]
+            header, cells = growth_table(records) or ([], [])
+            rows += [[f"{name}, {case}", *row] for row in cells]
+    if not rows:
+        return "Not measured yet."
+    said = said or ["- Nothing grows faster than its work."]
+    return "\n".join([*said, "", *_table(["case", *header], rows)])
+
+
+def _errors(document: dict) -> str:
+    """A table for every kind of inputs."""
+    blocks = []
+    for cases in groups(document).values():
+        for case, records in cases.items():
+            header, rows = growth_table(records) or ([], [])
+            blocks.append("\n".join([f"**{case}**", "", *_table(header, rows)]))
+    return "\n\n".join(blocks) or "Not measured yet."
+
+
+def _table(header: list[str], rows: list[list[str]]) -> list[str]:
+    lines = [f"| {' | '.join(row)} |" for row in (header, *rows)]
+    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (UserError, ValueError) as error:
+        sys.exit(f"gamba: {error}")
