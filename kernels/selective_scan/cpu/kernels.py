@@ -219,7 +219,7 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
     prepare, finish = token.prepare, token.finish
     retreat, sum_lanes, scale = state.retreat, state.sum_lanes, SCALES[discretization]
     chunk_size = tuning.chunk
-    room, kept_room = GRAD_TOKEN * chunk_size + EXTRA, KEPT * chunk_size + 1
+    room, kept_room = GRAD_TOKEN * chunk_size + EXTRA, KEPT * tuning.walked_back * chunk_size + 1
 
     @wp.kernel(enable_backward=False, module="unique")
     @no_type_check

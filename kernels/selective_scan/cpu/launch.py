@@ -45,6 +45,12 @@ def _carry(first: Tensor, local: Tensor, product: Tensor) -> Tensor:
     return states
 
 
+def _entries(x: Tensor) -> Tensor:
+    """B or C as the kernels read it: float32, the N entries of a token side by side."""
+    x = x.float()
+    return x if x.stride(-1) == 1 or x.shape[-1] == 1 else x.contiguous()
+
+
 class _Operands:
     """What the launches of one call share, by name."""
 
@@ -102,7 +108,7 @@ def forward(
     layout = Layout(u, A, B, SPAN, tuning.chunk)
     s = _Operands(layout, tuning, u, delta, A, z, delta_bias, discretization)
     sizes = _sizes(layout, softplus, z is not None)
-    b = B.float()
+    b = _entries(B)
     h = layout.states_of(initial_state)[None]
     if layout.segments > 1:
         local = _pairs(s.states())
@@ -113,7 +119,7 @@ def forward(
     s.run(
         kernels.forward_kernel,
         [
-            sizes, "u", "delta", "z", "a", "widest", b, C.float(),
+            sizes, "u", "delta", "z", "a", "widest", b, _entries(C),
             view(layout.pack(D), lanes), "bias",
         ],
         [_flat(h), _flat(h), view(starts, lanes), out],
@@ -131,7 +137,7 @@ def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretizat
     if layout.segments > 1:
         first, h = h[0], s.states()
     h = _pairs(h)
-    product = _accumulate(s, _sizes(layout, softplus, False), B.float(), h, starts)
+    product = _accumulate(s, _sizes(layout, softplus, False), _entries(B), h, starts)
     h = _values(h)
     if layout.segments > 1:
         h = torch.addcmul(h[-1:], product[-1:], _carry(first, h, product)[-1:])
@@ -176,7 +182,7 @@ def backward(
     flags = NEED_DZ * need_z + NEED_DC * need_C + NEED_DB * need_B + NEED_DH * through
     sizes = _sizes(layout, softplus, z is not None, flags)
     dout = lane_contiguous(dout)
-    b, c = B.float(), C.float()
+    b, c = _entries(B), _entries(C)
 
     def like(x: Tensor, needed: bool) -> Tensor:
         return empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), x.dtype)

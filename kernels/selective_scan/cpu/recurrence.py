@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from ...runtime.lanes import lanes, prelude
-from .decays import SPREAD, STATE, walks
+from .decays import FACTORS, SPREAD, STATE, walks
 from .tokens import TOKENS
 from .tuning import Tuning
 
@@ -20,33 +20,53 @@ NEED_DZ, NEED_DC, NEED_DB, NEED_DH = 1, 2, 4, 8
 _OPEN = (
     TOKENS
     + """
+TOKEN* const token = aligned_((TOKEN*)scratch.data);
 const F* const rates = (const F*)a_in.data;
 auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
-// entry n of B or C, token by token
+// B or C from entry n on, token by token
 struct Column {
     const char* at;
     const size_t step;
-    float operator[](int t) const { return *(const float*)(at + t * step); }
+    const float* row(int t) const { return (const float*)(at + t * step); }
+    float operator[](int t) const { return *row(t); }
 };
 auto column_ = [&](auto& array, int n) -> Column {
     const auto* s = array.strides;
     return {(const char*)array.data + (size_t)batch * s[0] + (size_t)t0 * s[1]
-        + (size_t)group * s[2] + (size_t)n * s[3], (size_t)s[1]};
+        + (size_t)group * s[2] + (size_t)n * 4, (size_t)s[1]};
 };
+"""
+)
+_STATES = """
 for (int n = 0; n < states; ++n) {
     const F a = rates[n];
 """
-)
 _CHOOSE = """
     const bool slow = slow_(*(const F*)&token[count] * a);
     if (slow) slow_walk(0);
     else if (tame) walk(exp2_tame_);
     else walk(exp2_);
 """
+# Where no state of a few needs care, they are walked at once: what does not depend on the state is
+# then read and written once for all of them. Sums are in the same order, to the last bit.
+_BLOCKS = """
+for (int n = 0; n < states; ++n) {
+    bool together = tame && n + AT_ONCE <= states ALSO;
+    for (int k = 0; together && k < AT_ONCE; ++k)
+        together = !slow_(*(const F*)&token[count] * rates[n + k]);
+    if (together) {
+        auto exp2 = exp2_tame_;
+        F a[AT_ONCE];
+        for (int k = 0; k < AT_ONCE; ++k) a[k] = rates[n + k];
+BLOCK
+        n += AT_ONCE - 1;
+        continue;
+    }
+    const F a = rates[n];
+"""
 
 # Equations 1 and 5.
 _ADVANCE = """
-    Token* const token = aligned_((Token*)scratch.data);
     const Column b = column_(b_in, n), c = column_(c_in, n);
 WALKS
 }
@@ -61,10 +81,32 @@ _ADVANCE_WALK = """
         }
         h.keep(state_(h_out, n), state_(h_out, states + n));
 """
+_ADVANCE_BLOCK = """
+        const Column b = column_(b_in, n), c = column_(c_in, n);
+        F h[AT_ONCE];
+        #pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k)
+            h[k] = state_(h_out, n + k) + state_(h_out, states + n + k);
+        for (int t = 0; t < count; ++t) {
+            const float *const bt = b.row(t), *const ct = c.row(t);
+            const F rate = token[t].rate, du = token[t].du;
+            F y = token[t].y;
+            #pragma unroll
+            for (int k = 0; k < AT_ONCE; ++k) {
+                const F x = rate * a[k];
+                FACTORS
+                h[k] = fma_(m, h[k], g * (du * bt[k]));
+                y = fma_(h[k], splat(ct[k]), y);
+            }
+            token[t].y = y;
+        }
+        #pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k)
+            state_(h_out, n + k) = h[k], state_(h_out, states + n + k) = F{};
+"""
 
 # Equation 1 alone, and the product of the decays.
 _ACCUMULATE = """
-    const Token* const token = aligned_((const Token*)scratch.data);
     const Column b = column_(b_in, n);
 WALKS
 }
@@ -84,7 +126,6 @@ _ACCUMULATE_WALK = """
 
 # What the outputs send back to the state before the first token, and the product of the decays.
 _GATHER = """
-    const GradToken* const token = aligned_((const GradToken*)scratch.data);
     const Column c = column_(c_in, n);
 WALKS
 }
@@ -104,9 +145,8 @@ _GATHER_WALK = """
 
 # As _ADVANCE, keeping m and h of every token, and adding dy·h to the sums of dC (equation 8); then
 # backwards, equations 6, 7 and 9 to 12. Σ rate q is left in da.
+_KEPT = "Kept* const kept = aligned_((Kept*)kept_out.data);"
 _RETREAT = f"""
-    GradToken* const token = aligned_((GradToken*)scratch.data);
-    Kept* const kept = aligned_((Kept*)kept_out.data);
     const Column b = column_(b_in, n), c = column_(c_in, n);
     F* const db = (F*)db_out.data + n * CHUNK;
     F* const dc = (F*)dc_out.data + n * CHUNK;
@@ -146,6 +186,58 @@ _RETREAT_BACK = """
         dh.keep(state_(dh_out, n), state_(dh_out, states + n));
         state_(da_out, n) += da;
 """
+# The same for several states, where all gradients are wanted.
+_RETREAT_BLOCK = f"""
+        const Column b = column_(b_in, n), c = column_(c_in, n);
+        F* const db = (F*)db_out.data + n * CHUNK;
+        F* const dc = (F*)dc_out.data + n * CHUNK;
+        if (first) for (int t = 0; t < AT_ONCE * CHUNK; ++t) db[t] = dc[t] = F{{}};
+        F h[AT_ONCE], dh[AT_ONCE], da[AT_ONCE];
+        #pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) h[k] = state_(starts_in, n + k);
+        for (int t = 0; t < count; ++t) {{
+            const float *const bt = b.row(t), *const ct = c.row(t);
+            const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
+            F y = token[t].y;
+            #pragma unroll
+            for (int k = 0; k < AT_ONCE; ++k) {{
+                const F x = rate * a[k];
+                FACTORS
+                kept[t * AT_ONCE + k].m = m;
+                kept[t * AT_ONCE + k].h = h[k];
+                h[k] = fma_(m, h[k], g * (du * bt[k]));
+                y = fma_(h[k], splat(ct[k]), y);
+                dc[k * CHUNK + t] = fma_(dy, h[k], dc[k * CHUNK + t]);
+            }}
+            token[t].y = y;
+        }}
+        #pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) {{
+            dh[k] = state_(dh_out, n + k) + state_(dh_out, states + n + k);
+            da[k] = F{{}};
+        }}
+        for (int t = count - 1; t >= 0; --t) {{
+            const float *const bt = b.row(t), *const ct = c.row(t);
+            const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
+            F s = token[t].s, p = token[t].p;
+            #pragma unroll
+            for (int k = 0; k < AT_ONCE; ++k) {{
+                const F v = fma_(dy, splat(ct[k]), dh[k]);
+                db[k * CHUNK + t] = fma_(v, du, db[k * CHUNK + t]);
+                s = fma_(v, splat(bt[k]), s);
+                dh[k] = v * kept[t * AT_ONCE + k].m;
+                const F q = dh[k] * kept[t * AT_ONCE + k].h;
+                p = fma_(q, a[k], p);
+                da[k] = fma_(q, rate, da[k]);
+            }}
+            token[t].s = s, token[t].p = p;
+        }}
+        #pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) {{
+            state_(dh_out, n + k) = dh[k], state_(dh_out, states + n + k) = F{{}};
+            state_(da_out, n + k) += da[k];
+        }}
+"""
 _OWN = f"""
             const F v = dh.value();
             if (needs & {NEED_DB}) db[t] = fma_(v, own.du, db[t]);
@@ -164,15 +256,35 @@ _GENERAL = f"""
 """
 
 
-def _leaf(text: str, walk: str, discretization: str, tuning: Tuning, back: str = "") -> str:
-    """The C++ text of a leaf: for every state its ``text``, with the walks that belong to it."""
+def _leaf(
+    text: str,
+    walk: str,
+    discretization: str,
+    tuning: Tuning,
+    *,
+    token: str,
+    head: str = "",
+    back: str = "",
+    block: str = "",
+    at_once: int = 1,
+    also: str = "",
+) -> str:
+    """The C++ text of a leaf: for every state its ``text``, with the walks that belong to it.
+
+    ``block`` walks ``at_once`` states, if that is more than one.
+    """
     parts = walks("walk", walk, discretization)
     if back:
         gradient = _OWN if discretization == "mamba" else _GENERAL
         parts += walks("back", back.replace("GRADIENT", gradient), discretization)
-    text = prelude(tuning.degree) + STATE + _OPEN + text.replace("WALKS", parts + _CHOOSE)
+    loop = _STATES if at_once == 1 else _BLOCKS.replace("BLOCK", block).replace("ALSO", also)
+    text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE)
+    text = prelude(tuning.degree) + STATE + text.replace("FACTORS", FACTORS[discretization])
     chunk = tuning.chunk
-    return text.replace("SPREAD", str(max(SPREAD, chunk))).replace("CHUNK", str(chunk))
+    names = {"SPREAD": max(SPREAD, chunk), "CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token}
+    for name, value in names.items():
+        text = text.replace(name, str(value))
+    return text
 
 
 @functools.cache
@@ -180,7 +292,10 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """``advance`` and ``accumulate`` bring a lane group's states from before a strip to after."""
     parts = discretization, tuning
 
-    @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts))
+    mamba = discretization == "mamba"  # the others need too many registers
+    block = {"block": _ADVANCE_BLOCK, "at_once": tuning.walked if mamba else 1}
+
+    @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts, token="Token", **block))
     def advance(
         states: int,
         tame: int,
@@ -195,7 +310,7 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
         h_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_leaf(_ACCUMULATE, _ACCUMULATE_WALK, *parts))
+    @wp.func_native(_leaf(_ACCUMULATE, _ACCUMULATE_WALK, *parts, token="const Token"))
     def accumulate(
         states: int,
         tame: int,
@@ -221,7 +336,12 @@ def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """
     parts = discretization, tuning
 
-    @wp.func_native(_leaf(_RETREAT, _RETREAT_WALK, *parts, _RETREAT_BACK))
+    kept = {"head": _KEPT, "back": _RETREAT_BACK}
+    if discretization == "mamba":
+        kept |= {"block": _RETREAT_BLOCK, "at_once": tuning.walked_back}
+        kept["also"] = f"&& needs == {NEED_DZ + NEED_DC + NEED_DB + NEED_DH}"
+
+    @wp.func_native(_leaf(_RETREAT, _RETREAT_WALK, *parts, token="GradToken", **kept))
     def retreat(
         states: int,
         tame: int,
@@ -243,7 +363,7 @@ def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
         da_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_leaf(_GATHER, _GATHER_WALK, *parts))
+    @wp.func_native(_leaf(_GATHER, _GATHER_WALK, *parts, token="const GradToken"))
     def gather(
         states: int,
         tame: int,

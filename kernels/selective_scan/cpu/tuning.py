@@ -18,11 +18,15 @@ class Tuning:
         strip: tokens that the forward walks at once for one state.
         degree: of the polynomial for the decays' 2^x, 2 to 6; the relative error of a decay is
             at most 2e-3, 1e-4, 3e-6, 3e-7 and 7.5e-9.
+        walked: states that the forward walks at once.
+        walked_back: states that the gradient walks at once.
     """
 
     chunk: int = 64
     strip: int = 64
     degree: int = 5
+    walked: int = 4
+    walked_back: int = 2
 
     def __post_init__(self) -> None:
         if self.strip < 1 or self.chunk < 8 or self.chunk % 8 or self.chunk % self.strip:
@@ -35,7 +39,7 @@ class Tuning:
 
     def numbers(self) -> list[int]:
         """The fields in their order, as the operators take them: ``Tuning(*numbers)`` is equal."""
-        return [self.chunk, self.strip, self.degree]
+        return [self.chunk, self.strip, self.degree, self.walked, self.walked_back]
 
 
 _choice = Choice(Tuning())
