@@ -102,9 +102,8 @@ PRELUDE = prelude(5)
 # softplus(x) = max(x, 0) + log1p(e), e = exp(-|x|), log1p(e) = 2 atanh(e / (2 + e)): no branch,
 # relatively accurate for x << 0, and x itself in float32 well before 20. NaN stays NaN.
 ACTIVATIONS = """
-auto softplus_ = [&](F v) -> F {
-    F e = decay_(v);
-    F s = e / (e + 2.0f);
+// from s = e / (2 + e)
+auto softplus_of_ = [&](F v, F s) -> F {
     F w = s * s;
     F p = splat(0.1401223282424694f);
     p = fma_(p, w, splat(0.13999569703388653f));
@@ -112,6 +111,10 @@ auto softplus_ = [&](F v) -> F {
     p = fma_(p, w, splat(0.33333206564805135f));
     p = fma_(p, w, splat(1.0f));
     return fma_(s + s, p, F{} > v ? F{} : v);
+};
+auto softplus_ = [&](F v) -> F {
+    F e = decay_(v);
+    return softplus_of_(v, e / (e + 2.0f));
 };
 auto sigmoid_ = [&](F v) -> F {
     F e = decay_(v);

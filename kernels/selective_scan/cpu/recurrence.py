@@ -22,6 +22,12 @@ _OPEN = (
     + """
 TOKEN* const token = aligned_((TOKEN*)scratch.data);
 const F* const rates = (const F*)a_in.data;
+const Tail& tail = *(const Tail*)&token[count];
+int fetched = 0;
+auto fetch_ = [&]() -> Fetch {  // the next of what is to be fetched, if there is one yet
+    if (fetched < tail.fetches) return tail.fetch[fetched++];
+    return {(const char*)token, 0, 0, 0, 1};
+};
 auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
 // B or C from entry n on, token by token
 struct Column {
@@ -41,8 +47,14 @@ _STATES = """
 for (int n = 0; n < states; ++n) {
     const F a = rates[n];
 """
+_REST = """
+while (fetched < tail.fetches) {
+    Fetch fetch = fetch_();
+    for (int t = 0; t < count; ++t) fetch.next();
+}
+"""
 _CHOOSE = """
-    const bool slow = slow_(*(const F*)&token[count] * a);
+    const bool slow = slow_(tail.top * a);
     if (slow) slow_walk(0);
     else if (tame) walk(exp2_tame_);
     else walk(exp2_);
@@ -53,7 +65,7 @@ _BLOCKS = """
 for (int n = 0; n < states; ++n) {
     bool together = tame && n + AT_ONCE <= states ALSO;
     for (int k = 0; together && k < AT_ONCE; ++k)
-        together = !slow_(*(const F*)&token[count] * rates[n + k]);
+        together = !slow_(tail.top * rates[n + k]);
     if (together) {
         auto exp2 = exp2_tame_;
         F a[AT_ONCE];
@@ -87,7 +99,9 @@ _ADVANCE_BLOCK = """
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k)
             h[k] = state_(h_out, n + k) + state_(h_out, states + n + k);
+        Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
+            fetch.next();
             const float *const bt = b.row(t), *const ct = c.row(t);
             const F rate = token[t].rate, du = token[t].du;
             F y = token[t].y;
@@ -195,7 +209,9 @@ _RETREAT_BLOCK = f"""
         F h[AT_ONCE], dh[AT_ONCE], da[AT_ONCE];
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) h[k] = state_(starts_in, n + k);
+        Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {{
+            fetch.next();
             const float *const bt = b.row(t), *const ct = c.row(t);
             const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
             F y = token[t].y;
@@ -216,7 +232,9 @@ _RETREAT_BLOCK = f"""
             dh[k] = state_(dh_out, n + k) + state_(dh_out, states + n + k);
             da[k] = F{{}};
         }}
+        fetch = fetch_();
         for (int t = count - 1; t >= 0; --t) {{
+            fetch.next();
             const float *const bt = b.row(t), *const ct = c.row(t);
             const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
             F s = token[t].s, p = token[t].p;
@@ -278,7 +296,7 @@ def _leaf(
         gradient = _OWN if discretization == "mamba" else _GENERAL
         parts += walks("back", back.replace("GRADIENT", gradient), discretization)
     loop = _STATES if at_once == 1 else _BLOCKS.replace("BLOCK", block).replace("ALSO", also)
-    text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE)
+    text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
     text = prelude(tuning.degree) + STATE + text.replace("FACTORS", FACTORS[discretization])
     chunk = tuning.chunk
     names = {"SPREAD": max(SPREAD, chunk), "CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token}
