@@ -17,7 +17,7 @@ from . import recurrence, tokens
 from .decays import SCALES
 from .layout import BLOCKS
 from .recurrence import NEED_DB, NEED_DC
-from .tokens import EXTRA, GRAD_TOKEN, KEPT, LATE, TOKEN
+from .tokens import EXTRA, GRAD_TOKEN, KEPT, LATE, TOKEN, settle
 from .tuning import Tuning
 
 SPAN = 32  # lane groups of a task at most: rows are read in long parts that fit a core's cache
@@ -43,6 +43,7 @@ class Sizes:
     use_softplus: int
     use_z: int
     needs: int
+    stream: int  # whether results go past the caches
 
 
 @struct
@@ -127,6 +128,7 @@ def forward_kernel(
     ):
         p = _place(sizes, offset + wp.tid())
         token = wp.zeros(shape=(room,), dtype=lanes)
+        write_soon = wp.static(int(output)) * (1 - sizes.stream)
         before = flush_denormals()
         for strip in range((p.end - p.begin + strip_size - 1) / strip_size):
             t0 = p.begin + strip * strip_size
@@ -142,19 +144,20 @@ def forward_kernel(
                 tame = prepare(
                     u_in, delta_in, z_in, p.b, t0, count, d, width, j, p.blocks, strip_size, p.end,
                     widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus, sizes.use_z,
-                    wp.static(int(output)), wp.static(scale), token, y_out,
+                    write_soon, wp.static(scale), token, y_out,
                 )  # fmt: skip
                 if wp.static(output):
                     advance(
                         sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, c_in, token, h
                     )
-                    finish(p.b, t0, count, d, width, token, y_out)
+                    finish(p.b, t0, count, d, width, sizes.stream, token, y_out)
                 else:
                     accumulate(
                         sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, token, h,
                         product_out[p.state, k],
                     )  # fmt: skip
         restore_denormals(before)
+        settle()
 
     return scan_forward
 
@@ -272,7 +275,7 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                 tame = prepare(
                     u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, j, p.blocks,
                     -chunk_size, p.end, widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus,
-                    sizes.use_z, 1, wp.static(scale), token, late, du_out, ddelta_out, dz_out,
+                    sizes.use_z, 1 - sizes.stream, wp.static(scale), token, late, du_out, ddelta_out, dz_out,
                 )  # fmt: skip
                 retreat(
                     sizes.states, tame, p.b, p.group, t0, count, int(j % _P == 0),
@@ -281,8 +284,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                     da_out[p.state, k],
                 )  # fmt: skip
                 finish(
-                    p.b, t0, count, d, width, k, skip_in[k], wp.static(scale), token, late,
-                    du_out, ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
+                    p.b, t0, count, d, width, k, sizes.stream, skip_in[k], wp.static(scale), token,
+                    late, du_out, ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
                 )  # fmt: skip
                 if j % _P == _P - 1 or j == p.blocks - 1:
                     part = p.part + j / _P
@@ -297,5 +300,6 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                             dc_out[part],
                         )  # fmt: skip
         restore_denormals(before)
+        settle()
 
     return scan_backward

@@ -16,6 +16,8 @@ from .layout import Layout
 from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ
 from .tuning import Tuning
 
+_STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
+
 
 def _sizes(layout: Layout, softplus: bool, use_z: bool, needs: int = 0) -> Sizes:
     sizes = Sizes()
@@ -24,6 +26,21 @@ def _sizes(layout: Layout, softplus: bool, use_z: bool, needs: int = 0) -> Sizes
         setattr(sizes, name, getattr(layout, name))
     sizes.use_softplus, sizes.use_z, sizes.needs = int(softplus), int(use_z), needs
     return sizes
+
+
+def _streams(layout: Layout, *results: Tensor) -> int:
+    """Whether results go past the caches, in whole lines: they are too large to be kept there."""
+    whole = layout.group_width % W == 0
+    return int(
+        whole
+        and all(
+            x.dtype == torch.float32
+            and x.numel() * 4 >= _STREAMED
+            and x.data_ptr() % 64 == 0
+            for x in results
+            if x.numel()
+        )
+    )
 
 
 def _pairs(states: Tensor) -> Tensor:
@@ -116,6 +133,7 @@ def forward(
         h = _carry(h[0], _values(local), product)
     h, starts = _pairs(h), s.starts(save)
     out = empty(u.shape, u.dtype)
+    sizes.stream = _streams(layout, out)
     s.run(
         kernels.forward_kernel,
         [
@@ -196,6 +214,7 @@ def backward(
     da = s.states()
     dskip, dbias = torch.zeros(2, layout.segments * layout.batch, layout.blocks, W)
     du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
+    sizes.stream = _streams(layout, du, ddelta, dz)
     db_lanes, db = partial(need_B)
     dc_lanes, dc = partial(need_C)
     s.run(

@@ -98,11 +98,39 @@ for (int t = 0; t < count; ++t) {
 }
 """
 
-# out = y silu(z), or y
-_FINISH = """
-const Token* const token = aligned_((const Token*)scratch.data);
-for (int t = 0; t < count; ++t) write_y(t, token[t].y * token[t].gate);
+# Large results go past the caches: their lines need not be read before they are written, and would
+# only push out what is wanted soon. ``stream`` says so, and that all lines are whole.
+_PUT = """
+typedef float Line __attribute__((vector_size(64), aligned(64)));
+auto put_NAME = [&](int t, F v) {
+    if (stream) __builtin_nontemporal_store((Line)v, (Line*)(NAME_rows + t * NAME_step));
+    else write_NAME(t, v);
+};
 """
+
+
+def _put(name: str) -> str:
+    """C++ text of ``put_NAME``, which writes a token's lanes as ``stream`` says."""
+    return _PUT.replace("NAME", name)
+
+
+# What was written past the caches is seen by other threads from here on.
+@wp.func_native("""
+#if defined(__x86_64__)
+__builtin_ia32_sfence();
+#endif
+""")
+def settle(): ...
+
+
+# out = y silu(z), or y
+_FINISH = (
+    _put("y")
+    + """
+const Token* const token = aligned_((const Token*)scratch.data);
+for (int t = 0; t < count; ++t) put_y(t, token[t].y * token[t].gate);
+"""
+)
 
 # As _PREPARE, and dy = dout silu(z); for later the slopes of the step and of the gate.
 _PREPARE_GRAD = (
@@ -155,7 +183,9 @@ for (int t = 0; t < count; ++t) {
 """
 
 # Equations 9 and 11, dz, and the sums for dD and ddelta_bias.
-_FINISH_GRAD = """
+_FINISH_GRAD = (
+    "".join(map(_put, ("du", "ddelta", "dz")))
+    + """
 const GradToken* const token = aligned_((const GradToken*)scratch.data);
 const Late* const late = aligned_((const Late*)late_in.data);
 const F skip = *(const F*)&skip_in;
@@ -168,13 +198,14 @@ for (int t = 0; t < count; ++t) {
     dskip = fma_(own.dy, u, dskip);
     const F ddelta = fma_(u, own.s, own.p) * late[t].slope;
     dbias += ddelta;
-    if (need_u) write_du(t, fma_(own.rate * (1.0f / scale), own.s, skip * own.dy));
-    if (need_delta) write_ddelta(t, ddelta);
-    if (need_z) write_dz(t, own.y * late[t].gate);
+    if (need_u) put_du(t, fma_(own.rate * (1.0f / scale), own.s, skip * own.dy));
+    if (need_delta) put_ddelta(t, ddelta);
+    if (need_z) put_dz(t, own.y * late[t].gate);
 }
 *(F*)&dskip_out.data[k] += dskip;
 *(F*)&dbias_out.data[k] += dbias;
 """
+)
 
 
 def _leaf(text: str, fill: str = "", **arrays: torch.dtype) -> str:
@@ -231,6 +262,7 @@ def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         count: int,
         d: int,
         width: int,
+        stream: int,
         scratch: wp.array(dtype=lanes),
         y_out: wp.array3d(dtype=scalar),
     ): ...
@@ -285,6 +317,7 @@ def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         d: int,
         width: int,
         k: int,
+        stream: int,
         skip_in: lanes,
         scale: float,
         scratch: wp.array(dtype=lanes),

@@ -23,10 +23,10 @@ class Tuning:
     """
 
     chunk: int = 64
-    strip: int = 64
+    strip: int = 32
     degree: int = 5
     walked: int = 4
-    walked_back: int = 2
+    walked_back: int = 4
 
     def __post_init__(self) -> None:
         if self.strip < 1 or self.chunk < 8 or self.chunk % 8 or self.chunk % self.strip:
