@@ -297,7 +297,7 @@ def _leaf(
         parts += walks("back", back.replace("GRADIENT", gradient), discretization)
     loop = _STATES if at_once == 1 else _BLOCKS.replace("BLOCK", block).replace("ALSO", also)
     text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
-    text = prelude(tuning.degree) + STATE + text.replace("FACTORS", FACTORS[discretization])
+    text = prelude(tuning.degree, bool(tuning.table)) + STATE + text.replace("FACTORS", FACTORS[discretization])
     chunk = tuning.chunk
     names = {"SPREAD": max(SPREAD, chunk), "CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token}
     for name, value in names.items():
