@@ -275,7 +275,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                 tame = prepare(
                     u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, j, p.blocks,
                     -chunk_size, p.end, widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus,
-                    sizes.use_z, 1 - sizes.stream, wp.static(scale), token, late, du_out, ddelta_out, dz_out,
+                    sizes.use_z, 1 - sizes.stream, wp.static(scale), token, late, du_out,
+                    ddelta_out, dz_out,
                 )  # fmt: skip
                 retreat(
                     sizes.states, tame, p.b, p.group, t0, count, int(j % _P == 0),

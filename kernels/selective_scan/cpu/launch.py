@@ -34,9 +34,7 @@ def _streams(layout: Layout, *results: Tensor) -> int:
     return int(
         whole
         and all(
-            x.dtype == torch.float32
-            and x.numel() * 4 >= _STREAMED
-            and x.data_ptr() % 64 == 0
+            x.dtype == torch.float32 and x.numel() * 4 >= _STREAMED and x.data_ptr() % 64 == 0
             for x in results
             if x.numel()
         )

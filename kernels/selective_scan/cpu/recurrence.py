@@ -201,22 +201,22 @@ _RETREAT_BACK = """
         state_(da_out, n) += da;
 """
 # The same for several states, where all gradients are wanted.
-_RETREAT_BLOCK = f"""
+_RETREAT_BLOCK = """
         const Column b = column_(b_in, n), c = column_(c_in, n);
         F* const db = (F*)db_out.data + n * CHUNK;
         F* const dc = (F*)dc_out.data + n * CHUNK;
-        if (first) for (int t = 0; t < AT_ONCE * CHUNK; ++t) db[t] = dc[t] = F{{}};
+        if (first) for (int t = 0; t < AT_ONCE * CHUNK; ++t) db[t] = dc[t] = F{};
         F h[AT_ONCE], dh[AT_ONCE], da[AT_ONCE];
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) h[k] = state_(starts_in, n + k);
         Fetch fetch = fetch_();
-        for (int t = 0; t < count; ++t) {{
+        for (int t = 0; t < count; ++t) {
             fetch.next();
             const float *const bt = b.row(t), *const ct = c.row(t);
             const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
             F y = token[t].y;
             #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {{
+            for (int k = 0; k < AT_ONCE; ++k) {
                 const F x = rate * a[k];
                 FACTORS
                 kept[t * AT_ONCE + k].m = m;
@@ -224,22 +224,22 @@ _RETREAT_BLOCK = f"""
                 h[k] = fma_(m, h[k], g * (du * bt[k]));
                 y = fma_(h[k], splat(ct[k]), y);
                 dc[k * CHUNK + t] = fma_(dy, h[k], dc[k * CHUNK + t]);
-            }}
+            }
             token[t].y = y;
-        }}
+        }
         #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) {{
+        for (int k = 0; k < AT_ONCE; ++k) {
             dh[k] = state_(dh_out, n + k) + state_(dh_out, states + n + k);
-            da[k] = F{{}};
-        }}
+            da[k] = F{};
+        }
         fetch = fetch_();
-        for (int t = count - 1; t >= 0; --t) {{
+        for (int t = count - 1; t >= 0; --t) {
             fetch.next();
             const float *const bt = b.row(t), *const ct = c.row(t);
             const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
             F s = token[t].s, p = token[t].p;
             #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {{
+            for (int k = 0; k < AT_ONCE; ++k) {
                 const F v = fma_(dy, splat(ct[k]), dh[k]);
                 db[k * CHUNK + t] = fma_(v, du, db[k * CHUNK + t]);
                 s = fma_(v, splat(bt[k]), s);
@@ -247,14 +247,14 @@ _RETREAT_BLOCK = f"""
                 const F q = dh[k] * kept[t * AT_ONCE + k].h;
                 p = fma_(q, a[k], p);
                 da[k] = fma_(q, rate, da[k]);
-            }}
+            }
             token[t].s = s, token[t].p = p;
-        }}
+        }
         #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) {{
-            state_(dh_out, n + k) = dh[k], state_(dh_out, states + n + k) = F{{}};
+        for (int k = 0; k < AT_ONCE; ++k) {
+            state_(dh_out, n + k) = dh[k], state_(dh_out, states + n + k) = F{};
             state_(da_out, n + k) += da[k];
-        }}
+        }
 """
 _OWN = f"""
             const F v = dh.value();
@@ -297,7 +297,11 @@ def _leaf(
         parts += walks("back", back.replace("GRADIENT", gradient), discretization)
     loop = _STATES if at_once == 1 else _BLOCKS.replace("BLOCK", block).replace("ALSO", also)
     text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
-    text = prelude(tuning.degree, bool(tuning.table)) + STATE + text.replace("FACTORS", FACTORS[discretization])
+    text = (
+        prelude(tuning.degree, bool(tuning.table))
+        + STATE
+        + text.replace("FACTORS", FACTORS[discretization])
+    )
     chunk = tuning.chunk
     names = {"SPREAD": max(SPREAD, chunk), "CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token}
     for name, value in names.items():

@@ -215,8 +215,7 @@ def _leaf(text: str, fill: str = "", **arrays: torch.dtype) -> str:
     inner = "".join(rows(x, dtype) for x, dtype in arrays.items() if x.endswith("_in"))
     usual = "const int width = 16; const bool use_softplus = true, use_z = true;"
     both = (
-        f"if (width >= 16 && use_softplus && use_z) {{ {usual} {inner} {fill} }}"
-        f"else {{ {fill} }}"
+        f"if (width >= 16 && use_softplus && use_z) {{ {usual} {inner} {fill} }}else {{ {fill} }}"
     )
     return head + reading + text.replace("FILL", both)
 
@@ -225,8 +224,8 @@ def _leaf(text: str, fill: str = "", **arrays: torch.dtype) -> str:
 def forward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
     """``prepare`` and ``finish`` for u, z and y of dtype ``io`` and delta of ``delta_io``.
 
-    ``prepare`` fills the tokens and their tail, and returns whether all |rate A| are tame. To be
-    fetched is this lane group's ``share`` of the ``lines`` of the rows that begin ``next`` tokens on.
+    ``prepare`` fills the tokens and their tail, and returns whether all |rate A| are tame. Its tail
+    asks for this lane group's ``share`` of the ``lines`` of the rows that begin ``next`` tokens on.
     """
     scalar, delta_scalar = WARP_DTYPES[io], WARP_DTYPES[delta_io]
 
@@ -278,9 +277,7 @@ def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
     inputs = {"u_in": io, "delta_in": delta_io, "z_in": io, "dout_in": io}
     outputs = {"du_out": io, "ddelta_out": delta_io, "dz_out": io}
 
-    @wp.func_native(
-        _leaf(_PREPARE_GRAD, _FILL_GRAD, **inputs, **outputs)
-    )
+    @wp.func_native(_leaf(_PREPARE_GRAD, _FILL_GRAD, **inputs, **outputs))
     def prepare(
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),

@@ -37,6 +37,11 @@ class Tuning:
                 f"chunk is {self.chunk}, strip is {self.strip}; "
                 "chunk must be a multiple of 8 and of strip"
             )
+        if self.walked < 1 or self.walked_back < 1:
+            raise ValueError(
+                f"walked is {self.walked}, walked_back is {self.walked_back}; "
+                "both must be at least 1"
+            )
         if not 2 <= self.degree <= 6:
             raise ValueError(f"degree is {self.degree}, allowed are 2 to 6")
 
