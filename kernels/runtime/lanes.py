@@ -93,8 +93,8 @@ auto exp2_tame_ = [&](F x) -> F {
 
 
 # The same from a table of 2^(i/16), which one instruction of AVX-512 reads, and a cubic of what is
-# left, |f| <= 1/32: one multiplication less than degree 5, and a smaller error. What the index would
-# add to the exponent is taken from the table. 786432 = 1.5 * 2^19 rounds to sixteenths.
+# left, |f| <= 1/32: one multiplication less than degree 5, and a smaller error. What the index adds
+# to the exponent is taken from the table beforehand. 786432 = 1.5 * 2^19 rounds to sixteenths.
 _TABLE = [
     *(1065353216, 1065200323, 1065063874, 1064944595, 1064843248, 1064760626),
     *(1064697559, 1064654911, 1064633587, 1064634532, 1064658730, 1064707212),

@@ -80,17 +80,10 @@ return tame_(top * *(const F*)&widest_in);
 _FILL = """
 for (int t = 0; t < count; ++t) {
     F step = read_delta(t) + bias, gate = splat(1.0f);
-    if (use_softplus && use_z) {  // both with one division
-        const F z = read_z(t), e = decay_(step), ez = decay_(z);
-        const F d = e + 2.0f, dz = ez + 1.0f, r = 1.0f / (d * dz);
-        gate = z * ((z < 0.0f ? ez : splat(1.0f)) * (d * r));
-        step = softplus_of_(step, e * (dz * r));
-    } else {
-        if (use_z) {
-            const F z = read_z(t);
-            gate = z * sigmoid_(z);
-        }
-        if (use_softplus) step = softplus_(step);
+    if (use_softplus) step = softplus_(step);
+    if (use_z) {
+        const F z = read_z(t);
+        gate = z * sigmoid_(z);
     }
     const F u = read_u(t), rate = step * scale;
     top = wider_(top, rate);
@@ -155,15 +148,14 @@ return tame_(top * *(const F*)&widest_in);
 _FILL_GRAD = """
 for (int t = 0; t < count; ++t) {
     F step = read_delta(t) + bias, slope = splat(1.0f), dy = read_dout(t), gate = F{};
-    if (use_softplus && use_z) {  // all with one division
+    if (use_softplus && use_z) {  // both slopes with one division
         const F z = read_z(t), e = decay_(step), ez = decay_(z);
-        const F d = e + 2.0f, ds = e + 1.0f, dz = ez + 1.0f, dd = d * ds;
-        const F r = 1.0f / (dd * dz), rz = dz * r;
-        const F sig = (z < 0.0f ? ez : splat(1.0f)) * (dd * r), silu = z * sig;
+        const F ds = e + 1.0f, dz = ez + 1.0f, r = 1.0f / (ds * dz);
+        const F sig = (z < 0.0f ? ez : splat(1.0f)) * (ds * r), silu = z * sig;
         gate = dy * fma_(silu, 1.0f - sig, sig);
         dy *= silu;
-        slope = (step < 0.0f ? e : splat(1.0f)) * (d * rz);
-        step = softplus_of_(step, e * (ds * rz));
+        slope = (step < 0.0f ? e : splat(1.0f)) * (dz * r);
+        step = softplus_of_(step, e / (e + 2.0f));  // as in the forward, to the last bit
     } else {
         if (use_z) {
             const F z = read_z(t), sig = sigmoid_(z), silu = z * sig;
