@@ -11,6 +11,7 @@ import warp as wp
 
 from ...runtime.lanes import lanes, prelude
 from .decays import FACTORS, SPREAD, STATE, walks
+from .together import ADVANCE_BLOCK, BLOCKS, RETREAT_BLOCK
 from .tokens import TOKENS
 from .tuning import Tuning
 
@@ -59,24 +60,6 @@ _CHOOSE = """
     else if (tame) walk(exp2_tame_);
     else walk(exp2_);
 """
-# Where no state of a few needs care, they are walked at once: what does not depend on the state is
-# then read and written once for all of them. Sums are in the same order, to the last bit.
-_BLOCKS = """
-for (int n = 0; n < states; ++n) {
-    bool together = tame && n + AT_ONCE <= states ALSO;
-    for (int k = 0; together && k < AT_ONCE; ++k)
-        together = !slow_(tail.top * rates[n + k]);
-    if (together) {
-        auto exp2 = exp2_tame_;
-        F a[AT_ONCE];
-        for (int k = 0; k < AT_ONCE; ++k) a[k] = rates[n + k];
-BLOCK
-        n += AT_ONCE - 1;
-        continue;
-    }
-    const F a = rates[n];
-"""
-
 # Equations 1 and 5.
 _ADVANCE = """
     const Column b = column_(b_in, n), c = column_(c_in, n);
@@ -92,31 +75,6 @@ _ADVANCE_WALK = """
             token[t].y = fma_(h.value(), splat(c[t]), token[t].y);
         }
         h.keep(state_(h_out, n), state_(h_out, states + n));
-"""
-_ADVANCE_BLOCK = """
-        const Column b = column_(b_in, n), c = column_(c_in, n);
-        F h[AT_ONCE];
-        #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k)
-            h[k] = state_(h_out, n + k) + state_(h_out, states + n + k);
-        Fetch fetch = fetch_();
-        for (int t = 0; t < count; ++t) {
-            fetch.next();
-            const float *const bt = b.row(t), *const ct = c.row(t);
-            const F rate = token[t].rate, du = token[t].du;
-            F y = token[t].y;
-            #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {
-                const F x = rate * a[k];
-                FACTORS
-                h[k] = fma_(m, h[k], g * (du * bt[k]));
-                y = fma_(h[k], splat(ct[k]), y);
-            }
-            token[t].y = y;
-        }
-        #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k)
-            state_(h_out, n + k) = h[k], state_(h_out, states + n + k) = F{};
 """
 
 # Equation 1 alone, and the product of the decays.
@@ -200,62 +158,6 @@ _RETREAT_BACK = """
         dh.keep(state_(dh_out, n), state_(dh_out, states + n));
         state_(da_out, n) += da;
 """
-# The same for several states, where all gradients are wanted.
-_RETREAT_BLOCK = """
-        const Column b = column_(b_in, n), c = column_(c_in, n);
-        F* const db = (F*)db_out.data + n * CHUNK;
-        F* const dc = (F*)dc_out.data + n * CHUNK;
-        if (first) for (int t = 0; t < AT_ONCE * CHUNK; ++t) db[t] = dc[t] = F{};
-        F h[AT_ONCE], dh[AT_ONCE], da[AT_ONCE];
-        #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) h[k] = state_(starts_in, n + k);
-        Fetch fetch = fetch_();
-        for (int t = 0; t < count; ++t) {
-            fetch.next();
-            const float *const bt = b.row(t), *const ct = c.row(t);
-            const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
-            F y = token[t].y;
-            #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {
-                const F x = rate * a[k];
-                FACTORS
-                kept[t * AT_ONCE + k].m = m;
-                kept[t * AT_ONCE + k].h = h[k];
-                h[k] = fma_(m, h[k], g * (du * bt[k]));
-                y = fma_(h[k], splat(ct[k]), y);
-                dc[k * CHUNK + t] = fma_(dy, h[k], dc[k * CHUNK + t]);
-            }
-            token[t].y = y;
-        }
-        #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) {
-            dh[k] = state_(dh_out, n + k) + state_(dh_out, states + n + k);
-            da[k] = F{};
-        }
-        fetch = fetch_();
-        for (int t = count - 1; t >= 0; --t) {
-            fetch.next();
-            const float *const bt = b.row(t), *const ct = c.row(t);
-            const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
-            F s = token[t].s, p = token[t].p;
-            #pragma unroll
-            for (int k = 0; k < AT_ONCE; ++k) {
-                const F v = fma_(dy, splat(ct[k]), dh[k]);
-                db[k * CHUNK + t] = fma_(v, du, db[k * CHUNK + t]);
-                s = fma_(v, splat(bt[k]), s);
-                dh[k] = v * kept[t * AT_ONCE + k].m;
-                const F q = dh[k] * kept[t * AT_ONCE + k].h;
-                p = fma_(q, a[k], p);
-                da[k] = fma_(q, rate, da[k]);
-            }
-            token[t].s = s, token[t].p = p;
-        }
-        #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) {
-            state_(dh_out, n + k) = dh[k], state_(dh_out, states + n + k) = F{};
-            state_(da_out, n + k) += da[k];
-        }
-"""
 _OWN = f"""
             const F v = dh.value();
             if (needs & {NEED_DB}) db[t] = fma_(v, own.du, db[t]);
@@ -295,7 +197,7 @@ def _leaf(
     if back:
         gradient = _OWN if discretization == "mamba" else _GENERAL
         parts += walks("back", back.replace("GRADIENT", gradient), discretization)
-    loop = _STATES if at_once == 1 else _BLOCKS.replace("BLOCK", block).replace("ALSO", also)
+    loop = _STATES if at_once == 1 else BLOCKS.replace("BLOCK", block).replace("ALSO", also)
     text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
     text = (
         prelude(tuning.degree, bool(tuning.table))
@@ -315,7 +217,7 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     parts = discretization, tuning
 
     mamba = discretization == "mamba"  # the others need too many registers
-    block = {"block": _ADVANCE_BLOCK, "at_once": tuning.walked if mamba else 1}
+    block = {"block": ADVANCE_BLOCK, "at_once": tuning.walked if mamba else 1}
 
     @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts, token="Token", **block))
     def advance(
@@ -360,7 +262,7 @@ def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
 
     kept = {"head": _KEPT, "back": _RETREAT_BACK}
     if discretization == "mamba":
-        kept |= {"block": _RETREAT_BLOCK, "at_once": tuning.walked_back}
+        kept |= {"block": RETREAT_BLOCK, "at_once": tuning.walked_back}
         kept["also"] = f"&& needs == {NEED_DZ + NEED_DC + NEED_DB + NEED_DH}"
 
     @wp.func_native(_leaf(_RETREAT, _RETREAT_WALK, *parts, token="GradToken", **kept))
