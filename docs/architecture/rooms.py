@@ -56,7 +56,9 @@ ROOMS = {
     "kernels.causal_conv1d": Room("the convolution before it", ("versions", "kernels.runtime")),
     "kernels.rasterize": Room("Gaussians to pictures", ("versions", "kernels.runtime")),
     "kernels": Room("the public operators, loaded when used", ("versions",), _OPS),
-    "kernels.bench.core": Room("what a case is, the clock, reports", ("versions",)),
+    "kernels.bench.core": Room(
+        "what a case is, the clock, reports", ("versions", "kernels.runtime")
+    ),
     "kernels.bench": Room("other packages, a bare loop", (*_KERNELS, "kernels.bench.core")),
     "kernels.bench.cases": Room(
         "one file a subject", (*_KERNELS, "kernels.bench.core", "kernels.bench")
