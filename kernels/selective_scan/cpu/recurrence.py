@@ -6,6 +6,7 @@ are read where they are, from token ``t0`` on.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -217,7 +218,7 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     parts = discretization, tuning
 
     mamba = discretization == "mamba"  # the others need too many registers
-    block = {"block": ADVANCE_BLOCK, "at_once": tuning.walked if mamba else 1}
+    block: dict[str, Any] = {"block": ADVANCE_BLOCK, "at_once": tuning.walked if mamba else 1}
 
     @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts, token="Token", **block))
     def advance(
@@ -260,7 +261,7 @@ def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """
     parts = discretization, tuning
 
-    kept = {"head": _KEPT, "back": _RETREAT_BACK}
+    kept: dict[str, Any] = {"head": _KEPT, "back": _RETREAT_BACK}
     if discretization == "mamba":
         kept |= {"block": RETREAT_BLOCK, "at_once": tuning.walked_back}
         kept["also"] = f"&& needs == {NEED_DZ + NEED_DC + NEED_DB + NEED_DH}"
