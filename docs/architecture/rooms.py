@@ -57,7 +57,9 @@ ROOMS = {
     "kernels.ssim": Room("1 - SSIM of pictures and its slope", ("versions", "kernels.runtime")),
     "kernels.rasterize": Room("Gaussians to pictures", ("versions", "kernels.runtime")),
     "kernels": Room("the public operators, loaded when used", ("versions",), _OPS),
-    "kernels.bench.core": Room("what a case is, the clock, reports", ("versions",)),
+    "kernels.bench.core": Room(
+        "what a case is, the clock, reports", ("versions", "kernels.runtime")
+    ),
     "kernels.bench": Room("other packages, a bare loop", (*_KERNELS, "kernels.bench.core")),
     "kernels.bench.cases": Room(
         "one file a subject", (*_KERNELS, "kernels.bench.core", "kernels.bench")

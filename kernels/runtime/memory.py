@@ -1,31 +1,132 @@
-"""Large tensors on the CPU."""
+"""Large tensors on the CPU, in memory that was touched before.
+
+The first touch of a page costs many times its use: the system has to find it, to clear it, and in a
+virtual machine to ask the host for it. Memory of the size of a result goes back to the system when
+the result is freed, so every call would pay anew. Here it goes to a pool instead, as soon as no
+tensor holds its storage any more, and the next result of about that size is taken from there.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import math
+import mmap
+import os
 import sys
+import weakref
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-_HUGE = 4 << 20  # bytes from which huge pages are worth it
+LARGE = 4 << 20  # bytes from which a tensor is taken from the pool
+_PAGE = 2 << 20  # a huge page
+_SHARE = 8  # the pool keeps this part of the memory at most
+_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of a container, in /sys/fs/cgroup
 
 
-_libc = ctypes.CDLL(None) if sys.platform == "linux" else None
+class Pool:
+    """Blocks of memory that no tensor holds.
+
+    What lies in it is only lent by the system, which may take a block's pages back when it needs
+    them (``MADV_FREE``); they are then fresh ones at the next use. Beyond ``most`` bytes the blocks
+    that have waited longest go back at once.
+
+    There is no lock: the operations on the list are atomic, and a block may come back from a
+    finalizer, which may run inside any of them.
+
+    Attributes:
+        most: bytes that are kept at most.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self._free: list[mmap.mmap] = []  # those that came last at the end
+
+    def take(self, size: int) -> Tensor:
+        """A new tensor of ``size`` bytes, uint8, of any contents.
+
+        Its storage cannot be resized.
+        """
+        block = self._find(size) or _fresh(size)
+        begin = ctypes.addressof(ctypes.c_char.from_buffer(block))
+        # torch holds this object for as long as the storage lives
+        held = (ctypes.c_char * size).from_buffer(block, -begin % _PAGE)
+        weakref.finalize(held, self._give_back, block).atexit = False
+        return torch.frombuffer(held, dtype=torch.uint8)
+
+    def _find(self, size: int) -> mmap.mmap | None:
+        """Takes the smallest block that is large enough, but not more than twice as large."""
+        while True:
+            fits = [x for x in self._free[::-1] if size <= len(x) - _PAGE <= 2 * size + _PAGE]
+            if not fits:
+                return None
+            best = min(fits, key=len)
+            with contextlib.suppress(ValueError):  # another thread has taken it: look again
+                self._free.remove(best)
+                return best
+
+    def _give_back(self, block: mmap.mmap) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # an old kernel keeps it as it is
+            block.madvise(mmap.MADV_FREE)
+        self._free.append(block)
+        with contextlib.suppress(IndexError):
+            while self.size() > self.most:
+                self._free.pop(0)
+
+    def size(self) -> int:
+        """Bytes that lie in the pool."""
+        return sum(map(len, self._free[:]))
+
+    def clear(self) -> None:
+        """Gives all that lies in the pool back to the system."""
+        self._free.clear()
+
+
+def _fresh(size: int) -> mmap.mmap:
+    """Memory for ``size`` bytes, rounded up, and room to begin at a huge page."""
+    block = mmap.mmap(
+        -1, -(-size // _PAGE) * _PAGE + _PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    )
+    with contextlib.suppress(OSError, AttributeError):  # a kernel without huge pages does no harm
+        block.madvise(mmap.MADV_HUGEPAGE)
+    return block
+
+
+def _most() -> int:
+    """What the pool may keep: ``GAMBA_POOL`` in MiB, or a part of the memory."""
+    chosen = os.environ.get("GAMBA_POOL", "")
+    if chosen.isdecimal():
+        return int(chosen) << 20
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for name in _LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # "max", or no such file
+            memory = min(memory, int((Path("/sys/fs/cgroup") / name).read_text(encoding="ascii")))
+    return memory // _SHARE
+
+
+pool = Pool(_most()) if sys.platform == "linux" else None
+
+if pool is not None and hasattr(os, "register_at_fork"):
+    # a child would have to copy the pages that it shares with its parent, which costs more
+    os.register_at_fork(after_in_child=pool.clear)
 
 
 def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """Makes a tensor as ``torch.empty`` does on the CPU; a large one asks for huge pages.
+    """Makes a tensor as ``torch.empty`` does on the CPU; a large one comes from the pool.
 
-    The first touch of a page costs more than filling it, and with rows of 4 KiB each row would be a
-    page of its own.
+    The storage of a large one cannot be resized. ``GAMBA_POOL=0`` in the environment switches the
+    pool off; another number is the MiB that it keeps at most.
     """
-    tensor = torch.empty(*shape, dtype=dtype)
-    size = tensor.numel() * tensor.element_size()
-    if _libc is not None and size >= _HUGE:
-        begin = -(-tensor.data_ptr() // 4096) * 4096
-        end = (tensor.data_ptr() + size) // 4096 * 4096
-        # 14 is MADV_HUGEPAGE; a kernel without huge pages refuses, which does no harm
-        _libc.madvise(ctypes.c_void_p(begin), ctypes.c_size_t(end - begin), 14)
-    return tensor
+    size = math.prod(shape) * dtype.itemsize
+    if pool is None or pool.most == 0 or size < LARGE:
+        return torch.empty(*shape, dtype=dtype)
+    return pool.take(size).view(dtype).view(*shape)
+
+
+def release() -> None:
+    """Gives the memory that waits for the next result back to the system."""
+    if pool is not None:
+        pool.clear()

@@ -156,7 +156,7 @@ def test_damaged_kernels_are_removed_on_windows(windows, tmp_path):
 
 
 def test_launches_without_openmp_and_huge_pages(windows, monkeypatch):
-    monkeypatch.setattr(memory, "_libc", None)
+    monkeypatch.setattr(memory, "pool", None)
     assert memory.empty((3, 1 << 20), torch.float32).shape == (3, 1 << 20)
     u, delta = torch.randn(1, 7, 35), torch.rand(1, 7, 35)
     A, B = -torch.rand(35, 2), torch.randn(1, 7, 2)

@@ -87,7 +87,8 @@ def _loop_length(settings: Settings) -> int:
 
 def _reference_loop(settings: Settings) -> list[Variant]:
     """The operator against the formula as a torch loop (as Mamba's reference does it), and against
-    peers where they are installed, all on the same input.
+    peers where they are installed, all on the same input. No target is set on the loop: it too
+    works on all channels at once, so that the bare probe is the limit and the loop is not.
     """
     length, tokens = _loop_length(settings), SIZES[settings.level][2]
     width = SIZES[settings.level][1]
@@ -246,12 +247,6 @@ def targets(settings: Settings) -> list[Target]:
     ours = _scan("operator", "default")
     made = [
         Target(
-            f"forward at L {_loop_length(settings)}, torch loop's time over ours",
-            (_scan("reference loop", "torch loop"),),
-            (_scan("reference loop", "default"),),
-            at_least=300,
-        ),
-        Target(
             "forward + backward over forward",
             (_scan("operator", "default", BOTH),),
             (ours,),
@@ -267,7 +262,7 @@ def targets(settings: Settings) -> list[Target]:
                     (long(direction, field),),
                     (short(direction, field),),
                     scale=4096 / 65536,
-                    at_most=1.1,
+                    at_most=1.2 if (name, direction) == ("time", BOTH) else 1.1,
                 )
             )
     made.append(
@@ -283,7 +278,7 @@ def targets(settings: Settings) -> list[Target]:
 
 def _cpu_targets(ours: Key) -> list[Target]:
     probe = _scan("operator", "probe, 2 threads")
-    made = [Target("forward over the bare probe, 2 threads", (ours,), (probe,), at_most=1.6)]
+    made = [Target("forward over the bare probe, 2 threads", (ours,), (probe,), at_most=1.3)]
     for direction in ("forward", BOTH):
         one, two = (_scan("threads", name, direction) for name in ("1 thread", "2 threads"))
         made.append(Target(f"{direction}, 1 thread over 2", (one,), (two,), at_least=1.8))

@@ -20,6 +20,7 @@ import warp as wp
 
 from gamba_warp.versions import __version__
 
+from ...runtime import memory
 from .case import LEVELS, Case, NotInstalled, Settings, Stopped, Variant
 
 FORMAT = "gamba_warp.bench.1"
@@ -279,7 +280,9 @@ def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
         return torch.cuda.max_memory_allocated(device) - before
     try:
         with _small_pages():
-            ctypes.CDLL(None).malloc_trim(0)  # memory that is free but kept would be reused unseen
+            # memory that is free but kept would be reused unseen
+            ctypes.CDLL(None).malloc_trim(0)
+            memory.release()
             Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
             before = _resident("VmRSS")
             result = run()
@@ -287,6 +290,7 @@ def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:
     except (OSError, AttributeError, TypeError, StopIteration):
         return None
     del result
+    memory.release()  # it has small pages
     return after - before
 
 

@@ -17,7 +17,7 @@ from . import recurrence, tokens
 from .decays import SCALES
 from .layout import BLOCKS
 from .recurrence import NEED_DB, NEED_DC
-from .tokens import EXTRA, GRAD_TOKEN, KEPT, TOKEN
+from .tokens import EXTRA, GRAD_TOKEN, KEPT, LATE, TOKEN, settle
 from .tuning import Tuning
 
 SPAN = 32  # lane groups of a task at most: rows are read in long parts that fit a core's cache
@@ -43,6 +43,7 @@ class Sizes:
     use_softplus: int
     use_z: int
     needs: int
+    stream: int  # whether results go past the caches
 
 
 @struct
@@ -127,6 +128,7 @@ def forward_kernel(
     ):
         p = _place(sizes, offset + wp.tid())
         token = wp.zeros(shape=(room,), dtype=lanes)
+        write_soon = wp.static(int(output)) * (1 - sizes.stream)
         before = flush_denormals()
         for strip in range((p.end - p.begin + strip_size - 1) / strip_size):
             t0 = p.begin + strip * strip_size
@@ -142,19 +144,20 @@ def forward_kernel(
                 tame = prepare(
                     u_in, delta_in, z_in, p.b, t0, count, d, width, j, p.blocks, strip_size, p.end,
                     widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus, sizes.use_z,
-                    wp.static(scale), token,
+                    write_soon, wp.static(scale), token, y_out,
                 )  # fmt: skip
                 if wp.static(output):
                     advance(
                         sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, c_in, token, h
                     )
-                    finish(z_in, p.b, t0, count, d, width, sizes.use_z, token, y_out)
+                    finish(p.b, t0, count, d, width, sizes.stream, token, y_out)
                 else:
                     accumulate(
                         sizes.states, tame, p.b, p.group, t0, count, a_in[k], b_in, token, h,
                         product_out[p.state, k],
                     )  # fmt: skip
         restore_denormals(before)
+        settle()
 
     return scan_forward
 
@@ -168,7 +171,7 @@ def gradient_states_kernel(
     prepare = tokens.backward_leaves(io, delta_io).prepare
     gather = recurrence.backward_leaves(discretization, tuning).gather
     scale, chunk_size = SCALES[discretization], tuning.chunk
-    room = GRAD_TOKEN * chunk_size + EXTRA
+    room, late_room = GRAD_TOKEN * chunk_size + EXTRA, LATE * chunk_size + 1
 
     @wp.kernel(enable_backward=False, module="unique")
     @no_type_check
@@ -190,6 +193,7 @@ def gradient_states_kernel(
     ):
         p = _place(sizes, offset + wp.tid())
         token = wp.zeros(shape=(room,), dtype=lanes)
+        late = wp.zeros(shape=(late_room,), dtype=lanes)
         before = flush_denormals()
         for chunk in range((p.end - p.begin + chunk_size - 1) / chunk_size):
             t0 = p.begin + chunk * chunk_size
@@ -199,7 +203,8 @@ def gradient_states_kernel(
                 tame = prepare(
                     u_in, delta_in, z_in, dout_in, p.b, t0, count, p.d + j * _W,
                     p.width - j * _W, j, p.blocks, chunk_size, p.end, widest_in[k], bias_in[k],
-                    bias_in[k], sizes.use_softplus, sizes.use_z, wp.static(scale), token,
+                    bias_in[k], sizes.use_softplus, sizes.use_z, 0, wp.static(scale), token, late,
+                    u_in, delta_in, z_in,
                 )  # fmt: skip
                 gather(
                     sizes.states, tame, p.b, p.group, t0, count, a_in[k], c_in, token,
@@ -219,7 +224,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
     prepare, finish = token.prepare, token.finish
     retreat, sum_lanes, scale = state.retreat, state.sum_lanes, SCALES[discretization]
     chunk_size = tuning.chunk
-    room, kept_room = GRAD_TOKEN * chunk_size + EXTRA, KEPT * chunk_size + 1
+    room, late_room = GRAD_TOKEN * chunk_size + EXTRA, LATE * chunk_size + 1
+    kept_room = KEPT * tuning.walked_back * chunk_size + 1
 
     @wp.kernel(enable_backward=False, module="unique")
     @no_type_check
@@ -256,6 +262,7 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
         p = _place(sizes, task)
         token = wp.zeros(shape=(room,), dtype=lanes)
         kept = wp.zeros(shape=(kept_room,), dtype=lanes)
+        late = wp.zeros(shape=(late_room,), dtype=lanes)
         before = flush_denormals()
         chunks = (p.end - p.begin + chunk_size - 1) / chunk_size
         for reverse in range(chunks):
@@ -268,7 +275,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                 tame = prepare(
                     u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, j, p.blocks,
                     -chunk_size, p.end, widest_in[k], bias_in[k], skip_in[k], sizes.use_softplus,
-                    sizes.use_z, wp.static(scale), token,
+                    sizes.use_z, 1 - sizes.stream, wp.static(scale), token, late, du_out,
+                    ddelta_out, dz_out,
                 )  # fmt: skip
                 retreat(
                     sizes.states, tame, p.b, p.group, t0, count, int(j % _P == 0),
@@ -277,9 +285,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                     da_out[p.state, k],
                 )  # fmt: skip
                 finish(
-                    u_in, delta_in, z_in, dout_in, p.b, t0, count, d, width, k, bias_in[k],
-                    skip_in[k], sizes.use_softplus, wp.static(scale), token, du_out,
-                    ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
+                    p.b, t0, count, d, width, k, sizes.stream, skip_in[k], wp.static(scale), token,
+                    late, du_out, ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
                 )  # fmt: skip
                 if j % _P == _P - 1 or j == p.blocks - 1:
                     part = p.part + j / _P
@@ -294,5 +301,6 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                             dc_out[part],
                         )  # fmt: skip
         restore_denormals(before)
+        settle()
 
     return scan_backward

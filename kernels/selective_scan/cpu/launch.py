@@ -16,6 +16,8 @@ from .layout import Layout
 from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ
 from .tuning import Tuning
 
+_STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
+
 
 def _sizes(layout: Layout, softplus: bool, use_z: bool, needs: int = 0) -> Sizes:
     sizes = Sizes()
@@ -24,6 +26,19 @@ def _sizes(layout: Layout, softplus: bool, use_z: bool, needs: int = 0) -> Sizes
         setattr(sizes, name, getattr(layout, name))
     sizes.use_softplus, sizes.use_z, sizes.needs = int(softplus), int(use_z), needs
     return sizes
+
+
+def _streams(layout: Layout, *results: Tensor) -> int:
+    """Whether results go past the caches, in whole lines: they are too large to be kept there."""
+    whole = layout.group_width % W == 0
+    return int(
+        whole
+        and all(
+            x.dtype == torch.float32 and x.numel() * 4 >= _STREAMED and x.data_ptr() % 64 == 0
+            for x in results
+            if x.numel()
+        )
+    )
 
 
 def _pairs(states: Tensor) -> Tensor:
@@ -43,6 +58,12 @@ def _carry(first: Tensor, local: Tensor, product: Tensor) -> Tensor:
         states[s] = first
         first = torch.addcmul(local[s], product[s], first)
     return states
+
+
+def _entries(x: Tensor) -> Tensor:
+    """B or C as the kernels read it: float32, the N entries of a token side by side."""
+    x = x.float()
+    return x if x.stride(-1) == 1 or x.shape[-1] == 1 else x.contiguous()
 
 
 class _Operands:
@@ -102,7 +123,7 @@ def forward(
     layout = Layout(u, A, B, SPAN, tuning.chunk)
     s = _Operands(layout, tuning, u, delta, A, z, delta_bias, discretization)
     sizes = _sizes(layout, softplus, z is not None)
-    b = B.float()
+    b = _entries(B)
     h = layout.states_of(initial_state)[None]
     if layout.segments > 1:
         local = _pairs(s.states())
@@ -110,10 +131,11 @@ def forward(
         h = _carry(h[0], _values(local), product)
     h, starts = _pairs(h), s.starts(save)
     out = empty(u.shape, u.dtype)
+    sizes.stream = _streams(layout, out)
     s.run(
         kernels.forward_kernel,
         [
-            sizes, "u", "delta", "z", "a", "widest", b, C.float(),
+            sizes, "u", "delta", "z", "a", "widest", b, _entries(C),
             view(layout.pack(D), lanes), "bias",
         ],
         [_flat(h), _flat(h), view(starts, lanes), out],
@@ -131,7 +153,7 @@ def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretizat
     if layout.segments > 1:
         first, h = h[0], s.states()
     h = _pairs(h)
-    product = _accumulate(s, _sizes(layout, softplus, False), B.float(), h, starts)
+    product = _accumulate(s, _sizes(layout, softplus, False), _entries(B), h, starts)
     h = _values(h)
     if layout.segments > 1:
         h = torch.addcmul(h[-1:], product[-1:], _carry(first, h, product)[-1:])
@@ -176,7 +198,7 @@ def backward(
     flags = NEED_DZ * need_z + NEED_DC * need_C + NEED_DB * need_B + NEED_DH * through
     sizes = _sizes(layout, softplus, z is not None, flags)
     dout = lane_contiguous(dout)
-    b, c = B.float(), C.float()
+    b, c = _entries(B), _entries(C)
 
     def like(x: Tensor, needed: bool) -> Tensor:
         return empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), x.dtype)
@@ -190,6 +212,7 @@ def backward(
     da = s.states()
     dskip, dbias = torch.zeros(2, layout.segments * layout.batch, layout.blocks, W)
     du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
+    sizes.stream = _streams(layout, du, ddelta, dz)
     db_lanes, db = partial(need_B)
     dc_lanes, dc = partial(need_C)
     s.run(

@@ -6,11 +6,13 @@ are read where they are, from token ``t0`` on.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from ...runtime.lanes import lanes, prelude
-from .decays import SPREAD, STATE, walks
+from .decays import FACTORS, SPREAD, STATE, walks
+from .together import ADVANCE_BLOCK, BLOCKS, RETREAT_BLOCK
 from .tokens import TOKENS
 from .tuning import Tuning
 
@@ -20,33 +22,47 @@ NEED_DZ, NEED_DC, NEED_DB, NEED_DH = 1, 2, 4, 8
 _OPEN = (
     TOKENS
     + """
+TOKEN* const token = aligned_((TOKEN*)scratch.data);
 const F* const rates = (const F*)a_in.data;
+const Tail& tail = *(const Tail*)&token[count];
+int fetched = 0;
+auto fetch_ = [&]() -> Fetch {  // the next of what is to be fetched, if there is one yet
+    if (fetched < tail.fetches) return tail.fetch[fetched++];
+    return {(const char*)token, 0, 0, 0, 1};
+};
 auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
-// entry n of B or C, token by token
+// B or C from entry n on, token by token
 struct Column {
     const char* at;
     const size_t step;
-    float operator[](int t) const { return *(const float*)(at + t * step); }
+    const float* row(int t) const { return (const float*)(at + t * step); }
+    float operator[](int t) const { return *row(t); }
 };
 auto column_ = [&](auto& array, int n) -> Column {
     const auto* s = array.strides;
     return {(const char*)array.data + (size_t)batch * s[0] + (size_t)t0 * s[1]
-        + (size_t)group * s[2] + (size_t)n * s[3], (size_t)s[1]};
+        + (size_t)group * s[2] + (size_t)n * 4, (size_t)s[1]};
 };
+"""
+)
+_STATES = """
 for (int n = 0; n < states; ++n) {
     const F a = rates[n];
 """
-)
+_REST = """
+while (fetched < tail.fetches) {
+    Fetch fetch = fetch_();
+    for (int t = 0; t < count; ++t) fetch.next();
+}
+"""
 _CHOOSE = """
-    const bool slow = slow_(*(const F*)&token[count] * a);
+    const bool slow = slow_(tail.top * a);
     if (slow) slow_walk(0);
     else if (tame) walk(exp2_tame_);
     else walk(exp2_);
 """
-
 # Equations 1 and 5.
 _ADVANCE = """
-    Token* const token = aligned_((Token*)scratch.data);
     const Column b = column_(b_in, n), c = column_(c_in, n);
 WALKS
 }
@@ -64,7 +80,6 @@ _ADVANCE_WALK = """
 
 # Equation 1 alone, and the product of the decays.
 _ACCUMULATE = """
-    const Token* const token = aligned_((const Token*)scratch.data);
     const Column b = column_(b_in, n);
 WALKS
 }
@@ -84,7 +99,6 @@ _ACCUMULATE_WALK = """
 
 # What the outputs send back to the state before the first token, and the product of the decays.
 _GATHER = """
-    const GradToken* const token = aligned_((const GradToken*)scratch.data);
     const Column c = column_(c_in, n);
 WALKS
 }
@@ -104,9 +118,8 @@ _GATHER_WALK = """
 
 # As _ADVANCE, keeping m and h of every token, and adding dy·h to the sums of dC (equation 8); then
 # backwards, equations 6, 7 and 9 to 12. Σ rate q is left in da.
+_KEPT = "Kept* const kept = aligned_((Kept*)kept_out.data);"
 _RETREAT = f"""
-    GradToken* const token = aligned_((GradToken*)scratch.data);
-    Kept* const kept = aligned_((Kept*)kept_out.data);
     const Column b = column_(b_in, n), c = column_(c_in, n);
     F* const db = (F*)db_out.data + n * CHUNK;
     F* const dc = (F*)dc_out.data + n * CHUNK;
@@ -164,15 +177,39 @@ _GENERAL = f"""
 """
 
 
-def _leaf(text: str, walk: str, discretization: str, tuning: Tuning, back: str = "") -> str:
-    """The C++ text of a leaf: for every state its ``text``, with the walks that belong to it."""
+def _leaf(
+    text: str,
+    walk: str,
+    discretization: str,
+    tuning: Tuning,
+    *,
+    token: str,
+    head: str = "",
+    back: str = "",
+    block: str = "",
+    at_once: int = 1,
+    also: str = "",
+) -> str:
+    """The C++ text of a leaf: for every state its ``text``, with the walks that belong to it.
+
+    ``block`` walks ``at_once`` states, if that is more than one.
+    """
     parts = walks("walk", walk, discretization)
     if back:
         gradient = _OWN if discretization == "mamba" else _GENERAL
         parts += walks("back", back.replace("GRADIENT", gradient), discretization)
-    text = prelude(tuning.degree) + STATE + _OPEN + text.replace("WALKS", parts + _CHOOSE)
+    loop = _STATES if at_once == 1 else BLOCKS.replace("BLOCK", block).replace("ALSO", also)
+    text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
+    text = (
+        prelude(tuning.degree, bool(tuning.table))
+        + STATE
+        + text.replace("FACTORS", FACTORS[discretization])
+    )
     chunk = tuning.chunk
-    return text.replace("SPREAD", str(max(SPREAD, chunk))).replace("CHUNK", str(chunk))
+    names = {"SPREAD": max(SPREAD, chunk), "CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token}
+    for name, value in names.items():
+        text = text.replace(name, str(value))
+    return text
 
 
 @functools.cache
@@ -180,7 +217,10 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """``advance`` and ``accumulate`` bring a lane group's states from before a strip to after."""
     parts = discretization, tuning
 
-    @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts))
+    mamba = discretization == "mamba"  # the others need too many registers
+    block: dict[str, Any] = {"block": ADVANCE_BLOCK, "at_once": tuning.walked if mamba else 1}
+
+    @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts, token="Token", **block))
     def advance(
         states: int,
         tame: int,
@@ -195,7 +235,7 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
         h_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_leaf(_ACCUMULATE, _ACCUMULATE_WALK, *parts))
+    @wp.func_native(_leaf(_ACCUMULATE, _ACCUMULATE_WALK, *parts, token="const Token"))
     def accumulate(
         states: int,
         tame: int,
@@ -221,7 +261,12 @@ def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """
     parts = discretization, tuning
 
-    @wp.func_native(_leaf(_RETREAT, _RETREAT_WALK, *parts, _RETREAT_BACK))
+    kept: dict[str, Any] = {"head": _KEPT, "back": _RETREAT_BACK}
+    if discretization == "mamba":
+        kept |= {"block": RETREAT_BLOCK, "at_once": tuning.walked_back}
+        kept["also"] = f"&& needs == {NEED_DZ + NEED_DC + NEED_DB + NEED_DH}"
+
+    @wp.func_native(_leaf(_RETREAT, _RETREAT_WALK, *parts, token="GradToken", **kept))
     def retreat(
         states: int,
         tame: int,
@@ -243,7 +288,7 @@ def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
         da_out: wp.array(dtype=lanes),
     ): ...
 
-    @wp.func_native(_leaf(_GATHER, _GATHER_WALK, *parts))
+    @wp.func_native(_leaf(_GATHER, _GATHER_WALK, *parts, token="const GradToken"))
     def gather(
         states: int,
         tame: int,

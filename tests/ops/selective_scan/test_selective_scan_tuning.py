@@ -5,7 +5,8 @@ import contextlib
 import pytest
 import torch
 import warp as wp
-from helpers.scan import leaves, make
+from helpers import assert_rel_rms
+from helpers.scan import leaves, make, oracle
 
 from gamba_warp.kernels.selective_scan import ops, selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.cpu.tuning import Tuning, use_tuning
@@ -73,6 +74,29 @@ def test_a_fake_result_has_the_shape_of_the_tuning(tuning):
     for a, b in zip((*fake, *fake_alone), (*real, *alone)):
         assert a.shape == b.shape and a.dtype == b.dtype
     assert real[2].shape[1] == -(-173 // tuning.chunk)
+
+
+@pytest.mark.parametrize("walked, walked_back", [(1, 1), (2, 5)])
+def test_states_walked_at_once_change_no_bit(walked, walked_back):
+    """Five states are a walk of four and one left over, or five, or two, two and one."""
+    tuning = Tuning(walked=walked, walked_back=walked_back)
+    outside = contextlib.nullcontext
+    assert same(scan(use_tuning(tuning), outside()), scan(outside(), outside()))
+
+
+def test_the_polynomial_without_avx_512_is_as_exact_as_the_table():
+    """1e-6 and 1e-5 are the limits of the accuracy tests, which see the default alone."""
+    inputs = make(1, 300, 20, 4)
+    theirs = leaves(inputs, torch.float64)
+    wants = oracle(**theirs, delta_softplus=True)[0]
+    wants = [wants, *torch.autograd.grad(wants.square().sum(), [*theirs.values()])]
+    for table in (True, False):
+        mine = leaves(inputs)
+        with use_tuning(Tuning(table=table)):
+            out = selective_scan(**mine, delta_softplus=True)
+        got = [out, *torch.autograd.grad(out.square().sum(), [*mine.values()])]
+        for name, a, b in zip(("out", *mine), got, wants):
+            assert_rel_rms(a, b, 1e-6 if name == "out" else 1e-5, f"{name}, table {table}")
 
 
 def test_numbers_are_the_tuning():
