@@ -123,18 +123,12 @@ _FORWARD = """
                     bad[j] = finite ? 0 : -1;
                 }
             float values[16 * D];
-            unsigned char marks[16 * D];
             for (int d = 0; d < D; ++d) {
                 const F color = sum[d] + 0.5f;
-                const I pass = (color >= 0.0f) & ~bad;
                 const F shown = bad ? F{} + __builtin_nanf("") : (color < 0.0f ? F{} : color);
-                for (int j = 0; j < 16; ++j) {
-                    values[j * D + d] = shown[j];
-                    marks[j * D + d] = pass[j] & 1;
-                }
+                for (int j = 0; j < 16; ++j) values[j * D + d] = shown[j];
             }
             __builtin_memcpy(colors.data + at * D, values, (size_t)live * D * 4);
-            __builtin_memcpy(passes.data + at * D, marks, (size_t)live * D);
         }
 """
 
@@ -148,17 +142,15 @@ _BACKWARD = """
                 load_rows_(coefficients.data + row * K_D, live, T);
             F v[D];
             I alive = {};
-            const unsigned char* const marks = passes.data + at * D;
             const float* const values = v_colors.data + at * D;
             for (int d = 0; d < D; ++d) {
-                float value[16] = {};
-                int mark[16] = {};
+                F value = {}, shown = {};
                 for (int j = 0; j < live; ++j) {
-                    mark[j] = -(int)marks[j * D + d];
-                    value[j] = mark[j] ? values[j * D + d] : 0.0f;
+                    value[j] = values[j * D + d];
+                    shown[j] = colors.data[(at + j) * D + d];
                 }
-                v[d] = *(const F*)value;
-                alive |= *(const I*)mark;
+                v[d] = shown > 0.0f ? value : F{};
+                alive |= shown > 0.0f;
             }
             F t[3], Y[COUNT];
             const F size = direction_(centers.data + image * 3, mean, t);
@@ -269,7 +261,6 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
         means: wp.array[wp.float32],
         centers: wp.array[wp.float32],
         colors: wp.array[wp.float32],
-        passes: wp.array[wp.uint8],
     ): ...
 
     @wp.func_native(_text(_BACKWARD, degree, channels, _BACKWARD_TOOLS))
@@ -281,7 +272,7 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
         coefficients: wp.array2d[wp.float32],
         means: wp.array[wp.float32],
         centers: wp.array[wp.float32],
-        passes: wp.array[wp.uint8],
+        colors: wp.array[wp.float32],
         v_colors: wp.array[wp.float32],
         v_coefficients: wp.array2d[wp.float32],
         v_means: wp.array[wp.float32],
@@ -298,7 +289,6 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
         means_in: wp.array[wp.float32],
         centers_in: wp.array[wp.float32],
         colors_out: wp.array[wp.float32],
-        passes_out: wp.array[wp.uint8],
     ):
         forward(
             offset + wp.tid(),
@@ -309,7 +299,6 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
             means_in,
             centers_in,
             colors_out,
-            passes_out,
         )
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
@@ -321,7 +310,7 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
         coefficients_in: wp.array2d[wp.float32],
         means_in: wp.array[wp.float32],
         centers_in: wp.array[wp.float32],
-        passes_in: wp.array[wp.uint8],
+        colors_in: wp.array[wp.float32],
         v_colors_in: wp.array[wp.float32],
         v_coefficients_out: wp.array2d[wp.float32],
         v_means_out: wp.array[wp.float32],
@@ -335,7 +324,7 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
             coefficients_in,
             means_in,
             centers_in,
-            passes_in,
+            colors_in,
             v_colors_in,
             v_coefficients_out,
             v_means_out,
@@ -360,9 +349,8 @@ def harmonics_forward(
     means: Tensor,
     centers: Tensor,
     colors: Tensor,
-    passes: Tensor,
 ) -> None:
-    """Fills colours and what passes a gradient on; float32, contiguous tensors.
+    """Fills the colours; float32, contiguous tensors.
 
     Args:
         degree: 0 to 4.
@@ -370,10 +358,9 @@ def harmonics_forward(
         means: ``[B, N, 3]``.
         centers: ``[B, V, 3]``.
         colors: written, ``[B, V, N, D]``.
-        passes: written, ``[B, V, N, D]`` uint8.
     """
     kernel = _compiled(degree, coefficients.shape[-1]).forward
-    _launch(kernel, [coefficients, means, centers], [colors.view(-1), passes.view(-1)])
+    _launch(kernel, [coefficients, means, centers], [colors.view(-1)])
 
 
 def harmonics_backward(
@@ -381,7 +368,7 @@ def harmonics_backward(
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
-    passes: Tensor,
+    colors: Tensor,
     v_colors: Tensor,
     wanted: list[bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -392,7 +379,7 @@ def harmonics_backward(
         coefficients: as given forward.
         means: as given forward.
         centers: as given forward.
-        passes: as forward wrote it.
+        colors: as forward wrote them.
         v_colors: ``[B, V, N, D]``.
         wanted: of which of the three the gradient is asked for.
     """
@@ -403,5 +390,5 @@ def harmonics_backward(
     outputs = [None if v_coefficients is None else v_coefficients.flatten(0, -3).flatten(1)]
     outputs += [None if x is None else x.view(-1) for x in (v_means, v_centers)]
     kernel = _compiled(degree, coefficients.shape[-1]).backward
-    _launch(kernel, [coefficients, means, centers, passes, v_colors], outputs)
+    _launch(kernel, [coefficients, means, centers, colors, v_colors], outputs)
     return v_coefficients, v_means, None if v_centers is None else v_centers.sum(2)

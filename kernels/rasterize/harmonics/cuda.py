@@ -66,7 +66,6 @@ def _compiled(degree: int) -> SimpleNamespace:
         means_in: wp.array[wp.vec3],
         centers_in: wp.array[wp.vec3],
         colors_out: wp.array2d[wp.float32],
-        passes_out: wp.array2d[wp.uint8],
     ):
         i = wp.tid()
         mean = means_in[i]
@@ -84,13 +83,11 @@ def _compiled(degree: int) -> SimpleNamespace:
                 # a coefficient that is not finite leaves such a sum; the reverse need not hold
                 bad = bad or not wp.isfinite(value)
                 value += 0.5
-                passes_out[at, d] = wp.where(value >= 0.0, wp.uint8(1), wp.uint8(0))
                 colors_out[at, d] = wp.where(value < 0.0, 0.0, value)
             if bad:
                 finite = wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2])
                 if not (finite and used_are_finite(coefficients_in, row)):
                     for d in range(colors_out.shape[1]):
-                        passes_out[at, d] = wp.uint8(0)
                         colors_out[at, d] = wp.nan
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -102,7 +99,7 @@ def _compiled(degree: int) -> SimpleNamespace:
         coefficients_in: wp.array3d[wp.float32],
         means_in: wp.array[wp.vec3],
         centers_in: wp.array[wp.vec3],
-        passes_in: wp.array2d[wp.uint8],
+        colors_in: wp.array2d[wp.float32],
         v_colors_in: wp.array2d[wp.float32],
         v_coefficients_out: wp.array3d[wp.float32],
         v_means_out: wp.array[wp.vec3],
@@ -119,7 +116,7 @@ def _compiled(degree: int) -> SimpleNamespace:
                     image = b * views + seen
                     at = image * num + i % num
                     # what passes no gradient on may hold NaN, which must not meet a zero
-                    if passes_in[at, d] != wp.uint8(0):
+                    if colors_in[at, d] > 0.0:
                         t = _direction(mean, centers_in[image])
                         v_column += v_colors_in[at, d] * basis(t[0], t[1], t[2])
                     last = per_view != 0 or seen == views - 1
@@ -139,7 +136,7 @@ def _compiled(degree: int) -> SimpleNamespace:
                 s = column()
                 alive = wp.bool(False)
                 for d in range(channels):
-                    if passes_in[at, d] != wp.uint8(0):
+                    if colors_in[at, d] > 0.0:
                         alive = True
                         v = v_colors_in[at, d]
                         for k in range(count):
@@ -177,10 +174,9 @@ def harmonics_forward(
     means: Tensor,
     centers: Tensor,
     colors: Tensor,
-    passes: Tensor,
 ) -> None:
-    """As the CPU's: fills colours and what passes a gradient on."""
-    outputs = [colors.flatten(0, -2), passes.flatten(0, -2)]
+    """As the CPU's: fills the colours."""
+    outputs = [colors.flatten(0, -2)]
     _launch(_compiled(degree).forward, [coefficients, means, centers], outputs)
 
 
@@ -189,7 +185,7 @@ def harmonics_backward(
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
-    passes: Tensor,
+    colors: Tensor,
     v_colors: Tensor,
     wanted: list[bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
@@ -203,7 +199,7 @@ def harmonics_backward(
         vectors(v_means, wp.vec3),
         None if v_centers is None else view(v_centers, wp.vec3),
     ]
-    tensors = [coefficients, means, centers, passes, v_colors]
+    tensors = [coefficients, means, centers, colors, v_colors]
     _launch(_compiled(degree).backward, tensors, outputs)
     return (
         v_coefficients,

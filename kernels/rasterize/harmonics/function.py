@@ -45,7 +45,7 @@ def colors_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: 
     if not _fits(coefficients, means, centers):
         return colors_by_formula(degree, coefficients, means, centers)
     each = (x.contiguous() for x in (coefficients, means, centers))
-    return harmonics(degree, *each)[0]
+    return harmonics(degree, *each)
 
 
 def _fits(coefficients: Tensor, means: Tensor, centers: Tensor) -> bool:

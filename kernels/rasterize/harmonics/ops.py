@@ -20,25 +20,17 @@ def _kernels(device: torch.device):
 
 @without_compiler
 @torch.library.custom_op(_OP, mutates_args=())
-def harmonics(
-    degree: int, coefficients: Tensor, means: Tensor, centers: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Colours as ``colors_seen_from`` returns them, of contiguous float32 tensors.
-
-    The second result, uint8 of the same shape, is 1 where a colour passes its gradient on.
-    """
-    shape = *centers.shape[:2], means.shape[1], coefficients.shape[-1]
-    colors, passes = means.new_empty(shape), means.new_empty(shape, dtype=torch.uint8)
+def harmonics(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    """Colours as ``colors_seen_from`` returns them, of contiguous float32 tensors."""
+    colors = means.new_empty(*centers.shape[:2], means.shape[1], coefficients.shape[-1])
     if colors.numel():
-        launch = _kernels(means.device).harmonics_forward
-        launch(degree, coefficients, means, centers, colors, passes)
-    return colors, passes
+        _kernels(means.device).harmonics_forward(degree, coefficients, means, centers, colors)
+    return colors
 
 
 @harmonics.register_fake
 def _(degree, coefficients, means, centers):
-    shape = *centers.shape[:2], means.shape[1], coefficients.shape[-1]
-    return means.new_empty(shape), means.new_empty(shape, dtype=torch.uint8)
+    return means.new_empty(*centers.shape[:2], means.shape[1], coefficients.shape[-1])
 
 
 @without_compiler
@@ -48,36 +40,31 @@ def _harmonics_vjp(
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
-    passes: Tensor,
+    colors: Tensor,
     v_colors: Tensor,
     wanted: List[bool],
 ) -> List[Tensor]:
     inputs = coefficients, means, centers
-    if not passes.numel():
+    if not colors.numel():
         return [torch.zeros_like(x) for x, want in zip(inputs, wanted) if want]
     launch = _kernels(means.device).harmonics_backward
-    grads = launch(degree, *inputs, passes, v_colors, wanted)
+    grads = launch(degree, *inputs, colors, v_colors, wanted)
     return [g for g in grads if g is not None]
 
 
 @_harmonics_vjp.register_fake
-def _(degree, coefficients, means, centers, passes, v_colors, wanted):
+def _(degree, coefficients, means, centers, colors, v_colors, wanted):
     inputs = coefficients, means, centers
     return [torch.empty_like(x) for x, want in zip(inputs, wanted) if want]
 
 
 def _setup(ctx, inputs, output):
     ctx.degree, *tensors = inputs
-    _, passes = output
-    ctx.mark_non_differentiable(passes)
-    ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*tensors, passes)
+    ctx.save_for_backward(*tensors, output)
 
 
-def _backward(ctx, v_colors, _passes):
+def _backward(ctx, v_colors):
     wanted = list(ctx.needs_input_grad[1:])
-    if v_colors is None or not any(wanted):
-        return None, None, None, None
     grads = iter(_harmonics_vjp(ctx.degree, *ctx.saved_tensors, v_colors.contiguous(), wanted))
     return None, *(next(grads) if want else None for want in wanted)
 
