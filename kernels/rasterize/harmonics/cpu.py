@@ -334,7 +334,7 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
     return SimpleNamespace(forward=harmonics, backward=harmonics_vjp)
 
 
-def _launch(kernel, tensors: list[Tensor | None], outputs: list[Tensor | None]) -> None:
+def _launch(kernel, tensors: list[Tensor], outputs: list) -> None:
     coefficients, means, centers, *rest = tensors
     batch, num, _ = means.shape
     sizes = [num, centers.shape[1], int(coefficients.dim() == 5)]
@@ -387,8 +387,11 @@ def harmonics_backward(
     v_coefficients = empty(coefficients.shape, torch.float32) if wanted[0] else None
     v_means = torch.zeros_like(means) if wanted[1] else None
     v_centers = means.new_zeros(batch, views, -(-num // _CHUNK), 3) if wanted[2] else None
-    outputs = [None if v_coefficients is None else v_coefficients.flatten(0, -3).flatten(1)]
-    outputs += [None if x is None else x.view(-1) for x in (v_means, v_centers)]
+    outputs = [
+        None if v_coefficients is None else v_coefficients.flatten(0, -3).flatten(1),
+        None if v_means is None else v_means.view(-1),
+        None if v_centers is None else v_centers.view(-1),
+    ]
     kernel = _compiled(degree, coefficients.shape[-1]).backward
     _launch(kernel, [coefficients, means, centers, colors, v_colors], outputs)
     return v_coefficients, v_means, None if v_centers is None else v_centers.sum(2)
