@@ -12,7 +12,7 @@ import torch
 from ...rasterize import Skip
 from .. import peers
 from ..core.case import Case, Error, Key, Settings, Target, Variant, compare
-from . import raster_knobs
+from . import harmonics, raster_knobs
 from .raster_parts import Parts
 from .raster_scene import LEAVES, Scene, orbit_cameras, shell
 from .raster_variants import BOTH, make_pair, make_scene, make_variant, sizes_of
@@ -49,7 +49,7 @@ def cases(settings: Settings) -> list[Case]:
             axis=axis,
         )
         for name, build, axis in builders
-    ]
+    ] + harmonics.cases(settings)
 
 
 def _scenes(settings: Settings) -> list[Variant]:
@@ -312,7 +312,8 @@ def targets(settings: Settings) -> list[Target]:
         many, one = (_raster("one call", name, direction) for name in ("32 calls", "one call"))
         text = f"8 objects x 4 views, {direction}, 32 calls over one"
         made.append(Target(text, (many,), (one,), at_least=1.3))
-    return made + _growth(settings) + (_cuda_targets() if settings.device.type == "cuda" else [])
+    made += _growth(settings) + harmonics.targets(settings)
+    return made + (_cuda_targets() if settings.device.type == "cuda" else [])
 
 
 def _growth(settings: Settings) -> list[Target]:

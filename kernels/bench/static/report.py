@@ -21,6 +21,7 @@ from gamba_warp.versions import __version__
 
 from ...causal_conv1d import causal_conv1d
 from ...rasterize import depth_quantile, rasterization
+from ...rasterize.harmonics import colors_seen_from
 from ...selective_scan import selective_scan, selective_scan_state
 from .cubin import RESERVED, Resources, read_cubin
 from .dry_run import Launch, can_dry_run, launches_of
@@ -144,6 +145,13 @@ def _depth() -> list[Tensor]:
     return [depth_quantile(meta)]
 
 
+def _harmonics(degree: int) -> list[Tensor]:
+    """Colours of 16,384 Gaussians in two views, all gradients."""
+    num = 16384
+    coefficients, means = _tensor(1, num, (degree + 1) ** 2, 3), _tensor(1, num, 3)
+    return [colors_seen_from(degree, coefficients, means, _tensor(1, 2, 3))]
+
+
 _HALF = {"dtype": torch.bfloat16}
 _SCANS = {
     "bfloat16": _HALF,
@@ -169,6 +177,7 @@ CASES: dict[tuple[str, str], Callable[[], list[Tensor]]] = {
     ("conv", "float32"): partial(_conv, torch.float32),
     **{("raster", name): partial(_raster, **options) for name, options in _RASTERS.items()},
     ("raster", "depth of a transmittance"): _depth,
+    **{("raster", f"harmonics of degree {n}"): partial(_harmonics, n) for n in range(5)},
 }
 
 

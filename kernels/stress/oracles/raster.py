@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ...rasterize.constants import ALPHA_MAX, COMPENSATION_MIN, FRUSTUM_MARGIN, T_MIN
-from ...rasterize.harmonics import colors_from_harmonics
+from ...rasterize.harmonics.formula import colors_by_formula
 from ..core.case import FACTOR
 from ..core.rounding import UNIT, Rounding
 from .scan import EXP_ULPS
@@ -266,9 +266,8 @@ def render_view(
     x = {name: None if t is None else r(t) for name, t in x.items()}
     bent = None
     if lens.sh_degree is not None:
-        view = torch.zeros(len(W), 1, 4, 4, dtype=W.dtype)
-        view[:, 0, :3, :3], view[:, 0, :3, 3], view[:, 0, 3, 3] = r(W), r(w), 1
-        colors = colors_from_harmonics(lens.sh_degree, x["colors"], x["means"], view)[:, 0]
+        centers = -(r(W).mT @ r(w)[..., None])[..., 0]
+        colors = colors_by_formula(lens.sh_degree, x["colors"], x["means"], centers[:, None])[:, 0]
         x["colors"] = r(colors, EXP_ULPS)
         with torch.no_grad():  # the clamp at 0
             bent = (colors[0] <= _band(colors) + 1e-6).any(-1) & (colors[0] >= 0).any(-1)

@@ -430,7 +430,7 @@ def test_the_scene_and_its_crop():
     assert counts["pairs"] > 100 and counts["tiles"] == 16 and counts["gaussians"] == 300
 
 
-@pytest.mark.parametrize("name", ["one call", "skipping", "batch", "exponential"])
+@pytest.mark.parametrize("name", ["one call", "skipping", "batch", "exponential", "harmonics"])
 def test_raster_cases_run(name):
     chosen = [c for c in raster_suite.cases(QUICK) if c.name == name]
     records = measure(chosen, QUICK)["records"]

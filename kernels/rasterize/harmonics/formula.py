@@ -1,4 +1,8 @@
-"""Real spherical harmonics up to degree 4, in torch (autograd gives the gradients)."""
+"""Real spherical harmonics up to degree 4, in torch (autograd gives the gradients).
+
+The operator of ``function.py`` takes this for what its kernels do not: other dtypes than float32,
+other devices, very many channels. In float64 it is the oracle of the kernels.
+"""
 
 import torch
 from torch import Tensor
@@ -54,25 +58,8 @@ def harmonics_basis(degree: int, directions: Tensor) -> Tensor:
     return torch.stack(basis, -1)
 
 
-def colors_from_harmonics(
-    degree: int, coefficients: Tensor, means: Tensor, viewmats: Tensor
-) -> Tensor:
-    """Colours seen from each camera, ``max(0, ½ + Σ_k Y_k(direction) coefficient_k)``.
-
-    Args:
-        degree: as for ``colors_seen_from``, like ``coefficients`` and ``means``.
-        viewmats: ``[B, V, 4, 4]``, rigid.
-
-    Returns:
-        as ``colors_seen_from``.
-    """
-    rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
-    centers = -(rotation.mT @ translation[..., None])[..., 0]
-    return colors_seen_from(degree, coefficients, means, centers)
-
-
-def colors_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
-    """Colours seen from each point, ``max(0, ½ + Σ_k Y_k(direction) coefficient_k)``.
+def colors_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    """The colours of ``colors_seen_from``, with gradients of any order.
 
     Args:
         degree: 0 to 4; coefficients beyond it are not used.
