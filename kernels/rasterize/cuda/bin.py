@@ -122,11 +122,14 @@ def _room(
     grid: Grid, depths: Tensor, count: Tensor, check: Callable[[int], None], exact: bool
 ) -> int:
     """The room of the lists; without a wait, unless they are ``exact`` or nothing is known yet."""
-    device = depths.device
-    key = (*depths.shape, grid.width, grid.height, grid.shift, grid.skip & TILE_TEST)
+    device, (images, num) = depths.device, depths.shape
+    # calls with about as many Gaussians share their room: some models give another number each time
+    shape = images, capacity.in_steps(num), grid.width, grid.height, grid.shift
+    key = (*shape, grid.skip & TILE_TEST)
     room = None if exact else capacity.find(key, device)
+    capturing = capacity.is_capturing(device)
     if room is None:
-        if capacity.is_capturing(device):
+        if capturing:
             raise RuntimeError(
                 "a CUDA graph cannot begin with shapes that were never rendered: run the same "
                 "call once before the capture, as torch asks for all that it captures"
@@ -135,6 +138,9 @@ def _room(
         check(total)
         if exact:
             return total
-        room = capacity.remember(key, device, total, depths.numel())
+        room = capacity.remember(key, device, total)
+    size = max(room.capacity, depths.numel())
+    if capturing:
+        capacity.captured(room, size)
     capacity.tell(room, count.view(1))
-    return room.capacity
+    return size

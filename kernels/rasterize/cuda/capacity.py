@@ -32,13 +32,11 @@ class Room:
 
     Attributes:
         place: its place in the ledger.
-        least: pairs for which there must be room, however few were told.
         capacity: pairs that the next call has room for.
         captured: the least capacity that a CUDA graph holds; None: no graph was captured.
     """
 
     place: int
-    least: int
     capacity: int
     captured: int | None = None
 
@@ -77,11 +75,15 @@ def _note(
     highs_out[place] = wp.max(high - high / wp.int64(64), count_in[0])
 
 
-def wanted(count: int, least: int) -> int:
-    """Room for half as many pairs again, in steps of about a tenth; at least ``least``."""
-    room = count + count // 2
-    step = 1 << max(0, room.bit_length() - 4)
-    return min(_MOST, max(least, -(-room // step) * step))
+def in_steps(number: int) -> int:
+    """The next number, up to an eighth larger, of which there are few: eight of each length."""
+    step = 1 << max(0, number.bit_length() - 4)
+    return -(-number // step) * step
+
+
+def wanted(count: int) -> int:
+    """Room for half as many pairs again."""
+    return min(_MOST, in_steps(count + count // 2))
 
 
 def is_capturing(device: torch.device) -> bool:
@@ -96,18 +98,21 @@ def find(key: Hashable, device: torch.device) -> Room | None:
     if ledger is None or room is None:
         return None
     count = ledger.read(room.place)
-    fitting = wanted(count, room.least)
+    fitting = wanted(count)
     if room.capacity < fitting and 4 * room.capacity < 5 * count or room.capacity > 4 * fitting:
         room.capacity = fitting
-    if is_capturing(device):
-        room.captured = min(room.capacity, room.captured or room.capacity)
     return room
 
 
-def remember(key: Hashable, device: torch.device, count: int, least: int) -> Room:
+def captured(room: Room, capacity: int) -> None:
+    """Notes the room that a CUDA graph holds."""
+    room.captured = capacity if room.captured is None else min(capacity, room.captured)
+
+
+def remember(key: Hashable, device: torch.device, count: int) -> Room:
     """Makes room for a shape whose count was read back."""
     if recorder() is not None:  # a dry run has no memory and leaves nothing behind
-        return Room(0, least, wanted(count, least))
+        return Room(0, wanted(count))
     with _lock:
         ledger = _ledgers.setdefault(device, _Ledger(device))
         if len(ledger.rooms) < _PLACES:
@@ -116,7 +121,7 @@ def remember(key: Hashable, device: torch.device, count: int, least: int) -> Roo
             place = ledger.rooms.pop(next(iter(ledger.rooms))).place
         ledger.highs[place].fill_(count)
         ledger.told.numpy()[place] = count
-        room = ledger.rooms[key] = Room(place, least, wanted(count, least))
+        room = ledger.rooms[key] = Room(place, wanted(count))
     return room
 
 

@@ -33,8 +33,9 @@ def _add_rows(
     begin = offsets_in[j]
     end = offsets_in[j + 1]
     if count_in[0] > wp.int64(v_pairs_in.shape[0]):
-        end = begin if end == begin else j + 1
-        begin = wp.min(j, end)
+        # rows of Gaussians, written where they have pairs
+        end = j + wp.where(end != begin, 1, 0)
+        begin = j
     total = wp.float32(0.0)
     for p in range(begin, end):
         total += v_pairs_in[p, column]
