@@ -48,7 +48,7 @@ class Splats:
 
     def __init__(self, device: torch.device, count: int = 700, views: int = 3, size: int = 75):
         gaussians = {name: x.to(device) for name, x in shell(count, scale=3.0).items()}
-        self.leaves = {name: x.clone().requires_grad_() for name, x in gaussians.items()}
+        self.leaves: dict[str, Any] = {k: x.requires_grad_() for k, x in gaussians.items()}
         self.cameras = [x.to(device) for x in orbit_cameras(views, size)]
         self.size = size
 
@@ -130,7 +130,8 @@ class TrainingStep:
     @torch.no_grad()
     def begin(self, weights: list[Tensor]) -> None:
         """Sets weights and the optimizer's state to those of a beginning, in place."""
-        torch._foreach_copy_(self.parameters, weights)
+        for parameter, weight in zip(self.parameters, weights):
+            parameter.copy_(weight)
         for state in self.optimizer.state.values():
             for value in state.values():
                 value.zero_()

@@ -214,7 +214,9 @@ def bin_op(
 
 
 @bin_op.register_fake
-def _(means2d, conics, depths, opacities, extents, width, height, alpha_min, skip, tuning, exact):
+def _(
+    means2d, conics, depths, opacity, extents, width, height, alpha_min, skip, tuning, exact=False
+):
     def ints(*shape):
         return depths.new_empty(shape, dtype=torch.int32)
 

@@ -283,8 +283,7 @@ def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], N
     pairs, rows = order.new_empty(total), order.new_empty(total)
     if total:
         parallel_launch(_emit, tasks, [*inputs, offsets], [cursors, pairs, rows], pieces=tasks)
-    every = dict(box_pairs=box_counts.sum(), count=torch.tensor(total))
-    return Bins(order, offsets, pairs, rows, starts, **every)
+    return Bins(order, offsets, pairs, rows, starts, box_counts.sum(), torch.tensor(total))
 
 
 def _sorted_and_recorded(
