@@ -1,4 +1,4 @@
-"""Checks of CUDA graphs: of the rasterizer both ways, and of a whole training step.
+"""Checks of CUDA graphs, and that nothing waits: the rasterizer both ways, a whole training step.
 
 A graph may hold nothing that makes the host wait, and its replays must give what plain calls give,
 also after inputs have changed.
@@ -70,6 +70,20 @@ class Splats:
     def grow(self, factor: float) -> None:
         """Multiplies the sizes of the Gaussians, and with these the number of pairs."""
         self.leaves["scales"].mul_(factor)
+
+
+def no_wait(device: torch.device) -> str:
+    """Checks that torch waits for the device in no call but the first, neither graph nor not."""
+    splats, steps = Splats(device), TrainingStep(device)
+    for run in (splats.run, steps.run):
+        run()
+        before = torch.cuda.get_sync_debug_mode()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            run()
+        finally:
+            torch.cuda.set_sync_debug_mode(before)
+    return "rendering with gradients and a training step go on"
 
 
 def raster_graph(device: torch.device) -> str:

@@ -23,7 +23,7 @@ from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.cuda.tuning import Tuning, use_tuning
 from .faults import same, within
-from .graphs import raster_graph, step_graph
+from .graphs import no_wait, raster_graph, step_graph
 
 # Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
 # rounds inputs and outputs, and a few pixels may cross the cut at the faintest alpha.
@@ -89,6 +89,7 @@ def checks(quick: bool) -> Iterator[Check]:
     yield Check("torch.compile, whole graph, inductor", partial(_compiled, "inductor"), cuda=True)
     yield Check("scan and convolution on a stream of their own", _side_stream, cuda=True)
     yield Check("scan and convolution in a CUDA graph", _graph, cuda=True)
+    yield Check("rasterizer and a training step: no wait for the device", no_wait, cuda=True)
     yield Check("rasterizer and its gradients in a CUDA graph", raster_graph, cuda=True)
     yield Check("a whole training step in a CUDA graph", step_graph, cuda=True)
 

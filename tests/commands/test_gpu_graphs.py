@@ -61,3 +61,22 @@ def test_a_training_step(graph):
     graph(lambda loss: loss.mul_(1.001))
     with pytest.raises(AssertionError, match="losses: relative rms error 0.001"):
         graphs.step_graph(CPU)
+
+
+def test_nothing_waits(monkeypatch):
+    """The first calls may wait, the second ones run under torch's own watch, which is put back."""
+    modes, ran = ["default"], []
+
+    def run(name):
+        ran.append((name, modes[-1]))
+        if name == "steps" and modes[-1] == "error":
+            raise RuntimeError("called a synchronizing CUDA operation")
+
+    monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", modes.append)
+    monkeypatch.setattr(graphs.Splats, "run", lambda self: run("splats"))
+    monkeypatch.setattr(graphs.TrainingStep, "run", lambda self: run("steps"))
+    with pytest.raises(RuntimeError, match="synchronizing"):
+        graphs.no_wait(CPU)
+    assert ran == [(name, mode) for name in ("splats", "steps") for mode in ("default", "error")]
+    assert modes[-1] == "default"
