@@ -114,13 +114,17 @@ def remember(key: Hashable, device: torch.device, count: int) -> Room:
     if recorder() is not None:  # a dry run has no memory and leaves nothing behind
         return Room(0, wanted(count))
     with _lock:
-        ledger = _ledgers.setdefault(device, _Ledger(device))
+        if device not in _ledgers:
+            _ledgers[device] = _Ledger(device)
+        ledger = _ledgers[device]
         if len(ledger.rooms) < _PLACES:
             place = len(ledger.rooms)
         else:
             place = ledger.rooms.pop(next(iter(ledger.rooms))).place
         ledger.highs[place].fill_(count)
         ledger.told.numpy()[place] = count
+        if device.type == "cuda":  # the next call may be on another stream
+            torch.cuda.current_stream(device).synchronize()
         room = ledger.rooms[key] = Room(place, wanted(count))
     return room
 
