@@ -98,6 +98,8 @@ def find(key: Hashable, device: torch.device) -> Room | None:
     if ledger is None or room is None:
         return None
     count = ledger.read(room.place)
+    if count > _MOST:  # no list can hold them, so those that there are do
+        return room
     fitting = wanted(count)
     if room.capacity < fitting and 4 * room.capacity < 5 * count or room.capacity > 4 * fitting:
         room.capacity = fitting

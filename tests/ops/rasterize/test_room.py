@@ -140,8 +140,12 @@ def test_room_shrinks_slowly():
         sizes.append(capacity.find("shape", CPU).capacity)
     assert sizes[44] == sizes[0] and sizes == sorted(sizes, reverse=True)
     assert 1500 <= sizes[-1] < 10_000
-    capacity.tell(room, torch.tensor([3_000_000_000]))
+    capacity.tell(room, torch.tensor([2_000_000_000]))
     assert capacity.find("shape", CPU).capacity == 2**31 - 1
+    capacity.tell(room, torch.tensor([1000]))
+    room.capacity = sizes[-1]
+    capacity.tell(room, torch.tensor([3_000_000_000]))  # no list holds so many
+    assert capacity.find("shape", CPU).capacity == sizes[-1]
     assert capacity.find("another shape", CPU) is None
     capacity.forget()
 
