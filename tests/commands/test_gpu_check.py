@@ -11,7 +11,7 @@ from typing import get_args
 
 import pytest
 import torch
-from helpers.watch import Watch
+from helpers.kernels import Watch
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.files import write_json

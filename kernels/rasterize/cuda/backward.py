@@ -78,6 +78,13 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
         return blocks & wanted | stops << STOP
 
     @wp.func
+    def row_of(rows: wp.array[wp.int32], k: wp.int32) -> wp.int32:
+        row = k
+        if wp.static(listed):
+            row = load_int(rows, k)
+        return row
+
+    @wp.func
     def of_tile(
         picture: Picture,
         gaussians: Gaussians,
@@ -131,9 +138,7 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
         upstream = upstream_type()
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         some = wp.int32(0)
-        walked = walked_in[p.tile]
-        if wp.static(not listed):
-            walked = -walked
+        walked = walked_in[p.tile] * wp.static(1 if listed else -1)
         for j in range(wp.static(pixels)):
             if walked > 0:
                 T[j] = load(transmittances_in, p.place, j * WARP)
@@ -166,15 +171,11 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                 bits = of_part(load_int(blocks_in, k), p.part, wanted)
                 if (picture.skip & _UNUSED) == 0:
                     bits |= wanted
-                row = k
-                if wp.static(listed):
-                    row = load_int(rows_in, k)
-                else:
+                if wp.static(not listed):
                     bits = of_tile(picture, gaussians, p.corner, pairs_in, rows_in, k, bits)
                 if bits != 0:
-                    g = load_int(pairs_in, k)
-                    row = row * wp.static(parts) + p.part
-                    stage(arena, picture, gaussians, lane, g, bits, row)
+                    row = row_of(rows_in, k) * wp.static(parts) + p.part
+                    stage(arena, picture, gaussians, lane, load_int(pairs_in, k), bits, row)
             todo = memory.ballot(arena, lane, bits)
             memory.sync()
             while todo != 0:

@@ -66,6 +66,18 @@ def _walking(channels: int, parts: int, listed: bool):
     sums_type = wp.types.matrix((pixels, channels), wp.float32)
 
     @wp.func
+    def leave(blocks: wp.array[wp.int32], k: wp.int32, part: wp.int32, mine: wp.int32):
+        # stores the bits of a pair, or joins those of the parts, or of the tiles that share it
+        if wp.static(parts == 1 and listed):
+            store_int(blocks, k, mine)
+        elif mine != 0:
+            shift_used = part * wp.static(16 // parts)
+            shift_stop = part * wp.static(pixels)
+            shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
+            shifted |= (mine & wp.static(~((1 << STOP) - 1))) << shift_stop
+            wp.atomic_or(blocks, k, shifted)
+
+    @wp.func
     @no_type_check
     def walk(
         picture: Picture,
@@ -167,14 +179,7 @@ def _walking(channels: int, parts: int, listed: bool):
                     if live == 0:
                         walked = k0 + i - begin + 1
             if k < end:
-                if wp.static(parts == 1 and listed):
-                    store_int(blocks_out, k, mine)
-                elif mine != 0:
-                    shift_used = p.part * wp.static(16 // parts)
-                    shift_stop = p.part * wp.static(pixels)
-                    shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
-                    shifted |= (mine & wp.static(~((1 << STOP) - 1))) << shift_stop
-                    wp.atomic_or(blocks_out, k, shifted)
+                leave(blocks_out, k, p.part, mine)
             memory.sync()
 
         if lane == 0:

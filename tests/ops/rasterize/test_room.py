@@ -5,8 +5,8 @@ from functools import partial
 import pytest
 import torch
 import warp as wp
+from helpers.kernels import Watch
 from helpers.raster import leaves, make
-from helpers.watch import Watch
 
 from gamba_warp.kernels.rasterize import Skip, depth_quantile, lists_outgrown, ops, rasterization
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda

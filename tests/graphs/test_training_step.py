@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.watch import Watch
+from helpers.kernels import Watch
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.kernels.bench.static import dry_run
