@@ -16,12 +16,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..kernels.bench import Error, compare
+from ..kernels.bench import compare
 from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.cuda.tuning import Tuning, use_tuning
+from .faults import same, within
+from .graphs import no_wait, raster_graph, step_graph
 
 # Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
 # rounds inputs and outputs, and a few pixels may cross the cut at the faintest alpha.
@@ -87,14 +89,9 @@ def checks(quick: bool) -> Iterator[Check]:
     yield Check("torch.compile, whole graph, inductor", partial(_compiled, "inductor"), cuda=True)
     yield Check("scan and convolution on a stream of their own", _side_stream, cuda=True)
     yield Check("scan and convolution in a CUDA graph", _graph, cuda=True)
-
-
-def _within(error: Error, limit: float) -> str:
-    if not error.rel_rms <= limit:
-        raise AssertionError(
-            f"{error.worst}: relative rms error {error.rel_rms:.2g}, allowed {limit:.2g}"
-        )
-    return f"{error.rel_rms:.1e}"
+    yield Check("rasterizer and a training step: no wait for the device", no_wait, cuda=True)
+    yield Check("rasterizer and its gradients in a CUDA graph", raster_graph, cuda=True)
+    yield Check("a whole training step in a CUDA graph", step_graph, cuda=True)
 
 
 def _problem(shape: tuple, device: torch.device) -> ScanProblem:
@@ -108,7 +105,7 @@ def _problem(shape: tuple, device: torch.device) -> ScanProblem:
 def _scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> str:
     """Checks the output and all gradients, from a given first state."""
     error = _problem(shape, device).check_backward(dtype)
-    return _within(error, LIMIT if dtype == torch.float32 else HALF_LIMIT)
+    return within(error, LIMIT if dtype == torch.float32 else HALF_LIMIT)
 
 
 def _tuned(tuning: Tuning, device: torch.device) -> str:
@@ -119,14 +116,8 @@ def _tuned(tuning: Tuning, device: torch.device) -> str:
 def _scan_twice(device: torch.device) -> str:
     problem = _problem((2, 577, 70, 16, 1), device)
     for dtype in (torch.float32, torch.bfloat16):
-        _same(problem.backward(dtype), problem.backward(dtype))
+        same(problem.backward(dtype), problem.backward(dtype))
     return "equal"
-
-
-def _same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
-    for i, (a, b) in enumerate(zip(first, second)):
-        if not torch.equal(a, b):
-            raise AssertionError(f"result {i} differs by up to {(a - b).abs().max().item():.2g}")
 
 
 def _conv(shape: tuple, device: torch.device) -> str:
@@ -144,7 +135,7 @@ def _conv(shape: tuple, device: torch.device) -> str:
     grads = torch.autograd.grad(out, list(mine.values()), cotangent.to(device))
     wants = torch.autograd.grad(want, list(exact.values()), cotangent.double())
     got = {"out": out} | dict(zip(mine, grads))
-    return _within(compare(got, {"out": want} | dict(zip(exact, wants))), LIMIT)
+    return within(compare(got, {"out": want} | dict(zip(exact, wants))), LIMIT)
 
 
 def _scene(count: int, size: int, views: int, options: dict, device: torch.device) -> Scene:
@@ -161,13 +152,13 @@ def _raster(count: int, size: int, views: int, options: dict, device: torch.devi
     picture, alphas, _ = scene.forward()
     if not (picture.isfinite().all() and alphas.max() <= 1):
         raise AssertionError("the picture is not finite, or alpha is over 1")
-    return _within(scene.check(backward=True), PICTURE_LIMIT)
+    return within(scene.check(backward=True), PICTURE_LIMIT)
 
 
 def _raster_twice(device: torch.device) -> str:
     scene = _scene(700, 75, 3, {}, device)
-    _same(scene.forward()[:2], scene.forward()[:2])
-    _same(scene.backward(), scene.backward())
+    same(scene.forward()[:2], scene.forward()[:2])
+    same(scene.backward(), scene.backward())
     return "equal"
 
 
@@ -195,7 +186,7 @@ def _compiled(backend: str, device: torch.device) -> str:
         leaves = [x.detach().clone().requires_grad_() for x in inputs]
         out = function(*leaves)
         results.append({"out": out} | dict(zip("uw", torch.autograd.grad(out.sum(), leaves))))
-    return _within(compare(results[1], results[0]), 1e-6)
+    return within(compare(results[1], results[0]), 1e-6)
 
 
 def _side_stream(device: torch.device) -> str:
@@ -209,7 +200,7 @@ def _side_stream(device: torch.device) -> str:
             big = big @ big * 1e-3
         out = layer(*(x + 0 * big[0, 0].nan_to_num(0.0, 0.0, 0.0) for x in inputs))
     stream.synchronize()
-    _same((out,), (want,))
+    same((out,), (want,))
     return "equal"
 
 
@@ -230,5 +221,5 @@ def _graph(device: torch.device) -> str:
             out.fill_(torch.nan)
             graph.replay()
             torch.cuda.synchronize(device)
-            _same((out,), (layer(*inputs),))
+            same((out,), (layer(*inputs),))
     return "equal"

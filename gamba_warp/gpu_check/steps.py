@@ -142,8 +142,6 @@ def _inference(part: Part, settings: Settings) -> None:
         part.leave_out("inference from a CUDA graph", "needs CUDA")
     else:
         part.result["reserved_gib"] = torch.cuda.memory_reserved(settings.device) / 2**30
-        reason = "the number of pairs is read back to make the lists, which no graph can hold"
-        part.leave_out("the view in the CUDA graph", reason)
 
 
 def _ceilings(settings: Settings) -> dict[str, float]:

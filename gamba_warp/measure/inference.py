@@ -135,7 +135,7 @@ class Inference:
 
     @torch.no_grad()
     def view(self, gaussians: Gaussians) -> Tensor:
-        """Renders the reference view; the rasterizer reads the number of pairs back meanwhile."""
+        """Renders the reference view."""
         cameras = replace(
             self.cameras, viewmats=self.cameras.viewmats[:, None], Ks=self.cameras.Ks[:, None]
         )

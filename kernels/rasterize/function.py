@@ -12,11 +12,11 @@ from .checks import check_inputs
 from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
 from .cpu.tuning import Tuning, tuning_for
 from .harmonics import colors_from_harmonics
-from .meta import Meta
+from .meta import Drawn, Meta
 from .ops import bin_op, composite, project
 from .project import LensOptions, Projected
 from .skip import Skip
-from .tiles import Bins, Limits, Size, Tiling, Walk
+from .tiles import Bins, Limits, Size, Walk
 
 EVERYTHING = Skip()
 _WEIGHT_EPS = 1e-10  # a sum of weights below this has no expected depth
@@ -92,7 +92,8 @@ def rasterization(
     Raises:
         TypeError: a tensor has another dtype, or is no tensor; an unknown option.
         ValueError: a shape, device or option is not as above; the message names it. Or there are
-            over 2^31 pairs of tiles and Gaussians.
+            over 2^31 pairs of tiles and Gaussians, and this is not CUDA, or the first such call.
+        RuntimeError: a CUDA graph is captured, and these shapes were never rendered before.
     """
     tensors = dict(
         means=means, quats=quats, scales=scales, opacities=opacities, colors=colors,
@@ -140,7 +141,8 @@ def _draw(
     splats: Projected, channels: Tensor, size: Size, limits: Limits, tuning: Tuning
 ) -> tuple[Tensor, Tensor, Meta]:
     """Makes the lists of I views and blends them: ``[I, H, W, C]``, ``[I, H, W, 1]``, counts."""
-    *parts, status = (x.detach() for x in splats)
+    means2d, conics, depths, opacities, extents, status = (x.detach() for x in splats)
+    parts = means2d, conics, depths, opacities, extents
     picture = size.width, size.height, limits.alpha_min, size.skip
     bins = Bins(*bin_op(*parts, *picture, tuning.numbers()))
     skipped = None if torch.compiler.is_compiling() else bins.box_pairs.new_full((), -1)
@@ -155,8 +157,8 @@ def _draw(
         tuning.numbers(),
         skipped,
     )
-    tiling = Tiling(size.width, size.height, tuning.tile)
-    return renders, alphas, Meta(tiling, bins, Walk(*walk), status, skipped)
+    drawn = Drawn(parts, size, limits, tuning)
+    return renders, alphas, Meta(drawn, bins, Walk(*walk), status, skipped)
 
 
 def _describe(meta: Meta, projected: Projected) -> None:

@@ -1,10 +1,45 @@
 """Counts of the work that a call did, computed only when somebody looks."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from .cpu.tuning import Tuning
+from .ops import bin_op, composite
 from .project import STATUS_NAMES
-from .tiles import Bins, Tiling, Walk
+from .tiles import Bins, Limits, Size, Tiling, Walk
+
+
+class Drawn(NamedTuple):
+    """What was drawn, and how: enough to make the lists anew.
+
+    Attributes:
+        splats: means2d, conics, depths, opacities and extents of I views, without gradients.
+        size: as ``composite`` was given it, like the next two.
+        limits: see above.
+        tuning: see above.
+    """
+
+    splats: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+    size: Size
+    limits: Limits
+    tuning: Tuning
+
+    def tiling(self) -> Tiling:
+        """The cut into tiles."""
+        return Tiling(self.size.width, self.size.height, self.tuning.tile)
+
+    def listed(self) -> tuple[Bins, Walk]:
+        """The lists with room for all pairs, whose number is read back, and what the walk left."""
+        means2d, conics, depths, opacities, extents = self.splats
+        size, numbers = self.size._replace(colors_per_view=1), self.tuning.numbers()
+        picture = size.width, size.height, self.limits.alpha_min, size.skip
+        bins = bin_op(means2d, conics, depths, opacities, extents, *picture, numbers, True)
+        color = torch.ones_like(depths).view(-1, 1)
+        splats = means2d, conics, opacities, color
+        _, _, *walk = composite(*splats, list(bins), list(size), list(self.limits), numbers, None)
+        return Bins(*bins), Walk(*walk)
 
 
 class Meta(dict):
@@ -17,16 +52,20 @@ class Meta(dict):
     ``tiles`` and ``tiles_empty``; ``tiles_skipped``: not walked by the latest backward, being empty
     or without upstream gradient. The last one is None before a backward and under torch.compile.
 
+    On CUDA, where the lists of a call had no room for its pairs, they are made once more for these
+    counts, with room. A key keeps its first value; after the replay of a CUDA graph
+    ``bins.count``, a tensor, has the graph's number of pairs.
+
     Attributes:
         tiling: the cut into tiles with which the lists were made.
         bins: the lists themselves.
     """
 
     def __init__(
-        self, tiling: Tiling, bins: Bins, walk: Walk, status: Tensor, skipped: Tensor | None
+        self, drawn: Drawn, bins: Bins, walk: Walk, status: Tensor, skipped: Tensor | None
     ):
         super().__init__()
-        self.tiling, self.bins = tiling, bins
+        self.tiling, self.bins, self._drawn = drawn.tiling(), bins, drawn
         self._walk, self._status, self._skipped = walk, status, skipped
 
     def __missing__(self, key: str):
@@ -35,7 +74,7 @@ class Meta(dict):
         counts = {
             "culled": self._culled,
             "pairs_box": lambda: int(self.bins.box_pairs),
-            "pairs": lambda: self.bins.pairs.numel(),
+            "pairs": lambda: int(self.bins.count),
             "pairs_walked": lambda: int(self._walk.walked.sum(dtype=torch.int64)),
             "blocks_walked": lambda: int(self._walk.blocks_walked.sum()),
             "blocks_used": self._blocks_used,
@@ -46,8 +85,14 @@ class Meta(dict):
         }
         if key not in counts:
             raise KeyError(key)
+        if key not in ("culled", "pairs_box", "pairs", "tiles"):
+            self._make_room()
         self[key] = counts[key]()
         return self[key]
+
+    def _make_room(self) -> None:
+        if int(self.bins.count) > self.bins.pairs.numel():
+            self.bins, self._walk = self._drawn.listed()
 
     def _culled(self) -> dict[str, int]:
         counts = torch.bincount(self._status.view(-1), minlength=len(STATUS_NAMES)).tolist()

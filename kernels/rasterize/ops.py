@@ -4,6 +4,8 @@ They hold no arithmetic: each calls the launchers of its file. ``function.py`` j
 operator takes tensors and plain numbers only, so each named tuple comes as a list of its values.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import List
 
 import torch
@@ -17,6 +19,7 @@ from .cpu import composite as composite_cpu
 from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
+from .cuda.reduce import reduce_rows
 from .project import LensOptions, Projected, make_lens, project_forward
 from .project_vjp import Cotangents, Gradients, Wanted, project_backward
 from .reduce import reduce_pairs
@@ -25,6 +28,9 @@ from .tiles import Bins, Limits, Picture, Size, Tiling, Walk, make_grid, make_pi
 
 _OP = "gamba_warp::rasterize_"
 MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
+
+
+_REDUCE = {composite_cpu: reduce_pairs, composite_cuda: reduce_rows}
 
 
 def _compositor(device: torch.device):
@@ -132,8 +138,12 @@ def bin_gaussians(
     alpha_min: float,
     skip: int,
     tile: int,
+    exact: bool = False,
 ) -> Bins:
-    """Makes the tile lists of all views; reads the number of pairs back (the one synchronisation).
+    """Makes the tile lists of all views; on CUDA without waiting for the number of pairs.
+
+    There the first call of a shape reads that number back, and later ones take the room that was
+    needed before: ``cuda/capacity.py``.
 
     Args:
         means2d: ``[I, N, 2]``, and so on as ``project_forward`` returns them, with I = B * V.
@@ -146,9 +156,12 @@ def bin_gaussians(
         alpha_min: what is fainter than this is not drawn.
         skip: from ``Skip.bits``.
         tile: side of a tile, pixels.
+        exact: lists as long as there are pairs; on CUDA the number is read back for that.
 
     Raises:
-        ValueError: there are more than 2^31 - 1 pairs, or more tiles.
+        ValueError: there are more than 2^31 - 1 pairs, or more tiles. On CUDA a number of pairs
+            that is not read back is not refused: the pictures are then made without lists.
+        RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
     """
     images, num = depths.shape
     tiling = Tiling(width, height, tile)
@@ -161,8 +174,11 @@ def bin_gaussians(
         view_opacities.view(-1),
         vectors(extents, wp.vec2),
     ]
-    bin_views = (bin_cpu if depths.device.type == "cpu" else bin_cuda).bin_views
-    return bin_views(grid, depths, inputs, _refuse_too_many)
+    return _bin_views(depths.device, exact)(grid, depths, inputs, _refuse_too_many)
+
+
+def _bin_views(device: torch.device, exact: bool) -> Callable[..., Bins]:
+    return bin_cpu.bin_views if device.type == "cpu" else partial(bin_cuda.bin_views, exact=exact)
 
 
 def _refuse_too_many(pairs: int) -> None:
@@ -186,18 +202,21 @@ def bin_op(
     alpha_min: float,
     skip: int,
     tuning: List[int],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    exact: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``bin_gaussians`` as an operator, with the numbers of a ``Tuning``, whose tile it takes.
 
-    The number of pairs is known only at run time.
+    The length of the lists is known only at run time.
     """
     per_view = means2d, conics, depths, view_opacities, extents
-    b = bin_gaussians(*per_view, width, height, alpha_min, skip, Tuning(*tuning).tile)
-    return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs
+    b = bin_gaussians(*per_view, width, height, alpha_min, skip, Tuning(*tuning).tile, exact)
+    return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs, b.count
 
 
 @bin_op.register_fake
-def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min, skip, tuning):
+def _(
+    means2d, conics, depths, opacity, extents, width, height, alpha_min, skip, tuning, exact=False
+):
     def ints(*shape):
         return depths.new_empty(shape, dtype=torch.int32)
 
@@ -211,6 +230,7 @@ def _(means2d, conics, depths, view_opacities, extents, width, height, alpha_min
             rows=ints(pairs),
             starts=ints(depths.shape[0] * tiling.count + 1),
             box_pairs=depths.new_empty((), dtype=torch.int64),
+            count=depths.new_empty((), dtype=torch.int64),
         )
     )
 
@@ -285,8 +305,8 @@ def _composite_vjp(
     v_alphas: Tensor,
     geometry: bool,
 ) -> List[Tensor]:
-    every = Bins(*bins)
-    v_pairs, written, skipped = _compositor(means2d.device).composite_backward(
+    every, compositor = Bins(*bins), _compositor(means2d.device)
+    v_pairs, written, skipped = compositor.composite_backward(
         means2d,
         conics,
         view_opacities,
@@ -299,7 +319,8 @@ def _composite_vjp(
         v_alphas,
         geometry,
     )
-    grads = reduce_pairs(v_pairs, written, every, conics, view_opacities, geometry)
+    reduce = _REDUCE[compositor]
+    grads = reduce(v_pairs, written, every, conics, view_opacities, geometry)
     return [skipped, *(g for g in grads if g is not None)]
 
 

@@ -26,6 +26,7 @@ def _quantile(
     height: wp.int32,
     tiles_x: wp.int32,
     tiles: wp.int32,
+    num: wp.int32,
     shift: wp.int32,
     transmittance: wp.float32,
     limit: wp.float32,
@@ -37,6 +38,9 @@ def _quantile(
     depths_in: wp.array[wp.float32],
     pairs_in: wp.array[wp.int32],
     starts_in: wp.array[wp.int32],
+    order_in: wp.array[wp.int32],
+    offsets_in: wp.array[wp.int32],
+    count_in: wp.array[wp.int64],
     depths_out: wp.array[wp.float32],
 ):
     pixel = offset + wp.tid()
@@ -48,8 +52,20 @@ def _quantile(
     depth = wp.float32(0.0)
     k = starts_in[tile]
     end = starts_in[tile + 1]
+    # where the pairs had no room, the list is that of all Gaussians of the view
+    listed = count_in[0] <= wp.int64(pairs_in.shape[0])
+    if not listed:
+        k = image * num
+        end = k + num
     while k < end:
-        g = pairs_in[k]
+        g = wp.int32(-1)
+        if listed:
+            g = pairs_in[k]
+        elif offsets_in[k] != offsets_in[k + 1]:
+            g = order_in[k]
+        if g < 0:
+            k += 1
+            continue
         conic = conics_in[g]
         dy = float(y) + 0.5 - means2d_in[g][1]
         dx = float(x) + 0.5 - means2d_in[g][0] + conic[1] * dy
@@ -95,7 +111,7 @@ def depth_quantile(
     cut, centers = meta.tiling, meta["depths"].detach()
     depths = centers.new_empty(*centers.shape[:-1], cut.height, cut.width, 1)
     limit = 2 * math.log(1 / alpha_min) + 1e-3  # where q is larger, no opacity reaches alpha_min
-    sizes = [cut.width, cut.height, cut.tiles_x, cut.count, cut.shift]
+    sizes = [cut.width, cut.height, cut.tiles_x, cut.count, centers.shape[-1], cut.shift]
     limits = [transmittance, limit, alpha_min, alpha_max]
     splats = [
         vectors(meta["means2d"].detach().contiguous(), wp.vec2),
@@ -103,6 +119,8 @@ def depth_quantile(
         meta["opacities"].detach().flatten(),
         centers.flatten(),
     ]
-    inputs = [*sizes, *limits, *splats, meta.bins.pairs, meta.bins.starts]
+    bins = meta.bins
+    lists = [bins.pairs, bins.starts, bins.order, bins.offsets, bins.count.view(1)]
+    inputs = [*sizes, *limits, *splats, *lists]
     launch(_quantile, depths.numel(), inputs, [depths.view(-1)], depths.device)
     return depths

@@ -57,7 +57,11 @@ class Tiling(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """The lists of tiles: P pairs of (tile, Gaussian) in I views; everything is int32.
+    """The lists of tiles: P pairs of (tile, Gaussian) in I views; int32 unless it is said.
+
+    On CUDA there may be room for more: ``count`` says how many pairs there are, and what follows
+    them belongs to no tile. If they are more than P, all lists are empty, and pictures are made of
+    ``order``, in which only Gaussians count that have pairs by ``offsets``. Then P >= I * N.
 
     Attributes:
         order: ``[I * N]`` view-major Gaussian indices, front to back within each view.
@@ -66,6 +70,7 @@ class Bins(NamedTuple):
         rows: ``[P]`` emission number of each pair, in tile order.
         starts: ``[I * tiles + 1]`` where each tile begins in ``pairs``.
         box_pairs: ``[]`` int64, number of pairs if tiles were tested against boxes only.
+        count: ``[]`` int64, number of pairs.
     """
 
     order: Tensor
@@ -74,6 +79,7 @@ class Bins(NamedTuple):
     rows: Tensor
     starts: Tensor
     box_pairs: Tensor
+    count: Tensor
 
 
 class Walk(NamedTuple):
@@ -83,7 +89,8 @@ class Walk(NamedTuple):
         transmittances: ``[blocks, 16]`` final T; negative where the pixel stopped early.
         stops: ``[blocks, 16]`` int32, the pair at which the pixel stopped.
         blocks: ``[P]`` int32, one bit for each block of the tile to which the pair contributed.
-        walked: ``[tiles]`` int32, pairs walked until every pixel had stopped.
+        walked: ``[tiles]`` int32, pairs walked until every pixel had stopped; on CUDA, where the
+            lists had no room, with a minus, and of all Gaussians of the view.
         blocks_walked: ``[tiles]`` int64, blocks evaluated for these pairs.
     """
 

@@ -140,9 +140,9 @@ def cuda_launch(
     wp.launch(kernel, dim, arguments, block_dim=block_dim, record_tape=False, **target)
 
 
-def launch(kernel: Any, dim: int, inputs, outputs, device: torch.device) -> None:
+def launch(kernel: Any, dim: int | Sequence[int], inputs, outputs, device: torch.device) -> None:
     """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing."""
-    if dim == 0:
+    if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
     if device.type == "cpu":
         parallel_launch(kernel, dim, inputs, outputs)

@@ -1,7 +1,9 @@
-"""A kernel of no operator, and the inputs of the convolution."""
+"""A kernel of no operator, the inputs of the convolution, a watch over torch's operators."""
 
 import torch
 import warp as wp
+from torch._library.custom_ops import OPDEFS
+from torch.utils._python_dispatch import TorchDispatchMode
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -18,3 +20,54 @@ def conv_inputs(batch, length, channels, width, dtype=torch.float32):
         "bias": torch.randn(channels),
         "initial_state": torch.randn(batch, width - 1, channels).to(dtype),
     }
+
+
+# Operators that wait for the GPU, or make a tensor on the host.
+WAITS = {
+    "aten::item", "aten::_local_scalar_dense", "aten::nonzero", "aten::is_nonzero", "aten::equal",
+    "aten::masked_select", "aten::_unique2", "aten::unique_dim", "aten::bincount",
+    "aten::linalg_inv_ex", "aten::_linalg_check_errors", "aten::linalg_solve_ex",
+    "aten::lift_fresh", "aten::repeat_interleave.Tensor",
+}  # fmt: skip
+INDEXING = {"aten::index.Tensor", "aten::index_put", "aten::index_put_"}
+
+
+class Watch(TorchDispatchMode):
+    """Notes operators that no CUDA graph can hold, inside our own operators too.
+
+    Tensors on the CPU show what reads numbers back; those of a dry run show copies between the
+    devices as well.
+
+    Attributes:
+        found: what was noted.
+        names: of all operators.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.found, self.names = [], set()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        body = OPDEFS.get(function.name()) if function.namespace == "gamba_warp" else None
+        if body is not None:
+            self.names.add(function.name())
+            with self:
+                return body._init_fn(*args, **(kwargs or {}))
+        name = function.name()
+        self.names.add(name)
+        if name in WAITS:
+            self.found.append(name)
+        out = function(*args, **(kwargs or {}))
+        leaves = torch.utils._pytree.tree_leaves((args, kwargs, out))
+        tensors = [x for x in leaves if isinstance(x, torch.Tensor)]
+        if name in INDEXING and any(x.dtype == torch.bool for x in tensors[1:-1]):
+            self.found.append(f"{name} by a mask")
+        devices = {x.device.type for x in tensors if x.dim()}
+        if len(devices) > 1 and not self._later(name, args, kwargs or {}):
+            self.found.append(f"{name} between {sorted(devices)}")
+        return out
+
+    @staticmethod
+    def _later(name, args, kwargs):
+        """Whether it is a copy that the host does not wait for."""
+        return name == "aten::copy_" and (kwargs.get("non_blocking") or args[2:3] == (True,))

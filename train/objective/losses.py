@@ -149,12 +149,11 @@ def _box(unequal: Tensor) -> tuple[slice, slice] | None:
 
 def _band(like: Tensor) -> Tensor:
     """SSIM's Gaussian window as the band of a matrix: ``[_TILE + 10, _TILE]``."""
-    places = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
-    weights = torch.exp(-places.square() / (2 * SSIM_SIGMA**2))
-    band = torch.zeros(_TILE + SSIM_WINDOW - 1, _TILE, dtype=torch.float64)
-    for column in range(_TILE):
-        band[column : column + SSIM_WINDOW, column] = weights / weights.sum()
-    return band.to(like)
+    rows = torch.arange(_TILE + SSIM_WINDOW - 1, device=like.device)  # no copy from the host
+    places = (rows[:, None] - rows[:_TILE]).double()
+    weights = torch.exp(-(places - SSIM_WINDOW // 2).square() / (2 * SSIM_SIGMA**2))
+    weights = torch.where((places >= 0) & (places < SSIM_WINDOW), weights, 0.0)
+    return (weights / weights[:SSIM_WINDOW, 0].sum()).to(like.dtype)
 
 
 def _window_means(maps: Tensor, band: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -
     count = math.ceil(math.hypot(width, height) / 2 / _STEP) + 3  # the last samples lie outside
     radii = torch.arange(count, device=masks.device) * _STEP
     directions = torch.stack([angles.cos(), angles.sin()], -1)
-    size = masks.new_tensor([width, height], dtype=torch.float32)
+    size = _pair(width, height, angles)
     grid = directions[:, None] * radii[:, None] * 2 / size  # from the centre, in [-1, 1]
     flat = masks.reshape(1, -1, height, width).float()
     samples = torch.nn.functional.grid_sample(flat, grid[None], align_corners=False)[0]
@@ -51,6 +51,11 @@ def contour_distances(masks: Tensor, rays: int = RAYS, threshold: float = 0.5) -
     crossing = last + (before - threshold) / (before - after).clamp_min(1e-6)
     distances = torch.where(inside.any(-1, keepdim=True), crossing, 0.0)[..., 0] * _STEP
     return (distances / (height / 2)).reshape(*masks.shape[:-2], rays)
+
+
+def _pair(x: float, y: float, like: Tensor) -> Tensor:
+    """Two numbers as a tensor; a GPU fills it in, where a copy of a list would be waited for."""
+    return torch.stack([like.new_full((), x), like.new_full((), y)])
 
 
 def project_means(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
@@ -91,11 +96,11 @@ def radial_mask_loss(means: Tensor, cameras: Cameras, contours: Tensor) -> Tenso
         ``[.., V]``, in squared half image heights.
     """
     positions, depths = project_means(means, cameras)
-    centre = positions.new_tensor([cameras.width / 2, cameras.height / 2])
+    centre = _pair(cameras.width / 2, cameras.height / 2, positions)
     offsets = (positions - centre) / (cameras.height / 2)
     # Square root and angle have no gradient at 0, where the loss is 0 in any case.
     usable = (depths > NEAR) & (offsets.square().sum(-1) > 1e-12)
-    offsets = torch.where(usable[..., None], offsets, offsets.new_tensor([1.0, 0.0]))
+    offsets = torch.where(usable[..., None], offsets, _pair(1.0, 0.0, offsets))
     x, y = offsets.unbind(-1)
     distances = (x * x + y * y).sqrt()
 

@@ -122,6 +122,7 @@ def _bins(pairs: Tensor, counts: Tensor, rows: int) -> Bins:
         rows=number.int(),
         starts=F.pad(counts.cumsum(0), (1, 0)).int(),
         box_pairs=counts.sum(),
+        count=counts.sum(),
     )
 
 

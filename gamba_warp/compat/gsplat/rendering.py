@@ -138,7 +138,8 @@ def _rasterize(a: SimpleNamespace, lead: tuple[int, ...]) -> tuple[Tensor, Tenso
     tuning = tuning_for(a.means.device.type)
     tiling = Tiling(a.width, a.height, tuning.tile)
     per_view = [x.detach().flatten(0, 1).contiguous() for x in splats[:5]]
-    bins = Bins(*bin_op(*per_view, a.width, a.height, ALPHA_MIN, SKIP, tuning.numbers()))
+    picture = a.width, a.height, ALPHA_MIN, SKIP
+    bins = Bins(*bin_op(*per_view, *picture, tuning.numbers(), True))  # its meta shows them
     keep = _keeper(meta["means2d"], meta.pop("_packing")) if a.absgrad else None
     meta.pop("_packing", None)
     renders, alphas = _blended(splats, channels, bins, tiling, tuning, keep)

@@ -79,6 +79,9 @@ def run_backward(outputs: Sequence[Tensor]) -> None:
     def give(node, index: int, gradient: Tensor | None) -> None:
         if node is None or gradient is None:
             return
+        wanted = node._input_metadata[index].shape
+        if gradient.shape != wanted:  # the engine undoes what broadcasting did
+            gradient = gradient.sum_to_size(wanted)
         waiting = pending.setdefault(node, [None] * len(node._input_metadata))
         waiting[index] = gradient if waiting[index] is None else waiting[index] + gradient
 

@@ -283,7 +283,7 @@ def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], N
     pairs, rows = order.new_empty(total), order.new_empty(total)
     if total:
         parallel_launch(_emit, tasks, [*inputs, offsets], [cursors, pairs, rows], pieces=tasks)
-    return Bins(order, offsets, pairs, rows, starts, box_pairs=box_counts.sum())
+    return Bins(order, offsets, pairs, rows, starts, box_counts.sum(), torch.tensor(total))
 
 
 def _sorted_and_recorded(

@@ -1,4 +1,9 @@
-"""The CUDA compositor's gradient kernel: back to front over the pairs of a tile (README §5)."""
+"""The CUDA compositor's gradient kernels: back to front over the pairs of a tile (README §5).
+
+``composite_vjp`` leaves a row of sums for each pair. ``composite_vjp_unlisted`` does nothing unless
+the lists had no room for all pairs; then a warp walks all tiles of its view, one after the other,
+and adds their sums in rows of Gaussians: in the order in which ``reduce.py`` adds up rows of pairs.
+"""
 
 import functools
 from typing import no_type_check
@@ -7,9 +12,9 @@ import warp as wp
 
 from ..skip import UNUSED, ZERO_UPSTREAM
 from ..tiles import Picture
+from .complete import completing, shared_size
 from .warp import (
     HEIGHT,
-    PITCH,
     RECORD,
     STOP,
     SUB_TILES,
@@ -20,6 +25,9 @@ from .warp import (
     exponent,
     first_block,
     load,
+    load1,
+    load2,
+    load3,
     load_int,
     load_stop,
     lowest_bit,
@@ -28,7 +36,7 @@ from .warp import (
     shared_memory,
     sheared,
     staging,
-    store,
+    touching,
 )
 
 _BLOCKS = (1 << STOP) - 1
@@ -36,28 +44,31 @@ _ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
 _UNUSED = wp.constant(UNUSED)
 
 
-@functools.cache
-def backward_kernel(channels: int, geometry: bool, parts: int):
-    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
+def _resident(channels: int) -> int:
+    """Warps of a multiprocessor, as registers allow."""
+    return 20 if channels < 4 else 16
 
-    Without ``geometry`` it is for colours alone. Each part has a row of its own for a pair.
+
+@functools.cache
+def _walking(channels: int, geometry: bool, parts: int, listed: bool):
+    """The function that walks a part of a tile, whose pairs are numbered from ``begin`` on.
+
+    Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
+    its pairs; what a tile's own test rules out is taken away from these.
     """
     moments = 6 if geometry else 0
-    values = moments + channels  # how many sums a pair has
-    slots = WARP // values  # pairs whose sums are completed at once, with a lane for each sum
-    rows_at = WARP * RECORD
-    sums_at = rows_at + WARP
-    size = sums_at + slots * values * PITCH
+    values = moments + channels
+    size = shared_size(channels, geometry)
     memory = shared_memory(size)
     arena_type = memory.arena
-    place, stage = placing(parts), staging(channels, size)
+    slots, leave, complete = completing(channels, geometry, listed)
+    place, touched, stage = placing(parts), touching(parts), staging(channels, size)
     pixels = SUB_TILES // parts  # how many a lane has
     part_blocks = (1 << 16 // parts) - 1
     part_stops = (1 << pixels) - 1
     pixels_type = wp.types.vector(pixels, wp.float32)
     values_type = wp.types.vector(values, wp.float32)
     upstream_type = wp.types.matrix((pixels, channels), wp.float32)
-    resident = 20 if channels < 4 else 16  # warps of a multiprocessor, as registers allow
 
     @wp.func
     def of_part(bits: wp.int32, part: wp.int32, wanted: wp.int32) -> wp.int32:
@@ -67,47 +78,49 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         return blocks & wanted | stops << STOP
 
     @wp.func
-    def leave(arena: arena_type, lane: wp.int32, slot: wp.int32, row: wp.int32, sums: values_type):
-        # stores a lane's sums of a pair, to be completed together with those of other pairs
-        at = wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
-        for v in range(wp.static(values)):
-            memory.put(arena, at + wp.static(v * PITCH), sums[v])
-        memory.put_int(arena, wp.static(rows_at) + slot, row)
+    def row_of(rows: wp.array[wp.int32], k: wp.int32) -> wp.int32:
+        row = k
+        if wp.static(listed):
+            row = load_int(rows, k)
+        return row
 
     @wp.func
-    def complete(
-        arena: arena_type,
-        gaussians: Gaussians,
-        lane: wp.int32,
-        count: wp.int32,
-        v_pairs: wp.array2d[wp.float32],
-    ):
-        # each lane adds up one value of one of the stored pairs, over the 32 lanes
-        if lane < count * wp.static(values):
-            at = wp.static(sums_at) + lane * PITCH
-            total = memory.get4(arena, at)
-            for i in range(1, wp.static(WARP // 4)):
-                total += memory.get4(arena, at + 4 * i)
-            value = (total[0] + total[1]) + (total[2] + total[3])
-            row = wp.int64(memory.get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
-            row *= wp.int64(gaussians.channels + 6)
-            column = lane % wp.static(values)
-            if column >= wp.static(moments):
-                column += wp.static(6 - moments) + gaussians.first
-            elif gaussians.first > 0:
-                value += load(v_pairs, row, column)
-            store(v_pairs, row, column, value)
-
-    @wp.kernel(
-        enable_backward=False, module="unique", launch_bounds=(WARP, resident), grid_stride=False
-    )
-    @no_type_check
-    def composite_vjp(
+    def of_tile(
         picture: Picture,
         gaussians: Gaussians,
+        corner: wp.vec2,
+        pairs: wp.array[wp.int32],
+        offsets: wp.array[wp.int32],
+        k: wp.int32,
+        bits: wp.int32,
+    ):
+        # of a pair's bits, which are those of all tiles together, what this tile's test leaves
+        left = wp.int32(0)
+        if load_int(offsets, k) != load_int(offsets, k + 1):
+            g = load_int(pairs, k)
+            mask = touched(
+                corner,
+                load2(gaussians.means2d, g),
+                load3(gaussians.conics, g),
+                load1(gaussians.opacities, g),
+                picture.alpha_min,
+            )
+            for j in range(wp.static(pixels)):
+                if (mask & wp.static(1 << j)) != 0:
+                    left |= bits & wp.static(3 << first_block(j) | 1 << (STOP + j))
+        return left
+
+    @wp.func
+    @no_type_check
+    def walk(
+        picture: Picture,
+        gaussians: Gaussians,
+        arena: arena_type,
+        index: wp.int32,
+        lane: wp.int32,
+        begin: wp.int32,
         pairs_in: wp.array[wp.int32],
         rows_in: wp.array[wp.int32],
-        starts_in: wp.array[wp.int32],
         transmittances_in: wp.array2d[wp.float32],
         stops_in: wp.array2d[wp.int32],
         blocks_in: wp.array[wp.int32],
@@ -117,8 +130,6 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         v_pairs_out: wp.array2d[wp.float32],
         skipped_out: wp.array[wp.int32],
     ):
-        index, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
         p = place(picture, index, lane)
         # as forward left it: negative until the walk comes to where the pixel stopped
         T = pixels_type()
@@ -127,7 +138,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         upstream = upstream_type()
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
         some = wp.int32(0)
-        walked = walked_in[p.tile]
+        walked = walked_in[p.tile] * wp.static(1 if listed else -1)
         for j in range(wp.static(pixels)):
             if walked > 0:
                 T[j] = load(transmittances_in, p.place, j * WARP)
@@ -152,7 +163,6 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         if walked > 0 and lane == 0:
             skipped_out[p.tile] = 0
 
-        begin = starts_in[p.tile]
         waiting = wp.int32(0)
         for done in range(0, walked, WARP):
             k = begin + walked - 1 - done - lane
@@ -161,10 +171,11 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
                 bits = of_part(load_int(blocks_in, k), p.part, wanted)
                 if (picture.skip & _UNUSED) == 0:
                     bits |= wanted
+                if wp.static(not listed):
+                    bits = of_tile(picture, gaussians, p.corner, pairs_in, rows_in, k, bits)
                 if bits != 0:
-                    g = load_int(pairs_in, k)
-                    row = load_int(rows_in, k) * wp.static(parts) + p.part
-                    stage(arena, picture, gaussians, lane, g, bits, row)
+                    row = row_of(rows_in, k) * wp.static(parts) + p.part
+                    stage(arena, picture, gaussians, lane, load_int(pairs_in, k), bits, row)
             todo = memory.ballot(arena, lane, bits)
             memory.sync()
             while todo != 0:
@@ -221,4 +232,118 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
         memory.sync()
         complete(arena, gaussians, lane, waiting, v_pairs_out)
 
+    return walk
+
+
+@functools.cache
+def backward_kernel(channels: int, geometry: bool, parts: int):
+    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
+
+    Without ``geometry`` it is for colours alone. Each part has a row of its own for a pair.
+    """
+    size, walk = shared_size(channels, geometry), _walking(channels, geometry, parts, True)
+
+    @wp.kernel(
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(WARP, _resident(channels)),
+        grid_stride=False,
+    )
+    @no_type_check
+    def composite_vjp(
+        picture: Picture,
+        gaussians: Gaussians,
+        pairs_in: wp.array[wp.int32],
+        rows_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        transmittances_in: wp.array2d[wp.float32],
+        stops_in: wp.array2d[wp.int32],
+        blocks_in: wp.array[wp.int32],
+        walked_in: wp.array[wp.int32],
+        v_renders_in: wp.array2d[wp.float32],
+        v_alphas_in: wp.array2d[wp.float32],
+        v_pairs_out: wp.array2d[wp.float32],
+        skipped_out: wp.array[wp.int32],
+    ):
+        index, lane = wp.tid()
+        arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
+        walk(
+            picture,
+            gaussians,
+            arena,
+            index,
+            lane,
+            starts_in[index // wp.static(parts)],
+            pairs_in,
+            rows_in,
+            transmittances_in,
+            stops_in,
+            blocks_in,
+            walked_in,
+            v_renders_in,
+            v_alphas_in,
+            v_pairs_out,
+            skipped_out,
+        )
+
     return composite_vjp
+
+
+@functools.cache
+def unlisted_kernel(channels: int, geometry: bool, parts: int):
+    """The kernel that makes the sums where ``count_in`` pairs have no room in ``blocks_in``.
+
+    A warp has a part of each tile of a view. A row is of a Gaussian's number in ``order_in``.
+    """
+    size, walk = shared_size(channels, geometry), _walking(channels, geometry, parts, False)
+
+    @wp.kernel(
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(WARP, _resident(channels)),
+        grid_stride=False,
+    )
+    @no_type_check
+    def composite_vjp_unlisted(
+        picture: Picture,
+        gaussians: Gaussians,
+        order_in: wp.array[wp.int32],
+        offsets_in: wp.array[wp.int32],
+        count_in: wp.array[wp.int64],
+        transmittances_in: wp.array2d[wp.float32],
+        stops_in: wp.array2d[wp.int32],
+        blocks_in: wp.array[wp.int32],
+        walked_in: wp.array[wp.int32],
+        v_renders_in: wp.array2d[wp.float32],
+        v_alphas_in: wp.array2d[wp.float32],
+        v_pairs_out: wp.array2d[wp.float32],
+        skipped_out: wp.array[wp.int32],
+    ):
+        worker, lane = wp.tid()
+        arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
+        image = worker // wp.static(parts)
+        tiles = picture.tiles_x * picture.tiles_y
+        if count_in[0] <= wp.int64(blocks_in.shape[0]):
+            tiles = 0
+        for tile in range(tiles):
+            tile += image * picture.tiles_x * picture.tiles_y
+            walk(
+                picture,
+                gaussians,
+                arena,
+                tile * wp.static(parts) + worker % wp.static(parts),
+                lane,
+                image * picture.num,
+                order_in,
+                offsets_in,
+                transmittances_in,
+                stops_in,
+                blocks_in,
+                walked_in,
+                v_renders_in,
+                v_alphas_in,
+                v_pairs_out,
+                skipped_out,
+            )
+
+    return composite_vjp_unlisted

@@ -1,4 +1,9 @@
-"""Tile lists on CUDA: a sort by depth, then counting, writing, and a stable sort by tile."""
+"""Tile lists on CUDA: a sort by depth, then counting, writing, and a stable sort by tile.
+
+The lists have room for more pairs than there are, so that nothing waits for the count; what is left
+over sorts behind the last tile. Where the pairs have no room, none is written and all lists are
+empty: then ``composite_unlisted`` makes the pictures.
+"""
 
 from collections.abc import Callable
 from typing import no_type_check
@@ -8,7 +13,9 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
+from ..skip import TILE_TEST
 from ..tiles import Bins, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
+from . import capacity
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,6 +61,7 @@ def _emit(
     view_opacities_in: wp.array[wp.float32],
     extents_in: wp.array[wp.vec2],
     offsets_in: wp.array[wp.int32],
+    count_in: wp.array[wp.int64],
     tiles_out: wp.array[wp.int32],
     gaussians_out: wp.array[wp.int32],
 ):
@@ -61,7 +69,7 @@ def _emit(
     i = order_in[j]
     p = offsets_in[j]
     extent = extents_in[i]
-    if extent[0] > 0.0:
+    if extent[0] > 0.0 and count_in[0] <= wp.int64(tiles_out.shape[0]):
         limit = q_limit(view_opacities_in[i], grid.alpha_min)
         ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
         rows = tile_rows(grid, ellipse.mean[1], extent[1])
@@ -74,8 +82,18 @@ def _emit(
                 p += 1
 
 
-def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None]) -> Bins:
-    """As ``bin_views`` of the CPU."""
+def bin_views(
+    grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None], exact: bool = False
+) -> Bins:
+    """As ``bin_views`` of the CPU, but the lists may have room for more pairs than there are.
+
+    Args:
+        grid: as there, like ``depths``, ``inputs`` and ``check``.
+        depths: see above.
+        inputs: see above.
+        check: see above; it is not called where the count is not read back.
+        exact: read the number of pairs back and make the lists as long.
+    """
     device, (images, num) = depths.device, depths.shape
     # stable: equal depths stay in the order of the Gaussians
     order = torch.argsort(depths, dim=1, stable=True)
@@ -85,17 +103,44 @@ def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], N
     box_counts = torch.empty_like(order, dtype=torch.int64)
     launch(_count, order.numel(), [grid, order, *inputs], [counts, box_counts], device)
     offsets = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0))
-    total = int(offsets[-1])
-    check(total)
-    offsets = offsets.int()
-    tile_of, gaussians = order.new_empty(2, total)
-    if total:
-        outputs = [tile_of, gaussians]
-        launch(_emit, order.numel(), [grid, order, *inputs, offsets], outputs, device)
+    count, offsets = offsets[-1].clone(), offsets.int()
+    room = _room(grid, depths, count, check, exact)
     tiles = images * grid.tiles_x * grid.tiles_y
+    # what stays free has the number behind the last tile's, so that it comes last
+    tile_of, gaussians = order.new_full((room,), tiles), order.new_zeros(room)
+    inputs = [grid, order, *inputs, offsets, count.view(1)]
+    launch(_emit, order.numel() if room else 0, inputs, [tile_of, gaussians], device)
     sorted_tiles, rows = torch.sort(tile_of, stable=True)
     # not bincount: on CUDA it reads the largest value back
     firsts = torch.arange(tiles + 1, dtype=torch.int32, device=device)
     starts = torch.searchsorted(sorted_tiles, firsts, out_int32=True)
     pairs, rows = gaussians[rows], rows.int()
-    return Bins(order, offsets, pairs, rows, starts, box_pairs=box_counts.sum())
+    return Bins(order, offsets, pairs, rows, starts, box_pairs=box_counts.sum(), count=count)
+
+
+def _room(
+    grid: Grid, depths: Tensor, count: Tensor, check: Callable[[int], None], exact: bool
+) -> int:
+    """The room of the lists; without a wait, unless they are ``exact`` or nothing is known yet."""
+    device, (images, num) = depths.device, depths.shape
+    # calls with about as many Gaussians share their room: some models give another number each time
+    shape = images, capacity.in_steps(num), grid.width, grid.height, grid.shift
+    key = (*shape, grid.skip & TILE_TEST)
+    room = None if exact else capacity.find(key, device)
+    capturing = capacity.is_capturing(device)
+    if room is None:
+        if capturing:
+            raise RuntimeError(
+                "a CUDA graph cannot begin with shapes that were never rendered: run the same "
+                "call once before the capture, as torch asks for all that it captures"
+            )
+        total = int(count)
+        check(total)
+        if exact:
+            return total
+        room = capacity.remember(key, device, total)
+    size = max(room.capacity, depths.numel())
+    if capturing:
+        capacity.captured(room, size)
+    capacity.tell(room, count.view(1))
+    return size

@@ -1,9 +1,12 @@
 """Compositing on CUDA: launches of one warp per tile of 16 x 16 pixels, or per part of one.
 
-Channels go in chunks of at most four: a chunk is a launch, and the geometry's gradients of chunks
-add up. Sums are written per pair and reduced by Gaussian afterwards: no atomics. README.md §3 and
-§5 hold the maths, CUDA.md the design.
+Channels go in chunks of at most four: a chunk is a launch, and has its own sums for the geometry's
+gradient. Sums are written per pair and reduced by Gaussian afterwards: no atomics. A second launch
+of each makes what the lists had no room for, and else ends at once. README.md §3 and §5 hold the
+maths, CUDA.md the design.
 """
+
+from typing import Any
 
 import torch
 import warp as wp
@@ -13,8 +16,8 @@ from ...runtime.launch import cuda_launch
 from ...runtime.recording import multiprocessors_of
 from ...runtime.views import array
 from ..tiles import Bins, Picture, Walk
-from .backward import backward_kernel
-from .forward import forward_kernel
+from . import backward, forward
+from .complete import row_length
 from .warp import CHUNK, WARP, Gaussians
 
 
@@ -72,24 +75,23 @@ def composite_forward(
         walked=bins.pairs.new_zeros(tiles),
         blocks_walked=bins.pairs.new_zeros(tiles, dtype=torch.int64),
     )
+    outputs = [
+        walk.transmittances,
+        walk.stops,
+        walk.blocks,
+        walk.walked,
+        walk.blocks_walked,
+        renders.view(-1, channels),
+        alphas.view(-1, 1),
+    ]
+    unlisted = [bins.order, bins.offsets, bins.count.view(1)]
     for first in range(0, channels if tiles else 0, CHUNK):
-        gaussians.first = first
-        cuda_launch(
-            forward_kernel(min(CHUNK, channels - first), parts),
-            (tiles * parts, WARP),
-            [picture, gaussians, bins.pairs, bins.starts],
-            [
-                walk.transmittances,
-                walk.stops,
-                walk.blocks,
-                walk.walked,
-                walk.blocks_walked,
-                renders.view(-1, channels),
-                alphas.view(-1, 1),
-            ],
-            device=colors.device,
-            block_dim=WARP,
-        )
+        gaussians.first, here = first, min(CHUNK, channels - first)
+        for kernel, lists in (
+            (forward.forward_kernel(here, parts), [bins.pairs, bins.starts]),
+            (forward.unlisted_kernel(here, parts), unlisted),
+        ):
+            _launch(kernel, tiles * parts, [picture, gaussians, *lists], outputs, colors.device)
     return renders, alphas, walk
 
 
@@ -106,32 +108,40 @@ def composite_backward(
     v_alphas: Tensor,
     geometry: bool,
 ) -> tuple[Tensor, None, Tensor]:
-    """As ``composite_backward`` of the CPU; all rows are written."""
+    """As ``composite_backward`` of the CPU; the rows are those of ``reduce_rows``, all written."""
     tiles, channels = walk.walked.numel(), colors.shape[1]
     gaussians = _gaussians(means2d, conics, view_opacities, colors)
     parts = parts_of_tile(tiles, colors.device)
-    v_pairs = colors.new_zeros(bins.pairs.numel(), parts, 6 + channels)
+    v_pairs = colors.new_zeros(bins.pairs.numel(), parts, row_length(channels))
     skipped = torch.ones_like(walk.walked)
+    inputs = [
+        walk.transmittances,
+        walk.stops,
+        walk.blocks,
+        walk.walked,
+        v_renders.view(-1, channels),
+        v_alphas.view(-1, 1),
+    ]
+    outputs = [v_pairs.flatten(0, 1), skipped]
+    unlisted = [bins.order, bins.offsets, bins.count.view(1)]
     for first in range(0, channels if tiles else 0, CHUNK):
-        gaussians.first = first
-        cuda_launch(
-            backward_kernel(min(CHUNK, channels - first), geometry, parts),
-            (tiles * parts, WARP),
-            [
-                picture,
-                gaussians,
-                bins.pairs,
-                bins.rows,
-                bins.starts,
-                walk.transmittances,
-                walk.stops,
-                walk.blocks,
-                walk.walked,
-                v_renders.view(-1, channels),
-                v_alphas.view(-1, 1),
-            ],
-            [v_pairs.view(-1, 6 + channels), skipped],
-            device=colors.device,
-            block_dim=WARP,
-        )
-    return v_pairs[:, 0] if parts == 1 else v_pairs.sum(1), None, skipped
+        gaussians.first, here = first, min(CHUNK, channels - first)
+        for kernel, warps, lists in (
+            (
+                backward.backward_kernel(here, geometry, parts),
+                tiles * parts,
+                [bins.pairs, bins.rows, bins.starts],
+            ),
+            (
+                backward.unlisted_kernel(here, geometry, parts),
+                means2d.shape[0] * parts,
+                unlisted,
+            ),
+        ):
+            arguments = [picture, gaussians, *lists, *inputs]
+            _launch(kernel, warps, arguments, outputs, colors.device)
+    return v_pairs, None, skipped
+
+
+def _launch(kernel: Any, warps: int, inputs: list, outputs: list, device: torch.device) -> None:
+    cuda_launch(kernel, (warps, WARP), inputs, outputs, device=device, block_dim=WARP)

@@ -1,4 +1,8 @@
-"""The CUDA compositor's forward kernel: front to back over the pairs of a tile (README §3)."""
+"""The CUDA compositor's forward kernels: front to back over the pairs of a tile (README §3).
+
+``composite`` walks the lists of the tiles. ``composite_unlisted`` does nothing unless these had no
+room for all pairs; then it walks all Gaussians of the view for each tile, in the same order.
+"""
 
 import functools
 from typing import no_type_check
@@ -41,25 +45,50 @@ _BLOCK_TEST = wp.constant(BLOCK_TEST)
 _STOPPED = wp.constant(STOPPED)
 
 
+def _resident(channels: int) -> int:
+    """Warps of a multiprocessor, as registers allow."""
+    return 24 if channels < 4 else 20
+
+
 @functools.cache
-def forward_kernel(channels: int, parts: int):
-    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4."""
+def _walking(channels: int, parts: int, listed: bool):
+    """The function that walks the pairs numbered ``begin`` to ``end`` for a tile's part.
+
+    Unless ``listed``, the tiles of a view share one list of all its Gaussians, in which ``offsets``
+    says where the pairs of each would begin, if there were room. Bits of tiles are then joined, and
+    numbers of walked pairs are stored with a minus, so that the gradient knows them.
+    """
     memory = shared_memory(_SIZE)
+    arena_type = memory.arena
     place, touched, stage = placing(parts), touching(parts), staging(channels, _SIZE)
     pixels = SUB_TILES // parts  # how many a lane has
     pixels_type = wp.types.vector(pixels, wp.float32)
     sums_type = wp.types.matrix((pixels, channels), wp.float32)
-    resident = 24 if channels < 4 else 20  # warps of a multiprocessor, as registers allow
 
-    @wp.kernel(
-        enable_backward=False, module="unique", launch_bounds=(WARP, resident), grid_stride=False
-    )
+    @wp.func
+    def leave(blocks: wp.array[wp.int32], k: wp.int32, part: wp.int32, mine: wp.int32):
+        # stores the bits of a pair, or joins those of the parts, or of the tiles that share it
+        if wp.static(parts == 1 and listed):
+            store_int(blocks, k, mine)
+        elif mine != 0:
+            shift_used = part * wp.static(16 // parts)
+            shift_stop = part * wp.static(pixels)
+            shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
+            shifted |= (mine & wp.static(~((1 << STOP) - 1))) << shift_stop
+            wp.atomic_or(blocks, k, shifted)
+
+    @wp.func
     @no_type_check
-    def composite(
+    def walk(
         picture: Picture,
         gaussians: Gaussians,
+        arena: arena_type,
+        index: wp.int32,
+        lane: wp.int32,
+        begin: wp.int32,
+        end: wp.int32,
         pairs_in: wp.array[wp.int32],
-        starts_in: wp.array[wp.int32],
+        offsets_in: wp.array[wp.int32],
         transmittances_out: wp.array2d[wp.float32],
         stops_out: wp.array2d[wp.int32],
         blocks_out: wp.array[wp.int32],
@@ -68,8 +97,6 @@ def forward_kernel(channels: int, parts: int):
         renders_out: wp.array2d[wp.float32],
         alphas_out: wp.array2d[wp.float32],
     ):
-        index, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
         p = place(picture, index, lane)
         half = lane // 4 % 2  # which of a sub-tile's two blocks of 4 x 4 pixels
         # positive: the pixel goes on; negative: it stopped; 0: it is outside the picture
@@ -82,8 +109,6 @@ def forward_kernel(channels: int, parts: int):
                 inside |= 1 << j
         live = memory.any_of(arena, lane, inside)
 
-        begin = starts_in[p.tile]
-        end = starts_in[p.tile + 1]
         walked = end - begin
         evaluated = wp.int32(0)
         for k0 in range(begin, end, WARP):
@@ -92,7 +117,11 @@ def forward_kernel(channels: int, parts: int):
             # each lane looks at one of the next 32 Gaussians
             k = k0 + lane
             mask = wp.int32(0)
-            if k < end:
+            seen = k < end
+            if wp.static(not listed):
+                if seen:
+                    seen = load_int(offsets_in, k) != load_int(offsets_in, k + 1)
+            if seen:
                 g = load_int(pairs_in, k)
                 mask = live & touched(
                     p.corner,
@@ -150,18 +179,14 @@ def forward_kernel(channels: int, parts: int):
                     if live == 0:
                         walked = k0 + i - begin + 1
             if k < end:
-                if wp.static(parts == 1):
-                    store_int(blocks_out, k, mine)
-                elif mine != 0:
-                    shift_used = p.part * wp.static(16 // parts)
-                    shift_stop = p.part * wp.static(pixels)
-                    shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
-                    shifted |= (mine & wp.static(~((1 << STOP) - 1))) << shift_stop
-                    wp.atomic_or(blocks_out, k, shifted)
+                leave(blocks_out, k, p.part, mine)
             memory.sync()
 
         if lane == 0:
-            wp.atomic_max(walked_out, p.tile, walked)
+            if wp.static(listed):
+                wp.atomic_max(walked_out, p.tile, walked)
+            else:
+                wp.atomic_min(walked_out, p.tile, -walked)
         if lane == 0 and gaussians.first == 0:
             wp.atomic_add(blocks_walked_out, p.tile, wp.int64(evaluated))
         p = place(picture, anew(index), lane)
@@ -175,4 +200,109 @@ def forward_kernel(channels: int, parts: int):
                 for c in range(wp.static(channels)):
                     store(renders_out, first, step + c, sums[j, c])
 
+    return walk
+
+
+@functools.cache
+def forward_kernel(channels: int, parts: int):
+    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4."""
+    walk = _walking(channels, parts, True)
+
+    @wp.kernel(
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(WARP, _resident(channels)),
+        grid_stride=False,
+    )
+    @no_type_check
+    def composite(
+        picture: Picture,
+        gaussians: Gaussians,
+        pairs_in: wp.array[wp.int32],
+        starts_in: wp.array[wp.int32],
+        transmittances_out: wp.array2d[wp.float32],
+        stops_out: wp.array2d[wp.int32],
+        blocks_out: wp.array[wp.int32],
+        walked_out: wp.array[wp.int32],
+        blocks_walked_out: wp.array[wp.int64],
+        renders_out: wp.array2d[wp.float32],
+        alphas_out: wp.array2d[wp.float32],
+    ):
+        index, lane = wp.tid()
+        arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
+        tile = index // wp.static(parts)
+        walk(
+            picture,
+            gaussians,
+            arena,
+            index,
+            lane,
+            starts_in[tile],
+            starts_in[tile + 1],
+            pairs_in,
+            starts_in,
+            transmittances_out,
+            stops_out,
+            blocks_out,
+            walked_out,
+            blocks_walked_out,
+            renders_out,
+            alphas_out,
+        )
+
     return composite
+
+
+@functools.cache
+def unlisted_kernel(channels: int, parts: int):
+    """The kernel that makes the pictures where ``count_in`` pairs have no room in ``blocks_out``.
+
+    Each tile walks ``order_in``, all Gaussians of its view; see ``Bins`` for the lists.
+    """
+    walk = _walking(channels, parts, False)
+
+    @wp.kernel(
+        enable_backward=False,
+        module="unique",
+        launch_bounds=(WARP, _resident(channels)),
+        grid_stride=False,
+    )
+    @no_type_check
+    def composite_unlisted(
+        picture: Picture,
+        gaussians: Gaussians,
+        order_in: wp.array[wp.int32],
+        offsets_in: wp.array[wp.int32],
+        count_in: wp.array[wp.int64],
+        transmittances_out: wp.array2d[wp.float32],
+        stops_out: wp.array2d[wp.int32],
+        blocks_out: wp.array[wp.int32],
+        walked_out: wp.array[wp.int32],
+        blocks_walked_out: wp.array[wp.int64],
+        renders_out: wp.array2d[wp.float32],
+        alphas_out: wp.array2d[wp.float32],
+    ):
+        index, lane = wp.tid()
+        arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
+        if count_in[0] > wp.int64(blocks_out.shape[0]):
+            image = index // wp.static(parts) // (picture.tiles_x * picture.tiles_y)
+            walk(
+                picture,
+                gaussians,
+                arena,
+                index,
+                lane,
+                image * picture.num,
+                (image + 1) * picture.num,
+                order_in,
+                offsets_in,
+                transmittances_out,
+                stops_out,
+                blocks_out,
+                walked_out,
+                blocks_walked_out,
+                renders_out,
+                alphas_out,
+            )
+
+    return composite_unlisted

@@ -1,0 +1,145 @@
+"""Sums of rows by Gaussian on CUDA: bitwise repeatable, no atomics, the same without lists.
+
+Rows are added up first, then the parts of a tile and the chunks of channels: so it makes no
+difference whether the rows of a Gaussian were written pair by pair or added by the compositor.
+"""
+
+from typing import no_type_check
+
+import warp as wp
+from torch import Tensor
+
+from ...runtime.launch import launch
+from ...runtime.views import vectors
+from ..reduce import PairGradients
+from ..tiles import Bins
+from .complete import columns_of_moments, row_length
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+@no_type_check
+def _add_rows(
+    offset: wp.int32,
+    offsets_in: wp.array[wp.int32],
+    count_in: wp.array[wp.int64],
+    v_pairs_in: wp.array2d[wp.float32],
+    sums_out: wp.array2d[wp.float32],
+):
+    # a thread has a column: those of a warp read one row, or few, that lie together
+    k, column = wp.tid()
+    j = offset + k
+    begin = offsets_in[j]
+    end = offsets_in[j + 1]
+    if count_in[0] > wp.int64(v_pairs_in.shape[0]):
+        # rows of Gaussians, written where they have pairs
+        end = j + wp.where(end != begin, 1, 0)
+        begin = j
+    total = wp.float32(0.0)
+    for p in range(begin, end):
+        total += v_pairs_in[p, column]
+    sums_out[j, column] = total
+
+
+@wp.func
+@no_type_check
+def _over_parts(sums: wp.array3d[wp.float32], j: wp.int32, column: wp.int32) -> wp.float32:
+    total = wp.float32(0.0)
+    for part in range(sums.shape[1]):
+        total += sums[j, part, column]
+    return total
+
+
+@wp.kernel
+@no_type_check
+def _finish(
+    offset: wp.int32,
+    order_in: wp.array[wp.int32],
+    offsets_in: wp.array[wp.int32],
+    sums_in: wp.array3d[wp.float32],
+    conics_in: wp.array[wp.vec3],
+    view_opacities_in: wp.array[wp.float32],
+    v_means2d_out: wp.array[wp.vec2],
+    v_conics_out: wp.array[wp.vec3],
+    v_view_opacities_out: wp.array[wp.float32],
+    v_colors_out: wp.array2d[wp.float32],
+):
+    j = offset + wp.tid()
+    i = order_in[j]
+    first = columns_of_moments(v_colors_out.shape[1])
+    for c in range(v_colors_out.shape[1]):
+        v_colors_out[i, c] = _over_parts(sums_in, j, first + c)
+    if v_means2d_out:
+        h = wp.float32(0.0)
+        hu = wp.float32(0.0)
+        hy = wp.float32(0.0)
+        huu = wp.float32(0.0)
+        huy = wp.float32(0.0)
+        hyy = wp.float32(0.0)
+        for at in range(0, first, 6):
+            h += _over_parts(sums_in, j, at)
+            hu += _over_parts(sums_in, j, at + 1)
+            hy += _over_parts(sums_in, j, at + 2)
+            huu += _over_parts(sums_in, j, at + 3)
+            huy += _over_parts(sums_in, j, at + 4)
+            hyy += _over_parts(sums_in, j, at + 5)
+        # README eq. 11: moments of h to the gradients
+        conic = conics_in[i]
+        a, k, e = conic[0], conic[1], conic[2]
+        v_means2d_out[i] = wp.vec2(a * hu, a * k * hu + e * hy)
+        v_conics_out[i] = wp.vec3(-0.5 * huu, -a * huy, -0.5 * hyy)
+        v_opacity = wp.float32(0.0)
+        if offsets_in[j + 1] != offsets_in[j]:
+            v_opacity = h / view_opacities_in[i]
+        v_view_opacities_out[i] = v_opacity
+
+
+def reduce_rows(
+    v_pairs: Tensor,
+    written: Tensor | None,
+    bins: Bins,
+    conics: Tensor,
+    view_opacities: Tensor,
+    geometry: bool,
+) -> PairGradients:
+    """As ``reduce_pairs``, of the rows that CUDA's ``composite_backward`` makes.
+
+    Args:
+        v_pairs: ``[P, parts, 6 · chunks + C]``, or where the lists had no room, rows of Gaussians
+            in the order of ``bins.order``.
+        written: None: all rows are written.
+        bins: as forward.
+        conics: ``[I, N, 3]``.
+        view_opacities: ``[I, N]``.
+        geometry: whether anything but colours is asked for.
+    """
+    v_means2d = v_conics = v_opacities = None
+    if geometry:
+        v_means2d = conics.new_empty(*conics.shape[:-1], 2)
+        v_conics = conics.new_empty(conics.shape)
+        v_opacities = conics.new_empty(conics.shape[:-1])
+    count, (_, parts, columns) = bins.order.numel(), v_pairs.shape
+    channels = next(c for c in range(columns) if row_length(c) == columns)
+    v_colors = conics.new_empty(*conics.shape[:-1], channels)
+    sums = conics.new_empty(count, parts, columns)
+    launch(
+        _add_rows,
+        (count, parts * columns),
+        [bins.offsets, bins.count.view(1), v_pairs.flatten(1)],
+        [sums.flatten(1)],
+        conics.device,
+    )
+    launch(
+        _finish,
+        count,
+        [bins.order, bins.offsets, sums, vectors(conics, wp.vec3), view_opacities.view(-1)],
+        [
+            vectors(v_means2d, wp.vec2),
+            vectors(v_conics, wp.vec3),
+            None if v_opacities is None else v_opacities.view(-1),
+            v_colors.view(-1, channels),
+        ],
+        conics.device,
+    )
+    return PairGradients(v_means2d, v_conics, v_opacities, v_colors)

@@ -1,0 +1,64 @@
+"""A training step on a GPU that is not there: nothing of it may make the host wait."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.kernels import Watch
+
+from gamba_warp.cameras import Cameras
+from gamba_warp.kernels.bench.static import dry_run
+from gamba_warp.kernels.rasterize.cuda import capacity
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.gamba import Gamba
+from train.data.samples import Batch
+from train.step import forward
+
+
+@pytest.fixture
+def on_paper(monkeypatch):
+    """Tensors on a GPU that is not there, where the rasterizer knows its room already."""
+    if not dry_run.can_dry_run():
+        pytest.skip(f"torch {torch.__version__} needs a GPU for it")
+    room = capacity.Room(0, 1 << 20)
+    monkeypatch.setattr(capacity, "find", lambda key, device: room)
+    with dry_run.dry_run() as launches:
+        yield launches
+
+
+def cameras(*lead, size):
+    return Cameras(torch.empty(*lead, 4, 4), torch.empty(*lead, 3, 3), size, size)
+
+
+@pytest.mark.parametrize("radial", [0.0, 0.1])
+def test_a_graph_can_hold_a_training_step(on_paper, radial):
+    """Network, rendering, losses, gradients, clipping and AdamW."""
+    objects, views, size = 2, 3, 64
+    config = replace(PRESETS["paper"], depth=1)
+    with torch.device("cuda"):
+        model = Gamba(config, "random")
+        side = config.image_size
+        batch = Batch(
+            [*"ab"],
+            torch.empty(objects, side, side, 3),
+            cameras(objects, size=side),
+            torch.empty(objects, views, size, size, 4),
+            cameras(objects, views, size=size),
+            torch.empty(objects, 1, 3),
+        )
+        parameters = [p for p in model.parameters() if p.requires_grad]
+        rate = torch.full((), 1e-3)
+        optimizer = torch.optim.AdamW(parameters, lr=rate, foreach=True, capturable=True)
+    weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "rdist": radial}
+    with Watch() as watch:
+        result = forward(model, batch, weights)
+        dry_run.run_backward([result.loss])
+        for p in parameters:
+            p.grad = torch.empty_like(p)
+        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
+        optimizer.step()
+    assert watch.found == []
+    names = [launch.kernel.func.__name__ for launch in on_paper]
+    for name in ("scan_forward", "scan_backward", "composite", "composite_vjp", "_note"):
+        assert name in names
+    assert {"aten::_foreach_addcdiv_.Scalar", "gamba_warp::rasterize_bin"} <= watch.names
