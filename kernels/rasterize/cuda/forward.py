@@ -66,6 +66,7 @@ def _walking(channels: int, parts: int, listed: bool):
     sums_type = wp.types.matrix((pixels, channels), wp.float32)
 
     @wp.func
+    @no_type_check
     def leave(blocks: wp.array[wp.int32], k: wp.int32, part: wp.int32, mine: wp.int32):
         # stores the bits of a pair, or joins those of the parts, or of the tiles that share it
         if wp.static(parts == 1 and listed):

@@ -298,7 +298,7 @@ def backward_leaves(io: torch.dtype, delta_io: torch.dtype) -> SimpleNamespace:
         dz_out: wp.array3d(dtype=scalar),
     ) -> int: ...
 
-    @wp.func_native(_leaf(_FINISH_GRAD, **outputs))
+    @wp.func_native(_leaf(_FINISH_GRAD, "", **outputs))
     def finish(
         b: int,
         t0: int,
