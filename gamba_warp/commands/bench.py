@@ -63,7 +63,8 @@ def bench_command(
         compare: An older bench.json; prints the ratios of the times.
         render: Measure nothing; make the tables and the page of these JSON files.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
-            (registers, stack, shared memory, occupancy) to static.json and static.md.
+            (registers, stack, shared memory, occupancy) to static.json and static.md; with nvdisasm
+            (on PATH, in CUDA_HOME or inside Triton) also instructions, and the scan's least times.
         data: Folder of posed views for train-step; made-up views if not given.
     """
     from ..measure import suites

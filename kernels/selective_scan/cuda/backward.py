@@ -28,8 +28,8 @@ from .blocks import (
     sync,
     widening,
 )
-from .groups import Groups, group_io, group_shared
-from .retreat import retreating, token_stride
+from .groups import Groups, group_io, group_shared, row_io
+from .retreat import retreating, token_stride, totalling
 from .tokens import SUB, marking
 
 MARK_TILE = 16  # tokens of a tile of the walk that marks
@@ -79,10 +79,13 @@ def backward_kernel(
     arena_type, _, _ = arena_io(size)
     marked, put_mark, _, _ = group_shared(m, size)
     own, put, get, sum_lanes = group_shared(g, size)
-    _, fetch_mark_matrix, put_mark_matrix = matrix_io(f, matrix, MARK_TILE, size)
-    _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, size)
+    _, _, put_mark_matrix = matrix_io(f, matrix, MARK_TILE, size)
+    _, _, put_matrix = matrix_io(f, matrix, TILE, size)
+    origin_matrix, fetch_matrix = row_io(f, matrix, TILE)
+    _, fetch_mark_matrix = row_io(f, matrix, MARK_TILE)
     mark = marking(f, mode, MARK_TILE, tuple(mark_at.items()), size)
     retreat = retreating(g, mode, tuple(at.items()), size, flags)
+    total = totalling(g, tuple(at.items()), size, flags)
     scale = 1.0 if mode == "bilinear" else LOG2E
     marks_size = MARK // SUB * f.walks * f.held + 4
     read = "read" in flags
@@ -91,7 +94,7 @@ def backward_kernel(
     @wp.func
     def set_marks(
         p: Place, arena: arena_type, marks_out: wp.array(dtype=float), t0: int, end: int,
-        bias: float, a: vec, h: vec, u_at: wp.uint64, delta_at: wp.uint64,
+        bias: float, a: vec, h: vec, u_at: wp.uint64, delta_at: wp.uint64, b_at: wp.uint64,
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
         b_in: wp.array4d(dtype=matrix_scalar),
@@ -100,7 +103,7 @@ def backward_kernel(
         t = t0 + p.row * wp.static(m.adjacent)
         u = fetch_mark(u_in, u_at, t, end - 1)
         delta = fetch_mark_delta(delta_in, delta_at, t, end - 1)
-        b = fetch_mark_matrix(b_in, p, t0, end)
+        b = fetch_mark_matrix(b_in, b_at, p.lane, p.states, t0, end - 1)
         for tile in range((end - t0 + wp.static(MARK_TILE - 1)) / wp.static(MARK_TILE)):
             base = (tile % 2) * wp.static(mark_size)
             left = wp.where(p.active != 0, end - t, 0)
@@ -119,7 +122,9 @@ def backward_kernel(
             t += wp.static(MARK_TILE)
             u = fetch_mark(u_in, u_at, t, end - 1)
             delta = fetch_mark_delta(delta_in, delta_at, t, end - 1)
-            b = fetch_mark_matrix(b_in, p, t - p.row * wp.static(m.adjacent), end)
+            b = fetch_mark_matrix(
+                b_in, b_at, p.lane, p.states, t - p.row * wp.static(m.adjacent), end - 1
+            )
             h = mark(arena, base, marks_out, tile, subs, p.slot, p.q, a, h)
         sync()
 
@@ -210,12 +215,14 @@ def backward_kernel(
         du_at = origin(du_out, p.b, p.d)
         ddelta_at = origin_delta(ddelta_out, p.b, p.d)
         dz_at = origin(dz_out, p.b, p.d)
+        b_at = origin_matrix(b_in, p.b, p.group)
+        c_at = origin_matrix(c_in, p.b, p.group)
         for back in range(chunks):
             chunk = p.begin + (chunks - 1 - back) * wp.static(MARK)
             end = wp.min(chunk + wp.static(MARK), p.end)
             h = read_states(starts_in, starts + chunk / wp.static(MARK), p)
             set_marks(
-                p, arena, marks, chunk, end, bias, a, h, u_at, delta_at, u_in, delta_in, b_in
+                p, arena, marks, chunk, end, bias, a, h, u_at, delta_at, b_at, u_in, delta_in, b_in
             )  # fmt: skip
             tiles = (end - chunk + wp.static(TILE - 1)) / wp.static(TILE)
             t0 = chunk + (tiles - 1) * wp.static(TILE)
@@ -224,11 +231,11 @@ def backward_kernel(
             delta_raw = fetch_delta(delta_in, delta_at, t, end - 1)
             z_raw = raw()
             dout_raw = raw()
-            b_raw = fetch_matrix(b_in, p, t0, end)
+            b_raw = fetch_matrix(b_in, b_at, lane, p.states, t0, end - 1)
             c_raw = b_raw
             if wp.static(read):
                 dout_raw = fetch(dout_in, dout_at, t, end - 1)
-                c_raw = fetch_matrix(c_in, p, t0, end)
+                c_raw = fetch_matrix(c_in, c_at, lane, p.states, t0, end - 1)
                 if wp.static(use_z):
                     z_raw = fetch(z_in, z_at, t, end - 1)
             for again in range(tiles):
@@ -270,16 +277,6 @@ def backward_kernel(
                     put_matrix(arena, wp.static(at["C"]), p, c_raw)
                 put_matrix(arena, wp.static(at["B"]), p, b_raw)
                 sync()
-                before = wp.max(t0 - wp.static(TILE), chunk)
-                ahead = before + p.row * wp.static(g.adjacent)
-                u_raw = fetch(u_in, u_at, ahead, end - 1)
-                delta_raw = fetch_delta(delta_in, delta_at, ahead, end - 1)
-                b_raw = fetch_matrix(b_in, p, before, end)
-                if wp.static(read):
-                    dout_raw = fetch(dout_in, dout_at, ahead, end - 1)
-                    c_raw = fetch_matrix(c_in, p, before, end)
-                    if wp.static(use_z):
-                        z_raw = fetch(z_in, z_at, ahead, end - 1)
                 first = (t0 - chunk) / wp.static(SUB)
                 subs = wp.min(
                     (end - t0 + wp.static(SUB - 1)) / wp.static(SUB), wp.static(TILE // SUB)
@@ -287,6 +284,20 @@ def backward_kernel(
                 state = retreat(
                     arena, 0, marks, first, subs, p.slot, p.q, lane, p.states,
                     t0, end - t0, product, a, state, db_out, dc_out,
+                )  # fmt: skip
+                # their loads are on their way while the sums are completed
+                before = wp.max(t0 - wp.static(TILE), chunk)
+                ahead = before + p.row * wp.static(g.adjacent)
+                u_raw = fetch(u_in, u_at, ahead, end - 1)
+                delta_raw = fetch_delta(delta_in, delta_at, ahead, end - 1)
+                b_raw = fetch_matrix(b_in, b_at, lane, p.states, before, end - 1)
+                if wp.static(read):
+                    dout_raw = fetch(dout_in, dout_at, ahead, end - 1)
+                    c_raw = fetch_matrix(c_in, c_at, lane, p.states, before, end - 1)
+                    if wp.static(use_z):
+                        z_raw = fetch(z_in, z_at, ahead, end - 1)
+                total(
+                    arena, 0, p.slot, lane, p.states, t0, end - t0, product, db_out, dc_out
                 )  # fmt: skip
                 sums += finish(
                     p, arena, t, left, skip, du_at, ddelta_at, dz_at, du_out, ddelta_out, dz_out

@@ -119,6 +119,48 @@ if (inside) *({element}*)at = rounded;
 
 
 @functools.cache
+def row_io(f: BlockShape, io: torch.dtype, tokens: int):
+    """As ``group_io`` for a block's tile of B or C, ``[B, L, G, N]``; for ``blocks.matrix_io``."""
+    scalar = WARP_DTYPES[io]
+    size = tokens * f.padded
+    count = -(-size // f.block)
+    raw = wp.types.vector(count, wp.uint32)
+
+    @wp.func_native(
+        f"{WIDE} const char* at = (char*)x_in.data + wide_(g, x_in.strides[2]); {_PLACE}"
+    )
+    def place(x_in: wp.array4d(dtype=scalar), b: int, g: int) -> wp.uint64: ...
+
+    load = f"""{WIDE}
+const char* at = (const char*)origin;
+{_GLOBAL}
+wp::vec_t<{count}, unsigned> r;
+WP_PRAGMA_UNROLL
+for (int i = 0; i < {count}; ++i) {{
+    const int e = {f.block} * i + lane, n = e % {f.padded};
+    int t = t0 + e / {f.padded};
+    t = t < last ? t : last;
+    const char* from = at + wide_(n, x_in.strides[3]);
+    if (n < states && e < {size})
+        r.c[i] = *(const {BITS[io][1]}*)(from + wide_(t, x_in.strides[1]));
+}}
+return r;
+"""
+
+    @wp.func_native(load)
+    def fetch(
+        x_in: wp.array4d(dtype=scalar),
+        origin: wp.uint64,
+        lane: int,
+        states: int,
+        t0: int,
+        last: int,
+    ) -> raw: ...
+
+    return place, fetch
+
+
+@functools.cache
 def group_shared(g: Groups, arena_size: int):
     """``put`` and ``get`` of a thread's elements in shared memory; ``sum_lanes`` of lanes' sums."""
     f = g.shape

@@ -84,25 +84,37 @@ def _backwards(g: Groups, mode: str, at: dict, flags: frozenset) -> str:
     if mode != "mamba":
         slopes = """
                 float f, g, df, dg;
-                slopes_(r[i][t], an[k], f, g, df, dg);
+                slopes_(rt[i], an[k], f, g, df, dg);
                 dh[k] = f * d;
-                const float w = g * d, p = d * (hs[t][k] * df + x[i][t] * v.b[j] * dg);"""
+                const float w = g * d, p = d * (hs[t][k] * df + xt[i] * v.b[j] * dg);"""
+    if mode == "zoh":  # its slopes need the registers: what can be loaded again is not held
+        own = f"(sub * SPAN + channel + i) * {SUB} + t"
+        operands = f"r[i][t], s[{at['DU']} + {own}], s[{at['DY']} + {own}]"
+    else:
+        operands = "r[i][t], x[i][t], dy[i][t]"
+    rate, own_x, own_dy = operands.split(", ")
     return f"""
         float through[CH][{SUB}] = {{}}, dstep[CH][{SUB}] = {{}};
         WP_PRAGMA_UNROLL
         for (int t = {SUB - 1}; t >= 0; --t) {{
             const Token v = next;
             if (t > 0) fetch_(t - 1, next);
-            float db[ST] = {{}};
+            float db[ST] = {{}}, rt[CH], xt[CH], dyt[CH];
+            WP_PRAGMA_UNROLL
+            for (int i = 0; i < CH; ++i) {{
+                rt[i] = {rate};
+                xt[i] = {own_x};
+                {f"dyt[i] = {own_dy};" if "read" in flags else ""}
+            }}
             WP_PRAGMA_UNROLL
             for (int k = 0; k < E; ++k) {{
                 const int i = k / ST, j = k % ST;
-                const float d = {"dh[k] + dy[i][t] * v.c[j]" if "read" in flags else "dh[k]"};
+                const float d = {"dh[k] + dyt[i] * v.c[j]" if "read" in flags else "dh[k]"};
                 {slopes}
-                {"db[j] += w * x[i][t];" if "dB" in flags else ""}
+                {"db[j] += w * xt[i];" if "dB" in flags else ""}
                 through[i][t] += w * v.b[j];
                 dstep[i][t] += p * an[k];
-                da[k] += p * r[i][t];
+                da[k] += p * rt[i];
             }}
             {_product(g.shape, at["DB"], "db") if "dB" in flags else ""}
         }}
@@ -212,7 +224,7 @@ for (int walk = 0; walk < WALKS; ++walk) {{
         both.c[(WALKS + walk) * E + k] = da[k];
     }}
     WP_TILE_SYNC();
-    {_totals(g, offset, flags)}
+    {_totals(g, offset, flags) if f.walks > 1 else ""}
     if (WALKS > 1) WP_TILE_SYNC();
 }}
 return both;
@@ -239,3 +251,35 @@ return both;
     ) -> pair: ...
 
     return retreat
+
+
+@functools.cache
+def totalling(g: Groups, at: tuple, arena_size: int, flags: frozenset):
+    """The sums for dB and dC after ``retreat``, where that has not made them state block by block.
+
+    Apart from it, so that loads can be on their way meanwhile that would cost the walk registers.
+    """
+    f = g.shape
+    arena_type, _, _ = arena_io(arena_size)
+    snippet = f"""
+{prelude(f, "mamba", SUB)}
+{WIDE}
+const int walk = 0;
+{_totals(g, dict(at), flags) if f.walks == 1 else ""}
+"""
+
+    @wp.func_native(snippet)
+    def total(
+        arena: arena_type,
+        base: int,
+        slot: int,
+        lane: int,
+        states: int,
+        t0: int,
+        left: int,
+        product: wp.int64,
+        db_out: wp.array3d(dtype=float),
+        dc_out: wp.array3d(dtype=float),
+    ): ...
+
+    return total
