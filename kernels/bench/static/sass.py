@@ -145,8 +145,9 @@ def parse(text: str, kernel: str) -> list[Instruction]:
 
 def _next(code: Sequence[Instruction], i: int) -> Iterator[int]:
     """Where execution goes from instruction i."""
-    if code[i].target is not None:
-        yield code[i].target
+    target = code[i].target
+    if target is not None:
+        yield target
     name = code[i].operation.split(".")[0]
     leaves = name in ("BRA", "EXIT", "RET", "BRX") or (
         name == "CALL" and code[i].target is not None

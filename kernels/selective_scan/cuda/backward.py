@@ -89,6 +89,9 @@ def backward_kernel(
     scale = 1.0 if mode == "bilinear" else LOG2E
     marks_size = MARK // SUB * f.walks * f.held + 4
     read = "read" in flags
+    # without outputs 168 registers do, which a compiler left alone exceeds or undercuts with spills
+    resident = 1 if read or f.walks > 1 else max(1, 3 * 128 // f.block)
+    bounds = (f.block, resident) if resident > 1 else f.block
     at = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P"), 0) | at
 
     @wp.func
@@ -129,6 +132,47 @@ def backward_kernel(
         sync()
 
     @wp.func
+    @no_type_check
+    def prepare(
+        p: Place, arena: arena_type, left: int, bias: float,
+        u_raw: raw, delta_raw: raw, dout_raw: raw, z_raw: raw,
+    ):  # fmt: skip
+        # what belongs to a channel alone: operands of the walk, and what ``finish`` needs
+        steps = own()
+        inputs = own()
+        u = own()
+        slopes = own()
+        for i in range(wp.static(g.count)):
+            x = widen_delta(delta_raw[i]) + bias
+            slopes[i] = 1.0
+            step = x
+            if wp.static(use_softplus):
+                step = softplus(x)
+                slopes[i] = softplus_slope(x)
+            inside = wp.static(g.token(i)) < left
+            steps[i] = wp.where(inside, step, 0.0)
+            u[i] = widen(u_raw[i])
+            inputs[i] = steps[i] * u[i]
+        put(arena, wp.static(at["STEP"]), p.c, p.row, steps)
+        put(arena, wp.static(at["DU"]), p.c, p.row, inputs)
+        put(arena, wp.static(at["U"]), p.c, p.row, u)
+        put(arena, wp.static(at["SLOPE"]), p.c, p.row, slopes)
+        if wp.static(read):
+            dys = own()
+            gates = own()
+            for i in range(wp.static(g.count)):
+                dys[i] = wp.where(wp.static(g.token(i)) < left, widen(dout_raw[i]), 0.0)
+                if wp.static(use_z):
+                    z = widen(z_raw[i])
+                    s = sigmoid(z)
+                    gates[i] = dys[i] * s * (1.0 + z * (1.0 - s))
+                    dys[i] = dys[i] * z * s
+            put(arena, wp.static(at["DY"]), p.c, p.row, dys)
+            if wp.static(use_z):
+                put(arena, wp.static(at["GATE"]), p.c, p.row, gates)
+
+    @wp.func
+    @no_type_check
     def finish(
         p: Place, arena: arena_type, t: int, left: int, skip: float,
         du_at: wp.uint64, ddelta_at: wp.uint64, dz_at: wp.uint64,
@@ -168,7 +212,7 @@ def backward_kernel(
             dskip += dys[i] * u[i]
         return wp.vec2(dskip, dbias)
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds, grid_stride=False)
     @no_type_check
     def scan_backward(
         # in
@@ -242,38 +286,8 @@ def backward_kernel(
                 t0 = chunk + (tiles - 1 - again) * wp.static(TILE)
                 t = t0 + p.row * wp.static(g.adjacent)
                 left = wp.where(p.active != 0, end - t, 0)
-                steps = own()
-                inputs = own()
-                u = own()
-                slopes = own()
-                for i in range(wp.static(g.count)):
-                    x = widen_delta(delta_raw[i]) + bias
-                    slopes[i] = 1.0
-                    step = x
-                    if wp.static(use_softplus):
-                        step = softplus(x)
-                        slopes[i] = softplus_slope(x)
-                    inside = wp.static(g.token(i)) < left
-                    steps[i] = wp.where(inside, step, 0.0)
-                    u[i] = widen(u_raw[i])
-                    inputs[i] = steps[i] * u[i]
-                put(arena, wp.static(at["STEP"]), p.c, p.row, steps)
-                put(arena, wp.static(at["DU"]), p.c, p.row, inputs)
-                put(arena, wp.static(at["U"]), p.c, p.row, u)
-                put(arena, wp.static(at["SLOPE"]), p.c, p.row, slopes)
+                prepare(p, arena, left, bias, u_raw, delta_raw, dout_raw, z_raw)
                 if wp.static(read):
-                    dys = own()
-                    gates = own()
-                    for i in range(wp.static(g.count)):
-                        dys[i] = wp.where(wp.static(g.token(i)) < left, widen(dout_raw[i]), 0.0)
-                        if wp.static(use_z):
-                            z = widen(z_raw[i])
-                            s = sigmoid(z)
-                            gates[i] = dys[i] * s * (1.0 + z * (1.0 - s))
-                            dys[i] = dys[i] * z * s
-                    put(arena, wp.static(at["DY"]), p.c, p.row, dys)
-                    if wp.static(use_z):
-                        put(arena, wp.static(at["GATE"]), p.c, p.row, gates)
                     put_matrix(arena, wp.static(at["C"]), p, c_raw)
                 put_matrix(arena, wp.static(at["B"]), p, b_raw)
                 sync()

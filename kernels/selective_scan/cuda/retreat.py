@@ -260,12 +260,13 @@ def totalling(g: Groups, at: tuple, arena_size: int, flags: frozenset):
     Apart from it, so that loads can be on their way meanwhile that would cost the walk registers.
     """
     f = g.shape
+    offset = dict.fromkeys(("DB", "DC"), 0) | dict(at)
     arena_type, _, _ = arena_io(arena_size)
     snippet = f"""
 {prelude(f, "mamba", SUB)}
 {WIDE}
 const int walk = 0;
-{_totals(g, dict(at), flags) if f.walks == 1 else ""}
+{_totals(g, offset, flags) if f.walks == 1 else ""}
 """
 
     @wp.func_native(snippet)

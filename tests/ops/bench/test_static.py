@@ -35,7 +35,7 @@ BOUNDS = {
     ("scan", "scan_backward", "bfloat16"): (248, 1200, 78000, 8),
     ("scan", "scan_backward", "float32"): (248, 1200, 78000, 8),
     ("scan", "scan_backward", "bfloat16, bilinear"): (255, 1200, 78000, 8),
-    ("scan", "scan_backward", "bfloat16, last state alone"): (168, 1200, 21000, 12),
+    ("scan", "scan_backward", "bfloat16, last state alone"): (168, 1200, 46000, 12),
     ("scan", "summarise_backward", "bfloat16, in segments"): (140, 0, 21000, 12),
     ("scan", "carry", "bfloat16, in segments"): (48, 0, 2000, 36),
     ("conv", "conv_forward", "bfloat16"): (64, 0, 2000, 32),
