@@ -233,9 +233,12 @@ def _symbol(launch: Launch) -> str:
 
 def compile_kernel(launch: Launch) -> dict[int, tuple[Resources, int]]:
     """By architecture what a kernel takes, and the bytes of its dynamic shared memory."""
+    paths = binaries(
+        launch
+    )  # before the symbol: a module that other kernels share has none earlier
     symbol = _symbol(launch)
     found = {}
-    for architecture, path in binaries(launch).items():
+    for architecture, path in paths.items():
         meta = json.loads((path.parent / f"{path.name.rsplit('.', 2)[0]}.meta").read_bytes())
         dynamic = meta.get(f"{symbol}_smem_bytes", 0)
         found[architecture] = read_cubin(path.read_bytes())[symbol], dynamic

@@ -229,7 +229,8 @@ def test_the_command_writes_both_files(listed, monkeypatch, tmp_path, capsys):
     }
     text = (tmp_path / "new" / "static.md").read_text()
     row = rows["conv_forward", "forward", "sm_90"]
-    (line,) = [line for line in text.splitlines() if line.startswith("| `conv_forward` |")]
+    table = text.partition("## Instructions")[0]
+    (line,) = [line for line in table.splitlines() if line.startswith("| `conv_forward` |")]
     assert f"{row['registers']} |" in line and f"{row['share']:.0%}" in line
     assert "4 rows" in capsys.readouterr().out
 
