@@ -65,7 +65,7 @@ ROOMS = {
         "one file a subject", (*_KERNELS, "kernels.bench.core", "kernels.bench")
     ),
     "kernels.bench.static": Room(
-        "registers and stack of the CUDA kernels", (*_KERNELS, "kernels.bench.core")
+        "registers and instructions of the CUDA kernels", (*_KERNELS, "kernels.bench.core")
     ),
     "kernels.stress.core": Room("what a case is, the runner, reports", ("versions",)),
     "kernels.stress.oracles": Room(

@@ -1,10 +1,10 @@
-"""The gradient kernels of the CUDA scan: a segment of the sequence backwards, chunk by chunk.
+"""The gradient kernel of the CUDA scan: a segment of the sequence backwards, chunk by chunk.
 
 A chunk starts from the state that the forward saved. It is walked once to mark the state before
-every few tokens, then in these few tokens at a time, last first: forwards again, holding decays and
-states in registers, and backwards. Sums over states and over the block's channels go through shared
-memory, so that dB and dC leave a block once per token and state. ``summarise_backward`` gives
-what a segment's own outputs send back through it, for all segments but the first at once.
+every few tokens, then in tiles, last first: what belongs to a channel alone is turned into operands
+in shared memory, the recurrence walks them a few tokens at a time, forwards again, holding decays
+and states in registers, and backwards. Sums over states and over the block's channels go through
+shared memory, so that dB and dC leave a block once per token and state.
 """
 
 import functools
@@ -20,7 +20,6 @@ from .blocks import (
     Place,
     Sizes,
     arena_io,
-    channel_io,
     halves,
     matrix_io,
     offsets,
@@ -29,23 +28,24 @@ from .blocks import (
     sync,
     widening,
 )
-from .retreat import lane_stride, retreating, token_stride
-from .tokens import SUB, advancing, decaying, marking
+from .groups import Groups, group_io, group_shared, row_io
+from .retreat import retreating, token_stride, totalling
+from .tokens import SUB, marking
 
-TILE = 16  # tokens
+MARK_TILE = 16  # tokens of a tile of the walk that marks
+TILE = 8  # and of the walk back
 
 
-def _retreat_layout(f: BlockShape, flags: frozenset) -> tuple[dict, int]:
-    partial = f.lanes * lane_stride(f)
-    products = SUB * token_stride(f)
-    parts = {"STEP": SUB * f.span, "DU": SUB * f.span, "B": SUB * f.padded}
+def _layout(g: Groups, flags: frozenset, use_z: bool) -> tuple[dict, int]:
+    f = g.shape
+    sums, products = f.lanes * g.lane_stride, g.tokens * token_stride(f)
+    parts = {"STEP": g.size, "DU": g.size, "U": g.size, "SLOPE": g.size}
+    parts |= {"B": g.tokens * f.padded}
     if "read" in flags:
-        parts |= {"DY": SUB * f.span, "C": SUB * f.padded}
-    parts |= {
-        name: partial
-        for name, flag in (("Y", "y"), ("S", "through"), ("P", "through"))
-        if flag in flags
-    }
+        parts |= {"DY": g.size, "C": g.tokens * f.padded}
+        parts |= {"GATE": g.size} if use_z else {}
+    parts |= {"Y": sums} if "y" in flags else {}
+    parts |= {"S": sums, "P": sums} if "through" in flags else {}
     parts |= {name: products for name, flag in (("DB", "dB"), ("DC", "dC")) if flag in flags}
     return offsets(parts)
 
@@ -67,68 +67,115 @@ def backward_kernel(
     place = placing(f)
     vec, read_states, write_states = states_io(f)
     pair, join, first_half, second_half = halves(f)
-    tile_count, _, fetch_tile, _ = channel_io(f, io, TILE)
-    _, _, fetch_tile_delta, _ = channel_io(f, delta_io, TILE)
-    count, raw, fetch, store = channel_io(f, io, SUB)
-    _, _, fetch_delta, store_delta = channel_io(f, delta_io, SUB)
-    own = wp.types.vector(count, wp.float32)
+    m, g = Groups(f, MARK_TILE), Groups(f, TILE)
+    _, origin, fetch_mark, _ = group_io(m, io)
+    _, origin_delta, fetch_mark_delta, _ = group_io(m, delta_io)
+    raw, _, fetch, store = group_io(g, io)
+    _, _, fetch_delta, store_delta = group_io(g, delta_io)
     widen, widen_delta = widening(io), widening(delta_io)
-    at, size = _retreat_layout(f, flags)
-    tile_at, tile_size = offsets({"STEP": TILE * f.span, "DU": TILE * f.span, "B": TILE * f.padded})
-    size = max(size, 2 * tile_size)
-    arena_type, put, get = arena_io(size)
-    _, fetch_tile_matrix, put_tile_matrix = matrix_io(f, matrix, TILE, size)
-    _, fetch_matrix, put_matrix = matrix_io(f, matrix, SUB, size)
-    mark = marking(f, mode, TILE, tuple(tile_at.items()), size)
-    retreat = retreating(f, mode, tuple(at.items()), size, flags)
+    at, size = _layout(g, flags, use_z)
+    mark_at, mark_size = offsets({"STEP": m.size, "DU": m.size, "B": MARK_TILE * f.padded})
+    size = max(size, 2 * mark_size)
+    arena_type, _, _ = arena_io(size)
+    marked, put_mark, _, _ = group_shared(m, size)
+    own, put, get, sum_lanes = group_shared(g, size)
+    _, _, put_mark_matrix = matrix_io(f, matrix, MARK_TILE, size)
+    _, _, put_matrix = matrix_io(f, matrix, TILE, size)
+    origin_matrix, fetch_matrix = row_io(f, matrix, TILE)
+    _, fetch_mark_matrix = row_io(f, matrix, MARK_TILE)
+    mark = marking(f, mode, MARK_TILE, tuple(mark_at.items()), size)
+    retreat = retreating(g, mode, tuple(at.items()), size, flags)
+    total = totalling(g, tuple(at.items()), size, flags)
     scale = 1.0 if mode == "bilinear" else LOG2E
     marks_size = MARK // SUB * f.walks * f.held + 4
     read = "read" in flags
+    # without outputs 168 registers do, which a compiler left alone exceeds or undercuts with spills
+    resident = 1 if read or f.walks > 1 else max(1, 3 * 128 // f.block)
+    bounds = (f.block, resident) if resident > 1 else f.block
+    at = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P"), 0) | at
 
     @wp.func
     def set_marks(
         p: Place, arena: arena_type, marks_out: wp.array(dtype=float), t0: int, end: int,
-        bias: float, a: vec, h: vec,
+        bias: float, a: vec, h: vec, u_at: wp.uint64, delta_at: wp.uint64, b_at: wp.uint64,
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
         b_in: wp.array4d(dtype=matrix_scalar),
     ):  # fmt: skip
         subs = (end - t0 + wp.static(SUB - 1)) / wp.static(SUB)
-        u = fetch_tile(u_in, p, t0, end)
-        delta = fetch_tile_delta(delta_in, p, t0, end)
-        b = fetch_tile_matrix(b_in, p, t0, end)
-        for tile in range((end - t0 + wp.static(TILE - 1)) / wp.static(TILE)):
-            base = (tile % 2) * wp.static(tile_size)
-            first = t0 + tile * wp.static(TILE)
-            left = wp.where(p.active != 0, end - first - p.row, 0)
-            for i in range(wp.static(tile_count)):
+        t = t0 + p.row * wp.static(m.adjacent)
+        u = fetch_mark(u_in, u_at, t, end - 1)
+        delta = fetch_mark_delta(delta_in, delta_at, t, end - 1)
+        b = fetch_mark_matrix(b_in, b_at, p.lane, p.states, t0, end - 1)
+        for tile in range((end - t0 + wp.static(MARK_TILE - 1)) / wp.static(MARK_TILE)):
+            base = (tile % 2) * wp.static(mark_size)
+            left = wp.where(p.active != 0, end - t, 0)
+            steps = marked()
+            inputs = marked()
+            for i in range(wp.static(m.count)):
                 step = widen_delta(delta[i]) + bias
                 if wp.static(use_softplus):
                     step = softplus(step)
-                step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
-                e = base + (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
-                put(arena, e + wp.static(tile_at["STEP"]), step)
-                put(arena, e + wp.static(tile_at["DU"]), step * widen(u[i]))
-            put_tile_matrix(arena, base + wp.static(tile_at["B"]), p, b)
+                steps[i] = wp.where(wp.static(m.token(i)) < left, step, 0.0)
+                inputs[i] = steps[i] * widen(u[i])
+            put_mark(arena, base + wp.static(mark_at["STEP"]), p.c, p.row, steps)
+            put_mark(arena, base + wp.static(mark_at["DU"]), p.c, p.row, inputs)
+            put_mark_matrix(arena, base + wp.static(mark_at["B"]), p, b)
             sync()
-            first += wp.static(TILE)
-            u = fetch_tile(u_in, p, first, end)
-            delta = fetch_tile_delta(delta_in, p, first, end)
-            b = fetch_tile_matrix(b_in, p, first, end)
+            t += wp.static(MARK_TILE)
+            u = fetch_mark(u_in, u_at, t, end - 1)
+            delta = fetch_mark_delta(delta_in, delta_at, t, end - 1)
+            b = fetch_mark_matrix(
+                b_in, b_at, p.lane, p.states, t - p.row * wp.static(m.adjacent), end - 1
+            )
             h = mark(arena, base, marks_out, tile, subs, p.slot, p.q, a, h)
         sync()
 
     @wp.func
-    def partial(arena: arena_type, p: Place, name: int, t: int) -> float:
-        total = get(arena, name + t * wp.static(f.span) + p.c)
-        for q in range(1, wp.static(f.lanes)):
-            total += get(arena, name + q * wp.static(lane_stride(f)) + t * wp.static(f.span) + p.c)
-        return total
+    @no_type_check
+    def prepare(
+        p: Place, arena: arena_type, left: int, bias: float,
+        u_raw: raw, delta_raw: raw, dout_raw: raw, z_raw: raw,
+    ):  # fmt: skip
+        # what belongs to a channel alone: operands of the walk, and what ``finish`` needs
+        steps = own()
+        inputs = own()
+        u = own()
+        slopes = own()
+        for i in range(wp.static(g.count)):
+            x = widen_delta(delta_raw[i]) + bias
+            slopes[i] = 1.0
+            step = x
+            if wp.static(use_softplus):
+                step = softplus(x)
+                slopes[i] = softplus_slope(x)
+            inside = wp.static(g.token(i)) < left
+            steps[i] = wp.where(inside, step, 0.0)
+            u[i] = widen(u_raw[i])
+            inputs[i] = steps[i] * u[i]
+        put(arena, wp.static(at["STEP"]), p.c, p.row, steps)
+        put(arena, wp.static(at["DU"]), p.c, p.row, inputs)
+        put(arena, wp.static(at["U"]), p.c, p.row, u)
+        put(arena, wp.static(at["SLOPE"]), p.c, p.row, slopes)
+        if wp.static(read):
+            dys = own()
+            gates = own()
+            for i in range(wp.static(g.count)):
+                dys[i] = wp.where(wp.static(g.token(i)) < left, widen(dout_raw[i]), 0.0)
+                if wp.static(use_z):
+                    z = widen(z_raw[i])
+                    s = sigmoid(z)
+                    gates[i] = dys[i] * s * (1.0 + z * (1.0 - s))
+                    dys[i] = dys[i] * z * s
+            put(arena, wp.static(at["DY"]), p.c, p.row, dys)
+            if wp.static(use_z):
+                put(arena, wp.static(at["GATE"]), p.c, p.row, gates)
 
     @wp.func
+    @no_type_check
     def finish(
-        p: Place, arena: arena_type, t0: int, left: int, u: own, steps: own, slopes: own,
-        dys: own, gates: own, skip: float,
+        p: Place, arena: arena_type, t: int, left: int, skip: float,
+        du_at: wp.uint64, ddelta_at: wp.uint64, dz_at: wp.uint64,
         du_out: wp.array3d(dtype=scalar),
         ddelta_out: wp.array3d(dtype=delta_scalar),
         dz_out: wp.array3d(dtype=scalar),
@@ -136,25 +183,36 @@ def backward_kernel(
         # equations 9 and 11; the terms of dD and ddelta_bias
         dskip = wp.float32(0.0)
         dbias = wp.float32(0.0)
-        for i in range(wp.static(count)):
-            t = p.row + wp.static(i * f.rows)
-            if wp.static(i * f.rows) < left:
-                dskip += dys[i] * u[i]
-                if wp.static("y" in flags):
-                    y = partial(arena, p, wp.static(at.get("Y", 0)), t) + skip * u[i]
-                    store(dz_out, p.b, p.d, t0 + t, gates[i] * y)
-                if wp.static("through" in flags):
-                    s = partial(arena, p, wp.static(at.get("S", 0)), t)
-                    d = partial(arena, p, wp.static(at.get("P", 0)), t)
-                    d = (d * wp.static(1.0 / scale) + u[i] * s) * slopes[i]
-                    dbias += d
-                    if wp.static("du" in flags):
-                        store(du_out, p.b, p.d, t0 + t, steps[i] * s + skip * dys[i])
-                    if wp.static("ddelta" in flags):
-                        store_delta(ddelta_out, p.b, p.d, t0 + t, d)
+        u = get(arena, wp.static(at["U"]), p.c, p.row)
+        dys = own()
+        if wp.static(read):
+            dys = get(arena, wp.static(at["DY"]), p.c, p.row)
+        if wp.static("y" in flags):
+            y = sum_lanes(arena, wp.static(at["Y"]), p.c, p.row)
+            gates = get(arena, wp.static(at["GATE"]), p.c, p.row)
+            for i in range(wp.static(g.count)):
+                inside = wp.static(g.token(i)) < left
+                dz = gates[i] * (y[i] + skip * u[i])
+                store(dz_out, dz_at, t + wp.static(g.token(i)), inside, dz)
+        if wp.static("through" in flags):
+            s = sum_lanes(arena, wp.static(at["S"]), p.c, p.row)
+            d = sum_lanes(arena, wp.static(at["P"]), p.c, p.row)
+            steps = get(arena, wp.static(at["STEP"]), p.c, p.row)
+            slopes = get(arena, wp.static(at["SLOPE"]), p.c, p.row)
+            for i in range(wp.static(g.count)):
+                inside = wp.static(g.token(i)) < left
+                ddelta = (d[i] * wp.static(1.0 / scale) + u[i] * s[i]) * slopes[i]
+                dbias += wp.where(inside, ddelta, 0.0)
+                if wp.static("du" in flags):
+                    du = steps[i] * s[i] + skip * dys[i]
+                    store(du_out, du_at, t + wp.static(g.token(i)), inside, du)
+                if wp.static("ddelta" in flags):
+                    store_delta(ddelta_out, ddelta_at, t + wp.static(g.token(i)), inside, ddelta)
+        for i in range(wp.static(g.count)):
+            dskip += dys[i] * u[i]
         return wp.vec2(dskip, dbias)
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds, grid_stride=False)
     @no_type_check
     def scan_backward(
         # in
@@ -191,76 +249,72 @@ def backward_kernel(
         skip = skip_in[p.d]
         sums = wp.vec2()
         row = (p.b * sizes.groups + p.group) * sizes.parts + p.part
+        product = wp.int64(row) * wp.int64(sizes.length) * wp.int64(sizes.states)
         chunks = (p.end - p.begin + wp.static(MARK - 1)) / wp.static(MARK)
         starts = p.b * ((sizes.length + wp.static(MARK - 1)) / wp.static(MARK))
+        u_at = origin(u_in, p.b, p.d)
+        delta_at = origin_delta(delta_in, p.b, p.d)
+        z_at = origin(z_in, p.b, p.d)
+        dout_at = origin(dout_in, p.b, p.d)
+        du_at = origin(du_out, p.b, p.d)
+        ddelta_at = origin_delta(ddelta_out, p.b, p.d)
+        dz_at = origin(dz_out, p.b, p.d)
+        b_at = origin_matrix(b_in, p.b, p.group)
+        c_at = origin_matrix(c_in, p.b, p.group)
         for back in range(chunks):
             chunk = p.begin + (chunks - 1 - back) * wp.static(MARK)
             end = wp.min(chunk + wp.static(MARK), p.end)
             h = read_states(starts_in, starts + chunk / wp.static(MARK), p)
-            set_marks(p, arena, marks, chunk, end, bias, a, h, u_in, delta_in, b_in)
-            subs = (end - chunk + wp.static(SUB - 1)) / wp.static(SUB)
-            t0 = chunk + (subs - 1) * wp.static(SUB)
-            u_raw = fetch(u_in, p, t0, end)
-            delta_raw = fetch_delta(delta_in, p, t0, end)
+            set_marks(
+                p, arena, marks, chunk, end, bias, a, h, u_at, delta_at, b_at, u_in, delta_in, b_in
+            )  # fmt: skip
+            tiles = (end - chunk + wp.static(TILE - 1)) / wp.static(TILE)
+            t0 = chunk + (tiles - 1) * wp.static(TILE)
+            t = t0 + p.row * wp.static(g.adjacent)
+            u_raw = fetch(u_in, u_at, t, end - 1)
+            delta_raw = fetch_delta(delta_in, delta_at, t, end - 1)
             z_raw = raw()
             dout_raw = raw()
-            b_raw = fetch_matrix(b_in, p, t0, end)
+            b_raw = fetch_matrix(b_in, b_at, lane, p.states, t0, end - 1)
             c_raw = b_raw
             if wp.static(read):
-                dout_raw = fetch(dout_in, p, t0, end)
-                c_raw = fetch_matrix(c_in, p, t0, end)
+                dout_raw = fetch(dout_in, dout_at, t, end - 1)
+                c_raw = fetch_matrix(c_in, c_at, lane, p.states, t0, end - 1)
                 if wp.static(use_z):
-                    z_raw = fetch(z_in, p, t0, end)
-            for again in range(subs):
-                t0 = chunk + (subs - 1 - again) * wp.static(SUB)
-                left = wp.where(p.active != 0, end - t0 - p.row, 0)
-                u = own()
-                steps = own()
-                slopes = own()
-                dys = own()
-                gates = own()
-                for i in range(wp.static(count)):
-                    x = widen_delta(delta_raw[i]) + bias
-                    inside = wp.static(i * f.rows) < left
-                    slopes[i] = 1.0
-                    step = x
-                    if wp.static(use_softplus):
-                        step = softplus(x)
-                        slopes[i] = softplus_slope(x)
-                    steps[i] = wp.where(inside, step, 0.0)
-                    u[i] = widen(u_raw[i])
-                    e = (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
-                    put(arena, e + wp.static(at["STEP"]), steps[i])
-                    put(arena, e + wp.static(at["DU"]), steps[i] * u[i])
-                    if wp.static(read):
-                        dy = wp.where(inside, widen(dout_raw[i]), 0.0)
-                        if wp.static(use_z):
-                            gate = widen(z_raw[i])
-                            s = sigmoid(gate)
-                            gates[i] = dy * s * (1.0 + gate * (1.0 - s))
-                            dy = dy * gate * s
-                        dys[i] = dy
-                        put(arena, e + wp.static(at.get("DY", 0)), dy)
+                    z_raw = fetch(z_in, z_at, t, end - 1)
+            for again in range(tiles):
+                t0 = chunk + (tiles - 1 - again) * wp.static(TILE)
+                t = t0 + p.row * wp.static(g.adjacent)
+                left = wp.where(p.active != 0, end - t, 0)
+                prepare(p, arena, left, bias, u_raw, delta_raw, dout_raw, z_raw)
+                if wp.static(read):
+                    put_matrix(arena, wp.static(at["C"]), p, c_raw)
                 put_matrix(arena, wp.static(at["B"]), p, b_raw)
-                if wp.static(read):
-                    put_matrix(arena, wp.static(at.get("C", 0)), p, c_raw)
                 sync()
-                ahead = t0 - wp.static(SUB)
-                u_raw = fetch(u_in, p, ahead, end)
-                delta_raw = fetch_delta(delta_in, p, ahead, end)
-                b_raw = fetch_matrix(b_in, p, ahead, end)
-                if wp.static(read):
-                    dout_raw = fetch(dout_in, p, ahead, end)
-                    c_raw = fetch_matrix(c_in, p, ahead, end)
-                    if wp.static(use_z):
-                        z_raw = fetch(z_in, p, ahead, end)
+                first = (t0 - chunk) / wp.static(SUB)
+                subs = wp.min(
+                    (end - t0 + wp.static(SUB - 1)) / wp.static(SUB), wp.static(TILE // SUB)
+                )
                 state = retreat(
-                    arena, 0, marks, subs - 1 - again, p.slot, p.q, lane, p.states,
-                    t0, end - t0, row, sizes.length, a, state, db_out, dc_out,
+                    arena, 0, marks, first, subs, p.slot, p.q, lane, p.states,
+                    t0, end - t0, product, a, state, db_out, dc_out,
+                )  # fmt: skip
+                # their loads are on their way while the sums are completed
+                before = wp.max(t0 - wp.static(TILE), chunk)
+                ahead = before + p.row * wp.static(g.adjacent)
+                u_raw = fetch(u_in, u_at, ahead, end - 1)
+                delta_raw = fetch_delta(delta_in, delta_at, ahead, end - 1)
+                b_raw = fetch_matrix(b_in, b_at, lane, p.states, before, end - 1)
+                if wp.static(read):
+                    dout_raw = fetch(dout_in, dout_at, ahead, end - 1)
+                    c_raw = fetch_matrix(c_in, c_at, lane, p.states, before, end - 1)
+                    if wp.static(use_z):
+                        z_raw = fetch(z_in, z_at, ahead, end - 1)
+                total(
+                    arena, 0, p.slot, lane, p.states, t0, end - t0, product, db_out, dc_out
                 )  # fmt: skip
                 sums += finish(
-                    p, arena, t0, left, u, steps, slopes, dys, gates, skip,
-                    du_out, ddelta_out, dz_out,
+                    p, arena, t, left, skip, du_at, ddelta_at, dz_at, du_out, ddelta_out, dz_out
                 )  # fmt: skip
             sync()
         if p.segment == 0:
@@ -271,96 +325,3 @@ def backward_kernel(
             dbias_out[p.at, p.row, p.d] = sums[1]
 
     return scan_backward
-
-
-@functools.cache
-def summary_kernel(
-    dtypes: tuple, mode: str, f: BlockShape, use_softplus: bool, use_z: bool, read: bool
-):
-    """What each segment's own outputs send to the state it starts from, and its decay.
-
-    Args: as ``backward_kernel``.
-    """
-    io, delta_io, matrix = dtypes
-    scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
-    place = placing(f)
-    vec, read_states, write_states = states_io(f)
-    count, raw, fetch, _ = channel_io(f, io, TILE)
-    _, _, fetch_delta, _ = channel_io(f, delta_io, TILE)
-    widen, widen_delta = widening(io), widening(delta_io)
-    at, size = offsets({"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded})
-    arena_type, put, _ = arena_io(2 * size)
-    _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
-    retreat = advancing(f, mode, TILE, tuple(at.items()), 2 * size, False, True)
-    decay = decaying(f, mode, TILE, tuple(at.items()), 2 * size)
-    multiply = mode == "bilinear"
-    scale = 1.0 if multiply else LOG2E
-
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
-    @no_type_check
-    def summarise_backward(
-        # in
-        sizes: Sizes,
-        delta_in: wp.array3d(dtype=delta_scalar),
-        z_in: wp.array3d(dtype=scalar),
-        a_in: wp.array3d(dtype=float),
-        c_in: wp.array4d(dtype=matrix_scalar),
-        bias_in: wp.array(dtype=float),
-        dout_in: wp.array3d(dtype=scalar),
-        # out
-        first_out: wp.array3d(dtype=float),
-        decay_out: wp.array3d(dtype=float),
-    ):
-        index, lane = wp.tid()
-        p = place(sizes, index, lane)
-        arena = wp.tile_empty(shape=(wp.static(2 * size),), dtype=float, storage="shared")
-        a = read_states(a_in, 0, p) * wp.static(scale)
-        dh = vec()
-        product = vec(1.0)
-        bias = bias_in[p.d]
-        total = wp.float32(0.0)
-        tiles = (p.end - p.begin + wp.static(TILE - 1)) / wp.static(TILE)
-        tiles = wp.where(p.segment == 0, 0, tiles)  # the first segment's is not needed
-        t0 = p.begin + (tiles - 1) * wp.static(TILE)
-        end = wp.where(tiles > 0, p.end, 0)
-        z = raw()
-        delta = fetch_delta(delta_in, p, t0, end)
-        dout = fetch(dout_in, p, t0, end)
-        c = fetch_matrix(c_in, p, t0, end)
-        if wp.static(use_z):
-            z = fetch(z_in, p, t0, end)
-        for again in range(tiles):
-            base = (again % 2) * wp.static(size)
-            left = wp.where(p.active != 0, end - t0 - p.row, 0)
-            for i in range(wp.static(count)):
-                step = widen_delta(delta[i]) + bias
-                if wp.static(use_softplus):
-                    step = softplus(step)
-                step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
-                dy = wp.where(wp.static(i * f.rows) < left, widen(dout[i]), 0.0)
-                if wp.static(not read):
-                    dy = 0.0
-                if wp.static(use_z):
-                    dy *= widen(z[i]) * sigmoid(widen(z[i]))
-                e = base + (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
-                put(arena, e + wp.static(at["STEP"]), step)
-                put(arena, e + wp.static(at["IN"]), dy)
-                total += step
-            put_matrix(arena, base + wp.static(at["W"]), p, c)
-            sync()
-            t0 -= wp.static(TILE)
-            delta = fetch_delta(delta_in, p, t0, end)
-            dout = fetch(dout_in, p, t0, end)
-            c = fetch_matrix(c_in, p, t0, end)
-            if wp.static(use_z):
-                z = fetch(z_in, p, t0, end)
-            if wp.static(multiply):
-                product = decay(arena, base, p.slot, p.q, a, product)
-            dh = retreat(arena, base, p.slot, p.q, a, dh)
-        write_states(first_out, p.at, p, dh)
-        if wp.static(multiply):
-            write_states(decay_out, p.at, p, product)
-        elif p.active != 0:
-            decay_out[p.at, p.row, p.d] = total
-
-    return summarise_backward

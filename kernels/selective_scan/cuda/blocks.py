@@ -76,7 +76,7 @@ def block_shape(block: int, channels: int, states: int, total: int) -> BlockShap
 
 
 # A type, an integer of its bits, and the float that such an integer means.
-_BITS = {
+BITS = {
     torch.float32: ("float", "unsigned", "float f; memcpy(&f, &bits, 4); return f;"),
     torch.float16: (
         "wp::float16",
@@ -95,7 +95,7 @@ _BITS = {
 def widening(io: torch.dtype):
     """Makes the function that turns the bits of an ``io`` into a float."""
 
-    @wp.func_native(_BITS[io][2])
+    @wp.func_native(BITS[io][2])
     def widen(bits: wp.uint32) -> float: ...
 
     return widen
@@ -282,7 +282,7 @@ def channel_io(f: BlockShape, io: torch.dtype, tokens: int):
     converting would wait for them. Elements from ``end`` on are 0.
     """
     scalar = WARP_DTYPES[io]
-    element, word, _ = _BITS[io]
+    element, word, _ = BITS[io]
     count = tokens // f.rows
     raw = wp.types.vector(count, wp.uint32)
 
@@ -338,7 +338,7 @@ for (int i = 0; i < {count}; ++i) {{
     const int e = {f.block} * i + lane, t = e / {f.padded}, n = e % {f.padded};
     r.c[i] = 0;
     if (t < left && n < states && e < {size})
-        r.c[i] = *(const {_BITS[io][1]}*)(
+        r.c[i] = *(const {BITS[io][1]}*)(
             from + wide_(n, x_in.strides[3]) + wide_(t0 + t, x_in.strides[1]));
 }}
 return r;

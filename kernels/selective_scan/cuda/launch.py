@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from ...runtime.views import lane_contiguous
-from .backward import backward_kernel, summary_kernel
+from .backward import backward_kernel
 from .blocks import MARK
 from .forward import forward_kernel
 from .operands import Operands
+from .summary import summary_kernel
 
 
 def forward(

@@ -95,8 +95,12 @@ _END_WALK = """
 """
 
 
-def prelude(f: BlockShape, mode: str) -> str:
-    """Constants, vector access to shared memory, and the factors of equations 2 to 4."""
+def prelude(f: BlockShape, mode: str, adjacent: int = 1) -> str:
+    """Constants, vector access to shared memory, and the factors of equations 2 to 4.
+
+    Access is to the channels of a thread, ``load_ch``, to its states, ``load_st``, and to
+    ``adjacent`` tokens of one channel, ``load_su``; each has its ``store_``.
+    """
 
     def access(name: str, count: int) -> str:
         w = min(4, count)
@@ -129,6 +133,7 @@ auto store_{name} = [](float* to, const float* from) {{
         + f"constexpr int PADDED = {f.padded}, WIDTH = {f.width}, WALKS = {f.walks};\n"
         + access("ch", f.channels)
         + access("st", f.states)
+        + access("su", adjacent)
         + f"""
 auto factors_ = [&](float rate, float a, float& f, float& g) {{ {_FACTORS[mode]} }};
 auto slopes_ = [&](float rate, float a, float& f, float& g, float& df, float& dg) {{
@@ -239,37 +244,42 @@ return h;
 def marking(f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int):
     """Walks the recurrence over a tile and keeps the state before every ``SUB`` tokens.
 
-    The marks of a chunk are local memory: up to 1 KB per channel, too much for registers, and left
-    to the cache where shared memory would limit the number of blocks.
+    δ and δu are ``[token / 4, channel, 4]``, as in ``groups.py``. The marks of a chunk are local
+    memory: up to 1 KB per channel, too much for registers, and left to the cache where shared
+    memory would limit the number of blocks.
     """
     offset = dict(at)
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     snippet = f"""
-{prelude(f, mode)}
+{prelude(f, mode, SUB)}
 {marks_access("marks_out")}
 {_WALK}
 WP_PRAGMA_NO_UNROLL
-for (int t0 = 0; t0 < {tokens}; t0 += {SUB}) {{
-    const int mark = tile * {tokens // SUB} + t0 / {SUB};
+for (int sub = 0; sub < {tokens // SUB}; ++sub) {{
+    const int mark = tile * {tokens // SUB} + sub;
     if (mark >= count) break;
     load_e(marks + (walk * {MARK // SUB} + mark) * E, hn, true);
     if (mark + 1 == count) break;
+    float r[CH][{SUB}], x[CH][{SUB}];
     WP_PRAGMA_UNROLL
-    for (int u = 0; u < {SUB}; ++u) {{
-        const int t = t0 + u;
-        float r[CH], x[CH], w[ST];
-        load_ch(s + {offset["STEP"]} + t * SPAN + channel, r);
-        load_ch(s + {offset["DU"]} + t * SPAN + channel, x);
-        load_st(s + {offset["B"]} + t * PADDED + state, w);
+    for (int i = 0; i < CH; ++i) {{
+        const int own = (sub * SPAN + channel + i) * {SUB};
+        load_su(s + {offset["STEP"]} + own, r[i]);
+        load_su(s + {offset["DU"]} + own, x[i]);
+    }}
+    WP_PRAGMA_UNROLL
+    for (int t = 0; t < {SUB}; ++t) {{
+        float w[ST];
+        load_st(s + {offset["B"]} + (sub * {SUB} + t) * PADDED + state, w);
         WP_PRAGMA_UNROLL
         for (int i = 0; i < CH; ++i)
             WP_PRAGMA_UNROLL
             for (int j = 0; j < ST; ++j) {{
                 const int k = i * ST + j;
                 float f, g;
-                factors_(r[i], an[k], f, g);
-                hn[k] = f * hn[k] + g * (x[i] * w[j]);
+                factors_(r[i][t], an[k], f, g);
+                hn[k] = f * hn[k] + g * (x[i][t] * w[j]);
             }}
     }}
 }}

@@ -1,0 +1,245 @@
+"""A kernel's instructions as a disassembler lists them: their kinds, and the loops they are in.
+
+``nvdisasm`` comes with CUDA's toolkit and inside Triton. Loops are the natural loops of the jumps:
+a jump back to a place that every way to the jump has passed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+# Kind: the operations that it holds, by the part of their name before the first dot. What is not
+# listed is "integer" (with comparisons, selections and bits), or "uniform" if it begins with U.
+KINDS = {
+    "float": ("FADD", "FMUL", "FFMA", "FADD32I", "FMUL32I", "FFMA32I"),
+    "special": ("MUFU",),
+    "multiply": ("IMAD", "HFMA2", "HADD2", "HMUL2"),  # on the float unit; moves constants as well
+    "convert": ("F2F", "F2FP", "F2I", "I2F", "I2FP", "F2IP", "FRND"),
+    "global": ("LDG", "STG", "LD", "ST", "RED", "ATOM", "ATOMG", "LDGSTS"),
+    "shared": ("LDS", "STS", "ATOMS", "LDSM"),
+    "local": ("LDL", "STL"),
+    "shuffle": ("SHFL", "REDUX", "VOTE", "MATCH"),
+    "constant": ("LDC",),
+    "barrier": ("BAR", "WARPSYNC", "DEPBAR", "LDGDEPBAR", "MEMBAR"),
+    "jump": ("BRA", "BSSY", "BSYNC", "EXIT", "CALL", "RET", "BREAK", "BRX", "JMP", "NOP", "BMOV"),
+    "tensor": ("HMMA", "IMMA", "DMMA", "HGMMA"),
+    "uniform": (),
+    "integer": (),
+}
+_KIND = {operation: kind for kind, operations in KINDS.items() for operation in operations}
+_MEMORY = ("global", "shared", "local", "shuffle")
+_LINE = re.compile(r"\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\w+\s+)?([A-Z][\w.]*)\s*([^;]*);")
+_JUMPS = ("BRA", "BRA.", "CALL")  # sm_80 jumps far with a call from which nothing returns
+_LABEL = re.compile(r"(\.L_\w+):")
+_TARGET = re.compile(r"`\((\.L_\w+)\)")
+
+
+@dataclass(frozen=True)
+class Instruction:
+    """One instruction.
+
+    Attributes:
+        operation: with its modifiers, e.g. "LDS.128".
+        always: it has no condition.
+        target: index of the instruction that it may jump to, else None.
+    """
+
+    operation: str
+    always: bool
+    target: int | None
+
+    @property
+    def kind(self) -> str:
+        """One of ``KINDS``."""
+        name = self.operation.split(".")[0]
+        return _KIND.get(name, "uniform" if name[0] == "U" or name == "R2UR" else "integer")
+
+    @property
+    def passes(self) -> int:
+        """32-bit words of a thread that go through the load and store unit; 0 for other units."""
+        if self.kind not in _MEMORY:
+            return 0
+        modifiers = self.operation.split(".")[1:]
+        return 4 if "128" in modifiers else 2 if "64" in modifiers else 1
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A natural loop.
+
+    Attributes:
+        first: index of its first instruction, where every turn begins.
+        body: indices of its instructions, those of the loops inside it included.
+        inside: the loops in it, by their place.
+    """
+
+    first: int
+    body: frozenset[int]
+    inside: tuple[Loop, ...]
+
+
+def find_nvdisasm() -> Path | None:
+    """NVIDIA's disassembler: on PATH, in CUDA_HOME or CUDA_PATH, or inside Triton."""
+    folders = [
+        Path(os.environ[name]) / "bin"
+        for name in ("CUDA_HOME", "CUDA_PATH")
+        if os.environ.get(name)
+    ]
+    triton = importlib.util.find_spec("triton")
+    if triton is not None and triton.origin:
+        folders.append(Path(triton.origin).parent / "backends" / "nvidia" / "bin")
+    found = shutil.which("nvdisasm")
+    if found is None:
+        found = shutil.which("nvdisasm", path=os.pathsep.join(map(str, folders)))
+    return Path(found) if found else None
+
+
+def disassemble(tool: Path, cubin: Path) -> str:
+    """The text that ``nvdisasm -c`` gives of a binary.
+
+    Raises:
+        ValueError: the tool fails, as one that is older than the binary does.
+    """
+    done = subprocess.run([tool, "-c", cubin], capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(f"{tool.name} fails: {done.stderr.strip().splitlines()[-1:]}")
+    return done.stdout
+
+
+def parse(text: str, kernel: str) -> list[Instruction]:
+    """The instructions of a kernel, those of functions that it calls included.
+
+    Args:
+        text: of ``disassemble``.
+        kernel: its symbol.
+
+    Raises:
+        ValueError: the text has no such kernel.
+    """
+    _, found, rest = text.partition(f"\n.text.{kernel}:")
+    if not found:
+        raise ValueError(f"the disassembly has no kernel {kernel}")
+    lines: list[tuple[str, bool, str]] = []
+    labels: dict[str, int] = {}
+    for line in rest.splitlines():
+        if ".section" in line:
+            break
+        if label := _LABEL.match(line):
+            labels[label[1]] = len(lines)
+        elif code := _LINE.match(line):
+            lines.append((code[2], "@" not in line.split("*/")[1].split(code[2])[0], code[3]))
+    found_targets = [_TARGET.search(operands) for _, _, operands in lines]
+    return [
+        Instruction(name, always, labels.get(to[1]) if to and name[:4] in _JUMPS else None)
+        for (name, always, _), to in zip(lines, found_targets)
+    ]
+
+
+def _next(code: Sequence[Instruction], i: int) -> Iterator[int]:
+    """Where execution goes from instruction i."""
+    target = code[i].target
+    if target is not None:
+        yield target
+    name = code[i].operation.split(".")[0]
+    leaves = name in ("BRA", "EXIT", "RET", "BRX") or (
+        name == "CALL" and code[i].target is not None
+    )
+    if i + 1 < len(code) and not (leaves and code[i].always):
+        yield i + 1
+
+
+def find_loops(code: Sequence[Instruction]) -> tuple[Loop, ...]:
+    """The outermost loops of a kernel, with those inside them."""
+    before: list[list[int]] = [[] for _ in code]
+    for i in range(len(code)):
+        for j in _next(code, i):
+            before[j].append(i)
+    bodies: dict[int, set[int]] = {}
+    for i, instruction in enumerate(code):
+        start = instruction.target
+        if start is None or start >= i:
+            continue
+        body, pending = {start}, [i]  # what reaches the jump without passing its target
+        while pending:
+            at = pending.pop()
+            if at not in body:
+                body.add(at)
+                pending += before[at]
+        if 0 not in body or start == 0:  # else a way from the entry avoids the target: no loop
+            bodies[start] = bodies.get(start, set()) | body
+    return _nest([(start, frozenset(body)) for start, body in sorted(bodies.items())])
+
+
+def _nest(bodies: list[tuple[int, frozenset[int]]]) -> tuple[Loop, ...]:
+    outer = [
+        (start, body)
+        for start, body in bodies
+        if not any(start in other and body < other for _, other in bodies)
+    ]
+    return tuple(
+        Loop(start, body, _nest([(s, b) for s, b in bodies if s in body and b < body]))
+        for start, body in outer
+    )
+
+
+def counts(code: Sequence[Instruction], body: frozenset[int] | None = None) -> Counter[str]:
+    """How often each kind occurs, and "passes"; of all the code or of a part."""
+    chosen = code if body is None else [code[i] for i in sorted(body)]
+    total = Counter(instruction.kind for instruction in chosen)
+    total["passes"] = sum(instruction.passes for instruction in chosen)
+    return total
+
+
+def innermost(code: Sequence[Instruction]) -> frozenset[int]:
+    """The body of the largest loop that holds no other; of a kernel without loops, all of it."""
+
+    def leaves(loops: Sequence[Loop]) -> Iterator[frozenset[int]]:
+        for loop in loops:
+            yield from leaves(loop.inside) if loop.inside else (loop.body,)
+
+    return max(leaves(find_loops(code)), key=len, default=frozenset(range(len(code))))
+
+
+# How often a loop turns, and the same of the loops inside it.
+Turns = tuple[float, tuple["Turns", ...]]
+
+
+def executed(code: Sequence[Instruction], turns: Sequence[Turns]) -> dict[str, float] | None:
+    """How many instructions of each kind a warp executes, conditions all taken to hold.
+
+    Args:
+        code: of the kernel.
+        turns: of its largest loops, in the order of their places; others count as one turn.
+
+    Returns:
+        None where the code has fewer loops than ``turns``.
+    """
+    total: dict[str, float] = dict(counts(code))
+    return total if _add(total, code, find_loops(code), turns, 1) else None
+
+
+def _add(
+    total: dict[str, float],
+    code: Sequence[Instruction],
+    loops: Sequence[Loop],
+    turns: Sequence[Turns],
+    times: float,
+) -> bool:
+    """Adds what the loops' turns add to counting every instruction ``times``; False: too few."""
+    if len(loops) < len(turns):
+        return False
+    largest = sorted(loops, key=lambda loop: len(loop.body), reverse=True)[: len(turns)]
+    for loop, (count, inside) in zip(sorted(largest, key=lambda loop: loop.first), turns):
+        for kind, number in counts(code, loop.body).items():
+            total[kind] += number * times * (count - 1)
+        if not _add(total, code, loop.inside, inside, times * count):
+            return False
+    return True

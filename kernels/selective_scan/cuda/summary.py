@@ -1,0 +1,121 @@
+"""The first kernel of a gradient in segments: what a segment's own outputs send back through it.
+
+It is computed for all segments but the first at once; ``carry`` then gives each segment the
+gradient of the state after it, and ``backward.py`` walks them all.
+"""
+
+import functools
+from typing import no_type_check
+
+import warp as wp
+
+from ...runtime.lanes import WARP_DTYPES
+from ...runtime.scalars import LOG2E, sigmoid, softplus
+from .blocks import (
+    BlockShape,
+    Sizes,
+    arena_io,
+    channel_io,
+    matrix_io,
+    offsets,
+    placing,
+    states_io,
+    sync,
+    widening,
+)
+from .tokens import advancing, decaying
+
+TILE = 16  # tokens
+
+
+@functools.cache
+def summary_kernel(
+    dtypes: tuple, mode: str, f: BlockShape, use_softplus: bool, use_z: bool, read: bool
+):
+    """What each segment's own outputs send to the state it starts from, and its decay.
+
+    Args: as ``backward_kernel``.
+    """
+    io, delta_io, matrix = dtypes
+    scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
+    place = placing(f)
+    vec, read_states, write_states = states_io(f)
+    count, raw, fetch, _ = channel_io(f, io, TILE)
+    _, _, fetch_delta, _ = channel_io(f, delta_io, TILE)
+    widen, widen_delta = widening(io), widening(delta_io)
+    at, size = offsets({"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded})
+    arena_type, put, _ = arena_io(2 * size)
+    _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
+    retreat = advancing(f, mode, TILE, tuple(at.items()), 2 * size, False, True)
+    decay = decaying(f, mode, TILE, tuple(at.items()), 2 * size)
+    multiply = mode == "bilinear"
+    scale = 1.0 if multiply else LOG2E
+
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
+    @no_type_check
+    def summarise_backward(
+        # in
+        sizes: Sizes,
+        delta_in: wp.array3d(dtype=delta_scalar),
+        z_in: wp.array3d(dtype=scalar),
+        a_in: wp.array3d(dtype=float),
+        c_in: wp.array4d(dtype=matrix_scalar),
+        bias_in: wp.array(dtype=float),
+        dout_in: wp.array3d(dtype=scalar),
+        # out
+        first_out: wp.array3d(dtype=float),
+        decay_out: wp.array3d(dtype=float),
+    ):
+        index, lane = wp.tid()
+        p = place(sizes, index, lane)
+        arena = wp.tile_empty(shape=(wp.static(2 * size),), dtype=float, storage="shared")
+        a = read_states(a_in, 0, p) * wp.static(scale)
+        dh = vec()
+        product = vec(1.0)
+        bias = bias_in[p.d]
+        total = wp.float32(0.0)
+        tiles = (p.end - p.begin + wp.static(TILE - 1)) / wp.static(TILE)
+        tiles = wp.where(p.segment == 0, 0, tiles)  # the first segment's is not needed
+        t0 = p.begin + (tiles - 1) * wp.static(TILE)
+        end = wp.where(tiles > 0, p.end, 0)
+        z = raw()
+        delta = fetch_delta(delta_in, p, t0, end)
+        dout = fetch(dout_in, p, t0, end)
+        c = fetch_matrix(c_in, p, t0, end)
+        if wp.static(use_z):
+            z = fetch(z_in, p, t0, end)
+        for again in range(tiles):
+            base = (again % 2) * wp.static(size)
+            left = wp.where(p.active != 0, end - t0 - p.row, 0)
+            for i in range(wp.static(count)):
+                step = widen_delta(delta[i]) + bias
+                if wp.static(use_softplus):
+                    step = softplus(step)
+                step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
+                dy = wp.where(wp.static(i * f.rows) < left, widen(dout[i]), 0.0)
+                if wp.static(not read):
+                    dy = 0.0
+                if wp.static(use_z):
+                    dy *= widen(z[i]) * sigmoid(widen(z[i]))
+                e = base + (p.row + wp.static(i * f.rows)) * wp.static(f.span) + p.c
+                put(arena, e + wp.static(at["STEP"]), step)
+                put(arena, e + wp.static(at["IN"]), dy)
+                total += step
+            put_matrix(arena, base + wp.static(at["W"]), p, c)
+            sync()
+            t0 -= wp.static(TILE)
+            delta = fetch_delta(delta_in, p, t0, end)
+            dout = fetch(dout_in, p, t0, end)
+            c = fetch_matrix(c_in, p, t0, end)
+            if wp.static(use_z):
+                z = fetch(z_in, p, t0, end)
+            if wp.static(multiply):
+                product = decay(arena, base, p.slot, p.q, a, product)
+            dh = retreat(arena, base, p.slot, p.q, a, dh)
+        write_states(first_out, p.at, p, dh)
+        if wp.static(multiply):
+            write_states(decay_out, p.at, p, product)
+        elif p.active != 0:
+            decay_out[p.at, p.row, p.d] = total
+
+    return summarise_backward

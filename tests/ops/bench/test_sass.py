@@ -1,0 +1,163 @@
+"""Counts from a disassembly, the loops in it, and the times estimated from them."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from gamba_warp.kernels.bench.static import sass
+from gamba_warp.kernels.bench.static.estimate import (
+    DEVICES,
+    Device,
+    Shape,
+    Work,
+    estimate,
+    per_element,
+    scan_work,
+)
+from gamba_warp.kernels.bench.static.page import static_markdown
+
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "benchmarks"
+
+# Two loops, one in the other; a cold part that comes after the end and jumps back; another kernel.
+TEXT = """
+	.section	.text.mine,"ax",@progbits
+.text.mine:
+        /*0000*/                   MOV R1, c[0x0][0x28] ;
+.L_x_2:
+        /*0010*/                   LDG.E.U16 R2, desc[UR4][R4.64] ;
+        /*0020*/              @!P0 BRA `(.L_x_4) ;
+.L_x_3:
+        /*0030*/                   LDS.128 R8, [R6+0x10] ;
+.L_x_1:
+        /*0040*/                   FFMA R0, R8, R9, R0 ;
+        /*0050*/                   FMUL R10, R8, -1.4426950216293334961 ;
+        /*0060*/                   MUFU.EX2 R11, R10 ;
+        /*0070*/               @P1 STS.64 [R6], R2 ;
+        /*0080*/              @!P2 BRA `(.L_x_1) ;
+        /*0090*/                   BAR.SYNC.DEFER_BLOCKING 0x0 ;
+        /*00a0*/               @P3 CALL.REL.NOINC `(.L_x_5) ;
+        /*00b0*/                   BRA `(.L_x_2) ;
+.L_x_5:
+        /*00c0*/                   UIADD3 UR4, UR4, 0x1, URZ ;
+        /*00d0*/                   STL [R1+0x8], R3 ;
+        /*00e0*/                   EXIT ;
+.L_x_4:
+        /*00f0*/                   F2FP.BF16.F32.PACK_AB R3, R2, R2 ;
+        /*0100*/                   BRA `(.L_x_3) ;
+.L_x_6:
+        /*0110*/                   BRA `(.L_x_6);
+	.section	.text.other,"ax",@progbits
+.text.other:
+        /*0000*/                   SHFL.BFLY PT, R2, R3, 0x1, 0x1f ;
+        /*0010*/                   EXIT ;
+"""
+
+
+@pytest.fixture
+def code():
+    return sass.parse(TEXT, "mine")
+
+
+def test_instructions_are_told_apart(code):
+    assert len(code) == 18
+    kinds = sass.counts(code)
+    assert kinds == {
+        **{"integer": 1, "global": 1, "jump": 7, "shared": 2, "float": 2, "special": 1},
+        **{"barrier": 1, "uniform": 1, "local": 1, "convert": 1},
+        "passes": 1 + 4 + 2 + 1,
+    }  # fmt: skip
+    assert [i.always for i in code].count(False) == 4
+    assert sass.counts(sass.parse(TEXT, "other"))["shuffle"] == 1
+    with pytest.raises(ValueError, match="no kernel its"):
+        sass.parse(TEXT, "its")
+
+
+def test_loops_are_found(code):
+    """The cold part after the end belongs to the outer loop, though its jump back is no loop."""
+    (outer,) = sass.find_loops(code)
+    assert outer.body == {*range(1, 12), 15, 16} and outer.first == 1
+    (inner,) = outer.inside
+    assert inner.body == {*range(4, 9)} and not inner.inside
+    assert sass.innermost(code) == inner.body
+
+
+def test_turns_multiply(code):
+    once = sass.counts(code)
+    total = sass.executed(code, [(10, ((4, ()),))])
+    assert total["special"] == 40 and total["float"] == 80
+    assert total["global"] == 10 and total["convert"] == 10
+    assert total["uniform"] == once["uniform"] == 1
+    assert total["passes"] == 10 * (1 + 4) + 40 * 2 + 1
+    assert sass.executed(code, [(1, ((1, ()),))]) == once
+    assert sass.executed(code, [(2, ()), (3, ())]) is None  # there is one outer loop
+    assert sass.executed(code, [(2, ((3, ((4, ()),)),))]) is None
+
+
+def test_a_self_jump_is_no_turn(code):
+    """Padding at the end jumps to itself and is never reached."""
+    assert all(17 not in loop.body for loop in sass.find_loops(code))
+
+
+def test_the_busiest_unit_sets_the_time():
+    device = Device("a toy", 10, 1e9, 1e12, 128)
+    work = Work(blocks=11, warps=4, turns=(), elements=4 * 32 * 50, traffic=2e6)
+    counted = Counter({"float": 400, "special": 40, "integer": 100, "multiply": 20, "passes": 70})
+    found = estimate(device, work, counted)
+    warps = 2 * 4  # the eleventh block is a second one for somebody
+    assert found.issue == pytest.approx(1e3 * warps * 560 / 4 / 1e9)
+    assert found.special == pytest.approx(1e3 * warps * 40 * 2 / 1e9)
+    assert found.float32 == pytest.approx(1e3 * warps * (400 / 4 + 20 / 2) / 1e9)
+    assert found.integer == pytest.approx(1e3 * warps * 100 / 2 / 1e9)
+    assert found.memory == pytest.approx(1e3 * warps * 70 / 1e9)
+    assert found.dram == pytest.approx(2e-3)
+    assert (found.ms, found.limit) == (found.dram, "dram")
+    found = estimate(device, work, counted + Counter(float=100_000))
+    assert found.limit == "issue"
+    found = estimate(DEVICES[80], work, Counter(float=100_000))
+    assert found.limit == "float32"  # two cycles for a warp
+    assert per_element(work, counted)["all"] == pytest.approx(560 / 50)
+
+
+def test_the_work_of_the_scan():
+    shape = Shape(16, 16961, 1024, 16, 2)
+    forward, back = (scan_work(k, shape, 132) for k in ("scan_forward", "scan_backward"))
+    tokens = 266 * 64  # whole chunks
+    for work in (forward, back):
+        assert (work.blocks, work.warps, work.elements) == (256, 4, tokens * 64 * 16)
+    each = 16 * 16961 * 1024
+    matrices = 16 * 16961 * 2 * 16
+    assert forward.traffic == each * (4 * 2 + 1) + matrices * 2
+    assert back.traffic == each * (7 * 2 + 1) + matrices * (2 + 4 * 16)
+    one = scan_work("summarise_backward", Shape(1, 16961, 1024, 16, 2), 132)
+    assert one.blocks > 256 and one.elements < back.elements
+    assert scan_work("carry", shape, 132) is None
+
+
+def rows(kernel, case):
+    document = json.loads((DOCS / "static.json").read_text())
+    found = [r for r in document["kernels"] if (r["kernel"], r["case"]) == (kernel, case)]
+    return {row["arch"]: row for row in found}
+
+
+def test_the_scan_is_within_its_budget():
+    """Of 16 sequences in bfloat16; the report is made again when the kernels change."""
+    forward, back = rows("scan_forward", "bfloat16"), rows("scan_backward", "bfloat16")
+    if "estimate" not in forward["sm_90"]:
+        pytest.skip("the report was made without a disassembler")
+    times = [r["sm_90"]["estimate"]["ms"] for r in (forward, back)]
+    assert 0.5 < times[0] <= 2.2 and sum(times) <= 6.0
+    for found in (forward, back):
+        for row in found.values():
+            assert row["estimate"]["ms"] >= row["estimate"]["dram"] > 0
+            assert row["per_element"]["special"] >= 1  # the exponential
+            assert row["reloads"] <= 4  # none but of the place of the marks
+
+
+def test_a_page_without_counts_says_so():
+    document = json.loads((DOCS / "static.json").read_text())
+    for row in document["kernels"]:
+        row.pop("loop", None), row.pop("estimate", None)
+    text = static_markdown(document)
+    assert "No disassembler was found" in text and "Least times" not in text
