@@ -72,7 +72,7 @@ def bench_command(
             that ends in .svg it draws their charts of growth, with .json it joins them.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
             (registers, stack, shared memory, occupancy) to static.json and static.md; with nvdisasm
-            (on PATH, in CUDA_HOME or inside Triton) also instructions, and the scan\x27s least times.
+            (on PATH, in CUDA_HOME or inside Triton) also instructions, and the scan's least times.
         data: Folder of posed views for step; made-up views if not given.
         only: Measure only these cases, by their full names, as L or "random, float32".
     """

@@ -9,7 +9,8 @@ Nothing runs, so no time is measured.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -236,21 +237,21 @@ def binaries(launch: Launch) -> dict[int, Path]:
     return dict(zip(MACHINES, map(Path, paths)))
 
 
-def _symbol(launch: Launch) -> str:
-    return launch.kernel.get_mangled_name() + "_cuda_kernel_forward"
+def _symbol(launch: Launch, names: Iterable[str]) -> str:
+    """A kernel's symbol in a binary: Warp gives it a hash that depends on the target."""
+    pattern = re.compile(re.escape(launch.kernel.key) + "_[0-9a-f]{8}_cuda_kernel_forward")
+    (symbol,) = {name for name in names if pattern.fullmatch(name)}
+    return symbol
 
 
 def compile_kernel(launch: Launch) -> dict[int, tuple[Resources, int]]:
     """By architecture what a kernel takes, and the bytes of its dynamic shared memory."""
-    paths = binaries(
-        launch
-    )  # before the symbol: a module that other kernels share has none earlier
-    symbol = _symbol(launch)
     found = {}
-    for architecture, path in paths.items():
+    for architecture, path in binaries(launch).items():
         meta = json.loads((path.parent / f"{path.name.rsplit('.', 2)[0]}.meta").read_bytes())
-        dynamic = meta.get(f"{symbol}_smem_bytes", 0)
-        found[architecture] = read_cubin(path.read_bytes())[symbol], dynamic
+        taken = read_cubin(path.read_bytes())
+        symbol = _symbol(launch, taken)
+        found[architecture] = taken[symbol], meta.get(f"{symbol}_smem_bytes", 0)
     return found
 
 
@@ -258,7 +259,8 @@ def _counted(entry: Entry, tool: Path) -> dict[int, dict]:
     """By architecture ``loop``, what the largest innermost loop holds, and the scan's estimate."""
     found = {}
     for arch, path in binaries(entry.launch).items():
-        code = parse(disassemble(tool, path), _symbol(entry.launch))
+        symbol = _symbol(entry.launch, read_cubin(path.read_bytes()))
+        code = parse(disassemble(tool, path), symbol)
         found[arch] = {"loop": dict(counts(code, innermost(code)))}
         if entry.op != "scan":
             continue
