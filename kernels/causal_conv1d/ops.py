@@ -56,7 +56,7 @@ def conv(
     strips = -(-x.shape[1] // STRIP)
     x = lane_contiguous(x)
     blocks, w, v, rows = _operands(x, weight, bias, state)
-    out = torch.empty(x.shape, dtype=x.dtype, device=x.device)
+    out = _empty(x, tuple(x.shape))
     kernel = forward_kernel(x.device.type, x.dtype)
     _launch(x, kernel, (x.shape[0] * strips, blocks), [strips, int(silu), x, w, v, rows], [out])
     return out
