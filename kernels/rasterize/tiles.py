@@ -17,8 +17,9 @@ from .skip import TILE_TEST
 wp.set_module_options({"enable_backward": False})
 
 # Rounding of q, relative and absolute; the test may keep too much, never too little.
-_SLACK = wp.constant(1.0 + 1e-4)
-_SLACK_ABS = wp.constant(1e-4)
+SLACK, SLACK_ABS = 1.0 + 1e-4, 1e-4
+_SLACK = wp.constant(SLACK)
+_SLACK_ABS = wp.constant(SLACK_ABS)
 _TILE_TEST = wp.constant(TILE_TEST)
 
 
