@@ -159,10 +159,17 @@ def unit(q: wp.vec4) -> wp.vec4:
 
 
 @wp.func
-def slope(p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.float32:
-    # README eq. 2: x/z kept within the picture and a margin around it
+def slope_bounds(center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.vec2:
+    # README eq. 2: the picture and a margin around it
     margin = _MARGIN * 0.5 * size / focal
-    return wp.clamp(p, -(center / focal + margin), (size - center) / focal + margin)
+    return wp.vec2(-(center / focal + margin), (size - center) / focal + margin)
+
+
+@wp.func
+def slope(p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.float32:
+    # x/z kept within these bounds
+    bounds = slope_bounds(center, size, focal)
+    return wp.clamp(p, bounds[0], bounds[1])
 
 
 @wp.func
@@ -329,31 +336,28 @@ def project_forward(
     means2d, conics, extents = (means.new_empty(*shape, size) for size in (2, 3, 2))
     depths, view_opacities = means.new_empty(shape), means.new_empty(shape)
     status = torch.empty(shape, dtype=torch.int32, device=means.device)
-    if status.numel():
-        launch(
-            _project,
-            status.numel(),
-            [
-                views,
-                num,
-                int(colors.dim() == 4),
-                lens,
-                vectors(means, wp.vec3),
-                vectors(quats, wp.vec4),
-                vectors(scales, wp.vec3),
-                opacities.view(-1),
-                colors.view(-1, colors.shape[-1]),
-                vectors(viewmats, wp.mat44),
-                vectors(Ks, wp.mat33),
-            ],
-            [
-                vectors(means2d, wp.vec2),
-                vectors(conics, wp.vec3),
-                depths.view(-1),
-                view_opacities.view(-1),
-                vectors(extents, wp.vec2),
-                status.view(-1),
-            ],
-            means.device,
-        )
+    inputs = [
+        vectors(means, wp.vec3),
+        vectors(quats, wp.vec4),
+        vectors(scales, wp.vec3),
+        opacities.view(-1),
+        colors.view(-1, colors.shape[-1]),
+        vectors(viewmats, wp.mat44),
+        vectors(Ks, wp.mat33),
+    ]
+    outputs = [
+        vectors(means2d, wp.vec2),
+        vectors(conics, wp.vec3),
+        depths.view(-1),
+        view_opacities.view(-1),
+        vectors(extents, wp.vec2),
+        status.view(-1),
+    ]
+    sizes = [views, num, int(colors.dim() == 4), lens]
+    if status.numel() and means.device.type == "cpu":
+        from .cpu.project import project_on_lanes  # which takes functions of this file
+
+        project_on_lanes(batch * views, *sizes, inputs, outputs)
+    elif status.numel():
+        launch(_project, status.numel(), [*sizes, *inputs], outputs, means.device)
     return Projected(means2d, conics, depths, view_opacities, extents, status)
