@@ -3,6 +3,7 @@
 One thread per (view, Gaussian). README.md §1 holds the maths; ``project_vjp.py`` the gradient.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, no_type_check
 
 import torch
@@ -10,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from ..runtime.launch import launch
+from ..runtime.memory import empty
 from ..runtime.views import struct, vectors
 from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 
@@ -309,6 +311,13 @@ def make_lens(options: LensOptions) -> Lens:
     return lens
 
 
+def room(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """An empty tensor; a large one on the CPU is of large pages, which are read at random."""
+    if device.type == "cpu":
+        return empty(shape, dtype)
+    return torch.empty(*shape, dtype=dtype, device=device)
+
+
 def project_forward(
     means: Tensor,
     quats: Tensor | None,
@@ -333,9 +342,10 @@ def project_forward(
     """
     (batch, views), num = viewmats.shape[:2], means.shape[1]
     shape = (batch, views, num)
-    means2d, conics, extents = (means.new_empty(*shape, size) for size in (2, 3, 2))
-    depths, view_opacities = means.new_empty(shape), means.new_empty(shape)
-    status = torch.empty(shape, dtype=torch.int32, device=means.device)
+    sizes, device = ((2,), (3,), (), (), (2,)), means.device
+    floats = (room([*shape, *size], torch.float32, device) for size in sizes)
+    means2d, conics, depths, view_opacities, extents = floats
+    status = room(shape, torch.int32, device)
     inputs = [
         vectors(means, wp.vec3),
         vectors(quats, wp.vec4),
@@ -353,11 +363,11 @@ def project_forward(
         vectors(extents, wp.vec2),
         status.view(-1),
     ]
-    sizes = [views, num, int(colors.dim() == 4), lens]
+    numbers = [views, num, int(colors.dim() == 4), lens]
     if status.numel() and means.device.type == "cpu":
         from .cpu.project import project_on_lanes  # which takes functions of this file
 
-        project_on_lanes(batch * views, *sizes, inputs, outputs)
+        project_on_lanes(batch * views, *numbers, inputs, outputs)
     elif status.numel():
-        launch(_project, status.numel(), [*sizes, *inputs], outputs, means.device)
+        launch(_project, status.numel(), [*numbers, *inputs], outputs, means.device)
     return Projected(means2d, conics, depths, view_opacities, extents, status)

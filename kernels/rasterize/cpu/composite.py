@@ -30,7 +30,7 @@ _STOPPED = wp.constant(STOPPED)
 _EMPTY_TILES = wp.constant(EMPTY_TILES)
 _ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
 _UNUSED = wp.constant(UNUSED)
-_AHEAD = wp.constant(6)  # pairs that pass while a Gaussian comes from memory
+_AHEAD = wp.constant(8)  # pairs that pass while a Gaussian comes from memory
 _NEVER = wp.constant(2**31 - 1)
 _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
 
@@ -102,12 +102,9 @@ def _forward_kernel(tuning: Tuning):
                 k = begin
                 while k < end and alive != 0:
                     g = pairs_in[k]
-                    L.fetch(
-                        means2d_in,
-                        conics_in,
-                        view_opacities_in,
-                        pairs_in[wp.min(k + _AHEAD, end - 1)],
-                    )
+                    later = pairs_in[wp.min(k + _AHEAD, end - 1)]
+                    row = color_row(picture, later)
+                    L.fetch(means2d_in, conics_in, view_opacities_in, colors_in, later, row)
                     mean = means2d_in[g]
                     conic = conics_in[g]
                     shear = conic[1]

@@ -121,12 +121,15 @@ def count_bits(bits: wp.int32) -> wp.int32:
 __builtin_prefetch(means2d.data + g);
 __builtin_prefetch(conics.data + g);
 __builtin_prefetch(view_opacities.data + g);
+__builtin_prefetch(colors.data + (size_t)row * colors.shape[1]);
 """)
 def fetch(
     means2d: wp.array[wp.vec2],
     conics: wp.array[wp.vec3],
     view_opacities: wp.array[wp.float32],
+    colors: wp.array2d[wp.float32],
     g: wp.int32,
+    row: wp.int32,
 ):
     """Prefetches a Gaussian that a later pair needs."""
     ...
