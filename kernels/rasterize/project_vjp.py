@@ -21,6 +21,7 @@ from .project import (
     quat_size,
     rotation,
     rotation_of,
+    room,
     row_of,
     slope,
     translation_of,
@@ -141,6 +142,24 @@ def _project_vjp(
 ):
     g = offset + wp.tid()
     b = g // num
+    seen = wp.int32(0)
+    for view_index in range(views):
+        i = (b * views + view_index) * num + g % num
+        if status_in[i] == _VISIBLE and not (
+            lens.skip_unused != 0
+            and _all_zero(v_means2d_in[i], v_conics_in[i], v_depths_in[i], v_view_opacities_in[i])
+        ):
+            seen += 1
+    if seen == 0:
+        if v_means_out:
+            v_means_out[g] = wp.vec3(0.0, 0.0, 0.0)
+        if v_scales_out:
+            v_scales_out[g] = wp.vec3(0.0, 0.0, 0.0)
+        if v_opacities_out:
+            v_opacities_out[g] = 0.0
+        if v_quats_out:
+            v_quats_out[g] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        return
     scale = scales_in[g]
     q = wp.vec4(1.0, 0.0, 0.0, 0.0)
     R = wp.identity(n=3, dtype=wp.float32)
@@ -236,6 +255,11 @@ def _project_vjp(
             v_quats_out[g] = _rotation_vjp(q, v_R) / size
 
 
+def _room(like: Tensor) -> Tensor:
+    """A gradient of that shape; the kernel writes all of it."""
+    return room(like.shape, like.dtype, like.device)
+
+
 def project_backward(
     means: Tensor,
     quats: Tensor | None,
@@ -265,10 +289,11 @@ def project_backward(
         wanted: what is asked for.
     """
     batch, views, num = status.shape
-    v_means = torch.zeros_like(means) if wanted.means else None
-    v_quats = torch.zeros_like(quats) if wanted.quats and quats is not None else None
-    v_scales = torch.zeros_like(scales) if wanted.scales else None
-    v_opacities = torch.zeros_like(opacities) if wanted.opacities else None
+    inputs = means, quats, scales, opacities
+    make = _room if status.numel() else torch.zeros_like
+    v_means, v_quats, v_scales, v_opacities = (
+        make(x) if want and x is not None else None for x, want in zip(inputs, wanted)
+    )
     v_viewmats = means.new_zeros(batch * views, num, 12) if wanted.viewmats else None
     if status.numel():
         launch(

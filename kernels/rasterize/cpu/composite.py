@@ -14,6 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import parallel_launch
+from ...runtime.memory import empty
 from ...runtime.views import vectors, view
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
 from ..tiles import Bins, Picture, Walk, color_row, q_limit
@@ -231,6 +232,12 @@ def _backward_kernel(tuning: Tuning):
                 k = starts_in[tile] + walked_in[tile] - 1
                 while k >= starts_in[tile]:
                     bits = blocks_in[k]
+                    later = wp.max(k - _AHEAD, starts_in[tile])
+                    if blocks_in[later] != 0:
+                        L.fetch_row(v_pairs_out, written_out, rows_in[later])
+                        later = pairs_in[later]
+                        row = color_row(picture, later)
+                        L.fetch(means2d_in, conics_in, view_opacities_in, colors_in, later, row)
                     if (picture.skip & _UNUSED) == 0:
                         bits = every
                     if bits != 0:
@@ -361,7 +368,7 @@ def composite_backward(
         ``skipped [tiles]`` int32, 1 where a tile was not walked.
     """
     tiles, channels = walk.walked.numel(), colors.shape[1]
-    v_pairs = colors.new_empty(bins.pairs.numel(), 6 + channels)
+    v_pairs = empty([bins.pairs.numel(), 6 + channels], torch.float32)
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     skipped = torch.empty_like(walk.walked)
     workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)

@@ -135,6 +135,17 @@ def fetch(
     ...
 
 
+@wp.func_native("""
+const char* const row = (const char*)(v_pairs.data + (size_t)pair * v_pairs.shape[1]);
+__builtin_prefetch(row, 1);
+__builtin_prefetch(row + v_pairs.shape[1] * 4 - 1, 1);
+__builtin_prefetch(written.data + pair, 1);
+""")
+def fetch_row(v_pairs: wp.array2d[wp.float32], written: wp.array[wp.uint8], pair: wp.int32):
+    """Prefetches the row that a later pair writes: rows are in the order of the Gaussians."""
+    ...
+
+
 @wp.func_native("return __atomic_fetch_add(counter.data, 1, __ATOMIC_RELAXED);")
 def take(counter: wp.array[wp.int32]) -> wp.int32:
     """The next number that no other worker has taken."""
