@@ -36,17 +36,6 @@ _NEVER = wp.constant(2**31 - 1)
 _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
 
 
-@wp.func
-@no_type_check
-def _blocks_inside(picture: Picture, columns: int, x: int, y: int) -> int:
-    # bit b is set if block b of the tile at (x, y) has a pixel in the picture
-    bits = wp.int32(0)
-    for b in range(columns * columns):
-        if x + (b % columns) * 4 < picture.width and y + (b // columns) * 4 < picture.height:
-            bits = bits | (1 << b)
-    return bits
-
-
 @functools.cache
 def _forward_kernel(tuning: Tuning):
     columns, blocks, side = tuning.columns, tuning.blocks, tuning.tile
@@ -97,7 +86,7 @@ def _forward_kernel(tuning: Tuning):
                 for i in range(blocks * channels):
                     room_out[worker, i] = lanes(0.0)
 
-                inside = _blocks_inside(picture, columns, x, y)
+                inside = L.blocks_inside(picture.width - x, picture.height - y, columns)
                 alive = inside
                 evaluated = wp.int64(0)
                 k = begin
@@ -208,7 +197,7 @@ def _backward_kernel(tuning: Tuning):
             any_v = wp.int32(0)
             inside = wp.int32(0)
             if walked_in[tile] > 0:
-                inside = _blocks_inside(picture, columns, x, y)
+                inside = L.blocks_inside(picture.width - x, picture.height - y, columns)
             every = inside
             while inside != 0:
                 b = L.lowest_bit(inside)

@@ -99,6 +99,16 @@ def block_leaves(tuning: Tuning) -> SimpleNamespace:
     return SimpleNamespace(first_x=first_x, first_y=first_y, touched=touched)
 
 
+@wp.func
+def blocks_inside(width: wp.int32, height: wp.int32, columns: wp.int32) -> wp.int32:
+    """Bit b is set if block b of a tile has a pixel in the picture, of which this much is left."""
+    bits = wp.int32(0)
+    for b in range(columns * columns):
+        if (b % columns) * 4 < width and (b // columns) * 4 < height:
+            bits = bits | (1 << b)
+    return bits
+
+
 @wp.func_native("return __builtin_ctz(bits);")
 def lowest_bit(bits: wp.int32) -> wp.int32:
     """Index of the lowest set bit; bits != 0."""

@@ -242,6 +242,7 @@ def _project_run(
     """Projects the Gaussians [begin, end) of an object into an image."""
     ...
 
+
 @wp.kernel
 @no_type_check
 def _project_lanes(
