@@ -6,8 +6,8 @@
 The objects of a folder of meshes stand on a square floor. Each gets the same number of Gaussians,
 at random places of its surface: flat ones along the surface, as wide as their distance from each
 other, in the colour of the texture there. The same folder and options give the same bytes. Views
-are timed from a walk inside the hall, where most Gaussians are beside or behind the camera, and
-from above, where all are in sight. The figures of docs/large-scenes.md are its output.
+are timed from inside the hall, where most Gaussians are beside or behind the camera, and from
+above, where all are in sight. The figures of docs/large-scenes.md are its output.
 """
 
 from __future__ import annotations
@@ -113,12 +113,12 @@ def make_hall(folder: Path, count: int, objects: int, seed: int) -> Gaussians:
 
 
 def views(gaussians: Gaussians, number: int, width: int, height: int) -> dict[str, Cameras]:
-    """Cameras of a walk inside the hall, and from above."""
+    """Cameras that fly through the hall, and from above."""
     half = float(gaussians.means[:, ::2].abs().max())
     azimuths = torch.arange(number) * (360 / number)
     Ks = intrinsics(width, height).expand(number, 3, 3)
     return {
-        "inside": Cameras(orbit(azimuths, 6.0, 0.55 * half), Ks, width, height),
+        "inside": Cameras(orbit(azimuths, 14.0, 0.55 * half), Ks, width, height),
         "from above": Cameras(orbit(azimuths, 40.0, 2.6 * half), Ks, width, height),
     }
 

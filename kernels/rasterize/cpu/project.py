@@ -17,9 +17,9 @@ wp.set_module_options({"enable_backward": False})
 _RUN = wp.constant(512)  # Gaussians of a task, a multiple of 16
 _PIECES_PER_THREAD = 8  # those that are culled cost less
 
-# The text of one run. A sum of products in one expression becomes fused operations, as it does in
-# Warp's own functions; other sums are functions, so that they do not.
-_PROJECT = (
+# What both directions share. A sum of products in one expression becomes fused operations, as it
+# does in Warp's own functions; other sums are functions, so that they do not.
+LEAD = (
     TYPES
     + """
 auto splat = [](float x) -> F { return F{} + x; };
@@ -59,6 +59,58 @@ auto write_ = [](float* p, int size, int n, const F* v) {
         for (int l = 0; l < n; ++l)
             for (int k = 0; k < size; ++k) p[size * l + k] = part[k][l];
 };
+// the length of quaternions, in numbers that do not leave float32's range
+auto length_ = [&](const F* q) -> F {
+    const F m = greater_(greater_(abs_(q[0]), abs_(q[1])), greater_(abs_(q[2]), abs_(q[3])));
+    F sum = F{};
+    for (int k = 0; k < 4; ++k) {
+        const F part = q[k] / m;
+        sum += part * part;
+    }
+    return m > 0.0f ? m * root_(sum) : F{};
+};
+// makes quaternions unit ones, and R their rotations
+auto rotate_ = [&](F* q, F size, F (*R)[3]) {
+    const I some = size > 0.0f;
+    for (int k = 0; k < 4; ++k) q[k] = some ? q[k] / size : splat(k == 0);
+    const F w = q[0], x = q[1], y = q[2], z = q[3], one = splat(1.0f), two = one + one;
+    auto plus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), mul_(c, d)); };
+    auto minus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), -mul_(c, d)); };
+    R[0][0] = add_(one, -mul_(two, plus(y, y, z, z)));
+    R[0][1] = mul_(two, minus(x, y, w, z));
+    R[0][2] = mul_(two, plus(x, z, w, y));
+    R[1][0] = mul_(two, plus(x, y, w, z));
+    R[1][1] = add_(one, -mul_(two, plus(x, x, z, z)));
+    R[1][2] = mul_(two, minus(y, z, w, x));
+    R[2][0] = mul_(two, minus(x, z, w, y));
+    R[2][1] = mul_(two, plus(y, z, w, x));
+    R[2][2] = add_(one, -mul_(two, plus(x, x, y, y)));
+};
+// rows of J W: those of J are (fx, 0, jx) and (0, fy, jy)
+auto camera_ = [&](const float* V, F fx, F jx, F fy, F jy, F* row0, F* row1) {
+    for (int k = 0; k < 3; ++k) {
+        row0[k] = fma_(jx, splat(V[8 + k]), mul_(fx, splat(V[k])));
+        row1[k] = fma_(jy, splat(V[8 + k]), mul_(fy, splat(V[4 + k])));
+    }
+};
+auto turned_ = [&](const F* row, const F (*R)[3], F* out) {
+    for (int k = 0; k < 3; ++k)
+        out[k] = fma_(row[2], R[2][k], fma_(row[1], R[1][k], mul_(row[0], R[0][k])));
+};
+auto to_camera_ = [&](const float* V, const F* mean, F* t) {
+    for (int r = 0; r < 3; ++r) {
+        F sum = mul_(mean[0], splat(V[4 * r]));
+        sum = add_(sum, mul_(mean[1], splat(V[4 * r + 1])));
+        sum = add_(sum, mul_(mean[2], splat(V[4 * r + 2])));
+        t[r] = add_(sum, splat(V[4 * r + 3]));
+    }
+};
+"""
+)
+
+_PROJECT = (
+    LEAD
+    + """
 const float* const V = (const float*)viewmats.data + (size_t)image * 16;
 const float* const K = (const float*)Ks.data + (size_t)image * 9;
 const int channels = colors.shape[1];
@@ -69,12 +121,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     read_((const float*)means.data + 3 * g, 3, n, mean);
     read_((const float*)scales.data + 3 * g, 3, n, scale);
     read_(opacities.data + g, 1, n, &opacity);
-    for (int r = 0; r < 3; ++r) {
-        F sum = mul_(mean[0], splat(V[4 * r]));
-        sum = add_(sum, mul_(mean[1], splat(V[4 * r + 1])));
-        sum = add_(sum, mul_(mean[2], splat(V[4 * r + 2])));
-        t[r] = add_(sum, splat(V[4 * r + 3]));
-    }
+    to_camera_(V, mean, t);
     I finite = finite_(sum_(mean)) & finite_(sum_(scale)) & finite_(opacity) & finite_(sum_(t));
     F q[4] = {splat(1.0f), F{}, F{}, F{}};
     if (quats.data) {
@@ -109,35 +156,12 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         const F sy = less_(greater_(splat(top), t[1] / z), splat(bottom));
         const F jx = -fx * sx, jy = -fy * sy;
         F M0[3], M1[3];
-        for (int k = 0; k < 3; ++k) {
-            M0[k] = fma_(jx, splat(V[8 + k]), mul_(fx, splat(V[k])));
-            M1[k] = fma_(jy, splat(V[8 + k]), mul_(fy, splat(V[4 + k])));
-        }
+        camera_(V, fx, jx, fy, jy, M0, M1);
         if (quats.data) {
-            F m = greater_(greater_(abs_(q[0]), abs_(q[1])), greater_(abs_(q[2]), abs_(q[3])));
-            F sum = F{};
-            for (int k = 0; k < 4; ++k) {
-                const F part = q[k] / m;
-                sum += part * part;
-            }
-            const F size = m > 0.0f ? m * root_(sum) : F{};
-            const I some = size > 0.0f;
-            for (int k = 0; k < 4; ++k) q[k] = some ? q[k] / size : splat(k == 0);
-            const F w = q[0], x = q[1], y = q[2], u = q[3], one = splat(1.0f), two = one + one;
-            auto plus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), mul_(c, d)); };
-            auto minus = [&](F a, F b, F c, F d) { return add_(mul_(a, b), -mul_(c, d)); };
-            const F R[3][3] = {
-                {add_(one, -mul_(two, plus(y, y, u, u))), mul_(two, minus(x, y, w, u)),
-                    mul_(two, plus(x, u, w, y))},
-                {mul_(two, plus(x, y, w, u)), add_(one, -mul_(two, plus(x, x, u, u))),
-                    mul_(two, minus(y, u, w, x))},
-                {mul_(two, minus(x, u, w, y)), mul_(two, plus(y, u, w, x)),
-                    add_(one, -mul_(two, plus(x, x, y, y)))}};
-            F N0[3], N1[3];
-            for (int k = 0; k < 3; ++k) {
-                N0[k] = fma_(M0[2], R[2][k], fma_(M0[1], R[1][k], mul_(M0[0], R[0][k])));
-                N1[k] = fma_(M1[2], R[2][k], fma_(M1[1], R[1][k], mul_(M1[0], R[0][k])));
-            }
+            F R[3][3], N0[3], N1[3];
+            rotate_(q, length_(q), R);
+            turned_(M0, R, N0);
+            turned_(M1, R, N1);
             for (int k = 0; k < 3; ++k) M0[k] = N0[k], M1[k] = N1[k];
         }
         for (int k = 0; k < 3; ++k) M0[k] = mul_(M0[k], scale[k]), M1[k] = mul_(M1[k], scale[k]);
