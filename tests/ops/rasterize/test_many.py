@@ -195,3 +195,28 @@ def test_sums_of_rows(monkeypatch, channels):
     )
     monkeypatch.setattr(reduce, "reduce_rows", one)
     assert_same(call(scene), got)
+
+
+@pytest.mark.parametrize("rotated, unused", [(True, True), (False, True), (True, False)])
+def test_gradient_of_the_projection_on_lanes(rotated, unused):
+    """To the bit: with a gradient of viewmats the scalar kernel runs, without it the lanes."""
+    scene = make(2, 3, 331, 45, 60, size=0.03)
+    scene["means"][0, :40] *= 6  # beside the picture, where the slopes are clamped, or behind
+    scene["means"][1, :9, 0] = torch.nan
+    scene["quats"][0, 50:60] = 0
+    scene["quats"][1, 50:90] *= 1e20
+    if not rotated:
+        scene["quats"] = None
+    scene["skip"] = Skip(unused=unused)
+    upstream = torch.randn(2, 3, 60, 45, 4)
+    made = []
+    for with_viewmats in (True, False):
+        tensors = leaves(scene, torch.float32)
+        tensors["viewmats"].requires_grad_(with_viewmats)
+        renders = rasterization(**tensors, render_mode="RGB+ED")[0]
+        renders.backward(upstream)
+        made.append({k: tensors[k].grad for k in NAMES if isinstance(tensors[k], torch.Tensor)})
+    assert (made[0]["viewmats"] != 0).any() and made[1]["viewmats"] is None
+    for name in ("means", "scales", "opacities", *(["quats"] if rotated else [])):
+        assert torch.equal(made[1][name], made[0][name]), name
+        assert (made[0][name] != 0).any(-1).float().mean() > 0.2, name
