@@ -61,7 +61,8 @@ class Bins(NamedTuple):
     """The lists of tiles: P pairs of (tile, Gaussian) in I views; everything is int32.
 
     Attributes:
-        order: ``[I * N]`` view-major Gaussian indices, front to back within each view.
+        order: ``[I * N]`` view-major Gaussian indices in the order in which pairs are numbered:
+            front to back within each view, or by index where views have many Gaussians on a CPU.
         offsets: ``[I * N + 1]`` where the pairs of ``order[j]`` begin, in emission order.
         pairs: ``[P]`` view-major Gaussian index of each pair, in tile order.
         rows: ``[P]`` emission number of each pair, in tile order.
