@@ -142,24 +142,6 @@ def _project_vjp(
 ):
     g = offset + wp.tid()
     b = g // num
-    seen = wp.int32(0)
-    for view_index in range(views):
-        i = (b * views + view_index) * num + g % num
-        if status_in[i] == _VISIBLE and not (
-            lens.skip_unused != 0
-            and _all_zero(v_means2d_in[i], v_conics_in[i], v_depths_in[i], v_view_opacities_in[i])
-        ):
-            seen += 1
-    if seen == 0:
-        if v_means_out:
-            v_means_out[g] = wp.vec3(0.0, 0.0, 0.0)
-        if v_scales_out:
-            v_scales_out[g] = wp.vec3(0.0, 0.0, 0.0)
-        if v_opacities_out:
-            v_opacities_out[g] = 0.0
-        if v_quats_out:
-            v_quats_out[g] = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        return
     scale = scales_in[g]
     q = wp.vec4(1.0, 0.0, 0.0, 0.0)
     R = wp.identity(n=3, dtype=wp.float32)
