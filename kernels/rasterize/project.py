@@ -3,6 +3,7 @@
 One thread per (view, Gaussian). README.md §1 holds the maths; ``project_vjp.py`` the gradient.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, no_type_check
 
 import torch
@@ -10,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from ..runtime.launch import launch
+from ..runtime.memory import empty
 from ..runtime.views import struct, vectors
 from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 
@@ -159,10 +161,17 @@ def unit(q: wp.vec4) -> wp.vec4:
 
 
 @wp.func
-def slope(p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.float32:
-    # README eq. 2: x/z kept within the picture and a margin around it
+def slope_bounds(center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.vec2:
+    # README eq. 2: the picture and a margin around it
     margin = _MARGIN * 0.5 * size / focal
-    return wp.clamp(p, -(center / focal + margin), (size - center) / focal + margin)
+    return wp.vec2(-(center / focal + margin), (size - center) / focal + margin)
+
+
+@wp.func
+def slope(p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.float32:
+    # x/z kept within these bounds
+    bounds = slope_bounds(center, size, focal)
+    return wp.clamp(p, bounds[0], bounds[1])
 
 
 @wp.func
@@ -302,6 +311,13 @@ def make_lens(options: LensOptions) -> Lens:
     return lens
 
 
+def room(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """An empty tensor; a large one on the CPU is of large pages, which are read at random."""
+    if device.type == "cpu":
+        return empty(shape, dtype)
+    return torch.empty(*shape, dtype=dtype, device=device)
+
+
 def project_forward(
     means: Tensor,
     quats: Tensor | None,
@@ -326,34 +342,32 @@ def project_forward(
     """
     (batch, views), num = viewmats.shape[:2], means.shape[1]
     shape = (batch, views, num)
-    means2d, conics, extents = (means.new_empty(*shape, size) for size in (2, 3, 2))
-    depths, view_opacities = means.new_empty(shape), means.new_empty(shape)
-    status = torch.empty(shape, dtype=torch.int32, device=means.device)
-    if status.numel():
-        launch(
-            _project,
-            status.numel(),
-            [
-                views,
-                num,
-                int(colors.dim() == 4),
-                lens,
-                vectors(means, wp.vec3),
-                vectors(quats, wp.vec4),
-                vectors(scales, wp.vec3),
-                opacities.view(-1),
-                colors.view(-1, colors.shape[-1]),
-                vectors(viewmats, wp.mat44),
-                vectors(Ks, wp.mat33),
-            ],
-            [
-                vectors(means2d, wp.vec2),
-                vectors(conics, wp.vec3),
-                depths.view(-1),
-                view_opacities.view(-1),
-                vectors(extents, wp.vec2),
-                status.view(-1),
-            ],
-            means.device,
-        )
+    sizes, device = ((2,), (3,), (), (), (2,)), means.device
+    floats = (room([*shape, *size], torch.float32, device) for size in sizes)
+    means2d, conics, depths, view_opacities, extents = floats
+    status = room(shape, torch.int32, device)
+    inputs = [
+        vectors(means, wp.vec3),
+        vectors(quats, wp.vec4),
+        vectors(scales, wp.vec3),
+        opacities.view(-1),
+        colors.view(-1, colors.shape[-1]),
+        vectors(viewmats, wp.mat44),
+        vectors(Ks, wp.mat33),
+    ]
+    outputs = [
+        vectors(means2d, wp.vec2),
+        vectors(conics, wp.vec3),
+        depths.view(-1),
+        view_opacities.view(-1),
+        vectors(extents, wp.vec2),
+        status.view(-1),
+    ]
+    numbers = [views, num, int(colors.dim() == 4), lens]
+    if status.numel() and means.device.type == "cpu":
+        from .cpu.project import project_on_lanes  # which takes functions of this file
+
+        project_on_lanes(batch * views, *numbers, inputs, outputs)
+    elif status.numel():
+        launch(_project, status.numel(), [*numbers, *inputs], outputs, means.device)
     return Projected(means2d, conics, depths, view_opacities, extents, status)

@@ -19,6 +19,7 @@ from .project import (
     jacobian,
     mat23,
     quat_size,
+    room,
     rotation,
     rotation_of,
     row_of,
@@ -236,6 +237,11 @@ def _project_vjp(
             v_quats_out[g] = _rotation_vjp(q, v_R) / size
 
 
+def _room(like: Tensor) -> Tensor:
+    """A gradient of that shape; the kernel writes all of it."""
+    return room(like.shape, like.dtype, like.device)
+
+
 def project_backward(
     means: Tensor,
     quats: Tensor | None,
@@ -265,41 +271,37 @@ def project_backward(
         wanted: what is asked for.
     """
     batch, views, num = status.shape
-    v_means = torch.zeros_like(means) if wanted.means else None
-    v_quats = torch.zeros_like(quats) if wanted.quats and quats is not None else None
-    v_scales = torch.zeros_like(scales) if wanted.scales else None
-    v_opacities = torch.zeros_like(opacities) if wanted.opacities else None
+    inputs = means, quats, scales, opacities
+    make = _room if status.numel() else torch.zeros_like
+    v_means, v_quats, v_scales, v_opacities = (
+        make(x) if want and x is not None else None for x, want in zip(inputs, wanted)
+    )
     v_viewmats = means.new_zeros(batch * views, num, 12) if wanted.viewmats else None
-    if status.numel():
-        launch(
-            _project_vjp,
-            batch * num,
-            [
-                views,
-                num,
-                lens,
-                vectors(means, wp.vec3),
-                vectors(quats, wp.vec4),
-                vectors(scales, wp.vec3),
-                opacities.view(-1),
-                vectors(viewmats, wp.mat44),
-                vectors(Ks, wp.mat33),
-                vectors(conics, wp.vec3),
-                status.view(-1),
-                vectors(cotangents.means2d, wp.vec2),
-                vectors(cotangents.conics, wp.vec3),
-                cotangents.depths.view(-1),
-                cotangents.view_opacities.view(-1),
-            ],
-            [
-                vectors(v_means, wp.vec3),
-                vectors(v_quats, wp.vec4),
-                vectors(v_scales, wp.vec3),
-                None if v_opacities is None else v_opacities.view(-1),
-                v_viewmats,
-            ],
-            means.device,
-        )
+    gaussians = [vectors(means, wp.vec3), vectors(quats, wp.vec4), vectors(scales, wp.vec3)]
+    given = [
+        vectors(viewmats, wp.mat44),
+        vectors(Ks, wp.mat33),
+        vectors(conics, wp.vec3),
+        status.view(-1),
+        vectors(cotangents.means2d, wp.vec2),
+        vectors(cotangents.conics, wp.vec3),
+        cotangents.depths.view(-1),
+        cotangents.view_opacities.view(-1),
+    ]
+    outputs = [
+        vectors(v_means, wp.vec3),
+        vectors(v_quats, wp.vec4),
+        vectors(v_scales, wp.vec3),
+        None if v_opacities is None else v_opacities.view(-1),
+    ]
+    plain = v_viewmats is None and not lens.antialiased
+    if status.numel() and means.device.type == "cpu" and plain:
+        from .cpu.project_vjp import vjp_on_lanes  # which takes functions of ``project.py``
+
+        vjp_on_lanes(batch, views, num, lens, [*gaussians, *given], outputs)
+    elif status.numel():
+        inputs = [views, num, lens, *gaussians, opacities.view(-1), *given]
+        launch(_project_vjp, batch * num, inputs, [*outputs, v_viewmats], means.device)
     if v_viewmats is not None:
         v_viewmats = v_viewmats.sum(1).view(batch, views, 3, 4)
         v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))

@@ -7,6 +7,8 @@ from torch import Tensor
 
 from ..runtime.launch import launch
 from ..runtime.views import vectors
+from .cpu.reduce import reduce_rows
+from .project import room
 from .tiles import Bins
 
 wp.set_module_options({"enable_backward": False})
@@ -80,6 +82,10 @@ class PairGradients(NamedTuple):
     colors: Tensor
 
 
+def _room(conics: Tensor, *size: int) -> Tensor:
+    return room([*conics.shape[:-1], *size], conics.dtype, conics.device)
+
+
 def reduce_pairs(
     v_pairs: Tensor,
     written: Tensor | None,
@@ -100,27 +106,25 @@ def reduce_pairs(
     """
     v_means2d = v_conics = v_opacities = None
     if geometry:
-        v_means2d = conics.new_empty(*conics.shape[:-1], 2)
-        v_conics = conics.new_empty(conics.shape)
-        v_opacities = conics.new_empty(conics.shape[:-1])
-    v_colors = conics.new_empty(*conics.shape[:-1], v_pairs.shape[1] - 6)
-    launch(
-        _reduce,
-        bins.order.numel(),
-        [
-            bins.order,
-            bins.offsets,
-            v_pairs,
-            written,
-            vectors(conics, wp.vec3),
-            view_opacities.view(-1),
-        ],
-        [
-            vectors(v_means2d, wp.vec2),
-            vectors(v_conics, wp.vec3),
-            None if v_opacities is None else v_opacities.view(-1),
-            v_colors.view(-1, v_colors.shape[-1]),
-        ],
-        conics.device,
-    )
+        sizes = (2,), (3,), ()
+        v_means2d, v_conics, v_opacities = (_room(conics, *size) for size in sizes)
+    v_colors = _room(conics, v_pairs.shape[1] - 6)
+    inputs = [
+        bins.order,
+        bins.offsets,
+        v_pairs,
+        written,
+        vectors(conics, wp.vec3),
+        view_opacities.view(-1),
+    ]
+    outputs = [
+        vectors(v_means2d, wp.vec2),
+        vectors(v_conics, wp.vec3),
+        None if v_opacities is None else v_opacities.view(-1),
+        v_colors.view(-1, v_colors.shape[-1]),
+    ]
+    if conics.device.type == "cpu" and bins.order.numel():
+        reduce_rows(bins.order.numel(), inputs, outputs)
+    else:
+        launch(_reduce, bins.order.numel(), inputs, outputs, conics.device)
     return PairGradients(v_means2d, v_conics, v_opacities, v_colors)

@@ -17,8 +17,9 @@ from .skip import TILE_TEST
 wp.set_module_options({"enable_backward": False})
 
 # Rounding of q, relative and absolute; the test may keep too much, never too little.
-_SLACK = wp.constant(1.0 + 1e-4)
-_SLACK_ABS = wp.constant(1e-4)
+SLACK, SLACK_ABS = 1.0 + 1e-4, 1e-4
+_SLACK = wp.constant(SLACK)
+_SLACK_ABS = wp.constant(SLACK_ABS)
 _TILE_TEST = wp.constant(TILE_TEST)
 
 
@@ -64,7 +65,8 @@ class Bins(NamedTuple):
     ``order``, in which only Gaussians count that have pairs by ``offsets``. Then P >= I * N.
 
     Attributes:
-        order: ``[I * N]`` view-major Gaussian indices, front to back within each view.
+        order: ``[I * N]`` view-major Gaussian indices in the order in which pairs are numbered:
+            front to back within each view, or by index where views have many Gaussians on a CPU.
         offsets: ``[I * N + 1]`` where the pairs of ``order[j]`` begin, in emission order.
         pairs: ``[P]`` view-major Gaussian index of each pair, in tile order.
         rows: ``[P]`` emission number of each pair, in tile order.

@@ -12,7 +12,7 @@ import torch
 from ...rasterize import Skip
 from .. import peers
 from ..core.case import Case, Error, Key, Settings, Target, Variant, compare
-from . import harmonics, raster_knobs
+from . import harmonics, raster_knobs, raster_large
 from .raster_parts import Parts
 from .raster_scene import LEAVES, Scene, orbit_cameras, shell
 from .raster_variants import BOTH, make_pair, make_scene, make_variant, sizes_of
@@ -35,6 +35,7 @@ def cases(settings: Settings) -> list[Case]:
         ("batch", _batches, "B"),
     ]
     if cpu:
+        builders.append(("large scenes", raster_large.large_scenes, "N"))
         builders.append(("threads", _threads, "threads"))
         if settings.peers:
             builders.append(("gsplat's parts", _gsplat_parts, None))
@@ -313,7 +314,8 @@ def targets(settings: Settings) -> list[Target]:
         text = f"8 objects x 4 views, {direction}, 32 calls over one"
         made.append(Target(text, (many,), (one,), at_least=1.3))
     made += _growth(settings) + harmonics.targets(settings)
-    return made + (_cuda_targets() if settings.device.type == "cuda" else [])
+    cuda = settings.device.type == "cuda"
+    return made + (_cuda_targets() if cuda else raster_large.targets(settings))
 
 
 def _growth(settings: Settings) -> list[Target]:

@@ -25,6 +25,7 @@ class Parts:
 
     def __init__(self, scene: Scene) -> None:
         self.x, self.size = scene.gaussians, scene.size
+        self.width, self.height = (scene.arguments()[side] for side in ("width", "height"))
         self.viewmats, self.Ks = scene.viewmats, scene.Ks
         count = len(self.x["means"])
         g = torch.Generator().manual_seed(5)
@@ -35,8 +36,8 @@ class Parts:
     def project(self) -> Projected:
         """Our projection, which is timed."""
         lens = LensOptions(
-            width=self.size,
-            height=self.size,
+            width=self.width,
+            height=self.height,
             near_plane=0.01,
             far_plane=1e10,
             radius_clip=0.0,
@@ -53,13 +54,17 @@ class Parts:
         means, quats, scales = (self.x[k] for k in ("means", "quats", "scales"))
         return peers.gsplat_projection(means, quats, scales, self.viewmats, self.Ks, self.size)
 
-    def bin(self) -> tuple[Tensor, ...]:
-        """Our tile lists, which are timed."""
-        x = self.projected
+    def front(self) -> tuple[Tensor, ...]:
+        """Our projection and tile lists, which are timed."""
+        return self.bin(self.project())
+
+    def bin(self, projected: Projected | None = None) -> tuple[Tensor, ...]:
+        """Our tile lists, which are timed; of the scene's own projection if none is given."""
+        x = projected or self.projected
         parts = x.means2d, x.conics, x.depths, x.view_opacities, x.extents
         per_view = [part.flatten(0, 1) for part in parts]
         means2d, conics, depths, opacities, extents = per_view
-        options = self.size, self.size, ALPHA_MIN, Skip().bits(), current().numbers()
+        options = self.width, self.height, ALPHA_MIN, Skip().bits(), current().numbers()
         return bin_op(means2d, conics, depths, opacities, extents, *options)
 
     def gsplat_bin(self) -> object:

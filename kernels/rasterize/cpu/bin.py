@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ..tiles import Bins, Ellipse, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
+from .bin_many import MANY, bin_many
 
 wp.set_module_options({"enable_backward": False})
 
@@ -262,6 +263,8 @@ def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], N
         check: raises if there are too many.
     """
     (images, num), tiles = depths.shape, grid.tiles_x * grid.tiles_y
+    if images and num >= MANY:
+        return bin_many(grid, depths, inputs, check)
     most = _PARTS_PER_THREAD * torch.get_num_threads()
     parts = 1 if images >= most else most
     order, records, box_counts = _sorted_and_recorded(grid, depths, inputs, most)

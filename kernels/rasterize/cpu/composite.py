@@ -14,6 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import parallel_launch
+from ...runtime.memory import empty
 from ...runtime.views import vectors, view
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
 from ..tiles import Bins, Picture, Walk, color_row, q_limit
@@ -30,20 +31,9 @@ _STOPPED = wp.constant(STOPPED)
 _EMPTY_TILES = wp.constant(EMPTY_TILES)
 _ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
 _UNUSED = wp.constant(UNUSED)
-_AHEAD = wp.constant(6)  # pairs that pass while a Gaussian comes from memory
+_AHEAD = wp.constant(8)  # pairs that pass while a Gaussian comes from memory
 _NEVER = wp.constant(2**31 - 1)
 _EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
-
-
-@wp.func
-@no_type_check
-def _blocks_inside(picture: Picture, columns: int, x: int, y: int) -> int:
-    # bit b is set if block b of the tile at (x, y) has a pixel in the picture
-    bits = wp.int32(0)
-    for b in range(columns * columns):
-        if x + (b % columns) * 4 < picture.width and y + (b // columns) * 4 < picture.height:
-            bits = bits | (1 << b)
-    return bits
 
 
 @functools.cache
@@ -96,18 +86,15 @@ def _forward_kernel(tuning: Tuning):
                 for i in range(blocks * channels):
                     room_out[worker, i] = lanes(0.0)
 
-                inside = _blocks_inside(picture, columns, x, y)
+                inside = L.blocks_inside(picture.width - x, picture.height - y, columns)
                 alive = inside
                 evaluated = wp.int64(0)
                 k = begin
                 while k < end and alive != 0:
                     g = pairs_in[k]
-                    L.fetch(
-                        means2d_in,
-                        conics_in,
-                        view_opacities_in,
-                        pairs_in[wp.min(k + _AHEAD, end - 1)],
-                    )
+                    later = pairs_in[wp.min(k + _AHEAD, end - 1)]
+                    row = color_row(picture, later)
+                    L.fetch(means2d_in, conics_in, view_opacities_in, colors_in, later, row)
                     mean = means2d_in[g]
                     conic = conics_in[g]
                     shear = conic[1]
@@ -210,7 +197,7 @@ def _backward_kernel(tuning: Tuning):
             any_v = wp.int32(0)
             inside = wp.int32(0)
             if walked_in[tile] > 0:
-                inside = _blocks_inside(picture, columns, x, y)
+                inside = L.blocks_inside(picture.width - x, picture.height - y, columns)
             every = inside
             while inside != 0:
                 b = L.lowest_bit(inside)
@@ -234,6 +221,12 @@ def _backward_kernel(tuning: Tuning):
                 k = starts_in[tile] + walked_in[tile] - 1
                 while k >= starts_in[tile]:
                     bits = blocks_in[k]
+                    later = wp.max(k - _AHEAD, starts_in[tile])
+                    if blocks_in[later] != 0:
+                        L.fetch_row(v_pairs_out, written_out, rows_in[later])
+                        later = pairs_in[later]
+                        row = color_row(picture, later)
+                        L.fetch(means2d_in, conics_in, view_opacities_in, colors_in, later, row)
                     if (picture.skip & _UNUSED) == 0:
                         bits = every
                     if bits != 0:
@@ -364,7 +357,7 @@ def composite_backward(
         ``skipped [tiles]`` int32, 1 where a tile was not walked.
     """
     tiles, channels = walk.walked.numel(), colors.shape[1]
-    v_pairs = colors.new_empty(bins.pairs.numel(), 6 + channels)
+    v_pairs = empty([bins.pairs.numel(), 6 + channels], torch.float32)
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     skipped = torch.empty_like(walk.walked)
     workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)

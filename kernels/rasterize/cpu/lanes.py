@@ -99,6 +99,16 @@ def block_leaves(tuning: Tuning) -> SimpleNamespace:
     return SimpleNamespace(first_x=first_x, first_y=first_y, touched=touched)
 
 
+@wp.func
+def blocks_inside(width: wp.int32, height: wp.int32, columns: wp.int32) -> wp.int32:
+    """Bit b is set if block b of a tile has a pixel in the picture, of which this much is left."""
+    bits = wp.int32(0)
+    for b in range(columns * columns):
+        if (b % columns) * 4 < width and (b // columns) * 4 < height:
+            bits = bits | (1 << b)
+    return bits
+
+
 @wp.func_native("return __builtin_ctz(bits);")
 def lowest_bit(bits: wp.int32) -> wp.int32:
     """Index of the lowest set bit; bits != 0."""
@@ -121,14 +131,28 @@ def count_bits(bits: wp.int32) -> wp.int32:
 __builtin_prefetch(means2d.data + g);
 __builtin_prefetch(conics.data + g);
 __builtin_prefetch(view_opacities.data + g);
+__builtin_prefetch(colors.data + (size_t)row * colors.shape[1]);
 """)
 def fetch(
     means2d: wp.array[wp.vec2],
     conics: wp.array[wp.vec3],
     view_opacities: wp.array[wp.float32],
+    colors: wp.array2d[wp.float32],
     g: wp.int32,
+    row: wp.int32,
 ):
     """Prefetches a Gaussian that a later pair needs."""
+    ...
+
+
+@wp.func_native("""
+const char* const row = (const char*)(v_pairs.data + (size_t)pair * v_pairs.shape[1]);
+__builtin_prefetch(row, 1);
+__builtin_prefetch(row + v_pairs.shape[1] * 4 - 1, 1);
+__builtin_prefetch(written.data + pair, 1);
+""")
+def fetch_row(v_pairs: wp.array2d[wp.float32], written: wp.array[wp.uint8], pair: wp.int32):
+    """Prefetches the row that a later pair writes: rows are in the order of the Gaussians."""
     ...
 
 

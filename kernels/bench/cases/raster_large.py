@@ -1,0 +1,112 @@
+"""Large scenes on a CPU: up to a million Gaussians, views of 512² and of 1920 x 1080."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from ...rasterize import rasterization
+from ..core.case import Key, Settings, Target, Variant
+from .raster_parts import Parts
+from .raster_scene import Scene, orbit_cameras, shell
+from .raster_variants import BOTH, make_variant
+
+_FEW = 16384
+_CASE = "large scenes"
+_FRONT = "projection and lists"
+_SUM = "pairs_and_gaussians"
+_MARGIN = 16  # pixels around the crop of the check, within which the oracle sees all Gaussians
+_LEVELS = {"quick": (1024, 40000), "normal": (_FEW, 262144), "full": (_FEW, 262144, 1048576)}
+
+
+class LargeScene(Scene):
+    """A shell whose oracle sees only the Gaussians around the crop: it is dense.
+
+    Attributes:
+        wide: whether pictures are 16:9; ``size`` is their height.
+    """
+
+    wide: bool = False
+
+    def arguments(self) -> dict:
+        """As of any scene, with the width of the picture."""
+        width = self.size * 16 // 9 if self.wide else self.size
+        return super().arguments() | {"width": width}
+
+    def _crop(self, backward: bool) -> tuple[int, int, int, int]:
+        return super()._crop(True)
+
+    def see_around_the_crop(self) -> None:
+        """Gives the oracle the Gaussians whose boxes meet the crop or a margin around it."""
+        left, top, width, height = self._crop(False)
+        Ks = self.Ks[:1].clone()
+        Ks[:, 0, 2] -= left - _MARGIN
+        Ks[:, 1, 2] -= top - _MARGIN
+        sizes = dict(width=width + 2 * _MARGIN, height=height + 2 * _MARGIN)
+        with torch.no_grad():
+            meta = rasterization(**self.gaussians, viewmats=self.viewmats[:1], Ks=Ks, **sizes)[2]
+        near: Tensor = (meta["radii"][0] > 0).any(-1)
+        self.truth = {k: x[near] for k, x in self.gaussians.items()}
+
+
+def _scene(settings: Settings, count: int, few: int, size: int, wide: bool) -> LargeScene:
+    viewmats, Ks = orbit_cameras(1, size)
+    width = size * 16 // 9 if wide else size
+    Ks[:, 0, 2] = width / 2
+    g = torch.Generator().manual_seed(3)
+    cotangent = torch.randn(1, size, width, 3, generator=g).to(settings.device)
+    gaussians = shell(count, math.sqrt(few / count))
+    scene = LargeScene(gaussians, viewmats, Ks, size, settings.device, cotangent=cotangent)
+    scene.wide = wide
+    if count > few:
+        scene.see_around_the_crop()
+    return scene
+
+
+def _work(scene: LargeScene, backward: bool) -> dict[str, float]:
+    counts = scene.work(backward)
+    return counts | {_SUM: counts["pairs"] + counts["gaussians"]}
+
+
+def large_scenes(settings: Settings) -> list[Variant]:
+    """From 16,384 to a million Gaussians that get smaller, so that they cover the same area, and
+    what of the forward is the projection and the lists of tiles. The check is that of a forward.
+    """
+    counts = _LEVELS[settings.level]
+    size, high = (128, 144) if settings.level == "quick" else (512, 1080)
+    made = []
+    for count in counts:
+        for wide in (False, True) if count > counts[0] else (False,):
+            scene = _scene(settings, count, counts[0], high if wide else size, wide)
+            name = f"{count} Gaussians" + f", {high * 16 // 9} x {high}" * wide
+            front = Parts(scene)
+            forward, both = (make_variant(scene, name, d) for d in ("forward", BOTH))
+            both.check, both.oracle = forward.check, forward.oracle
+            variants = [forward, both, Variant(f"{_FRONT}, {name}", front.front, None)]
+            for variant, backward in zip(variants, (False, True)):
+                variant.work = partial(_work, scene, backward)
+            for variant in variants:
+                variant.parameters = {"N": count, "side": scene.size, "wide": int(wide)}
+            made += variants
+    return made
+
+
+def targets(settings: Settings) -> list[Target]:
+    """Time grows no faster than pairs and Gaussians together; projection and lists are half."""
+    made = []
+    for count in _LEVELS[settings.level][1:]:
+        few, many = f"{_FEW} Gaussians", f"{count} Gaussians"
+        for direction in ("forward", BOTH):
+            key = partial(Key, "raster", _CASE, direction=direction)
+            text = f"{direction}, growth of time over that of pairs + Gaussians, {_FEW} to {count}"
+            times = key(variant=many), key(variant=few, field=_SUM)
+            over = key(variant=few), key(variant=many, field=_SUM)
+            made.append(Target(text, times, over, at_most=1.0))
+        for name in (many, f"{many}, 1920 x 1080"):
+            front, whole = (Key("raster", _CASE, x) for x in (f"{_FRONT}, {name}", name))
+            text = f"{_FRONT} over the forward, {name}"
+            made.append(Target(text, (front,), (whole,), at_most=0.5))
+    return made

@@ -1,0 +1,222 @@
+"""Lists of many Gaussians, which are sorted tile by tile, and the kernels that go with them."""
+
+import pytest
+import torch
+import warp as wp
+from helpers.raster import NAMES, leaves, make
+
+from gamba_warp.kernels.rasterize import Skip, project, rasterization, reduce
+from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
+from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
+from gamba_warp.kernels.rasterize.project import LensOptions, Projected, make_lens
+from gamba_warp.kernels.runtime.launch import launch
+from gamba_warp.kernels.runtime.views import vectors
+
+LISTS = ("pairs", "starts", "box_pairs")
+
+
+def call(scene, **options):
+    """Renderings, gradients by name, and the lists; the gradient of the upper half alone."""
+    tensors = leaves(scene, torch.float32)
+    renders, alphas, meta = rasterization(**tensors, **options)
+    generator = torch.Generator().manual_seed(1)
+    v = [torch.randn(x.shape, generator=generator) for x in (renders, alphas)]
+    v[0][..., : renders.shape[-3] // 2, :, :] = 0
+    torch.autograd.backward([renders, alphas], v)
+    found = {name: tensors[name].grad for name in NAMES if tensors[name] is not None}
+    return {"renders": renders, "alphas": alphas, **found}, meta
+
+
+def both_ways(monkeypatch, scene, **options):
+    """The results of ``call`` with the lists of few Gaussians, and with those of many."""
+    made = []
+    for many in (1 << 30, 0):
+        monkeypatch.setattr(bin_cpu, "MANY", many)
+        made.append(call(scene, **options))
+    return made
+
+
+def assert_same(few, many):
+    for name, value in few[0].items():
+        assert torch.equal(many[0][name], value), name
+    for name in LISTS:
+        assert torch.equal(getattr(many[1].bins, name), getattr(few[1].bins, name)), name
+
+
+@pytest.mark.parametrize("size", [0.004, 0.03, 0.5])  # from a pixel to most rows of tiles
+@pytest.mark.parametrize("shape", [(33, 41), (300, 17), (19, 600)])
+def test_same_lists_pictures_and_gradients(monkeypatch, size, shape):
+    scene = make(2, 2, 333, *shape, size=size)
+    scene["opacities"][0, :50] = 1e-3  # culled
+    scene["means"][1, :50, 2] = torch.nan
+    few, many = both_ways(monkeypatch, scene)
+    assert_same(few, many)
+    assert few[1]["pairs"] > 100
+
+
+@pytest.mark.parametrize("options", [{"skip": Skip(tile_test=False)}, {"render_mode": "RGB+ED"}])
+def test_same_with_options(monkeypatch, options):
+    assert_same(*both_ways(monkeypatch, make(1, 2, 200, 50, 70), **options))
+
+
+def test_same_with_another_tile(monkeypatch):
+    with use_tuning(Tuning(tile=8)):
+        assert_same(*both_ways(monkeypatch, make(1, 2, 200, 50, 70)))
+
+
+def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):
+    """Lists of a few pairs and of thousands take different ways; many depths are equal."""
+    monkeypatch.setattr(bin_cpu, "MANY", 0)
+    num = 7001
+    scene = make(1, 1, num, 40, 40, size=0.01)
+    scene["means"] = scene["means"].mul(20).round().div(20)  # stacked at a few places
+    scene["viewmats"][:] = torch.eye(4)
+    scene["viewmats"][..., 2, 3] = 2.0
+    meta = rasterization(**scene)[2]
+    bins, depths = meta.bins, meta["depths"].flatten()
+    lengths = bins.starts.diff()
+    assert (lengths.max() > 1500) & ((lengths > 0) & (lengths <= 24)).any()
+    tile = torch.arange(len(lengths)).repeat_interleave(lengths)
+    key = depths[bins.pairs.long()].double()
+    same = tile[1:] == tile[:-1]
+    rises = (key.diff() > 0) | ((key.diff() == 0) & (bins.pairs.diff() > 0))
+    assert rises[same].all()
+    assert (key.diff() == 0)[same].float().mean() > 0.5
+
+
+def test_pairs_are_numbered_by_gaussian(monkeypatch):
+    """What ``reduce.py`` relies on: the rows of a Gaussian are adjacent, from its offset on."""
+    monkeypatch.setattr(bin_cpu, "MANY", 0)
+    bins = rasterization(**make(2, 2, 150, 50, 70))[2].bins
+    total = len(bins.pairs)
+    assert torch.equal(bins.rows.sort().values, torch.arange(total, dtype=torch.int32))
+    owners = torch.empty_like(bins.pairs)
+    owners[bins.rows.long()] = bins.pairs
+    assert torch.equal(owners, bins.order.repeat_interleave(bins.offsets.diff()))
+    assert bins.offsets[0] == 0 and bins.offsets[-1] == total
+
+
+def test_repeatable_with_any_number_of_threads(monkeypatch):
+    monkeypatch.setattr(bin_cpu, "MANY", 0)
+    scene, before = make(1, 2, 400, 90, 61), torch.get_num_threads()
+    want = call(scene)
+    try:
+        for threads in (1, 3, 5):
+            torch.set_num_threads(threads)
+            assert_same(want, call(scene))
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("num, views", [(1, 1), (17, 2), (0, 1), (5, 0)])
+def test_few_or_none(monkeypatch, num, views):
+    monkeypatch.setattr(bin_cpu, "MANY", 0)
+    scene = make(1, views, num)
+    got, meta = call(scene)
+    assert all(x.isfinite().all() for x in got.values())
+    assert len(meta.bins.order) == num * views
+    scene["means"][..., 2] += 100 if num else 0  # nothing is in sight
+    scene["far_plane"] = 10.0
+    assert rasterization(**scene)[2]["pairs"] == 0
+
+
+def test_too_many_pairs(monkeypatch):
+    monkeypatch.setattr(bin_cpu, "MANY", 0)
+    monkeypatch.setattr("gamba_warp.kernels.rasterize.ops.MAX_PAIRS", 100)
+    with pytest.raises(ValueError, match="pairs of tiles"):
+        rasterization(**make(1, 1, 90, 37, 53, size=0.3))
+
+
+def scalar_projection(inputs, viewmats, Ks, lens) -> Projected:
+    """The kernel of one Gaussian a thread, which is CUDA's."""
+    means, quats, scales, opacities, colors = inputs
+    shape = (*viewmats.shape[:2], means.shape[1])
+    floats = [torch.full((*shape, *size), 7.0) for size in ((2,), (3,), (), (), (2,))]
+    made = Projected(*floats, torch.full(shape, 7, dtype=torch.int32))
+    sizes = [shape[1], shape[2], int(colors.dim() == 4), lens]
+    outputs = [
+        vectors(made.means2d, wp.vec2),
+        vectors(made.conics, wp.vec3),
+        made.depths.view(-1),
+        made.view_opacities.view(-1),
+        vectors(made.extents, wp.vec2),
+        made.status.view(-1),
+    ]
+    arguments = [
+        *sizes,
+        vectors(means, wp.vec3),
+        vectors(quats, wp.vec4),
+        vectors(scales, wp.vec3),
+        opacities.view(-1),
+        colors.view(-1, colors.shape[-1]),
+        vectors(viewmats, wp.mat44),
+        vectors(Ks, wp.mat33),
+    ]
+    launch(project._project, made.status.numel(), arguments, outputs, means.device)
+    return made
+
+
+@pytest.mark.parametrize(
+    "num, rotated, antialiased, rounded, channels",
+    [(1037, True, 0, 0, 3), (530, True, 1, 0, 1), (77, False, 0, 1, 5), (9, True, 0, 0, 18)],
+)
+def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
+    """To the bit: the operations are the same, in the same order."""
+    means, scales = torch.randn(2, num, 3), torch.exp(torch.randn(2, num, 3) - 3.5)
+    quats, opacities = torch.randn(2, num, 4), torch.rand(2, num)
+    colors = torch.rand(2, num, channels)
+    if rotated and channels == 3:
+        quats[:, :20] = 0
+        for x in (means, quats, scales, opacities, colors):
+            bad = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e30, 1e-30, 0.0]).repeat(2)
+            x.view(-1)[torch.randperm(x.numel())[: len(bad)]] = bad
+    viewmats = torch.eye(4).repeat(2, 3, 1, 1)
+    viewmats[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3))[0]
+    viewmats[..., 2, 3] = 2.0
+    Ks = torch.tensor([[300.0, 0, 130], [0, 310.0, 110], [0, 0, 1]]).repeat(2, 3, 1, 1)
+    options = dict(width=257, height=203, near_plane=0.5, far_plane=4.0, radius_clip=1.5)
+    options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=antialiased, rounded=rounded)
+    lens = make_lens(LensOptions(skip_unused=1, **options))
+    inputs = means, quats if rotated else None, scales, opacities, colors
+    got = project.project_forward(*inputs, viewmats, Ks, lens)
+    want = scalar_projection(inputs, viewmats, Ks, lens)
+    for name, value in want._asdict().items():
+        assert torch.equal(getattr(got, name), value), name
+    assert len(got.status.unique()) >= (5 if num > 500 else 3)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 10, 11, 20])
+def test_sums_of_rows(monkeypatch, channels):
+    """To the bit, for rows that are lanes (to ten channels) and for wider ones."""
+    scene = make(1, 2, 150, 50, 70, channels=channels)
+    got = call(scene)
+    one = lambda count, inputs, outputs: launch(  # noqa: E731
+        reduce._reduce, count, inputs, outputs, torch.device("cpu")
+    )
+    monkeypatch.setattr(reduce, "reduce_rows", one)
+    assert_same(call(scene), got)
+
+
+@pytest.mark.parametrize("rotated, unused", [(True, True), (False, True), (True, False)])
+def test_gradient_of_the_projection_on_lanes(rotated, unused):
+    """To the bit: with a gradient of viewmats the scalar kernel runs, without it the lanes."""
+    scene = make(2, 3, 331, 45, 60, size=0.03)
+    scene["means"][0, :40] *= 6  # beside the picture, where the slopes are clamped, or behind
+    scene["means"][1, :9, 0] = torch.nan
+    scene["quats"][0, 50:60] = 0
+    scene["quats"][1, 50:90] *= 1e20
+    if not rotated:
+        scene["quats"] = None
+    scene["skip"] = Skip(unused=unused)
+    upstream = torch.randn(2, 3, 60, 45, 4)
+    made = []
+    for with_viewmats in (True, False):
+        tensors = leaves(scene, torch.float32)
+        tensors["viewmats"].requires_grad_(with_viewmats)
+        renders = rasterization(**tensors, render_mode="RGB+ED")[0]
+        renders.backward(upstream)
+        made.append({k: tensors[k].grad for k in NAMES if isinstance(tensors[k], torch.Tensor)})
+    assert (made[0]["viewmats"] != 0).any() and made[1]["viewmats"] is None
+    for name in ("means", "scales", "opacities", *(["quats"] if rotated else [])):
+        assert torch.equal(made[1][name], made[0][name]), name
+        assert (made[0][name] != 0).any(-1).float().mean() > 0.2, name
