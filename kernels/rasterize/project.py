@@ -168,6 +168,7 @@ def slope_bounds(center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.
 
 
 @wp.func
+@no_type_check
 def slope(p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.float32:
     # x/z kept within these bounds
     bounds = slope_bounds(center, size, focal)
@@ -367,7 +368,8 @@ def project_forward(
     if status.numel() and means.device.type == "cpu":
         from .cpu.project import project_on_lanes  # which takes functions of this file
 
-        project_on_lanes(batch * views, *numbers, inputs, outputs)
+        per_view = int(colors.dim() == 4)
+        project_on_lanes(batch * views, views, num, per_view, lens, inputs, outputs)
     elif status.numel():
         launch(_project, status.numel(), [*numbers, *inputs], outputs, means.device)
     return Projected(means2d, conics, depths, view_opacities, extents, status)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,7 +46,7 @@ class LargeScene(Scene):
         Ks = self.Ks[:1].clone()
         Ks[:, 0, 2] -= left - _MARGIN
         Ks[:, 1, 2] -= top - _MARGIN
-        sizes = dict(width=width + 2 * _MARGIN, height=height + 2 * _MARGIN)
+        sizes: dict[str, Any] = dict(width=width + 2 * _MARGIN, height=height + 2 * _MARGIN)
         with torch.no_grad():
             meta = rasterization(**self.gaussians, viewmats=self.viewmats[:1], Ks=Ks, **sizes)[2]
         near: Tensor = (meta["radii"][0] > 0).any(-1)
@@ -67,7 +68,7 @@ def _scene(settings: Settings, count: int, few: int, size: int, wide: bool) -> L
 
 
 def _work(scene: LargeScene, backward: bool) -> dict[str, float]:
-    counts = scene.work(backward)
+    counts: dict[str, float] = {**scene.work(backward)}
     return counts | {_SUM: counts["pairs"] + counts["gaussians"]}
 
 

@@ -6,6 +6,7 @@ instructions. The loops around them are Warp kernels. In a block, lane l is pixe
 
 import functools
 from types import SimpleNamespace
+from typing import no_type_check
 
 import warp as wp
 
@@ -100,6 +101,7 @@ def block_leaves(tuning: Tuning) -> SimpleNamespace:
 
 
 @wp.func
+@no_type_check
 def blocks_inside(width: wp.int32, height: wp.int32, columns: wp.int32) -> wp.int32:
     """Bit b is set if block b of a tile has a pixel in the picture, of which this much is left."""
     bits = wp.int32(0)
