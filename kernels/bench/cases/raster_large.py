@@ -37,12 +37,12 @@ class LargeScene(Scene):
         width = self.size * 16 // 9 if self.wide else self.size
         return super().arguments() | {"width": width}
 
-    def _crop(self, backward: bool) -> tuple[int, int, int, int]:
-        return super()._crop(True)
+    def crop(self, backward: bool) -> tuple[int, int, int, int]:
+        return super().crop(True)
 
     def see_around_the_crop(self) -> None:
         """Gives the oracle the Gaussians whose boxes meet the crop or a margin around it."""
-        left, top, width, height = self._crop(False)
+        left, top, width, height = self.crop(False)
         Ks = self.Ks[:1].clone()
         Ks[:, 0, 2] -= left - _MARGIN
         Ks[:, 1, 2] -= top - _MARGIN

@@ -181,4 +181,4 @@ def bin_many(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], No
     room = totals.new_empty(workers, 2 * max(longest, 1))
     outputs = [order.new_zeros(1), room, pairs, rows]
     parallel_launch(_sort, workers, [images * tiles, starts, staged], outputs)
-    return Bins(order, offsets, pairs, rows, starts, box_pairs=totals[:, 1].sum())
+    return Bins(order, offsets, pairs, rows, starts, totals[:, 1].sum(), torch.tensor(total))
