@@ -97,7 +97,7 @@ def test_a_kernel_is_in_its_bounds(entries, key):
 
 
 # Of the sources outside of folders ``cpu``, what only a CPU launches.
-ON_THE_HOST = {"runtime/team.py", "rasterize/reduce.py"}
+ON_THE_HOST = {"runtime/team.py", "rasterize/reduce.py", "ssim/kernels.py"}
 
 
 def kernels_of_the_sources():
@@ -142,7 +142,7 @@ def test_the_choice_of_kernels_is_the_operators(entries):
     directions = {e.name: e.direction for e in entries if e.op != "scan"}
     assert {n for n, d in directions.items() if d == "gradient"} == {
         *("conv_backward", "composite_vjp", "composite_vjp_unlisted", "project_vjp"),
-        *("add_rows", "finish"),
+        *("add_rows", "finish", "harmonics_vjp"),
     }
 
 
