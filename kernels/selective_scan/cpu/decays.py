@@ -88,11 +88,12 @@ struct Slow {
     void keep(F& high, F& low) const { high = h, low = change - (h - base); }
 };
 auto within_ = [&](F x, float most) -> I { return (x <= most) & (x >= -most); };
-// whether largest x of each lane are worth a slow walk
-auto worth_ = [&](F x) -> bool {
-    return __builtin_reduce_or(within_(x, SLOWEST)) || !__builtin_reduce_or(~within_(x, MODERATE));
+// whether largest x of each lane are worth a slow walk; without branches, which would be guessed
+auto worth_ = [&](F x) -> int {
+    return (int)(__builtin_reduce_or(within_(x, SLOWEST)) != 0)
+        | (int)(__builtin_reduce_or(~within_(x, MODERATE)) == 0);
 };
-auto quiet_ = [&](F x) -> I { return worth_(x) ? within_(x, MODERATE) : I{}; };  // slow lanes
+auto quiet_ = [&](F x) -> I { return within_(x, MODERATE) & -worth_(x); };  // the slow lanes
 auto wild = [&](F x, F& rise) __attribute__((always_inline)) -> F { return rise = exp2_(x); };
 auto tamed = [&](F x, F& rise) __attribute__((always_inline)) -> F { return exp2_rise_(x, rise); };
 """
