@@ -44,8 +44,8 @@ _EXP2 = {
 
 
 def _polynomial(degree: int) -> str:
-    """C++ text that computes p, the polynomial of that degree, from f."""
-    first, *rest = _EXP2[degree]
+    """C++ text that computes p from f, so that fma_(p, f, 1) is the polynomial of that degree."""
+    first, *rest, _ = _EXP2[degree]
     lines = [f"F p = splat({first!r}f);", *(f"p = fma_(p, f, splat({c!r}f));" for c in rest)]
     return "\n    ".join(lines)
 
@@ -69,7 +69,7 @@ auto exp2_clamped_ = [&](F x) -> F {
     F r = x + shifter;
     F f = x - (r - shifter);
     ACCURATE
-    return p * (F)((I)r << 23);
+    return fma_(p, f, splat(1.0f)) * (F)((I)r << 23);
 };
 auto exp2_ = [&](F x) -> F {
     x = x < -126.0f ? splat(-126.0f) : x;
@@ -80,14 +80,18 @@ auto decay_ = [&](F x) -> F {
     x = (F)((I)x | (int)0x80000000) * LOG2E;
     return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
 };
-// exp2 of another degree for |x| <= 125 and no NaN: the exponent is added as an integer
-auto exp2_tame_ = [&](F x) -> F {
+// exp2 of another degree for |x| <= 125 and no NaN: the exponent is added as an integer. Where
+// |x| < 1/32, rise is 2^x - 1 and keeps what 2^x rounds away; elsewhere it is some number.
+auto exp2_rise_ = [&](F x, F& rise) -> F {
     const F plain = splat(12582912.0f);
     F r = x + plain;
     F f = x - (r - plain);
     TAME
+    rise = f * p;
+    p = fma_(p, f, splat(1.0f));
     return (F)((I)p + ((I)r << 23));
 };
+auto exp2_tame_ = [&](F x) -> F { F rise; return exp2_rise_(x, rise); };
 """
 ).replace("ACCURATE", _polynomial(6))
 
@@ -102,7 +106,7 @@ _TABLE = [
 ]
 _TABLED = """
 #if defined(__AVX512F__)
-auto exp2_tame_ = [&](F x) -> F {
+auto exp2_rise_ = [&](F x, F& rise) -> F {
     const F plain = splat(786432.0f);
     const I table = {TABLE};
     F r = x + plain;
@@ -111,7 +115,8 @@ auto exp2_tame_ = [&](F x) -> F {
     F p = splat(0.05550522f);
     p = fma_(p, f, splat(0.24023214f));
     p = fma_(p, f, splat(0.69314718f));
-    return fma_(near, f * p, near);
+    rise = f * p;
+    return fma_(near, rise, near);
 };
 #else
 POLYNOMIAL
@@ -123,14 +128,14 @@ def prelude(degree: int, table: bool = False) -> str:
     """C++ text of the arithmetic on lanes.
 
     Args:
-        degree: of the polynomial in ``exp2_tame_``.
+        degree: of the polynomial in ``exp2_rise_`` and ``exp2_tame_``.
         table: whether a table takes its place where the processor has AVX-512.
     """
     text = _PRELUDE
     if table:
-        begin = text.index("auto exp2_tame_")
+        begin, end = text.index("auto exp2_rise_"), text.index("auto exp2_tame_")
         tabled = _TABLED.replace("TABLE", ", ".join(map(str, _TABLE)))
-        text = text[:begin] + tabled.replace("POLYNOMIAL", text[begin:])
+        text = text[:begin] + tabled.replace("POLYNOMIAL", text[begin:end]) + text[end:]
     return text.replace("TAME", _polynomial(degree))
 
 

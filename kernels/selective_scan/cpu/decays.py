@@ -1,8 +1,8 @@
 """A step's decay f and weight g in C++ text, and a state that takes them: equations 2 to 4, 10.
 
-f of a slow decay is so near to 1 that float32 rounds most of what it says away. So the states of a
-chunk whose decays are all slow take f - 1 instead, which float32 holds to its last bit, and are
-kept as a sum of two numbers.
+f of a slow decay is so near to 1 that float32 rounds most of what it says away. So a channel that
+is slow for all tokens of a chunk takes f - 1 as well, which float32 holds to its last bit, and its
+state is kept as a sum of two numbers.
 """
 
 # The factor from δ to ``rate``: exponentials are computed as powers of two.
@@ -18,88 +18,95 @@ _PHI = """
     for (int i = 0; i < 9; ++i) slope = fma_(slope, xe, splat(series_of[i] * (float)(9 - i)));
     const I small = (xe < 1.0f) & (xe > -1.0f);
     const F safe = small ? splat(1.0f) : xe;
-    const F g = small ? series : (m - 1.0f) / safe;
+    const F g = small ? series : (f - 1.0f) / safe;
 """
-# Of x = rate A: m, which is f here, and g.
+# Of x = rate A: f, g, and the rise f - 1, which is exact where f is slow, and any number elsewhere.
 FACTORS = {
-    "mamba": "const F m = exp2(x), g = splat(1.0f);",
-    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x), m = fma_(x, g, splat(1.0f));",
-    "zoh": "const F m = exp2(x);" + _PHI,
+    "mamba": "F rise; const F f = exp2(x, rise), g = splat(1.0f);",
+    "bilinear": """
+        const F g = 1.0f / (1.0f - 0.5f * x), rise = x * g, f = fma_(x, g, splat(1.0f));
+    """,
+    "zoh": "F rise; const F f = exp2(x, rise);" + _PHI,
 }
-# From x and m: the slopes df and dg of f and g, and g again.
+# From x and m, which is f or its rise: the slopes df and dg of f and g, and g again.
 SLOPES = {
     "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x), df = g * g, dg = 0.5f * df;",
-    "zoh": _PHI + "const F df = m, dg = small ? slope : (m - g) / safe;",
+    "zoh": "const F f = State::decay_of(m, quiet);"
+    + _PHI
+    + "const F df = f, dg = small ? slope : (f - g) / safe;",
 }
 
-SPREAD = 64  # a decay is slow where |x| <= 1 / SPREAD; longer chunks take their length instead
-# (2^x - 1) / x for |x| <= 1/64: the series of the exponential, off by 5.3e-8 at most.
-_RISE = """
-    const F rise = fma_(fma_(splat(0.05550410866482158f), x, splat(0.2402265069591007f)), x,
-        splat(0.6931471805599453f));
-"""
-# The same where the decay is slow; m is f - 1 here.
-SLOW_FACTORS = {
-    "mamba": _RISE + "const F m = x * rise, g = splat(1.0f);",
-    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x), m = x * g;",
-    "zoh": _RISE + "const F m = x * rise, g = rise * 1.4426950408889634f;",
-}
-SLOW_SLOPES = {
-    "bilinear": SLOPES["bilinear"],
-    "zoh": _RISE
-    + """
-    const F g = rise * 1.4426950408889634f, df = m + 1.0f, xe = x * 0.6931471805599453f;
-    const F dg = fma_(fma_(splat(0.125f), xe, splat(0.3333333333333333f)), xe, splat(0.5f));
-    """,
-}
+# A chunk is walked with care for slow decays where |x| <= 1/128 in one channel of the sixteen at
+# least, or 1/32 in all. Then all channels with |x| <= 1/32 count as slow. Chunks of more than 64
+# tokens take smaller limits, by their length, so that a state does not leave its base far behind.
+SLOWEST, MODERATE = 1 / 128, 1 / 32
 
-# A state while it is walked. ``Plain`` is one number. ``Slow`` is a base and the change since then,
-# which is small, so that a step rounds away no more than a last bit of the change. In memory a
-# state is two numbers, the second of which is what the first has rounded away: otherwise changes by
-# less than a last bit would be lost at the end of every chunk.
+
+def limits(chunk: int) -> dict[str, str]:
+    """The numbers that ``STATE`` names, for chunks of that many tokens."""
+    share = min(1.0, 64 / chunk)
+    return {"SLOWEST": f"{SLOWEST * share!r}f", "MODERATE": f"{MODERATE * share!r}f"}
+
+
+# A state while it is walked. ``Plain`` is one number. ``Slow`` has lanes like it, and in those of
+# ``quiet`` a base and the change since then, which is small, so that a step rounds away no more
+# than a last bit of the change. In memory a state is two numbers, the second of which is what the
+# first has rounded away: otherwise changes by less than a last bit would be lost at the end of
+# every chunk. The base of a lane that is not slow is 0, which leaves the arithmetic of ``Plain``:
+# such a lane has the same bits in both.
 STATE = """
 struct Plain {
     F h;
-    Plain(F high, F low) : h(high + low) {}
+    Plain() {}
+    Plain(F high, F low, I) : h(high + low) {}
+    static F one_of(F f, F, I) { return f; }
+    static F decay_of(F m, I) { return m; }
     F value() const { return h; }
     void add(F a, F b) { h = __builtin_elementwise_fma(a, b, h); }
     void decay(F m) { h *= m; }
-    void step(F m, F w) { h = __builtin_elementwise_fma(m, h, w); }
+    void step(F f, F, F w) { h = __builtin_elementwise_fma(f, h, w); }
     void keep(F& high, F& low) const { high = h, low = F{}; }
 };
 struct Slow {
-    F base, change;
-    Slow(F high, F low) : base(high), change(low) {}
-    F value() const { return base + change; }
-    void add(F a, F b) { change = __builtin_elementwise_fma(a, b, change); }
-    void decay(F m) { change = __builtin_elementwise_fma(m, base + change, change); }
-    void step(F m, F w) {
-        change += __builtin_elementwise_fma(m, change, __builtin_elementwise_fma(m, base, w));
+    F base, change, h;
+    I quiet;
+    Slow() {}
+    Slow(F high, F low, I slow)
+        : base((F)((I)high & slow)), change(slow ? low : high + low), h(high + low), quiet(slow) {}
+    // what is kept of a decay: its rise where it is slow
+    static F one_of(F f, F rise, I slow) { return (F)((I)f & ~slow | (I)rise & slow); }
+    static F decay_of(F m, I slow) { return m + (F)((I)(F{} + 1.0f) & slow); }
+    F value() const { return h; }
+    void add(F a, F b) { change = __builtin_elementwise_fma(a, b, change), h = base + change; }
+    void decay(F m) {
+        change = __builtin_elementwise_fma(m, h, (F)((I)change & quiet)), h = base + change;
     }
-    void keep(F& high, F& low) const {
-        const F h = base + change;
-        low = change - (h - base), high = h;
+    void step(F f, F rise, F w) {
+        change = __builtin_elementwise_fma(f, change, __builtin_elementwise_fma(rise, base, w));
+        h = base + change;
     }
+    void keep(F& high, F& low) const { high = h, low = change - (h - base); }
 };
-const float slowest = 1.0f / SPREAD;
-auto slow_ = [&](F x) -> bool {
-    return !__builtin_reduce_or(~((x <= slowest) & (x >= -slowest)));
+auto within_ = [&](F x, float most) -> I { return (x <= most) & (x >= -most); };
+// whether largest x of each lane are worth a slow walk; without branches, which would be guessed
+auto worth_ = [&](F x) -> int {
+    return (int)(__builtin_reduce_or(within_(x, SLOWEST)) != 0)
+        | (int)(__builtin_reduce_or(~within_(x, MODERATE)) == 0);
 };
+auto quiet_ = [&](F x) -> I { return within_(x, MODERATE) & -worth_(x); };  // the slow lanes
+auto wild = [&](F x, F& rise) __attribute__((always_inline)) -> F { return rise = exp2_(x); };
+auto tamed = [&](F x, F& rise) __attribute__((always_inline)) -> F { return exp2_rise_(x, rise); };
 """
 
 
-def walks(name: str, body: str, discretization: str) -> str:
-    """C++ text of two lambdas with that body: ``name``, of an exp2, and ``slow_name``, of anything.
+def walk(name: str, body: str) -> str:
+    """C++ text of a lambda with that body, of a kind of state and an exp2.
 
-    The body may hold FACTORS and SLOPES, which stand for m, g, df and dg of x, and STATE, which
-    stands for the type of a state.
+    These are Plain or Slow, and ``tamed``, or ``wild`` for Plain. The body may name State.
     """
-    plain = {"FACTORS": FACTORS, "SLOPES": SLOPES}, "Plain"
-    slow = {"FACTORS": SLOW_FACTORS, "SLOPES": SLOW_SLOPES}, "Slow"
-    text = ""
-    for prefix, (parts, state) in (("", plain), ("slow_", slow)):
-        own = body.replace("STATE", state)
-        for part, by_name in parts.items():
-            own = own.replace(part, by_name.get(discretization, ""))
-        text += f"auto {prefix}{name} = [&](auto exp2) __attribute__((always_inline)) {{{own}}};\n"
-    return text
+    return f"""
+auto {name} = [&](auto kind, auto exp2) __attribute__((always_inline)) {{
+    using State = decltype(kind);
+    {body}
+}};
+"""

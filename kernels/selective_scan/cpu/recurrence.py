@@ -11,7 +11,8 @@ from typing import Any
 import warp as wp
 
 from ...runtime.lanes import lanes, prelude
-from .decays import FACTORS, SPREAD, STATE, walks
+from .decays import FACTORS, SLOPES, STATE, limits
+from .decays import walk as walk_of
 from .together import ADVANCE_BLOCK, BLOCKS, RETREAT_BLOCK
 from .tokens import TOKENS
 from .tuning import Tuning
@@ -55,11 +56,14 @@ while (fetched < tail.fetches) {
     for (int t = 0; t < count; ++t) fetch.next();
 }
 """
+_LOOK = """
+    const I quiet = quiet_(tail.top * a);
+    const bool care = tame && __builtin_reduce_or(quiet);
+"""
 _CHOOSE = """
-    const bool slow = slow_(tail.top * a);
-    if (slow) slow_walk(0);
-    else if (tame) walk(exp2_tame_);
-    else walk(exp2_);
+    if (care) walk(Slow(), tamed);
+    else if (tame) walk(Plain(), tamed);
+    else walk(Plain(), wild);
 """
 # Equations 1 and 5.
 _ADVANCE = """
@@ -68,11 +72,11 @@ WALKS
 }
 """
 _ADVANCE_WALK = """
-        STATE h(state_(h_out, n), state_(h_out, states + n));
+        State h(state_(h_out, n), state_(h_out, states + n), quiet);
         for (int t = 0; t < count; ++t) {
             const F x = token[t].rate * a;
             FACTORS
-            h.step(m, g * (token[t].du * b[t]));
+            h.step(f, rise, g * (token[t].du * b[t]));
             token[t].y = fma_(h.value(), splat(c[t]), token[t].y);
         }
         h.keep(state_(h_out, n), state_(h_out, states + n));
@@ -85,13 +89,13 @@ WALKS
 }
 """
 _ACCUMULATE_WALK = """
-        STATE h(state_(h_out, n), state_(h_out, states + n));
-        STATE product(state_(product_out, n), state_(product_out, states + n));
+        State h(state_(h_out, n), state_(h_out, states + n), quiet);
+        State product(state_(product_out, n), state_(product_out, states + n), quiet);
         for (int t = 0; t < count; ++t) {
             const F x = token[t].rate * a;
             FACTORS
-            h.step(m, g * (token[t].du * b[t]));
-            product.decay(m);
+            h.step(f, rise, g * (token[t].du * b[t]));
+            product.decay(State::one_of(f, rise, quiet));
         }
         h.keep(state_(h_out, n), state_(h_out, states + n));
         product.keep(state_(product_out, n), state_(product_out, states + n));
@@ -104,12 +108,12 @@ WALKS
 }
 """
 _GATHER_WALK = """
-        STATE dh(state_(dh_out, n), state_(dh_out, states + n));
-        STATE product(state_(product_out, n), state_(product_out, states + n));
+        State dh(state_(dh_out, n), state_(dh_out, states + n), quiet);
+        State product(state_(product_out, n), state_(product_out, states + n), quiet);
         for (int t = 0; t < count; ++t) {
             const F x = token[t].rate * a;
             FACTORS
-            product.decay(m);
+            product.decay(State::one_of(f, rise, quiet));
             dh.add(product.value(), token[t].dy * c[t]);
         }
         dh.keep(state_(dh_out, n), state_(dh_out, states + n));
@@ -129,24 +133,24 @@ _RETREAT = f"""
     }}
 WALKS
     if (!(needs & {NEED_DH})) continue;
-    if (slow) slow_back(0);
-    else back(0);
+    if (care) back(Slow(), 0);
+    else back(Plain(), 0);
 }}
 """
 _RETREAT_WALK = f"""
-        STATE h(state_(starts_in, n), F{{}});
+        State h(state_(starts_in, n), F{{}}, quiet);
         for (int t = 0; t < count; ++t) {{
             const F x = token[t].rate * a;
             FACTORS
-            kept[t].m = m;
+            kept[t].m = State::one_of(f, rise, quiet);
             kept[t].h = h.value();
-            h.step(m, g * (token[t].du * b[t]));
+            h.step(f, rise, g * (token[t].du * b[t]));
             if (needs & {NEED_DZ}) token[t].y = fma_(h.value(), splat(c[t]), token[t].y);
             if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h.value(), dc[t]);
         }}
 """
 _RETREAT_BACK = """
-        STATE dh(state_(dh_out, n), state_(dh_out, states + n));
+        State dh(state_(dh_out, n), state_(dh_out, states + n), quiet);
         F da = F{};
         for (int t = count - 1; t >= 0; --t) {
             GradToken& own = token[t];
@@ -194,19 +198,21 @@ def _leaf(
 
     ``block`` walks ``at_once`` states, if that is more than one.
     """
-    parts = walks("walk", walk, discretization)
+    parts = _LOOK + walk_of("walk", walk)
     if back:
         gradient = _OWN if discretization == "mamba" else _GENERAL
-        parts += walks("back", back.replace("GRADIENT", gradient), discretization)
-    loop = _STATES if at_once == 1 else BLOCKS.replace("BLOCK", block).replace("ALSO", also)
-    text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
-    text = (
-        prelude(tuning.degree, bool(tuning.table))
-        + STATE
-        + text.replace("FACTORS", FACTORS[discretization])
+        parts += walk_of("back", back.replace("GRADIENT", gradient))
+    loop = (
+        _STATES
+        if at_once == 1
+        else BLOCKS.replace("BLOCK", walk_of("block", block)).replace("ALSO", also)
     )
+    text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
+    text = text.replace("FACTORS", FACTORS[discretization])
+    text = text.replace("SLOPES", SLOPES.get(discretization, ""))
+    text = prelude(tuning.degree, bool(tuning.table)) + STATE + text
     chunk = tuning.chunk
-    names = {"SPREAD": max(SPREAD, chunk), "CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token}
+    names = {"CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token, **limits(chunk)}
     for name, value in names.items():
         text = text.replace(name, str(value))
     return text

@@ -1,21 +1,27 @@
 """The walks of several states at once, in C++ text for the leaves of ``recurrence.py``.
 
 What does not depend on the state is read and written once for all of them. It is done where none of
-them needs care: no exponential needs a clamp, no decay is slow, and in the gradient all is wanted.
+their exponentials needs a clamp, and where in the gradient all is wanted.
 Sums are in the same order as state by state, to the last bit.
 """
 
 # Begins the loop over the states; BLOCK is one of the texts below, ALSO a further condition.
 BLOCKS = """
 for (int n = 0; n < states; ++n) {
-    bool together = tame && n + AT_ONCE <= states ALSO;
-    for (int k = 0; together && k < AT_ONCE; ++k)
-        together = !slow_(tail.top * rates[n + k]);
+    const bool together = tame && n + AT_ONCE <= states ALSO;
     if (together) {
-        auto exp2 = exp2_tame_;
-        F a[AT_ONCE];
-        for (int k = 0; k < AT_ONCE; ++k) a[k] = rates[n + k];
+        F a[AT_ONCE], least = splat(125.0f);
+        #pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) {
+            a[k] = rates[n + k];
+            least = __builtin_elementwise_min(least, __builtin_elementwise_abs(tail.top * a[k]));
+        }
+        I quiets[AT_ONCE], any = I{};
+        const bool look = worth_(least);  // if no state is worth it, this is all that is looked at
+        for (int k = 0; look && k < AT_ONCE; ++k) any |= quiets[k] = quiet_(tail.top * a[k]);
 BLOCK
+        if (look && __builtin_reduce_or(any)) block(Slow(), tamed);
+        else block(Plain(), tamed);
         n += AT_ONCE - 1;
         continue;
     }
@@ -25,10 +31,10 @@ BLOCK
 # Equations 1 and 5.
 ADVANCE_BLOCK = """
         const Column b = column_(b_in, n), c = column_(c_in, n);
-        F h[AT_ONCE];
+        State h[AT_ONCE];
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k)
-            h[k] = state_(h_out, n + k) + state_(h_out, states + n + k);
+            h[k] = State(state_(h_out, n + k), state_(h_out, states + n + k), quiets[k]);
         Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
             fetch.next();
@@ -39,14 +45,14 @@ ADVANCE_BLOCK = """
             for (int k = 0; k < AT_ONCE; ++k) {
                 const F x = rate * a[k];
                 FACTORS
-                h[k] = fma_(m, h[k], g * (du * bt[k]));
-                y = fma_(h[k], splat(ct[k]), y);
+                h[k].step(f, rise, g * (du * bt[k]));
+                y = fma_(h[k].value(), splat(ct[k]), y);
             }
             token[t].y = y;
         }
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k)
-            state_(h_out, n + k) = h[k], state_(h_out, states + n + k) = F{};
+            h[k].keep(state_(h_out, n + k), state_(h_out, states + n + k));
 """
 
 # Equations 1, 6 to 9, 11 and 12, and the sums of 7 and 8.
@@ -55,9 +61,10 @@ RETREAT_BLOCK = """
         F* const db = (F*)db_out.data + n * CHUNK;
         F* const dc = (F*)dc_out.data + n * CHUNK;
         if (first) for (int t = 0; t < AT_ONCE * CHUNK; ++t) db[t] = dc[t] = F{};
-        F h[AT_ONCE], dh[AT_ONCE], da[AT_ONCE];
+        State h[AT_ONCE], dh[AT_ONCE];
+        F da[AT_ONCE];
         #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) h[k] = state_(starts_in, n + k);
+        for (int k = 0; k < AT_ONCE; ++k) h[k] = State(state_(starts_in, n + k), F{}, quiets[k]);
         Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
             fetch.next();
@@ -68,17 +75,17 @@ RETREAT_BLOCK = """
             for (int k = 0; k < AT_ONCE; ++k) {
                 const F x = rate * a[k];
                 FACTORS
-                kept[t * AT_ONCE + k].m = m;
-                kept[t * AT_ONCE + k].h = h[k];
-                h[k] = fma_(m, h[k], g * (du * bt[k]));
-                y = fma_(h[k], splat(ct[k]), y);
-                dc[k * CHUNK + t] = fma_(dy, h[k], dc[k * CHUNK + t]);
+                kept[t * AT_ONCE + k].m = State::one_of(f, rise, quiets[k]);
+                kept[t * AT_ONCE + k].h = h[k].value();
+                h[k].step(f, rise, g * (du * bt[k]));
+                y = fma_(h[k].value(), splat(ct[k]), y);
+                dc[k * CHUNK + t] = fma_(dy, h[k].value(), dc[k * CHUNK + t]);
             }
             token[t].y = y;
         }
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
-            dh[k] = state_(dh_out, n + k) + state_(dh_out, states + n + k);
+            dh[k] = State(state_(dh_out, n + k), state_(dh_out, states + n + k), quiets[k]);
             da[k] = F{};
         }
         fetch = fetch_();
@@ -89,11 +96,12 @@ RETREAT_BLOCK = """
             F s = token[t].s, p = token[t].p;
             #pragma unroll
             for (int k = 0; k < AT_ONCE; ++k) {
-                const F v = fma_(dy, splat(ct[k]), dh[k]);
+                dh[k].add(dy, splat(ct[k]));
+                const F v = dh[k].value();
                 db[k * CHUNK + t] = fma_(v, du, db[k * CHUNK + t]);
                 s = fma_(v, splat(bt[k]), s);
-                dh[k] = v * kept[t * AT_ONCE + k].m;
-                const F q = dh[k] * kept[t * AT_ONCE + k].h;
+                dh[k].decay(kept[t * AT_ONCE + k].m);
+                const F q = dh[k].value() * kept[t * AT_ONCE + k].h;
                 p = fma_(q, a[k], p);
                 da[k] = fma_(q, rate, da[k]);
             }
@@ -101,7 +109,7 @@ RETREAT_BLOCK = """
         }
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
-            state_(dh_out, n + k) = dh[k], state_(dh_out, states + n + k) = F{};
+            dh[k].keep(state_(dh_out, n + k), state_(dh_out, states + n + k));
             state_(da_out, n + k) += da[k];
         }
 """
