@@ -345,7 +345,7 @@ def test_outputs_that_cannot_be_written_are_failures(tmp_path, picture, checkpoi
 def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):
     gaussians = some(9)
     gaussians.means[3] = float("nan")
-    monkeypatch.setattr(predict, "reconstruct", lambda model, rgba: gaussians)
+    monkeypatch.setattr(predict, "reconstruct", lambda model, rgba, precision: gaussians)
     assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
     assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err
 

@@ -108,7 +108,7 @@ def disassemble(tool: Path, cubin: Path) -> str:
     Raises:
         ValueError: the tool fails, as one that is older than the binary does.
     """
-    done = subprocess.run([tool, "-c", cubin], capture_output=True, text=True)
+    done = subprocess.run([tool, "-c", cubin], capture_output=True, encoding="utf-8")
     if done.returncode:
         raise ValueError(f"{tool.name} fails: {done.stderr.strip().splitlines()[-1:]}")
     return done.stdout
