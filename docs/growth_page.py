@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import torch
+from page_parts import with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
@@ -25,7 +26,6 @@ HERE = Path(__file__).parent
 PAGE = HERE / "growth.md"
 RESULTS = HERE / "benchmarks" / "cpu-growth.json"
 PICTURES = {"costs": HERE / "pictures" / "growth.svg", "errors": HERE / "pictures" / "errors.svg"}
-MARK = "<!-- {name}: written by docs/growth_page.py -->"
 
 
 def main() -> None:
@@ -65,13 +65,7 @@ def page_of(text: str, document: dict) -> str:
         "costs": costs + _costs(parts["costs"]),
         "errors": errors + _errors(parts["errors"]),
     }
-    for name, content in written.items():
-        begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
-        if begin not in text or end not in text:
-            raise ValueError(f"no mark {begin}")
-        head, _, rest = text.partition(begin)
-        text = f"{head}{begin}\n\n{content}\n\n{end}{rest.partition(end)[2]}"
-    return text
+    return with_parts(text, "docs/growth_page.py", written)
 
 
 def _missing(document: dict) -> list[str]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 import tyro
+from page_parts import with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
@@ -26,7 +27,6 @@ from gamba_warp.untrusted.documents import read_document
 
 PAGE = Path(__file__).with_name("model-card.md")
 README = Path(__file__).parents[1] / "README.md"
-MARK = "<!-- {name}: written by docs/model_card.py -->"
 TITLES = {"novel": "New views", "input": "The input view", "shape": "Shape"}
 
 
@@ -81,7 +81,7 @@ def page_of(text: str, card: ModelCard) -> str:
         "figures": "\n\n".join([card.measured, *_tables(card)]),
         "limits": "\n".join(f"- {limit}" for limit in card.limits),
     }
-    return _written(text, parts)
+    return with_parts(text, "docs/model_card.py", parts)
 
 
 def readme_of(text: str, card: ModelCard) -> str:
@@ -108,18 +108,7 @@ def readme_of(text: str, card: ModelCard) -> str:
         ]
         name = "**shipped model**" if row.name == "model" else row.name.replace("_", " ")
         lines.append(f"| {name} | {' | '.join(texts)} |")
-    return _written(text, {"results": "\n".join(lines)})
-
-
-def _written(text: str, parts: dict[str, str]) -> str:
-    """A page with each part written between its marks."""
-    for name, content in parts.items():
-        begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
-        if begin not in text or end not in text:
-            raise ValueError(f"no mark {begin}")
-        head, _, rest = text.partition(begin)
-        text = f"{head}{begin}\n{content}\n{end}{rest.partition(end)[2]}"
-    return text
+    return with_parts(text, "docs/model_card.py", {"results": "\n".join(lines)})
 
 
 def _tables(card: ModelCard) -> list[str]:
