@@ -114,6 +114,23 @@ def load_model(
     return model.to(device).eval()
 
 
+def shipped_model(preset: str, device: str | torch.device = "cpu") -> Gamba | None:
+    """The model of a preset that comes with the package, in eval mode.
+
+    Args:
+        preset: its name.
+        device: the model's device.
+
+    Returns:
+        The model; None where none of this preset comes with the package.
+
+    Raises:
+        UserError: the file cannot be read, as in ``load_model``.
+    """
+    path = STARTER / f"{preset}.safetensors"
+    return load_model(path, device) if path.is_file() else None
+
+
 def _outline(config: GambaConfig, path: Path) -> Gamba:
     """The model that a file's configuration means, as shapes without memory."""
     try:
