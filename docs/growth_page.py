@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import torch
-from page_parts import with_parts
+from page_parts import table, with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
@@ -98,7 +98,7 @@ def _costs(document: dict) -> str:
     if not rows:
         return "Not measured yet."
     said = said or ["- Nothing grows faster than its work."]
-    return "\n".join([*said, "", *_table(["case", *header], rows)])
+    return "\n".join([*said, "", table(["case", *header], rows)])
 
 
 def _errors(document: dict) -> str:
@@ -107,13 +107,8 @@ def _errors(document: dict) -> str:
     for cases in groups(document).values():
         for case, records in cases.items():
             header, rows = growth_table(records) or ([], [])
-            blocks.append("\n".join([f"**{case}**", "", *_table(header, rows)]))
+            blocks.append(f"**{case}**\n\n{table(header, rows)}")
     return "\n\n".join(blocks) or "Not measured yet."
-
-
-def _table(header: list[str], rows: list[list[str]]) -> list[str]:
-    lines = [f"| {' | '.join(row)} |" for row in (header, *rows)]
-    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]
 
 
 if __name__ == "__main__":
