@@ -73,8 +73,8 @@ def load_model(
     """Reads a file of ``save_model``.
 
     Args:
-        path: the file, or a folder with a ``model.safetensors``; without it the small model that
-            comes with the package.
+        path: the file, or a folder with a ``model.safetensors``; without it the shipped
+            model.
         device: the model's device.
         encoder_weights: as for ``build_encoder``; a frozen timm encoder needs them. Without them
             the ``encoder.safetensors`` beside the model is taken, if there is one.
