@@ -129,26 +129,27 @@ def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
 
 
 class _Products:
-    """How many threads are inside ``network_products`` and ``exact_products``, and torch's setting,
-    which is that of the whole process, before the first of them.
+    """How many threads are inside each of the two settings below; before them all, torch's own.
+
+    torch has one setting for the whole process.
     """
 
     lock = threading.Lock()
-    network = exact = 0
+    network = float32 = 0
     before = "highest"
 
 
-def _count(network: int = 0, exact: int = 0) -> None:
+def _count(network: int = 0, float32: int = 0) -> None:
     """Counts threads that come or go, and sets what those that are left need."""
     import torch
 
     with _Products.lock:
-        if not (_Products.network or _Products.exact):
+        if not (_Products.network or _Products.float32):
             _Products.before = torch.get_float32_matmul_precision()
         _Products.network += network
-        _Products.exact += exact
+        _Products.float32 += float32
         wanted = "medium" if _Products.network else _Products.before
-        torch.set_float32_matmul_precision("highest" if _Products.exact else wanted)
+        torch.set_float32_matmul_precision("highest" if _Products.float32 else wanted)
 
 
 @contextmanager
@@ -165,7 +166,7 @@ def network_products(device: torch.device, precision: torch.dtype | None = None)
     - Other CPUs: nothing. Intel's are those that MKL is made for.
     - A GPU: nothing. It rounds the factors (TF32) where the process lets it.
 
-    Products of bfloat16 are torch's autocast, on every processor. Inside ``exact_products``, of
+    Products of bfloat16 are torch's autocast, on every processor. Inside ``float32_products``, of
     whichever thread, and inside torch.compile the library stays as it is. What autograd computes
     later is outside, unless ``backward`` is called inside too.
 
@@ -191,7 +192,7 @@ def network_products(device: torch.device, precision: torch.dtype | None = None)
 
 
 @contextmanager
-def exact_products() -> Iterator[None]:
+def float32_products() -> Iterator[None]:
     """Matrix products of float32 inside keep all digits, and are made by torch's own library.
 
     - A GPU does not round their factors (no TF32), whatever the process lets it do otherwise.
@@ -200,11 +201,11 @@ def exact_products() -> Iterator[None]:
 
     What autograd computes later is outside.
     """
-    _count(exact=1)
+    _count(float32=1)
     try:
         yield
     finally:
-        _count(exact=-1)
+        _count(float32=-1)
 
 
 @functools.cache

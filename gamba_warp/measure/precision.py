@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, orbit
-from ..devices import exact_products, network_products
+from ..devices import float32_products, network_products
 from ..gaussians import Gaussians
 from ..kernels.bench import Error, Key, Settings, Target, Variant, compare
 from ..model.checkpoint import shipped_model
@@ -66,7 +66,7 @@ class _Precise:
         viewmats = orbit(torch.tensor([0.0, 90.0, 180.0]), distance=config.distance)
         K = intrinsics(size, size, config.fov).repeat(3, 1, 1)
         self.views = Cameras(viewmats, K, size, size).to(settings.device)
-        with exact_products():
+        with float32_products():
             self.truth = self.run(torch.float32)
         self.seen = self._render(self.truth)
 
@@ -129,7 +129,7 @@ def _alone(run: Callable[[], object], kind: str, settings: Settings) -> list[Var
     products = Products(run, settings.device)
 
     def plain() -> None:
-        with exact_products():
+        with float32_products():
             products.run()
 
     runs = {f"paper, {kind}, {ALONE}": products.run}

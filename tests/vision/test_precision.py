@@ -24,22 +24,22 @@ def better(monkeypatch):
 def test_the_setting_of_products_is_put_back_also_after_an_error_and_inside_one_another(better):
     before = torch.get_float32_matmul_precision()
     with pytest.raises(KeyError), devices.network_products(CPU):
-        with devices.network_products(CPU), devices.exact_products():
+        with devices.network_products(CPU), devices.float32_products():
             assert torch.get_float32_matmul_precision() == "highest"
         assert torch.get_float32_matmul_precision() == "medium"
         raise KeyError
     assert torch.get_float32_matmul_precision() == before
-    with devices.exact_products(), devices.network_products(CPU):
+    with devices.float32_products(), devices.network_products(CPU):
         assert torch.get_float32_matmul_precision() == "highest"
     with devices.network_products(torch.device("meta")):
         assert torch.get_float32_matmul_precision() == before
 
 
-def test_exact_products_end_the_rounding_that_a_user_has_allowed():
+def test_float32_products_end_the_rounding_that_a_user_has_allowed():
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
     try:
-        with devices.exact_products():
+        with devices.float32_products():
             assert torch.get_float32_matmul_precision() == "highest"
         assert torch.get_float32_matmul_precision() == "high"
     finally:
@@ -56,12 +56,12 @@ def test_a_network_keeps_the_callers_autocast_unless_it_is_given_a_precision():
     assert (a @ a).dtype == torch.float32
 
 
-def test_exact_products_stay_exact_while_another_thread_comes_and_goes(better):
+def test_float32_products_keep_all_digits_while_another_thread_comes_and_goes(better):
     def other() -> None:
         with devices.network_products(CPU):
             pass
 
-    with devices.exact_products():
+    with devices.float32_products():
         thread = threading.Thread(target=other)
         thread.start()
         thread.join()

@@ -11,7 +11,7 @@ from torch.nn.functional import cosine_similarity
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.devices import exact_products
+from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
 from gamba_warp.kernels.bench.core.parts import measure_parts
@@ -236,7 +236,7 @@ class _Precise:
         self.batch = step_source(self.model.config, settings, BATCH).batch(0, NOVEL)
         self.batch = self.batch.to(settings.device)
         self.optimizer = torch.optim.SGD(self.model.parameters(), lr=0.0)
-        with exact_products():
+        with float32_products():
             self.truth = self.gradient(torch.float32)
 
     def gradient(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:
