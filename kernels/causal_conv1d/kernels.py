@@ -13,6 +13,7 @@ import warp as wp
 from ..runtime import rows as cpu_values
 from ..runtime import scalars as cuda_values
 from ..runtime.lanes import WARP_DTYPES
+from .cpu import strip as cpu_strip
 
 TAPS = 4
 STRIP = 16  # tokens of a forward task; few, because each row may lie in another page
@@ -30,10 +31,60 @@ def _values(device_type: str, io: torch.dtype):
 
 
 @functools.cache
+def _strip(device_type: str, io: torch.dtype):
+    """The function of ``count`` tokens of one value from ``t0`` on, after three older ones.
+
+    On a CPU it is one loop of native code: the text below it, which has the same bits, takes 1.1 to
+    1.4 times as long there.
+    """
+    if device_type == "cpu":
+        return cpu_strip(io)
+    value, _, load, store, times, fma, sigmoid = _values(device_type, io)
+    scalar = WARP_DTYPES[io]
+
+    @wp.func
+    @no_type_check
+    def strip(
+        x_in: wp.array3d(dtype=scalar),
+        b: int,
+        t0: int,
+        count: int,
+        d: int,
+        width: int,
+        w0: value,
+        w1: value,
+        w2: value,
+        w3: value,
+        bias: value,
+        first: value,
+        second: value,
+        third: value,
+        use_silu: int,
+        stream: int,
+        y_out: wp.array3d(dtype=scalar),
+    ):
+        x0 = first
+        x1 = second
+        x2 = third
+        for t in range(t0, t0 + count):
+            x3 = load(x_in, b, t, d, width)
+            y = fma(w0, x0, fma(w1, x1, fma(w2, x2, fma(w3, x3, bias))))
+            if use_silu != 0:
+                y = times(y, sigmoid(y))
+            store(y_out, b, t, d, width, y)
+            x0 = x1
+            x1 = x2
+            x2 = x3
+
+    return strip
+
+
+@functools.cache
 def forward_kernel(device_type: str, io: torch.dtype):
     """The kernel for tensors of dtype ``io`` on a device of that type (README, equation 1)."""
-    value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
+    value, channels_of_value, load, *_ = _values(device_type, io)
     scalar = WARP_DTYPES[io]
+    strip = _strip(device_type, io)
 
     @wp.kernel(enable_backward=False, module="unique")
     @no_type_check
@@ -42,6 +93,7 @@ def forward_kernel(device_type: str, io: torch.dtype):
         # in
         strips: int,
         use_silu: int,
+        stream: int,
         x_in: wp.array3d(dtype=scalar),
         weight_in: wp.array2d(dtype=value),
         bias_in: wp.array(dtype=value),
@@ -55,7 +107,6 @@ def forward_kernel(device_type: str, io: torch.dtype):
         t0 = (task % strips) * _S
         d = k * wp.static(channels_of_value)
         width = wp.min(wp.static(channels_of_value), x_in.shape[2] - d)
-        w0, w1, w2, w3 = weight_in[0, k], weight_in[1, k], weight_in[2, k], weight_in[3, k]
         x0, x1, x2 = value(0.0), value(0.0), value(0.0)
         for i in range(_HISTORY):
             x0 = x1
@@ -65,15 +116,11 @@ def forward_kernel(device_type: str, io: torch.dtype):
                 x2 = load(x_in, b, t, d, width)
             elif state_in.shape[1] > 0:
                 x2 = load(state_in, b, t + _HISTORY, d, width)
-        for t in range(t0, wp.min(t0 + _S, x_in.shape[1])):
-            x3 = load(x_in, b, t, d, width)
-            y = fma(w0, x0, fma(w1, x1, fma(w2, x2, fma(w3, x3, bias_in[k]))))
-            if use_silu != 0:
-                y = times(y, sigmoid(y))
-            store(y_out, b, t, d, width, y)
-            x0 = x1
-            x1 = x2
-            x2 = x3
+        strip(
+            x_in, b, t0, wp.min(_S, x_in.shape[1] - t0), d, width, weight_in[0, k],
+            weight_in[1, k], weight_in[2, k], weight_in[3, k], bias_in[k], x0, x1, x2, use_silu,
+            stream, y_out,
+        )  # fmt: skip
 
     return conv_forward
 

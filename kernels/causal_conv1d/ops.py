@@ -9,10 +9,10 @@ from ..runtime import rows as cpu_values
 from ..runtime import scalars as cuda_values
 from ..runtime.launch import cuda_launch, parallel_launch
 from ..runtime.memory import empty
+from ..runtime.rows import streams
 from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, backward_kernel, forward_kernel
-
 
 _FEW = 1 << 15  # elements that one thread has done before it could wake another
 
@@ -66,7 +66,9 @@ def conv(
     blocks, w, v, rows = _operands(x, weight, bias, state)
     out = _empty(x, tuple(x.shape))
     kernel = forward_kernel(x.device.type, x.dtype)
-    _launch(x, kernel, (x.shape[0] * strips, blocks), [strips, int(silu), x, w, v, rows], [out])
+    stream = int(x.device.type == "cpu" and streams([out]))
+    inputs = [strips, int(silu), stream, x, w, v, rows]
+    _launch(x, kernel, (x.shape[0] * strips, blocks), inputs, [out])
     return out
 
 

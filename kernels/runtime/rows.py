@@ -4,12 +4,27 @@ A row is dense in D; tokens and batch elements may be strided. Lanes past ``widt
 and not written.
 """
 
+from collections.abc import Sequence
+
 import torch
 import warp as wp
+from torch import Tensor
 
 from .lanes import LANES, PRELUDE, WARP_DTYPES, W, fma, lanes, sigmoid, times
 
-__all__ = ["ACCESSORS", "ELEMENTS", "VALUE", "WIDTH", "fma", "rows", "sigmoid", "times"]
+__all__ = [
+    "ACCESSORS",
+    "ELEMENTS",
+    "VALUE",
+    "WIDTH",
+    "fma",
+    "put",
+    "rows",
+    "settle",
+    "sigmoid",
+    "streams",
+    "times",
+]
 
 VALUE, WIDTH = lanes, W  # scalars.py has these names too, as kernels for both devices need them
 
@@ -28,6 +43,13 @@ auto narrow = [](I i) -> I {  // to nearest, ties to even; NaN stays a NaN
     I rounded = (i + 0x7fff + ((i >> 16) & 1)) >> 16;
     return (is_nan ? (i >> 16) | 0x40 : rounded) & 0xffff;
 };
+// One instruction where the processor has it: the same bits, but a result below 2^-126 becomes 0.
+#if defined(__AVX512BF16__)
+typedef __bf16 N __attribute__((vector_size(32), aligned(2)));
+auto write_bf16 = [](unsigned short* p, F v) { *(N*)p = __builtin_convertvector(v, N); };
+#else
+auto write_bf16 = [](unsigned short* p, F v) { *(S*)p = __builtin_convertvector(narrow((I)v), S); };
+#endif
 """
 # By dtype what replaces the names in ``_ROWS``. TYPE is the element's type; READ gives the lanes at
 # p and READ_ONE lane i of them; WRITE stores the lanes v at p and WRITE_ONE lane i of them.
@@ -51,7 +73,7 @@ _CODE = {
         "READ_ONE": "widen(p[i])",
         "READ": "(F)(__builtin_convertvector(*(const S*)p, I) << 16)",
         "WRITE_ONE": "p[i] = (unsigned short)narrow(I{} + bits(v[i]))[0]",
-        "WRITE": "*(S*)p = __builtin_convertvector(narrow((I)v), S)",
+        "WRITE": "write_bf16(p, v)",
     },
 }
 _ROWS = """
@@ -85,6 +107,50 @@ def rows(array: str, dtype: torch.dtype) -> str:
     for part, code in _CODE[dtype].items():
         text = text.replace(part, code)
     return text
+
+
+# Large results go past the caches: their lines need not be read before they are written, and would
+# only push out what is wanted soon. ``stream`` says so, and that all lines are whole.
+_PUT = """
+typedef float Line __attribute__((vector_size(64), aligned(64)));
+auto put_NAME = [&](int t, F v) {
+    if (stream) __builtin_nontemporal_store((Line)v, (Line*)(NAME_rows + t * NAME_step));
+    else write_NAME(t, v);
+};
+"""
+_STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
+
+
+def put(name: str) -> str:
+    """C++ text of ``put_NAME(t, v)``, which writes a token's lanes as ``stream`` in scope says.
+
+    The text of ``rows`` for the array must stand before it.
+    """
+    return _PUT.replace("NAME", name)
+
+
+def streams(results: Sequence[Tensor]) -> bool:
+    """Whether results ``[B, L, D]`` may go past the caches: they are too large to be kept there.
+
+    Of float32 each, dense, with whole cache lines; results without elements do not count.
+    """
+    written = [x for x in results if x.numel()]
+    return bool(written) and all(
+        x.dtype == torch.float32
+        and x.shape[-1] % W == 0
+        and x.data_ptr() % 64 == 0
+        and 4 * x.numel() >= _STREAMED
+        for x in written
+    )
+
+
+# What was written past the caches is seen by other threads from here on.
+@wp.func_native("""
+#if defined(__x86_64__)
+__builtin_ia32_sfence();
+#endif
+""")
+def settle(): ...
 
 
 def _accessors(dtype: torch.dtype):

@@ -12,12 +12,13 @@ import torch
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES, W, flush_denormals, lanes, restore_denormals
+from ...runtime.rows import settle
 from ...runtime.views import struct
 from . import recurrence, tokens
 from .decays import KEPT, SCALES
 from .layout import BLOCKS
 from .recurrence import NEED_DB, NEED_DC
-from .tokens import EXTRA, GRAD_TOKEN, LATE, TOKEN, settle
+from .tokens import EXTRA, GRAD_TOKEN, LATE, TOKEN
 from .tuning import Tuning
 
 SPAN = 32  # lane groups of a task at most: rows are read in long parts that fit a core's cache

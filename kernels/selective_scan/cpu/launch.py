@@ -11,6 +11,7 @@ from torch import Tensor
 from ...runtime.lanes import W, lanes
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
+from ...runtime.rows import streams
 from ...runtime.views import lane_contiguous, view
 from . import kernels
 from .decays import SCALES
@@ -20,7 +21,6 @@ from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ
 from .tuning import Tuning
 
 _FIELDS = tuple(Sizes.__annotations__)
-_STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
 
 
 def _sizes(
@@ -29,7 +29,8 @@ def _sizes(
     y = layout
     return _struct(
         *(y.length, y.segment, y.segments, y.batch, y.states, y.groups, y.group_width),
-        *(y.group_blocks, y.span, int(softplus), int(use_z), needs, _streams(y, results)),
+        *(y.group_blocks, y.span, int(softplus), int(use_z), needs),
+        int(y.group_width % W == 0 and streams(results)),
     )
 
 
@@ -39,15 +40,6 @@ def _struct(*values: int) -> Sizes:
     for name, value in zip(_FIELDS, values, strict=True):
         setattr(sizes, name, value)
     return sizes
-
-
-def _streams(layout: Layout, results: Sequence[Tensor]) -> int:
-    """Whether results go past the caches, in whole lines: they are too large to be kept there."""
-    each = 4 * layout.batch * layout.length * layout.channels
-    if each < _STREAMED or layout.group_width % W:
-        return 0
-    written = [x for x in results if x.numel()]
-    return int(all(x.dtype == torch.float32 and x.data_ptr() % 64 == 0 for x in written))
 
 
 def _pairs(states: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from ...runtime.lanes import ACTIVATIONS, PRELUDE, WARP_DTYPES, lanes
-from ...runtime.rows import ELEMENTS, rows
+from ...runtime.rows import ELEMENTS, put, rows
 
 # What is kept of a token; its rate is δ times a scale. The values of a token lie together, because
 # arrays of 4 KiB would evict one another from the cache. What the states do not need lies apart.
@@ -90,34 +90,9 @@ for (int t = 0; t < count; ++t) {
 }
 """
 
-# Large results go past the caches: their lines need not be read before they are written, and would
-# only push out what is wanted soon. ``stream`` says so, and that all lines are whole.
-_PUT = """
-typedef float Line __attribute__((vector_size(64), aligned(64)));
-auto put_NAME = [&](int t, F v) {
-    if (stream) __builtin_nontemporal_store((Line)v, (Line*)(NAME_rows + t * NAME_step));
-    else write_NAME(t, v);
-};
-"""
-
-
-def _put(name: str) -> str:
-    """C++ text of ``put_NAME``, which writes a token's lanes as ``stream`` says."""
-    return _PUT.replace("NAME", name)
-
-
-# What was written past the caches is seen by other threads from here on.
-@wp.func_native("""
-#if defined(__x86_64__)
-__builtin_ia32_sfence();
-#endif
-""")
-def settle(): ...
-
-
 # out = y silu(z), or y
 _FINISH = (
-    _put("y")
+    put("y")
     + """
 const Token* const token = aligned_((const Token*)scratch.data);
 for (int t = 0; t < count; ++t) put_y(t, token[t].y * token[t].gate);
@@ -175,7 +150,7 @@ for (int t = 0; t < count; ++t) {
 
 # Equations 9 and 11, dz, and the sums for dD and ddelta_bias.
 _FINISH_GRAD = (
-    "".join(map(_put, ("du", "ddelta", "dz")))
+    "".join(map(put, ("du", "ddelta", "dz")))
     + """
 const GradToken* const token = aligned_((const GradToken*)scratch.data);
 const Late* const late = aligned_((const Late*)late_in.data);
