@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import torch
+from page_parts import table, with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
@@ -25,7 +26,6 @@ HERE = Path(__file__).parent
 PAGE = HERE / "growth.md"
 RESULTS = HERE / "benchmarks" / "cpu-growth.json"
 PICTURES = {"costs": HERE / "pictures" / "growth.svg", "errors": HERE / "pictures" / "errors.svg"}
-MARK = "<!-- {name}: written by docs/growth_page.py -->"
 
 
 def main() -> None:
@@ -65,13 +65,7 @@ def page_of(text: str, document: dict) -> str:
         "costs": costs + _costs(parts["costs"]),
         "errors": errors + _errors(parts["errors"]),
     }
-    for name, content in written.items():
-        begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
-        if begin not in text or end not in text:
-            raise ValueError(f"no mark {begin}")
-        head, _, rest = text.partition(begin)
-        text = f"{head}{begin}\n\n{content}\n\n{end}{rest.partition(end)[2]}"
-    return text
+    return with_parts(text, "docs/growth_page.py", written)
 
 
 def _missing(document: dict) -> list[str]:
@@ -104,7 +98,7 @@ def _costs(document: dict) -> str:
     if not rows:
         return "Not measured yet."
     said = said or ["- Nothing grows faster than its work."]
-    return "\n".join([*said, "", *_table(["case", *header], rows)])
+    return "\n".join([*said, "", table(["case", *header], rows)])
 
 
 def _errors(document: dict) -> str:
@@ -113,13 +107,8 @@ def _errors(document: dict) -> str:
     for cases in groups(document).values():
         for case, records in cases.items():
             header, rows = growth_table(records) or ([], [])
-            blocks.append("\n".join([f"**{case}**", "", *_table(header, rows)]))
+            blocks.append(f"**{case}**\n\n{table(header, rows)}")
     return "\n\n".join(blocks) or "Not measured yet."
-
-
-def _table(header: list[str], rows: list[list[str]]) -> list[str]:
-    lines = [f"| {' | '.join(row)} |" for row in (header, *rows)]
-    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]
 
 
 if __name__ == "__main__":

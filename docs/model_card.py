@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 import tyro
+from page_parts import table, with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
@@ -26,7 +27,6 @@ from gamba_warp.untrusted.documents import read_document
 
 PAGE = Path(__file__).with_name("model-card.md")
 README = Path(__file__).parents[1] / "README.md"
-MARK = "<!-- {name}: written by docs/model_card.py -->"
 TITLES = {"novel": "New views", "input": "The input view", "shape": "Shape"}
 
 
@@ -81,7 +81,7 @@ def page_of(text: str, card: ModelCard) -> str:
         "figures": "\n\n".join([card.measured, *_tables(card)]),
         "limits": "\n".join(f"- {limit}" for limit in card.limits),
     }
-    return _written(text, parts)
+    return with_parts(text, "docs/model_card.py", parts)
 
 
 def readme_of(text: str, card: ModelCard) -> str:
@@ -98,7 +98,7 @@ def readme_of(text: str, card: ModelCard) -> str:
     shapes = {row.name: row for row in card.figures if row.views == "shape"}
     of_views, of_shapes = ("psnr", "ssim", "lpips", "mask_iou"), ("chamfer", "iou")
     heads = [METRICS[key][0] for key in (*of_views, *of_shapes)]
-    lines = [f"| {novel[0].objects} objects | {' | '.join(heads)} |", "| --- " * 7 + "|"]
+    rows = []
     for row in novel:
         cells = [getattr(row, key) for key in of_views]
         cells += [getattr(shapes.get(row.name), key, None) for key in of_shapes]
@@ -107,19 +107,9 @@ def readme_of(text: str, card: ModelCard) -> str:
             for key, cell in zip((*of_views, *of_shapes), cells)
         ]
         name = "**shipped model**" if row.name == "model" else row.name.replace("_", " ")
-        lines.append(f"| {name} | {' | '.join(texts)} |")
-    return _written(text, {"results": "\n".join(lines)})
-
-
-def _written(text: str, parts: dict[str, str]) -> str:
-    """A page with each part written between its marks."""
-    for name, content in parts.items():
-        begin, end = MARK.format(name=name), MARK.format(name=f"end of {name}")
-        if begin not in text or end not in text:
-            raise ValueError(f"no mark {begin}")
-        head, _, rest = text.partition(begin)
-        text = f"{head}{begin}\n{content}\n{end}{rest.partition(end)[2]}"
-    return text
+        rows.append([name, *texts])
+    results = table([f"{novel[0].objects} objects", *heads], rows)
+    return with_parts(text, "docs/model_card.py", {"results": results})
 
 
 def _tables(card: ModelCard) -> list[str]:
@@ -129,15 +119,14 @@ def _tables(card: ModelCard) -> list[str]:
         keys = [key for key in METRICS if any(getattr(row, key) for row in rows)]
         if not rows:
             continue
-        head = f"| {title}, {rows[0].objects:,} objects | "
-        lines = [head + " | ".join(METRICS[key][0] for key in keys) + " |"]
-        lines.append("| --- " * (1 + len(keys)) + "|")
+        header = [f"{title}, {rows[0].objects:,} objects", *(METRICS[key][0] for key in keys)]
+        lines = []
         for row in rows:
             cells = [getattr(row, key) for key in keys]
             texts = [cell.text(METRICS[key][1]) if cell else "–" for key, cell in zip(keys, cells)]
             name = "**this model**" if row.name == "model" else row.name.replace("_", " ")
-            lines.append(f"| {name} | {' | '.join(texts)} |")
-        tables.append("\n".join(lines))
+            lines.append([name, *texts])
+        tables.append(table(header, lines))
     return tables
 
 

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from .conventions import DeviceChoice, Precision
@@ -62,10 +62,14 @@ def share_cores() -> None:
 def keep_memory() -> None:
     """Lets the process keep the memory that it frees, up to 1 GiB, where glibc gives it.
 
-    A block of some MiB is otherwise given back at once, and the system clears each of its pages
-    again at the next use: in a picture's forward pass at the paper's size that was 80,000 pages in
-    two blocks, an eighth of the time. Blocks over 256 MiB are given back as before. It leaves what
-    the user has set by MALLOC_* or GLIBC_TUNABLES as it is.
+    It is for the tensors of torch's own operators. Their blocks of some MiB are otherwise given
+    back at once, and the system clears each page again at the next use: four blocks at the paper's
+    size touched 238,000 fresh pages a picture, and took 1.4 times as long. The results of our
+    operators do not need it: the pool of ``kernels/runtime/memory.py`` keeps them in every program,
+    also those over 256 MiB, which glibc gives back as before.
+
+    It changes the allocator of the whole process, so only commands call it; a program that runs the
+    network often may do so too. What the user has set by MALLOC_* or GLIBC_TUNABLES stays.
     """
     chosen = [name for name in os.environ if name.startswith("MALLOC_")]
     if chosen or "GLIBC_TUNABLES" in os.environ or sys.platform != "linux":
@@ -81,7 +85,7 @@ def pick_precision(name: Precision, device: torch.device, width: int) -> torch.d
 
     Args:
         name: ``auto`` is bfloat16 where a product of the model's size is at least 1.2 times as
-            fast in it as in float32 (``quick_products``), else float32. The trial takes about
+            fast in it as in float32 (``network_products``), else float32. The trial takes about
             50 ms once a process; a processor without bfloat16 products fails it by far.
         device: where the model computes.
         width: channels of the model's tokens.
@@ -109,7 +113,7 @@ def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
     pairs = [(full, matrix), (full.bfloat16(), matrix.bfloat16())]
     best, rounds = [float("inf")] * 2, 0
     began = time.perf_counter()
-    with torch.no_grad(), quick_products(device):
+    with torch.no_grad(), network_products(device):
         while rounds < 3 or time.perf_counter() - began < _TRIAL_SECONDS * (
             1 if best[0] >= _FASTER * best[1] else _DOUBT
         ):
@@ -124,64 +128,84 @@ def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
     return best[0] / best[1]
 
 
-@contextmanager
-def lower_products(precision: torch.dtype, device: torch.device) -> Iterator[None]:
-    """Matrix products inside are made in ``precision``, by autocast; float32 changes nothing."""
-    import torch
+class _Products:
+    """How many threads are inside each of the two settings below; before them all, torch's own.
 
-    with torch.autocast(device.type, precision, enabled=precision != torch.float32):
-        yield
-
-
-class _Quick:
-    """How many threads are inside ``quick_products``, and the setting before the first."""
+    torch has one setting for the whole process.
+    """
 
     lock = threading.Lock()
-    count = 0
+    network = float32 = 0
     before = "highest"
-    off = False
+
+
+def _count(network: int = 0, float32: int = 0) -> None:
+    """Counts threads that come or go, and sets what those that are left need."""
+    import torch
+
+    with _Products.lock:
+        if not (_Products.network or _Products.float32):
+            _Products.before = torch.get_float32_matmul_precision()
+        _Products.network += network
+        _Products.float32 += float32
+        wanted = "medium" if _Products.network else _Products.before
+        torch.set_float32_matmul_precision("highest" if _Products.float32 else wanted)
 
 
 @contextmanager
-def quick_products(device: torch.device) -> Iterator[None]:
-    """Float32 products of a CPU by oneDNN where that is faster, with all digits as before.
+def network_products(device: torch.device, precision: torch.dtype | None = None) -> Iterator[None]:
+    """Matrix products inside are those of a network: in ``precision``, by the fastest library.
 
-    torch gives them to MKL, which on AMD's processors makes no use of AVX-512. Its setting "medium"
-    allows oneDNN to round the factors to bfloat16; on processors with AVX-512 and without AMX there
-    is nothing to be gained by that, and it computes in float32, twice as fast as MKL on a Zen 5.
-    Once a process a product is compared with float64, and where its error is not float32's, nothing
-    is changed. Nor is it on a GPU, on Intel's processors, or inside torch.compile.
+    What it does to products of float32 depends on the processor:
 
-    What autograd computes later is outside, unless ``backward`` is called inside too.
+    - AMD with AVX-512, without AMX: oneDNN makes them. torch gives them to MKL, which makes no use
+      of AVX-512 there and takes twice as long on a Zen 5. torch's setting for oneDNN is "medium",
+      which also allows it to round the factors to bfloat16; without AMX nothing is to be gained by
+      that, and all digits are kept. Once a process a product is compared with float64, and where
+      its error is not that of float32, nothing is changed.
+    - Other CPUs: nothing. Intel's are those that MKL is made for.
+    - A GPU: nothing. It rounds the factors (TF32) where the process lets it.
+
+    Products of bfloat16 are torch's autocast, on every processor. Inside ``float32_products``, of
+    whichever thread, and inside torch.compile the library stays as it is. What autograd computes
+    later is outside, unless ``backward`` is called inside too.
+
+    Args:
+        device: where the network computes.
+        precision: ``torch.bfloat16``, or ``torch.float32``, which also ends an autocast of the
+            caller inside; None leaves an autocast as it is.
     """
     import torch
 
-    skip = _Quick.off or device.type != "cpu" or torch.compiler.is_compiling()
-    if skip or not _onednn_is_better():
-        yield
-        return
-    with _Quick.lock:
-        if not _Quick.count:
-            _Quick.before = torch.get_float32_matmul_precision()
-            torch.set_float32_matmul_precision("medium")
-        _Quick.count += 1
-    try:
-        yield
-    finally:
-        with _Quick.lock:
-            _Quick.count -= 1
-            if not _Quick.count:
-                torch.set_float32_matmul_precision(_Quick.before)
+    cast = nullcontext()
+    if precision is not None:
+        cast = torch.autocast(device.type, precision, enabled=precision != torch.float32)
+    with cast:
+        if device.type != "cpu" or torch.compiler.is_compiling() or not _onednn_is_better():
+            yield
+            return
+        _count(network=1)
+        try:
+            yield
+        finally:
+            _count(network=-1)
 
 
 @contextmanager
-def plain_products() -> Iterator[None]:
-    """``quick_products`` changes nothing inside, for a comparison; meant for one thread alone."""
-    before, _Quick.off = _Quick.off, True
+def float32_products() -> Iterator[None]:
+    """Matrix products of float32 inside keep all digits, and are made by torch's own library.
+
+    - A GPU does not round their factors (no TF32), whatever the process lets it do otherwise.
+    - A CPU makes them by MKL, or what else torch was built with: ``network_products`` changes
+      nothing inside. That is for comparisons; it loses no digits either.
+
+    What autograd computes later is outside.
+    """
+    _count(float32=1)
     try:
         yield
     finally:
-        _Quick.off = before
+        _count(float32=-1)
 
 
 @functools.cache
@@ -196,26 +220,11 @@ def _onednn_is_better() -> bool:
         return False
     a, b = torch.randn(2, 128, 128, generator=torch.Generator().manual_seed(0))
     truth = a.double() @ b.double()
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("medium")
-    try:
-        error = (a @ b).double() - truth
-    finally:
-        torch.set_float32_matmul_precision(before)
+    with _Products.lock:
+        before = torch.get_float32_matmul_precision()
+        torch.set_float32_matmul_precision("medium")
+        try:
+            error = (a @ b).double() - truth
+        finally:
+            torch.set_float32_matmul_precision(before)
     return bool(error.norm() <= _ALL_DIGITS * truth.norm())
-
-
-@contextmanager
-def full_products() -> Iterator[None]:
-    """Matrix products of float32 keep all digits inside, whatever the process lets a GPU round to.
-
-    It holds for what is computed inside, and so for no backward pass that autograd runs later.
-    """
-    import torch
-
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from gamba_warp.conventions import over_background
-from gamba_warp.devices import lower_products, quick_products
+from gamba_warp.devices import network_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
 from gamba_warp.model.gamba import Gamba
@@ -68,7 +68,7 @@ def forward(
             else is float32.
         lpips_crop: as for ``view_losses``.
     """
-    with lower_products(precision, batch.inputs.device):
+    with network_products(batch.inputs.device, precision):
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
@@ -164,7 +164,7 @@ def compute_gradients(
         hold = contextlib.nullcontext()
         if number < count - 1 and isinstance(model, DistributedDataParallel):
             hold = model.no_sync()
-        with hold, quick_products(batch.inputs.device):
+        with hold, network_products(batch.inputs.device):
             result = forward(model, batch, weights, lpips, precision, lpips_crop)
             (result.loss / count).backward()
         losses.append(result.loss.detach())

@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from page_parts import with_parts
+
 from .imports import Import, read_imports
 from .picture import arrows, draw
 from .rooms import ROOMS, edges, refused
 
 ROOT = Path(__file__).resolve().parents[2]
-BEGIN, END = "<!-- rooms: written by make architecture -->\n", "<!-- end of rooms -->\n"
 
 
 def picture(entries: list[Import]) -> str:
@@ -32,13 +33,12 @@ def table(entries: list[Import]) -> str:
         cells = (now, any_time.get(name, set()) - now)
         texts = (", ".join(r for r in ROOMS if r in cell) for cell in cells)
         lines.append(f"| `{name}` | {room.holds} | {' | '.join(texts)} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def page(text: str, entries: list[Import]) -> str:
     """The page with its table made anew; ``text`` is the page as it stands."""
-    head, rest = text.split(BEGIN)
-    return head + BEGIN + table(entries) + END + rest.split(END)[1]
+    return with_parts(text, "make architecture", {"rooms": table(entries)})
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import torch
 
 from gamba_warp.conventions import Precision
 from gamba_warp.data.dataset import ViewDataset
-from gamba_warp.devices import lower_products, pick_precision
+from gamba_warp.devices import network_products, pick_precision
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256, sha256_of_all, visible
 from gamba_warp.formats.ply import load_ply
@@ -89,7 +89,7 @@ class ModelPredictions(Predictions):
         views = dataset.load(uid, views=[reference], size=config.image_size)
         images, cameras = posed_input(views, config)
         images, cameras = images.to(self.device), cameras.to(self.device)
-        with lower_products(self.precision, images.device):
+        with network_products(images.device, self.precision):
             return self.model(images, cameras, background_margin=self.margin)[0]
 
 

@@ -25,7 +25,7 @@ def app_command(
     """Serves a page that makes 3D objects of pictures, for this machine alone, until Ctrl-C.
 
     Args:
-        checkpoint: Trained model (.safetensors); the starter model if not given.
+        checkpoint: Trained model (.safetensors); the shipped model if not given.
         encoder_weights: The image encoder's weights, where the model has a pretrained one.
         matte_model: ONNX file of an ISNet or U2-Net that cuts objects out; if not given, one that
             rembg keeps on this machine, or it is fetched once (179 MB).

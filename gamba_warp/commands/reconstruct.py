@@ -72,7 +72,7 @@ def reconstruct_command(
 
     Args:
         images: Picture files, or folders of them.
-        checkpoint: Trained model (.safetensors); the starter model if not given.
+        checkpoint: Trained model (.safetensors); the shipped model if not given.
         encoder_weights: The image encoder's weights, where the model has a pretrained one.
         out: Folder for the results.
         splats: Files of Gaussians to write.

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ..devices import quick_products
+from ..devices import network_products
 from ..kernels.bench import Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
@@ -114,7 +114,7 @@ class Products:
     @torch.no_grad()
     def run(self) -> None:
         """Repeats all products, by the library that the model takes; this is what is timed."""
-        with quick_products(self._device):
+        with network_products(self._device):
             for call in self._calls:
                 call()
 
@@ -138,7 +138,7 @@ class _Backbone:
 
     def run(self, tokens: Tensor) -> Tensor:
         """Runs the blocks as ``Gamba.forward`` does: first the prefix states, then the tokens."""
-        with quick_products(self.device):
+        with network_products(self.device):
             states = prefix_states(self.blocks, self.camera, self.image)
             return run_blocks(self.blocks, tokens, states)
 
@@ -151,7 +151,7 @@ class _Backbone:
     def prepended(self) -> Tensor:
         """Runs the paper's eq. 2 as it reads, prepending and dropping; this is timed too."""
         tokens = self.tokens
-        with quick_products(self.device):
+        with network_products(self.device):
             for block in self.blocks:
                 assert block.project_camera is not None and block.project_image is not None
                 prefix = [block.project_camera(self.camera), block.project_image(self.image)]
@@ -166,7 +166,7 @@ class _Backbone:
         """
         tokens = self.tokens.detach().requires_grad_()
         leaves = [tokens, *(p for block in self.blocks for p in block.parameters())]
-        with quick_products(self.device):
+        with network_products(self.device):
             return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
 
     def check(self, forward: Callable[[], Tensor]) -> Error:

@@ -59,7 +59,7 @@ def abilities() -> Iterator[tuple[str, str, bool]]:
         except Exception as error:  # a broken installation raises anything: that is what to tell
             yield name, f"no: {first_line(error)}", True
     there = DEFAULT_CHECKPOINT.is_file()
-    missing = "no starter model, though it comes with the package; give --checkpoint"
+    missing = "no shipped model, though it comes with the package; give --checkpoint"
     yield "reconstruct", "yes" if there else missing, False
     yield "lpips", "yes" if lpips_available() else f"no weights here; '{FETCH}' fetches them", False
     yield "sam", "with --sam CHECKPOINT; only busy backgrounds need it", False

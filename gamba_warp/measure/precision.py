@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, orbit
-from ..devices import lower_products, plain_products
+from ..devices import float32_products, network_products
 from ..gaussians import Gaussians
 from ..kernels.bench import Error, Key, Settings, Target, Variant, compare
-from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
+from ..model.checkpoint import shipped_model
 from ..model.config import PRESETS, Preset
 from ..model.gamba import Gamba
 from ..model.posing import reference_cameras
@@ -46,15 +46,15 @@ class _Precise:
 
     def __init__(self, settings: Settings, preset: Preset) -> None:
         torch.manual_seed(0)
-        shipped = DEFAULT_CHECKPOINT.parent / f"{preset}.safetensors"
-        self.trained = shipped.exists() and settings.level != "quick"
-        if self.trained:
-            self.model = load_model(shipped, settings.device)
-        else:
+        quick = settings.level == "quick"
+        shipped = None if quick else shipped_model(preset, settings.device)
+        self.trained = shipped is not None
+        if shipped is None:
             config = replace(PRESETS[preset], encoder="none")
-            if settings.level == "quick":
+            if quick:
                 config = replace(config, image_size=32, width=16, depth=1)
-            self.model = Gamba(config).to(settings.device).eval()
+            shipped = Gamba(config).to(settings.device).eval()
+        self.model = shipped
         config = self.model.config
         size = config.image_size
         picture = torch.rand(1, size, size, config.input_channels)
@@ -66,14 +66,14 @@ class _Precise:
         viewmats = orbit(torch.tensor([0.0, 90.0, 180.0]), distance=config.distance)
         K = intrinsics(size, size, config.fov).repeat(3, 1, 1)
         self.views = Cameras(viewmats, K, size, size).to(settings.device)
-        with plain_products():
+        with float32_products():
             self.truth = self.run(torch.float32)
         self.seen = self._render(self.truth)
 
     @torch.no_grad()
     def run(self, precision: torch.dtype) -> Gaussians:
         """Runs the model; this is what is timed."""
-        with lower_products(precision, self.picture.device):
+        with network_products(self.picture.device, precision):
             return self.model(self.picture, self.camera)
 
     @torch.no_grad()
@@ -129,7 +129,7 @@ def _alone(run: Callable[[], object], kind: str, settings: Settings) -> list[Var
     products = Products(run, settings.device)
 
     def plain() -> None:
-        with plain_products():
+        with float32_products():
             products.run()
 
     runs = {f"paper, {kind}, {ALONE}": products.run}

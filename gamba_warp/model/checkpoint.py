@@ -73,8 +73,8 @@ def load_model(
     """Reads a file of ``save_model``.
 
     Args:
-        path: the file, or a folder with a ``model.safetensors``; without it the small model that
-            comes with the package.
+        path: the file, or a folder with a ``model.safetensors``; without it the shipped
+            model.
         device: the model's device.
         encoder_weights: as for ``build_encoder``; a frozen timm encoder needs them. Without them
             the ``encoder.safetensors`` beside the model is taken, if there is one.
@@ -112,6 +112,23 @@ def load_model(
                 f"{path}: was trained with other weights of {config.encoder} than those given"
             )
     return model.to(device).eval()
+
+
+def shipped_model(preset: str, device: str | torch.device = "cpu") -> Gamba | None:
+    """The model of a preset that comes with the package, in eval mode.
+
+    Args:
+        preset: its name.
+        device: the model's device.
+
+    Returns:
+        The model; None where none of this preset comes with the package.
+
+    Raises:
+        UserError: the file cannot be read, as in ``load_model``.
+    """
+    path = STARTER / f"{preset}.safetensors"
+    return load_model(path, device) if path.is_file() else None
 
 
 def _outline(config: GambaConfig, path: Path) -> Gamba:

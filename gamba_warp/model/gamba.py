@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ..cameras import Cameras
 from ..conventions import over_background
-from ..devices import quick_products
+from ..devices import network_products
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .encoders import ImageEncoder, Weights, build_encoder
@@ -84,7 +84,7 @@ class Gamba(nn.Module):
         planes' blocks follow. Arguments and errors are those of ``forward``.
         """
         self._check(images, cameras)
-        with quick_products(images.device):
+        with network_products(images.device):
             camera = self.camera_token(cameras) if self.camera_token else None
             image = None
             if self.encoder:
@@ -126,7 +126,7 @@ class Gamba(nn.Module):
             ValueError: a shape that does not fit, or a negative margin.
         """
         self._check(images, cameras)
-        with quick_products(images.device):
+        with network_products(images.device):
             if condition is None:
                 condition = self.condition(images, cameras)
             if isinstance(self.decoder, RayDecoder):

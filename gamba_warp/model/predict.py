@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..conventions import Precision
 from ..data.preprocess import composite, resize_rgba
-from ..devices import lower_products, pick_precision
+from ..devices import network_products, pick_precision
 from ..gaussians import Gaussians
 from .config import GambaConfig
 from .posing import reference_cameras
@@ -47,7 +47,7 @@ def reconstruct(
     device = next(model.parameters()).device
     images = model_input(rgba, config).to(device)
     dtype = pick_precision(precision, device, config.width)
-    with lower_products(dtype, device):
+    with network_products(device, dtype):
         return model(images, reference_cameras(config, 1).to(device))[0]
 
 

@@ -4,6 +4,12 @@ The first touch of a page costs many times its use: the system has to find it, t
 virtual machine to ask the host for it. Memory of the size of a result goes back to the system when
 the result is freed, so every call would pay anew. Here it goes to a pool instead, as soon as no
 tensor holds its storage any more, and the next result of about that size is taken from there.
+
+Only our operators' results come from here. For those of torch's operators a command can tell the C
+library to keep what is freed (``gamba_warp.devices.keep_memory``); that is a setting of the whole
+process, which a library must not change, and it reaches no block over 256 MiB: the gradient of a
+scan of 65,536 tokens touches 493,000 fresh pages with neither, 506,000 with that setting alone, and
+16 with this pool alone, in a third of the time.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from page_parts import marks
 
 from gamba_warp.errors import UserError
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
@@ -95,13 +96,13 @@ def test_the_shipped_model_has_a_card_and_the_page_is_made_of_it(tool):
 def test_reports_become_figures(tool, model, tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     names = ("facts", "command", "figures", "limits")
-    marks = [tool.MARK.format(name=f"{end}{n}") for n in names for end in ("", "end of ")]
-    page.write_text("# Top\n" + "\n".join(marks) + "\nlast\n")
+    lines = [line for name in names for line in marks("docs/model_card.py", name)]
+    page.write_text("# Top\n" + "\n".join(lines) + "\nlast\n")
     model.write_bytes(b"weights")
     monkeypatch.setattr(tool, "DEFAULT_CHECKPOINT", model)
     monkeypatch.setattr(tool, "PAGE", page)
     readme = tmp_path / "README.md"
-    readme.write_text("\n".join(tool.MARK.format(name=f"{end}results") for end in ("", "end of ")))
+    readme.write_text("\n".join(marks("docs/model_card.py", "results")))
     monkeypatch.setattr(tool, "README", readme)
     metrics = {"psnr": {"mean": 21.0, "interval": [20.0, 22.0]}, "lpips": {"mean": None}}
     line = {"views": "novel", "name": "model", "objects": 9, **metrics}

@@ -34,7 +34,7 @@ def test_missing_weights_come_with_a_remedy_and_are_no_fault(capsys, monkeypatch
     assert code == 0
     assert f"{tmp_path}/none (0 MiB)" in out
     assert re.search(r"lpips +no weights here; 'gamba weights lpips' fetches them", out)
-    assert re.search(r"reconstruct +no starter model, .*--checkpoint", out)
+    assert re.search(r"reconstruct +no shipped model, .*--checkpoint", out)
     (tmp_path / "tiny.safetensors").touch()
     assert re.search(r"reconstruct +yes\n", run(capsys)[1])
 

@@ -17,7 +17,7 @@ from gamba_warp.cameras import (
     relative_to_reference,
 )
 from gamba_warp.data.dataset import ObjectViews
-from gamba_warp.devices import full_products
+from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.model.parts.decoder import GaussianDecoder
 from gamba_warp.model.posing import posed_input, relative_cameras
@@ -72,7 +72,7 @@ def test_products_are_noted():
     with Products() as seen:
         layer(torch.randn(2, 3)).sum().backward()
         forward = len(seen.rounded)
-        with full_products():
+        with float32_products():
             torch.randn(3, 3) @ torch.randn(3, 3)
     assert forward >= 2 and len(seen.rounded) == forward
 

@@ -232,7 +232,7 @@ def test_pickle_builds_arrays_only():
             fetch.load_numpy_pickle(io.BytesIO(bad), "x")
 
 
-def test_lower_products_keep_the_value_and_the_gradients_direction(state):
+def test_bfloat16_products_keep_the_value_and_the_gradients_direction(state):
     """Kernels of real weights bear rounding better; these bounds are the ones that are stated."""
     net = LPIPS(ours.read_cached() if ours.lpips_available() else state)
     g = torch.Generator().manual_seed(0)

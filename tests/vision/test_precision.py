@@ -21,18 +21,51 @@ def better(monkeypatch):
     monkeypatch.setattr(devices, "_onednn_is_better", lambda: True)
 
 
-def test_quick_products_are_put_back_also_after_an_error_and_inside_one_another(better):
+def test_the_setting_of_products_is_put_back_also_after_an_error_and_inside_one_another(better):
     before = torch.get_float32_matmul_precision()
-    with pytest.raises(KeyError), devices.quick_products(CPU):
-        with devices.quick_products(CPU), devices.full_products():
+    with pytest.raises(KeyError), devices.network_products(CPU):
+        with devices.network_products(CPU), devices.float32_products():
             assert torch.get_float32_matmul_precision() == "highest"
         assert torch.get_float32_matmul_precision() == "medium"
         raise KeyError
     assert torch.get_float32_matmul_precision() == before
-    with devices.plain_products(), devices.quick_products(CPU):
+    with devices.float32_products(), devices.network_products(CPU):
+        assert torch.get_float32_matmul_precision() == "highest"
+    with devices.network_products(torch.device("meta")):
         assert torch.get_float32_matmul_precision() == before
-    with devices.quick_products(torch.device("meta")):
-        assert torch.get_float32_matmul_precision() == before
+
+
+def test_float32_products_end_the_rounding_that_a_user_has_allowed():
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        with devices.float32_products():
+            assert torch.get_float32_matmul_precision() == "highest"
+        assert torch.get_float32_matmul_precision() == "high"
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def test_a_network_keeps_the_callers_autocast_unless_it_is_given_a_precision():
+    a = torch.ones(2, 2)
+    with devices.network_products(CPU, torch.bfloat16):
+        with devices.network_products(CPU):
+            assert (a @ a).dtype == torch.bfloat16
+        with devices.network_products(CPU, torch.float32):
+            assert (a @ a).dtype == torch.float32
+    assert (a @ a).dtype == torch.float32
+
+
+def test_float32_products_keep_all_digits_while_another_thread_comes_and_goes(better):
+    def other() -> None:
+        with devices.network_products(CPU):
+            pass
+
+    with devices.float32_products():
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        assert torch.get_float32_matmul_precision() == "highest"
 
 
 def test_the_last_thread_puts_the_products_back(better):
@@ -40,12 +73,12 @@ def test_the_last_thread_puts_the_products_back(better):
     inside, leave = threading.Event(), threading.Event()
 
     def other() -> None:
-        with devices.quick_products(CPU):
+        with devices.network_products(CPU):
             inside.set()
             leave.wait(10)
 
     thread = threading.Thread(target=other)
-    with devices.quick_products(CPU):
+    with devices.network_products(CPU):
         thread.start()
         assert inside.wait(10)
     assert torch.get_float32_matmul_precision() == "medium"
@@ -54,12 +87,12 @@ def test_the_last_thread_puts_the_products_back(better):
     assert torch.get_float32_matmul_precision() == before
 
 
-def test_quick_products_keep_all_digits():
+def test_products_of_a_network_keep_all_digits():
     """Whatever this processor is: if oneDNN is chosen here, its products are float32's."""
     g = torch.Generator().manual_seed(1)
     a, b = torch.randn(300, 200, generator=g), torch.randn(200, 250, generator=g)
     truth = a.double() @ b.double()
-    with devices.quick_products(CPU):
+    with devices.network_products(CPU):
         error = (a @ b).double() - truth
     assert error.norm() < 1e-6 * truth.norm()  # bfloat16 has 2e-3
 

@@ -14,14 +14,13 @@ from gamba_warp.cameras import Cameras
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench import Error, Settings, Variant, compare
 from gamba_warp.kernels.bench.core.measure import peak_bytes
-from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.patches import foreground_patches
 from gamba_warp.render import render
 
 from ..data.samples import Batch
 from ..step import compute_gradients
-from .made_up import BOTH, NOVEL, SPREAD, WEIGHTS, step_config, step_source
+from .made_up import BOTH, NOVEL, SPREAD, WEIGHTS, step_model, step_source
 
 _SHARES = {"quick": (0.1,), "normal": (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)}
 _ALONE_LIMIT = 1e-4  # the same sums in products of other shapes
@@ -99,16 +98,9 @@ class _Covered:
         return counts | ({} if peak is None else {"peak_bytes": peak})
 
 
-def _rays_model(settings: Settings) -> Gamba:
-    torch.manual_seed(0)
-    if settings.level == "quick" or not DEFAULT_CHECKPOINT.exists():
-        return Gamba(step_config("rays", settings)).to(settings.device)
-    return load_model(DEFAULT_CHECKPOINT, settings.device).train().requires_grad_()
-
-
 def background(settings: Settings) -> list[Variant]:
     """The variants of the case background."""
-    model = _rays_model(settings)
+    model, _ = step_model("rays", settings)
     whole = model.config.grid_size  # a margin that takes every patch
     made = []
     for share in _SHARES.get(settings.level, _SHARES["normal"]):

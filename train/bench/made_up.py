@@ -12,7 +12,9 @@ from torch.nn.functional import interpolate
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.data.dataset import ObjectViews, ViewDataset, open_dataset
 from gamba_warp.kernels.bench import Settings
+from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, GambaConfig
+from gamba_warp.model.gamba import Gamba
 
 from ..batches import BatchSource
 from ..config import DataConfig
@@ -77,6 +79,20 @@ def step_config(name: str, settings: Settings) -> GambaConfig:
     if settings.level == "quick":
         config = replace(config, image_size=32, width=16, depth=1)
     return config
+
+
+def step_model(name: str, settings: Settings) -> tuple[Gamba, bool]:
+    """A model to train, with seed 0, and whether its weights are those that come with the package.
+
+    Args:
+        name: of a variant; those of the presets may have such weights, but not in a quick run.
+        settings: of the cases.
+    """
+    torch.manual_seed(0)
+    shipped = None if settings.level == "quick" else shipped_model(name, settings.device)
+    if shipped is None:
+        return Gamba(step_config(name, settings)).to(settings.device), False
+    return shipped.train().requires_grad_(), True
 
 
 def step_source(

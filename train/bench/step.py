@@ -11,11 +11,10 @@ from torch.nn.functional import cosine_similarity
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.devices import plain_products
+from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
 from gamba_warp.kernels.bench.core.parts import measure_parts
-from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
@@ -25,7 +24,19 @@ from ..optim import Ema, build_optimizer
 from ..step import compute_gradients
 from . import losses, optimizer
 from .background import background
-from .made_up import BATCH, BOTH, LOWER, NOVEL, OP, SIZE, SLIM, WEIGHTS, step_config, step_source
+from .made_up import (
+    BATCH,
+    BOTH,
+    LOWER,
+    NOVEL,
+    OP,
+    SIZE,
+    SLIM,
+    WEIGHTS,
+    step_config,
+    step_model,
+    step_source,
+)
 
 _CROP = 64
 _COMPARED = ("tiny", f"tiny{LOWER}", "rays", f"rays{LOWER}", SLIM)
@@ -221,17 +232,11 @@ class _Precise:
     """A model and a batch, whose gradient is made in a precision of the products."""
 
     def __init__(self, settings: Settings, name: str) -> None:
-        torch.manual_seed(0)
-        shipped = DEFAULT_CHECKPOINT.parent / f"{name}.safetensors"
-        self.trained = shipped.exists() and settings.level != "quick"
-        if self.trained:
-            self.model = load_model(shipped, settings.device).train().requires_grad_()
-        else:
-            self.model = Gamba(step_config(name, settings)).to(settings.device)
+        self.model, self.trained = step_model(name, settings)
         self.batch = step_source(self.model.config, settings, BATCH).batch(0, NOVEL)
         self.batch = self.batch.to(settings.device)
         self.optimizer = torch.optim.SGD(self.model.parameters(), lr=0.0)
-        with plain_products():
+        with float32_products():
             self.truth = self.gradient(torch.float32)
 
     def gradient(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from torch.nn.functional import pad, smooth_l1_loss
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.devices import full_products
+from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
 from gamba_warp.kernels.ssim import dissimilarity
@@ -80,7 +80,7 @@ class _Structure(torch.autograd.Function):
         if pictures.device.type == "cpu":
             size = max(1, _CACHED // max(1, math.prod(pictures.shape[1:])))
         values = []
-        with full_products():  # a variance is the small difference of two means of products
+        with float32_products():  # a variance is the small difference of two means of products
             for i in range(0, len(pictures), size):
                 part = slice(i, i + size)
                 slope = None if slopes is None else slopes[part]

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from ...devices import quick_products
+from ...devices import network_products
 from ...kernels.causal_conv1d import causal_conv1d
 from ...kernels.selective_scan import selective_scan, selective_scan_state
 from ..config import GambaConfig
@@ -289,20 +289,20 @@ def run_blocks(
         for i, block in enumerate(blocks):
             run = block
             if recompute and gradients:
-                run = partial(checkpoint, _Quick(block), use_reentrant=False)
+                run = partial(checkpoint, _Repeated(block), use_reentrant=False)
             segment, states[i] = run(segment, states[i], layout)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
 
-class _Quick:
-    """A block whose products are quick also when a backward pass runs it again."""
+class _Repeated:
+    """A block that a backward pass runs again, by the library of the first time."""
 
     def __init__(self, block: nn.Module) -> None:
         self._block = block
 
     def __call__(self, tokens: Tensor, *others: Any) -> tuple[Tensor, Any]:
-        with quick_products(tokens.device):
+        with network_products(tokens.device):
             return self._block(tokens, *others)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import partial
 
@@ -15,7 +16,13 @@ from ..core.case import Case, Error, Key, Settings, Target, Variant, compare
 from . import harmonics, raster_knobs, raster_large
 from .raster_parts import Parts
 from .raster_scene import LEAVES, Scene, orbit_cameras, shell
-from .raster_variants import BOTH, make_pair, make_scene, make_variant, sizes_of
+from .raster_variants import BOTH, COUNT, make_pair, make_scene, make_variant, sizes_of
+
+# gsplat's lists of many Gaussians take seconds: a loop in Python.
+_LARGE_PARTS: dict[str, dict[int, tuple[str, ...]]] = {
+    "normal": {262144: ("projection", "tile lists")},
+    "full": {262144: ("projection", "tile lists"), 1048576: ("projection",)},
+}
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -100,17 +107,27 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
 
 
 def _gsplat_parts(settings: Settings) -> list[Variant]:
-    """The torch functions of gsplat that run on a CPU, beside the same part of ours, at scale 1:
-    projection, tile lists (theirs of boxes, ours of ellipses) and harmonics of degree 3. Its
-    compositing needs CUDA.
+    """The torch functions of gsplat that run on a CPU, beside the same part of ours: projection,
+    tile lists (theirs of boxes, ours of ellipses) and harmonics of degree 3. Its compositing needs
+    CUDA. More Gaussians are smaller, so that they cover the same area.
     """
-    scene, made = make_scene(settings), []
-    parts = Parts(scene)
-    for part, (ours, theirs, check) in parts.pairs().items():
+    made = _parts_of(make_scene(settings), "", ("projection", "tile lists", "harmonics"))
+    for count, parts in _LARGE_PARTS.get(settings.level, {}).items():
+        scene = make_scene(settings, math.sqrt(COUNT / count), count)
+        made += _parts_of(scene, f", {count} Gaussians", parts)
+    return made
+
+
+def _parts_of(scene: Scene, suffix: str, wanted: Sequence[str]) -> list[Variant]:
+    """Parts of ours and of gsplat on a scene; ``suffix`` ends their names."""
+    made = []
+    pairs = Parts(scene).pairs()
+    for part in wanted:
+        ours, theirs, check = pairs[part]
         for name, run, peer in (("ours", ours, False), ("gsplat", theirs, True)):
             made.append(
                 Variant(
-                    name=name,
+                    name=name + suffix,
                     run=run,
                     check=check if peer else None,
                     limit=1e-4,

@@ -10,7 +10,7 @@ from .raster_scene import Scene, orbit_cameras, shell
 # Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
 FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 10.0
 BOTH = "forward+backward"
-_COUNT = 16384
+COUNT = 16384
 _SIZE = 512
 
 
@@ -23,7 +23,7 @@ def make_scene(
 ) -> Scene:
     """The shell; a quick run has an eighth of the Gaussians and a quarter of the pixels."""
     quick = settings.level == "quick"
-    count = count or (_COUNT // 8 if quick else _COUNT)
+    count = count or (COUNT // 8 if quick else COUNT)
     size = size or (_SIZE // 2 if quick else _SIZE)
     return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
 

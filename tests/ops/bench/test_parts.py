@@ -100,7 +100,7 @@ def test_a_step_has_its_parts():
 
 
 @pytest.mark.parametrize(("op", "name"), [("step", "precision"), ("model", "precision")])
-def test_lower_products_have_their_error_on_the_chart(op, name):
+def test_bfloat16_products_have_their_error_on_the_chart(op, name):
     (case,) = [c for c in bench.load_suite(op).cases(QUICK) if c.name == name]
     records = measure([case], QUICK)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4

@@ -1,0 +1,50 @@
+"""The parts of a page that a program writes, each between two marks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+_MARK = "<!-- {name}: written by {writer} -->"
+
+
+def marks(writer: str, name: str) -> tuple[str, str]:
+    """The lines before and behind a part.
+
+    Args:
+        writer: what writes the part, as a reader would call it.
+        name: of the part.
+    """
+    begin, end = (_MARK.format(name=text, writer=writer) for text in (name, f"end of {name}"))
+    return begin, end
+
+
+def with_parts(text: str, writer: str, parts: Mapping[str, str]) -> str:
+    """A page with its parts written anew; everything else stays as it is.
+
+    Args:
+        text: of the page, with the marks of every part.
+        writer: what writes the parts, as in ``marks``.
+        parts: text of each part by its name.
+
+    Raises:
+        ValueError: the page lacks a mark.
+    """
+    for name, part in parts.items():
+        begin, end = marks(writer, name)
+        head, found, rest = text.partition(begin)
+        tail = rest.partition(end)
+        if not found or not tail[1]:
+            raise ValueError(f"no mark {begin if not found else end}")
+        text = f"{head}{begin}\n\n{part}\n\n{end}{tail[2]}"
+    return text
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown.
+
+    Args:
+        header: of the columns.
+        rows: cells of each row.
+    """
+    lines = [f"| {' | '.join(row)} |" for row in (header, *rows)]
+    return "\n".join([lines[0], "|" + " --- |" * len(header), *lines[1:]])

@@ -1,0 +1,172 @@
+r"""Writes the tables of docs/step.md from docs/benchmarks/cpu-step.json and cpu-precision.json.
+
+After both measurements:
+
+    gamba bench step --threads 1 --data starter/data --out out/step
+    gamba bench model --only precision --out out/model
+    gamba bench --render out/step/bench.json --out docs/benchmarks/cpu-step.json
+    gamba bench --render out/model/bench.json --out docs/benchmarks/cpu-precision.json
+    python docs/step_page.py
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from page_parts import table, with_parts
+
+from gamba_warp.errors import UserError
+from gamba_warp.files import write_text
+from gamba_warp.kernels.bench.core.parts import WHOLE, parts_of
+from gamba_warp.kernels.bench.core.report import machine_line
+from gamba_warp.measure.suites import read_document
+
+HERE = Path(__file__).parent
+PAGE = HERE / "step.md"
+STEP, PRECISION = (HERE / "benchmarks" / f"cpu-{name}.json" for name in ("step", "precision"))
+_PRECISIONS = ("float32", "bfloat16")
+_BOTH = " / ".join(_PRECISIONS)
+
+
+def main() -> None:
+    """Writes the page again."""
+    text = PAGE.read_text(encoding="utf-8")
+    write_text(PAGE, page_of(text, read_document(STEP), read_document(PRECISION)))
+
+
+def page_of(text: str, step: dict, precision: dict) -> str:
+    """The page with the parts between its marks written from the results.
+
+    Args:
+        text: of the page.
+        step: results of the suite step, as ``read_document`` returns them.
+        precision: those of the case precision of the suite model.
+
+    Raises:
+        ValueError: the page lacks a mark, or the results lack a variant.
+    """
+    pictures = _Case(precision, "model", "precision")
+    parts = {
+        "shares": "\n\n".join([_shares(_Case(step, "step", "parts")), machine_line(step)]),
+        "products": "\n\n".join([_products(pictures), machine_line(precision)]),
+        "pictures": _pictures(pictures),
+        "gradients": _gradients(_Case(step, "step", "precision")),
+        "ssim": _ssim(_Case(step, "step", "SSIM")),
+        "optimizer": _optimizer(_Case(step, "step", "optimizer")),
+    }
+    return with_parts(text, "docs/step_page.py", parts)
+
+
+class _Case:
+    """The records of a case."""
+
+    def __init__(self, document: dict, op: str, case: str) -> None:
+        self._name = f"{op}, {case}"
+        records = document["records"]
+        self._records = {r["variant"]: r for r in records if (r["op"], r["case"]) == (op, case)}
+
+    def __getitem__(self, variant: str) -> dict[str, Any]:
+        """The record of a variant; ValueError if there is none that was timed."""
+        found = self._records.get(variant)
+        if found is None or found["ms_p50"] is None:
+            raise ValueError(f"no time of {self._name}, {variant}")
+        return found
+
+    def ms(self, variant: str) -> str:
+        """The median of a variant's times."""
+        ms = self[variant]["ms_p50"]
+        return f"{ms:,.0f}" if ms >= 20 else f"{ms:.3g}"
+
+
+def _shares(case: _Case) -> str:
+    """Where the time of a step goes, as shares of the whole."""
+    names = ("tiny", "tiny, bfloat16", "rays", "rays, bfloat16")
+    columns = [(case[name]["work"][WHOLE], parts_of(case[name])) for name in names]
+    rows = [["whole, ms", *(f"{whole:,.0f}" for whole, _ in columns)]]
+    for part in columns[0][1]:
+        shares = [sum(parts.get(part, (0.0,))) / whole for whole, parts in columns]
+        rows.append([part, *(f"{100 * x:.{1 if x < 0.02 else 0}f} %" for x in shares)])
+    return table(["share of a step", *names], rows)
+
+
+def _products(case: _Case) -> str:
+    """A picture at the paper's size, and how fast its products are."""
+    kinds = ("paper, float32", "paper, bfloat16")
+    alone = [*(f"{kind}, products alone" for kind in kinds), "paper, MKL's products alone"]
+    rates = [f"{case[x]['work']['flops'] / case[x]['ms_p50'] / 1e6:,.0f}" for x in alone]
+    rows = [
+        ["a picture to Gaussians, ms", *map(case.ms, kinds), ""],
+        ["its products alone, ms", *map(case.ms, alone)],
+        ["the same, GFLOP/s", *rates],
+    ]
+    return table(["", *_PRECISIONS, "float32 by MKL"], rows)
+
+
+def _pictures(case: _Case) -> str:
+    """How far a picture's Gaussians are from those of float32."""
+    rows = []
+    for preset in ("tiny", "rays", "paper"):
+        found = [case[f"{preset}, {kind}"] for kind in _PRECISIONS]
+        rows.append(
+            [
+                f"{preset}, {found[0]['parameters']['weights']} weights",
+                " / ".join(case.ms(r["variant"]) for r in found),
+                " / ".join(f"{r['rel_rms_error']:.1e}" for r in found),
+                " / ".join(f"{r['work']['psnr_to_float32']:.1f}" for r in found),
+            ]
+        )
+    return table([_BOTH, "ms", "Gaussians, relative rms", "pictures, PSNR in dB"], rows)
+
+
+def _gradients(case: _Case) -> str:
+    """How far a step's gradient is from that of float32."""
+    rows = []
+    for preset in ("tiny", "rays"):
+        found = [case[f"{preset}, {kind}"] for kind in _PRECISIONS]
+        rows.append(
+            [
+                f"{preset}, {found[0]['parameters']['weights']} weights",
+                " / ".join(case.ms(r["variant"]) for r in found),
+                " / ".join(f"{r['rel_rms_error']:.1e}" for r in found),
+                " / ".join(f"{r['work']['gradient_angle']:.0e}" for r in found),
+                " / ".join(f"{r['work']['psnr_to_float32']:.1f}" for r in found),
+            ]
+        )
+    header = [_BOTH, "ms", "gradient, relative rms", "1 - cosine", "pictures, PSNR in dB"]
+    return table(header, rows)
+
+
+def _ssim(case: _Case) -> str:
+    """1 - SSIM beside kornia's."""
+    rows = []
+    for name, text in (("objects", "objects before white"), ("all over", "everywhere different")):
+        ours, theirs = case[f"ours, {name}"], case[f"kornia, {name}"]
+        rows.append(
+            [
+                text,
+                *(case.ms(r["variant"]) for r in (theirs, ours)),
+                f"{theirs['ms_p50'] / ours['ms_p50']:.1f} x",
+                *(f"{r['rel_rms_error']:.1e}" for r in (theirs, ours)),
+            ]
+        )
+    header = ["pictures", "kornia, ms", "kernels, ms", "ratio", "error of kornia", "of the kernels"]
+    return table(header, rows)
+
+
+def _optimizer(case: _Case) -> str:
+    """What follows the gradient, in each way."""
+    ways = ("fused", "foreach", "single")
+    rows = [["AdamW", *(case.ms(f"AdamW, {way}") for way in ways)]]
+    for name, text in (("norm", "norm of the gradient"), ("average", "running average")):
+        rows.append([text, "", *(case.ms(f"{name}, {way}") for way in ways[1:])])
+    ends = " and ".join(f"{case.ms(f'gradients to {to}')} ms to {to}" for to in ("None", "zero"))
+    return f"{table(['ms', *ways], rows)}\n\nTo set the gradients takes {ends}."
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (UserError, ValueError) as error:
+        sys.exit(f"gamba: {error}")
