@@ -97,7 +97,7 @@ def test_a_kernel_is_in_its_bounds(entries, key):
 
 
 # Of the sources outside of folders ``cpu``, what only a CPU launches.
-ON_THE_HOST = {"runtime/team.py", "rasterize/reduce.py", "ssim/kernels.py"}
+ON_THE_HOST = {"runtime/team.py", "ssim/kernels.py"}
 
 
 def kernels_of_the_sources():
