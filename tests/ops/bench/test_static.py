@@ -96,8 +96,7 @@ def test_a_kernel_is_in_its_bounds(entries, key):
             assert fit.warps >= warps, (arch, fit)
 
 
-# Of the sources outside of folders ``cpu``, what only a CPU launches.
-ON_THE_HOST = {"runtime/team.py", "ssim/kernels.py"}
+ON_THE_HOST = {"runtime/team.py"}  # outside of folders ``cpu``, and a CPU launches it
 
 
 def kernels_of_the_sources():
