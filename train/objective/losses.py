@@ -56,9 +56,9 @@ class _Structure(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, got: Tensor, want: Tensor) -> Tensor:
-        pictures = [x.reshape(-1, *got.shape[-3:]) for x in (got, want)]
+        a, b = (x.reshape(-1, *got.shape[-3:]) for x in (got, want))
         with full_products():  # a variance is the small difference of two means of products
-            values, slope = dissimilarity(*pictures, ctx.needs_input_grad[0])
+            values, slope = dissimilarity(a, b, ctx.needs_input_grad[0])
         if slope is not None:
             ctx.save_for_backward(slope.reshape(got.shape))
         return values.reshape(got.shape[:-3])

@@ -32,7 +32,8 @@ def dissimilarity_on_lanes(got: Tensor, want: Tensor, slope: bool) -> tuple[Tens
     got, want = got.contiguous(), want.contiguous()
     slopes = torch.zeros_like(got) if slope else None
     size = max(1, min(len(got), _TOGETHER // max(1, got[:1].numel())))
-    most = sum(map(math.prod, _between(size, *got.shape[1:], slope)))
+    height, width, channels = got.shape[1:]
+    most = sum(map(math.prod, _between(size, height, width, channels, slope)))
     scratch = got.new_empty(max(most, got[:size].numel()))
     values = [_compute(*group, scratch) for group in groups(size, got, want, slopes)]
     return torch.cat(values) if values else got.new_zeros(0), slopes
