@@ -222,11 +222,10 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
 def _oracle(case: Case, x: dict) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Results and leaves, ``[SAMPLES, ..]``."""
     o, leaves = case.options, {name: samples_of(t) for name, t in x.items()}
-    used = dict(leaves)
+    used, r = dict(leaves), Rounding(case.seed)
     if o["constant_B"]:  # every channel is a group of its own
-        shape = (o["batch"], o["length"], -1, -1)
-        used["B"] = leaves["B"][:, None, None].expand(-1, *shape)
-    out, last = scan_oracle.scan(used, o["softplus"], o["discretization"], Rounding(case.seed))
+        used["B"] = scan_oracle.over_tokens(r(leaves["B"]), leaves["u"], r)
+    out, last = scan_oracle.scan(used, o["softplus"], o["discretization"], r)
     results = {"out": out[:, :, o["split"] :], "last": last}
     return results, {k: t for k, t in leaves.items() if t is not None}
 

@@ -158,6 +158,11 @@ def generator(case: Case, name: str) -> torch.Generator:
     return torch.Generator().manual_seed(case.seed * 1009 + sum(name.encode()))
 
 
+def fits(truth: Tensor, dtype: torch.dtype) -> Tensor:
+    """Which numbers of a truth a dtype holds for sure; beyond them a result may be infinite."""
+    return truth.detach().abs() < 0.99 * torch.finfo(dtype).max
+
+
 def judge(
     name: str,
     got: Tensor,
@@ -186,13 +191,13 @@ def judge(
     if not want.numel():
         return Comparison(name, 0.0, 0.0)
     relative, absolute = _STORED[got.dtype]
-    fits = want.abs() < 0.99 * torch.finfo(got.dtype).max
-    nonfinite = int((fits & ~value.isfinite()).sum())
+    held = fits(want, got.dtype)
+    nonfinite = int((held & ~value.isfinite()).sum())
     if nonfinite:
         return Comparison(name, math.inf, math.inf, nonfinite)
 
     def rms(x: Tensor) -> Tensor:
-        x = torch.where(fits, x, 0.0).nan_to_num(0.0, 0.0, 0.0)
+        x = torch.where(held, x, 0.0).nan_to_num(0.0, 0.0, 0.0)
         scale = x.abs().amax().clamp_min(1e-300) if x.numel() else 1.0  # squares must not underflow
         dims = tuple(d % want.dim() - want.dim() for d in parts)
         return (x / scale).square().mean(dims).sqrt() * scale if dims else x.abs()
@@ -203,7 +208,7 @@ def judge(
     limit = limit + absolute * FACTOR + (0.0 if extra is None else extra)
     ratio = (rms(difference) / limit).max().item()
     parts = tuple(range(want.dim()))
-    fits = fits if shown is None else fits & shown
+    held = held if shown is None else held & shown
     total, spread = rms(want).item(), rms(samples[1:] - want).max().item()
     counts = got.dtype == torch.float32 and total > 1e-30 and spread < 1e-3 * total
     return Comparison(name, rms(difference).item() / total if total else 0.0, ratio, 0, counts)
