@@ -130,8 +130,8 @@ def _picture(kind: str, images: Tensor) -> Tensor:
 class _Oracle:
     """The network in float64 from its parameters, sample by sample, the condition prepended."""
 
-    def __init__(self, case: Case, model: Gamba) -> None:
-        self.config, self.r = model.config, Rounding(case.seed)
+    def __init__(self, case: Case, model: Gamba, trial: int) -> None:
+        self.config, self.r = model.config, Rounding(case.seed, trial)
         self.ulps = _BFLOAT16 if case.options["autocast"] else 1.0
         self.weights = {k: samples_of(p) for k, p in model.named_parameters()}
         self.orders = model.tokens.orders.cpu()
@@ -253,11 +253,11 @@ def _run(model: Gamba, o: dict, inputs: dict, cameras: Cameras) -> dict[str, Ten
     return {k: x for k, x in vars(gaussians).items() if x is not None}
 
 
-def evaluate(case: Case, device: torch.device) -> Outcome:
+def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the model and judges all attributes and the gradients of all parameters and inputs."""
     model, inputs, cameras = build(case, device)
     leaves = inputs | dict(model.named_parameters())
-    oracle = _Oracle(case, model)
+    oracle = _Oracle(case, model, trial)
     samples = {k: samples_of(x) for k, x in inputs.items()}
     truths = oracle.run(samples, cameras)
     cotangents = {

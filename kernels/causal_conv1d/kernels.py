@@ -17,8 +17,11 @@ from ..runtime.lanes import WARP_DTYPES
 TAPS = 4
 STRIP = 16  # tokens of a forward task; few, because each row may lie in another page
 CHUNK = 64  # tokens of a backward task, each with its own sum for the gradient of the weight
+# Tokens that are added one after the other: equal terms would round to the same side 64 times.
+RUN = 8
 _S = wp.constant(STRIP)
 _K = wp.constant(CHUNK)
+_R = wp.constant(RUN)
 _HISTORY = wp.constant(TAPS - 1)
 
 
@@ -121,6 +124,7 @@ def backward_kernel(device_type: str, io: torch.dtype):
                 x2 = load(state_in, b, t + _HISTORY, d, width)
         g0, g1, g2, g3 = value(0.0), value(0.0), value(0.0), value(0.0)
         v0, v1, v2, v3, vb = value(0.0), value(0.0), value(0.0), value(0.0), value(0.0)
+        s0, s1, s2, s3, sb = value(0.0), value(0.0), value(0.0), value(0.0), value(0.0)
         # dx of token t needs the gradients g of t to t + 3: the loop runs three tokens behind
         for t in range(t0, end + _HISTORY):
             g3 = value(0.0)
@@ -137,6 +141,9 @@ def backward_kernel(device_type: str, io: torch.dtype):
                     v2 = fma(g3, x2, v2)
                     v3 = fma(g3, x3, v3)
                     vb = vb + g3
+            if (t - t0) % _R == _R - 1 or t == end - 1:
+                s0, s1, s2, s3, sb = s0 + v0, s1 + v1, s2 + v2, s3 + v3, sb + vb
+                v0, v1, v2, v3, vb = value(0.0), value(0.0), value(0.0), value(0.0), value(0.0)
             dx = fma(w3, g0, fma(w2, g1, fma(w1, g2, times(w0, g3))))
             at = t - _HISTORY
             if at >= t0:
@@ -151,10 +158,10 @@ def backward_kernel(device_type: str, io: torch.dtype):
             g1 = g2
             g2 = g3
         if dweight_out.shape[1] > 0:
-            dweight_out[task, 0, k] = v0
-            dweight_out[task, 1, k] = v1
-            dweight_out[task, 2, k] = v2
-            dweight_out[task, 3, k] = v3
-            dweight_out[task, 4, k] = vb
+            dweight_out[task, 0, k] = s0
+            dweight_out[task, 1, k] = s1
+            dweight_out[task, 2, k] = s2
+            dweight_out[task, 3, k] = s3
+            dweight_out[task, 4, k] = sb
 
     return conv_backward

@@ -110,7 +110,7 @@ class _Pixels(NamedTuple):
 class _Truth:
     """The picture in float64, sample by sample, and where rounding decides."""
 
-    def __init__(self, case: Case, x: dict[str, Tensor | None]) -> None:
+    def __init__(self, case: Case, x: dict[str, Tensor | None], trial: int = 0) -> None:
         self.o, lead = case.options, LEADS[case.options["lead"]]
         self.lead, self.batch, self.views = lead, math.prod(lead), self.o["views"]
         self.leaves = {k: samples_of(t) for k, t in x.items() if t is not None and k != "Ks"}
@@ -124,7 +124,7 @@ class _Truth:
         names = ("width", "height", "alpha_min", "alpha_max", "eps2d", "radius_clip", "antialiased")
         degree = None if self.o["sh_degree"] == "none" else int(self.o["sh_degree"])
         self.lens = Lens(**{k: self.o[k] for k in names}, sh_degree=degree)
-        self.round = Rounding(case.seed)
+        self.round = Rounding(case.seed, trial)
         pairs = [(b, v) for b in range(self.batch) for v in range(self.views)]
         made = [self._view(b, v) for b, v in pairs] or [self._blank()]
         self.renders = self._together([view.renders for view in made], sampled=True)
@@ -186,11 +186,11 @@ _PARTS = {
 }  # fmt: skip
 
 
-def evaluate(case: Case, device: torch.device) -> Outcome:
+def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the operator; pictures pixel by pixel, gradients Gaussian by Gaussian."""
     x = build(case, device)
     leaves = {k: t for k, t in x.items() if t is not None and k != "Ks"}
-    truth = _Truth(case, x)
+    truth = _Truth(case, x, trial)
     cotangents = {}
     for name, like in (("renders", truth.renders), ("alphas", truth.alphas)):
         values = fill(like.shape[1:], case.options["cotangent"], generator(case, f"v_{name}"))

@@ -81,8 +81,8 @@ class Rounding:
     float32. Gradients are rounded on their way back in the same way.
     """
 
-    def __init__(self, seed: int) -> None:
-        self.generator = torch.Generator().manual_seed(seed)
+    def __init__(self, seed: int, trial: int = 0) -> None:
+        self.generator = torch.Generator().manual_seed((seed + 1_000_003 * trial) % 2**32)
         self.salt = torch.randint(2**31, (SAMPLES - 2,), generator=self.generator)
         # An approximation always errs to the same side, in each sample by another share.
         self.side = torch.tensor([0.0, *torch.linspace(-1, 1, SAMPLES - 2).tolist(), 0.0])
@@ -157,13 +157,14 @@ class Rounding:
 
         Each addition in float32 is off by up to half the last bit of its result, evenly spread, but
         exact where a term is 0. n additions are independent, so they are off by the root of a third
-        of their squares' sum together. Samples 1 to 6 are off by this, to either side; sample 7 is
-        added in float32. The total is not rounded: the caller does.
+        of their squares' sum together. Samples 1 to 6 are off by this, to either side, and drop the
+        terms that may count as 0; sample 7 is added in float32. The caller rounds the total.
         """
         if not dims:
             return x.clone()
         x = x.movedim(dims, tuple(range(-len(dims), 0))).flatten(-len(dims))
         squares, rounded = torch.zeros_like(x[..., 0]), x[-1].float()
+        dropped = torch.where(x[1:-1].abs() < UNDERFLOW, x[1:-1], 0.0).sum(-1)
         while x.shape[-1] > 1:
             if x.shape[-1] % 2:
                 x, rounded = F.pad(x, (0, 1)), F.pad(rounded, (0, 1))
@@ -173,7 +174,7 @@ class Rounding:
                 squares += torch.where((even != 0) & (odd != 0), x, 0.0).square().sum(-1)
         total = x.sum(-1)
         side = self._noise(total[1:-1]).sign()
-        total[1:-1] += side * UNIT * (squares[1:-1] / 3).sqrt()
+        total[1:-1] += side * UNIT * (squares[1:-1] / 3).sqrt() - dropped
         total[-1] = rounded.sum(-1).double()
         return total
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from gamba_warp.kernels.stress import Case, run_case
 from gamba_warp.kernels.stress.cases import raster
+from gamba_warp.kernels.stress.core.case import Comparison, Outcome
 from gamba_warp.kernels.stress.core.rounding import SAMPLES, UNDERFLOW, Rounding, samples_of
 from gamba_warp.kernels.stress.oracles.scan import states
 from gamba_warp.measure import stress_run
@@ -59,6 +61,50 @@ def test_additions_of_nothing_are_exact():
     values = torch.zeros(SAMPLES, 5, 130, dtype=torch.float64)
     values[:, torch.arange(5), 7 * torch.arange(5)] = 0.75
     assert (Rounding(0).sum(values, -1) == 0.75).all()
+
+
+def test_small_terms_of_a_sum_may_count_as_nothing():
+    values = torch.full((SAMPLES, 500), 0.9 * 2.0**-126, dtype=torch.float64)
+    spread = spread_of(Rounding(0).sum(values, -1)[:, None])[:-1]
+    assert (spread >= 0.99 * values[0].sum()).all()
+    values = torch.full((SAMPLES, 500), 2.0**-123, dtype=torch.float64)
+    spread = spread_of(Rounding(0).sum(values, -1)[:, None])
+    assert (spread < 1e-6 * values[0].sum()).all()
+
+
+@pytest.mark.parametrize(
+    "ratios, fails",
+    [
+        ((0.9,), False),
+        ((1.2, 0.5, 0.6, 1.1, 0.4), False),
+        ((1.2, 0.5, 1.1, 1.1, 0.4), True),
+    ],
+)
+def test_most_trials_decide(ratios, fails):
+    seen = []
+
+    def evaluate(case, device, trial):
+        seen.append(trial)
+        return Outcome([Comparison("out", 1e-7, ratios[trial])])
+
+    op = replace(raster.OP, evaluate=evaluate)
+    outcome = run_case(op, Case("raster", "uniform", 0, {}), CPU)
+    assert (outcome.failure() is not None) == fails and seen == [*range(len(ratios))]
+
+
+def test_a_fault_in_one_trial_is_a_failure():
+    def evaluate(case, device, trial):
+        faults = ["two runs differ in out"] if trial == 3 else []
+        return Outcome([Comparison("out", 1e-7, 1.2 if trial == 0 else 0.5)], faults)
+
+    outcome = run_case(replace(raster.OP, evaluate=evaluate), Case("raster", "x", 0, {}), CPU)
+    assert outcome.faults
+
+
+def test_trials_round_differently():
+    value = torch.full((SAMPLES, 1), 0.7, dtype=torch.float64)
+    first, again, other = (Rounding(3, trial)(value) for trial in (0, 0, 1))
+    assert torch.equal(first, again) and not (first[1:-1] == other[1:-1]).any()
 
 
 def test_a_state_keeps_what_its_tokens_round():
