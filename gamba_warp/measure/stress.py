@@ -148,11 +148,16 @@ class _Oracle:
         return self.r(y + self.r(bias).reshape(len(bias), *axes, 1, -1), ulps, ulps)
 
     def norm(self, x: Tensor, name: str) -> Tensor:
-        """Applies the configuration's norm."""
-        x = self.r(x)
+        """Applies the configuration's norm.
+
+        The gradient is a difference: of what goes past the mean, and through it. Each is rounded.
+        """
+        r, x = self.r, self.r(x)
+        own = lambda x: r.stored(x, torch.float32)  # noqa: E731
         if self.config.norm == "layer":
-            x = self.r(x - x.mean(-1, keepdim=True))
-        x = self.r(x * (x.square().mean(-1, keepdim=True) + 1e-5).rsqrt(), 4.0)
+            x = r(own(x) - r(own(x).mean(-1, keepdim=True)))
+        square = r(own(x).square().mean(-1, keepdim=True) + 1e-5)
+        x = r(own(x) * r(square.rsqrt()), 4.0)
         x = x * self.weights[f"{name}.weight"][:, None, None]
         bias = self.weights.get(f"{name}.bias")
         return self.r(x if bias is None else x + bias[:, None, None])
