@@ -17,11 +17,11 @@ from ..runtime.lanes import WARP_DTYPES
 TAPS = 4
 STRIP = 16  # tokens of a forward task; few, because each row may lie in another page
 CHUNK = 64  # tokens of a backward task, each with its own sum for the gradient of the weight
-# Tokens that are added one after the other: equal terms would round to the same side 64 times.
+# Tokens that a CPU adds one after the other: equal terms would round to the same side 64 times.
+# CUDA has no registers for a second level of sums: with 86 of them, not 78, a block less fits.
 RUN = 16
 _S = wp.constant(STRIP)
 _K = wp.constant(CHUNK)
-_R = wp.constant(RUN)
 _HISTORY = wp.constant(TAPS - 1)
 
 
@@ -86,6 +86,8 @@ def backward_kernel(device_type: str, io: torch.dtype):
     """The kernel of the gradients (README, equation 2); those of the weight are one sum a chunk."""
     value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
     scalar = WARP_DTYPES[io]
+    in_runs = device_type == "cpu"
+    most = RUN if in_runs else CHUNK + TAPS - 1
 
     @wp.kernel(enable_backward=False, module="unique")
     @no_type_check
@@ -125,10 +127,13 @@ def backward_kernel(device_type: str, io: torch.dtype):
         g0, g1, g2, g3 = value(0.0), value(0.0), value(0.0), value(0.0)
         s0, s1, s2, s3, sb = value(0.0), value(0.0), value(0.0), value(0.0), value(0.0)
         # dx of token t needs the gradients g of t to t + 3: the loops run three tokens behind
-        for run in range((end + _HISTORY - t0 + _R - 1) / _R):
-            first = t0 + run * _R
+        runs = 1
+        if wp.static(in_runs):
+            runs = (end + _HISTORY - t0 + wp.static(most - 1)) / wp.static(most)
+        for run in range(runs):
+            first = t0 + run * wp.static(most)
             v0, v1, v2, v3, vb = value(0.0), value(0.0), value(0.0), value(0.0), value(0.0)
-            for t in range(first, wp.min(first + _R, end + _HISTORY)):
+            for t in range(first, wp.min(first + wp.static(most), end + _HISTORY)):
                 g3 = value(0.0)
                 if t < length:
                     x3 = load(x_in, b, t, d, width)

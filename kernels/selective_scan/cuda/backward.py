@@ -247,6 +247,7 @@ def backward_kernel(
         state = join(read_states(last_in, p.at, p), vec())
         bias = bias_in[p.d]
         skip = skip_in[p.d]
+        sums = wp.vec2()
         row = (p.b * sizes.groups + p.group) * sizes.parts + p.part
         product = wp.int64(row) * wp.int64(sizes.length) * wp.int64(sizes.states)
         chunks = (p.end - p.begin + wp.static(MARK - 1)) / wp.static(MARK)
@@ -281,7 +282,6 @@ def backward_kernel(
                 c_raw = fetch_matrix(c_in, c_at, lane, p.states, t0, end - 1)
                 if wp.static(use_z):
                     z_raw = fetch(z_in, z_at, t, end - 1)
-            sums = wp.vec2()
             for again in range(tiles):
                 t0 = chunk + (tiles - 1 - again) * wp.static(TILE)
                 t = t0 + p.row * wp.static(g.adjacent)
@@ -316,12 +316,12 @@ def backward_kernel(
                 sums += finish(
                     p, arena, t, left, skip, du_at, ddelta_at, dz_at, du_out, ddelta_out, dz_out
                 )  # fmt: skip
-            if p.active != 0:  # a chunk's own, for sums of many equal terms round to one side
-                dskip_out[starts + chunk / wp.static(MARK), p.row, p.d] = sums[0]
-                dbias_out[starts + chunk / wp.static(MARK), p.row, p.d] = sums[1]
             sync()
         if p.segment == 0:
             write_states(first_out, p.b, p, first_half(state))
         write_states(da_out, p.at, p, second_half(state))
+        if p.active != 0:
+            dskip_out[p.at, p.row, p.d] = sums[0]
+            dbias_out[p.at, p.row, p.d] = sums[1]
 
     return scan_backward

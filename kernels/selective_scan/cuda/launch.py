@@ -118,7 +118,7 @@ def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str
     db, dc = sums("dB"), sums("dC")
     rows = o.batch * o.segments
     dfirst, da = torch.empty_like(o.state), o.empty(rows, o.channels, o.states)
-    dskip, dbias = o.empty(2, o.batch * o.marks, o.shape.rows, o.channels)
+    dskip, dbias = o.empty(2, rows, o.shape.rows, o.channels)
     if o.u.numel():
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state
