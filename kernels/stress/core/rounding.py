@@ -164,7 +164,10 @@ class Rounding:
             return x.clone()
         x = x.movedim(dims, tuple(range(-len(dims), 0))).flatten(-len(dims))
         squares, rounded = torch.zeros_like(x[..., 0]), x[-1].float()
-        dropped = torch.where(x[1:-1].abs() < UNDERFLOW, x[1:-1], 0.0).sum(-1)
+        small = torch.where(x[1:-1].abs() < UNDERFLOW, x[1:-1], 0.0)
+        small[2:4].clamp_(min=0.0)  # all terms, or those of one sign, which may be the smaller ones
+        small[4:].clamp_(max=0.0)
+        dropped = small.sum(-1)
         while x.shape[-1] > 1:
             if x.shape[-1] % 2:
                 x, rounded = F.pad(x, (0, 1)), F.pad(rounded, (0, 1))
