@@ -255,8 +255,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
         da_out: wp.array3d(dtype=lanes),
         db_out: wp.array2d(dtype=wp.float32),
         dc_out: wp.array2d(dtype=wp.float32),
-        dskip_out: wp.array2d(dtype=lanes),
-        dbias_out: wp.array2d(dtype=lanes),
+        dskip_out: wp.array3d(dtype=lanes),
+        dbias_out: wp.array3d(dtype=lanes),
     ):
         task = offset + wp.tid()
         p = _place(sizes, task)
@@ -286,7 +286,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                 )  # fmt: skip
                 finish(
                     p.b, t0, count, d, width, k, sizes.stream, skip_in[k], wp.static(scale), token,
-                    late, du_out, ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
+                    late, du_out, ddelta_out, dz_out, dskip_out[p.b, t0 / chunk_size],
+                    dbias_out[p.b, t0 / chunk_size],
                 )  # fmt: skip
                 if j % _P == _P - 1 or j == p.blocks - 1:
                     part = p.part + j / _P

@@ -210,7 +210,7 @@ def backward(
 
     dh = _pairs(_carry_back(s, sizes, c, dout, dlast))
     da = s.states()
-    dskip, dbias = torch.zeros(2, layout.segments * layout.batch, layout.blocks, W)
+    dskip, dbias = torch.empty(2, layout.batch, layout.chunks, layout.blocks, W)
     du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
     sizes.stream = _streams(layout, du, ddelta, dz)
     db_lanes, db = partial(need_B)
@@ -232,9 +232,9 @@ def backward(
         lambda: layout.unpack(da.sum((0, 1))) / SCALES[discretization],
         lambda: layout.total(db, B.dtype),
         lambda: layout.total(dc, C.dtype),
-        lambda: layout.unpack(dskip.sum(0)).to(D.dtype),
+        lambda: layout.unpack(dskip.sum((0, 1))).to(D.dtype),
         lambda: dz,
-        lambda: layout.unpack(dbias.sum(0)).to(delta_bias.dtype),
+        lambda: layout.unpack(dbias.sum((0, 1))).to(delta_bias.dtype),
         lambda: layout.unpack(_values(dh)[0], (layout.batch,)),
     )
     return [value() if needed else None for value, needed in zip(values, needs)]
