@@ -13,7 +13,6 @@ from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, backward_kernel, forward_kernel
 
-
 _FEW = 1 << 15  # elements that one thread has done before it could wake another
 
 

@@ -113,7 +113,9 @@ _TABLE = [
     *(1064781053, 1064881375, 1065009351, 1065166205),
 ]
 # What float32 rounds away of 2^(i/16), relative to it.
-_LOW = [2 ** (i / 16) / struct.unpack("f", struct.pack("f", 2 ** (i / 16)))[0] - 1 for i in range(16)]
+_LOW = [
+    2 ** (i / 16) / struct.unpack("f", struct.pack("f", 2 ** (i / 16)))[0] - 1 for i in range(16)
+]
 _TABLED = """
 #if defined(__AVX512F__)
 auto exp2_parts_ = [&](F x, F& near, F& low, F& f) -> F {

@@ -128,7 +128,7 @@ def forward(
     Returns:
         ``out [B, L, D]``, the last state ``[B, D, N]`` and the saved states (a private layout).
     """
-    tuning = Tuning(*tuning)
+    tuning = Tuning(*tuning).forward(A.shape[1])
     layout = Layout(u, A, B, SPAN, tuning.chunk)
     s = _Operands(layout, tuning, u, delta, A, z, delta_bias, discretization)
     b = _entries(B)
@@ -155,7 +155,7 @@ def forward(
 
 def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning):
     """The last state alone, ``[B, D, N]``, and the saved states; arguments as ``forward``."""
-    tuning = Tuning(*tuning)
+    tuning = Tuning(*tuning).forward(A.shape[1])
     layout = Layout(u, A, B, SPAN, tuning.chunk, split=not save)
     s = _Operands(layout, tuning, u, delta, A, None, delta_bias, discretization)
     h, starts = layout.states_of(initial_state)[None], s.starts(save)
