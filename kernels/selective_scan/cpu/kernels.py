@@ -1,8 +1,8 @@
-"""The CPU kernels: lanes are adjacent channels, tokens run in strips, states one by one.
+"""The CPU kernels: lanes are adjacent channels, tokens run in strips, states a few at a time.
 
 A task is one batch element, a segment of its tokens, and lane groups of one channel group. In a
-strip it holds what does not depend on the state n, and walks the tokens once per n and lane group:
-h_n lives in registers and N is free. Equations are those of README.md.
+strip it holds what does not depend on the state n, and walks the tokens once per few n and lane
+group: their h_n live in registers and N is free. Equations are those of README.md.
 """
 
 import functools
