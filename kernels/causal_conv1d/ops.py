@@ -13,18 +13,24 @@ from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, backward_kernel, forward_kernel
 
+_FEW = 1 << 15  # elements that one thread has done before it could wake another
+
 
 def _empty(like: Tensor, shape: tuple[int, ...]) -> Tensor:
     return empty(shape, like.dtype) if like.device.type == "cpu" else like.new_empty(shape)
 
 
 def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
-    """``[D, rows]`` to float32 ``[rows, channels]``, zeros in front of too few rows."""
-    packed = torch.zeros(rows, channels, device=like.device)
-    if x is not None:
-        x = x.reshape(like.shape[2], -1)
-        packed[rows - x.shape[1] :, : like.shape[2]] = x.T
-    return packed
+    """``[D, rows]`` to float32 ``[rows, channels]``, zeros in front of too few rows.
+
+    The result may lie in the memory of ``x``.
+    """
+    if x is None:
+        return torch.zeros(rows, channels, device=like.device)
+    x = x.reshape(like.shape[2], -1).T.float()
+    if x.shape != (rows, channels):
+        x = torch.constant_pad_nd(x, (0, channels - x.shape[1], rows - x.shape[0], 0))
+    return x.contiguous()
 
 
 def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None):
@@ -34,15 +40,16 @@ def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | No
     shape = (m.WIDTH,) if m.WIDTH > 1 else ()
     w = _pack(weight, TAPS, blocks * m.WIDTH, x).view(TAPS, blocks, *shape)
     v = _pack(bias, 1, blocks * m.WIDTH, x).view(blocks, *shape)
-    rows = x.new_zeros(x.shape[0], 0 if state is None else TAPS - 1, x.shape[2])
-    if state is not None:
-        rows[:, TAPS - 1 - state.shape[1] :] = state
+    rows = x.narrow(1, 0, 0) if state is None else lane_contiguous(state)
+    if state is not None and (short := TAPS - 1 - state.shape[1]):
+        rows = torch.constant_pad_nd(state, (0, 0, short, 0))
     return blocks, view(w, m.VALUE), view(v, m.VALUE), rows
 
 
 def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list) -> None:
     if x.device.type == "cpu":
-        parallel_launch(kernel, dim, inputs, outputs)
+        threads = 1 if x.numel() < _FEW else None
+        parallel_launch(kernel, dim, inputs, outputs, threads=threads)
     else:
         cuda_launch(kernel, dim, [0, *inputs], outputs, device=x.device, block_dim=128)
 

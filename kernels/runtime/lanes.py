@@ -4,6 +4,8 @@ A leaf is a little C++ with the compiler's vector types, which become AVX-512, A
 instructions. The loops around them, and all that is not arithmetic on lanes, are Warp kernels.
 """
 
+import struct
+
 import torch
 import warp as wp
 
@@ -80,18 +82,24 @@ auto decay_ = [&](F x) -> F {
     x = (F)((I)x | (int)0x80000000) * LOG2E;
     return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
 };
-// exp2 of another degree for |x| <= 125 and no NaN: the exponent is added as an integer. Where
-// |x| < 1/32, rise is 2^x - 1 and keeps what 2^x rounds away; elsewhere it is some number.
-auto exp2_rise_ = [&](F x, F& rise) -> F {
+// p for |x| <= 125 and no NaN, of another degree: 2^x is near (1 + low) (1 + f p), where near is a
+// float32 and low what that rounds away. If |x| < 1/32, near is 1, low is 0 and f is x.
+auto exp2_parts_ = [&](F x, F& near, F& low, F& f) -> F {
     const F plain = splat(12582912.0f);
     F r = x + plain;
-    F f = x - (r - plain);
+    f = x - (r - plain);
+    near = (F)(((I)r << 23) + 0x3f800000), low = F{};
     TAME
-    rise = f * p;
-    p = fma_(p, f, splat(1.0f));
-    return (F)((I)p + ((I)r << 23));
+    return p;
 };
-auto exp2_tame_ = [&](F x) -> F { F rise; return exp2_rise_(x, rise); };
+// 2^x of the same x. Where |x| < 1/32, rise is 2^x - 1 and keeps what 2^x rounds away; elsewhere it
+// is some number.
+auto exp2_rise_ = [&](F x, F& rise) -> F {
+    F near, low, f;
+    const F p = exp2_parts_(x, near, low, f);
+    rise = f * p;
+    JOIN
+};
 """
 ).replace("ACCURATE", _polynomial(6))
 
@@ -104,22 +112,34 @@ _TABLE = [
     *(1064697559, 1064654911, 1064633587, 1064634532, 1064658730, 1064707212),
     *(1064781053, 1064881375, 1065009351, 1065166205),
 ]
+# What float32 rounds away of 2^(i/16), relative to it.
+_LOW = [
+    2 ** (i / 16) / struct.unpack("f", struct.pack("f", 2 ** (i / 16)))[0] - 1 for i in range(16)
+]
 _TABLED = """
 #if defined(__AVX512F__)
-auto exp2_rise_ = [&](F x, F& rise) -> F {
+auto exp2_parts_ = [&](F x, F& near, F& low, F& f) -> F {
     const F plain = splat(786432.0f);
     const I table = {TABLE};
+    const F lows = {LOW};
     F r = x + plain;
-    F f = x - (r - plain);
-    F near = (F)((I)__builtin_ia32_permvarsi512(table, (I)r) + ((I)r << 19));
+    f = x - (r - plain);
+    near = (F)((I)__builtin_ia32_permvarsi512(table, (I)r) + ((I)r << 19));
+    low = (F)__builtin_ia32_permvarsi512((I)lows, (I)r);
     F p = splat(0.05550522f);
     p = fma_(p, f, splat(0.24023214f));
-    p = fma_(p, f, splat(0.69314718f));
-    rise = f * p;
-    return fma_(near, rise, near);
+    return fma_(p, f, splat(0.69314718f));
 };
 #else
 POLYNOMIAL
+#endif
+"""
+_JOIN = "return (F)((I)fma_(p, f, splat(1.0f)) + ((I)near - 0x3f800000));"
+_JOIN_TABLED = f"""
+#if defined(__AVX512F__)
+    return fma_(near, rise, near);
+#else
+    {_JOIN}
 #endif
 """
 
@@ -128,13 +148,14 @@ def prelude(degree: int, table: bool = False) -> str:
     """C++ text of the arithmetic on lanes.
 
     Args:
-        degree: of the polynomial in ``exp2_rise_`` and ``exp2_tame_``.
+        degree: of the polynomial in ``exp2_parts_`` and ``exp2_rise_``.
         table: whether a table takes its place where the processor has AVX-512.
     """
-    text = _PRELUDE
+    text = _PRELUDE.replace("JOIN", _JOIN_TABLED if table else _JOIN)
     if table:
-        begin, end = text.index("auto exp2_rise_"), text.index("auto exp2_tame_")
+        begin, end = text.index("auto exp2_parts_"), text.index("// 2^x of the same x.")
         tabled = _TABLED.replace("TABLE", ", ".join(map(str, _TABLE)))
+        tabled = tabled.replace("LOW", ", ".join(f"{x!r}f" for x in _LOW))
         text = text[:begin] + tabled.replace("POLYNOMIAL", text[begin:end]) + text[end:]
     return text.replace("TAME", _polynomial(degree))
 

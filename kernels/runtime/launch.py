@@ -85,6 +85,8 @@ def parallel_launch(
         dims = [(end - begin, *dim[1:]) for begin, end in zip(cuts[:-1], cuts[1:])]
         if team.run(kernel, dims, arguments, threads):
             return
+    if pieces == 1 and team.run_alone(kernel, dim, arguments):
+        return
     kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
     todo = iter(list(zip(cuts[:-1], cuts[1:])))
 

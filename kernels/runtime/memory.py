@@ -30,26 +30,36 @@ from torch import Tensor
 LARGE = 4 << 20  # bytes from which a tensor is taken from the pool
 _PAGE = 2 << 20  # a huge page
 _SHARE = 8  # the pool keeps this part of the memory at most
+_TOUCHED = 256 << 20  # bytes that are not lent to the system, at most
 _LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of a container, in /sys/fs/cgroup
+
+
+class _Block(mmap.mmap):
+    """Memory; ``lent`` says whether the system may take its pages."""
+
+    lent = False
 
 
 class Pool:
     """Blocks of memory that no tensor holds.
 
-    What lies in it is only lent by the system, which may take a block's pages back when it needs
-    them (``MADV_FREE``); they are then fresh ones at the next use. Beyond ``most`` bytes the blocks
-    that have waited longest go back at once.
+    The blocks that came last stay as they are, up to ``touched`` bytes. The others are lent to the
+    system, which may take their pages when it needs them (``MADV_FREE``); they are then fresh ones
+    at the next use. The first write to a lent page costs more than filling it, even where the
+    system did not take it. Beyond ``most`` bytes the blocks that have waited longest go back at
+    once.
 
     There is no lock: the operations on the list are atomic, and a block may come back from a
     finalizer, which may run inside any of them.
 
     Attributes:
         most: bytes that are kept at most.
+        touched: bytes of them that are not lent.
     """
 
-    def __init__(self, most: int) -> None:
-        self.most = most
-        self._free: list[mmap.mmap] = []  # those that came last at the end
+    def __init__(self, most: int, touched: int = _TOUCHED) -> None:
+        self.most, self.touched = most, min(touched, most)
+        self._free: list[_Block] = []  # those that came last at the end
 
     def take(self, size: int) -> Tensor:
         """A new tensor of ``size`` bytes, uint8, of any contents.
@@ -57,13 +67,14 @@ class Pool:
         Its storage cannot be resized.
         """
         block = self._find(size) or _fresh(size)
+        block.lent = False
         begin = ctypes.addressof(ctypes.c_char.from_buffer(block))
         # torch holds this object for as long as the storage lives
         held = (ctypes.c_char * size).from_buffer(block, -begin % _PAGE)
         weakref.finalize(held, self._give_back, block).atexit = False
         return torch.frombuffer(held, dtype=torch.uint8)
 
-    def _find(self, size: int) -> mmap.mmap | None:
+    def _find(self, size: int) -> _Block | None:
         """Takes the smallest block that is large enough, but not more than twice as large."""
         while True:
             fits = [x for x in self._free[::-1] if size <= len(x) - _PAGE <= 2 * size + _PAGE]
@@ -74,13 +85,27 @@ class Pool:
                 self._free.remove(best)
                 return best
 
-    def _give_back(self, block: mmap.mmap) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # an old kernel keeps it as it is
-            block.madvise(mmap.MADV_FREE)
+    def _give_back(self, block: _Block) -> None:
         self._free.append(block)
         with contextlib.suppress(IndexError):
             while self.size() > self.most:
                 self._free.pop(0)
+        self._lend()
+
+    def _lend(self) -> None:
+        """Lends the system all blocks but the newest, whose sum is at most ``touched`` bytes."""
+        newer = 0
+        for block in self._free[::-1]:
+            newer += len(block)
+            if newer <= self.touched or block.lent:
+                continue
+            with contextlib.suppress(ValueError):  # another thread has taken it
+                place = self._free.index(block)
+                self._free.remove(block)  # nobody may take it while its pages are given away
+                with contextlib.suppress(OSError, AttributeError):  # an old kernel keeps it
+                    block.madvise(mmap.MADV_FREE)
+                block.lent = True
+                self._free.insert(place, block)
 
     def size(self) -> int:
         """Bytes that lie in the pool."""
@@ -91,9 +116,9 @@ class Pool:
         self._free.clear()
 
 
-def _fresh(size: int) -> mmap.mmap:
+def _fresh(size: int) -> _Block:
     """Memory for ``size`` bytes, rounded up, and room to begin at a huge page."""
-    block = mmap.mmap(
+    block = _Block(
         -1, -(-size // _PAGE) * _PAGE + _PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
     )
     with contextlib.suppress(OSError, AttributeError):  # a kernel without huge pages does no harm

@@ -191,19 +191,19 @@ def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, thr
     return True
 
 
-def run_alone(kernel: Any, tasks: int, arguments: list) -> bool:
-    """Runs a launch of one dimension in this thread, in a quarter of the time of ``wp.launch``.
+def run_alone(kernel: Any, dim: Sequence[int], arguments: list) -> bool:
+    """Runs a launch in this thread, in a quarter of the time of ``wp.launch``.
 
     Returns False, having done nothing, where this Warp cannot do it.
 
     Args:
         kernel: its first parameter is ``offset: wp.int32``, which is 0 here.
-        tasks: at least 1.
+        dim: of the launch, each at least 1.
         arguments: after ``offset``.
     """
     arguments = [0, *arguments]
-    entry = _entry(kernel, (tasks,), arguments)
+    entry = _entry(kernel, dim, arguments)
     if entry is None:
         return False
-    entry.call(ctypes.byref(entry.extent((tasks,))), ctypes.byref(entry.pack(arguments)))
+    entry.call(ctypes.byref(entry.extent(dim)), ctypes.byref(entry.pack(arguments)))
     return True

@@ -8,33 +8,34 @@ state is kept as a sum of two numbers.
 # The factor from δ to ``rate``: exponentials are computed as powers of two.
 SCALES = {"mamba": 1.4426950408889634, "bilinear": 1.0, "zoh": 1.4426950408889634}
 
-_PHI = """
-    const F xe = x * 0.6931471805599453f;
-    F series = splat(2.505210838544172e-8f), slope = splat(2.505210838544172e-7f);
-    const float series_of[10] = {2.755731922398589e-7f, 2.755731922398589e-6f, 2.48015873015873e-5f,
-        1.984126984126984e-4f, 1.388888888888889e-3f, 8.333333333333333e-3f,
-        4.1666666666666664e-2f, 0.16666666666666666f, 0.5f, 1.0f};
-    for (int i = 0; i < 10; ++i) series = fma_(series, xe, splat(series_of[i]));
-    for (int i = 0; i < 9; ++i) slope = fma_(slope, xe, splat(series_of[i] * (float)(9 - i)));
-    const I small = (xe < 1.0f) & (xe > -1.0f);
-    const F safe = small ? splat(1.0f) : xe;
-    const F g = small ? series : (f - 1.0f) / safe;
-"""
 # Of x = rate A: f, g, and the rise f - 1, which is exact where f is slow, and any number elsewhere.
 FACTORS = {
-    "mamba": "F rise; const F f = exp2(x, rise), g = splat(1.0f);",
+    "mamba": "F rise; const F f = decay(x, rise), g = splat(1.0f);",
     "bilinear": """
         const F g = 1.0f / (1.0f - 0.5f * x), rise = x * g, f = fma_(x, g, splat(1.0f));
     """,
-    "zoh": "F rise; const F f = exp2(x, rise);" + _PHI,
+    "zoh": "F rise, g; const F f = decay(x, rise, g);",
 }
-# From x and m, which is f or its rise: the slopes df and dg of f and g, and g again.
+# From x, g and m, which is f or its rise: the slopes df and dg of f and g. That of zoh is a
+# polynomial where f - g would cancel.
 SLOPES = {
-    "bilinear": "const F g = 1.0f / (1.0f - 0.5f * x), df = g * g, dg = 0.5f * df;",
-    "zoh": "const F f = State::decay_of(m, quiet);"
-    + _PHI
-    + "const F df = f, dg = small ? slope : (f - g) / safe;",
+    "bilinear": "const F df = g * g, dg = 0.5f * df;",
+    "zoh": """
+    const F df = State::decay_of(m, quiet), xe = x * 0.6931471805599453f;
+    F slope = splat(1.7469932608e-4f);
+    slope = fma_(slope, xe, splat(1.20015557571e-3f));
+    slope = fma_(slope, xe, splat(6.9443082995e-3f));
+    slope = fma_(slope, xe, splat(3.33321221218e-2f));
+    slope = fma_(slope, xe, splat(0.12500000425576f));
+    slope = fma_(slope, xe, splat(0.33333337119712f));
+    slope = fma_(slope, xe, splat(0.5f));
+    const F dg = within_(xe, 0.5f) ? slope : (df - g) / xe;
+    """,
 }
+
+# What the gradient keeps of a token and state: f or its rise, the state before, and what it needs
+# of g that is not quickly computed again.
+KEPT = {"mamba": ("m", "h"), "bilinear": ("m", "h", "g"), "zoh": ("m", "h", "g")}
 
 # A chunk is walked with care for slow decays where |x| <= 1/128 in one channel of the sixteen at
 # least, or 1/32 in all. Then all channels with |x| <= 1/32 count as slow. Chunks of more than 64
@@ -94,18 +95,41 @@ auto worth_ = [&](F x) -> int {
         | (int)(__builtin_reduce_or(~within_(x, MODERATE)) == 0);
 };
 auto quiet_ = [&](F x) -> I { return within_(x, MODERATE) & -worth_(x); };  // the slow lanes
+"""
+
+# What gives f and its rise of x, and for zoh g: ``tamed`` where |x| <= 125, ``wild`` anywhere.
+_DECAYS = """
 auto wild = [&](F x, F& rise) __attribute__((always_inline)) -> F { return rise = exp2_(x); };
 auto tamed = [&](F x, F& rise) __attribute__((always_inline)) -> F { return exp2_rise_(x, rise); };
 """
+# g = (f - 1) / (x ln 2). f - 1 is summed without the rounding of f; where |x| <= 1/32, f - 1 = x p.
+_DECAYS_ZOH = """
+const float LN2 = 0.6931471805599453f;
+auto tamed = [&](F x, F& rise, F& g) __attribute__((always_inline)) -> F {
+    F near, low, part;
+    const F p = exp2_parts_(x, near, low, part);
+    rise = part * p;
+    const F less = fma_(near, rise + low, near - 1.0f);
+    g = within_(x, 0.03125f) ? p * LOG2E : less / (x * LN2);
+    return fma_(near, rise, near);
+};
+auto wild = [&](F x, F& rise, F& g) __attribute__((always_inline)) -> F {
+    const I calm = within_(x, 125.0f);
+    const F near = tamed(calm ? x : F{}, rise, g), far = exp2_(x);
+    g = calm ? g : (far - 1.0f) / (x * LN2);
+    return rise = calm ? near : far;
+};
+"""
+DECAYS = {"mamba": _DECAYS, "bilinear": _DECAYS, "zoh": _DECAYS_ZOH}
 
 
 def walk(name: str, body: str) -> str:
-    """C++ text of a lambda with that body, of a kind of state and an exp2.
+    """C++ text of a lambda with that body, of a kind of state and what gives its decays.
 
     These are Plain or Slow, and ``tamed``, or ``wild`` for Plain. The body may name State.
     """
     return f"""
-auto {name} = [&](auto kind, auto exp2) __attribute__((always_inline)) {{
+auto {name} = [&](auto kind, auto decay) __attribute__((always_inline)) {{
     using State = decltype(kind);
     {body}
 }};

@@ -1,8 +1,8 @@
-"""The CPU kernels: lanes are adjacent channels, tokens run in strips, states one by one.
+"""The CPU kernels: lanes are adjacent channels, tokens run in strips, states a few at a time.
 
 A task is one batch element, a segment of its tokens, and lane groups of one channel group. In a
-strip it holds what does not depend on the state n, and walks the tokens once per n and lane group:
-h_n lives in registers and N is free. Equations are those of README.md.
+strip it holds what does not depend on the state n, and walks the tokens once per few n and lane
+group: their h_n live in registers and N is free. Equations are those of README.md.
 """
 
 import functools
@@ -14,10 +14,10 @@ import warp as wp
 from ...runtime.lanes import WARP_DTYPES, W, flush_denormals, lanes, restore_denormals
 from ...runtime.views import struct
 from . import recurrence, tokens
-from .decays import SCALES
+from .decays import KEPT, SCALES
 from .layout import BLOCKS
 from .recurrence import NEED_DB, NEED_DC
-from .tokens import EXTRA, GRAD_TOKEN, KEPT, LATE, TOKEN, settle
+from .tokens import EXTRA, GRAD_TOKEN, LATE, TOKEN, settle
 from .tuning import Tuning
 
 SPAN = 32  # lane groups of a task at most: rows are read in long parts that fit a core's cache
@@ -225,7 +225,7 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
     retreat, sum_lanes, scale = state.retreat, state.sum_lanes, SCALES[discretization]
     chunk_size = tuning.chunk
     room, late_room = GRAD_TOKEN * chunk_size + EXTRA, LATE * chunk_size + 1
-    kept_room = KEPT * tuning.walked_back * chunk_size + 1
+    kept_room = len(KEPT[discretization]) * tuning.walked_back * chunk_size + 1
 
     @wp.kernel(enable_backward=False, module="unique")
     @no_type_check

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -16,34 +19,40 @@ from .layout import Layout
 from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ
 from .tuning import Tuning
 
+_FIELDS = tuple(Sizes.__annotations__)
 _STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
 
 
-def _sizes(layout: Layout, softplus: bool, use_z: bool, needs: int = 0) -> Sizes:
+def _sizes(
+    layout: Layout, softplus: bool, use_z: bool, needs: int = 0, results: Sequence[Tensor] = ()
+) -> Sizes:
+    y = layout
+    return _struct(
+        *(y.length, y.segment, y.segments, y.batch, y.states, y.groups, y.group_width),
+        *(y.group_blocks, y.span, int(softplus), int(use_z), needs, _streams(y, results)),
+    )
+
+
+@functools.lru_cache(256)  # to fill one takes as long as a short scan
+def _struct(*values: int) -> Sizes:
     sizes = Sizes()
-    names = "length segment segments batch states groups group_width group_blocks span"
-    for name in names.split():
-        setattr(sizes, name, getattr(layout, name))
-    sizes.use_softplus, sizes.use_z, sizes.needs = int(softplus), int(use_z), needs
+    for name, value in zip(_FIELDS, values, strict=True):
+        setattr(sizes, name, value)
     return sizes
 
 
-def _streams(layout: Layout, *results: Tensor) -> int:
+def _streams(layout: Layout, results: Sequence[Tensor]) -> int:
     """Whether results go past the caches, in whole lines: they are too large to be kept there."""
-    whole = layout.group_width % W == 0
-    return int(
-        whole
-        and all(
-            x.dtype == torch.float32 and x.numel() * 4 >= _STREAMED and x.data_ptr() % 64 == 0
-            for x in results
-            if x.numel()
-        )
-    )
+    each = 4 * layout.batch * layout.length * layout.channels
+    if each < _STREAMED or layout.group_width % W:
+        return 0
+    written = [x for x in results if x.numel()]
+    return int(all(x.dtype == torch.float32 and x.data_ptr() % 64 == 0 for x in written))
 
 
 def _pairs(states: Tensor) -> Tensor:
     """States as the kernels hold them, each with what it has rounded away, which is 0 at first."""
-    return torch.cat([states, torch.zeros_like(states)], -2)
+    return torch.constant_pad_nd(states, (0, 0, 0, states.shape[-2]))
 
 
 def _values(pairs: Tensor) -> Tensor:
@@ -119,19 +128,19 @@ def forward(
     Returns:
         ``out [B, L, D]``, the last state ``[B, D, N]`` and the saved states (a private layout).
     """
-    tuning = Tuning(*tuning)
+    tuning = Tuning(*tuning).forward(A.shape[1])
     layout = Layout(u, A, B, SPAN, tuning.chunk)
     s = _Operands(layout, tuning, u, delta, A, z, delta_bias, discretization)
-    sizes = _sizes(layout, softplus, z is not None)
     b = _entries(B)
     h = layout.states_of(initial_state)[None]
     if layout.segments > 1:
         local = _pairs(s.states())
+        sizes = _sizes(layout, softplus, z is not None)
         product = _accumulate(s, sizes, b, local, s.starts(False))
         h = _carry(h[0], _values(local), product)
     h, starts = _pairs(h), s.starts(save)
     out = empty(u.shape, u.dtype)
-    sizes.stream = _streams(layout, out)
+    sizes = _sizes(layout, softplus, z is not None, results=[out])
     s.run(
         kernels.forward_kernel,
         [
@@ -146,7 +155,7 @@ def forward(
 
 def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning):
     """The last state alone, ``[B, D, N]``, and the saved states; arguments as ``forward``."""
-    tuning = Tuning(*tuning)
+    tuning = Tuning(*tuning).forward(A.shape[1])
     layout = Layout(u, A, B, SPAN, tuning.chunk, split=not save)
     s = _Operands(layout, tuning, u, delta, A, None, delta_bias, discretization)
     h, starts = layout.states_of(initial_state)[None], s.starts(save)
@@ -196,7 +205,6 @@ def backward(
     need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
     through = need_u or need_delta or need_A or need_B or need_bias or need_h
     flags = NEED_DZ * need_z + NEED_DC * need_C + NEED_DB * need_B + NEED_DH * through
-    sizes = _sizes(layout, softplus, z is not None, flags)
     dout = lane_contiguous(dout)
     b, c = _entries(B), _entries(C)
 
@@ -208,11 +216,11 @@ def backward(
         sums = torch.empty(layout.tasks, rows * tuning.chunk, W)
         return sums, empty((layout.parts, rows * layout.length), torch.float32)
 
+    du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
+    sizes = _sizes(layout, softplus, z is not None, flags, [du, ddelta, dz])
     dh = _pairs(_carry_back(s, sizes, c, dout, dlast))
     da = s.states()
     dskip, dbias = torch.empty(2, layout.batch, layout.chunks, layout.blocks, W)
-    du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
-    sizes.stream = _streams(layout, du, ddelta, dz)
     db_lanes, db = partial(need_B)
     dc_lanes, dc = partial(need_C)
     s.run(

@@ -49,24 +49,27 @@ class Layout:
         self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
 
     def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
-        """Copies ``[.., D, *]`` to float32 ``[.., blocks, *, W]``; None becomes zeros."""
+        """Brings ``[.., D, *]`` to float32 ``[.., blocks, *, W]``; None becomes zeros.
+
+        The result may lie in the memory of ``x``.
+        """
         if x is None:
             return torch.zeros(*lead, self.blocks, W)
         n = len(lead)
-        tail = tuple(x.shape[n + 1 :])
-        x = x.float().reshape(*lead, self.groups, self.group_width, *tail)
-        x = x.movedim(n + 1, -1)
-        x = F.pad(x, (0, self.group_blocks * W - self.group_width))
-        x = x.reshape(*lead, self.groups, *tail, self.group_blocks, W).movedim(-2, n + 1)
-        return x.reshape(*lead, self.blocks, *tail, W).clone(memory_format=torch.contiguous_format)
+        tail, x = tuple(x.shape[n + 1 :]), x.float()
+        if missing := self.group_blocks * W - self.group_width:
+            x = x.reshape(*lead, self.groups, self.group_width, *tail)
+            x = F.pad(x, (0, 0) * len(tail) + (0, missing))
+        x = x.reshape(*lead, self.blocks, W, *tail)
+        return x.movedim(n + 1, -1).contiguous()
 
     def unpack(self, x: Tensor, lead: tuple[int, ...] = ()) -> Tensor:
-        """The inverse of ``pack``, dense."""
+        """The inverse of ``pack``, dense, in the memory of ``x`` if that is its order."""
         n = len(lead)
-        tail = tuple(x.shape[n + 1 : -1])
-        x = x.reshape(*lead, self.groups, self.group_blocks, *tail, W).movedim(n + 1, -2)
-        x = x.reshape(*lead, self.groups, *tail, self.group_blocks * W)
-        x = x[..., : self.group_width].movedim(-1, n + 1)
+        tail, x = tuple(x.shape[n + 1 : -1]), x.movedim(-1, n + 1)
+        if self.group_blocks * W > self.group_width:
+            x = x.reshape(*lead, self.groups, self.group_blocks * W, *tail)
+            x = x.narrow(n + 1, 0, self.group_width)
         return x.reshape(*lead, self.channels, *tail).contiguous()
 
     def states_of(self, x: Tensor | None) -> Tensor:

@@ -1,4 +1,4 @@
-"""Native inner loops of the CPU scan: a state, a strip of tokens, sixteen channels.
+"""Native inner loops of the CPU scan: one state or a few, a strip of tokens, sixteen channels.
 
 Equations are those of README.md. Values per token come from ``tokens.py``; B and C
 are read where they are, from token ``t0`` on.
@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from ...runtime.lanes import lanes, prelude
-from .decays import FACTORS, SLOPES, STATE, limits
+from .decays import DECAYS, FACTORS, KEPT, SLOPES, STATE, limits
 from .decays import walk as walk_of
 from .together import ADVANCE_BLOCK, BLOCKS, RETREAT_BLOCK
 from .tokens import TOKENS
@@ -122,7 +122,10 @@ _GATHER_WALK = """
 
 # As _ADVANCE, keeping m and h of every token, and adding dy·h to the sums of dC (equation 8); then
 # backwards, equations 6, 7 and 9 to 12. Σ rate q is left in da.
-_KEPT = "Kept* const kept = aligned_((Kept*)kept_out.data);"
+_KEPT = """
+struct Kept { F KEPT; };
+Kept* const kept = aligned_((Kept*)kept_out.data);
+"""
 _RETREAT = f"""
     const Column b = column_(b_in, n), c = column_(c_in, n);
     F* const db = (F*)db_out.data + n * CHUNK;
@@ -140,45 +143,49 @@ WALKS
 _RETREAT_WALK = f"""
         State h(state_(starts_in, n), F{{}}, quiet);
         for (int t = 0; t < count; ++t) {{
+            Kept& own = kept[t];
             const F x = token[t].rate * a;
             FACTORS
-            kept[t].m = State::one_of(f, rise, quiet);
-            kept[t].h = h.value();
+            own.m = State::one_of(f, rise, quiet), own.h = h.value();
+            KEEP
             h.step(f, rise, g * (token[t].du * b[t]));
             if (needs & {NEED_DZ}) token[t].y = fma_(h.value(), splat(c[t]), token[t].y);
             if (needs & {NEED_DC}) dc[t] = fma_(token[t].dy, h.value(), dc[t]);
         }}
 """
-_RETREAT_BACK = """
+_RETREAT_BACK = f"""
         State dh(state_(dh_out, n), state_(dh_out, states + n), quiet);
-        F da = F{};
-        for (int t = count - 1; t >= 0; --t) {
-            GradToken& own = token[t];
-            const F m = kept[t].m;
-            dh.add(own.dy, splat(c[t]));
+        F da = F{{}};
+        for (int t = count - 1; t >= 0; --t) {{
+            const Kept& own = kept[t];
+            const F rate = token[t].rate, du = token[t].du;
+            const float b_t = b[t];
+            dh.add(token[t].dy, splat(c[t]));
+            const F v = dh.value();
+            WEIGH
+            if (needs & {NEED_DB}) db[t] = fma_(gv, du, db[t]);
+            token[t].s = fma_(gv, splat(b_t), token[t].s);
             GRADIENT
-            own.p = fma_(q, a, own.p);
-            da = fma_(q, own.rate, da);
-        }
+            token[t].p = fma_(q, a, token[t].p);
+            da = fma_(q, rate, da);
+        }}
         dh.keep(state_(dh_out, n), state_(dh_out, states + n));
         state_(da_out, n) += da;
 """
-_OWN = f"""
-            const F v = dh.value();
-            if (needs & {NEED_DB}) db[t] = fma_(v, own.du, db[t]);
-            own.s = fma_(v, splat(b[t]), own.s);
-            dh.decay(m);
-            const F q = dh.value() * kept[t].h;
-"""
-_GENERAL = f"""
-            const F x = own.rate * a;
+# What both walks back do with a state of a token: ``gv`` is g dh, ``q`` that of equation 10.
+_BACK = {
+    "KEEP": ("", "own.g = g;"),
+    "WEIGH": ("const F gv = v;", "const F g = own.g, gv = g * v;"),
+    "GRADIENT": (
+        "dh.decay(own.m); const F q = dh.value() * own.h;",
+        """
+            const F x = rate * a, m = own.m;
             SLOPES
-            const F v = dh.value(), gv = g * v;
-            if (needs & {NEED_DB}) db[t] = fma_(gv, own.du, db[t]);
-            own.s = fma_(gv, splat(b[t]), own.s);
-            const F q = v * (kept[t].h * df + own.du * b[t] * dg);
+            const F q = v * (own.h * df + du * b_t * dg);
             dh.decay(m);
-"""
+        """,
+    ),
+}
 
 
 def _leaf(
@@ -200,19 +207,21 @@ def _leaf(
     """
     parts = _LOOK + walk_of("walk", walk)
     if back:
-        gradient = _OWN if discretization == "mamba" else _GENERAL
-        parts += walk_of("back", back.replace("GRADIENT", gradient))
+        parts += walk_of("back", back)
     loop = (
         _STATES
         if at_once == 1
         else BLOCKS.replace("BLOCK", walk_of("block", block)).replace("ALSO", also)
     )
     text = _OPEN + head + loop + text.replace("WALKS", parts + _CHOOSE) + _REST
+    for name, forms in _BACK.items():
+        text = text.replace(name, forms[discretization != "mamba"])
     text = text.replace("FACTORS", FACTORS[discretization])
     text = text.replace("SLOPES", SLOPES.get(discretization, ""))
-    text = prelude(tuning.degree, bool(tuning.table)) + STATE + text
+    text = prelude(tuning.degree, bool(tuning.table)) + STATE + DECAYS[discretization] + text
     chunk = tuning.chunk
     names = {"CHUNK": chunk, "AT_ONCE": at_once, "TOKEN": token, **limits(chunk)}
+    names["KEPT"] = ", ".join(KEPT[discretization])
     for name, value in names.items():
         text = text.replace(name, str(value))
     return text
@@ -223,8 +232,7 @@ def forward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     """``advance`` and ``accumulate`` bring a lane group's states from before a strip to after."""
     parts = discretization, tuning
 
-    mamba = discretization == "mamba"  # the others need too many registers
-    block: dict[str, Any] = {"block": ADVANCE_BLOCK, "at_once": tuning.walked if mamba else 1}
+    block: dict[str, Any] = {"block": ADVANCE_BLOCK, "at_once": tuning.walked}
 
     @wp.func_native(_leaf(_ADVANCE, _ADVANCE_WALK, *parts, token="Token", **block))
     def advance(
@@ -268,9 +276,8 @@ def backward_leaves(discretization: str, tuning: Tuning) -> SimpleNamespace:
     parts = discretization, tuning
 
     kept: dict[str, Any] = {"head": _KEPT, "back": _RETREAT_BACK}
-    if discretization == "mamba":
-        kept |= {"block": RETREAT_BLOCK, "at_once": tuning.walked_back}
-        kept["also"] = f"&& needs == {NEED_DZ + NEED_DC + NEED_DB + NEED_DH}"
+    kept |= {"block": RETREAT_BLOCK, "at_once": tuning.walked_back}
+    kept["also"] = f"&& needs == {NEED_DZ + NEED_DC + NEED_DB + NEED_DH}"
 
     @wp.func_native(_leaf(_RETREAT, _RETREAT_WALK, *parts, token="GradToken", **kept))
     def retreat(

@@ -11,10 +11,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ...runtime import team
 from ...runtime.lanes import ACTIVATIONS, PRELUDE, W, flush_denormals, restore_denormals
 from ...runtime.launch import parallel_launch
-from ...runtime.views import view
 
 _PLAIN = (Tensor, torch.nn.Parameter)  # no fake tensor, which has no memory
 _FEW = 64  # tasks of sixteen channels below which one thread is as fast as several
@@ -275,7 +273,5 @@ def _changed(state: Tensor) -> None:
 
 
 def _launch(kernel, tasks: int, arguments: list) -> None:
-    arguments = [view(a) if isinstance(a, Tensor) else a for a in arguments]
     threads = torch.get_num_threads() if tasks >= _FEW else 1
-    if tasks and not (threads == 1 and team.run_alone(kernel, tasks, arguments)):
-        parallel_launch(kernel, tasks, arguments, threads=threads)
+    parallel_launch(kernel, tasks, arguments, threads=threads)

@@ -10,15 +10,15 @@ BLOCKS = """
 for (int n = 0; n < states; ++n) {
     const bool together = tame && n + AT_ONCE <= states ALSO;
     if (together) {
-        F a[AT_ONCE], least = splat(125.0f);
+        F as[AT_ONCE], least = splat(125.0f);
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
-            a[k] = rates[n + k];
-            least = __builtin_elementwise_min(least, __builtin_elementwise_abs(tail.top * a[k]));
+            as[k] = rates[n + k];
+            least = __builtin_elementwise_min(least, __builtin_elementwise_abs(tail.top * as[k]));
         }
         I quiets[AT_ONCE], any = I{};
         const bool look = worth_(least);  // if no state is worth it, this is all that is looked at
-        for (int k = 0; look && k < AT_ONCE; ++k) any |= quiets[k] = quiet_(tail.top * a[k]);
+        for (int k = 0; look && k < AT_ONCE; ++k) any |= quiets[k] = quiet_(tail.top * as[k]);
 BLOCK
         if (look && __builtin_reduce_or(any)) block(Slow(), tamed);
         else block(Plain(), tamed);
@@ -31,10 +31,10 @@ BLOCK
 # Equations 1 and 5.
 ADVANCE_BLOCK = """
         const Column b = column_(b_in, n), c = column_(c_in, n);
-        State h[AT_ONCE];
+        State hs[AT_ONCE];
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k)
-            h[k] = State(state_(h_out, n + k), state_(h_out, states + n + k), quiets[k]);
+            hs[k] = State(state_(h_out, n + k), state_(h_out, states + n + k), quiets[k]);
         Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
             fetch.next();
@@ -43,16 +43,16 @@ ADVANCE_BLOCK = """
             F y = token[t].y;
             #pragma unroll
             for (int k = 0; k < AT_ONCE; ++k) {
-                const F x = rate * a[k];
+                const F x = rate * as[k];
                 FACTORS
-                h[k].step(f, rise, g * (du * bt[k]));
-                y = fma_(h[k].value(), splat(ct[k]), y);
+                hs[k].step(f, rise, g * (du * bt[k]));
+                y = fma_(hs[k].value(), splat(ct[k]), y);
             }
             token[t].y = y;
         }
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k)
-            h[k].keep(state_(h_out, n + k), state_(h_out, states + n + k));
+            hs[k].keep(state_(h_out, n + k), state_(h_out, states + n + k));
 """
 
 # Equations 1, 6 to 9, 11 and 12, and the sums of 7 and 8.
@@ -61,10 +61,10 @@ RETREAT_BLOCK = """
         F* const db = (F*)db_out.data + n * CHUNK;
         F* const dc = (F*)dc_out.data + n * CHUNK;
         if (first) for (int t = 0; t < AT_ONCE * CHUNK; ++t) db[t] = dc[t] = F{};
-        State h[AT_ONCE], dh[AT_ONCE];
-        F da[AT_ONCE];
+        State hs[AT_ONCE], dhs[AT_ONCE];
+        F das[AT_ONCE];
         #pragma unroll
-        for (int k = 0; k < AT_ONCE; ++k) h[k] = State(state_(starts_in, n + k), F{}, quiets[k]);
+        for (int k = 0; k < AT_ONCE; ++k) hs[k] = State(state_(starts_in, n + k), F{}, quiets[k]);
         Fetch fetch = fetch_();
         for (int t = 0; t < count; ++t) {
             fetch.next();
@@ -73,20 +73,22 @@ RETREAT_BLOCK = """
             F y = token[t].y;
             #pragma unroll
             for (int k = 0; k < AT_ONCE; ++k) {
-                const F x = rate * a[k];
+                State& h = hs[k];
+                Kept& own = kept[t * AT_ONCE + k];
+                const F x = rate * as[k];
                 FACTORS
-                kept[t * AT_ONCE + k].m = State::one_of(f, rise, quiets[k]);
-                kept[t * AT_ONCE + k].h = h[k].value();
-                h[k].step(f, rise, g * (du * bt[k]));
-                y = fma_(h[k].value(), splat(ct[k]), y);
-                dc[k * CHUNK + t] = fma_(dy, h[k].value(), dc[k * CHUNK + t]);
+                own.m = State::one_of(f, rise, quiets[k]), own.h = h.value();
+                KEEP
+                h.step(f, rise, g * (du * bt[k]));
+                y = fma_(h.value(), splat(ct[k]), y);
+                dc[k * CHUNK + t] = fma_(dy, h.value(), dc[k * CHUNK + t]);
             }
             token[t].y = y;
         }
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
-            dh[k] = State(state_(dh_out, n + k), state_(dh_out, states + n + k), quiets[k]);
-            da[k] = F{};
+            dhs[k] = State(state_(dh_out, n + k), state_(dh_out, states + n + k), quiets[k]);
+            das[k] = F{};
         }
         fetch = fetch_();
         for (int t = count - 1; t >= 0; --t) {
@@ -96,20 +98,25 @@ RETREAT_BLOCK = """
             F s = token[t].s, p = token[t].p;
             #pragma unroll
             for (int k = 0; k < AT_ONCE; ++k) {
-                dh[k].add(dy, splat(ct[k]));
-                const F v = dh[k].value();
-                db[k * CHUNK + t] = fma_(v, du, db[k * CHUNK + t]);
-                s = fma_(v, splat(bt[k]), s);
-                dh[k].decay(kept[t * AT_ONCE + k].m);
-                const F q = dh[k].value() * kept[t * AT_ONCE + k].h;
-                p = fma_(q, a[k], p);
-                da[k] = fma_(q, rate, da[k]);
+                State& dh = dhs[k];
+                const Kept& own = kept[t * AT_ONCE + k];
+                const F a = as[k];
+                const I quiet = quiets[k];
+                const float b_t = bt[k];
+                dh.add(dy, splat(ct[k]));
+                const F v = dh.value();
+                WEIGH
+                db[k * CHUNK + t] = fma_(gv, du, db[k * CHUNK + t]);
+                s = fma_(gv, splat(b_t), s);
+                GRADIENT
+                p = fma_(q, a, p);
+                das[k] = fma_(q, rate, das[k]);
             }
             token[t].s = s, token[t].p = p;
         }
         #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
-            dh[k].keep(state_(dh_out, n + k), state_(dh_out, states + n + k));
-            state_(da_out, n + k) += da[k];
+            dhs[k].keep(state_(dh_out, n + k), state_(dh_out, states + n + k));
+            state_(da_out, n + k) += das[k];
         }
 """

@@ -19,7 +19,6 @@ TOKENS = """
 struct Token { F rate, du, y, gate; };
 struct GradToken { F rate, du, dy, y, s, p; };
 struct Late { F u, slope, gate; };
-struct Kept { F m, h; };
 struct Fetch {
     const char* at;
     int64_t step, jump;
@@ -34,7 +33,7 @@ struct Fetch {
 struct Tail { F top; Fetch fetch[8]; int fetches; };
 auto aligned_ = [](auto* p) { return (decltype(p))(((size_t)p + 63) & ~(size_t)63); };
 """
-TOKEN, GRAD_TOKEN, LATE, KEPT = 4, 6, 3, 2  # lanes of each
+TOKEN, GRAD_TOKEN, LATE = 4, 6, 3  # lanes of each
 EXTRA = 7  # lanes beside the tokens: the tail, and room for the alignment
 
 # A row's lines lie together, but a lane group wants one line of each row. So the rows of the next

@@ -25,6 +25,7 @@ from .blocks import (
     offsets,
     placing,
     states_io,
+    stepping,
     sync,
     widening,
 )
@@ -73,6 +74,7 @@ def backward_kernel(
     raw, _, fetch, store = group_io(g, io)
     _, _, fetch_delta, store_delta = group_io(g, delta_io)
     widen, widen_delta = widening(io), widening(delta_io)
+    step_of = stepping(delta_io, use_softplus)
     at, size = _layout(g, flags, use_z)
     mark_at, mark_size = offsets({"STEP": m.size, "DU": m.size, "B": MARK_TILE * f.padded})
     size = max(size, 2 * mark_size)
@@ -113,10 +115,7 @@ def backward_kernel(
             steps = marked()
             inputs = marked()
             for i in range(wp.static(m.count)):
-                step = widen_delta(delta[i]) + bias
-                if wp.static(use_softplus):
-                    step = softplus(step)
-                steps[i] = wp.where(wp.static(m.token(i)) < left, step, 0.0)
+                steps[i] = step_of(delta[i], bias, wp.static(m.token(i)) < left)
                 inputs[i] = steps[i] * widen(u[i])
             put_mark(arena, base + wp.static(mark_at["STEP"]), p.c, p.row, steps)
             put_mark(arena, base + wp.static(mark_at["DU"]), p.c, p.row, inputs)

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import WIDE
+from ...runtime.scalars import WIDE, softplus
 from ...runtime.views import struct
 
 STATES = 16  # of a state block, the most that a channel holds in registers
@@ -99,6 +99,20 @@ def widening(io: torch.dtype):
     def widen(bits: wp.uint32) -> float: ...
 
     return widen
+
+
+def stepping(delta_io: torch.dtype, use_softplus: bool):
+    """Makes the function that turns the bits of a delta into δ, which is 0 where not ``inside``."""
+    widen = widening(delta_io)
+
+    @wp.func
+    def step_of(bits: wp.uint32, bias: float, inside: bool) -> float:
+        step = widen(bits) + bias
+        if wp.static(use_softplus):
+            step = softplus(step)
+        return wp.where(inside, step, 0.0)
+
+    return step_of
 
 
 @struct

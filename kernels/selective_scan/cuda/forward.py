@@ -12,7 +12,7 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import LOG2E, sigmoid, softplus
+from ...runtime.scalars import LOG2E, sigmoid
 from .blocks import (
     MARK,
     BlockShape,
@@ -24,6 +24,7 @@ from .blocks import (
     offsets,
     placing,
     states_io,
+    stepping,
     sync,
     widening,
 )
@@ -68,7 +69,7 @@ def forward_kernel(
     vec, read_states, write_states = states_io(f)
     count, raw, fetch, store = channel_io(f, io, tokens)
     _, _, fetch_delta, _ = channel_io(f, delta_io, tokens)
-    widen, widen_delta = widening(io), widening(delta_io)
+    widen, step_of = widening(io), stepping(delta_io, use_softplus)
     at, size = _layout(f, read)
     arena_type, put, get = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, tokens, 2 * size)
@@ -143,10 +144,7 @@ def forward_kernel(
             left = wp.where(p.active != 0, p.end - t0 - p.row, 0)
             for i in range(wp.static(count)):
                 t = p.row + wp.static(i * f.rows)
-                step = widen_delta(delta[i]) + bias
-                if wp.static(use_softplus):
-                    step = softplus(step)
-                step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
+                step = step_of(delta[i], bias, wp.static(i * f.rows) < left)
                 e = base + t * wp.static(f.span) + p.c
                 put(arena, e + wp.static(at["STEP"]), step)
                 put(arena, e + wp.static(at["IN"]), step * widen(u[i]))

@@ -10,7 +10,7 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import LOG2E, sigmoid, softplus
+from ...runtime.scalars import LOG2E, sigmoid
 from .blocks import (
     BlockShape,
     Sizes,
@@ -20,6 +20,7 @@ from .blocks import (
     offsets,
     placing,
     states_io,
+    stepping,
     sync,
     widening,
 )
@@ -42,7 +43,7 @@ def summary_kernel(
     vec, read_states, write_states = states_io(f)
     count, raw, fetch, _ = channel_io(f, io, TILE)
     _, _, fetch_delta, _ = channel_io(f, delta_io, TILE)
-    widen, widen_delta = widening(io), widening(delta_io)
+    widen, step_of = widening(io), stepping(delta_io, use_softplus)
     at, size = offsets({"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded})
     arena_type, put, _ = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
@@ -88,10 +89,7 @@ def summary_kernel(
             base = (again % 2) * wp.static(size)
             left = wp.where(p.active != 0, end - t0 - p.row, 0)
             for i in range(wp.static(count)):
-                step = widen_delta(delta[i]) + bias
-                if wp.static(use_softplus):
-                    step = softplus(step)
-                step = wp.where(wp.static(i * f.rows) < left, step, 0.0)
+                step = step_of(delta[i], bias, wp.static(i * f.rows) < left)
                 dy = wp.where(wp.static(i * f.rows) < left, widen(dout[i]), 0.0)
                 if wp.static(not read):
                     dy = 0.0
