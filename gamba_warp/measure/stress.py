@@ -130,8 +130,8 @@ def _picture(kind: str, images: Tensor) -> Tensor:
 class _Oracle:
     """The network in float64 from its parameters, sample by sample, the condition prepended."""
 
-    def __init__(self, case: Case, model: Gamba) -> None:
-        self.config, self.r = model.config, Rounding(case.seed)
+    def __init__(self, case: Case, model: Gamba, trial: int) -> None:
+        self.config, self.r = model.config, Rounding(case.seed, trial)
         self.ulps = _BFLOAT16 if case.options["autocast"] else 1.0
         self.weights = {k: samples_of(p) for k, p in model.named_parameters()}
         self.orders = model.tokens.orders.cpu()
@@ -148,11 +148,16 @@ class _Oracle:
         return self.r(y + self.r(bias).reshape(len(bias), *axes, 1, -1), ulps, ulps)
 
     def norm(self, x: Tensor, name: str) -> Tensor:
-        """Applies the configuration's norm."""
-        x = self.r(x)
+        """Applies the configuration's norm.
+
+        The gradient is a difference: of what goes past the mean, and through it. Each is rounded.
+        """
+        r, x = self.r, self.r(x)
+        own = lambda x: r.stored(x, torch.float32)  # noqa: E731
         if self.config.norm == "layer":
-            x = self.r(x - x.mean(-1, keepdim=True))
-        x = self.r(x * (x.square().mean(-1, keepdim=True) + 1e-5).rsqrt(), 4.0)
+            x = r(own(x) - r(own(x).mean(-1, keepdim=True)))
+        square = r(own(x).square().mean(-1, keepdim=True) + 1e-5)
+        x = r(own(x) * r(square.rsqrt()), 4.0)
         x = x * self.weights[f"{name}.weight"][:, None, None]
         bias = self.weights.get(f"{name}.bias")
         return self.r(x if bias is None else x + bias[:, None, None])
@@ -253,11 +258,11 @@ def _run(model: Gamba, o: dict, inputs: dict, cameras: Cameras) -> dict[str, Ten
     return {k: x for k, x in vars(gaussians).items() if x is not None}
 
 
-def evaluate(case: Case, device: torch.device) -> Outcome:
+def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the model and judges all attributes and the gradients of all parameters and inputs."""
     model, inputs, cameras = build(case, device)
     leaves = inputs | dict(model.named_parameters())
-    oracle = _Oracle(case, model)
+    oracle = _Oracle(case, model, trial)
     samples = {k: samples_of(x) for k, x in inputs.items()}
     truths = oracle.run(samples, cameras)
     cotangents = {

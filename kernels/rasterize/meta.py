@@ -16,9 +16,9 @@ class Drawn(NamedTuple):
 
     Attributes:
         splats: means2d, conics, depths, opacities and extents of I views, without gradients.
-        size: as ``composite`` was given it, like the next two.
-        limits: see above.
-        tuning: see above.
+        size: what ``composite`` was given, like the next two.
+        limits: what ``composite`` was given.
+        tuning: what ``composite`` was given.
     """
 
     splats: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]

@@ -19,18 +19,13 @@ from .cpu import composite as composite_cpu
 from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
-from .cuda.reduce import reduce_rows
 from .project import LensOptions, Projected, make_lens, project_forward
 from .project_vjp import Cotangents, Gradients, Wanted, project_backward
-from .reduce import reduce_pairs
 from .skip import UNASKED
 from .tiles import Bins, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
 
 _OP = "gamba_warp::rasterize_"
 MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
-
-
-_REDUCE = {composite_cpu: reduce_pairs, composite_cuda: reduce_rows}
 
 
 def _compositor(device: torch.device):
@@ -305,13 +300,12 @@ def _composite_vjp(
     v_alphas: Tensor,
     geometry: bool,
 ) -> List[Tensor]:
-    every, compositor = Bins(*bins), _compositor(means2d.device)
-    v_pairs, written, skipped = compositor.composite_backward(
+    grads, skipped = _compositor(means2d.device).composite_backward(
         means2d,
         conics,
         view_opacities,
         colors,
-        every,
+        Bins(*bins),
         _picture(means2d, size, limits, tuning),
         Tuning(*tuning),
         Walk(*walk),
@@ -319,8 +313,6 @@ def _composite_vjp(
         v_alphas,
         geometry,
     )
-    reduce = _REDUCE[compositor]
-    grads = reduce(v_pairs, written, every, conics, view_opacities, geometry)
     return [skipped, *(g for g in grads if g is not None)]
 
 

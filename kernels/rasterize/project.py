@@ -312,8 +312,8 @@ def make_lens(options: LensOptions) -> Lens:
     return lens
 
 
-def room(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """An empty tensor; a large one on the CPU is of large pages, which are read at random."""
+def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+    """An empty tensor; a large one on the CPU is of large pages, since it is read at random."""
     if device.type == "cpu":
         return empty(shape, dtype)
     return torch.empty(*shape, dtype=dtype, device=device)
@@ -344,9 +344,9 @@ def project_forward(
     (batch, views), num = viewmats.shape[:2], means.shape[1]
     shape = (batch, views, num)
     sizes, device = ((2,), (3,), (), (), (2,)), means.device
-    floats = (room([*shape, *size], torch.float32, device) for size in sizes)
+    floats = (empty_on(device, [*shape, *size], torch.float32) for size in sizes)
     means2d, conics, depths, view_opacities, extents = floats
-    status = room(shape, torch.int32, device)
+    status = empty_on(device, shape, torch.int32)
     inputs = [
         vectors(means, wp.vec3),
         vectors(quats, wp.vec4),

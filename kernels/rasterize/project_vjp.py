@@ -16,10 +16,10 @@ from .project import (
     COMPENSATION_FLOOR,
     VISIBLE,
     Lens,
+    empty_on,
     jacobian,
     mat23,
     quat_size,
-    room,
     rotation,
     rotation_of,
     row_of,
@@ -237,9 +237,8 @@ def _project_vjp(
             v_quats_out[g] = _rotation_vjp(q, v_R) / size
 
 
-def _room(like: Tensor) -> Tensor:
-    """A gradient of that shape; the kernel writes all of it."""
-    return room(like.shape, like.dtype, like.device)
+def _empty_like(x: Tensor) -> Tensor:
+    return empty_on(x.device, x.shape, x.dtype)
 
 
 def project_backward(
@@ -272,7 +271,8 @@ def project_backward(
     """
     batch, views, num = status.shape
     inputs = means, quats, scales, opacities
-    make = _room if status.numel() else torch.zeros_like
+    # the kernel writes all of a gradient, where there is a view
+    make = _empty_like if status.numel() else torch.zeros_like
     v_means, v_quats, v_scales, v_opacities = (
         make(x) if want and x is not None else None for x, want in zip(inputs, wanted)
     )

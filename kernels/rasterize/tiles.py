@@ -1,9 +1,10 @@
 """Tiles: how a picture is cut into them, their lists, and which of them an ellipse touches.
 
 In this order: ``Tiling``, the cut; ``Bins`` and ``Walk``, what binning and compositing leave to the
-steps after them; ``Grid`` and ``Picture``, the scalars that the launches of these two steps take;
-the test of an ellipse, row by row of tiles, by exact intervals of columns. README.md §2 proves the
-test. Counting and writing call the same functions.
+steps after them; ``PairGradients``, what the compositor's gradient gives; ``Grid`` and ``Picture``,
+the scalars that the launches of these two steps take; the test of an ellipse, row by row of tiles,
+by exact intervals of columns. README.md §2 proves the test. Counting and writing call the same
+functions.
 """
 
 from typing import NamedTuple, no_type_check
@@ -101,6 +102,22 @@ class Walk(NamedTuple):
     blocks: Tensor
     walked: Tensor
     blocks_walked: Tensor
+
+
+class PairGradients(NamedTuple):
+    """Gradients of the compositor's inputs: of each (view, Gaussian), the sum over its pairs.
+
+    Attributes:
+        means2d: ``[I, N, 2]``, or None if colours alone are asked for, like the next two.
+        conics: ``[I, N, 3]`` or None.
+        view_opacities: ``[I, N]`` or None.
+        colors: ``[I, N, C]``.
+    """
+
+    means2d: Tensor | None
+    conics: Tensor | None
+    view_opacities: Tensor | None
+    colors: Tensor
 
 
 @struct

@@ -1,4 +1,4 @@
-"""1 - SSIM of pictures with its gradient, on the CPU."""
+"""1 - SSIM of pictures with its gradient."""
 
 from .function import dissimilarity
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-WINDOW, SIGMA = 11, 1.5
-C1, C2 = 0.01**2, 0.03**2
+from .constants import C1, C2, SIGMA, WINDOW
 
 
 def dissimilarity_reference(got: Tensor, want: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 
 from gamba_warp.conventions import over_background
 from gamba_warp.image_metrics import ssim
-from gamba_warp.train.objective import losses
+from gamba_warp.kernels.ssim import products
 from gamba_warp.train.objective.losses import (
     mse,
     random_crops,
@@ -100,7 +100,7 @@ def test_pictures_taken_together_are_those_taken_alone(monkeypatch):
     got.requires_grad_()
     values, slopes = [], []
     for numbers in (1, 2 * 14 * 40 * 3, 1 << 20):  # one picture, two, all
-        monkeypatch.setattr(losses, "_CACHED", numbers)
+        monkeypatch.setattr(products, "_TOGETHER", numbers)
         values.append(structure(got, want))
         slopes.append(torch.autograd.grad(values[-1].sum(), got)[0])
     for value, slope in zip(values[1:], slopes[1:]):

@@ -5,20 +5,19 @@ Every term has one value per view, ``[.., V]``; ``total_loss`` weighs and averag
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import pad, smooth_l1_loss
+from torch.nn.functional import smooth_l1_loss
 from torch.profiler import record_function
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import SSIM_SIGMA, SSIM_WINDOW, psnr
+from gamba_warp.image_metrics import psnr
 from gamba_warp.kernels.ssim import dissimilarity
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available
@@ -27,9 +26,6 @@ from ..config import TrainConfig
 from .radial_mask import project_means
 
 DEPTH_BEND = 0.02  # object units; see ``depth_loss``
-_C1, _C2 = 0.01**2, 0.03**2  # of SSIM, for pictures in [0, 1]
-_TILE = 32  # columns of a banded product of SSIM
-_CACHED = 1 << 17  # numbers of the pictures that a CPU takes together for SSIM, two of 128²
 
 
 def mse(got: Tensor, want: Tensor) -> Tensor:
@@ -38,11 +34,9 @@ def mse(got: Tensor, want: Tensor) -> Tensor:
 
 
 def structure(got: Tensor, want: Tensor) -> Tensor:
-    """Computes 1 - SSIM, as ``image_metrics.ssim`` defines it.
+    """Computes 1 - SSIM, as ``image_metrics.ssim`` defines it, by ``kernels/ssim``.
 
-    With s = got + want and d = got - want, SSIM needs the windowed means of s, d, s² and d² alone:
-    2ab = (s² - d²) / 2 and a² + b² = (s² + d²) / 2, for the means and for the variances alike. The
-    gradient reaches ``got`` only, and has no gradient of its own.
+    The gradient reaches ``got`` only, and has no gradient of its own.
 
     Args:
         got: ``[.., H, W, C]``, H and W at least 11.
@@ -57,121 +51,22 @@ def structure(got: Tensor, want: Tensor) -> Tensor:
 class _Structure(torch.autograd.Function):
     """``structure``, whose gradient is computed with its value.
 
-    A picture's value depends on no other picture, so its gradient is a factor times its slope. On a
-    CPU float32 has a kernel of its own (``kernels/ssim``); the rest of this file's SSIM is for GPUs
-    and other dtypes.
+    A picture's value depends on no other picture, so its gradient is a factor times its slope.
     """
 
     @staticmethod
     def forward(ctx: Any, got: Tensor, want: Tensor) -> Tensor:
-        lead, shape = got.shape[:-3], got.shape[-3:]
-        if got.device.type == "cpu" and got.dtype == want.dtype == torch.float32:
-            a, b = (x.detach().reshape(-1, *shape) for x in (got, want))
-            made, slope = dissimilarity(a, b, ctx.needs_input_grad[0])
-            if slope is not None:
-                ctx.save_for_backward(slope.view(got.shape))
-            return made.reshape(lead)
-        pictures, truths = (
-            x.detach().reshape(-1, *shape).movedim(-1, 1).contiguous() for x in (got, want)
-        )
-        band = _band(pictures)
-        slopes = torch.zeros_like(pictures) if ctx.needs_input_grad[0] else None
-        size = max(1, len(pictures))
-        if pictures.device.type == "cpu":
-            size = max(1, _CACHED // max(1, math.prod(pictures.shape[1:])))
-        values = []
+        a, b = (x.reshape(-1, *got.shape[-3:]) for x in (got, want))
         with float32_products():  # a variance is the small difference of two means of products
-            for i in range(0, len(pictures), size):
-                part = slice(i, i + size)
-                slope = None if slopes is None else slopes[part]
-                values.append(_unequal(pictures[part], truths[part], band, slope))
-        if slopes is not None:
-            ctx.save_for_backward(slopes.movedim(1, -1).reshape(got.shape))
-        return torch.cat(values).reshape(lead) if values else pictures.new_zeros(lead)
+            values, slope = dissimilarity(a, b, ctx.needs_input_grad[0])
+        if slope is not None:
+            ctx.save_for_backward(slope.reshape(got.shape))
+        return values.reshape(got.shape[:-3])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, None]:
         return cotangents[0][..., None, None, None] * ctx.saved_tensors[0], None
-
-
-def _unequal(got: Tensor, want: Tensor, band: Tensor, slope: Tensor | None) -> Tensor:
-    """1 - SSIM of ``[n, C, H, W]``: ``[n]``; its derivative goes into ``slope``, if that is given.
-
-    Windows in which the pictures are equal, as they are on the background, add 0 and have no
-    slope. A CPU leaves out the rows and columns that lie in no other window.
-    """
-    count = got.shape[1] * (got.shape[2] - SSIM_WINDOW + 1) * (got.shape[3] - SSIM_WINDOW + 1)
-    if got.device.type == "cpu":
-        box = _box((got != want).flatten(0, 1).any(0))
-        if box is None:
-            return got.new_zeros(len(got))
-        got, want = got[..., box[0], box[1]], want[..., box[0], box[1]]
-        slope = None if slope is None else slope[..., box[0], box[1]]
-    # The variances do not depend on a constant. Without the background, which a corner has as a
-    # rule, those of flat regions are no differences of large numbers.
-    shift = 2 * want[..., :1, :1]
-    maps = got.new_empty(4, *got.shape)
-    torch.sub(torch.add(got, want, out=maps[0]), shift, out=maps[0])
-    torch.sub(got, want, out=maps[1])
-    torch.mul(maps[:2], maps[:2], out=maps[2:])
-    means = _window_means(maps, band)
-    s, d = means[0] + shift, means[1]
-    variances = means[2:] - means[:2].square()
-    bright, dark = s.square() + _C1 * 2, d.square()
-    rough, odd = variances[0] + _C2 * 2, variances[1]
-    light, shape = (bright - dark) / (bright + dark), (rough - odd) / (rough + odd)
-    if slope is not None:
-        # of the value by the means of s and d together, of s², and of d²
-        by = torch.empty_like(means[:3])
-        factor = light * (-2 / count) / (rough + odd).square()
-        torch.mul(factor, odd, out=by[1])
-        torch.mul(factor, -rough, out=by[2])
-        factor = shape * (-4 / count) / (bright + dark).square()
-        by[0] = factor * (dark * s - bright * d) - 2 * (by[1] * means[0] + by[2] * d)
-        edge = SSIM_WINDOW - 1  # the window is symmetric, so its transpose is itself, padded
-        back = _window_means(pad(by, (edge,) * 4), band)
-        slope.copy_(back[0] + 2 * (maps[0] * back[1] + maps[1] * back[2]))
-    return (1 - light * shape).sum((1, 2, 3)) / count
-
-
-def _box(unequal: Tensor) -> tuple[slice, slice] | None:
-    """The rows and columns of all windows that hold a True of ``[H, W]``; None if there is none."""
-    sides = []
-    for axis in (1, 0):
-        places = unequal.any(axis).nonzero()[:, 0].tolist()
-        if not places:
-            return None
-        reach = SSIM_WINDOW - 1
-        sides.append(slice(max(0, places[0] - reach), places[-1] + reach + 1))
-    return sides[0], sides[1]
-
-
-def _band(like: Tensor) -> Tensor:
-    """SSIM's Gaussian window as the band of a matrix: ``[_TILE + 10, _TILE]``."""
-    rows = torch.arange(_TILE + SSIM_WINDOW - 1, device=like.device)  # no copy from the host
-    places = (rows[:, None] - rows[:_TILE]).double()
-    weights = torch.exp(-(places - SSIM_WINDOW // 2).square() / (2 * SSIM_SIGMA**2))
-    weights = torch.where((places >= 0) & (places < SSIM_WINDOW), weights, 0.0)
-    return (weights / weights[:SSIM_WINDOW, 0].sum()).to(like.dtype)
-
-
-def _window_means(maps: Tensor, band: Tensor) -> Tensor:
-    """Means over SSIM's window, ``[.., H, W]`` to ``[.., H - 10, W - 10]``, by products.
-
-    A matrix for whole rows would be zeros but for its band, so a product makes ``_TILE`` columns.
-    """
-    edge, lead = SSIM_WINDOW - 1, maps.shape[:-2]
-    planes = maps.reshape(-1, *maps.shape[-2:])
-    for axis in (2, 1):
-        total = planes.shape[axis] - edge
-        parts = []
-        for start in range(0, total, _TILE):
-            size = min(_TILE, total - start)
-            piece, tile = planes.narrow(axis, start, size + edge), band[: size + edge, :size]
-            parts.append(piece @ tile if axis == 2 else tile.mT @ piece)
-        planes = torch.cat(parts, axis)
-    return planes.unflatten(0, lead)
 
 
 def rendered_psnr(got: Tensor, want: Tensor) -> Tensor:

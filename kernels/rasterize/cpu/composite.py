@@ -17,10 +17,11 @@ from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.views import vectors, view
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
-from ..tiles import Bins, Picture, Walk, color_row, q_limit
+from ..tiles import Bins, PairGradients, Picture, Walk, color_row, q_limit
 from . import lanes as L
 from .blend import blend_leaves
 from .lanes import block_leaves, lanes, lanes_int
+from .reduce import reduce_rows
 from .tuning import Tuning
 
 # To unroll the loops over blocks and pixels would take the compiler long, for no gain.
@@ -336,8 +337,8 @@ def composite_backward(
     v_renders: Tensor,
     v_alphas: Tensor,
     geometry: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradient sums of each pair, in emission order, for ``reduce_pairs``.
+) -> tuple[PairGradients, Tensor]:
+    """Gradients of ``composite_forward`` by (view, Gaussian), from a row of sums for each pair.
 
     Args:
         means2d: as forward.
@@ -353,8 +354,7 @@ def composite_backward(
         geometry: whether anything but colours is asked for.
 
     Returns:
-        ``v_pairs [P, 6 + C]``, ``written [P]`` uint8, 0 where a row was left as it was, and
-        ``skipped [tiles]`` int32, 1 where a tile was not walked.
+        The gradients and ``skipped [tiles]`` int32, 1 where a tile was not walked.
     """
     tiles, channels = walk.walked.numel(), colors.shape[1]
     v_pairs = empty([bins.pairs.numel(), 6 + channels], torch.float32)
@@ -390,4 +390,4 @@ def composite_backward(
             skipped,
         ],
     )
-    return v_pairs, written, skipped
+    return reduce_rows(v_pairs, written, bins, conics, view_opacities, geometry), skipped

@@ -1,9 +1,16 @@
-"""Sums of pair gradients by Gaussian on the CPU: a row of a pair as lanes, in emission order."""
+"""Sums of pair gradients by Gaussian on the CPU: a row of a pair as lanes, in emission order.
+
+The rows of a Gaussian are added by one thread, without atomics: the same bits every time.
+"""
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from ...runtime.launch import parallel_launch
+from ...runtime.memory import empty
+from ...runtime.views import vectors
+from ..tiles import Bins, PairGradients
 from .lanes import TYPES
 
 wp.set_module_options({"enable_backward": False})
@@ -25,7 +32,7 @@ for (int j = begin; j < end; ++j) {
     if (width <= 16) {
         F sum = F{};
         for (int p = from; p < to; ++p) {
-            if (written.data && !written.data[p]) continue;
+            if (!written.data[p]) continue;
             const float* const row = v_pairs.data + (size_t)p * width;
             if ((long long)p * width + 16 <= all) sum += *(const F*)row;
             else {
@@ -39,7 +46,7 @@ for (int j = begin; j < end; ++j) {
     } else {
         for (int c = 0; c < channels; ++c) colors[c] = 0.0f;
         for (int p = from; p < to; ++p) {
-            if (written.data && !written.data[p]) continue;
+            if (!written.data[p]) continue;
             const float* const row = v_pairs.data + (size_t)p * width;
             for (int c = 0; c < 6; ++c) sums[c] += row[c];
             for (int c = 0; c < channels; ++c) colors[c] += row[6 + c];
@@ -113,14 +120,49 @@ def _reduce_rows(
     )
 
 
-def reduce_rows(count: int, inputs: list, outputs: list) -> None:
-    """Does what the scalar kernel of ``../reduce.py`` does, to the same bits.
+def reduce_rows(
+    v_pairs: Tensor,
+    written: Tensor,
+    bins: Bins,
+    conics: Tensor,
+    view_opacities: Tensor,
+    geometry: bool,
+) -> PairGradients:
+    """Sums rows of pairs by (view, Gaussian); float32, contiguous tensors on the CPU.
 
     Args:
-        count: of the Gaussians of all views.
-        inputs: as the scalar kernel has them.
-        outputs: as the scalar kernel has them.
+        v_pairs: ``[P, 6 + C]``: six moments of h (README eq. 11), then the colours.
+        written: ``[P]`` uint8, 0 where a row of ``v_pairs`` was not written and is not read.
+        bins: as forward.
+        conics: ``[I, N, 3]``.
+        view_opacities: ``[I, N]``.
+        geometry: whether anything but colours is asked for.
     """
-    tasks = -(-count // _RUN)
-    pieces = min(tasks, _PIECES_PER_THREAD * torch.get_num_threads())
-    parallel_launch(_reduce_rows, tasks, inputs, outputs, pieces=pieces)
+    lead, channels = view_opacities.shape, v_pairs.shape[1] - 6
+    v_means2d = v_conics = v_opacities = None
+    if geometry:
+        v_means2d, v_conics, v_opacities = (
+            empty([*lead, *size], torch.float32) for size in ((2,), (3,), ())
+        )
+    v_colors = empty([*lead, channels], torch.float32)
+    tasks = -(-bins.order.numel() // _RUN)
+    parallel_launch(
+        _reduce_rows,
+        tasks,
+        [
+            bins.order,
+            bins.offsets,
+            v_pairs,
+            written,
+            vectors(conics, wp.vec3),
+            view_opacities.view(-1),
+        ],
+        [
+            vectors(v_means2d, wp.vec2),
+            vectors(v_conics, wp.vec3),
+            None if v_opacities is None else v_opacities.view(-1),
+            v_colors.view(-1, channels),
+        ],
+        pieces=min(tasks, _PIECES_PER_THREAD * torch.get_num_threads()),
+    )
+    return PairGradients(v_means2d, v_conics, v_opacities, v_colors)

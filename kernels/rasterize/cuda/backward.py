@@ -13,6 +13,19 @@ import warp as wp
 from ..skip import UNUSED, ZERO_UPSTREAM
 from ..tiles import Picture
 from .complete import completing, shared_size
+from .leaves import (
+    exp2,
+    exponent,
+    load,
+    load1,
+    load2,
+    load3,
+    load_int,
+    load_stop,
+    lowest_bit,
+    reciprocal,
+    sheared,
+)
 from .warp import (
     HEIGHT,
     RECORD,
@@ -21,20 +34,11 @@ from .warp import (
     WARP,
     WIDTH,
     Gaussians,
-    exp2,
-    exponent,
+    Place,
     first_block,
-    load,
-    load1,
-    load2,
-    load3,
-    load_int,
-    load_stop,
-    lowest_bit,
+    kernel_options,
     placing,
-    reciprocal,
     shared_memory,
-    sheared,
     staging,
     touching,
 )
@@ -44,8 +48,8 @@ _ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
 _UNUSED = wp.constant(UNUSED)
 
 
-def _resident(channels: int) -> int:
-    """Warps of a multiprocessor, as registers allow."""
+def _warps(channels: int) -> int:
+    """How many of a multiprocessor there are registers for."""
     return 20 if channels < 4 else 16
 
 
@@ -112,6 +116,41 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
 
     @wp.func
     @no_type_check
+    def start(
+        picture: Picture,
+        gaussians: Gaussians,
+        p: Place,
+        walked: wp.int32,
+        transmittances: wp.array2d[wp.float32],
+        v_renders: wp.array2d[wp.float32],
+        v_alphas: wp.array2d[wp.float32],
+    ):
+        # the lane's pixels before the walk, and bits of the blocks whose upstream gradient is not 0
+        T = pixels_type()
+        R = pixels_type()
+        upstream = upstream_type()
+        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
+        some = wp.int32(0)
+        for j in range(wp.static(pixels)):
+            if walked > 0:
+                T[j] = load(transmittances, p.place, j * WARP)
+            if T[j] != 0.0:
+                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
+                largest = wp.float32(0.0)
+                if gaussians.first == 0:
+                    R[j] = -load(v_alphas, p.pixel, step)
+                    largest += wp.abs(R[j])
+                step *= gaussians.channels
+                for c in range(wp.static(channels)):
+                    upstream[j, c] = load(v_renders, first, step + c)
+                    largest += wp.abs(upstream[j, c])
+                # NaN is not taken for zero
+                if not (largest <= 0.0):
+                    some |= wp.static(3 << first_block(j))
+        return T, R, upstream, some
+
+    @wp.func
+    @no_type_check
     def walk(
         picture: Picture,
         gaussians: Gaussians,
@@ -131,30 +170,12 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
         skipped_out: wp.array[wp.int32],
     ):
         p = place(picture, index, lane)
-        # as forward left it: negative until the walk comes to where the pixel stopped
-        T = pixels_type()
-        # README eq. 10, less the gradient of alpha, which is the same for all pairs
-        R = pixels_type()
-        upstream = upstream_type()
-        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
-        some = wp.int32(0)
         walked = walked_in[p.tile] * wp.static(1 if listed else -1)
-        for j in range(wp.static(pixels)):
-            if walked > 0:
-                T[j] = load(transmittances_in, p.place, j * WARP)
-            if T[j] != 0.0:
-                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
-                largest = wp.float32(0.0)
-                if gaussians.first == 0:
-                    R[j] = -load(v_alphas_in, p.pixel, step)
-                    largest += wp.abs(R[j])
-                step *= gaussians.channels
-                for c in range(wp.static(channels)):
-                    upstream[j, c] = load(v_renders_in, first, step + c)
-                    largest += wp.abs(upstream[j, c])
-                # NaN is not taken for zero
-                if not (largest <= 0.0):
-                    some |= wp.static(3 << first_block(j))
+        # T is as forward left it, negative until the walk comes to where the pixel stopped; R is
+        # that of README eq. 10, less the gradient of alpha, which is the same for all pairs
+        T, R, upstream, some = start(
+            picture, gaussians, p, walked, transmittances_in, v_renders_in, v_alphas_in
+        )
         if (picture.skip & _ZERO_UPSTREAM) == 0:
             some = wp.static(part_blocks)
         wanted = memory.any_of(arena, lane, some)
@@ -243,12 +264,7 @@ def backward_kernel(channels: int, geometry: bool, parts: int):
     """
     size, walk = shared_size(channels, geometry), _walking(channels, geometry, parts, True)
 
-    @wp.kernel(
-        enable_backward=False,
-        module="unique",
-        launch_bounds=(WARP, _resident(channels)),
-        grid_stride=False,
-    )
+    @wp.kernel(**kernel_options(_warps(channels)))
     @no_type_check
     def composite_vjp(
         picture: Picture,
@@ -297,12 +313,7 @@ def unlisted_kernel(channels: int, geometry: bool, parts: int):
     """
     size, walk = shared_size(channels, geometry), _walking(channels, geometry, parts, False)
 
-    @wp.kernel(
-        enable_backward=False,
-        module="unique",
-        launch_bounds=(WARP, _resident(channels)),
-        grid_stride=False,
-    )
+    @wp.kernel(**kernel_options(_warps(channels)))
     @no_type_check
     def composite_vjp_unlisted(
         picture: Picture,

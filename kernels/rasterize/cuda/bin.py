@@ -88,11 +88,11 @@ def bin_views(
     """As ``bin_views`` of the CPU, but the lists may have room for more pairs than there are.
 
     Args:
-        grid: as there, like ``depths``, ``inputs`` and ``check``.
-        depths: see above.
-        inputs: see above.
-        check: see above; it is not called where the count is not read back.
-        exact: read the number of pairs back and make the lists as long.
+        grid: from ``make_grid``.
+        depths: ``[I, N]``, not negative.
+        inputs: flat views of means2d, conics, opacities and extents.
+        check: raises if there are too many; it is called only where the number is read back.
+        exact: whether to read the number of pairs back and to make the lists as long.
     """
     device, (images, num) = depths.device, depths.shape
     # stable: equal depths stay in the order of the Gaussians

@@ -4,16 +4,8 @@ import functools
 
 import warp as wp
 
-from .warp import (
-    CHUNK,
-    PITCH,
-    RECORD,
-    WARP,
-    Gaussians,
-    load,
-    shared_memory,
-    store,
-)
+from .leaves import load, store
+from .warp import CHUNK, PITCH, RECORD, WARP, Gaussians, shared_memory
 
 wp.set_module_options({"enable_backward": False})
 

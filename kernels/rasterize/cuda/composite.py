@@ -15,9 +15,10 @@ from torch import Tensor
 from ...runtime.launch import cuda_launch
 from ...runtime.recording import multiprocessors_of
 from ...runtime.views import array
-from ..tiles import Bins, Picture, Walk
+from ..tiles import Bins, PairGradients, Picture, Walk
 from . import backward, forward
 from .complete import row_length
+from .reduce import reduce_rows
 from .warp import CHUNK, WARP, Gaussians
 
 
@@ -107,8 +108,8 @@ def composite_backward(
     v_renders: Tensor,
     v_alphas: Tensor,
     geometry: bool,
-) -> tuple[Tensor, None, Tensor]:
-    """As ``composite_backward`` of the CPU; the rows are those of ``reduce_rows``, all written."""
+) -> tuple[PairGradients, Tensor]:
+    """As ``composite_backward`` of the CPU; ``tuning`` is not read."""
     tiles, channels = walk.walked.numel(), colors.shape[1]
     gaussians = _gaussians(means2d, conics, view_opacities, colors)
     parts = parts_of_tile(tiles, colors.device)
@@ -140,7 +141,7 @@ def composite_backward(
         ):
             arguments = [picture, gaussians, *lists, *inputs]
             _launch(kernel, warps, arguments, outputs, colors.device)
-    return v_pairs, None, skipped
+    return reduce_rows(v_pairs, bins, conics, view_opacities, geometry), skipped
 
 
 def _launch(kernel: Any, warps: int, inputs: list, outputs: list, device: torch.device) -> None:

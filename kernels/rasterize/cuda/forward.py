@@ -11,6 +11,21 @@ import warp as wp
 
 from ..skip import BLOCK_TEST, STOPPED
 from ..tiles import Picture
+from .leaves import (
+    anew,
+    count_bits,
+    exp2,
+    exponent,
+    load1,
+    load2,
+    load3,
+    load_int,
+    lowest_bit,
+    sheared,
+    store,
+    store_int,
+    store_stop,
+)
 from .warp import (
     HEIGHT,
     RECORD,
@@ -19,23 +34,12 @@ from .warp import (
     WARP,
     WIDTH,
     Gaussians,
-    anew,
-    count_bits,
-    exp2,
-    exponent,
+    Place,
     first_block,
-    load1,
-    load2,
-    load3,
-    load_int,
-    lowest_bit,
+    kernel_options,
     placing,
     shared_memory,
-    sheared,
     staging,
-    store,
-    store_int,
-    store_stop,
     touching,
     word,
 )
@@ -45,8 +49,8 @@ _BLOCK_TEST = wp.constant(BLOCK_TEST)
 _STOPPED = wp.constant(STOPPED)
 
 
-def _resident(channels: int) -> int:
-    """Warps of a multiprocessor, as registers allow."""
+def _warps(channels: int) -> int:
+    """How many of a multiprocessor there are registers for."""
     return 24 if channels < 4 else 20
 
 
@@ -67,6 +71,18 @@ def _walking(channels: int, parts: int, listed: bool):
 
     @wp.func
     @no_type_check
+    def start(picture: Picture, p: Place):
+        # the transmittances of the lane's pixels, and bits of those that lie in the picture
+        T = pixels_type()
+        inside = wp.int32(0)
+        for j in range(wp.static(pixels)):
+            if p.px + j % 2 * WIDTH < picture.width and p.py + j // 2 * HEIGHT < picture.height:
+                T[j] = 1.0
+                inside |= 1 << j
+        return T, inside
+
+    @wp.func
+    @no_type_check
     def leave(blocks: wp.array[wp.int32], k: wp.int32, part: wp.int32, mine: wp.int32):
         # stores the bits of a pair, or joins those of the parts, or of the tiles that share it
         if wp.static(parts == 1 and listed):
@@ -77,6 +93,29 @@ def _walking(channels: int, parts: int, listed: bool):
             shifted = (mine & wp.static((1 << STOP) - 1)) << shift_used
             shifted |= (mine & wp.static(~((1 << STOP) - 1))) << shift_stop
             wp.atomic_or(blocks, k, shifted)
+
+    @wp.func
+    @no_type_check
+    def put(
+        picture: Picture,
+        gaussians: Gaussians,
+        p: Place,
+        T: pixels_type,
+        sums: sums_type,
+        transmittances: wp.array2d[wp.float32],
+        renders: wp.array2d[wp.float32],
+        alphas: wp.array2d[wp.float32],
+    ):
+        # stores the lane's pixels
+        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
+        for j in range(wp.static(pixels)):
+            store(transmittances, p.place, j * WARP, T[j])
+            if T[j] != 0.0:
+                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
+                store(alphas, p.pixel, step, 1.0 - wp.abs(T[j]))
+                step *= gaussians.channels
+                for c in range(wp.static(channels)):
+                    store(renders, first, step + c, sums[j, c])
 
     @wp.func
     @no_type_check
@@ -100,14 +139,9 @@ def _walking(channels: int, parts: int, listed: bool):
     ):
         p = place(picture, index, lane)
         half = lane // 4 % 2  # which of a sub-tile's two blocks of 4 x 4 pixels
-        # positive: the pixel goes on; negative: it stopped; 0: it is outside the picture
-        T = pixels_type()
+        # T is positive where a pixel goes on, negative where it stopped, 0 outside of the picture
+        T, inside = start(picture, p)
         sums = sums_type()
-        inside = wp.int32(0)
-        for j in range(wp.static(pixels)):
-            if p.px + j % 2 * WIDTH < picture.width and p.py + j // 2 * HEIGHT < picture.height:
-                T[j] = 1.0
-                inside |= 1 << j
         live = memory.any_of(arena, lane, inside)
 
         walked = end - begin
@@ -191,15 +225,7 @@ def _walking(channels: int, parts: int, listed: bool):
         if lane == 0 and gaussians.first == 0:
             wp.atomic_add(blocks_walked_out, p.tile, wp.int64(evaluated))
         p = place(picture, anew(index), lane)
-        first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
-        for j in range(wp.static(pixels)):
-            store(transmittances_out, p.place, j * WARP, T[j])
-            if T[j] != 0.0:
-                step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
-                store(alphas_out, p.pixel, step, 1.0 - wp.abs(T[j]))
-                step *= gaussians.channels
-                for c in range(wp.static(channels)):
-                    store(renders_out, first, step + c, sums[j, c])
+        put(picture, gaussians, p, T, sums, transmittances_out, renders_out, alphas_out)
 
     return walk
 
@@ -209,12 +235,7 @@ def forward_kernel(channels: int, parts: int):
     """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4."""
     walk = _walking(channels, parts, True)
 
-    @wp.kernel(
-        enable_backward=False,
-        module="unique",
-        launch_bounds=(WARP, _resident(channels)),
-        grid_stride=False,
-    )
+    @wp.kernel(**kernel_options(_warps(channels)))
     @no_type_check
     def composite(
         picture: Picture,
@@ -262,12 +283,7 @@ def unlisted_kernel(channels: int, parts: int):
     """
     walk = _walking(channels, parts, False)
 
-    @wp.kernel(
-        enable_backward=False,
-        module="unique",
-        launch_bounds=(WARP, _resident(channels)),
-        grid_stride=False,
-    )
+    @wp.kernel(**kernel_options(_warps(channels)))
     @no_type_check
     def composite_unlisted(
         picture: Picture,

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from ...runtime.launch import launch
 from ...runtime.views import vectors
-from ..reduce import PairGradients
-from ..tiles import Bins
+from ..tiles import Bins, PairGradients
 from .complete import columns_of_moments, row_length
 
 wp.set_module_options({"enable_backward": False})
@@ -97,18 +96,16 @@ def _finish(
 
 def reduce_rows(
     v_pairs: Tensor,
-    written: Tensor | None,
     bins: Bins,
     conics: Tensor,
     view_opacities: Tensor,
     geometry: bool,
 ) -> PairGradients:
-    """As ``reduce_pairs``, of the rows that CUDA's ``composite_backward`` makes.
+    """Sums rows by (view, Gaussian), as the CPU's; all rows are written.
 
     Args:
         v_pairs: ``[P, parts, 6 · chunks + C]``, or where the lists had no room, rows of Gaussians
             in the order of ``bins.order``.
-        written: None: all rows are written.
         bins: as forward.
         conics: ``[I, N, 3]``.
         view_opacities: ``[I, N]``.

@@ -1,13 +1,9 @@
-"""The harmonics on the CPU: sixteen Gaussians as the lanes of one SIMD value.
+"""The harmonics on the CPU: kernels and launches of what ``lanes.py`` says in C++.
 
-Rows of coefficients are turned, 16 x 16 floats at a time, so that a lane holds those of one
-Gaussian; what is computed with them is then arithmetic on lanes, and the gradient is turned back.
 A thread takes chunks of Gaussians with all views of them, so that no two add to the same place.
-README.md §6 of the rasterizer holds the maths.
 """
 
 import functools
-from types import SimpleNamespace
 
 import torch
 import warp as wp
@@ -15,243 +11,14 @@ from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from .polynomials import SHORTEST, basis_text, slopes_text
+from .lanes import CHUNK, backward_text, forward_text
 
-_LANES = 16
-_CHUNK = 256  # Gaussians whose gradient by a centre is one partial sum
-_UNROLLED = 96  # floats of a row up to which its loops are written out
-
-
-def _turning() -> str:
-    """C++ that transposes 16 x 16 floats by exchanging ever smaller squares."""
-    steps = []
-    for width in (8, 4, 2, 1):
-        low = [lane if not lane & width else 16 + lane - width for lane in range(16)]
-        high = [lane + width if not lane & width else 16 + lane for lane in range(16)]
-        low, high = (", ".join(map(str, side)) for side in (low, high))
-        for i in range(16):
-            if not i & width:
-                a, b = f"r[{i}]", f"r[{i + width}]"
-                steps.append(
-                    f"{{ const F a = {a}, b = {b};"
-                    f" {a} = __builtin_shufflevector(a, b, {low});"
-                    f" {b} = __builtin_shufflevector(a, b, {high}); }}"
-                )
-    return "\n".join(steps)
-
-
-# A row of coefficients is K * D floats, of which FLOATS are used. Lanes beyond the last Gaussian
-# hold the last one again.
-_COMMON = """
-    typedef float F __attribute__((vector_size(64), aligned(4)));
-    typedef int I __attribute__((vector_size(64), aligned(4)));
-    const int COUNT = {count}, D = {channels}, FLOATS = COUNT * D, PADDED = (FLOATS + 15) / 16 * 16;
-    const float SHORTEST = {shortest}f;
-    auto fma_ = [](F a, F b, F c) -> F {{ return __builtin_elementwise_fma(a, b, c); }};
-    auto any_ = [](I mask) -> bool {{ return __builtin_reduce_or(mask) != 0; }};
-    // not finite, by the exponent's bits
-    auto wild_ = [](F x) -> I {{ return ((I)x & 0x7fffffff) >= 0x7f800000; }};
-    auto turn_ = [](F* r) {{ {turning} }};
-    const size_t K_D = coefficients.shape[1];
-    const float* const stop = coefficients.data + (size_t)coefficients.shape[0] * K_D;
-    // turns the rows of ``live`` Gaussians: the i-th float of each becomes into[i]
-    auto load_rows_ = [&](const float* row, int live, F* into) {{
-        const bool inside = row + (live - 1) * K_D + PADDED <= stop;
-        for (int o = 0; o < FLOATS; o += 16) {{
-            F r[16];
-            for (int j = 0; j < 16; ++j) {{
-                const float* const from = row + (j < live ? j : live - 1) * K_D + o;
-                if (inside) {{
-                    r[j] = *(const F*)from;
-                }} else {{
-                    float part[16] = {{}};
-                    for (int i = 0; i < 16 && o + i < FLOATS; ++i) part[i] = from[i];
-                    r[j] = *(const F*)part;
-                }}
-            }}
-            turn_(r);
-            for (int i = 0; i < 16; ++i) into[o + i] = r[i];
-        }}
-    }};
-    // from the centre to the means of the lanes: its length, at least SHORTEST, and the direction
-    auto direction_ = [&](const float* center, const F* mean, F* t) -> F {{
-        for (int i = 0; i < 3; ++i) t[i] = mean[i] - center[i];
-        const F square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2];
-        const F size = __builtin_elementwise_sqrt(square);
-        const F divisor = size > SHORTEST ? size : F{{}} + SHORTEST;
-        for (int i = 0; i < 3; ++i) t[i] /= divisor;
-        return size;
-    }};
-    auto basis_ = [&](F x, F y, F z, F* Y) {{ {basis} }};
-    const int chunks = (num + {chunk} - 1) / {chunk};
-    const int b = piece / chunks, begin = piece % chunks * {chunk};
-    const int end = begin + {chunk} < num ? begin + {chunk} : num;
-    for (int first = begin; first < end; first += 16) {{
-        const int live = end - first < 16 ? end - first : 16;
-        const float* const points = means.data + ((size_t)b * num + first) * 3;
-        F mean[3];
-        for (int j = 0; j < 16; ++j)
-            for (int i = 0; i < 3; ++i) mean[i][j] = points[(j < live ? j : live - 1) * 3 + i];
-        {body}
-    }}
-"""
-
-_FORWARD = """
-        F T[PADDED];
-        I lost = {};
-        for (int i = 0; i < 3; ++i) lost |= wild_(mean[i]);
-        for (int view = 0; view < views; ++view) {
-            const size_t image = (size_t)b * views + view, at = image * num + first;
-            const size_t row = per_view ? at : (size_t)b * num + first;
-            if (per_view || view == 0) load_rows_(coefficients.data + row * K_D, live, T);
-            F t[3], Y[COUNT], sum[D];
-            direction_(centers.data + image * 3, mean, t);
-            basis_(t[0], t[1], t[2], Y);
-            for (int d = 0; d < D; ++d) sum[d] = Y[0] * T[d];
-            UNROLL
-            for (int k = 1; k < COUNT; ++k)
-                UNROLL
-                for (int d = 0; d < D; ++d) sum[d] = fma_(Y[k], T[k * D + d], sum[d]);
-            // a coefficient that is not finite leaves a sum that is not; the reverse need not hold
-            I bad = lost;
-            for (int d = 0; d < D; ++d) bad |= wild_(sum[d]);
-            if (any_(bad))
-                for (int j = 0; j < live; ++j) {
-                    bool finite = !lost[j];
-                    for (int i = 0; i < FLOATS; ++i)
-                        finite &= __builtin_isfinite(coefficients.data[(row + j) * K_D + i]);
-                    bad[j] = finite ? 0 : -1;
-                }
-            float values[16 * D];
-            for (int d = 0; d < D; ++d) {
-                const F color = sum[d] + 0.5f;
-                const F shown = bad ? F{} + __builtin_nanf("") : (color < 0.0f ? F{} : color);
-                for (int j = 0; j < 16; ++j) values[j * D + d] = shown[j];
-            }
-            __builtin_memcpy(colors.data + at * D, values, (size_t)live * D * 4);
-        }
-"""
-
-_BACKWARD = """
-        F T[PADDED], v_T[PADDED], v_mean[3] = {};
-        const bool slopes = COUNT > 1 && (v_means.data || v_centers.data);
-        for (int view = 0; view < views; ++view) {
-            const size_t image = (size_t)b * views + view, at = image * num + first;
-            const size_t row = per_view ? at : (size_t)b * num + first;
-            if (slopes && (per_view || view == 0))
-                load_rows_(coefficients.data + row * K_D, live, T);
-            F v[D];
-            I alive = {};
-            const float* const values = v_colors.data + at * D;
-            for (int d = 0; d < D; ++d) {
-                F value = {}, shown = {};
-                for (int j = 0; j < live; ++j) {
-                    value[j] = values[j * D + d];
-                    shown[j] = colors.data[(at + j) * D + d];
-                }
-                v[d] = shown > 0.0f ? value : F{};
-                alive |= shown > 0.0f;
-            }
-            F t[3], Y[COUNT];
-            const F size = direction_(centers.data + image * 3, mean, t);
-            // what passes no gradient on may hold NaN, which must not meet a zero
-            for (int i = 0; i < 3; ++i) t[i] = alive ? t[i] : F{};
-            basis_(t[0], t[1], t[2], Y);
-            if (v_coefficients.data) {
-                if (per_view || view == 0) {
-                    UNROLL
-                    for (int k = 0; k < COUNT; ++k)
-                        UNROLL
-                        for (int d = 0; d < D; ++d) v_T[k * D + d] = Y[k] * v[d];
-                } else {
-                    UNROLL
-                    for (int k = 0; k < COUNT; ++k)
-                        UNROLL
-                        for (int d = 0; d < D; ++d)
-                            v_T[k * D + d] = fma_(Y[k], v[d], v_T[k * D + d]);
-                }
-                if (per_view || view == views - 1)
-                    store_rows_(v_coefficients.data + row * K_D, live, v_T);
-            }
-            if (!slopes) continue;
-            F s[COUNT];
-            UNROLL
-            for (int k = 0; k < COUNT; ++k) {
-                s[k] = T[k * D] * v[0];
-                UNROLL
-                for (int d = 1; d < D; ++d) s[k] = fma_(T[k * D + d], v[d], s[k]);
-            }
-            F v_t[3] = {};
-            slopes_(t[0], t[1], t[2], s, v_t[0], v_t[1], v_t[2]);
-            // through the division by the length, which is a constant where it is SHORTEST
-            F along = t[0] * v_t[0] + t[1] * v_t[1] + t[2] * v_t[2];
-            along = size >= SHORTEST ? along : F{};
-            const F divisor = size > SHORTEST ? size : F{} + SHORTEST;
-            for (int i = 0; i < 3; ++i) {
-                v_t[i] = alive ? (v_t[i] - t[i] * along) / divisor : F{};
-                v_mean[i] += v_t[i];
-            }
-            if (v_centers.data) {
-                float* const out = v_centers.data + (image * chunks + piece % chunks) * 3;
-                for (int i = 0; i < 3; ++i)
-                    out[i] = (first == begin ? 0.0f : out[i]) - total_(v_t[i]);
-            }
-        }
-        if (v_means.data)
-            for (int j = 0; j < live; ++j)
-                for (int i = 0; i < 3; ++i)
-                    v_means.data[((size_t)b * num + first + j) * 3 + i] = v_mean[i][j];
-"""
-
-# What the gradient needs beside that: it comes before the loop over Gaussians.
-_BACKWARD_TOOLS = """
-    auto slopes_ = [&](F x, F y, F z, const F* s, F& v_x, F& v_y, F& v_z) {{ {slopes} }};
-    // pairwise, in a fixed order
-    auto total_ = [](F x) -> float {{
-        float s[16];
-        *(F*)s = x;
-        for (int w = 8; w > 0; w >>= 1)
-            for (int l = 0; l < w; ++l) s[l] += s[l + w];
-        return s[0];
-    }};
-    // the way back from load_rows_, and zeros for the coefficients that are not used
-    auto store_rows_ = [&](float* row, int live, const F* from) {{
-        for (int o = 0; o < FLOATS; o += 16) {{
-            F r[16];
-            for (int i = 0; i < 16; ++i) r[i] = from[o + i];
-            turn_(r);
-            for (int j = 0; j < live; ++j)
-                if (o + 16 <= FLOATS) *(F*)(row + j * K_D + o) = r[j];
-                else __builtin_memcpy(row + j * K_D + o, r + j, FLOATS % 16 * 4);
-        }}
-        for (int j = 0; j < live && K_D > FLOATS; ++j)
-            __builtin_memset(row + j * K_D + FLOATS, 0, (K_D - FLOATS) * 4);
-    }};
-"""
-
-
-def _text(body: str, degree: int, channels: int, tools: str = "") -> str:
-    count = (degree + 1) ** 2
-    text = _COMMON.format(
-        count=count,
-        channels=channels,
-        shortest=SHORTEST,
-        turning=_turning(),
-        basis=basis_text(degree),
-        chunk=_CHUNK,
-        body="@BODY@",
-    )
-    before, loop = text.split("const int chunks", 1)
-    text = before + tools.format(slopes=slopes_text(degree)) + "const int chunks" + loop
-    unroll = '_Pragma("clang loop unroll(full)")' if count * channels <= _UNROLLED else ""
-    return text.replace("@BODY@", body).replace("UNROLL", unroll)
+_OPTIONS = {"enable_backward": False}
 
 
 @functools.cache
-def _compiled(degree: int, channels: int) -> SimpleNamespace:
-    """The kernels of a degree and a number of channels."""
-
-    @wp.func_native(_text(_FORWARD, degree, channels))
+def _forward_kernel(degree: int, channels: int):
+    @wp.func_native(forward_text(degree, channels))
     def forward(
         piece: wp.int32,
         num: wp.int32,
@@ -263,23 +30,7 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
         colors: wp.array[wp.float32],
     ): ...
 
-    @wp.func_native(_text(_BACKWARD, degree, channels, _BACKWARD_TOOLS))
-    def backward(
-        piece: wp.int32,
-        num: wp.int32,
-        views: wp.int32,
-        per_view: wp.int32,
-        coefficients: wp.array2d[wp.float32],
-        means: wp.array[wp.float32],
-        centers: wp.array[wp.float32],
-        colors: wp.array[wp.float32],
-        v_colors: wp.array[wp.float32],
-        v_coefficients: wp.array2d[wp.float32],
-        v_means: wp.array[wp.float32],
-        v_centers: wp.array[wp.float32],
-    ): ...
-
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def harmonics(
         offset: wp.int32,
         num: wp.int32,
@@ -301,7 +52,28 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
             colors_out,
         )
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    return harmonics
+
+
+@functools.cache
+def _backward_kernel(degree: int, channels: int):
+    @wp.func_native(backward_text(degree, channels))
+    def backward(
+        piece: wp.int32,
+        num: wp.int32,
+        views: wp.int32,
+        per_view: wp.int32,
+        coefficients: wp.array2d[wp.float32],
+        means: wp.array[wp.float32],
+        centers: wp.array[wp.float32],
+        colors: wp.array[wp.float32],
+        v_colors: wp.array[wp.float32],
+        v_coefficients: wp.array2d[wp.float32],
+        v_means: wp.array[wp.float32],
+        v_centers: wp.array[wp.float32],
+    ): ...
+
+    @wp.kernel(module="unique", module_options=_OPTIONS)
     def harmonics_vjp(
         offset: wp.int32,
         num: wp.int32,
@@ -331,16 +103,17 @@ def _compiled(degree: int, channels: int) -> SimpleNamespace:
             v_centers_out,
         )
 
-    return SimpleNamespace(forward=harmonics, backward=harmonics_vjp)
+    return harmonics_vjp
 
 
 def _launch(kernel, tensors: list[Tensor], outputs: list) -> None:
+    # the tensors are coefficients, means, centers and what lies in the order of the colours
     coefficients, means, centers, *rest = tensors
     batch, num, _ = means.shape
     sizes = [num, centers.shape[1], int(coefficients.dim() == 5)]
     rows = coefficients.flatten(0, -3).flatten(1)
     inputs = [rows, means.view(-1), centers.view(-1), *(x.view(-1) for x in rest)]
-    parallel_launch(kernel, batch * -(-num // _CHUNK), [*sizes, *inputs], outputs)
+    parallel_launch(kernel, batch * -(-num // CHUNK), [*sizes, *inputs], outputs)
 
 
 def harmonics_forward(
@@ -359,7 +132,7 @@ def harmonics_forward(
         centers: ``[B, V, 3]``.
         colors: written, ``[B, V, N, D]``.
     """
-    kernel = _compiled(degree, coefficients.shape[-1]).forward
+    kernel = _forward_kernel(degree, coefficients.shape[-1])
     _launch(kernel, [coefficients, means, centers], [colors.view(-1)])
 
 
@@ -386,12 +159,12 @@ def harmonics_backward(
     (batch, views, _), num = centers.shape, means.shape[1]
     v_coefficients = empty(coefficients.shape, torch.float32) if wanted[0] else None
     v_means = torch.zeros_like(means) if wanted[1] else None
-    v_centers = means.new_zeros(batch, views, -(-num // _CHUNK), 3) if wanted[2] else None
+    v_centers = means.new_zeros(batch, views, -(-num // CHUNK), 3) if wanted[2] else None
     outputs = [
         None if v_coefficients is None else v_coefficients.flatten(0, -3).flatten(1),
         None if v_means is None else v_means.view(-1),
         None if v_centers is None else v_centers.view(-1),
     ]
-    kernel = _compiled(degree, coefficients.shape[-1]).backward
+    kernel = _backward_kernel(degree, coefficients.shape[-1])
     _launch(kernel, [coefficients, means, centers, colors, v_colors], outputs)
     return v_coefficients, v_means, None if v_centers is None else v_centers.sum(2)

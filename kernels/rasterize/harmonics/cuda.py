@@ -32,8 +32,11 @@ def _direction(mean: wp.vec3, center: wp.vec3) -> wp.vec4:
 
 
 @functools.cache
-def _compiled(degree: int) -> SimpleNamespace:
-    """The kernels of a degree."""
+def _leaves(degree: int) -> SimpleNamespace:
+    """The type ``column``, of all coefficients of a channel, and the functions of a degree.
+
+    ``basis`` gives the Y_k of a direction, ``slopes`` the gradient of ``Σ_k s_k Y_k`` by it.
+    """
     count = (degree + 1) ** 2
     column = wp.types.vector(count, wp.float32)
     packed = f"wp::vec_t<{count}, float>"
@@ -55,6 +58,16 @@ def _compiled(degree: int) -> SimpleNamespace:
                 if not wp.isfinite(coefficients[row, k, d]):
                     return False
         return True
+
+    return SimpleNamespace(
+        column=column, basis=basis, slopes=slopes, used_are_finite=used_are_finite
+    )
+
+
+@functools.cache
+def _forward_kernel(degree: int):
+    count, leaves = (degree + 1) ** 2, _leaves(degree)
+    basis, used_are_finite = leaves.basis, leaves.used_are_finite
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     @no_type_check
@@ -89,6 +102,14 @@ def _compiled(degree: int) -> SimpleNamespace:
                 if not (finite and used_are_finite(coefficients_in, row)):
                     for d in range(colors_out.shape[1]):
                         colors_out[at, d] = wp.nan
+
+    return harmonics
+
+
+@functools.cache
+def _backward_kernel(degree: int):
+    count, leaves = (degree + 1) ** 2, _leaves(degree)
+    column, basis, slopes = leaves.column, leaves.basis, leaves.slopes
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     @no_type_check
@@ -155,7 +176,7 @@ def _compiled(degree: int) -> SimpleNamespace:
             if v_means_out:
                 v_means_out[i] = v_mean
 
-    return SimpleNamespace(forward=harmonics, backward=harmonics_vjp)
+    return harmonics_vjp
 
 
 def _launch(kernel, tensors: list[Tensor], outputs: list) -> None:
@@ -177,7 +198,7 @@ def harmonics_forward(
 ) -> None:
     """As the CPU's: fills the colours."""
     outputs = [colors.flatten(0, -2)]
-    _launch(_compiled(degree).forward, [coefficients, means, centers], outputs)
+    _launch(_forward_kernel(degree), [coefficients, means, centers], outputs)
 
 
 def harmonics_backward(
@@ -200,7 +221,7 @@ def harmonics_backward(
         None if v_centers is None else view(v_centers, wp.vec3),
     ]
     tensors = [coefficients, means, centers, colors, v_colors]
-    _launch(_compiled(degree).backward, tensors, outputs)
+    _launch(_backward_kernel(degree), tensors, outputs)
     return (
         v_coefficients,
         v_means,

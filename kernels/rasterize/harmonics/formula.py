@@ -59,16 +59,16 @@ def harmonics_basis(degree: int, directions: Tensor) -> Tensor:
 
 
 def colors_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
-    """The colours of ``colors_seen_from``, with gradients of any order.
+    """The colours of ``colors_seen_from``, in any floating dtype, with gradients of any order.
 
     Args:
-        degree: 0 to 4; coefficients beyond it are not used.
-        coefficients: ``[B, N, K, D]``, or ``[B, V, N, K, D]`` for each point its own.
+        degree: as for ``colors_seen_from``, like the rest.
+        coefficients: ``[B, N, K, D]`` or ``[B, V, N, K, D]``.
         means: ``[B, N, 3]``.
-        centers: ``[B, V, 3]``, of the cameras.
+        centers: ``[B, V, 3]``.
 
     Returns:
-        ``[B, V, N, D]``; NaN without a gradient where the mean or a used coefficient is not finite.
+        ``[B, V, N, D]``, as ``colors_seen_from``.
     """
     used = coefficients[..., : (degree + 1) ** 2, :]
     used = used if used.dim() == 5 else used[:, None]

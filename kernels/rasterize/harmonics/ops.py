@@ -18,11 +18,15 @@ def _kernels(device: torch.device):
     return cpu if device.type == "cpu" else cuda
 
 
+def _empty_colors(coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    return means.new_empty(*centers.shape[:2], means.shape[1], coefficients.shape[-1])
+
+
 @without_compiler
 @torch.library.custom_op(_OP, mutates_args=())
 def harmonics(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
     """Colours as ``colors_seen_from`` returns them, of contiguous float32 tensors."""
-    colors = means.new_empty(*centers.shape[:2], means.shape[1], coefficients.shape[-1])
+    colors = _empty_colors(coefficients, means, centers)
     if colors.numel():
         _kernels(means.device).harmonics_forward(degree, coefficients, means, centers, colors)
     return colors
@@ -30,7 +34,7 @@ def harmonics(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor)
 
 @harmonics.register_fake
 def _(degree, coefficients, means, centers):
-    return means.new_empty(*centers.shape[:2], means.shape[1], coefficients.shape[-1])
+    return _empty_colors(coefficients, means, centers)
 
 
 @without_compiler

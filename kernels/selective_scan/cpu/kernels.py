@@ -1,8 +1,8 @@
-"""The CPU kernels: lanes are adjacent channels, tokens run in strips, states one by one.
+"""The CPU kernels: lanes are adjacent channels, tokens run in strips, states a few at a time.
 
 A task is one batch element, a segment of its tokens, and lane groups of one channel group. In a
-strip it holds what does not depend on the state n, and walks the tokens once per n and lane group:
-h_n lives in registers and N is free. Equations are those of README.md.
+strip it holds what does not depend on the state n, and walks the tokens once per few n and lane
+group: their h_n live in registers and N is free. Equations are those of README.md.
 """
 
 import functools
@@ -256,8 +256,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
         da_out: wp.array3d(dtype=lanes),
         db_out: wp.array2d(dtype=wp.float32),
         dc_out: wp.array2d(dtype=wp.float32),
-        dskip_out: wp.array2d(dtype=lanes),
-        dbias_out: wp.array2d(dtype=lanes),
+        dskip_out: wp.array3d(dtype=lanes),
+        dbias_out: wp.array3d(dtype=lanes),
     ):
         task = offset + wp.tid()
         p = _place(sizes, task)
@@ -287,7 +287,8 @@ def backward_kernel(tuning: Tuning, io: torch.dtype, delta_io: torch.dtype, disc
                 )  # fmt: skip
                 finish(
                     p.b, t0, count, d, width, k, sizes.stream, skip_in[k], wp.static(scale), token,
-                    late, du_out, ddelta_out, dz_out, dskip_out[p.state], dbias_out[p.state],
+                    late, du_out, ddelta_out, dz_out, dskip_out[p.b, t0 / chunk_size],
+                    dbias_out[p.b, t0 / chunk_size],
                 )  # fmt: skip
                 if j % _P == _P - 1 or j == p.blocks - 1:
                     part = p.part + j / _P

@@ -120,7 +120,7 @@ def forward(
     Returns:
         ``out [B, L, D]``, the last state ``[B, D, N]`` and the saved states (a private layout).
     """
-    tuning = Tuning(*tuning)
+    tuning = Tuning(*tuning).forward(A.shape[1])
     layout = Layout(u, A, B, SPAN, tuning.chunk)
     s = _Operands(layout, tuning, u, delta, A, z, delta_bias, discretization)
     b = _entries(B)
@@ -147,7 +147,7 @@ def forward(
 
 def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning):
     """The last state alone, ``[B, D, N]``, and the saved states; arguments as ``forward``."""
-    tuning = Tuning(*tuning)
+    tuning = Tuning(*tuning).forward(A.shape[1])
     layout = Layout(u, A, B, SPAN, tuning.chunk, split=not save)
     s = _Operands(layout, tuning, u, delta, A, None, delta_bias, discretization)
     h, starts = layout.states_of(initial_state)[None], s.starts(save)
@@ -212,7 +212,7 @@ def backward(
     sizes = _sizes(layout, softplus, z is not None, flags, [du, ddelta, dz])
     dh = _pairs(_carry_back(s, sizes, c, dout, dlast))
     da = s.states()
-    dskip, dbias = torch.zeros(2, layout.segments * layout.batch, layout.blocks, W)
+    dskip, dbias = torch.empty(2, layout.batch, layout.chunks, layout.blocks, W)
     db_lanes, db = partial(need_B)
     dc_lanes, dc = partial(need_C)
     s.run(
@@ -232,9 +232,9 @@ def backward(
         lambda: layout.unpack(da.sum((0, 1))) / SCALES[discretization],
         lambda: layout.total(db, B.dtype),
         lambda: layout.total(dc, C.dtype),
-        lambda: layout.unpack(dskip.sum(0)).to(D.dtype),
+        lambda: layout.unpack(dskip.sum((0, 1))).to(D.dtype),
         lambda: dz,
-        lambda: layout.unpack(dbias.sum(0)).to(delta_bias.dtype),
+        lambda: layout.unpack(dbias.sum((0, 1))).to(delta_bias.dtype),
         lambda: layout.unpack(_values(dh)[0], (layout.batch,)),
     )
     return [value() if needed else None for value, needed in zip(values, needs)]

@@ -1,4 +1,4 @@
-"""Native inner loops of the CPU scan: a state, a strip of tokens, sixteen channels.
+"""Native inner loops of the CPU scan: one state or a few, a strip of tokens, sixteen channels.
 
 Equations are those of README.md. Values per token come from ``tokens.py``; B and C
 are read where they are, from token ``t0`` on.

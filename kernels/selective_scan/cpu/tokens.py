@@ -148,28 +148,33 @@ for (int t = 0; t < count; ++t) {
 }
 """
 
-# Equations 9 and 11, dz, and the sums for dD and ddelta_bias.
+# Equations 9 and 11, dz, and the chunk's sums for dD and ddelta_bias. They are added by runs of
+# eight tokens, because equal terms would round to the same side at every token.
 _FINISH_GRAD = (
     "".join(map(put, ("du", "ddelta", "dz")))
     + """
 const GradToken* const token = aligned_((const GradToken*)scratch.data);
 const Late* const late = aligned_((const Late*)late_in.data);
 const F skip = *(const F*)&skip_in;
-F dskip = F{}, dbias = F{};
+F dskip = F{}, dbias = F{}, skips = F{}, biases = F{};
 const bool need_u = du_out.shape[1] > 0, need_delta = ddelta_out.shape[1] > 0;
 const bool need_z = dz_out.shape[1] > 0;
 for (int t = 0; t < count; ++t) {
     const GradToken& own = token[t];
     const F u = late[t].u;
-    dskip = fma_(own.dy, u, dskip);
+    skips = fma_(own.dy, u, skips);
     const F ddelta = fma_(u, own.s, own.p) * late[t].slope;
-    dbias += ddelta;
+    biases += ddelta;
+    if ((t & 7) == 7 || t == count - 1) {
+        dskip += skips, dbias += biases;
+        skips = biases = F{};
+    }
     if (need_u) put_du(t, fma_(own.rate * (1.0f / scale), own.s, skip * own.dy));
     if (need_delta) put_ddelta(t, ddelta);
     if (need_z) put_dz(t, own.y * late[t].gate);
 }
-*(F*)&dskip_out.data[k] += dskip;
-*(F*)&dbias_out.data[k] += dbias;
+*(F*)&dskip_out.data[k] = dskip;
+*(F*)&dbias_out.data[k] = dbias;
 """
 )
 

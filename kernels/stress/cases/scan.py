@@ -219,14 +219,13 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
     return {"out": result}
 
 
-def _oracle(case: Case, x: dict) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def _oracle(case: Case, x: dict, trial: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Results and leaves, ``[SAMPLES, ..]``."""
     o, leaves = case.options, {name: samples_of(t) for name, t in x.items()}
-    used = dict(leaves)
+    used, r = dict(leaves), Rounding(case.seed, trial)
     if o["constant_B"]:  # every channel is a group of its own
-        shape = (o["batch"], o["length"], -1, -1)
-        used["B"] = leaves["B"][:, None, None].expand(-1, *shape)
-    out, last = scan_oracle.scan(used, o["softplus"], o["discretization"], Rounding(case.seed))
+        used["B"] = scan_oracle.over_tokens(r(leaves["B"]), leaves["u"], r)
+    out, last = scan_oracle.scan(used, o["softplus"], o["discretization"], r)
     results = {"out": out[:, :, o["split"] :], "last": last}
     return results, {k: t for k, t in leaves.items() if t is not None}
 
@@ -271,12 +270,12 @@ def compared(results, grads, truths, true_grads, parts) -> list[Comparison]:
     ]
 
 
-def evaluate(case: Case, device: torch.device) -> Outcome:
+def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the operator and compares outputs and all gradients with float64."""
     o = case.options
     x = build(case, device)
     leaves = {k: t for k, t in x.items() if t is not None}
-    truths, true_leaves = _oracle(case, x)
+    truths, true_leaves = _oracle(case, x, trial)
     dtypes = {"out": DTYPES[o["dtype"]], "last": torch.float32}
     cotangents = {
         n: fill(t.shape[1:], o["cotangent"], generator(case, f"v_{n}")).to(dtypes[n])

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..core.rounding import Rounding
+from ..core.rounding import UNDERFLOW, Rounding
 
 EXP_ULPS = 5.0  # the kernels' exponential: 3e-7 relative to its argument's fraction
 
@@ -27,8 +27,8 @@ def factors(x: Tensor, discretization: str, r: Rounding) -> tuple[Tensor, Tensor
     return f, r(torch.where(small, series, torch.expm1(safe) / safe), EXP_ULPS)
 
 
-def states(f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> Tensor:
-    """All states h ← f h + w, ``[S, B, L, D, N]``, from ``first [S, B, D, N]``.
+def _walk(f: Tensor, w: Tensor, first: Tensor) -> Tensor:
+    """All states h ← f h + w, ``[S, B, L, D, N]``, from ``first [S, B, D, N]``, in float64.
 
     Pieces of tokens are walked side by side, each from 0, and joined: as many steps as √L.
     """
@@ -41,20 +41,65 @@ def states(f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> Tensor:
     h, p = torch.zeros_like(f[:, :, :, 0]), torch.ones_like(f[:, :, :, 0])
     local, decay = [], []
     for f_t, w_t in zip(f.unbind(3), w.unbind(3)):
-        h, p = r(r.decay(f_t, h) + w_t), r.decay(f_t, p)
+        h, p = f_t * h + w_t, f_t * p
         local.append(h)
         decay.append(p)
     starts = [first]
     for d, own in zip(decay[-1].unbind(2)[:-1], local[-1].unbind(2)[:-1]):
-        starts.append(r(r(d * starts[-1]) + own))
+        starts.append(d * starts[-1] + own)
     start = torch.stack(starts, 2)[:, :, :, None]
-    joined = torch.stack(local, 3) + r(torch.stack(decay, 3) * start)
-    return r(joined.flatten(2, 3)[:, :, :length])
+    joined = torch.stack(local, 3) + torch.stack(decay, 3) * start
+    return joined.flatten(2, 3)[:, :, :length]
 
 
-def _channels(x: Tensor, channels: int) -> Tensor:
+def _walk_rounded(f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> tuple[Tensor, Tensor]:
+    """The states of ``_walk`` with product and sum rounded at each token, and those before them.
+
+    What a token rounds goes on to the next with the state, as another input does. So it is found
+    for all tokens of the exact walk at once, and a second walk takes it along.
+    """
+    before = lambda h: torch.cat([first[:, :, None], h[:, :, :-1]], 2)  # noqa: E731
+    h = _walk(f, w, first)
+    products = f * before(h)
+    rounded = r.rounded(products, 1.0) - products + (r.rounded(h, 1.0) - h)
+    h = _walk(f, w + rounded, first)
+    return h, before(h)
+
+
+class _States(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> Tensor:
+        h, before = _walk_rounded(f, w, first, r)
+        ctx.r = r
+        ctx.save_for_backward(f, before)
+        return h
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor):
+        r, (f, before) = ctx.r, ctx.saved_tensors
+        later = torch.cat([f[:, :, 1:], torch.ones_like(f[:, :, :1])], 2)
+        none = torch.zeros_like(f[:, :, 0])
+        dh, _ = _walk_rounded(later.flip(2), gradient.flip(2), none, r)
+        dh = dh.flip(2)
+        lost = r.underflow(dh * f)  # the slope of e^x is used as (dh f) h
+        df = (dh + lost / f.abs().clamp_min(UNDERFLOW)) * before
+        return df, dh, dh[:, :, 0] * f[:, :, 0], None
+
+
+def states(f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> Tensor:
+    """All states h ← f h + w, ``[S, B, L, D, N]``, from ``first [S, B, D, N]``."""
+    return _States.apply(f, w, first, r)
+
+
+def over_tokens(x: Tensor, like: Tensor, r: Rounding) -> Tensor:
+    """``[S, ..]`` to ``[S, B, L, ..]``: the same for all tokens of ``like [S, B, L, D]``."""
+    return r.share(x[:, None, None], -1, *like.shape[1:3], *[-1] * (x.dim() - 1))
+
+
+def _channels(x: Tensor, channels: int, r: Rounding) -> Tensor:
     """``[S, B, L, G, N]`` to ``[S, B, L, D, N]``."""
-    return x.repeat_interleave(channels // x.shape[3], dim=3)
+    groups = x.shape[3]
+    return r.share(x[:, :, :, :, None], -1, -1, -1, -1, channels // groups, -1).flatten(3, 4)
 
 
 def scan(x: dict, softplus: bool, discretization: str, r: Rounding) -> tuple[Tensor, Tensor]:
@@ -62,20 +107,24 @@ def scan(x: dict, softplus: bool, discretization: str, r: Rounding) -> tuple[Ten
     x = {name: None if t is None else r(t) for name, t in x.items()}
     u, step = x["u"], x["delta"]
     if x["delta_bias"] is not None:
-        step = r(step + x["delta_bias"][:, None, None])
+        step = r(step + over_tokens(x["delta_bias"], u, r))
     if softplus:
         step = r.softplus(step, EXP_ULPS)
-    f, g = factors(r(step[..., None] * x["A"][:, None, None]), discretization, r)
-    w = r(r(step * u)[..., None] * _channels(x["B"], u.shape[3]))
+    A, B, C = over_tokens(x["A"], u, r), *(_channels(x[k], u.shape[3], r) for k in "BC")
+    steps, inputs = (
+        r.share(v[..., None], -1, -1, -1, -1, A.shape[-1]) for v in (step, r(step * u))
+    )
+    f, g = factors(r(steps * A), discretization, r)
+    w = r(inputs * B)
     first = x["initial_state"]
     if first is None:
         first = torch.zeros_like(f[:, :, :1].sum(2))
     if not u.shape[2]:
         return torch.zeros_like(u), first
     h = states(f, w if g is None else r(w * g), first, r)
-    y = r(r(h * _channels(x["C"], u.shape[3])).sum(-1))
+    y = r(r.sum(r(h * C), -1))
     if x["D"] is not None:
-        y = r(y + r(x["D"][:, None, None] * u))
+        y = r(y + r(over_tokens(x["D"], u, r) * u))
     if x["z"] is not None:
         y = r(y * r(x["z"] * r.sigmoid(x["z"], EXP_ULPS)))
     return y, h[:, :, -1]
@@ -94,10 +143,10 @@ def conv(x: dict, silu: bool, dtype: torch.dtype, r: Rounding) -> tuple[Tensor, 
         first = tokens.new_zeros(*tokens.shape[:2], width - 1, tokens.shape[3])
     whole = torch.cat([first, tokens], 2)
     padded = r.stored(whole, dtype)
-    out = tokens.new_zeros(()) if x["bias"] is None else x["bias"][:, None, None]
+    out = tokens.new_zeros(()) if x["bias"] is None else over_tokens(x["bias"], tokens, r)
+    weight = over_tokens(weight, tokens, r)
     for k in range(width):
-        out = r(out + r(weight[:, None, None, :, k] * padded[:, :, k : k + length]))
-    out = out.expand_as(tokens)
+        out = r(out + r(weight[..., k] * padded[:, :, k : k + length]))
     if silu:
         out = r(out * r.sigmoid(out, EXP_ULPS))
     return out, whole[:, :, whole.shape[2] - (width - 1) :]

@@ -158,19 +158,21 @@ def document(monkeypatch, sizes):
 
 
 def test_a_series_ends_at_its_limit_and_says_so(monkeypatch):
-    found = document(monkeypatch, Sizes((4, 8, 16, 32, 64), 8, 0.015))
+    found = document(monkeypatch, Sizes((4, 8, 16, 32, 64), 8, 0.017))
     status = {r["variant"]: r["status"] for r in found["records"]}
-    # The first length over 15 ms is measured still, and is the last one.
+    # 32 tokens would be the first length over 17 ms, so it is not begun.
     assert [status[f"{name}, L {L}"] for name in "ab" for L in (4, 8, 16)] == ["ok"] * 6
     stopped = {text for text in status.values() if text != "ok"}
-    assert stopped == {"stopped: a call at L 16 took 0.0 s, limit 0.015 s"}
+    limits = {f"stopped: L 32 would take {seconds} s, limit 0.017 s" for seconds in (0.032, 0.064)}
+    assert stopped == limits
     assert sum(text != "ok" for text in status.values()) == 4
     assert not suites.failed_records(found)
     check_document(json.loads(json.dumps(found, allow_nan=False)))
     assert found["crossings"][0]["lengths"] == (4, 16)
     text = suites.summary(found, None)
-    assert "stopped: a call at L 16" in text and "lengths: forward, float32, memory" in text
-    assert "stopped: a call" in markdown([found]) and "<svg" in page([found])
+    assert "stopped: L 32 would take 0.064 s" in text
+    assert "lengths: forward, float32, memory" in text
+    assert "stopped: L 32 would" in markdown([found]) and "<svg" in page([found])
 
 
 def test_known_memory_is_seen_and_ends_a_series(monkeypatch):

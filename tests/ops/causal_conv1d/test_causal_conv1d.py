@@ -48,6 +48,17 @@ def test_without_bias_and_state():
     compare({k: inputs[k] for k in ("x", "weight")}, "silu")
 
 
+def test_equal_terms_of_a_sum():
+    """Equal additions round to the same side, so not all tokens of a task are added in a row."""
+    inputs = make(1, 640, 37, 4)
+    inputs["x"] = (0.1 + torch.rand(37)).expand_as(inputs["x"]).contiguous()
+    inputs["initial_state"] = inputs["x"][:, :3].clone()
+    mine = leaves(inputs)
+    (got,) = torch.autograd.grad(causal_conv1d(**mine).sum(), [mine["weight"]])
+    want = 640 * inputs["x"][0, 0].double()[:, None].expand_as(got)
+    assert_rel_rms(got, want, 3e-7, "gradient of weight")  # in a row: 5e-7
+
+
 @pytest.mark.parametrize("cut", [1, 2, 300])
 def test_split_consistency(cut):
     inputs = make(2, 310, 19, 4)

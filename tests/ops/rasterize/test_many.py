@@ -5,10 +5,12 @@ import torch
 import warp as wp
 from helpers.raster import NAMES, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, project, rasterization, reduce
+from gamba_warp.kernels.rasterize import Skip, project, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
+from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
 from gamba_warp.kernels.rasterize.project import LensOptions, Projected, make_lens
+from gamba_warp.kernels.rasterize.tiles import PairGradients
 from gamba_warp.kernels.runtime.launch import launch
 from gamba_warp.kernels.runtime.views import vectors
 
@@ -85,7 +87,7 @@ def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):
 
 
 def test_pairs_are_numbered_by_gaussian(monkeypatch):
-    """What ``reduce.py`` relies on: the rows of a Gaussian are adjacent, from its offset on."""
+    """What the sums of rows rely on: the rows of a Gaussian are adjacent, from its offset on."""
     monkeypatch.setattr(bin_cpu, "MANY", 0)
     bins = rasterization(**make(2, 2, 150, 50, 70))[2].bins
     total = len(bins.pairs)
@@ -185,15 +187,30 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     assert len(got.status.unique()) >= (5 if num > 500 else 3)
 
 
+def sums_one_by_one(v_pairs, written, bins, conics, view_opacities, geometry):
+    """Row after row in float32, and README eq. 11 with every product rounded."""
+    sums = torch.zeros(bins.order.numel(), v_pairs.shape[1])
+    firsts = bins.offsets.tolist()
+    for i, begin, end in zip(bins.order.tolist(), firsts, firsts[1:]):
+        for p in range(begin, end):
+            if written[p]:
+                sums[i] += v_pairs[p]
+    sums = sums.view(*view_opacities.shape, -1)
+    h, hu, hy, huu, huy, hyy = sums[..., :6].unbind(-1)
+    a, k, e = conics.unbind(-1)
+    v_means2d = torch.stack([a * hu, a * k * hu + e * hy], -1)
+    v_conics = torch.stack([-0.5 * huu, -a * huy, -0.5 * hyy], -1)
+    v_opacities = torch.where(h != 0, h / view_opacities, 0.0)
+    assert geometry
+    return PairGradients(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
+
+
 @pytest.mark.parametrize("channels", [1, 3, 10, 11, 20])
 def test_sums_of_rows(monkeypatch, channels):
     """To the bit, for rows that are lanes (to ten channels) and for wider ones."""
     scene = make(1, 2, 150, 50, 70, channels=channels)
     got = call(scene)
-    one = lambda count, inputs, outputs: launch(  # noqa: E731
-        reduce._reduce, count, inputs, outputs, torch.device("cpu")
-    )
-    monkeypatch.setattr(reduce, "reduce_rows", one)
+    monkeypatch.setattr(composite_cpu, "reduce_rows", sums_one_by_one)
     assert_same(call(scene), got)
 
 

@@ -99,6 +99,17 @@ def test_the_polynomial_without_avx_512_is_as_exact_as_the_table():
             assert_rel_rms(a, b, 1e-6 if name == "out" else 1e-5, f"{name}, table {table}")
 
 
+def test_the_forward_walks_fewer_states_where_there_are_few():
+    """By the shape alone, so that nothing depends on what was timed."""
+    assert Tuning().forward(16) == Tuning(walked=4)
+    assert Tuning().forward(8) == Tuning(walked=2)
+    chosen = Tuning(strip=64, walked=3)
+    assert chosen.forward(4) == chosen == chosen.forward(64)
+    for wrong in ({"strip": 0}, {"strip": 48}, {"walked": -1}, {"walked_back": 0}):
+        with pytest.raises(ValueError):
+            Tuning(**wrong)
+
+
 def test_numbers_are_the_tuning():
     for tuning in (Tuning(32, 8, 4), cuda_tuning.Tuning(2, 1, 8, 3, 4, 4, 64)):
         assert type(tuning)(*tuning.numbers()) == tuning

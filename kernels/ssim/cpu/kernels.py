@@ -1,7 +1,8 @@
-"""1 - SSIM of pictures and its slope, sixteen adjacent numbers of a row at a time (README.md).
+"""1 - SSIM of pictures and its slope, sixteen adjacent numbers of a row at a time.
 
 Pictures are ``[P, H, E]`` with E = W · C. The maps between two launches have their rows side by
-side: row ``4 y + i`` is map i of row y, and ``3 y + i`` where there are three.
+side: row ``4 y + i`` is map i of row y, and ``3 y + i`` where there are three. README.md has the
+formulas.
 """
 
 from typing import no_type_check
@@ -9,10 +10,10 @@ from typing import no_type_check
 import torch
 import warp as wp
 
-from ..runtime.lanes import LANES, VECTORS, W, lanes
-from .reference import C1, C2, SIGMA, WINDOW
+from ...runtime.lanes import LANES, VECTORS, W, lanes
+from ...runtime.views import struct
+from ..constants import C1, C2, EDGE, SIGMA, WINDOW
 
-EDGE = WINDOW - 1
 STRIP = 8  # rows of windows of a task, whose values are summed before they are stored
 _STRIP, _EDGE = wp.constant(STRIP), wp.constant(EDGE)
 _ROW = wp.array3d(dtype=wp.float32)
@@ -25,9 +26,10 @@ def _weights() -> str:
     return ", ".join(f"{float(w)!r}f" for w in line / line.sum())
 
 
-# ``at`` is the place of row r of picture b, from number d on; lanes past ``width`` are read as 0.
+# ``AT`` is where row r of the task's picture has its number d; lanes past ``width`` are read as 0.
 _PRELUDE = (
     VECTORS
+    + "const int b = at.picture, d = at.first, width = at.width;"
     + f"const float weights[{WINDOW}] = {{{_weights()}}};"
     + """
 auto fma_ = [&](float a, F b, F c) -> F { return __builtin_elementwise_fma(splat(a), b, c); };
@@ -120,32 +122,51 @@ write(AT(slope_out, y, d), b0 + 2.0f * (s * b1 + q * b2));
 """
 
 
-@wp.func_native(_PRELUDE + _ACROSS)
+@struct
+class Place:
+    """The numbers of a task: sixteen of a picture's row, or fewer at its end."""
+
+    picture: int
+    row: int  # or the number of a strip of rows
+    first: int  # the first of the numbers in the row
+    width: int  # how many numbers the row still has, at most sixteen
+
+
+@wp.func
+@no_type_check
+def _place(task: int, rows: int, group: int, numbers: int) -> Place:
+    # of pictures with so many rows to a picture and numbers to a row
+    at = Place()
+    at.picture = task / rows
+    at.row = task % rows
+    at.first = group * wp.static(W)
+    at.width = wp.min(wp.static(W), numbers - at.first)
+    return at
+
+
+@wp.func_native(_PRELUDE + "const int y = at.row;" + _ACROSS)
 def _across(
-    got_in: _ROW, want_in: _ROW, shift_in: _ROW, b: int, y: int, d: int, width: int,
-    channels: int, hor_out: _ROW,
-): ...  # fmt: skip
+    at: Place, channels: int, got_in: _ROW, want_in: _ROW, shift_in: _ROW, hor_out: _ROW
+): ...
 
 
 @wp.func_native(_PRELUDE + _DOWN)
-def _down(
-    hor_in: _ROW, shift_in: _ROW, b: int, y: int, d: int, width: int, scale: float, by_out: _ROW
-) -> lanes: ...
+def _down(at: Place, y: int, scale: float, hor_in: _ROW, shift_in: _ROW, by_out: _ROW) -> lanes: ...
 
 
-@wp.func_native(_PRELUDE + _UP)
-def _up(by_in: _ROW, b: int, y: int, d: int, width: int, rows: int, edge: int, col_out: _ROW): ...
+@wp.func_native(_PRELUDE + "const int y = at.row;" + _UP)
+def _up(at: Place, rows: int, edge: int, by_in: _ROW, col_out: _ROW): ...
 
 
-@wp.func_native(_PRELUDE + _BACK)
+@wp.func_native(_PRELUDE + "const int y = at.row;" + _BACK)
 def _back(
-    got_in: _ROW, want_in: _ROW, shift_in: _ROW, col_in: _ROW, b: int, y: int, d: int, width: int,
-    channels: int, slope_out: _ROW,
+    at: Place, channels: int, got_in: _ROW, want_in: _ROW, shift_in: _ROW, col_in: _ROW,
+    slope_out: _ROW,
 ): ...  # fmt: skip
 
 
-@wp.func_native(_PRELUDE + "write(AT(values_out, y, d), *(const F*)&v);")
-def _store(values_out: _ROW, b: int, y: int, d: int, width: int, v: lanes): ...
+@wp.func_native(_PRELUDE + "write(AT(values_out, at.row, d), *(const F*)&v);")
+def _store(at: Place, v: lanes, values_out: _ROW): ...
 
 
 @wp.kernel(enable_backward=False)
@@ -161,11 +182,9 @@ def across(
     hor_out: _ROW,
 ):
     """The four maps' means along rows: ``hor_out [P, 4 H, E - 10 C]``."""
-    task, k = wp.tid()
-    task = task + offset
-    b, y, d = task / got_in.shape[1], task % got_in.shape[1], k * wp.static(W)
-    width = wp.min(wp.static(W), hor_out.shape[2] - d)
-    _across(got_in, want_in, shift_in, b, y, d, width, channels, hor_out)
+    task, group = wp.tid()
+    at = _place(offset + task, got_in.shape[1], group, hor_out.shape[2])
+    _across(at, channels, got_in, want_in, shift_in, hor_out)
 
 
 @wp.kernel(enable_backward=False)
@@ -182,14 +201,12 @@ def down(
     values_out: _ROW,
 ):
     """Values ``[P, strips, E - 10 C]``, sums of ``STRIP`` rows, and what the slope is made of."""
-    task, k = wp.tid()
-    task = task + offset
-    b, strip, d = task / values_out.shape[1], task % values_out.shape[1], k * wp.static(W)
-    width = wp.min(wp.static(W), hor_in.shape[2] - d)
+    task, group = wp.tid()
+    at = _place(offset + task, values_out.shape[1], group, hor_in.shape[2])
     total = lanes(0.0)
-    for y in range(strip * _STRIP, wp.min((strip + 1) * _STRIP, rows)):
-        total = total + _down(hor_in, shift_in, b, y, d, width, scale, by_out)
-    _store(values_out, b, strip, d, width, total)
+    for y in range(at.row * _STRIP, wp.min((at.row + 1) * _STRIP, rows)):
+        total = total + _down(at, y, scale, hor_in, shift_in, by_out)
+    _store(at, total, values_out)
 
 
 @wp.kernel(enable_backward=False)
@@ -204,12 +221,9 @@ def up(
     col_out: _ROW,
 ):
     """Transposed means along columns: ``col_out [P, 3 H, E + 10 C]``, with room at both sides."""
-    task, k = wp.tid()
-    task = task + offset
-    height = rows + _EDGE
-    b, y, d = task / height, task % height, k * wp.static(W)
-    width = wp.min(wp.static(W), by_in.shape[2] - d)
-    _up(by_in, b, y, d, width, rows, edge, col_out)
+    task, group = wp.tid()
+    at = _place(offset + task, rows + _EDGE, group, by_in.shape[2])
+    _up(at, rows, edge, by_in, col_out)
 
 
 @wp.kernel(enable_backward=False)
@@ -226,8 +240,6 @@ def back(
     slope_out: _ROW,
 ):
     """The slope ``[P, H, E]``."""
-    task, k = wp.tid()
-    task = task + offset
-    b, y, d = task / got_in.shape[1], task % got_in.shape[1], k * wp.static(W)
-    width = wp.min(wp.static(W), got_in.shape[2] - d)
-    _back(got_in, want_in, shift_in, col_in, b, y, d, width, channels, slope_out)
+    task, group = wp.tid()
+    at = _place(offset + task, got_in.shape[1], group, got_in.shape[2])
+    _back(at, channels, got_in, want_in, shift_in, col_in, slope_out)

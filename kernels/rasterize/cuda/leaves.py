@@ -1,0 +1,135 @@
+"""Leaf functions of the CUDA compositor: C++ with a CPU form, for tests on CPU blocks."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return exp2f(x);
+#endif
+""")
+def exp2(x: wp.float32) -> wp.float32:
+    """2^x, to 2 units in the last place."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return 1.0f / x;
+#endif
+""")
+def reciprocal(x: wp.float32) -> wp.float32:
+    """1/x of a normal number, to 1 unit in the last place; 1/1 is exactly 1."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return sqrtf(x);
+#endif
+""")
+def root(x: wp.float32) -> wp.float32:
+    """The square root, to 2 units in the last place."""
+    ...
+
+
+# Arrays are dense. Warp's own indexing multiplies by strides that it reads from the array, which
+# costs instructions and, in loops, registers.
+@wp.func_native("return values.data[i];")
+def load_int(values: wp.array[wp.int32], i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("values.data[i] = v;")
+def store_int(values: wp.array[wp.int32], i: wp.int32, v: wp.int32): ...
+
+
+@wp.func_native("return values.data[i];")
+def load1(values: wp.array[wp.float32], i: wp.int32) -> wp.float32: ...
+
+
+@wp.func_native("return values.data[i];")
+def load2(values: wp.array[wp.vec2], i: wp.int32) -> wp.vec2: ...
+
+
+@wp.func_native("return values.data[i];")
+def load3(values: wp.array[wp.vec3], i: wp.int32) -> wp.vec3: ...
+
+
+@wp.func_native("return values.data[i + step];")
+def load(values: wp.array2d[wp.float32], i: wp.int64, step: wp.int32) -> wp.float32: ...
+
+
+@wp.func_native("values.data[i + step] = v;")
+def store(values: wp.array2d[wp.float32], i: wp.int64, step: wp.int32, v: wp.float32): ...
+
+
+@wp.func_native("return values.data[i + step];")
+def load_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native("values.data[i + step] = v;")
+def store_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32, v: wp.int32): ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(x));
+#endif
+    return x;
+""")
+def anew(x: wp.int32) -> wp.int32:
+    """Returns x; what was computed from x before is not kept in registers for its sake."""
+    ...
+
+
+# fmaf is named, since forward and backward must see the same alpha: the compiler has no choice.
+@wp.func_native("return fmaf(k, dy, dx);")
+def sheared(k: wp.float32, dx: wp.float32, dy: wp.float32) -> wp.float32:
+    """The u of README §5."""
+    ...
+
+
+@wp.func_native("return fmaf(a * u, u, fmaf(e * dy, dy, level));")
+def exponent(
+    a: wp.float32, e: wp.float32, level: wp.float32, u: wp.float32, dy: wp.float32
+) -> wp.float32:
+    """log2 of alpha; ``a, e`` are the conic's times -log2(e)/2, ``level`` is log2 of opacity."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(x) - 1;
+#else
+    return __builtin_ctz(x);
+#endif
+""")
+def lowest_bit(x: wp.int32) -> wp.int32:
+    """The number of the lowest bit that is set; one must be."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(x);
+#else
+    return __builtin_popcount(x);
+#endif
+""")
+def count_bits(x: wp.int32) -> wp.int32:
+    """The number of bits that are set."""
+    ...

@@ -1,0 +1,1 @@
+"""The kernels of 1 - SSIM for CPUs."""

@@ -1,0 +1,103 @@
+"""1 - SSIM by matrix products in torch: for GPUs, and for other dtypes than float32.
+
+A mean over the window along rows or columns is a product with a matrix that is zero but for a band,
+so a product makes ``_TILE`` columns of it at a time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from .constants import C1, C2, EDGE, SIGMA, WINDOW
+from .parts import box_of_windows, groups
+
+_TILE = 32  # columns of a banded product
+_TOGETHER = 1 << 17  # numbers of the pictures that a CPU takes together, two of 128²
+
+
+def dissimilarity_by_products(
+    got: Tensor, want: Tensor, slope: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Computes ``dissimilarity`` of pictures of any floating dtype, on any device.
+
+    Args:
+        got: ``[P, H, W, C]`` without a gradient.
+        want: the same shape.
+        slope: whether the derivative is wanted.
+
+    Returns:
+        Values ``[P]`` and the slope ``[P, H, W, C]`` or None.
+    """
+    got, want = (x.movedim(-1, 1).contiguous() for x in (got, want))
+    band = _band(got)
+    slopes = torch.zeros_like(got) if slope else None
+    size = max(1, len(got))
+    if got.device.type == "cpu":
+        size = max(1, _TOGETHER // max(1, math.prod(got.shape[1:])))
+    values = [_compute(*group, band) for group in groups(size, got, want, slopes)]
+    slopes = None if slopes is None else slopes.movedim(1, -1)
+    return torch.cat(values) if values else got.new_zeros(0), slopes
+
+
+def _compute(got: Tensor, want: Tensor, slope: Tensor | None, band: Tensor) -> Tensor:
+    """Values ``[n]`` of ``[n, C, H, W]``; the derivative goes into ``slope``, if that is given."""
+    count = got.shape[1] * (got.shape[2] - EDGE) * (got.shape[3] - EDGE)
+    if got.device.type == "cpu":
+        box = box_of_windows((got != want).flatten(0, 1).any(0))
+        if box is None:
+            return got.new_zeros(len(got))
+        got, want = got[..., box[0], box[1]], want[..., box[0], box[1]]
+        slope = None if slope is None else slope[..., box[0], box[1]]
+    # The variances do not depend on a constant. Without the background, which a corner has as a
+    # rule, those of flat regions are no differences of large numbers.
+    shift = 2 * want[..., :1, :1]
+    maps = got.new_empty(4, *got.shape)
+    torch.sub(torch.add(got, want, out=maps[0]), shift, out=maps[0])
+    torch.sub(got, want, out=maps[1])
+    torch.mul(maps[:2], maps[:2], out=maps[2:])
+    means = _window_means(maps, band)
+    s, d = means[0] + shift, means[1]
+    variances = means[2:] - means[:2].square()
+    bright, dark = s.square() + C1 * 2, d.square()
+    rough, odd = variances[0] + C2 * 2, variances[1]
+    light, shape = (bright - dark) / (bright + dark), (rough - odd) / (rough + odd)
+    if slope is not None:
+        # of the value by the means of s and d together, of s², and of d²
+        by = torch.empty_like(means[:3])
+        factor = light * (-2 / count) / (rough + odd).square()
+        torch.mul(factor, odd, out=by[1])
+        torch.mul(factor, -rough, out=by[2])
+        factor = shape * (-4 / count) / (bright + dark).square()
+        by[0] = factor * (dark * s - bright * d) - 2 * (by[1] * means[0] + by[2] * d)
+        # the window is symmetric, so its transpose is itself, padded
+        back = _window_means(pad(by, (EDGE,) * 4), band)
+        slope.copy_(back[0] + 2 * (maps[0] * back[1] + maps[1] * back[2]))
+    return (1 - light * shape).sum((1, 2, 3)) / count
+
+
+def _band(like: Tensor) -> Tensor:
+    """SSIM's Gaussian window as the band of a matrix: ``[_TILE + 10, _TILE]``."""
+    rows = torch.arange(_TILE + EDGE, device=like.device)  # no copy from the host
+    places = (rows[:, None] - rows[:_TILE]).double()
+    weights = torch.exp(-(places - WINDOW // 2).square() / (2 * SIGMA**2))
+    weights = torch.where((places >= 0) & (places < WINDOW), weights, 0.0)
+    return (weights / weights[:WINDOW, 0].sum()).to(like.dtype)
+
+
+def _window_means(maps: Tensor, band: Tensor) -> Tensor:
+    """Means over SSIM's window, ``[.., H, W]`` to ``[.., H - 10, W - 10]``."""
+    lead = maps.shape[:-2]
+    planes = maps.reshape(-1, *maps.shape[-2:])
+    for axis in (2, 1):
+        total = planes.shape[axis] - EDGE
+        parts = []
+        for start in range(0, total, _TILE):
+            size = min(_TILE, total - start)
+            piece, tile = planes.narrow(axis, start, size + EDGE), band[: size + EDGE, :size]
+            parts.append(piece @ tile if axis == 2 else tile.mT @ piece)
+        planes = torch.cat(parts, axis)
+    return planes.unflatten(0, lead)
