@@ -16,11 +16,13 @@ from ..runtime.start import without_compiler
 from ..runtime.views import vectors
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
+from .cpu.project import project_on_lanes
+from .cpu.project_vjp import vjp_on_lanes
 from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
 from .cuda.reduce import reduce_rows
-from .project import LensOptions, Projected, make_lens, project_forward
+from .project import LensOptions, Projected, make_lens, project_forward, project_on_threads
 from .project_vjp import Cotangents, Gradients, Wanted, project_backward
 from .reduce import reduce_pairs
 from .skip import UNASKED
@@ -37,6 +39,10 @@ def _compositor(device: torch.device):
     return composite_cpu if device.type == "cpu" else composite_cuda
 
 
+def _projector(device: torch.device) -> Callable[..., None]:
+    return project_on_lanes if device.type == "cpu" else partial(project_on_threads, device=device)
+
+
 @without_compiler
 @torch.library.custom_op(_OP + "project", mutates_args=())
 def project(
@@ -51,7 +57,8 @@ def project(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``project_forward`` as an operator, with the numbers of ``LensOptions``."""
     gaussians = means, quats, scales, opacities, colors
-    p = project_forward(*gaussians, viewmats, Ks, make_lens(LensOptions(*lens)))
+    run = _projector(means.device)
+    p = project_forward(*gaussians, viewmats, Ks, make_lens(LensOptions(*lens)), run)
     return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
@@ -90,6 +97,7 @@ def _project_vjp(
         status,
         Cotangents(*cotangents),
         Wanted(*wanted),
+        vjp_on_lanes if means.device.type == "cpu" else None,
     )
     return [g for g in grads if g is not None]
 

@@ -6,6 +6,7 @@ the test of an ellipse, row by row of tiles, by exact intervals of columns. READ
 test. Counting and writing call the same functions.
 """
 
+import functools
 from typing import NamedTuple, no_type_check
 
 import warp as wp
@@ -117,8 +118,9 @@ class Grid:
     skip: int
 
 
+@functools.lru_cache(maxsize=256)
 def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
-    """The scalars of a binning launch as one kernel argument.
+    """The scalars of a binning launch as one kernel argument, which is shared: not to be changed.
 
     Args:
         tiling: the cut of each view's picture.
@@ -176,8 +178,9 @@ class Picture:
     skip: int
 
 
+@functools.lru_cache(maxsize=256)
 def make_picture(size: Size, limits: Limits, *, num: int, tile: int) -> Picture:
-    """The scalars of a compositing launch as one kernel argument.
+    """The scalars of a compositing launch as one kernel argument, not to be changed either.
 
     Args:
         size: the integers.

@@ -68,9 +68,10 @@ def _count(
     corners_out: wp.array2d[wp.int32],
     windows_out: wp.array2d[wp.int16],
     counts_out: wp.array2d[wp.int32],
-    totals_out: wp.array2d[wp.int64],
+    totals_out: wp.array[wp.int64],
+    boxes_out: wp.array[wp.int64],
 ):
-    """Tasks are parts of the Gaussians of a view; totals are pairs, and pairs of boxes."""
+    """Tasks are parts of the Gaussians of a view."""
     task = offset + wp.tid()
     part = _part(grid.num, parts, task)
     count_part(
@@ -87,6 +88,7 @@ def _count(
         windows_out,
         counts_out,
         totals_out,
+        boxes_out,
     )
 
 
@@ -169,12 +171,12 @@ def bin_many(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], No
     order = torch.arange(images * num, out=empty([images * num], torch.int32))
     corners, windows = empty([groups, 16], torch.int32), empty([groups, 16], torch.int16)
     counts = order.new_zeros(tasks, tiles)
-    totals = order.new_empty(tasks, 2, dtype=torch.int64)
-    outputs = [corners, windows, counts, totals]
+    totals, boxes = (order.new_empty(tasks, dtype=torch.int64) for _ in range(2))
+    outputs = [corners, windows, counts, totals, boxes]
     parallel_launch(_count, tasks, [grid, parts, *inputs], outputs, pieces=tasks)
     offsets = empty([images * num + 1], torch.int32)
     by_row = counts.view(images, parts, grid.tiles_y, grid.tiles_x)
-    places = place_pairs(by_row, totals, offsets, grid.tiles_x, check)
+    places = place_pairs(by_row, totals, boxes, offsets, grid.tiles_x, check)
     staged = empty([places.total, 3], torch.int32)
     inputs = [grid, parts, *inputs, depths.view(-1), places.numbers, corners, windows]
     parallel_launch(_scatter, tasks, inputs, [counts, offsets, staged], pieces=tasks)

@@ -102,7 +102,7 @@ _COUNT = (
     _SPANS
     + """
 int* const many = counts.data + (size_t)task * counts.shape[1];
-long long pairs = 0, boxes = 0;
+long long pairs = 0, in_boxes = 0;
 for (int i = begin, g = group; i < end; i += 16, ++g) {
     const int n = end - i < 16 ? end - i : 16;
     const float* const m = (const float*)means2d.data + (size_t)i * 2;
@@ -134,7 +134,7 @@ for (int i = begin, g = group; i < end; i += 16, ++g) {
     }
     const I top = top_(get(1), ry), count = bottom_(get(1), ry) - top + 1;
     const I box = count * (tile_(get(0) + rx, wide) - tile_(get(0) - rx, wide) + 1);
-    boxes += __builtin_reduce_add(seen ? box : I{});  // each is at most 2^24
+    in_boxes += __builtin_reduce_add(seen ? box : I{});  // each is at most 2^24
     const Ellipse E = ellipse_(get(0), get(1), get(2), get(3), get(4), get(5), rx);
     I few = seen & (count <= 4);
     const int most = __builtin_reduce_max(few ? count : I{});
@@ -176,8 +176,8 @@ for (int i = begin, g = group; i < end; i += 16, ++g) {
                     pairs += last - first + 1;
                 });
 }
-totals.data[2 * task] = pairs;
-totals.data[2 * task + 1] = boxes;
+totals.data[task] = pairs;
+boxes.data[task] = in_boxes;
 """
 )
 
@@ -296,7 +296,8 @@ def count_part(
     corners: wp.array2d[wp.int32],
     windows: wp.array2d[wp.int16],
     counts: wp.array2d[wp.int32],
-    totals: wp.array2d[wp.int64],
+    totals: wp.array[wp.int64],
+    boxes: wp.array[wp.int64],
 ):
     """Windows of the Gaussians [begin, end), the first of that group, their pairs, and two sums."""
     ...

@@ -20,7 +20,8 @@ wp.set_module_options({"enable_backward": False})
 def _places(
     offset: wp.int32,
     tiles_x: wp.int32,
-    totals_in: wp.array2d[wp.int64],
+    totals_in: wp.array[wp.int64],
+    boxes_in: wp.array[wp.int64],
     counts_out: wp.array4d[wp.int32],
     numbers_out: wp.array[wp.int32],
     starts_out: wp.array[wp.int32],
@@ -30,11 +31,12 @@ def _places(
 ):
     """One task. Too many pairs overflow here and are refused by their sum, of 64 bits."""
     pairs = wp.int64(0)
-    boxes = wp.int64(0)
     for task in range(totals_in.shape[0]):
         numbers_out[task] = wp.int32(pairs)
-        pairs += totals_in[task, 0]
-        boxes += totals_in[task, 1]
+        pairs += totals_in[task]
+    boxes = wp.int64(0)
+    for task in range(boxes_in.shape[0]):
+        boxes += boxes_in[task]
     pairs_out[0] = pairs
     boxes_out[0] = boxes
     offsets_out[offsets_out.shape[0] - 1] = wp.int32(pairs)
@@ -71,14 +73,20 @@ class Places(NamedTuple):
 
 
 def place_pairs(
-    counts: Tensor, totals: Tensor, offsets: Tensor, tiles_x: int, check: Callable[[int], None]
+    counts: Tensor,
+    totals: Tensor,
+    boxes: Tensor,
+    offsets: Tensor,
+    tiles_x: int,
+    check: Callable[[int], None],
 ) -> Places:
     """Turns counts into places.
 
     Args:
         counts: ``[I, parts, tiles_y, columns]`` int32, columns >= ``tiles_x``, pairs of each tile;
             becomes where each part writes its first pair of it.
-        totals: ``[I * parts, 2]`` int64, pairs and pairs of boxes of each part.
+        totals: ``[I * parts]`` int64, pairs of each part.
+        boxes: int64, pairs of boxes, cut into parts in some way.
         offsets: ``[I * N + 1]`` int32, whose last number is set.
         tiles_x: tiles in a row.
         check: raises if there are too many.
@@ -86,9 +94,9 @@ def place_pairs(
     images, _, tiles_y, _ = counts.shape
     numbers = counts.new_empty(totals.shape[0])
     starts = counts.new_empty(images * tiles_y * tiles_x + 1)
-    count, boxes = (totals.new_empty(()) for _ in range(2))
-    outputs = [counts, numbers, starts, offsets, count.view(1), boxes.view(1)]
-    parallel_launch(_places, 1, [tiles_x, totals], outputs)
+    count, box_pairs = (totals.new_empty(()) for _ in range(2))
+    outputs = [counts, numbers, starts, offsets, count.view(1), box_pairs.view(1)]
+    parallel_launch(_places, 1, [tiles_x, totals, boxes], outputs)
     total = int(count)
     check(total)
-    return Places(total, numbers, starts, count, boxes)
+    return Places(total, numbers, starts, count, box_pairs)
