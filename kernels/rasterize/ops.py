@@ -16,10 +16,12 @@ from ..runtime.start import without_compiler
 from ..runtime.views import vectors
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
+from .cpu.project import project_on_lanes
+from .cpu.project_vjp import vjp_on_lanes
 from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
-from .project import LensOptions, Projected, make_lens, project_forward
+from .project import LensOptions, Projected, make_lens, project_forward, project_on_threads
 from .project_vjp import Cotangents, Gradients, Wanted, project_backward
 from .skip import UNASKED
 from .tiles import Bins, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
@@ -30,6 +32,10 @@ MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 
 def _compositor(device: torch.device):
     return composite_cpu if device.type == "cpu" else composite_cuda
+
+
+def _projector(device: torch.device) -> Callable[..., None]:
+    return project_on_lanes if device.type == "cpu" else partial(project_on_threads, device=device)
 
 
 @without_compiler
@@ -46,7 +52,8 @@ def project(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``project_forward`` as an operator, with the numbers of ``LensOptions``."""
     gaussians = means, quats, scales, opacities, colors
-    p = project_forward(*gaussians, viewmats, Ks, make_lens(LensOptions(*lens)))
+    run = _projector(means.device)
+    p = project_forward(*gaussians, viewmats, Ks, make_lens(LensOptions(*lens)), run)
     return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
@@ -85,6 +92,7 @@ def _project_vjp(
         status,
         Cotangents(*cotangents),
         Wanted(*wanted),
+        vjp_on_lanes if means.device.type == "cpu" else None,
     )
     return [g for g in grads if g is not None]
 

@@ -3,7 +3,8 @@
 One thread per (view, Gaussian). README.md §1 holds the maths; ``project_vjp.py`` the gradient.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, no_type_check
 
 import torch
@@ -300,8 +301,9 @@ def _project(
     extents_out[i] = extent
 
 
+@functools.lru_cache(maxsize=256)
 def make_lens(options: LensOptions) -> Lens:
-    """The scalars of a projection as one kernel argument."""
+    """The scalars of a projection as one kernel argument, which is shared: not to be changed."""
     lens = Lens()
     lens.width, lens.height = options.width, options.height
     lens.near_plane, lens.far_plane = options.near_plane, options.far_plane
@@ -319,6 +321,33 @@ def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> 
     return torch.empty(*shape, dtype=dtype, device=device)
 
 
+def project_on_threads(
+    images: int,
+    views: int,
+    num: int,
+    colors_per_view: int,
+    lens: Lens,
+    inputs: list,
+    outputs: list,
+    *,
+    device: torch.device,
+) -> None:
+    """Runs the projection of B objects into V views each, a thread for each (view, Gaussian).
+
+    Args:
+        images: I = B * V.
+        views: of an object, V.
+        num: Gaussians of an object, at least 1.
+        colors_per_view: 1 if each view has colours of its own, otherwise 0.
+        lens: from ``make_lens``.
+        inputs: of the kernel, from the means on.
+        outputs: of the kernel.
+        device: of the tensors.
+    """
+    numbers = [views, num, colors_per_view, lens]
+    launch(_project, images * num, [*numbers, *inputs], outputs, device)
+
+
 def project_forward(
     means: Tensor,
     quats: Tensor | None,
@@ -328,6 +357,7 @@ def project_forward(
     viewmats: Tensor,
     Ks: Tensor,
     lens: Lens,
+    run: Callable[..., None],
 ) -> Projected:
     """Projects B objects of N Gaussians into V views each; float32, contiguous tensors.
 
@@ -340,6 +370,7 @@ def project_forward(
         viewmats: ``[B, V, 4, 4]``.
         Ks: ``[B, V, 3, 3]``.
         lens: from ``make_lens``.
+        run: launcher of the device, ``project_on_threads`` or ``cpu/project.py``'s.
     """
     (batch, views), num = viewmats.shape[:2], means.shape[1]
     shape = (batch, views, num)
@@ -364,12 +395,6 @@ def project_forward(
         vectors(extents, wp.vec2),
         status.view(-1),
     ]
-    numbers = [views, num, int(colors.dim() == 4), lens]
-    if status.numel() and means.device.type == "cpu":
-        from .cpu.project import project_on_lanes  # which takes functions of this file
-
-        per_view = int(colors.dim() == 4)
-        project_on_lanes(batch * views, views, num, per_view, lens, inputs, outputs)
-    elif status.numel():
-        launch(_project, status.numel(), [*numbers, *inputs], outputs, means.device)
+    if status.numel():
+        run(batch * views, views, num, int(colors.dim() == 4), lens, inputs, outputs)
     return Projected(means2d, conics, depths, view_opacities, extents, status)

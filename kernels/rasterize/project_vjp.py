@@ -4,6 +4,7 @@ One thread per Gaussian, which loops over its views: sums over views are then in
 README.md §4 holds the maths.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple, no_type_check
 
 import torch
@@ -253,6 +254,7 @@ def project_backward(
     status: Tensor,
     cotangents: Cotangents,
     wanted: Wanted,
+    on_lanes: Callable[..., None] | None,
 ) -> Gradients:
     """Gradients of ``project_forward``.
 
@@ -268,6 +270,8 @@ def project_backward(
         status: as returned forward.
         cotangents: of what forward returned.
         wanted: what is asked for.
+        on_lanes: the device's launcher where neither viewmats nor antialiasing are asked for, that
+            of ``cpu/project_vjp.py``, or None.
     """
     batch, views, num = status.shape
     inputs = means, quats, scales, opacities
@@ -295,10 +299,8 @@ def project_backward(
         None if v_opacities is None else v_opacities.view(-1),
     ]
     plain = v_viewmats is None and not lens.antialiased
-    if status.numel() and means.device.type == "cpu" and plain:
-        from .cpu.project_vjp import vjp_on_lanes  # which takes functions of ``project.py``
-
-        vjp_on_lanes(batch, views, num, lens, [*gaussians, *given], outputs)
+    if status.numel() and on_lanes and plain:
+        on_lanes(batch, views, num, lens, [*gaussians, *given], outputs)
     elif status.numel():
         inputs = [views, num, lens, *gaussians, opacities.view(-1), *given]
         launch(_project_vjp, batch * num, inputs, [*outputs, v_viewmats], means.device)

@@ -7,6 +7,7 @@ by exact intervals of columns. README.md §2 proves the test. Counting and writi
 functions.
 """
 
+import functools
 from typing import NamedTuple, no_type_check
 
 import warp as wp
@@ -134,8 +135,9 @@ class Grid:
     skip: int
 
 
+@functools.lru_cache(maxsize=256)
 def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
-    """The scalars of a binning launch as one kernel argument.
+    """The scalars of a binning launch as one kernel argument, which is shared: not to be changed.
 
     Args:
         tiling: the cut of each view's picture.
@@ -193,8 +195,9 @@ class Picture:
     skip: int
 
 
+@functools.lru_cache(maxsize=256)
 def make_picture(size: Size, limits: Limits, *, num: int, tile: int) -> Picture:
-    """The scalars of a compositing launch as one kernel argument.
+    """The scalars of a compositing launch as one kernel argument, not to be changed either.
 
     Args:
         size: the integers.

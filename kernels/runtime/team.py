@@ -90,6 +90,9 @@ def has_team() -> bool:
     return _parallel != 0
 
 
+_MOST_EXTENTS = 1024  # that a kernel keeps
+
+
 class _Entry:
     """A kernel's compiled function and the C structures that it takes.
 
@@ -99,7 +102,7 @@ class _Entry:
         AttributeError: this Warp has no such attributes; also TypeError, where they are others.
     """
 
-    def __init__(self, kernel: wp.Kernel, command: Any, dim: Sequence[int], arguments: list):
+    def __init__(self, kernel: wp.Kernel, command: Any, dim: tuple[int, ...], arguments: list):
         self.rank = kernel.adj.kernel_dim
         self.call = command.hooks.forward
         self.address = ctypes.cast(self.call, ctypes.c_void_p).value
@@ -110,26 +113,34 @@ class _Entry:
         self.names = [arg.label for arg in kernel.adj.args]
         fields = [(name, type(x)) for name, x in zip(self.names, command.params[1:])]
         self.record: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        self._empty = [kind() for _, kind in fields]
+        self._structs = [i for i, x in enumerate(arguments) if hasattr(x, "__ctype__")]
+        self._extents: dict[tuple[int, ...], Any] = {}
         self.extent(dim)  # so that an error comes now and not in a later launch
         self.pack(arguments)
 
     def pack(self, arguments: list) -> ctypes.Structure:
         """The arguments as the compiled function takes them; an array that is None is empty."""
-        record = self.record()
-        for name, value in zip(self.names, arguments):
-            if value is not None:
-                setattr(record, name, value.__ctype__() if hasattr(value, "__ctype__") else value)
-        return record
+        values = [y if x is None else x for x, y in zip(arguments, self._empty)]
+        for i in self._structs:
+            values[i] = values[i].__ctype__()
+        return self.record(*values)
 
-    def extent(self, dim: Sequence[int]) -> ctypes.Structure:
-        """The dimensions as the compiled function takes them."""
-        return self.bounds((*dim, *(1,) * (self.rank - len(dim))))
+    def extent(self, dim: tuple[int, ...]) -> ctypes.Structure:
+        """The dimensions as the compiled function takes them; not to be changed."""
+        known = self._extents.get(dim)  # looked up once: another thread may clear them
+        if known is None:
+            if len(self._extents) >= _MOST_EXTENTS:
+                self._extents.clear()
+            known = self.bounds((*dim, *(1,) * (self.rank - len(dim))))
+            self._extents[dim] = known
+        return known
 
 
 _entries: dict[Any, _Entry] = {}  # by kernel
 
 
-def _entry(kernel: Any, dim: Sequence[int], arguments: list) -> _Entry | None:
+def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> _Entry | None:
     """The entry of a kernel; None, and no team from now on, where this Warp has no such thing.
 
     It is made by a launch that is recorded only, which checks the arguments; later launches have
@@ -169,9 +180,9 @@ def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, thr
     if entry is None:
         return False
     bounds, records = (entry.bounds * len(dims))(), (entry.record * len(dims))()
-    record, offset = entry.pack([0, *arguments]), 0
+    record, name, offset = entry.pack([0, *arguments]), entry.names[0], 0
     for i, dim in enumerate(dims):
-        setattr(record, entry.names[0], offset)
+        setattr(record, name, offset)
         bounds[i], records[i] = entry.extent(dim), record
         offset += dim[0]
     job = _Job(

@@ -15,6 +15,7 @@ from torch import Tensor
 from ...runtime.launch import parallel_launch
 from ..tiles import Bins, Ellipse, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
 from .bin_many import MANY, bin_many
+from .places import place_pairs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -186,30 +187,39 @@ def _count(
     extents_in: wp.array[wp.vec2],
     order_in: wp.array[wp.int32],
     records_in: wp.array2d[wp.int32],
-    counts_out: wp.array[wp.int32],
-    steps_out: wp.array3d[wp.int32],
+    counts_out: wp.array4d[wp.int32],
+    totals_out: wp.array[wp.int64],
 ):
-    """Steps are how the number of pairs changes from tile to tile in a row of tiles."""
+    """Counts hold zeros at first, and a column more than there are tiles in a row."""
     task = offset + wp.tid()
-    parts = steps_out.shape[1]
+    parts = counts_out.shape[1]
     image = task // parts
     part = task % parts
+    total = wp.int64(0)
     for j in range(
         image * grid.num + _part(grid.num, part, parts),
         image * grid.num + _part(grid.num, part + 1, parts),
     ):
         i = order_in[j]
         _fetch(records_in, order_in[wp.min(j + _AHEAD, order_in.shape[0] - 1)])
-        counts_out[j] = records_in[i, _COUNT]
+        total += wp.int64(records_in[i, _COUNT])
         for ty in range(records_in[i, _FIRST_ROW], records_in[i, _LAST_ROW] + 1):
             columns = _columns(
                 grid, means2d_in, conics_in, view_opacities_in, extents_in, records_in, i, ty
             )
             if columns[0] <= columns[1]:
-                first = ty * (grid.tiles_x + 1) + columns[0]
-                last = ty * (grid.tiles_x + 1) + columns[1] + 1
-                steps_out[image, part, first] = steps_out[image, part, first] + 1
-                steps_out[image, part, last] = steps_out[image, part, last] - 1
+                # how the number of pairs changes from tile to tile, until all are through
+                end = columns[1] + 1
+                counts_out[image, part, ty, columns[0]] = (
+                    counts_out[image, part, ty, columns[0]] + 1
+                )
+                counts_out[image, part, ty, end] = counts_out[image, part, ty, end] - 1
+    totals_out[task] = total
+    for ty in range(grid.tiles_y):
+        count = wp.int32(0)
+        for tx in range(grid.tiles_x):
+            count += counts_out[image, part, ty, tx]
+            counts_out[image, part, ty, tx] = count
 
 
 @wp.kernel
@@ -223,8 +233,9 @@ def _emit(
     extents_in: wp.array[wp.vec2],
     order_in: wp.array[wp.int32],
     records_in: wp.array2d[wp.int32],
-    offsets_in: wp.array[wp.int32],
-    cursors_out: wp.array3d[wp.int32],
+    numbers_in: wp.array[wp.int32],
+    cursors_out: wp.array4d[wp.int32],
+    offsets_out: wp.array[wp.int32],
     pairs_out: wp.array[wp.int32],
     rows_out: wp.array[wp.int32],
 ):
@@ -233,21 +244,21 @@ def _emit(
     parts = cursors_out.shape[1]
     image = task // parts
     part = task % parts
+    p = numbers_in[task]
     for j in range(
         image * grid.num + _part(grid.num, part, parts),
         image * grid.num + _part(grid.num, part + 1, parts),
     ):
         i = order_in[j]
         _fetch(records_in, order_in[wp.min(j + _AHEAD, order_in.shape[0] - 1)])
-        p = offsets_in[j]
+        offsets_out[j] = p
         for ty in range(records_in[i, _FIRST_ROW], records_in[i, _LAST_ROW] + 1):
             columns = _columns(
                 grid, means2d_in, conics_in, view_opacities_in, extents_in, records_in, i, ty
             )
             for tx in range(columns[0], columns[1] + 1):
-                tile = ty * grid.tiles_x + tx
-                place = cursors_out[image, part, tile]
-                cursors_out[image, part, tile] = place + 1
+                place = cursors_out[image, part, ty, tx]
+                cursors_out[image, part, ty, tx] = place + 1
                 pairs_out[place] = i
                 rows_out[place] = p
                 p += 1
@@ -262,31 +273,23 @@ def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], N
         inputs: flat views of means2d, conics, opacities and extents.
         check: raises if there are too many.
     """
-    (images, num), tiles = depths.shape, grid.tiles_x * grid.tiles_y
+    images, num = depths.shape
     if images and num >= MANY:
         return bin_many(grid, depths, inputs, check)
     most = _PARTS_PER_THREAD * torch.get_num_threads()
     parts = 1 if images >= most else most
-    order, records, box_counts = _sorted_and_recorded(grid, depths, inputs, most)
-    counts = order.new_empty(images * num)
-    steps = order.new_zeros(images, parts, grid.tiles_y, grid.tiles_x + 1)
+    order, records, boxes = _sorted_and_recorded(grid, depths, inputs, most)
+    counts = order.new_zeros(images, parts, grid.tiles_y, grid.tiles_x + 1)
+    totals = boxes.new_empty(images * parts)
     tasks = images * parts
     inputs = [grid, *inputs, order, records]
-    parallel_launch(_count, tasks, inputs, [counts, steps.flatten(2)], pieces=tasks)
-    offsets = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0))
-    total = int(offsets[-1])
-    check(total)
-    offsets = offsets.int()
-    # running sums in the order of the pairs: view, tile, part
-    in_tiles = steps.cumsum(3, dtype=torch.int32)[..., :-1].reshape(images, parts, tiles)
-    ends = in_tiles.transpose(1, 2).reshape(-1).cumsum(0).int()
-    begins = torch.nn.functional.pad(ends, (1, 0)).view(-1)
-    starts = begins[::parts].clone()  # the cursors, which are changed, share the memory
-    cursors = begins[:-1].view(images, tiles, parts).transpose(1, 2).contiguous()
-    pairs, rows = order.new_empty(total), order.new_empty(total)
-    if total:
-        parallel_launch(_emit, tasks, [*inputs, offsets], [cursors, pairs, rows], pieces=tasks)
-    return Bins(order, offsets, pairs, rows, starts, box_counts.sum(), torch.tensor(total))
+    parallel_launch(_count, tasks, inputs, [counts, totals], pieces=tasks)
+    offsets = order.new_empty(images * num + 1)
+    places = place_pairs(counts, totals, boxes, offsets, grid.tiles_x, check)
+    pairs, rows = (order.new_empty(places.total) for _ in range(2))
+    outputs = [counts, offsets, pairs, rows]
+    parallel_launch(_emit, tasks, [*inputs, places.numbers], outputs, pieces=tasks)
+    return Bins(order, offsets, pairs, rows, places.starts, places.box_pairs, places.count)
 
 
 def _sorted_and_recorded(
@@ -295,11 +298,13 @@ def _sorted_and_recorded(
     """``order``, the records ``[I * N, 12]``, and pairs of boxes by ``parts`` of the Gaussians."""
     images, num = depths.shape
     order = torch.empty(images, num, dtype=torch.int32)
-    box_counts = torch.zeros(parts, dtype=torch.int64)
+    box_counts = torch.empty(parts, dtype=torch.int64)
     records = order.new_empty(images * num, _RECORD)
     room = [order.new_empty(images, 2, num), torch.empty_like(order)]
     outputs = [*room, order.new_empty(images, 3, 1 << 11), order, records, box_counts]
+    tasks = images + parts
     if depths.numel():
-        tasks = images + parts
         parallel_launch(_prepare, tasks, [grid, *inputs, depths], outputs, pieces=tasks)
+    else:
+        box_counts.zero_()
     return order.view(-1), records, box_counts

@@ -2,9 +2,9 @@
 
 A sort of a million Gaussians by depth, and every later step in that random order, wait for memory.
 Here each step but the last goes through the Gaussians as they lie, sixteen at a time: ``_count``
-finds how many pairs each tile has, ``_scatter`` finds the tiles once more, which is quicker than to
-remember them, and writes the pairs to the lists. ``_sort`` puts each list, which fits the nearest
-cache, in order of depth. README.md §2 holds the maths.
+finds the tiles of each, leaves them as a window of 4 x 4 tiles, and finds how many pairs each tile
+has; ``_scatter`` writes the pairs of the windows to the lists. ``_sort`` puts each list, which fits
+the nearest cache, in order of depth. README.md §2 holds the maths.
 """
 
 from collections.abc import Callable
@@ -16,31 +16,43 @@ from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from ..skip import TILE_TEST
 from ..tiles import Bins, Grid
 from .lanes import take
 from .lists import count_part, scatter_part, sort_list
+from .places import place_pairs
 
 wp.set_module_options({"enable_backward": False})
 
-_TILE_TEST = wp.constant(TILE_TEST)
 MANY = 1 << 15  # Gaussians of a view from which these lists are the faster ones
 _PARTS_PER_THREAD = 4
+_LANES = wp.constant(16)  # Gaussians of a group
 
 
 @wp.func
 @no_type_check
-def _begin(num: wp.int32, parts: wp.int32, task: wp.int32) -> wp.int32:
-    # where the Gaussians of a task begin; num * part may not fit an int32
-    part = wp.int64(num) * wp.int64(task % parts) / wp.int64(parts)
-    return task // parts * num + wp.int32(part)
+def _groups(num: wp.int32) -> wp.int32:
+    return (num + _LANES - 1) // _LANES
 
 
 @wp.func
 @no_type_check
-def _end(num: wp.int32, parts: wp.int32, task: wp.int32) -> wp.int32:
-    part = wp.int64(num) * wp.int64(task % parts + 1) / wp.int64(parts)
-    return task // parts * num + wp.int32(part)
+def _group(num: wp.int32, part: wp.int32, parts: wp.int32) -> wp.int32:
+    # the first group of a part of a view; their product may not fit an int32
+    return wp.int32(wp.int64(_groups(num)) * wp.int64(part) / wp.int64(parts))
+
+
+@wp.func
+@no_type_check
+def _part(num: wp.int32, parts: wp.int32, task: wp.int32) -> wp.vec3i:
+    # the Gaussians of a task, from and to, and the first group of them
+    image = task // parts
+    first = _group(num, task % parts, parts)
+    last = _group(num, task % parts + 1, parts)
+    return wp.vec3i(
+        image * num + first * _LANES,
+        image * num + wp.min(last * _LANES, num),
+        image * _groups(num) + first,
+    )
 
 
 @wp.kernel
@@ -53,27 +65,30 @@ def _count(
     conics_in: wp.array[wp.vec3],
     view_opacities_in: wp.array[wp.float32],
     extents_in: wp.array[wp.vec2],
-    steps_out: wp.array2d[wp.int32],
-    totals_out: wp.array2d[wp.int64],
+    corners_out: wp.array2d[wp.int32],
+    windows_out: wp.array2d[wp.int16],
+    counts_out: wp.array2d[wp.int32],
+    totals_out: wp.array[wp.int64],
+    boxes_out: wp.array[wp.int64],
 ):
-    """Tasks are parts of the Gaussians of a view; totals are pairs, and pairs of boxes."""
+    """Tasks are parts of the Gaussians of a view."""
     task = offset + wp.tid()
+    part = _part(grid.num, parts, task)
     count_part(
         task,
-        _begin(grid.num, parts, task),
-        _end(grid.num, parts, task),
-        grid.width,
-        grid.height,
-        grid.tiles_x,
-        grid.shift,
-        grid.skip & _TILE_TEST,
-        grid.alpha_min,
+        part[0],
+        part[1],
+        part[2],
+        grid,
         means2d_in,
         conics_in,
         view_opacities_in,
         extents_in,
-        steps_out,
+        corners_out,
+        windows_out,
+        counts_out,
         totals_out,
+        boxes_out,
     )
 
 
@@ -89,28 +104,29 @@ def _scatter(
     extents_in: wp.array[wp.vec2],
     depths_in: wp.array[wp.float32],
     numbers_in: wp.array[wp.int32],
+    corners_in: wp.array2d[wp.int32],
+    windows_in: wp.array2d[wp.int16],
     cursors_out: wp.array2d[wp.int32],
     offsets_out: wp.array[wp.int32],
     staged_out: wp.array2d[wp.int32],
 ):
     """Cursors hold, at first, the place of the first pair of each (task, tile)."""
     task = offset + wp.tid()
+    part = _part(grid.num, parts, task)
     scatter_part(
         task,
-        _begin(grid.num, parts, task),
-        _end(grid.num, parts, task),
+        part[0],
+        part[1],
+        part[2],
         numbers_in[task],
-        grid.width,
-        grid.height,
-        grid.tiles_x,
-        grid.shift,
-        grid.skip & _TILE_TEST,
-        grid.alpha_min,
+        grid,
         means2d_in,
         conics_in,
         view_opacities_in,
         extents_in,
         depths_in,
+        corners_in,
+        windows_in,
         cursors_out,
         offsets_out,
         staged_out,
@@ -149,36 +165,24 @@ def bin_many(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], No
         inputs: flat views of means2d, conics, opacities and extents.
         check: raises if there are too many.
     """
-    (images, num), tiles, workers = (
-        depths.shape,
-        grid.tiles_x * grid.tiles_y,
-        torch.get_num_threads(),
-    )
-    parts = _PARTS_PER_THREAD * workers
-    tasks = images * parts
-    order = torch.arange(images * num, dtype=torch.int32)
-    steps = order.new_zeros(tasks, grid.tiles_y * (grid.tiles_x + 1))
-    totals = order.new_empty(tasks, 2, dtype=torch.int64)
-    parallel_launch(_count, tasks, [grid, parts, *inputs], [steps, totals], pieces=tasks)
-    ends = totals[:, 0].cumsum(0)
-    total = int(ends[-1])
-    check(total)
-    numbers = torch.nn.functional.pad(ends, (1, 0)).int()
-    # running sums in the order of the pairs: view, tile, part
-    in_tiles = steps.view(images, parts, grid.tiles_y, -1).cumsum(3, dtype=torch.int32)
-    in_tiles = in_tiles[..., :-1].reshape(images, parts, tiles)
-    begins = in_tiles.transpose(1, 2).reshape(-1).cumsum(0).int()
-    begins = torch.nn.functional.pad(begins, (1, 0))
-    starts = begins[::parts].clone()  # the cursors, which are changed, share the memory
-    cursors = begins[:-1].view(images, tiles, parts).transpose(1, 2).contiguous().flatten(0, 1)
-    offsets = order.new_empty(images * num + 1)
-    offsets[-1] = total
-    staged = empty([total, 3], torch.int32)
-    inputs = [grid, parts, *inputs, depths.view(-1), numbers[:-1]]
-    parallel_launch(_scatter, tasks, inputs, [cursors, offsets, staged], pieces=tasks)
-    pairs, rows = (empty([total], torch.int32) for _ in range(2))
-    longest = int(starts.diff().max())
+    (images, num), workers = depths.shape, torch.get_num_threads()
+    tiles, parts = grid.tiles_x * grid.tiles_y, _PARTS_PER_THREAD * workers
+    tasks, groups = images * parts, images * -(-num // 16)
+    order = torch.arange(images * num, out=empty([images * num], torch.int32))
+    corners, windows = empty([groups, 16], torch.int32), empty([groups, 16], torch.int16)
+    counts = order.new_zeros(tasks, tiles)
+    totals, boxes = (order.new_empty(tasks, dtype=torch.int64) for _ in range(2))
+    outputs = [corners, windows, counts, totals, boxes]
+    parallel_launch(_count, tasks, [grid, parts, *inputs], outputs, pieces=tasks)
+    offsets = empty([images * num + 1], torch.int32)
+    by_row = counts.view(images, parts, grid.tiles_y, grid.tiles_x)
+    places = place_pairs(by_row, totals, boxes, offsets, grid.tiles_x, check)
+    staged = empty([places.total, 3], torch.int32)
+    inputs = [grid, parts, *inputs, depths.view(-1), places.numbers, corners, windows]
+    parallel_launch(_scatter, tasks, inputs, [counts, offsets, staged], pieces=tasks)
+    pairs, rows = (empty([places.total], torch.int32) for _ in range(2))
+    longest = int(places.starts.diff().max())
     room = totals.new_empty(workers, 2 * max(longest, 1))
     outputs = [order.new_zeros(1), room, pairs, rows]
-    parallel_launch(_sort, workers, [images * tiles, starts, staged], outputs)
-    return Bins(order, offsets, pairs, rows, starts, totals[:, 1].sum(), torch.tensor(total))
+    parallel_launch(_sort, workers, [images * tiles, places.starts, staged], outputs)
+    return Bins(order, offsets, pairs, rows, places.starts, places.box_pairs, places.count)

@@ -184,7 +184,8 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         seen &= sound & ~faint;
         float cuts[16];
         const F over = shown / alpha_min;
-        for (int l = 0; l < 16; ++l) cuts[l] = seen[l] ? wp::log(over[l]) : 0.0f;
+        // of all lanes: to ask each costs more than its logarithm
+        for (int l = 0; l < 16; ++l) cuts[l] = wp::log(over[l]);
         const F cut = root_(mul_(splat(2.0f), *(const F*)cuts));
         extent[0] = mul_(cut, root_(sxx));
         extent[1] = mul_(cut, root_(syy));
@@ -215,7 +216,9 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     write_((float*)extents_out.data + 2 * i, 2, n, extent);
     write_(depths_out.data + i, 1, n, &depth);
     write_(opacities_out.data + i, 1, n, &shown);
-    for (int l = 0; l < n; ++l) status_out.data[i + l] = status[l];
+    if (n == 16) *(I*)(status_out.data + i) = status;
+    else
+        for (int l = 0; l < n; ++l) status_out.data[i + l] = status[l];
 }
 """
 )

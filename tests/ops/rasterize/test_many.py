@@ -8,6 +8,7 @@ from helpers.raster import NAMES, leaves, make
 from gamba_warp.kernels.rasterize import Skip, project, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
+from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
 from gamba_warp.kernels.rasterize.project import LensOptions, Projected, make_lens
 from gamba_warp.kernels.rasterize.tiles import PairGradients
@@ -180,7 +181,7 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=antialiased, rounded=rounded)
     lens = make_lens(LensOptions(skip_unused=1, **options))
     inputs = means, quats if rotated else None, scales, opacities, colors
-    got = project.project_forward(*inputs, viewmats, Ks, lens)
+    got = project.project_forward(*inputs, viewmats, Ks, lens, project_on_lanes)
     want = scalar_projection(inputs, viewmats, Ks, lens)
     for name, value in want._asdict().items():
         assert torch.equal(getattr(got, name), value), name
