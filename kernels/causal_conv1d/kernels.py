@@ -33,16 +33,15 @@ def _values(device_type: str, io: torch.dtype):
     return m.VALUE, m.WIDTH, load, store, m.times, m.fma, m.sigmoid
 
 
-@functools.cache
 def _strip(device_type: str, io: torch.dtype):
     """The function of ``count`` tokens of one value from ``t0`` on, after three older ones.
 
-    On a CPU it is one loop of native code: the text below it, which has the same bits, takes 1.1 to
-    1.4 times as long there.
+    Where a value is lanes of channels it is one loop of native code: the text below, which has the
+    same bits, takes 1.1 to 1.4 times as long there.
     """
-    if device_type == "cpu":
+    value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
+    if channels_of_value > 1:
         return cpu_strip(io)
-    value, _, load, store, times, fma, sigmoid = _values(device_type, io)
     scalar = WARP_DTYPES[io]
 
     @wp.func

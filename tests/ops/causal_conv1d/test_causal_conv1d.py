@@ -8,6 +8,7 @@ from helpers.scan import leaves
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
+from gamba_warp.kernels.runtime.rows import streams
 
 FORWARD = 2e-7  # float32 rounding of four products and a SiLU
 GRADIENT = 2e-6  # float32 sums over up to 2 * 577 tokens
@@ -71,6 +72,34 @@ def test_split_consistency(cut):
         )
         parts.append(out)
     assert torch.equal(torch.cat(parts, 1), whole)
+
+
+def test_large_results_have_the_same_bits():
+    """From 32 MiB on they are written past the caches; rows are strided, a strip is not full."""
+    inputs = make(1, 8195, 2048, 4)
+    inputs["x"] = inputs["x"][..., 512:1536]
+    inputs |= {name: inputs[name][512:1536] for name in ("weight", "bias")}
+    inputs.pop("initial_state", None)
+    whole = causal_conv1d(**inputs, activation="silu")
+    assert streams([whole]) and not streams([whole[:, :8000]]) and not streams([whole.bfloat16()])
+    first = causal_conv1d(**inputs | {"x": inputs["x"][:, :4100]}, activation="silu")
+    assert not streams([first]) and torch.equal(whole[:, :4100], first)
+    exact = {name: x.double() for name, x in inputs.items()}
+    want, _ = causal_conv1d_reference(**exact, activation="silu")
+    assert_rel_rms(whole, want, 2e-7, "out")
+
+
+@pytest.mark.parametrize("channels", [19, 64])
+def test_bfloat16_rounds_to_the_nearest(channels):
+    """Ties go to the even number, NaN and infinity stay, on every processor alike."""
+    x = make(1, 70, channels, 4)["x"]
+    x[0, :4, :5] = torch.tensor([torch.nan, torch.inf, -torch.inf, 3.0e38, -1.0])
+    one = torch.zeros(channels, 4)
+    one[:, 3] = 1 + 2**-8  # a tie for each power of two
+    got = causal_conv1d(x.bfloat16(), one.float())
+    want = (x.bfloat16().float() * one[0, 3]).bfloat16()
+    assert torch.equal(got[:, 7:], want[:, 7:])  # 0 times NaN reaches three tokens further
+    assert got[0, :4, 0].isnan().all() and got[0, 0, 3].isfinite()
 
 
 @pytest.mark.parametrize("name", ["x", "weight", "bias", "initial_state"])
