@@ -81,14 +81,12 @@ def parallel_launch(
     pieces = max(threads, min(pieces or threads, dim[0]))
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
     cuts = [dim[0] * i // pieces for i in range(pieces + 1)]
-    if threads == len(dim) == 1 and team.has_team() and team.run_alone(kernel, dim[0], arguments):
+    if threads == 1 and team.has_team() and team.run_alone(kernel, dim, arguments):
         return
     if threads > 1 and team.has_team():
         dims = [(end - begin, *dim[1:]) for begin, end in zip(cuts[:-1], cuts[1:])]
         if team.run(kernel, dims, arguments, threads):
             return
-    if pieces == 1 and team.run_alone(kernel, dim, arguments):
-        return
     kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
     todo = iter(list(zip(cuts[:-1], cuts[1:])))
 

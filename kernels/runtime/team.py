@@ -202,7 +202,7 @@ def run(kernel: wp.Kernel, dims: Sequence[tuple[int, ...]], arguments: list, thr
     return True
 
 
-def run_alone(kernel: Any, dim: Sequence[int], arguments: list) -> bool:
+def run_alone(kernel: Any, dim: tuple[int, ...], arguments: list) -> bool:
     """Runs a launch in this thread, in a quarter of the time of ``wp.launch``.
 
     Returns False, having done nothing, where this Warp cannot do it.
