@@ -13,7 +13,7 @@ from ..cameras import Cameras, intrinsics, orbit, reference_viewmat
 from ..gaussians import Gaussians
 from ..kernels.bench import Error, NotInstalled, Settings, Variant, compare
 from ..model.checkpoint import load_model
-from ..model.config import PRESETS, Preset
+from ..model.config import PRESETS, GambaConfig, Preset
 from ..model.gamba import Gamba
 from ..model.posing import reference_cameras
 from ..render import render
@@ -21,10 +21,15 @@ from ..render import render
 _REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
 
 
+def without_encoder(config: GambaConfig) -> GambaConfig:
+    """The configuration without an image encoder; where only its tokens are prepended, none are."""
+    return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
+
+
 def _model(preset: Preset, settings: Settings, count: int) -> tuple[Gamba, Callable[[], Gaussians]]:
     """Makes a model with fresh weights and no image encoder, and its run on ``count`` pictures."""
     torch.manual_seed(0)
-    config = replace(PRESETS[preset], encoder="none")
+    config = without_encoder(PRESETS[preset])
     model = Gamba(config).to(settings.device).eval()
     size = config.image_size
     # Random alpha leaves no background, so that with "rays" every token is computed.

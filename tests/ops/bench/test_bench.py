@@ -5,6 +5,7 @@ import math
 import mmap
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -39,6 +40,9 @@ from gamba_warp.kernels.bench.core.report import judge, markdown, ratio_table, r
 from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import suites
+from gamba_warp.measure.pictures import without_encoder
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.gamba import Gamba
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 # DESIGN's schema, and what it leaves to us.
@@ -454,6 +458,15 @@ def test_model_cases_run(op):
         assert 0 < error["default"] < 1e-5
         products = next(r for r in records if r["variant"] == "matrix products alone")
         assert products["work"]["products"] >= 7 and products["ms_p50"] > 0
+
+
+def test_every_preset_can_be_measured_without_its_encoder():
+    """``one picture`` at the normal level takes all of them; "released" prepends no camera."""
+    for name, config in PRESETS.items():
+        made = without_encoder(config)
+        assert made.encoder == "none" and made.num_gaussians == config.num_gaussians, name
+        with torch.device("meta"):
+            Gamba(replace(made, depth=1))
 
 
 def test_products_are_all_of_a_runs():
