@@ -32,13 +32,19 @@ class LargeScene(Scene):
 
     wide: bool = False
 
+    @property
+    def width(self) -> int:
+        """Of the picture, pixels."""
+        return self.size * 16 // 9 if self.wide else self.size
+
     def arguments(self) -> dict:
         """As of any scene, with the width of the picture."""
-        width = self.size * 16 // 9 if self.wide else self.size
-        return super().arguments() | {"width": width}
+        return super().arguments() | {"width": self.width}
 
     def crop(self, backward: bool) -> tuple[int, int, int, int]:
-        return super().crop(True)
+        """As of any scene; the object is in the middle of a wide picture too."""
+        left, top, width, height = super().crop(True)
+        return left + (self.width - self.size) // 2, top, width, height
 
     def see_around_the_crop(self) -> None:
         """Gives the oracle the Gaussians whose boxes meet the crop or a margin around it."""

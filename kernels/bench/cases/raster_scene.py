@@ -184,6 +184,8 @@ class Scene:
         want = self._run(
             rasterization_reference, truth, rest, exact | self.exact, cotangents, backward
         )
+        if not want["alpha"].any():
+            raise ValueError("the crop of the check sees no Gaussian")
         return compare(got, want)
 
     def _run(self, function, gaussians, rest, options, cotangents, backward) -> dict[str, Tensor]:
