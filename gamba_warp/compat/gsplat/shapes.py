@@ -1,4 +1,4 @@
-"""Plain torch about single Gaussians: covariances, spherical harmonics, steps of a projection."""
+"""About single Gaussians: covariances and steps of a projection in torch, spherical harmonics."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gamba_warp.kernels.rasterize.constants import FRUSTUM_MARGIN
-from gamba_warp.kernels.rasterize.harmonics import harmonics_basis
+from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 
 from .checks import MAX_SH_DEGREE, only, shape, side
 
@@ -85,7 +85,8 @@ def spherical_harmonics(
         masks: ``[..]`` bool, or None; the result is 0 where it is False.
 
     Returns:
-        ``[.., D]``.
+        ``[.., D]``; NaN in all D without a gradient where a direction or a used coefficient is not
+        finite.
 
     Raises:
         TypeError: no tensor.
@@ -101,8 +102,9 @@ def spherical_harmonics(
         raise ValueError(f"coeffs has shape {list(coeffs.shape)}, allowed is K >= {used}")
     if masks is not None:
         shape("masks", masks, lead)
-    basis = harmonics_basis(degrees_to_use, F.normalize(dirs, dim=-1))
-    values = torch.einsum("...k,...kd->...d", basis, coeffs[..., :used, :])
+    rows = coeffs.reshape(1, -1, *coeffs.shape[-2:])
+    values = sums_seen_from(degrees_to_use, rows, dirs.reshape(1, -1, 3), dirs.new_zeros(1, 1, 3))
+    values = values.reshape(*lead, coeffs.shape[-1])
     return values if masks is None else torch.where(masks[..., None], values, 0.0)
 
 

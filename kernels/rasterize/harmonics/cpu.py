@@ -17,8 +17,8 @@ _OPTIONS = {"enable_backward": False}
 
 
 @functools.cache
-def _forward_kernel(degree: int, channels: int):
-    @wp.func_native(forward_text(degree, channels))
+def _forward_kernel(degree: int, channels: int, clamped: bool):
+    @wp.func_native(forward_text(degree, channels, clamped))
     def forward(
         piece: wp.int32,
         num: wp.int32,
@@ -56,8 +56,8 @@ def _forward_kernel(degree: int, channels: int):
 
 
 @functools.cache
-def _backward_kernel(degree: int, channels: int):
-    @wp.func_native(backward_text(degree, channels))
+def _backward_kernel(degree: int, channels: int, clamped: bool):
+    @wp.func_native(backward_text(degree, channels, clamped))
     def backward(
         piece: wp.int32,
         num: wp.int32,
@@ -118,6 +118,7 @@ def _launch(kernel, tensors: list[Tensor], outputs: list) -> None:
 
 def harmonics_forward(
     degree: int,
+    clamped: bool,
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
@@ -127,17 +128,19 @@ def harmonics_forward(
 
     Args:
         degree: 0 to 4.
+        clamped: whether a colour is max(0, ½ + sum), or the sum itself.
         coefficients: ``[B, N, K, D]`` or ``[B, V, N, K, D]``.
         means: ``[B, N, 3]``.
         centers: ``[B, V, 3]``.
         colors: written, ``[B, V, N, D]``.
     """
-    kernel = _forward_kernel(degree, coefficients.shape[-1])
+    kernel = _forward_kernel(degree, coefficients.shape[-1], clamped)
     _launch(kernel, [coefficients, means, centers], [colors.view(-1)])
 
 
 def harmonics_backward(
     degree: int,
+    clamped: bool,
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
@@ -148,7 +151,8 @@ def harmonics_backward(
     """Gradients of ``harmonics_forward`` by coefficients, means and centers; None if not wanted.
 
     Args:
-        degree: as given forward, like the next three.
+        degree: as given forward, like the next four.
+        clamped: as given forward.
         coefficients: as given forward.
         means: as given forward.
         centers: as given forward.
@@ -165,6 +169,6 @@ def harmonics_backward(
         None if v_means is None else v_means.view(-1),
         None if v_centers is None else v_centers.view(-1),
     ]
-    kernel = _backward_kernel(degree, coefficients.shape[-1])
+    kernel = _backward_kernel(degree, coefficients.shape[-1], clamped)
     _launch(kernel, [coefficients, means, centers, colors, v_colors], outputs)
     return v_coefficients, v_means, None if v_centers is None else v_centers.sum(2)

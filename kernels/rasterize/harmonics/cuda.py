@@ -31,6 +31,19 @@ def _direction(mean: wp.vec3, center: wp.vec3) -> wp.vec4:
     return wp.vec4(t[0], t[1], t[2], size)
 
 
+# Which results pass a gradient on: of colours those above 0, of sums all but NaN.
+@wp.func
+@no_type_check
+def _is_lit(color: wp.float32) -> bool:
+    return color > 0.0
+
+
+@wp.func
+@no_type_check
+def _is_known(value: wp.float32) -> bool:
+    return value == value
+
+
 @functools.cache
 def _leaves(degree: int) -> SimpleNamespace:
     """The type ``column``, of all coefficients of a channel, and the functions of a degree.
@@ -65,7 +78,7 @@ def _leaves(degree: int) -> SimpleNamespace:
 
 
 @functools.cache
-def _forward_kernel(degree: int):
+def _forward_kernel(degree: int, clamped: bool):
     count, leaves = (degree + 1) ** 2, _leaves(degree)
     basis, used_are_finite = leaves.basis, leaves.used_are_finite
 
@@ -95,8 +108,10 @@ def _forward_kernel(degree: int):
                     value += Y[k] * coefficients_in[row, k, d]
                 # a coefficient that is not finite leaves such a sum; the reverse need not hold
                 bad = bad or not wp.isfinite(value)
-                value += 0.5
-                colors_out[at, d] = wp.where(value < 0.0, 0.0, value)
+                if wp.static(clamped):
+                    value += 0.5
+                    value = wp.where(value < 0.0, 0.0, value)
+                colors_out[at, d] = value
             if bad:
                 finite = wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2])
                 if not (finite and used_are_finite(coefficients_in, row)):
@@ -107,8 +122,9 @@ def _forward_kernel(degree: int):
 
 
 @functools.cache
-def _backward_kernel(degree: int):
+def _backward_kernel(degree: int, clamped: bool):
     count, leaves = (degree + 1) ** 2, _leaves(degree)
+    passes = _is_lit if clamped else _is_known
     column, basis, slopes = leaves.column, leaves.basis, leaves.slopes
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -137,7 +153,7 @@ def _backward_kernel(degree: int):
                     image = b * views + seen
                     at = image * num + i % num
                     # what passes no gradient on may hold NaN, which must not meet a zero
-                    if colors_in[at, d] > 0.0:
+                    if passes(colors_in[at, d]):
                         t = _direction(mean, centers_in[image])
                         v_column += v_colors_in[at, d] * basis(t[0], t[1], t[2])
                     last = per_view != 0 or seen == views - 1
@@ -157,7 +173,7 @@ def _backward_kernel(degree: int):
                 s = column()
                 alive = wp.bool(False)
                 for d in range(channels):
-                    if colors_in[at, d] > 0.0:
+                    if passes(colors_in[at, d]):
                         alive = True
                         v = v_colors_in[at, d]
                         for k in range(count):
@@ -191,6 +207,7 @@ def _launch(kernel, tensors: list[Tensor], outputs: list) -> None:
 
 def harmonics_forward(
     degree: int,
+    clamped: bool,
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
@@ -198,11 +215,12 @@ def harmonics_forward(
 ) -> None:
     """As the CPU's: fills the colours."""
     outputs = [colors.flatten(0, -2)]
-    _launch(_forward_kernel(degree), [coefficients, means, centers], outputs)
+    _launch(_forward_kernel(degree, clamped), [coefficients, means, centers], outputs)
 
 
 def harmonics_backward(
     degree: int,
+    clamped: bool,
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
@@ -221,7 +239,7 @@ def harmonics_backward(
         None if v_centers is None else view(v_centers, wp.vec3),
     ]
     tensors = [coefficients, means, centers, colors, v_colors]
-    _launch(_backward_kernel(degree), tensors, outputs)
+    _launch(_backward_kernel(degree, clamped), tensors, outputs)
     return (
         v_coefficients,
         v_means,

@@ -70,6 +70,12 @@ def colors_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers:
     Returns:
         ``[B, V, N, D]``, as ``colors_seen_from``.
     """
+    sums = sums_by_formula(degree, coefficients, means, centers)
+    return torch.where(sums.isnan(), sums, (sums + 0.5).clamp_min(0))
+
+
+def sums_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    """As ``colors_by_formula``, of ``sums_seen_from``."""
     used = coefficients[..., : (degree + 1) ** 2, :]
     used = used if used.dim() == 5 else used[:, None]
     # what is not finite must not meet a zero gradient: 0 * NaN would spread to the whole view
@@ -79,7 +85,7 @@ def colors_by_formula(degree: int, coefficients: Tensor, means: Tensor, centers:
     directions = torch.nn.functional.normalize(means[:, None] - centers[:, :, None], dim=-1)
     basis = harmonics_basis(degree, directions)
     if used.shape[1] == 1:  # without this, the coefficients of all views would be written out
-        colors = torch.einsum("bvnk,bnkd->bvnd", basis, used[:, 0])
+        sums = torch.einsum("bvnk,bnkd->bvnd", basis, used[:, 0])
     else:
-        colors = torch.einsum("bvnk,bvnkd->bvnd", basis, used)
-    return torch.where(finite[..., None], (colors + 0.5).clamp_min(0), torch.nan)
+        sums = torch.einsum("bvnk,bvnkd->bvnd", basis, used)
+    return torch.where(finite[..., None], sums, torch.nan)

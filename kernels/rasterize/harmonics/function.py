@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .formula import colors_by_formula
+from .formula import colors_by_formula, sums_by_formula
 from .ops import harmonics
 from .polynomials import MOST_CHANNELS
 
@@ -45,7 +45,15 @@ def colors_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: 
     if not _fits(coefficients, means, centers):
         return colors_by_formula(degree, coefficients, means, centers)
     each = (x.contiguous() for x in (coefficients, means, centers))
-    return harmonics(degree, *each)
+    return harmonics(degree, True, *each)
+
+
+def sums_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    """The sums alone, ``Σ_k Y_k(direction) coefficient_k``, as ``colors_seen_from`` else."""
+    if not _fits(coefficients, means, centers):
+        return sums_by_formula(degree, coefficients, means, centers)
+    each = (x.contiguous() for x in (coefficients, means, centers))
+    return harmonics(degree, False, *each)
 
 
 def _fits(coefficients: Tensor, means: Tensor, centers: Tensor) -> bool:

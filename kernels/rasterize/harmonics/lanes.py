@@ -74,6 +74,17 @@ _TOOLS = """
     auto basis_ = [&](F x, F y, F z, F* Y) {{ {basis} }};
 """
 
+# From a sum to the result, and which results pass a gradient on: of colours those above 0, else all
+# but NaN, which says that something was not finite.
+_COLORS = """
+    auto shown_ = [](F sum) -> F { const F c = sum + 0.5f; return c < 0.0f ? F{} : c; };
+    auto passes_ = [](F shown) -> I { return shown > 0.0f; };
+"""
+_SUMS = """
+    auto shown_ = [](F sum) -> F { return sum; };
+    auto passes_ = [](F shown) -> I { return shown == shown; };
+"""
+
 # What each direction does is the body of a loop over groups of Gaussians.
 _LOOP = """
     const int chunks = (num + {chunk} - 1) / {chunk};
@@ -117,8 +128,7 @@ _FORWARD = """
                 }
             float values[16 * D];
             for (int d = 0; d < D; ++d) {
-                const F color = sum[d] + 0.5f;
-                const F shown = bad ? F{} + __builtin_nanf("") : (color < 0.0f ? F{} : color);
+                const F shown = bad ? F{} + __builtin_nanf("") : shown_(sum[d]);
                 for (int j = 0; j < 16; ++j) values[j * D + d] = shown[j];
             }
             __builtin_memcpy(colors.data + at * D, values, (size_t)live * D * 4);
@@ -142,8 +152,9 @@ _BACKWARD = """
                     value[j] = values[j * D + d];
                     shown[j] = colors.data[(at + j) * D + d];
                 }
-                v[d] = shown > 0.0f ? value : F{};
-                alive |= shown > 0.0f;
+                const I passes = passes_(shown);
+                v[d] = passes ? value : F{};
+                alive |= passes;
             }
             F t[3], Y[COUNT];
             const F size = direction_(centers.data + image * 3, mean, t);
@@ -223,17 +234,17 @@ _BACKWARD_TOOLS = """
 """
 
 
-def forward_text(degree: int, channels: int) -> str:
-    """C++ that fills the colours of a chunk of Gaussians, for a number of channels."""
-    return _text(_FORWARD, degree, channels)
+def forward_text(degree: int, channels: int, clamped: bool) -> str:
+    """C++ that fills the colours, or the bare sums, of a chunk of Gaussians."""
+    return _text(_FORWARD, degree, channels, clamped)
 
 
-def backward_text(degree: int, channels: int) -> str:
+def backward_text(degree: int, channels: int, clamped: bool) -> str:
     """C++ of the gradient of ``forward_text``."""
-    return _text(_BACKWARD, degree, channels, _BACKWARD_TOOLS)
+    return _text(_BACKWARD, degree, channels, clamped, _BACKWARD_TOOLS)
 
 
-def _text(body: str, degree: int, channels: int, tools: str = "") -> str:
+def _text(body: str, degree: int, channels: int, clamped: bool, tools: str = "") -> str:
     count = (degree + 1) ** 2
     text = (_TOOLS + tools).format(
         count=count,
@@ -244,4 +255,5 @@ def _text(body: str, degree: int, channels: int, tools: str = "") -> str:
         slopes=slopes_text(degree),
     )
     unroll = '_Pragma("clang loop unroll(full)")' if count * channels <= _UNROLLED else ""
+    text += _COLORS if clamped else _SUMS
     return text + _LOOP.format(chunk=CHUNK, body=body.replace("UNROLL", unroll))

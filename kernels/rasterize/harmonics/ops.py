@@ -24,16 +24,20 @@ def _empty_colors(coefficients: Tensor, means: Tensor, centers: Tensor) -> Tenso
 
 @without_compiler
 @torch.library.custom_op(_OP, mutates_args=())
-def harmonics(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
-    """Colours as ``colors_seen_from`` returns them, of contiguous float32 tensors."""
+def harmonics(
+    degree: int, clamped: bool, coefficients: Tensor, means: Tensor, centers: Tensor
+) -> Tensor:
+    """``colors_seen_from`` if ``clamped``, else ``sums_seen_from``; contiguous float32 tensors."""
     colors = _empty_colors(coefficients, means, centers)
     if colors.numel():
-        _kernels(means.device).harmonics_forward(degree, coefficients, means, centers, colors)
+        _kernels(means.device).harmonics_forward(
+            degree, clamped, coefficients, means, centers, colors
+        )
     return colors
 
 
 @harmonics.register_fake
-def _(degree, coefficients, means, centers):
+def _(degree, clamped, coefficients, means, centers):
     return _empty_colors(coefficients, means, centers)
 
 
@@ -41,6 +45,7 @@ def _(degree, coefficients, means, centers):
 @torch.library.custom_op(_OP + "_vjp", mutates_args=())
 def _harmonics_vjp(
     degree: int,
+    clamped: bool,
     coefficients: Tensor,
     means: Tensor,
     centers: Tensor,
@@ -52,25 +57,26 @@ def _harmonics_vjp(
     if not colors.numel():
         return [torch.zeros_like(x) for x, want in zip(inputs, wanted) if want]
     launch = _kernels(means.device).harmonics_backward
-    grads = launch(degree, *inputs, colors, v_colors, wanted)
+    grads = launch(degree, clamped, *inputs, colors, v_colors, wanted)
     return [g for g in grads if g is not None]
 
 
 @_harmonics_vjp.register_fake
-def _(degree, coefficients, means, centers, colors, v_colors, wanted):
+def _(degree, clamped, coefficients, means, centers, colors, v_colors, wanted):
     inputs = coefficients, means, centers
     return [torch.empty_like(x) for x, want in zip(inputs, wanted) if want]
 
 
 def _setup(ctx, inputs, output):
-    ctx.degree, *tensors = inputs
+    ctx.degree, ctx.clamped, *tensors = inputs
     ctx.save_for_backward(*tensors, output)
 
 
 def _backward(ctx, v_colors):
-    wanted = list(ctx.needs_input_grad[1:])
-    grads = iter(_harmonics_vjp(ctx.degree, *ctx.saved_tensors, v_colors.contiguous(), wanted))
-    return None, *(next(grads) if want else None for want in wanted)
+    wanted = list(ctx.needs_input_grad[2:])
+    each = ctx.degree, ctx.clamped, *ctx.saved_tensors
+    grads = iter(_harmonics_vjp(*each, v_colors.contiguous(), wanted))
+    return None, None, *(next(grads) if want else None for want in wanted)
 
 
 harmonics.register_autograd(_backward, setup_context=_setup)

@@ -12,8 +12,13 @@ from gamba_warp.kernels.rasterize.harmonics import (
     cpu,
     cuda,
     ops,
+    sums_seen_from,
 )
-from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula, harmonics_basis
+from gamba_warp.kernels.rasterize.harmonics.formula import (
+    colors_by_formula,
+    harmonics_basis,
+    sums_by_formula,
+)
 
 NAMES = ("coefficients", "means", "centers")
 # float32 sums of up to 25 terms; the gradient by a centre adds up 300 Gaussians
@@ -47,14 +52,14 @@ def run(function, degree, inputs, v, dtype=torch.float32):
     return colors.detach(), dict(zip(inputs, grads))
 
 
-def check(degree, inputs):
-    """Colours and all gradients against the formula in float64."""
+def check(degree, inputs, ours=colors_seen_from, oracle=colors_by_formula):
+    """Colours, or bare sums, and all gradients against the formula in float64."""
     shape = *inputs["centers"].shape[:2], inputs["means"].shape[1], inputs["coefficients"].shape[-1]
     v = torch.randn(shape)
     # where rounding decides whether a colour is clamped, the gradient is either
     v[unclamped(degree, inputs).abs() < 1e-6] = 0
-    got, grads = run(colors_seen_from, degree, inputs, v)
-    want, expected = run(colors_by_formula, degree, inputs, v, torch.float64)
+    got, grads = run(ours, degree, inputs, v)
+    want, expected = run(oracle, degree, inputs, v, torch.float64)
     assert (got - want).abs().max() <= FORWARD * want.abs().max()
     for name in NAMES:
         if expected[name] is None:  # degree 0 does not see the direction
@@ -81,6 +86,19 @@ def test_colours_and_gradients(device, degree, per_view):
     """37 Gaussians are two groups of lanes and five, and rows are longer than what is used."""
     want = check(degree, make(degree=degree, extra=2, per_view=per_view))
     assert 0.05 < (want == 0).double().mean() < 0.5, "some are clamped, most are not"
+
+
+@pytest.mark.parametrize("per_view", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_bare_sums_and_gradients(device, degree, per_view):
+    """Nothing is added and nothing clamped: sums below 0 stay, and pass their gradient on."""
+    inputs = make(degree=degree, extra=1, per_view=per_view)
+    want = check(degree, inputs, sums_seen_from, sums_by_formula)
+    assert 0.2 < (want < -0.1).double().mean() < 0.7
+    inputs["means"][1, 5, 0] = math.nan
+    got, grads = run(sums_seen_from, degree, inputs, torch.randn(2, 3, 37, 3))
+    assert got[1, :, 5].isnan().all() and got.isnan().sum() == 3 * 3
+    assert all(g.isfinite().all() for g in grads.values())
 
 
 @pytest.mark.parametrize("num", [1, 16, 257, 300])
