@@ -31,17 +31,9 @@ def _direction(mean: wp.vec3, center: wp.vec3) -> wp.vec4:
     return wp.vec4(t[0], t[1], t[2], size)
 
 
-# Which results pass a gradient on: of colours those above 0, of sums all but NaN.
-@wp.func
-@no_type_check
-def _is_lit(color: wp.float32) -> bool:
-    return color > 0.0
-
-
-@wp.func
-@no_type_check
-def _is_known(value: wp.float32) -> bool:
-    return value == value
+# Results above these pass their gradient on: colours that are not clamped, and sums that are
+# neither NaN nor -inf. (A function in place of the comparison takes 20 registers more.)
+_ABOVE = {True: 0.0, False: -3.4e38}
 
 
 @functools.cache
@@ -124,7 +116,7 @@ def _forward_kernel(degree: int, clamped: bool):
 @functools.cache
 def _backward_kernel(degree: int, clamped: bool):
     count, leaves = (degree + 1) ** 2, _leaves(degree)
-    passes = _is_lit if clamped else _is_known
+    above = _ABOVE[clamped]
     column, basis, slopes = leaves.column, leaves.basis, leaves.slopes
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -153,7 +145,7 @@ def _backward_kernel(degree: int, clamped: bool):
                     image = b * views + seen
                     at = image * num + i % num
                     # what passes no gradient on may hold NaN, which must not meet a zero
-                    if passes(colors_in[at, d]):
+                    if colors_in[at, d] > wp.static(above):
                         t = _direction(mean, centers_in[image])
                         v_column += v_colors_in[at, d] * basis(t[0], t[1], t[2])
                     last = per_view != 0 or seen == views - 1
@@ -173,7 +165,7 @@ def _backward_kernel(degree: int, clamped: bool):
                 s = column()
                 alive = wp.bool(False)
                 for d in range(channels):
-                    if passes(colors_in[at, d]):
+                    if colors_in[at, d] > wp.static(above):
                         alive = True
                         v = v_colors_in[at, d]
                         for k in range(count):

@@ -74,15 +74,15 @@ _TOOLS = """
     auto basis_ = [&](F x, F y, F z, F* Y) {{ {basis} }};
 """
 
-# From a sum to the result, and which results pass a gradient on: of colours those above 0, else all
-# but NaN, which says that something was not finite.
+# From a sum to the result, and which results pass a gradient on: colours above 0, and sums that are
+# neither NaN, which says that something was not finite, nor -inf.
 _COLORS = """
     auto shown_ = [](F sum) -> F { const F c = sum + 0.5f; return c < 0.0f ? F{} : c; };
     auto passes_ = [](F shown) -> I { return shown > 0.0f; };
 """
 _SUMS = """
     auto shown_ = [](F sum) -> F { return sum; };
-    auto passes_ = [](F shown) -> I { return shown == shown; };
+    auto passes_ = [](F shown) -> I { return shown > -3.4e38f; };
 """
 
 # What each direction does is the body of a loop over groups of Gaussians.
