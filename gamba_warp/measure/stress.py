@@ -145,7 +145,8 @@ class _Oracle:
         y = self.r(self.r(x, ulps, ulps) @ W.mT, ulps, ulps)
         if bias is None:
             return y
-        return self.r(y + self.r(bias).reshape(len(bias), *axes, 1, -1), ulps, ulps)
+        bias = self.r(bias, ulps, ulps).reshape(len(bias), *axes, 1, -1)  # rounded as W is
+        return self.r(y + bias, ulps, ulps)
 
     def norm(self, x: Tensor, name: str) -> Tensor:
         """Applies the configuration's norm.
@@ -181,7 +182,8 @@ class _Oracle:
         patches = patches.permute(0, 1, 2, 4, 6, 3, 5).flatten(4).flatten(2, 3)
         weight = self.weights["tokens.patchify.weight"].flatten(2)
         x = r(patches, self.ulps) @ r(weight, self.ulps, self.ulps)[:, None].mT
-        x = r(x + self.weights["tokens.patchify.bias"][:, None, None], self.ulps, self.ulps)
+        bias = r(self.weights["tokens.patchify.bias"], self.ulps, self.ulps)
+        x = r(x + bias[:, None, None], self.ulps, self.ulps)
         return r(x[:, :, self.orders] + embedding)
 
     def mamba(self, x: Tensor, name: str) -> Tensor:
