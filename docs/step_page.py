@@ -12,6 +12,7 @@ After both measurements:
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,10 @@ def page_of(text: str, step: dict, precision: dict) -> str:
     parts = {
         "shares": "\n\n".join([_shares(_Case(step, "step", "parts")), machine_line(step)]),
         "products": "\n\n".join([_products(pictures), machine_line(precision)]),
-        "pictures": _pictures(pictures),
-        "gradients": _gradients(_Case(step, "step", "precision")),
+        "pictures": _compared(pictures, ("tiny", "rays", "paper"), "Gaussians"),
+        "gradients": _compared(
+            _Case(step, "step", "precision"), ("tiny", "rays"), "gradient", angle=True
+        ),
         "ssim": _ssim(_Case(step, "step", "SSIM")),
         "optimizer": _optimizer(_Case(step, "step", "optimizer")),
     }
@@ -104,38 +107,21 @@ def _products(case: _Case) -> str:
     return table(["", *_PRECISIONS, "float32 by MKL"], rows)
 
 
-def _pictures(case: _Case) -> str:
-    """How far a picture's Gaussians are from those of float32."""
+def _compared(case: _Case, presets: tuple[str, ...], what: str, angle: bool = False) -> str:
+    """How far ``what`` of each preset is from that of float32, in both precisions."""
+    shown: dict[str, Callable[[dict], str]] = {
+        "ms": lambda r: case.ms(r["variant"]),
+        f"{what}, relative rms": lambda r: f"{r['rel_rms_error']:.1e}",
+    }
+    if angle:
+        shown["1 - cosine"] = lambda r: f"{r['work']['gradient_angle']:.0e}"
+    shown["pictures, PSNR in dB"] = lambda r: f"{r['work']['psnr_to_float32']:.1f}"
     rows = []
-    for preset in ("tiny", "rays", "paper"):
+    for preset in presets:
         found = [case[f"{preset}, {kind}"] for kind in _PRECISIONS]
-        rows.append(
-            [
-                f"{preset}, {found[0]['parameters']['weights']} weights",
-                " / ".join(case.ms(r["variant"]) for r in found),
-                " / ".join(f"{r['rel_rms_error']:.1e}" for r in found),
-                " / ".join(f"{r['work']['psnr_to_float32']:.1f}" for r in found),
-            ]
-        )
-    return table([_BOTH, "ms", "Gaussians, relative rms", "pictures, PSNR in dB"], rows)
-
-
-def _gradients(case: _Case) -> str:
-    """How far a step's gradient is from that of float32."""
-    rows = []
-    for preset in ("tiny", "rays"):
-        found = [case[f"{preset}, {kind}"] for kind in _PRECISIONS]
-        rows.append(
-            [
-                f"{preset}, {found[0]['parameters']['weights']} weights",
-                " / ".join(case.ms(r["variant"]) for r in found),
-                " / ".join(f"{r['rel_rms_error']:.1e}" for r in found),
-                " / ".join(f"{r['work']['gradient_angle']:.0e}" for r in found),
-                " / ".join(f"{r['work']['psnr_to_float32']:.1f}" for r in found),
-            ]
-        )
-    header = [_BOTH, "ms", "gradient, relative rms", "1 - cosine", "pictures, PSNR in dB"]
-    return table(header, rows)
+        name = f"{preset}, {found[0]['parameters']['weights']} weights"
+        rows.append([name, *(" / ".join(map(show, found)) for show in shown.values())])
+    return table([_BOTH, *shown], rows)
 
 
 def _ssim(case: _Case) -> str:

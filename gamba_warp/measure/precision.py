@@ -19,6 +19,7 @@ from ..model.gamba import Gamba
 from ..model.posing import reference_cameras
 from ..render import render
 from .blocks import Products
+from .pictures import without_encoder
 
 PAPER, ALONE, PLAIN = "paper, float32", "products alone", "MKL's products alone"
 # Allowed relative rms errors of the Gaussians: roundings that 14 blocks carry on.
@@ -50,7 +51,7 @@ class _Precise:
         shipped = None if quick else shipped_model(preset, settings.device)
         self.trained = shipped is not None
         if shipped is None:
-            config = replace(PRESETS[preset], encoder="none")
+            config = without_encoder(PRESETS[preset])
             if quick:
                 config = replace(config, image_size=32, width=16, depth=1)
             shipped = Gamba(config).to(settings.device).eval()

@@ -4,23 +4,22 @@ import torch
 import warp as wp
 
 from ..runtime.lanes import ACTIVATIONS, PRELUDE, WARP_DTYPES, lanes
-from ..runtime.rows import ELEMENTS, put, rows
+from ..runtime.rows import ELEMENTS, SETTLE, put, rows
 
-_STRIP = """
+_STRIP = f"""
 const F v0 = *(const F*)&w0, v1 = *(const F*)&w1, v2 = *(const F*)&w2, v3 = *(const F*)&w3;
 const F v = *(const F*)&bias;
 F x0 = *(const F*)&first, x1 = *(const F*)&second, x2 = *(const F*)&third;
-for (int t = 0; t < count; ++t) {
+for (int t = 0; t < count; ++t) {{
     const F x3 = read_x(t);
     F y = fma_(v0, x0, fma_(v1, x1, fma_(v2, x2, fma_(v3, x3, v))));
     if (use_silu) y = y * sigmoid_(y);
     put_y(t, y);
     x0 = x1, x1 = x2, x2 = x3;
-}
-#if defined(__x86_64__)
-// The last channels of a row of tasks: what went past the caches is seen by others from here on.
-if (stream && d + 16 >= x_in.shape[2]) __builtin_ia32_sfence();
-#endif
+}}
+if (stream && d + 16 >= x_in.shape[2]) {{  // the last channels of a row of tasks
+{SETTLE}
+}}
 """
 
 

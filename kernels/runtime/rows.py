@@ -15,6 +15,7 @@ from .lanes import LANES, PRELUDE, WARP_DTYPES, W, fma, lanes, sigmoid, times
 __all__ = [
     "ACCESSORS",
     "ELEMENTS",
+    "SETTLE",
     "VALUE",
     "WIDTH",
     "fma",
@@ -145,11 +146,14 @@ def streams(results: Sequence[Tensor]) -> bool:
 
 
 # What was written past the caches is seen by other threads from here on.
-@wp.func_native("""
+SETTLE = """
 #if defined(__x86_64__)
 __builtin_ia32_sfence();
 #endif
-""")
+"""
+
+
+@wp.func_native(SETTLE)
 def settle(): ...
 
 

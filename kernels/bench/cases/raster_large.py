@@ -23,6 +23,10 @@ _MARGIN = 16  # pixels around the crop of the check, within which the oracle see
 _LEVELS = {"quick": (1024, 40000), "normal": (_FEW, 262144), "full": (_FEW, 262144, 1048576)}
 
 
+def _width(size: int, wide: bool) -> int:
+    return size * 16 // 9 if wide else size
+
+
 class LargeScene(Scene):
     """A shell whose oracle sees only the Gaussians around the crop: it is dense.
 
@@ -35,7 +39,7 @@ class LargeScene(Scene):
     @property
     def width(self) -> int:
         """Of the picture, pixels."""
-        return self.size * 16 // 9 if self.wide else self.size
+        return _width(self.size, self.wide)
 
     def arguments(self) -> dict:
         """As of any scene, with the width of the picture."""
@@ -61,7 +65,7 @@ class LargeScene(Scene):
 
 def _scene(settings: Settings, count: int, few: int, size: int, wide: bool) -> LargeScene:
     viewmats, Ks = orbit_cameras(1, size)
-    width = size * 16 // 9 if wide else size
+    width = _width(size, wide)
     Ks[:, 0, 2] = width / 2
     g = torch.Generator().manual_seed(3)
     cotangent = torch.randn(1, size, width, 3, generator=g).to(settings.device)

@@ -338,17 +338,7 @@ def _project_lanes(
 def project_on_lanes(
     images: int, views: int, num: int, colors_per_view: int, lens: Lens, inputs: list, outputs: list
 ) -> None:
-    """Runs the projection of B objects into V views each.
-
-    Args:
-        images: I = B * V.
-        views: of an object, V.
-        num: Gaussians of an object, at least 1.
-        colors_per_view: 1 if each view has colours of its own, otherwise 0.
-        lens: from ``make_lens``.
-        inputs: as the scalar kernel has them, from the means on.
-        outputs: as the scalar kernel has them.
-    """
+    """Does what ``project_on_threads`` does, with the same arguments, on the lanes of a CPU."""
     runs = -(-num // _RUN)
     tasks = images * runs
     pieces = min(tasks, _PIECES_PER_THREAD * torch.get_num_threads())
