@@ -42,18 +42,22 @@ def colors_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: 
     Returns:
         ``[B, V, N, D]``; NaN without a gradient where the mean or a used coefficient is not finite.
     """
-    if not _fits(coefficients, means, centers):
-        return colors_by_formula(degree, coefficients, means, centers)
-    each = (x.contiguous() for x in (coefficients, means, centers))
-    return harmonics(degree, True, *each)
+    return _seen_from(degree, True, coefficients, means, centers)
 
 
 def sums_seen_from(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
-    """The sums alone, ``Σ_k Y_k(direction) coefficient_k``, as ``colors_seen_from`` else."""
+    """The sums in ``colors_seen_from``, ``Σ_k Y_k(direction) coefficient_k``, and no clamp."""
+    return _seen_from(degree, False, coefficients, means, centers)
+
+
+def _seen_from(
+    degree: int, clamped: bool, coefficients: Tensor, means: Tensor, centers: Tensor
+) -> Tensor:
     if not _fits(coefficients, means, centers):
-        return sums_by_formula(degree, coefficients, means, centers)
+        formula = colors_by_formula if clamped else sums_by_formula
+        return formula(degree, coefficients, means, centers)
     each = (x.contiguous() for x in (coefficients, means, centers))
-    return harmonics(degree, False, *each)
+    return harmonics(degree, clamped, *each)
 
 
 def _fits(coefficients: Tensor, means: Tensor, centers: Tensor) -> bool:
