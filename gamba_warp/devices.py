@@ -220,7 +220,8 @@ def _onednn_is_better() -> bool:
         return False
     a, b = torch.randn(2, 128, 128, generator=torch.Generator().manual_seed(0))
     truth = a.double() @ b.double()
-    with _Products.lock:
+    # The caller's autocast would round this product, and all later ones would be MKL's.
+    with _Products.lock, torch.autocast("cpu", enabled=False):
         before = torch.get_float32_matmul_precision()
         torch.set_float32_matmul_precision("medium")
         try:

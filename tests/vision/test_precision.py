@@ -87,6 +87,16 @@ def test_the_last_thread_puts_the_products_back(better):
     assert torch.get_float32_matmul_precision() == before
 
 
+def test_the_first_use_under_an_autocast_chooses_the_same_library(monkeypatch):
+    """The comparison with float64 once took the caller's autocast for the library's error."""
+    known = {"cpu_name": "AMD EPYC", "avx512_f": True}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known, raising=False)
+    chosen = devices._onednn_is_better.__wrapped__
+    alone = chosen()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert chosen() == alone
+
+
 def test_products_of_a_network_keep_all_digits():
     """Whatever this processor is: if oneDNN is chosen here, its products are float32's."""
     g = torch.Generator().manual_seed(1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import Random
 
 import torch
@@ -51,6 +51,7 @@ class Comparison:
         nonfinite: count of numbers that are NaN or infinite although the truth fits in the dtype.
         counts: whether ``error`` is shown. It is shown for a float32 result whose truth is well
             above what may count as 0, and is not itself the rounding error of a sum that cancels.
+        noise: whether rounding changes the worst part by more than half of its truth.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Comparison:
     ratio: float
     nonfinite: int = 0
     counts: bool = True
+    noise: bool = False
 
     @property
     def is_gradient(self) -> bool:
@@ -74,12 +76,14 @@ class Outcome:
         faults: everything else that is wrong, such as an exception or two runs that differ.
         pixels: number of pixels that were compared (rasterizer).
         undecided: number of those pixels in which rounding decides a cut or an order.
+        steep: whether the case was over its limit once and is judged by its widest limit.
     """
 
     comparisons: list[Comparison] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     pixels: int = 0
     undecided: int = 0
+    steep: bool = False
 
     @property
     def nonfinite(self) -> int:
@@ -133,7 +137,8 @@ class Op:
 def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
     """Runs a case and turns an exception into a fault.
 
-    A case that is over its limit is run ``TRIALS`` times, and the middle one of these counts.
+    A case that is over its limit is run ``TRIALS`` times, and the middle one of these counts, or
+    the widest limit of each result if the case is steep.
     """
     try:
         outcome = op.evaluate(case, device, 0)
@@ -141,12 +146,24 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
         if failure is None or failure["what"] != "limit":
             return outcome
         found = [outcome, *(op.evaluate(case, device, trial) for trial in range(1, TRIALS))]
-        found.sort(key=lambda o: o.worst.ratio if o.worst else 0.0)
         bad = [o for o in found if o.faults or o.nonfinite]
-        return bad[0] if bad else found[TRIALS // 2]
+        return bad[0] if bad else _judged(found)
     except Exception as error:
         text = str(error).strip().splitlines() or [""]
         return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
+
+
+def _judged(found: list[Outcome]) -> Outcome:
+    """What all trials of a case give together; README.md says why steep ones are another matter."""
+    found = sorted(found, key=lambda o: o.worst.ratio if o.worst else 0.0)
+    middle, all_results = found[len(found) // 2], [c for o in found for c in o.comparisons]
+    if not any(c.noise for c in all_results):
+        return middle
+    least = {name: math.inf for name in (c.name for c in all_results)}
+    for c in all_results:
+        least[c.name] = min(c.ratio, least[c.name])
+    comparisons = [replace(c, ratio=least[c.name]) for c in middle.comparisons]
+    return replace(middle, comparisons=comparisons, steep=True)
 
 
 def fitted(options: dict, sizes: tuple[str, ...], largest: int) -> dict:
@@ -215,11 +232,15 @@ def judge(
 
     difference = value - want
     size = rms(want)
-    limit = FACTOR * rms(samples[1:] - want).amax(0) + (relative + FACTOR * UNIT) * size
+    by_rounding = rms(samples[1:] - want).amax(0)
+    limit = FACTOR * by_rounding + (relative + FACTOR * UNIT) * size
     limit = limit + absolute * FACTOR + (0.0 if extra is None else extra)
-    ratio = (rms(difference) / limit).max().item()
+    ratios = (rms(difference) / limit).flatten()
+    worst = int(ratios.argmax())
+    noise = bool((by_rounding > size / 2).flatten()[worst])
     parts = tuple(range(want.dim()))
     held = held if shown is None else held & shown
     total, spread = rms(want).item(), rms(samples[1:] - want).max().item()
     counts = got.dtype == torch.float32 and total > 1e-30 and spread < 1e-3 * total
-    return Comparison(name, rms(difference).item() / total if total else 0.0, ratio, 0, counts)
+    error = rms(difference).item() / total if total else 0.0
+    return Comparison(name, error, ratios[worst].item(), 0, counts, noise)

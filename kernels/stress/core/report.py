@@ -11,7 +11,7 @@ from .runner import Row, Tally
 FORMAT = "gamba_warp.stress.1"
 _HEAD = (
     "op", "kind", "cases", "forward error", "of", "gradient error", "of", "error / limit",
-    "undecided pixels", "non-finite", "failures",
+    "undecided pixels", "steep", "non-finite", "failures",
 )  # fmt: skip
 
 
@@ -24,7 +24,7 @@ def _cells(row: Row) -> list[str]:
     return [
         row.op, row.kind, str(row.cases), _error(row.forward[0]), row.forward[1],
         _error(row.gradient[0]), row.gradient[1].removeprefix("gradient of "), f"{row.ratio:.2f}",
-        share, str(row.nonfinite), str(row.failures),
+        share, str(row.steep), str(row.nonfinite), str(row.failures),
     ]  # fmt: skip
 
 

@@ -40,6 +40,7 @@ class Row:
         failures: number of cases that failed in any way.
         pixels: number of pixels compared (rasterizer).
         undecided: number of those pixels in which rounding decides a cut or an order.
+        steep: number of cases that are judged by their widest limit.
         seconds: time spent.
     """
 
@@ -53,6 +54,7 @@ class Row:
     failures: int = 0
     pixels: int = 0
     undecided: int = 0
+    steep: int = 0
     seconds: float = 0.0
 
     def add(self, outcome: Outcome, seconds: float) -> None:
@@ -63,12 +65,16 @@ class Row:
         self.failures += outcome.failure() is not None
         self.pixels += outcome.pixels
         self.undecided += outcome.undecided
+        self.steep += outcome.steep
         for c in outcome.comparisons:
             self.ratio = max(self.ratio, c.ratio)
             if c.is_gradient:
                 self.gradient = max(self.gradient, _entry(c))
             else:
                 self.forward = max(self.forward, _entry(c))
+
+
+_COUNTS = ("cases", "nonfinite", "failures", "pixels", "undecided", "steep", "seconds")
 
 
 def _entry(c: Comparison) -> tuple[float, str]:
@@ -96,7 +102,7 @@ class Tally:
         made: dict[str, Row] = {}
         for row in self.rows.values():
             total = made.setdefault(row.op, Row(row.op, "all"))
-            for name in ("cases", "nonfinite", "failures", "pixels", "undecided", "seconds"):
+            for name in _COUNTS:
                 setattr(total, name, getattr(total, name) + getattr(row, name))
             for name in ("forward", "gradient", "ratio"):
                 setattr(total, name, max(getattr(total, name), getattr(row, name)))

@@ -10,7 +10,7 @@ import torch
 
 from gamba_warp.kernels.stress import Case, run_case
 from gamba_warp.kernels.stress.cases import raster
-from gamba_warp.kernels.stress.core.case import Comparison, Outcome
+from gamba_warp.kernels.stress.core.case import Comparison, Outcome, judge
 from gamba_warp.kernels.stress.core.rounding import SAMPLES, UNDERFLOW, Rounding, samples_of
 from gamba_warp.kernels.stress.oracles.scan import states
 from gamba_warp.measure import stress_run
@@ -90,6 +90,32 @@ def test_most_trials_decide(ratios, fails):
     op = replace(raster.OP, evaluate=evaluate)
     outcome = run_case(op, Case("raster", "uniform", 0, {}), CPU)
     assert (outcome.failure() is not None) == fails and seen == [*range(len(ratios))]
+
+
+@pytest.mark.parametrize("noise, ratios, fails", [
+    (True, (9.0, 4.0, 0.9, 4.0, 3.0), False),
+    (True, (9.0, 4.0, 1.1, 4.0, 3.0), True),
+    (False, (9.0, 4.0, 0.9, 4.0, 3.0), True),
+])  # fmt: skip
+def test_the_widest_limit_counts_for_steep_cases_alone(noise, ratios, fails):
+    def evaluate(case, device, trial):
+        steep = Comparison("gradient of u", 20.0, 0.7, noise=noise and trial == 1)
+        return Outcome([Comparison("out", 1e-7, ratios[trial]), steep])
+
+    outcome = run_case(replace(raster.OP, evaluate=evaluate), Case("raster", "x", 0, {}), CPU)
+    assert (outcome.failure() is not None) == fails and outcome.steep == noise
+
+
+@pytest.mark.parametrize("off, noise", [(0.3, False), (0.7, True)])
+def test_a_result_without_a_certain_digit_is_noise(off, noise):
+    """The part decides in which the error is worst."""
+    samples = torch.ones(SAMPLES, 2, 50, dtype=torch.float64)
+    samples[1, 0] += off
+    samples[1, 1] += 0.9 - off  # the other part, whose error is smaller
+    got = torch.ones(2, 50)
+    got[0] += 10 * off
+    found = judge("out", got, samples, (-1,))
+    assert found.ratio == pytest.approx(10 / 8, rel=1e-5) and found.noise == noise
 
 
 def test_a_fault_in_one_trial_is_a_failure():
