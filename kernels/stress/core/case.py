@@ -14,6 +14,7 @@ from .rounding import UNDERFLOW, UNIT
 
 FACTOR = 8.0  # largest error, as a multiple of what rounding does to the formula
 TRIALS = 5  # evaluations of a case that is over its limit, an odd number; most of them decide
+STEEP_TRIALS = 50  # and if rounding leaves no digit of a result
 # A result's dtype: its relative error, and its absolute error below its normal numbers.
 _STORED = {
     torch.float32: (0.0, UNDERFLOW),
@@ -76,7 +77,7 @@ class Outcome:
         faults: everything else that is wrong, such as an exception or two runs that differ.
         pixels: number of pixels that were compared (rasterizer).
         undecided: number of those pixels in which rounding decides a cut or an order.
-        steep: whether the case was over its limit once and is judged by its widest limit.
+        steep: whether each result is judged by the widest limit of many trials.
     """
 
     comparisons: list[Comparison] = field(default_factory=list)
@@ -137,33 +138,43 @@ class Op:
 def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
     """Runs a case and turns an exception into a fault.
 
-    A case that is over its limit is run ``TRIALS`` times, and the middle one of these counts, or
-    the widest limit of each result if the case is steep.
+    A case that is over its limit is run ``TRIALS`` times, and the middle one of these counts. If it
+    is steep, up to ``STEEP_TRIALS`` count, each result by its widest limit. README.md says why.
     """
     try:
         outcome = op.evaluate(case, device, 0)
-        failure = outcome.failure()
-        if failure is None or failure["what"] != "limit":
+        if not _over(outcome):
             return outcome
         found = [outcome, *(op.evaluate(case, device, trial) for trial in range(1, TRIALS))]
-        bad = [o for o in found if o.faults or o.nonfinite]
-        return bad[0] if bad else _judged(found)
+        found.sort(key=lambda o: o.worst.ratio if o.worst else 0.0)
+        middle = found[TRIALS // 2]
+        if bad := [o for o in found if o.faults or o.nonfinite]:
+            return bad[0]
+        steep = any(c.noise for o in found for c in o.comparisons)
+        return _widest(op, case, device, found) if steep and _over(middle) else middle
     except Exception as error:
         text = str(error).strip().splitlines() or [""]
         return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
 
 
-def _judged(found: list[Outcome]) -> Outcome:
-    """What all trials of a case give together; README.md says why steep ones are another matter."""
-    found = sorted(found, key=lambda o: o.worst.ratio if o.worst else 0.0)
-    middle, all_results = found[len(found) // 2], [c for o in found for c in o.comparisons]
-    if not any(c.noise for c in all_results):
-        return middle
-    least = {name: math.inf for name in (c.name for c in all_results)}
-    for c in all_results:
-        least[c.name] = min(c.ratio, least[c.name])
-    comparisons = [replace(c, ratio=least[c.name]) for c in middle.comparisons]
-    return replace(middle, comparisons=comparisons, steep=True)
+def _over(outcome: Outcome) -> bool:
+    failure = outcome.failure()
+    return failure is not None and failure["what"] == "limit"
+
+
+def _widest(op: Op, case: Case, device: torch.device, found: list[Outcome]) -> Outcome:
+    """What is left over its widest limit, in the trials found and as many more as it takes."""
+    least = found[0]
+    for trial in range(STEEP_TRIALS):
+        other = found[trial] if trial < len(found) else op.evaluate(case, device, trial)
+        ratios = {c.name: c.ratio for c in other.comparisons}
+        comparisons = [replace(c, ratio=min(c.ratio, ratios[c.name])) for c in least.comparisons]
+        least = replace(least, comparisons=comparisons, steep=True)
+        if other.faults or other.nonfinite:
+            return other
+        if trial >= len(found) and not _over(least):
+            break
+    return least
 
 
 def fitted(options: dict, sizes: tuple[str, ...], largest: int) -> dict:

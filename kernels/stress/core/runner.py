@@ -40,7 +40,7 @@ class Row:
         failures: number of cases that failed in any way.
         pixels: number of pixels compared (rasterizer).
         undecided: number of those pixels in which rounding decides a cut or an order.
-        steep: number of cases that are judged by their widest limit.
+        steep: number of cases that are judged by the widest limit of many trials.
         seconds: time spent.
     """
 

@@ -92,18 +92,22 @@ def test_most_trials_decide(ratios, fails):
     assert (outcome.failure() is not None) == fails and seen == [*range(len(ratios))]
 
 
-@pytest.mark.parametrize("noise, ratios, fails", [
-    (True, (9.0, 4.0, 0.9, 4.0, 3.0), False),
-    (True, (9.0, 4.0, 1.1, 4.0, 3.0), True),
-    (False, (9.0, 4.0, 0.9, 4.0, 3.0), True),
+@pytest.mark.parametrize("noise, at, fails, trials", [
+    (True, 30, False, 31),  # until a trial has a limit that is wide enough
+    (True, 70, True, 50),
+    (False, 2, True, 5),
 ])  # fmt: skip
-def test_the_widest_limit_counts_for_steep_cases_alone(noise, ratios, fails):
+def test_the_widest_limit_counts_for_steep_cases_alone(noise, at, fails, trials):
+    seen = []
+
     def evaluate(case, device, trial):
-        steep = Comparison("gradient of u", 20.0, 0.7, noise=noise and trial == 1)
-        return Outcome([Comparison("out", 1e-7, ratios[trial]), steep])
+        seen.append(trial)
+        other = Comparison("gradient of u", 20.0, 0.7, noise=noise and trial == 1)
+        return Outcome([Comparison("out", 1e-7, 0.9 if trial == at else 4.0), other])
 
     outcome = run_case(replace(raster.OP, evaluate=evaluate), Case("raster", "x", 0, {}), CPU)
     assert (outcome.failure() is not None) == fails and outcome.steep == noise
+    assert seen == [*range(trials)]
 
 
 @pytest.mark.parametrize("off, noise", [(0.3, False), (0.7, True)])
