@@ -35,6 +35,16 @@ from .tokens import SUB, marking
 
 MARK_TILE = 16  # tokens of a tile of the walk that marks
 TILE = 8  # and of the walk back
+# Chunks whose sums are added in a row: equal terms in a row round to the same side.
+RUN = 16
+
+# The number, of which the compiler knows nothing: what is computed from it is not kept in registers.
+_ANEW = """
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(x));
+#endif
+    return x;
+"""
 
 
 def _layout(g: Groups, flags: frozenset, use_z: bool) -> tuple[dict, int]:
@@ -95,6 +105,9 @@ def backward_kernel(
     resident = 1 if read or f.walks > 1 else max(1, 3 * 128 // f.block)
     bounds = (f.block, resident) if resident > 1 else f.block
     at = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P"), 0) | at
+
+    @wp.func_native(_ANEW)
+    def anew(x: int) -> int: ...
 
     @wp.func
     def set_marks(
@@ -316,11 +329,17 @@ def backward_kernel(
                     p, arena, t, left, skip, du_at, ddelta_at, dz_at, du_out, ddelta_out, dz_out
                 )  # fmt: skip
             sync()
+            # the chunk's sums join those of its run, which begin at 0 in memory
+            e = place(sizes, anew(index), anew(lane))
+            run = e.at * ((sizes.segment / MARK + RUN - 1) / RUN) + back / RUN
+            write_states(da_out, run, e, second_half(state) + read_states(da_out, run, e))
+            state = join(first_half(state), vec())
+            if e.active != 0:
+                sums += wp.vec2(dskip_out[run, e.row, e.d], dbias_out[run, e.row, e.d])
+                dskip_out[run, e.row, e.d] = sums[0]
+                dbias_out[run, e.row, e.d] = sums[1]
+            sums = wp.vec2()
         if p.segment == 0:
             write_states(first_out, p.b, p, first_half(state))
-        write_states(da_out, p.at, p, second_half(state))
-        if p.active != 0:
-            dskip_out[p.at, p.row, p.d] = sums[0]
-            dbias_out[p.at, p.row, p.d] = sums[1]
 
     return scan_backward

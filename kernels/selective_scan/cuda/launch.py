@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...runtime.views import lane_contiguous
-from .backward import backward_kernel
+from .backward import RUN, backward_kernel
 from .blocks import MARK
 from .forward import forward_kernel
 from .operands import Operands
@@ -116,9 +116,10 @@ def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str
 
     du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
     db, dc = sums("dB"), sums("dC")
-    rows = o.batch * o.segments
-    dfirst, da = torch.empty_like(o.state), o.empty(rows, o.channels, o.states)
-    dskip, dbias = o.empty(2, rows, o.shape.rows, o.channels)
+    runs = o.batch * o.segments * -(-o.segment // (RUN * MARK))
+    dfirst = torch.empty_like(o.state)
+    da = torch.zeros(runs, o.channels, o.states, device=o.device)
+    dskip, dbias = torch.zeros(2, runs, o.shape.rows, o.channels, device=o.device)
     if o.u.numel():
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state

@@ -91,6 +91,20 @@ def test_block_kernels_equal_lane_kernels_and_oracle(cpu_blocks, shape, discreti
     assert_all(blocks, run(cpu, inputs, discretization, v_out, v_last))
 
 
+def test_equal_terms_of_a_sum_do_not_round_to_one_side(cpu_blocks):
+    """A constant input of quick decays; added in a row, these sums are 1e-6 to 2e-5 off."""
+    inputs = make(1, 2500, 5, 3)
+    inputs = {k: x[:, :1].expand_as(x) if x.dim() > 2 else x for k, x in inputs.items()}
+    inputs["A"] = inputs["A"].abs() * -1 - 1
+    inputs["delta"] = inputs["delta"].abs() + 1
+    v_out = torch.randn_like(inputs["u"][:, :1]).expand_as(inputs["u"])
+    v_last = torch.zeros(1, *inputs["A"].shape)
+    got = run(cuda, inputs, "mamba", v_out, v_last, needs=("A", "D", "delta_bias"))
+    want = exact(inputs, "mamba", v_out, v_last)
+    for name in ("A", "D", "delta_bias"):
+        assert_rel_rms(got[name], want[name], 6e-7, name)
+
+
 @pytest.mark.parametrize("length", [1, 4, 5, 63, 64, 65, 128])
 def test_lengths_around_a_chunk(cpu_blocks, length):
     inputs = make(1, length, 5, 3)
