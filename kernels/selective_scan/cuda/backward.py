@@ -38,7 +38,7 @@ TILE = 8  # and of the walk back
 # Chunks whose sums are added in a row: equal terms in a row round to the same side.
 RUN = 16
 
-# The number, of which the compiler knows nothing: what is computed from it is not kept in registers.
+# The number, unknown to the compiler: what is computed from it is not kept in registers.
 _ANEW = """
 #if defined(__CUDA_ARCH__)
     asm volatile("" : "+r"(x));
