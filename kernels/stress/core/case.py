@@ -150,7 +150,7 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
         middle = found[TRIALS // 2]
         if bad := [o for o in found if o.faults or o.nonfinite]:
             return bad[0]
-        steep = any(c.noise for o in found for c in o.comparisons)
+        steep = any(c.noise and c.ratio > 1 for o in found for c in o.comparisons)
         return _widest(op, case, device, found) if steep and _over(middle) else middle
     except Exception as error:
         text = str(error).strip().splitlines() or [""]

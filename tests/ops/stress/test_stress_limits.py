@@ -92,21 +92,22 @@ def test_most_trials_decide(ratios, fails):
     assert (outcome.failure() is not None) == fails and seen == [*range(len(ratios))]
 
 
-@pytest.mark.parametrize("noise, at, fails, trials", [
-    (True, 30, False, 31),  # until a trial has a limit that is wide enough
-    (True, 70, True, 50),
-    (False, 2, True, 5),
+@pytest.mark.parametrize("noise, ratio, at, fails, trials", [
+    (True, 1.1, 30, False, 31),  # until a trial has a limit that is wide enough
+    (True, 1.1, 70, True, 50),
+    (True, 0.9, 2, True, 5),  # noise within its limit makes no case steep
+    (False, 1.1, 2, True, 5),
 ])  # fmt: skip
-def test_the_widest_limit_counts_for_steep_cases_alone(noise, at, fails, trials):
+def test_the_widest_limit_counts_for_steep_cases_alone(noise, ratio, at, fails, trials):
     seen = []
 
     def evaluate(case, device, trial):
         seen.append(trial)
-        other = Comparison("gradient of u", 20.0, 0.7, noise=noise and trial == 1)
+        other = Comparison("gradient of u", 20.0, ratio if trial == 1 else 0.7, noise=noise)
         return Outcome([Comparison("out", 1e-7, 0.9 if trial == at else 4.0), other])
 
     outcome = run_case(replace(raster.OP, evaluate=evaluate), Case("raster", "x", 0, {}), CPU)
-    assert (outcome.failure() is not None) == fails and outcome.steep == noise
+    assert (outcome.failure() is not None) == fails and outcome.steep == (trials > 5)
     assert seen == [*range(trials)]
 
 
