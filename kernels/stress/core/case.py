@@ -14,7 +14,8 @@ from .rounding import UNDERFLOW, UNIT
 
 FACTOR = 8.0  # largest error, as a multiple of what rounding does to the formula
 TRIALS = 5  # evaluations of a case that is over its limit, an odd number; most of them decide
-STEEP_TRIALS = 50  # and if rounding leaves no digit of a result
+STEEP_TRIALS = 50  # evaluations of a steep case
+STEEP_RANGE = 8.0  # how far apart the limits of one result are by trial in such a case
 # A result's dtype: its relative error, and its absolute error below its normal numbers.
 _STORED = {
     torch.float32: (0.0, UNDERFLOW),
@@ -150,8 +151,8 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
         middle = found[TRIALS // 2]
         if bad := [o for o in found if o.faults or o.nonfinite]:
             return bad[0]
-        steep = any(c.noise and c.ratio > 1 for o in found for c in o.comparisons)
-        return _widest(op, case, device, found) if steep and _over(middle) else middle
+        steep = _over(middle) and _is_steep(found)
+        return _widest(op, case, device, found) if steep else middle
     except Exception as error:
         text = str(error).strip().splitlines() or [""]
         return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
@@ -160,6 +161,16 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
 def _over(outcome: Outcome) -> bool:
     failure = outcome.failure()
     return failure is not None and failure["what"] == "limit"
+
+
+def _is_steep(found: list[Outcome]) -> bool:
+    """Whether a result that is over its limit is noise, or its limit differs much by trial."""
+    ratios: dict[str, list[float]] = {}
+    for c in (c for o in found for c in o.comparisons):
+        if c.noise and c.ratio > 1:
+            return True
+        ratios.setdefault(c.name, []).append(c.ratio)
+    return any(max(r) > max(1.0, STEEP_RANGE * min(r)) for r in ratios.values())
 
 
 def _widest(op: Op, case: Case, device: torch.device, found: list[Outcome]) -> Outcome:

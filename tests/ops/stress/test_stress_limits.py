@@ -92,18 +92,20 @@ def test_most_trials_decide(ratios, fails):
     assert (outcome.failure() is not None) == fails and seen == [*range(len(ratios))]
 
 
-@pytest.mark.parametrize("noise, ratio, at, fails, trials", [
-    (True, 1.1, 30, False, 31),  # until a trial has a limit that is wide enough
-    (True, 1.1, 70, True, 50),
-    (True, 0.9, 2, True, 5),  # noise within its limit makes no case steep
-    (False, 1.1, 2, True, 5),
+@pytest.mark.parametrize("noise, ratios, at, fails, trials", [
+    (True, (0.7, 1.1), 30, False, 31),  # until a trial has a limit that is wide enough
+    (True, (0.7, 1.1), 70, True, 50),
+    (True, (0.7, 0.9), 2, True, 5),  # noise within its limit makes no case steep
+    (False, (0.7, 1.1), 2, True, 5),
+    (False, (0.1, 1.1), 30, False, 31),  # limits that differ by trial
+    (False, (0.1, 0.9), 2, True, 5),
 ])  # fmt: skip
-def test_the_widest_limit_counts_for_steep_cases_alone(noise, ratio, at, fails, trials):
+def test_the_widest_limit_counts_for_steep_cases_alone(noise, ratios, at, fails, trials):
     seen = []
 
     def evaluate(case, device, trial):
         seen.append(trial)
-        other = Comparison("gradient of u", 20.0, ratio if trial == 1 else 0.7, noise=noise)
+        other = Comparison("gradient of u", 20.0, ratios[trial == 1], noise=noise)
         return Outcome([Comparison("out", 1e-7, 0.9 if trial == at else 4.0), other])
 
     outcome = run_case(replace(raster.OP, evaluate=evaluate), Case("raster", "x", 0, {}), CPU)
