@@ -38,13 +38,15 @@ TILE = 8  # and of the walk back
 # Chunks whose sums are added in a row: equal terms in a row round to the same side.
 RUN = 16
 
+
 # The number, unknown to the compiler: what is computed from it is not kept in registers.
-_ANEW = """
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
     asm volatile("" : "+r"(x));
 #endif
     return x;
-"""
+""")
+def _anew(x: int) -> int: ...
 
 
 def _layout(g: Groups, flags: frozenset, use_z: bool) -> tuple[dict, int]:
@@ -105,9 +107,6 @@ def backward_kernel(
     resident = 1 if read or f.walks > 1 else max(1, 3 * 128 // f.block)
     bounds = (f.block, resident) if resident > 1 else f.block
     at = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P"), 0) | at
-
-    @wp.func_native(_ANEW)
-    def anew(x: int) -> int: ...
 
     @wp.func
     def set_marks(
@@ -330,7 +329,7 @@ def backward_kernel(
                 )  # fmt: skip
             sync()
             # the chunk's sums join those of its run, which begin at 0 in memory
-            e = place(sizes, anew(index), anew(lane))
+            e = place(sizes, _anew(index), _anew(lane))
             run = e.at * ((sizes.segment / MARK + RUN - 1) / RUN) + back / RUN
             write_states(da_out, run, e, second_half(state) + read_states(da_out, run, e))
             state = join(first_half(state), vec())

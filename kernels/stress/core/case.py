@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from random import Random
 
 import torch
@@ -175,15 +176,16 @@ def _is_steep(found: list[Outcome]) -> bool:
 
 def _widest(op: Op, case: Case, device: torch.device, found: list[Outcome]) -> Outcome:
     """What is left over its widest limit, in the trials found and as many more as it takes."""
-    least = found[0]
-    for trial in range(STEEP_TRIALS):
-        other = found[trial] if trial < len(found) else op.evaluate(case, device, trial)
-        ratios = {c.name: c.ratio for c in other.comparisons}
-        comparisons = [replace(c, ratio=min(c.ratio, ratios[c.name])) for c in least.comparisons]
-        least = replace(least, comparisons=comparisons, steep=True)
+    least = replace(found[0], steep=True)
+    more = (op.evaluate(case, device, trial) for trial in range(len(found), STEEP_TRIALS))
+    for other in chain(found, more):
         if other.faults or other.nonfinite:
             return other
-        if trial >= len(found) and not _over(least):
+        ratios = {c.name: c.ratio for c in other.comparisons}
+        least.comparisons = [
+            replace(c, ratio=min(c.ratio, ratios[c.name])) for c in least.comparisons
+        ]
+        if not _over(least):
             break
     return least
 
