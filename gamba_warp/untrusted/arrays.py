@@ -7,6 +7,8 @@ states.
 from __future__ import annotations
 
 import io
+import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from ..errors import UserError
 from .documents import read_bytes
 
 MAX_BYTES = 1 << 20
+_NUMBERS = re.compile("[<>|=](?:[iu][1248]|f(?:[248]|12|16))")
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
@@ -50,15 +53,36 @@ def _parse(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
         stated, columns_first, dtype = header(file)
     except Exception as error:  # numpy asks Python's own parser, which has a dozen kinds
         raise UserError("its header is not that of an array") from error
-    if dtype.kind not in "fiu" or dtype.shape:
-        raise UserError(f"it holds {dtype.name[:40]}, not numbers")
     wanted = "x".join(map(str, shape))
     if tuple(stated) != shape:
         got = "x".join(map(str, stated))[:40] or "a single number"
         raise UserError(f"expected {wanted} numbers, it states {got}")
-    values = data[file.tell() :]
-    if len(values) != dtype.itemsize * int(np.prod(shape)):
-        raise UserError(f"expected {wanted} numbers, it holds {len(values)} bytes of them")
-    order = "F" if columns_first else "C"
+    array = plain_array(data[file.tell() :], dtype.str, shape, columns_first)
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.frombuffer(values, dtype).reshape(shape, order=order).astype(np.float64)
+        return array.astype(np.float64)
+
+
+def plain_array(data: bytes, dtype: str, shape: tuple[int, ...], columns_first: bool) -> np.ndarray:
+    """An array of numbers over bytes, all of whose parts may be a stranger's.
+
+    Args:
+        data: what the array holds.
+        dtype: as numpy writes it: byte order, kind and bytes, ``<f4``.
+        shape: of the array.
+        columns_first: whether the first index runs fastest.
+
+    Returns:
+        Read-only array; it shares the bytes.
+
+    Raises:
+        UserError: the type is not of plain integers or floats, or the shape needs another number of
+            bytes.
+    """
+    if not isinstance(dtype, str) or not _NUMBERS.fullmatch(dtype):
+        raise UserError(f"it holds {str(dtype)[:40]}, not numbers")
+    if not isinstance(data, bytes) or not all(type(n) is int and n >= 0 for n in shape):
+        raise UserError("its bytes or its shape are of another kind")
+    if len(data) != int(dtype[2:]) * math.prod(shape):
+        stated = "x".join(map(str, shape))[:40]
+        raise UserError(f"expected {stated} numbers, it holds {len(data)} bytes of them")
+    return np.ndarray(shape, dtype, data, order="F" if columns_first else "C")

@@ -19,6 +19,7 @@ import numpy as np
 
 from ..errors import UserError, first_line
 from ..kernels.runtime.cache import writable_folder
+from ..untrusted.arrays import plain_array
 
 _MAX_PICKLE = 512 << 20  # bytes; that of LPIPS takes 59 MB
 _MAX_MEMO = 1_000_000  # values that a pickle may number: room is taken up to the largest number
@@ -91,20 +92,38 @@ def pip_download(requirement: str, digest: str, source: bool = False) -> Iterato
         yield found[0]
 
 
-class _NumpyUnpickler(pickle.Unpickler):
-    """An unpickler that knows dense arrays only, so that a pickle can build no other object."""
+class _Dtype:
+    """Stands for ``numpy.dtype``: a pickle's numbers about a type do not reach numpy."""
+
+    def __init__(self, name: str, *_: object) -> None:
+        self.name, self.order = name, "="
+
+    def __setstate__(self, state: tuple) -> None:
+        self.order = state[1]
+
+
+class _Array:
+    """Stands for an array until all its parts are there and ``plain_array`` has made it of them."""
+
+    def __init__(self, *_: object) -> None:
+        self.value: np.ndarray | None = None
+
+    def __setstate__(self, state: tuple) -> None:
+        _, shape, dtype, columns_first, data = state
+        self.value = plain_array(data, dtype.order + dtype.name, shape, columns_first)
+
+
+class _Unpickler(pickle.Unpickler):
+    """An unpickler of arrays that calls nothing but the two stand-ins of this module."""
 
     def find_class(self, module: str, name: str) -> Any:
         if name == "_reconstruct" and module.endswith("multiarray"):
-            return _empty_array
-        if (module, name) in {("numpy", "ndarray"), ("numpy", "dtype")}:
-            return getattr(np, name)
+            return _Array
+        if (module, name) == ("numpy", "dtype"):
+            return _Dtype
+        if (module, name) == ("numpy", "ndarray"):
+            return name  # the argument of ``_reconstruct``, which nobody asks
         raise pickle.UnpicklingError(f"{module}.{name} is not allowed in this file")
-
-
-def _empty_array(*_: object) -> np.ndarray:
-    """Stands for numpy's own, which takes memory by a shape; the true one comes with the bytes."""
-    return np.empty(0)
 
 
 def _check_sizes(data: bytes) -> None:
@@ -114,34 +133,41 @@ def _check_sizes(data: bytes) -> None:
             raise pickle.UnpicklingError(f"it numbers {argument} values")
 
 
-def _check_arrays(value: Any, seen: set[int]) -> None:
-    """Refuses arrays of Python objects anywhere in nested containers."""
-    if isinstance(value, np.ndarray) and value.dtype.hasobject:
-        raise pickle.UnpicklingError("it holds an array of objects")
-    if isinstance(value, (dict, list, tuple)) and id(value) not in seen:
-        seen.add(id(value))
-        for item in value.values() if isinstance(value, dict) else value:
-            _check_arrays(item, seen)
+def _unwrapped(value: Any, done: dict[int, Any]) -> Any:
+    """The containers with arrays for their stand-ins; each is copied once, however often it is met.
+
+    What holds itself goes too deep, which is a RecursionError.
+    """
+    if id(value) not in done:
+        if isinstance(value, _Array) and value.value is not None:
+            done[id(value)] = value.value
+        elif isinstance(value, dict) and all(type(key) is str for key in value):
+            done[id(value)] = {key: _unwrapped(item, done) for key, item in value.items()}
+        elif isinstance(value, (list, tuple)):
+            done[id(value)] = [_unwrapped(item, done) for item in value]
+        else:
+            raise pickle.UnpicklingError(f"it holds a {type(value).__name__.strip('_')}")
+    return done[id(value)]
 
 
 def load_numpy_pickle(file: BinaryIO, name: str) -> Any:
-    """Reads a pickle of nested containers of numpy arrays; any other class is refused.
+    """Reads a pickle of nested dicts and lists of arrays of plain numbers; all else is refused.
+
+    numpy is not asked to unpickle: it would believe the numbers that describe an array's type.
 
     Args:
         file: open for reading bytes.
         name: what to call it in an error.
 
     Raises:
-        UserError: not a pickle, truncated, larger than ``_MAX_PICKLE``, or holds another class.
+        UserError: not a pickle, truncated, larger than ``_MAX_PICKLE``, or it holds anything else.
     """
     try:
         data = file.read(_MAX_PICKLE + 1)
         if len(data) > _MAX_PICKLE:
             raise pickle.UnpicklingError(f"over {_MAX_PICKLE >> 20} MB")
         _check_sizes(data)
-        value = _NumpyUnpickler(io.BytesIO(data)).load()
-        _check_arrays(value, set())
-        return value
+        return _unwrapped(_Unpickler(io.BytesIO(data)).load(), {})
     except Exception as error:  # a damaged pickle calls what it has with what it likes
         reason = first_line(error)
         raise UserError(f"{name}: not a pickle of numpy arrays ({reason})") from error
