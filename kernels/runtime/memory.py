@@ -153,7 +153,8 @@ def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     size = math.prod(shape) * dtype.itemsize
     if pool is None or pool.most == 0 or size < LARGE:
         return torch.empty(*shape, dtype=dtype)
-    return pool.take(size).view(dtype).view(*shape)
+    # Not a view: autograd lets nobody change a view in place that was made inside an operator.
+    return torch.empty(0, dtype=dtype).set_(pool.take(size).untyped_storage(), 0, tuple(shape))
 
 
 def release() -> None:

@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from gamba_warp.kernels import selective_scan
+from gamba_warp.kernels import causal_conv1d_fn, rasterization, selective_scan, selective_scan_fn
 from gamba_warp.kernels.runtime import memory
 from gamba_warp.kernels.runtime.memory import LARGE, Pool
 
@@ -109,6 +109,44 @@ def test_an_operator_does_not_overwrite_its_last_result(pool):
     place = first.data_ptr()
     del first
     assert selective_scan(u, delta, A, B, B).data_ptr() == place
+
+
+def _convolution(x):
+    return causal_conv1d_fn(x.transpose(1, 2), torch.linspace(-1, 1, 3).expand(x.shape[2], 3))
+
+
+def _scan(x):
+    A, B = -torch.ones(x.shape[2], 1), torch.ones(len(x), 1, x.shape[1])
+    return selective_scan_fn(x.transpose(1, 2), x.detach().abs().transpose(1, 2), A, B, B)
+
+
+def _picture(x):
+    means = torch.tensor([[0.0, 0, 0], [0.3, 0.2, 0.1]])
+    colors = x[0, :2, :5]
+    camera = torch.eye(4).index_put((torch.tensor(2), torch.tensor(3)), torch.tensor(3.0))[None]
+    K = torch.tensor([[[500.0, 0, 256], [0, 500, 256], [0, 0, 1]]])
+    scales, opacities = torch.full((2, 3), 0.1), torch.full((2,), 0.7)
+    return rasterization(means, None, scales, opacities, colors, camera, K, 512, 512)[0]
+
+
+@pytest.mark.parametrize("call", [_convolution, _scan, _picture])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_large_result_can_be_changed_in_place(call, compiled):
+    """With torch's own results it can; autograd refuses it of a view that an operator made."""
+
+    def changed(x):
+        y = call(x)
+        y += 1
+        y *= y.detach().sign()
+        return y
+
+    x = torch.randn(2, 1024, 1024, requires_grad=True)
+    run = torch.compile(changed, fullgraph=True, backend="aot_eager") if compiled else changed
+    got, apart = run(x), call(x) + 1
+    want = apart * apart.detach().sign()
+    assert got.nbytes >= LARGE and torch.equal(got, want)
+    (grad,), (expected,) = (torch.autograd.grad(y.square().sum(), x) for y in (got, want))
+    assert torch.equal(grad, expected) and grad.abs().sum() > 0
 
 
 @pytest.mark.parametrize("chosen, most", [("0", 0), ("7", 7 << 20)])
