@@ -37,6 +37,8 @@ _BAD_OBJ = re.compile(
 )
 # Faces of one or two corners, which many a modeller leaves behind: they have no area.
 _THIN = re.compile(rb"(?m)^[ \t]*f(?:[ \t]+" + _CORNER + rb"){1,2}[ \t\r]*$")
+# A texture coordinate of one number, which OBJ allows; trimesh would cut all others to one.
+_FLAT = re.compile(rb"(?m)^(vt[ \t]+" + _NUMBER + rb")[ \t]*$")
 
 Y_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
@@ -211,11 +213,13 @@ def _mixed_mesh(path: Path, data: PlyData):
 def _checked_obj(path: Path, text: bytes) -> bytes:
     """An OBJ file whose lines of vertices and faces are numbers; trimesh stops at what is none.
 
+    A texture coordinate of one number gets its second, 0.
+
     Raises:
         UserError: one is not.
     """
     text = text.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
-    text = _THIN.sub(b"", text)
+    text = _FLAT.sub(rb"\1 0", _THIN.sub(b"", text))
     bad = _BAD_OBJ.search(text)
     if bad:
         line = " ".join(bad[0][:60].decode("ascii", "replace").split())
@@ -275,7 +279,7 @@ def _flatten(
     visual = mesh.visual
     if visual.kind == "texture":
         material = make_material(visual.material, path, warnings, budget)
-        if visual.uv is not None and len(visual.uv) == len(vertices):
+        if np.shape(visual.uv) == (len(vertices), 2):
             uvs = np.nan_to_num(np.asarray(visual.uv, np.float32)[faces])
         elif material.texture is not None:
             warnings.append("a textured part has no UV coordinates")

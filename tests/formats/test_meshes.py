@@ -1,3 +1,6 @@
+import json
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -91,6 +94,35 @@ def test_negative_indices_count_back_from_their_line(tmp_path):
     relative = load_mesh(write_quad(tmp_path, obj=negative))
     np.testing.assert_allclose(relative.vertices[relative.faces], good.vertices[good.faces])
     np.testing.assert_allclose(relative.uvs, good.uvs)
+
+
+@pytest.mark.parametrize("old", ["vt 0 0", "vt 1 0"])  # where others say how many numbers
+def test_a_texture_coordinate_of_one_number_has_v_0(tmp_path, old):
+    plain = "usemtl nothing\nf 1 2 3\n"  # two materials
+    want = load_mesh(write_quad(tmp_path, obj=QUAD + plain))
+    assert QUAD.count(old) == 1
+    short = QUAD.replace(old, old[:-2]) + plain
+    for text in (short, short.replace("\n", "\r\n"), short.replace("vt 0 1", "vt 0 1 0")):
+        np.testing.assert_array_equal(load_mesh(write_quad(tmp_path, obj=text)).uvs, want.uvs)
+    flat = load_mesh(write_quad(tmp_path, obj=re.sub("(vt .) .", r"\1", QUAD)))
+    np.testing.assert_array_equal(flat.uvs[..., 0], load_mesh(write_quad(tmp_path)).uvs[..., 0])
+    assert not flat.uvs[..., 1].any()
+
+
+def test_texture_coordinates_of_three_numbers_in_a_gltf_are_none(tmp_path):
+    box = trimesh.creation.box()
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (2, 2)))
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    for name, content in trimesh.exchange.gltf.export_gltf(trimesh.Scene([box])).items():
+        (tmp_path / name).write_bytes(content)
+    path = tmp_path / "model.gltf"
+    tree = json.loads(path.read_text())
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TEXCOORD_0"] = attributes["POSITION"]
+    path.write_text(json.dumps(tree))
+    mesh = load_mesh(path)
+    assert mesh.uvs.shape == (12, 3, 2) and not mesh.uvs.any()
+    assert mesh.warnings == ["a textured part has no UV coordinates"]
 
 
 def test_polygons_become_triangles(tmp_path):
