@@ -5,9 +5,12 @@ from __future__ import annotations
 import importlib
 import io
 import os
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import is_dataclass
+from typing import get_args, get_type_hints
 
 from .devices import keep_memory, share_cores
 from .errors import UserError
@@ -111,6 +114,7 @@ def run(name: str, arguments: list[str]) -> int:
         if name in KEEPING:
             keep_memory()
         command = load_command(name)
+        arguments = _joined(arguments, command)
         expand = getattr(sys.modules.get(command.__module__), "expand", None)
         arguments = expand(arguments) if expand else arguments
         return tyro.cli(command, args=arguments, prog=f"gamba {name}") or 0
@@ -125,6 +129,53 @@ def run(name: str, arguments: list[str]) -> int:
             raise
         _complain(reason)
         return 2
+
+
+def _joined(arguments: list[str], command: Callable) -> list[str]:
+    """The arguments with the values of an option that is there twice behind one another.
+
+    tyro keeps the last ones without a word. Raises UserError for an option that takes one value.
+    """
+    options = dict(_options(command))
+    first: dict[str, list[str]] = {}
+    groups = [values := []]
+    for at, word in enumerate(arguments):
+        if word == "--":  # what follows are no options
+            groups.append(arguments[at:])
+            break
+        if not re.match("--?[A-Za-z]", word):
+            values.append(word)
+            continue
+        written, _, value = word.partition("=")
+        key = written.lstrip("-").replace("_", "-").removeprefix("no-")
+        name, several = options.get(key, (key, False))
+        if name not in first:
+            values = [written, *([value] if value else [])] if several else [word]
+            groups.append(values)
+            first[name] = values
+        elif several:
+            values = first[name]
+            values += [value] if value else []
+        else:
+            earlier = first[name][0].partition("=")[0]
+            which = f"{earlier} once" if written == earlier else f"{earlier} or {written}"
+            raise UserError(f"give {which}: this option takes one value")
+    return [word for group in groups for word in group]
+
+
+def _options(kind: Callable) -> Iterator[tuple[str, tuple[str, bool]]]:
+    """Of a command or class of options: each option, what it is an alias of, if it is a list."""
+    noted = get_type_hints(kind, include_extras=True)
+    for name, hint in get_type_hints(kind).items():
+        parts = hint, *get_args(hint)  # of a union its members
+        several = any(... in get_args(part) for part in parts)  # tuple[str, ...]
+        aliases = [
+            x for note in get_args(noted[name]) for x in getattr(note, "aliases", None) or ()
+        ]
+        for written in (name, *aliases):
+            yield written.lstrip("-").replace("_", "-"), (name, several)
+        for part in filter(is_dataclass, parts):
+            yield from _options(part)
 
 
 def _outside_reason(error: Exception, command: str) -> str | None:

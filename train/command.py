@@ -42,13 +42,13 @@ def expand(arguments: list[str]) -> list[str]:
     With ``--help`` it prints what the recipe sets.
 
     Args:
-        arguments: of ``gamba train``.
+        arguments: of ``gamba train``, each option once.
 
     Returns:
-        The same without ``--config``; of an option that is there twice the last one counts.
+        The same without ``--config``; of an option that is then there twice the last one counts.
 
     Raises:
-        UserError: there are two such options, the file is no run's config.json, or there is no
+        UserError: nothing is named, or both, the file is no run's config.json, or there is no
             such recipe.
     """
     words = [w for word in arguments for w in (word.split("=", 1) if _names(word) else [word])]
@@ -58,8 +58,8 @@ def expand(arguments: list[str]) -> list[str]:
     if "--config" not in words or helped:
         return arguments
     at = words.index("--config")
-    if words.count("--config") > 1 or at + 1 == len(words):
-        raise UserError("--config: expected once, with a run's folder or its config.json")
+    if at + 1 == len(words):
+        raise UserError("--config: expected a run's folder or its config.json")
     before, after = words[:at], words[at + 2 :]
     data = [before.pop(0)] if before and not before[0].startswith("-") else []
     taken, *options = _options_of(Path(words[at + 1]))
@@ -71,8 +71,8 @@ def _with_recipe(words: list[str], helped: bool) -> list[str]:
     if "--config" in words:
         raise UserError("--recipe and --config: give one of them")
     at = words.index("--recipe")
-    if words.count("--recipe") > 1 or at + 1 == len(words):
-        raise UserError("--recipe: expected once, with the name of a recipe")
+    if at + 1 == len(words):
+        raise UserError("--recipe: expected the name of a recipe")
     rest = [*words[:at], *words[at + 2 :]]
     if helped:
         print(table_of(words[at + 1]) + "\n")

@@ -1,8 +1,11 @@
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
+from typing import Annotated
 
 import pytest
+import tyro
 
 from gamba_warp import __version__, cli
 from gamba_warp.errors import UserError
@@ -104,6 +107,54 @@ def test_wrong_options_exit_with_2(command, capsys):
     assert exit_code(["try", "--nonsense", "5"]) == 2
     assert exit_code(["try", "--number", "five"]) == 2
     assert "number" in capsys.readouterr().err
+
+
+@dataclass(frozen=True)
+class Place:
+    """Options of a group."""
+
+    axes: tuple[str, ...] = ()
+    """Names."""
+
+
+def _with_lists(
+    files: Annotated[tuple[str, ...], tyro.conf.Positional],
+    /,
+    change: tuple[str, ...] | None = None,
+    number: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 3,
+    page: bool = True,
+    place: Annotated[Place, tyro.conf.OmitArgPrefixes] = Place(),
+) -> None:
+    """Prints what it is given."""
+    print(files, change, number, place.axes)
+
+
+def test_a_repeated_option_of_several_values_is_joined(command, capsys):
+    command(_with_lists)
+    for words, want in (
+        ("f --change a=1 b=2 --number -1", (("f",), ("a=1", "b=2"), -1, ())),
+        ("f --change a=1 --number -1 --change=b=2", (("f",), ("a=1", "b=2"), -1, ())),
+        ("--axes x --change --axes=y z --change c -- -n", (("-n",), ("c",), 3, tuple("xyz"))),
+    ):  # fmt: skip
+        assert exit_code(["try", *words.split()]) == 0
+        assert capsys.readouterr().out == " ".join(map(str, want)) + "\n"
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        ("--number 1 --change a --number 1", "give --number once"),
+        ("-n 1 -n 2", "give -n once"),
+        ("-n=1 --number 2", "give -n or --number"),
+        ("--page --no-page", "give --page or --no-page"),
+        ("--number=1 --number", "give --number once"),
+    ],
+)
+def test_a_repeated_option_of_one_value_is_refused(command, capsys, words, said):
+    command(_with_lists)
+    assert exit_code(["try", "f", *words.split()]) == 2
+    read = capsys.readouterr()
+    assert read.out == "" and read.err == f"gamba: {said}: this option takes one value\n"
 
 
 def test_help_of_a_command(command, capsys):

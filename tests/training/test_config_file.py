@@ -68,8 +68,8 @@ def test_bad_files_are_one_line(tmp_path, content, words):
     with pytest.raises(UserError, match=words) as caught:
         expand(["--config", str(path)])
     assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match="--config: expected once"):
-        expand(["--config", str(path), "--config"])
+    with pytest.raises(UserError, match="--config: expected a run's folder"):
+        expand(["--lr", "1", "--config"])
 
 
 def test_bad_values_end_with_code_two(tmp_path):
