@@ -56,17 +56,24 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yields a path of the same name in a new folder beside; on success the file moves to ``path``.
 
     Many writers go by the suffix, and safetensors makes a temporary file of its own beside what it
-    writes: in a folder of ours both are right, and what a killed process leaves can be told.
+    writes: in a folder of ours both are right, and what a killed process leaves can be told. The
+    file is on the disk before it has its name, so a power cut leaves it whole or not there.
 
     Raises:
         UserError: the folder or the file cannot be written, or the disk is full.
     """
     path = Path(path)
+    # What lies in a folder that is unfinished itself goes to the disk with it, all at once.
+    alone = not any(_PART_NAME.fullmatch(parent.name) for parent in path.parents)
     with _unfinished(path) as folder:
         temporary = folder / path.name
         yield temporary
         os.chmod(temporary, 0o666 & ~_umask())  # safetensors makes 0600
+        if alone:
+            _sync(temporary)
         os.replace(temporary, path)
+        if alone:
+            _sync(path.parent)
 
 
 @contextmanager
@@ -110,7 +117,7 @@ def atomic_folder(path: str | Path, replace: bool = False) -> Iterator[Path]:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
     with _unfinished(path) as temporary:
         yield temporary
-        for part in [*temporary.iterdir(), temporary]:
+        for part in [*temporary.rglob("*"), temporary]:
             _sync(part)
         temporary.chmod(0o777 & ~_umask())  # mkdtemp makes 0700
         with _set_aside(path) if replace else nullcontext():
@@ -150,15 +157,21 @@ def remove_folder(folder: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Waits until a file or a folder is on the disk; Windows opens no folders for this."""
-    windows = sys.platform == "win32"
-    if windows and path.is_dir():
-        return
-    handle = os.open(path, os.O_RDWR if windows else os.O_RDONLY)  # it syncs what can be written
+    """Waits until a file or a folder is on the disk, where the system can do that.
+
+    Windows opens no folders for it, and drives of other machines may refuse it.
+    """
+    # Windows syncs only what can be written.
+    mode = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        handle = os.open(path, mode)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        if error.errno in DISK_ERRORS:
+            raise
 
 
 def sweep(folder: str | Path, age: float = _DAY) -> None:

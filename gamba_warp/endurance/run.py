@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ..files import remove_folder
+from ..files import remove_folder, sha256, sha256_of_all
 from .child import End, run_child
 from .folders import age, contents, leftovers, lost
 from .jobs import Job, command, jobs, make_world, training, training_words
@@ -154,7 +154,7 @@ def kill_training(folder: Path, kills: int, rng: random.Random, bar: tqdm) -> Co
     count, out = Count("train", "SIGKILL"), folder / "killed"
     steps = 12 if kills < 20 else 60
     quiet = _undisturbed(run_child(training(folder, folder / "quiet", steps)), "train")
-    model = _weights(folder / "quiet" / _MODEL)
+    model = sha256(folder / "quiet" / _MODEL)
     saved = _checkpoint(folder / "quiet")
     newest = -1
     while count.runs < kills:
@@ -168,7 +168,7 @@ def kill_training(folder: Path, kills: int, rng: random.Random, bar: tqdm) -> Co
             if end.code:
                 count.not_resumed += 1
                 _note(count, "train did not go on", end)
-            elif _weights(out / _MODEL) != model or _checkpoint(out) != saved:
+            elif sha256(out / _MODEL) != model or _checkpoint(out) != saved:
                 count.lost += 1
                 count.notes.append(f"train: after {count.runs} kills the weights differ")
             count.debris += len(leftovers(out))
@@ -202,7 +202,7 @@ def kill_processes(folder: Path, kills: int, rng: random.Random, bar: tqdm) -> C
     finally:
         bar.update(kills)
     count.untold += "Traceback" in found.said
-    if found.steps != steps or _weights(out / _MODEL) != _weights(quiet / _MODEL):
+    if found.steps != steps or sha256(out / _MODEL) != sha256(quiet / _MODEL):
         count.lost += 1
         count.notes.append("train, 2 processes: the weights differ from those of one")
     count.debris = len(leftovers(out))
@@ -217,19 +217,12 @@ def _newest(out: Path) -> int:
     return max(steps, default=-1)
 
 
-def _weights(path: Path) -> dict[str, bytes]:
-    """The bits of each tensor; safetensors writes the entries of its header in any order."""
-    from safetensors.numpy import load_file
-
-    return {name: value.tobytes() for name, value in load_file(path).items()}
-
-
-def _checkpoint(out: Path) -> dict[str, dict[str, bytes]]:
-    """The newest checkpoint's weights by file."""
+def _checkpoint(out: Path) -> str:
+    """The SHA-256 of the newest checkpoint's weights."""
     from ..train.checkpoint import list_checkpoints
 
     found = list_checkpoints(out)[-1]
-    return {path.name: _weights(path) for path in found.glob("*.safetensors")}
+    return sha256_of_all(found.glob("*.safetensors"), found)
 
 
 def fill_training(folder: Path, times: int, rng: random.Random, bar: tqdm) -> Count:

@@ -6,6 +6,7 @@ of the file's tensors, takes memory.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,6 +64,21 @@ def save_model(
     state = {name: value.contiguous() for name, value in model.stored_state().items()}
     with atomic_path(path) as temporary:
         save_file(state, temporary, metadata=metadata)
+        _sort_metadata(temporary)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Sorts the header's entries, which the library writes in another order each time.
+
+    So equal weights are equal bytes. The header keeps its length, and the tensors their places.
+    """
+    with open(path, "r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        text = json.dumps(header, ensure_ascii=False, separators=(",", ":"))
+        file.seek(8)
+        file.write(text.encode().ljust(size))
 
 
 def load_model(

@@ -1,5 +1,6 @@
 """Digests of files; writing them: whole or not at all, and what is left over goes."""
 
+import errno
 import hashlib
 import os
 import time
@@ -99,6 +100,60 @@ def test_a_full_disk_is_one_line_and_the_older_file_stays(tmp_path, kind):
     assert os.listdir(tmp_path) == [path.name] and path.read_bytes() == b"older"
     write()
     assert path.stat().st_size > 1000
+
+
+def test_what_has_its_name_is_on_the_disk(tmp_path, monkeypatch):
+    """So a power cut leaves an older file or a whole one: files first, then names in folders."""
+    done, real = [], os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: done.append(os.fstat(handle).st_ino))
+
+    def name(part, path):
+        done.append(os.path.basename(path))
+        real(part, path)
+
+    monkeypatch.setattr(os, "replace", name)
+    monkeypatch.setattr(os, "rename", name)
+    path = tmp_path / "a.txt"
+    write_text(path, "a")
+    assert done == [path.stat().st_ino, "a.txt", tmp_path.stat().st_ino]
+    done.clear()
+    folder = tmp_path / "b"
+    with atomic_folder(folder, replace=True) as temporary:
+        (temporary / "deep").mkdir()
+        write_text(temporary / "deep" / "c.txt", "c")
+        assert done == ["c.txt"]  # all of a folder is synced at once, when it is whole
+    parts = {part.stat().st_ino for part in (folder, folder / "deep", folder / "deep" / "c.txt")}
+    assert set(done[1:-2]) == parts and done[-2:] == ["b", tmp_path.stat().st_ino]
+
+    def refuse(number):
+        def sync(handle):
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(os, "fsync", sync)
+
+    refuse(errno.EINVAL)  # of a drive that cannot sync
+    write_text(path, "b")
+    refuse(errno.EIO)
+    with pytest.raises(UserError, match="a.txt: Input/output error"):
+        write_text(path, "c")
+    assert path.read_text() == "b"
+
+
+def test_a_folder_that_cannot_be_replaced_is_back(tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "one").touch()
+    real = os.rename
+
+    def rename(part, path):
+        if os.path.exists(os.path.join(part, "two")):
+            raise OSError(errno.EIO, "Input/output error")
+        real(part, path)
+
+    monkeypatch.setattr(os, "rename", rename)
+    with pytest.raises(UserError, match="cannot write .*a: Input/output error"):
+        with atomic_folder(tmp_path / "a", replace=True) as temporary:
+            (temporary / "two").touch()
+    assert os.listdir(tmp_path) == ["a"] and os.listdir(tmp_path / "a") == ["one"]
 
 
 def test_a_folder_appears_whole_and_replaces_only_when_told(tmp_path):

@@ -49,6 +49,17 @@ def test_round_trip_is_bit_equal(tmp_path, changes, weights):
     assert stored == (model.encoder is not None and not frozen)
 
 
+def test_equal_models_are_equal_bytes(tmp_path):
+    model = Gamba(micro(encoder="none"))
+    extra = {letter: letter * 9 for letter in 'ghijklmä\n\x7f"'}  # some are escaped in the header
+    save_model(tmp_path / "a", model, extra)
+    save_model(tmp_path / "b", model, dict(reversed(extra.items())))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    with safe_open(tmp_path / "a", framework="pt") as file:
+        found = file.metadata()
+    assert extra.items() <= found.items() and found.keys() - extra.keys() == {"format", "config"}
+
+
 def test_folder_is_accepted(tmp_path):
     save_model(tmp_path / FILE_NAME, Gamba(micro(encoder="none")))
     assert load_model(tmp_path).config == micro(encoder="none")

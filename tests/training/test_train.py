@@ -19,6 +19,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gamba_warp import cli
 from gamba_warp.errors import UserError
+from gamba_warp.files import sha256
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train import loop, step
 from gamba_warp.train.batches import choose_views
@@ -34,10 +35,11 @@ def data(tmp_path_factory):
 
 
 def assert_same_files(a, b):
-    a, b = load_file(a), load_file(b)
-    assert a.keys() == b.keys()
-    for name in a:
-        assert torch.equal(a[name], b[name]), name
+    one, other = load_file(a), load_file(b)
+    assert one.keys() == other.keys()
+    for name in one:
+        assert torch.equal(one[name], other[name]), name
+    assert sha256(a) == sha256(b)
 
 
 def stop_after(monkeypatch, count):
@@ -69,9 +71,15 @@ def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("accumulate", [1, 2])
 def test_resume_is_bit_identical(data, tmp_path, monkeypatch, accumulate):
+    class Difference(torch.nn.Module):
+        def forward(self, got, want):
+            return (got - want).abs().mean((-3, -2, -1))
+
+    monkeypatch.setattr(losses, "load_lpips", Difference)
     # Another number of views at almost every step, so that one prepared too early would show.
-    views = {"accumulate": accumulate, "background": "random", "views_last": 5}
-    views = {"views": views}
+    views = {"accumulate": accumulate, "background": "random", "views_last": 5, "size": 20}
+    # Where the crops lie comes from torch's random numbers.
+    views = {"views": views, "loss": {"lpips": "on", "lpips_crop": 16}}
     assert run(data, tmp_path / "whole", **views) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3 * accumulate)
@@ -296,7 +304,11 @@ def test_minutes_alone_limit_the_run(data, tmp_path, monkeypatch):
     ticks = itertools.count()
     clock = SimpleNamespace(monotonic=lambda: float(next(ticks)), perf_counter=time.perf_counter)
     monkeypatch.setattr(loop, "time", clock)
-    assert run(data, tmp_path, length={"steps": None, "minutes": 0.5}, run={"save_every": 99}) == 0
+    options = {"length": {"steps": None, "minutes": 0.5}, "run": {"save_every": 99}}
+    with monkeypatch.context() as patch:
+        stop_after(patch, 10)
+        assert run(data, tmp_path, **options) == 128 + signal.SIGTERM
+    assert run(data, tmp_path, **options) == 0  # the time before counts
     records = lines(tmp_path, "train")
     assert 25 <= len(records) <= 30
     rates = [record["lr"] for record in records]
