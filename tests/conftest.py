@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -18,6 +19,9 @@ from helpers.browser import browser, browser_page  # noqa: E402, F401
 # No test fetches a matting model, or uses one that rembg keeps on this machine.
 os.environ["GAMBA_OFFLINE"] = "1"
 os.environ["U2NET_HOME"] = os.devnull
+
+# A script that runs us in the background has us ignore Ctrl-C, and so every process of a test too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Minutes of the run; GAMBA_STRESS_MINUTES asks for a longer one.
 MINUTES = float(os.environ.get("GAMBA_STRESS_MINUTES", "2"))
@@ -85,6 +89,14 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def no_nohup():
+    """SIGHUP ends a process, as it does not where the tests themselves run below nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture(autouse=True)

@@ -34,7 +34,7 @@ from .step import collapse_reason, compute_gradients, health, validate
 def stop_signals() -> Iterator[list[int]]:
     """Collects SIGTERM, SIGHUP and SIGINT in the yielded list; a second SIGINT interrupts at once.
 
-    A SIGHUP that is ignored, as below nohup, stays so; Windows has none.
+    A SIGHUP that is ignored stays so (``end_signals``).
     """
     received: list[int] = []
 
@@ -43,11 +43,7 @@ def stop_signals() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         received.append(number)
 
-    stopping = [signal.SIGINT]
-    for sign in end_signals():
-        if sign == signal.SIGTERM or signal.getsignal(sign) != signal.SIG_IGN:
-            stopping.append(sign)
-    old = {number: signal.signal(number, note) for number in stopping}
+    old = {number: signal.signal(number, note) for number in (signal.SIGINT, *end_signals())}
     try:
         yield received
     finally:

@@ -19,7 +19,6 @@ from ..kernels.runtime.system import end_signals
 
 GAMBA = [sys.executable, "-m", "gamba_warp"]
 _TAIL = 1 << 14  # bytes of a log that are searched for what went wrong
-_HARMLESS = (signal.SIGINT, *end_signals())  # somebody asked it to end: no failure of its own
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class End:
     @property
     def stopped(self) -> bool:
         """Whether somebody asked it to stop; the same command goes on from there."""
-        return self.code - 128 in {int(number) for number in _HARMLESS}
+        return self.code - 128 in (signal.SIGINT, *end_signals())
 
 
 class Child:
@@ -124,10 +123,10 @@ class Child:
 def stop_requests() -> Iterator[list[int]]:
     """Collects the signals that ask this process to stop, in the yielded list."""
     received: list[int] = []
-    old = {}
-    for number in _HARMLESS:
-        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # nohup
-            old[number] = signal.signal(number, lambda number, frame: received.append(number))
+    old = {
+        number: signal.signal(number, lambda number, frame: received.append(number))
+        for number in (signal.SIGINT, *end_signals())
+    }
     try:
         yield received
     finally:

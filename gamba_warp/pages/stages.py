@@ -123,17 +123,13 @@ class Stages:
             if code == 0:
                 self._record.ended.append(stage)
         self._write()
-        if code in _STOPPED:
+        if code - 128 in (signal.SIGINT, *end_signals()):
             raise Stopped(code)
         if code and not may_fail:
             raise UserError(f"the command above ended with exit code {code}")
 
     def _write(self) -> None:
         write_json(self._path, msgspec.to_builtins(self._record))
-
-
-_HANDED_ON = tuple(end_signals())
-_STOPPED = {128 + number for number in (*_HANDED_ON, signal.SIGINT)}
 
 
 def _call(words: list[str]) -> int:
@@ -146,7 +142,7 @@ def _call(words: list[str]) -> int:
     def hand_on(number: int, frame: object) -> None:
         process.send_signal(number)
 
-    old = {number: signal.signal(number, hand_on) for number in _HANDED_ON}
+    old = {number: signal.signal(number, hand_on) for number in end_signals()}
     old[signal.SIGINT] = signal.signal(signal.SIGINT, lambda number, frame: None)
     try:
         code = process.wait()

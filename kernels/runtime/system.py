@@ -21,9 +21,14 @@ def is_own(found: os.stat_result) -> bool:
 
 
 def end_signals() -> list[signal.Signals]:
-    """The signals by which others ask a process to end: SIGTERM, and SIGHUP where there is one."""
-    names = ("SIGTERM", "SIGHUP")
-    return [getattr(signal, name) for name in names if hasattr(signal, name)]
+    """The signals by which others ask this process to end: SIGTERM, and SIGHUP where there is one.
+
+    A SIGHUP that is ignored, as below nohup, is left out: it is to stay so.
+    """
+    found = [signal.SIGTERM]
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        found.append(signal.SIGHUP)
+    return found
 
 
 def cores() -> int:

@@ -180,7 +180,7 @@ def test_limits_of_memory_are_left_out(monkeypatch):
     children._limit(1 << 20)
 
 
-def test_training_stops_without_sighup(monkeypatch):
+def test_training_stops_without_sighup(no_nohup, monkeypatch):
     assert system.end_signals() == [signal.SIGTERM, signal.SIGHUP]
     monkeypatch.delattr(signal, "SIGHUP")
     with stop_signals() as received:

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from functools import partial
 
 import pytest
 import torch
@@ -11,8 +12,10 @@ from helpers.disk import full_at
 from helpers.micro import run
 
 from gamba_warp import cli
+from gamba_warp.ablation.processes import stop_requests
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, only_process
+from gamba_warp.hostile.pool import Pool
 from gamba_warp.train import loop
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.log import Quiet, RunLog, say
@@ -122,17 +125,19 @@ def test_what_killed_processes_left_goes_when_training_starts(data, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_each_signal_saves_and_stops(number):
+def test_each_signal_saves_and_stops(no_nohup, number):
     with loop.stop_signals() as received:
         os.kill(os.getpid(), number)
         assert received == [number]
 
 
-def test_nohup_holds():
-    old = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with loop.stop_signals() as received:
-            os.kill(os.getpid(), signal.SIGHUP)
-            assert received == [] and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, old)
+@pytest.mark.parametrize(
+    "collect",
+    [loop.stop_signals, stop_requests, partial(Pool, 0)],
+    ids=["train", "ablate", "stress"],
+)
+def test_nohup_holds(no_nohup, collect):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with collect():
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN

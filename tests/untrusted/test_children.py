@@ -81,8 +81,11 @@ def test_children_end_with_their_parent(tmp_path, number):
     parent = subprocess.Popen([sys.executable, script], stderr=subprocess.PIPE, text=True)
     children = [int(parent.stderr.readline()) for _ in range(2)]
     parent.send_signal(number)
-    parent.wait(20)
-    parent.stderr.close()
+    try:
+        parent.wait(20)
+    finally:
+        parent.kill()
+        parent.communicate()
     deadline = time.monotonic() + 20
     while left := [pid for pid in children if _runs(pid)]:
         assert time.monotonic() < deadline, left
