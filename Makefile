@@ -38,7 +38,7 @@ bench: $(STAMP)
 # The site, in site/: a broken link, anchor or docstring is an error.
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "open site/index.html"
+	@echo "to read it (its search needs a server): $(BIN)/python -m http.server --bind 127.0.0.1 --directory site"
 
 # pyright reads what users get: the wheel, unpacked. (build/ goes first: setuptools would take
 # files from it that are gone from the checkout.)

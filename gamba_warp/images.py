@@ -17,6 +17,7 @@ from PIL import Image, UnidentifiedImageError, features
 
 from .errors import UserError, first_line
 from .files import atomic_path
+from .versions import to_install
 
 MAX_PIXELS = 64 * 1024 * 1024
 MAX_SIDE = 32_768  # pixels; panoramas are shorter, and what pads to a square stays possible
@@ -189,7 +190,7 @@ def _phones(path: str | Path) -> tuple[str, ...]:
         from pillow_heif import register_heif_opener
     except ImportError as error:
         raise UserError(
-            f"{path}: if it is a HEIC, it needs pillow-heif: pip install 'gamba-warp[photo]'"
+            f"{path}: if it is a HEIC, it needs pillow-heif: {to_install('photo')}"
         ) from error
     register_heif_opener(thumbnails=False)
     return ("HEIF",)

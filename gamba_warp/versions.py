@@ -1,7 +1,8 @@
 """The version of this package, and the other packages that it uses: versions, and which may lack.
 
 The core (setup.cfg, ``install_requires``) runs the kernels and the model, and turns a picture with
-alpha into a ``.ply``, a turntable and a page. Everything else comes with ``gamba-warp[EXTRA]``.
+alpha into a ``.ply``, a turntable and a page. Everything else comes with an extra, which ``to_install``
+says how to get.
 """
 
 from __future__ import annotations
@@ -147,7 +148,16 @@ def advice(library: str, command: str) -> str | None:
     extra = OWN.get(command, "")
     if name not in HOLDS.get(extra, ()):
         extra = EXTRA_OF[name]
-    return f"{command} needs {name}, which is not installed: pip install 'gamba-warp[{extra}]'"
+    return f"{command} needs {name}, which is not installed: {to_install(extra)}"
+
+
+def to_install(extra: str) -> str:
+    """How to get an extra, in a few words: from the checkout, or from a wheel's file.
+
+    The distribution's name stands in no package index, so whoever registers it there would be
+    given what a line with that name installs.
+    """
+    return f"pip install '.[{extra}]' in the checkout, or 'FILE.whl[{extra}]'"
 
 
 def import_open3d() -> ModuleType:

@@ -16,6 +16,7 @@ import msgspec
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json
 from gamba_warp.untrusted.documents import read_document
+from gamba_warp.versions import to_install
 
 
 class Board(Protocol):
@@ -35,7 +36,7 @@ def check_boards(names: Sequence[str]) -> None:
         UserError: it says how to install it.
     """
     if "wandb" in names and find_spec("wandb") is None:
-        raise UserError("--log wandb: it is not installed: pip install 'gamba-warp[wandb]'")
+        raise UserError(f"--log wandb: it is not installed: {to_install('wandb')}")
 
 
 def open_board(name: str, run: Path) -> Board | None:

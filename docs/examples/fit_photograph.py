@@ -1,6 +1,6 @@
 """Fits Gaussians to a photograph with gsplat's strategies over our rasterizer.
 
-    pip install gamba-warp gsplat
+    pip install '.[fit]'         # in the checkout
     python docs/examples/fit_photograph.py --out astronaut.png
 
 Everything here is gsplat's interface: with ``gsplat`` for ``gamba_warp.compat.gsplat`` in the two

@@ -1,6 +1,6 @@
 """Times one Mamba layer beside mambapy's and mamba-ssm's reference formula, on the same weights.
 
-Run ``python docs/examples/layer_speed.py`` with mambapy installed (``gamba-warp[peers]``). The
+Run ``python docs/examples/layer_speed.py`` with mambapy installed (``pip install '.[peers]'``). The
 layers take turns, so that other work on the machine meets all of them.
 """
 

@@ -15,7 +15,7 @@ from ..gaussians import Gaussians
 from ..kernels.selective_scan import selective_scan
 from ..model.checkpoint import DEFAULT_CHECKPOINT
 from ..render import render
-from ..versions import EXTRA_OF, import_open3d
+from ..versions import EXTRA_OF, import_open3d, to_install
 from ..vision.fetch import cache_folder
 from ..vision.weights import FETCH, lpips_available
 
@@ -54,7 +54,7 @@ def abilities() -> Iterator[tuple[str, str, bool]]:
             yield name, "yes", False
         except ModuleNotFoundError as error:  # of an extra that nobody asked for
             extra = EXTRA_OF.get(error.name or "")
-            how = f"pip install 'gamba-warp[{extra}]'" if extra else first_line(error)
+            how = to_install(extra) if extra else first_line(error)
             yield name, f"no: {how}", extra is None
         except Exception as error:  # a broken installation raises anything: that is what to tell
             yield name, f"no: {first_line(error)}", True

@@ -141,7 +141,7 @@ def model_card(model: Gamba, name: str, card: str = "") -> str:
         f"# {name}",
         "",
         "One picture to 3D Gaussians: a Gamba network, read and written by "
-        f"[gamba-warp](https://pypi.org/project/gamba-warp/) {__version__}.",
+        f"gamba_warp {__version__}.",
         "",
         f"- {config.depth} blocks of {config.width} channels, {count:,} parameters{encoder}",
         f"- pictures of {config.image_size}² pixels; at most {config.num_gaussians:,} Gaussians by "

@@ -15,6 +15,7 @@ from ..data.preprocess import resize_rgba
 from ..errors import UserError, first_line
 from ..images import to_uint8
 from ..untrusted.children import Failed, run_each
+from ..versions import to_install
 from . import models, network
 
 MAX_MODEL = 2 << 30  # bytes of a model's file; the largest that rembg publishes has 1.1 GB
@@ -47,7 +48,7 @@ class Matte:
         if find_spec("onnxruntime") is None:
             if file is not None:
                 raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
-            raise NoMatte("onnxruntime is not installed: pip install 'gamba-warp[photo]'")
+            raise NoMatte(f"onnxruntime is not installed: {to_install('photo')}")
         self._given = file is not None
         self.path = Path(file) if file is not None else _published(fetch, say)
         self._version = _version_of(self.path) if self._given else (0, 0)
@@ -101,7 +102,7 @@ def _published(fetch: bool, say: Callable[[str], None]) -> Path:
     if not fetch or not models.may_fetch():
         raise NoMatte(how)
     if find_spec("pooch") is None:
-        raise NoMatte("pooch, which fetches it, is not installed: pip install 'gamba-warp[photo]'")
+        raise NoMatte(f"pooch, which fetches it, is not installed: {to_install('photo')}")
     say(f"fetching a matting model once, {model.megabytes} MB, from {model.address}")
     try:
         return models.fetch()

@@ -46,7 +46,7 @@ def command(*options):
 @pytest.fixture(scope="module")
 def served(browser, tmp_path_factory):
     """The command as users start it, in a folder for temporary files of its own."""
-    pytest.importorskip("gradio", reason="needs gradio: pip install 'gamba-warp[app]'")
+    pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
     temporary = tmp_path_factory.mktemp("tmp")
     environment = {**os.environ, "TMPDIR": str(temporary), "HTTP_PROXY": "http://127.0.0.1:9"}
     process = subprocess.Popen(

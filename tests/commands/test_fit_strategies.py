@@ -192,7 +192,7 @@ def test_without_gsplat(tmp_path, monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "gamba_warp.compat.gsplat.strategy", raising=False)
     arguments = [str(tmp_path / "ball"), "--out", str(tmp_path / "out"), "--strategy", "mcmc"]
     assert run("fit", arguments) == 2
-    reason = "fit needs gsplat, which is not installed: pip install 'gamba-warp[fit]'"
+    reason = "fit needs gsplat, which is not installed: pip install '.[fit]' in the checkout, or 'FILE.whl[fit]'"
     assert capsys.readouterr().err == f"gamba: {reason}\n"
     assert not (tmp_path / "out").exists()
     arguments = [*arguments[:-1], "fixed", "--steps", "2", "--gaussians", "9"]

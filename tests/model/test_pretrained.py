@@ -61,7 +61,7 @@ def test_needs_no_hub_for_a_folder(tmp_path, monkeypatch):
     model = _model()
     model.save_pretrained(tmp_path)
     assert _same(model, Gamba.from_pretrained(tmp_path))
-    with pytest.raises(UserError, match=r"pip install 'gamba-warp\[hub\]'"):
+    with pytest.raises(UserError, match=r"pip install '\.\[hub\]' in the checkout"):
         Gamba.from_pretrained("nobody/nothing")
 
 

@@ -110,7 +110,8 @@ def test_wandb_that_is_not_installed_is_said_before_anything(data, tmp_path, mon
     arguments = [str(data), "--out", str(out), "--log", "wandb", "--device", "cpu", "--steps", "1"]
     assert cli.run("train", arguments) == 2
     assert capsys.readouterr().err == (
-        "gamba: --log wandb: it is not installed: pip install 'gamba-warp[wandb]'\n"
+        "gamba: --log wandb: it is not installed: pip install '.[wandb]' in the checkout, or "
+        "'FILE.whl[wandb]'\n"
     )
     assert not out.exists()
 

@@ -203,6 +203,6 @@ def test_without_the_extra_colours_alone_cut(monkeypatch, busy):
     for module in (cutout, matte):
         monkeypatch.setattr(module, "find_spec", lambda name: None)
     found = cut_out(busy[0])
-    assert found.method == "grabcut" and "pip install 'gamba-warp[photo]'" in found.how
+    assert found.method == "grabcut" and "pip install '.[photo]'" in found.how
     with pytest.raises(ModuleNotFoundError, match="onnxruntime"):
         Ways(matte_model="model.onnx").checked()

@@ -20,6 +20,10 @@ ALL_OF_IT = {
     ROOT / "gamba_warp" / "compat" / "gsplat" / "strategy.py",
     *(ROOT / "gamba_warp" / "app" / f"{name}.py" for name in ("actions", "interface", "look")),
 }
+# The name on the command line of an installer, or as an address there.
+BY_NAME = re.compile(
+    r"(install|run|add)\s[^\n]*?\s*['\"\s]gamba[-_]warp[\[=\s'\"]|pypi\.org/\S*gamba"
+)
 # Refuses each library of the extras as if it were not installed, and runs a command.
 WITHOUT = """
 import importlib.util, sys
@@ -60,6 +64,19 @@ def declared():
         return found
 
     return {extra: names(extra) for extra in section}
+
+
+def test_nothing_is_installed_by_a_name_that_is_nobodys():
+    """No index has ``gamba-warp``; whoever registers it there would be installed by such a line."""
+    kinds = {".md", ".py", ".ipynb", ".cfg", ".toml", ".yml", ".sh", ".js", ".html", ".txt", ""}
+    files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+    named, seen = [], 0
+    for name in files.stdout.decode().split("\0")[:-1]:
+        path = ROOT / name
+        if path.suffix in kinds and path.is_file():
+            text, seen = path.read_text(encoding="utf-8"), seen + 1
+            named += [f"{name}: {found[0]}" for found in BY_NAME.finditer(text)]
+    assert seen > 500 and not named
 
 
 def test_each_library_is_in_the_extras_that_are_named():
@@ -116,7 +133,7 @@ def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):
     name = " ".join(arguments[:2]) if arguments[0] == "data" else arguments[0]
     assert done.returncode == 2
     what = f"{name} needs {library}, which is not installed"
-    assert done.stderr == f"gamba: {what}: pip install 'gamba-warp[{extra}]'\n"
+    assert done.stderr == f"gamba: {what}: {versions.to_install(extra)}\n"
 
 
 @pytest.mark.slow
@@ -130,8 +147,8 @@ def test_what_only_an_option_needs(tmp_path):
     ):
         done = in_the_core("reconstruct", *options, *quick)
         assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].endswith(
-            f"needs {library}, which is not installed: pip install 'gamba-warp[{extra}]'"
+            f"needs {library}, which is not installed: {versions.to_install(extra)}"
         ), done.stderr
     done = in_the_core("reconstruct", tmp_path / "busy.png", *quick)
     assert done.returncode == 0 and "Colours alone (GrabCut)" in done.stdout, done.stderr
-    assert "pip install 'gamba-warp[photo]'" in done.stdout
+    assert versions.to_install("photo") in done.stdout

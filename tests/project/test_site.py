@@ -36,7 +36,7 @@ class Loaded(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    pytest.importorskip("mkdocstrings", reason="needs gamba-warp[docs]")
+    pytest.importorskip("mkdocstrings", reason="needs pip install '.[docs]'")
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
@@ -81,6 +81,27 @@ def test_a_page_loads_nothing_from_elsewhere(site):
         reader.feed(page.read_text(encoding="utf-8"))
         outside = [name for name in reader.found if re.match(r"(https?:)?//", name)]
         assert not outside, f"{page}: {outside}"
+
+
+def test_the_command_that_make_docs_prints_serves_the_site_with_its_search(site, browser_page):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    words = re.search(r'@echo "[^"]*: \$\(BIN\)/python (-m http\.server [^"]*)"', makefile)[1]
+    words = words.replace("--directory site", f"--directory {site}")
+    command = [sys.executable, "-u", *words.split(), "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            opened = browser_page(re.search(r"http://\S+/", server.stdout.readline())[0], 1300)
+            opened.page.fill("[data-md-component=search-query]", "turntable")
+            opened.until("!!document.querySelector('.md-search-result__item a')")
+        finally:
+            server.kill()
+
+
+def test_the_folder_that_is_entered_is_the_one_that_the_clone_makes():
+    for page in ("README.md", "docs/index.md"):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        clones = re.findall(r"git clone <[^>]+>(.*)&& cd (\S+)", text)
+        assert clones and all(made.strip() == entered for made, entered in clones), page
 
 
 def test_links_lead_to_the_pages_of_files():

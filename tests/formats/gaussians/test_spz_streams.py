@@ -224,5 +224,5 @@ def test_without_the_library_one_line_says_how_to_get_it(tmp_path, monkeypatch):
         read_gaussians(tmp_path / "a.spz")
     assert str(caught.value) == (
         f"{tmp_path / 'a.spz'}: .spz of version 4 needs backports.zstd, which is not installed:"
-        " pip install 'gamba-warp[spz]'"
+        " pip install '.[spz]' in the checkout, or 'FILE.whl[spz]'"
     )
