@@ -7,10 +7,13 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 from unicodedata import normalize
 
 from .errors import UserError, first_line, one_line
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 Item = TypeVar("Item")
 # What one bad input may raise: everything else is a defect of the program, and stops it.
@@ -36,10 +39,8 @@ def for_each(
     Returns:
         The items that failed, each with a reason of one line, after what was in ``failures``.
     """
-    from tqdm import tqdm
-
     failures = [] if failures is None else failures
-    with tqdm(named.items(), desc=desc, unit=unit, disable=None) as bar:
+    with progress_bar(named.items(), desc=desc, unit=unit) as bar:
         STAGES.show = bar.set_postfix_str
         for name, item in bar:
             try:
@@ -48,6 +49,16 @@ def for_each(
                 failures.append((item, first_line(error).removeprefix(f"{item}: ")))
         STAGES.show = None
     return failures
+
+
+def progress_bar(items: Iterable[Item] | None = None, **options: Any) -> tqdm[Item]:
+    """A bar of tqdm's on stderr, with its options; nothing is drawn where that is no terminal.
+
+    A log or a pipe would keep every state of the bar, one behind the other on one line.
+    """
+    from tqdm import tqdm
+
+    return tqdm(items, disable=None, **options)
 
 
 def say(line: str) -> None:

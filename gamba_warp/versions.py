@@ -1,8 +1,8 @@
 """The version of this package, and the other packages that it uses: versions, and which may lack.
 
 The core (setup.cfg, ``install_requires``) runs the kernels and the model, and turns a picture with
-alpha into a ``.ply``, a turntable and a page. Everything else comes with an extra, which ``to_install``
-says how to get.
+alpha into a ``.ply``, a turntable and a page. Everything else comes with an extra, and
+``to_install`` says how to get it.
 """
 
 from __future__ import annotations

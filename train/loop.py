@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import math
 import signal
 import sys
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.runtime.system import end_signals
 from gamba_warp.model.checkpoint import save_model
@@ -241,13 +243,7 @@ class Trainer:
             UserError: as ``train_step``, or the run folder cannot be written.
         """
         batches = self._queue()
-        bar = tqdm(
-            total=self.total,
-            initial=self.step,
-            unit="step",
-            disable=not self.world.main,
-            file=Quiet(sys.stderr),
-        )
+        bar = self._bar()
         began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
         try:
@@ -272,6 +268,15 @@ class Trainer:
             save_model(self.config.run.out / "model.safetensors", best)
         return 0
 
+    def _bar(self) -> tqdm:
+        """The bar of the run: of its minutes if they are limited, or else of its steps."""
+        file = Quiet(sys.stderr if self.world.main else io.StringIO())  # a terminal, or no bar
+        if (minutes := self.config.length.minutes) is None:
+            return progress_bar(total=self.total, initial=self.step, unit="step", file=file)
+        form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:g} min{postfix}"
+        began = min(minutes, self.elapsed / 60)
+        return progress_bar(total=minutes, initial=began, bar_format=form, file=file)
+
     def _agree(self, clock: float, received: list[int]) -> tuple[float, float]:
         """Returns elapsed seconds and stop signal (0: none), the same on all processes."""
         signals = [float(received[0] if received else 0)]
@@ -287,13 +292,13 @@ class Trainer:
         return self.total is not None and self.step >= self.total
 
     def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
-        run = self.config.run
-        bar.update()
+        run, minutes = self.config.run, self.config.length.minutes
+        bar.update(1 if minutes is None else min(minutes, self.elapsed / 60) - bar.n)
         self._name_failures()
         if self.log is not None and self.step % run.log_every == 0:
             shown = {"loss": f"{figures['loss']:.4f}", "psnr": f"{figures['psnr']:.1f}"}
-            if self.total is None:  # only minutes are limited, so the bar has no end
-                shown["minutes"] = f"{self.elapsed / 60:.1f} of {self.config.length.minutes:g}"
+            if minutes is not None:
+                shown = {"step": self.step, **shown}
             bar.set_postfix(shown)
             epoch = self.step / self.steps_per_epoch
             done = {"minutes": self.elapsed / 60, "epoch": epoch, "skipped": self.skipped}

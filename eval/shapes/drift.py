@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import tyro
-from tqdm import tqdm
+
+from gamba_warp.batch import progress_bar
 
 from .flags import tidied
 from .metrics import volume_iou
@@ -115,7 +116,7 @@ def main(voxels: int = 32, seeds: int = 3) -> None:
     print(f"| shape | damage | {' | '.join(RULES)} |\n| --- | --- |{' --- |' * len(RULES)}")
     damages = {f"hole {100 * share:g} %": _hole(share) for share in HOLES}
     for name, mesh in known_shapes().items():
-        for damage, function in tqdm({**damages, **DAMAGES}.items(), desc=name, disable=None):
+        for damage, function in progress_bar({**damages, **DAMAGES}.items(), desc=name):
             values = drift(mesh, function, voxels, seeds)
             print(f"| {name} | {damage} | {' | '.join(f'{v:.3f}' for v in values.values())} |")
 

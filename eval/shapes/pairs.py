@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.data import gso
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, sha256, visible, write_text
@@ -294,7 +294,7 @@ def evaluate_pairs(
     )
     found = run_each(attempt, pairs, seconds=PAIR_SECONDS)
     objects = []
-    for index, result in tqdm(found, total=len(pairs), unit="object", disable=None):
+    for index, result in progress_bar(found, total=len(pairs), unit="object"):
         if isinstance(result, Failed):
             result = failure(pairs[index].name, result.reason)
         objects.append(result)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, grid_sample
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.cameras import from_opengl, relative_to_reference
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
@@ -121,7 +121,7 @@ class Retrieval:
         self.found: dict[str, Found] = {}
         self._places: list[tuple[str, int]] = []  # (uid, view) of each thumbnail
         found = []
-        for uid in tqdm(training.uids, desc="retrieval index", unit="object", disable=None):
+        for uid in progress_bar(training.uids, desc="retrieval index", unit="object"):
             try:
                 small = thumbnails(training.load(uid, size=THUMBNAIL).images)
             except UserError as error:

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.cameras import relative_to_reference
 from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.data.dataset import ObjectViews, ViewDataset
@@ -95,7 +95,7 @@ class Ceiling:
         path = self.folder / f"{uid}.ply" if self.folder else None
         if path and path.exists() and _stated(path.with_suffix(".json")) == key:
             return load_ply(path).to(device)
-        with tqdm(total=100, desc=f"ceiling {uid}", unit="%", leave=False, disable=None) as bar:
+        with progress_bar(total=100, desc=f"ceiling {uid}", unit="%", leave=False) as bar:
 
             def show(done: float, _: float) -> None:
                 bar.update(int(100 * done) - bar.n)

@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.files import output_folder, write_text
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
@@ -203,7 +203,7 @@ def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], boo
         )
     }
     try:
-        for number, uid in enumerate(tqdm(job.uids, unit="object", disable=None)):
+        for number, uid in enumerate(progress_bar(job.uids, unit="object")):
             strips = folder / "strips" if folder and number < options.strips else None
             try:
                 objects.append(evaluate_object(job, uid, Files(strips=strips, **made)))

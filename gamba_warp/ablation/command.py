@@ -207,7 +207,7 @@ def _run(
 
     from tqdm import tqdm
 
-    from ..batch import check_not_read
+    from ..batch import check_not_read, progress_bar
     from ..files import only_process, output_folder
     from .plan import keep_plan
     from .run import row_line, run_tasks
@@ -222,9 +222,8 @@ def _run(
             if task not in todo:
                 print(f"{row_line(plan, task)} (before)", flush=True)
         tqdm.monitor_interval = 0  # its thread could hold a lock at the moment of a fork
-        with tqdm(
-            total=len(tasks), initial=len(tasks) - len(todo), unit="run", disable=None
-        ) as bar:
+        begun = len(tasks) - len(todo)
+        with progress_bar(total=len(tasks), initial=begun, unit="run") as bar:
 
             def ended(task: Task) -> None:
                 tqdm.write(row_line(plan, task), sys.stdout)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 from msgspec import Meta
 
-from ..batch import check_not_read, for_each, plan_outputs, report
+from ..batch import check_not_read, for_each, plan_outputs, progress_bar, report
 from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
@@ -58,8 +58,6 @@ def render_command(
         depth: Also pictures of depth, 16 bits (png only).
         device: Device that renders; auto is the GPU if there is one.
     """
-    from tqdm import tqdm
-
     from ..formats.gaussians.files import read_gaussians
     from ..pages.export import find_gaussians
     from ..surfaces.extract import unit_frame
@@ -90,7 +88,7 @@ def render_command(
     def one(target: str, path: Path) -> None:
         count = len(film.cameras.viewmats)
         gaussians = read_gaussians(path)
-        with tqdm(total=count, desc=path.name, unit="view", leave=False, disable=None) as bar:
+        with progress_bar(total=count, desc=path.name, unit="view", leave=False) as bar:
             shoot(Path(target), kind, gaussians, unit_frame(gaussians), film, chosen, bar.update)
 
     for_each(targets, one, "render", "file", failures)

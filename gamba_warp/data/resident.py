@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..batch import EXPECTED
+from ..batch import EXPECTED, progress_bar
 from ..errors import UserError
 from .dataset import ViewDataset
 from .layouts import ObjectFiles
@@ -72,12 +72,10 @@ class ResidentViews(ViewDataset):
     def _fill(
         self, objects: Sequence[int], sizes: Sequence[int], device: torch.device, workers: int
     ) -> None:
-        from tqdm import tqdm
-
         threads: Prefetcher[_Pictures, _Pictures] = Prefetcher(workers)
         keys = [(self.uids[index], size) for index in objects for size in sizes]
         try:
-            for number, key in enumerate(tqdm(keys, desc="decoding", unit="object", disable=None)):
+            for number, key in enumerate(progress_bar(keys, desc="decoding", unit="object")):
                 for uid, size in keys[number : number + workers + 1]:
                     if (uid, size) not in threads:
                         part = partial(self._dataset.pictures, uid, None, size)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from ..batch import progress_bar
 from ..files import remove_folder, sha256, sha256_of_all
 from .child import End, run_child
 from .folders import age, contents, leftovers, lost
@@ -97,7 +98,7 @@ def endurance(folder: Path, plan: Plan) -> dict:
     total = plan.kills + plan.processes + plan.full + len(chosen) * (plan.command_kills + plan.full)
     rng, counts = random.Random(plan.seed), []
     tqdm.monitor_interval = 0  # its thread could hold a lock at the moment of a fork
-    with tqdm(total=total, unit="fault", disable=None) as bar:
+    with progress_bar(total=total, unit="fault") as bar:
         for found in _counts(folder, plan, chosen, rng, bar):
             counts.append(found)
     spent = round(time.monotonic() - started, 1)

@@ -10,9 +10,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
-from ..batch import for_each
+from ..batch import for_each, progress_bar
 from ..cameras import Cameras, relative_to_reference
 from ..conventions import DEFAULT_DISTANCE, over_background
 from ..data.dataset import ObjectViews, ViewDataset
@@ -158,7 +157,7 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
     views = load_views(job, uid, fitted)
     images, cameras = views.images.to(job.device), views.cameras.to(job.device)
     wall, cpu = time.perf_counter(), time.process_time()
-    with tqdm(total=100, desc=uid, unit="%", leave=False, disable=None) as bar:
+    with progress_bar(total=100, desc=uid, unit="%", leave=False) as bar:
 
         def show(done: float, loss: float) -> None:
             bar.set_postfix(loss=f"{loss:.4f}", refresh=False)

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
-from tqdm import tqdm
-
+from ..batch import progress_bar
 from ..errors import UserError
 from ..files import atomic_path, write_json
 from ..kernels.runtime.system import cores
@@ -171,7 +170,7 @@ class FilesRun:
         drawn = itertools.islice(self._cases.draw(), count)
         small: list[tuple[Case, Verdict, str]] = []
         total = count if seconds == math.inf else None
-        bar = tqdm(total=total, unit="case", desc="stress files", disable=None)
+        bar = progress_bar(total=total, unit="case", desc="stress files")
         with Pool(self._children) as pool, bar:
             try:
                 for case, verdict in pool.run(drawn, seconds):

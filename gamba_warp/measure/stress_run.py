@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
+from ..batch import progress_bar
 from ..errors import UserError
 from ..files import atomic_path, write_json
 from ..kernels.stress import (
@@ -97,7 +97,7 @@ class StressRun:
         began, interrupted, worst = time.monotonic(), False, 0.0
         total = count if seconds == math.inf else None
         seed = self.about["seed"]
-        with tqdm(total=total, unit="case", desc="stress", disable=None) as bar:
+        with progress_bar(total=total, unit="case", desc="stress") as bar:
             try:
                 found = run_cases(self._ops, seed, self._device, count=count, seconds=seconds)
                 for op, case, outcome, spent in found:

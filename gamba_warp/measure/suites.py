@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from ..batch import progress_bar
 from ..errors import UserError
 from ..files import atomic_path, output_folder, write_json
 from ..kernels.bench import Case, Settings, Target, measure
@@ -77,7 +78,7 @@ def run_suites(
         if unknown := [name for name in only if name not in names]:
             raise UserError(f"--only {unknown[0]}: no such case; there are {'; '.join(names)}")
         cases = [case for case in cases if case.name in only]
-    with tqdm(total=len(cases), unit="case", desc="bench", disable=None) as bar:
+    with progress_bar(total=len(cases), unit="case", desc="bench") as bar:
         document = measure(cases, settings, _progress(bar))
     document["machine"]["peers"] = versions() if settings.peers else {}
     document["targets"] = judge(targets, document["records"])
@@ -190,7 +191,7 @@ def write_static(folder: Path) -> int:
     Raises:
         UserError: this build of Warp has no compiler, or a file cannot be written.
     """
-    with tqdm(unit="kernel", desc="static", disable=None) as bar:
+    with progress_bar(unit="kernel", desc="static") as bar:
 
         def say(kernel: str) -> None:
             bar.set_postfix_str(kernel)

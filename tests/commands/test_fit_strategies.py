@@ -18,6 +18,7 @@ from gamba_warp.fitting.optimize import fit
 from gamba_warp.fitting.start import random_start
 from gamba_warp.image_metrics import psnr
 from gamba_warp.render import render
+from gamba_warp.versions import to_install
 
 NEEDS_GSPLAT = pytest.mark.skipif(
     importlib.util.find_spec("gsplat") is None,
@@ -192,7 +193,7 @@ def test_without_gsplat(tmp_path, monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "gamba_warp.compat.gsplat.strategy", raising=False)
     arguments = [str(tmp_path / "ball"), "--out", str(tmp_path / "out"), "--strategy", "mcmc"]
     assert run("fit", arguments) == 2
-    reason = "fit needs gsplat, which is not installed: pip install '.[fit]' in the checkout, or 'FILE.whl[fit]'"
+    reason = "fit needs gsplat, which is not installed: " + to_install("fit")
     assert capsys.readouterr().err == f"gamba: {reason}\n"
     assert not (tmp_path / "out").exists()
     arguments = [*arguments[:-1], "fixed", "--steps", "2", "--gaussians", "9"]

@@ -65,3 +65,14 @@ def test_kernel_arrays_say_their_direction(path):
         assert all(n.endswith(("_in", "_out")) for n in names), f"{node.name}: {names}"
         directions = [name.endswith("_out") for name in names]
         assert directions == sorted(directions), f"{node.name}: outputs come last"
+
+
+def test_every_progress_bar_is_the_one_that_logs_do_without():
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in (
+                "tqdm",
+                "tqdm.tqdm",
+                "trange",
+            ):
+                assert path == ROOT / "gamba_warp" / "batch.py", f"{path}, line {node.lineno}"

@@ -1,10 +1,13 @@
 """The training loop: resumes to the bit, skips what is not finite, refuses what does not fit."""
 
+import io
 import itertools
 import json
 import math
 import os
+import re
 import signal
+import sys
 import time
 from types import SimpleNamespace
 
@@ -53,6 +56,23 @@ def stop_after(monkeypatch, count):
         return real(*arguments, **options)
 
     monkeypatch.setattr(step, "forward", counting)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_the_bar_is_of_the_minutes_and_a_log_has_none(data, tmp_path, monkeypatch):
+    def drawn(stream, out, **length):
+        monkeypatch.setattr(sys, "stderr", stream)
+        assert run(data, out, length=length) == 0
+        return stream.getvalue()
+
+    assert "\r" not in drawn(io.StringIO(), tmp_path / "log", steps=2)
+    assert "2/2" in drawn(Terminal(), tmp_path / "steps", steps=2)
+    shown = drawn(Terminal(), tmp_path / "minutes", steps=None, minutes=0.02)
+    assert "of 0.02 min, step=1, loss=" in shown and re.search(r" (9\d|100)%\|", shown), shown
 
 
 def test_recomputation_changes_no_bit(data, tmp_path, monkeypatch):

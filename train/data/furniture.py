@@ -18,8 +18,8 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 import msgspec
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, output_folder, write_json
 from gamba_warp.formats.catalogue import CATALOGUE, check_rotation
@@ -234,7 +234,7 @@ def unpack_library(path: Path, target: Path, icons: Path) -> list[dict]:
         if missing:
             raise UserError(f"{path}: not a furniture library (it holds no {min(missing)!r})")
         target.mkdir()
-        for member in tqdm(members, desc=library, unit="file", leave=False):
+        for member in progress_bar(members, desc=library, unit="file", leave=False):
             archive.unpack(member, target)
         for entry, picture in zip(entries, pictures):
             (icons / f"{entry['uid']}.png").write_bytes(archive.read(picture, _MAX_ICON))

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
-from tqdm import tqdm
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.data.dataset import split_of
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, output_folder, write_json
@@ -50,7 +50,7 @@ def make_primitives(out: Path, count: int, seed: int) -> None:
     ours = all(path.name.startswith("primitive-") for path in out.glob("*.glb"))
     if (out / CATALOGUE).exists() and not ours:
         raise UserError(f"{out / CATALOGUE}: there are other objects; choose another --out")
-    for number, entry in enumerate(tqdm(entries, unit="object")):
+    for number, entry in enumerate(progress_bar(entries, unit="object")):
         path = out / entry["model"]
         if path.exists():
             continue

@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 import torch
 from PIL import Image
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.cameras import intrinsics
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import write_split
@@ -218,7 +218,7 @@ def render_meshes(
     warnings: dict[str, list[str]] = {}
     failures: dict[str, str] = {}
     found = _run(meshes, out, settings, workers)
-    for mesh, result in tqdm(found, total=len(meshes), unit="object"):
+    for mesh, result in progress_bar(found, total=len(meshes), unit="object"):
         if isinstance(result, str):
             failures[mesh.uid] = result
         elif result:

@@ -14,8 +14,8 @@ import sys
 from pathlib import Path
 
 import tyro
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.conventions import DEFAULT_FOV
 from gamba_warp.data.dataset import split_of, write_split
 from gamba_warp.errors import UserError
@@ -96,7 +96,7 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
     for folder in made:
         shutil.rmtree(folder, ignore_errors=True)
         output_folder(folder)
-    for uid in tqdm(OBJECTS, unit="object"):
+    for uid in progress_bar(OBJECTS, unit="object"):
         render_object(meshes[uid], out / "data", SETTINGS)
     write_split(out / "data", groups)
     for uid in held_out:

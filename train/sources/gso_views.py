@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
+from gamba_warp.batch import progress_bar
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import SPLIT_VERSION
 from gamba_warp.errors import UserError
@@ -51,7 +50,7 @@ def take_models(source: Path, out: Path, names: Sequence[str]) -> dict[str, str]
     wanted = [name for name in names if not (meshes / name / "model.obj").is_file()]
     found = find_models(source, names) if wanted else {}
     failures = {name: f"not in {source}" for name in wanted if name not in found}
-    for name in tqdm([name for name in wanted if name in found], unit="model", disable=None):
+    for name in progress_bar([name for name in wanted if name in found], unit="model"):
         try:
             take_model(name, found[name], meshes)
         except UserError as error:

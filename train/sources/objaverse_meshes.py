@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from gamba_warp.batch import progress_bar
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_path, output_folder, write_json
 from gamba_warp.formats.catalogue import CATALOGUE
@@ -53,7 +52,7 @@ def take_meshes(names: Sequence[str], out: Path, processes: int) -> tuple[int, d
     failures: dict[str, str] = {}
     # It reads 160 large files for this, so all at once.
     known = _asked(package.load_annotations, uids=wanted) if wanted else {}
-    with tqdm(total=len(wanted), unit="object", disable=None) as progress:
+    with progress_bar(total=len(wanted), unit="object") as progress:
         for start in range(0, len(wanted), _BATCH):
             batch = wanted[start : start + _BATCH]
             paths = _asked(package.load_objects, uids=batch, download_processes=processes)

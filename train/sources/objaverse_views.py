@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.data.layouts import GOBJAVERSE, GOBJAVERSE_DEPTH, ObjectFiles
 from gamba_warp.errors import UserError
@@ -88,7 +88,7 @@ def take_views(
     failures: dict[str, str] = {}
     marks = (GOBJAVERSE, GOBJAVERSE_DEPTH) if depth else (GOBJAVERSE,)
     wanted = [name for name in names if not all((out / name / mark).exists() for mark in marks)]
-    for name in tqdm(wanted, unit="object", disable=None):
+    for name in progress_bar(wanted, unit="object"):
         try:
             _take(objects[name], out / name, least, copy, depth)
         except UserError as error:

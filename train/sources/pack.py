@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from gamba_warp.batch import EXPECTED
+from gamba_warp.batch import EXPECTED, progress_bar
 from gamba_warp.data.dataset import ViewDataset, open_dataset, splits_of
 from gamba_warp.data.packs import (
     FORMAT,
@@ -188,11 +188,9 @@ def _blocks(
     failures: dict[str, str],
 ) -> Iterator[_Block]:
     """Yields the objects that can be read, in their order, decoded ahead on threads."""
-    from tqdm import tqdm
-
     threads: Prefetcher[_Block, _Block] = Prefetcher(workers)
     try:
-        for number, uid in enumerate(tqdm(uids, desc="packing", unit="object", disable=None)):
+        for number, uid in enumerate(progress_bar(uids, desc="packing", unit="object")):
             for ahead in uids[number : number + 1 + _AHEAD * workers]:
                 if ahead not in threads:
                     part = partial(_block, dataset, ahead, splits[ahead], settings.size)
