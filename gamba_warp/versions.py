@@ -151,6 +151,20 @@ def advice(library: str, command: str) -> str | None:
     return f"{command} needs {name}, which is not installed: {to_install(extra)}"
 
 
+def require(*libraries: str) -> None:
+    """Refuses what is not installed before any work is done for it.
+
+    Args:
+        libraries: names by which they are imported, such as ``trimesh``.
+
+    Raises:
+        ModuleNotFoundError: one is not there; the console script says how to get it (``advice``).
+    """
+    for name in libraries:
+        if find_spec(name) is None:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
 def to_install(extra: str) -> str:
     """How to get an extra, in a few words: from the checkout, or from a wheel's file.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
 import os
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from gamba_warp.batch import progress_bar
 from gamba_warp.errors import UserError
 from gamba_warp.files import reason_of
 from gamba_warp.images import save_image
@@ -174,3 +176,20 @@ def save_strip(path: Path, rows: list[Tensor]) -> None:
     width = max(strip.shape[1] for strip in strips)
     padded = [torch.nn.functional.pad(s, (0, 0, 0, width - s.shape[1]), value=1.0) for s in strips]
     save_image(path, torch.cat(padded).cpu().numpy())
+
+
+def run_bar(total: int | None, minutes: float | None, step: int, spent: float, main: bool) -> tqdm:
+    """The bar of a run: of its minutes if they are limited, or else of its steps.
+
+    Args:
+        total: steps of the run, or None where only minutes limit it.
+        minutes: its time limit, or None.
+        step: steps that are done.
+        spent: minutes that are spent.
+        main: whether this process draws it; that of another draws nothing.
+    """
+    file = Quiet(sys.stderr if main else io.StringIO())
+    if minutes is None:
+        return progress_bar(total=total, initial=step, unit="step", file=file)
+    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:g} min{postfix}"
+    return progress_bar(total=minutes, initial=min(minutes, spent), bar_format=form, file=file)

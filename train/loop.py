@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
@@ -16,7 +14,6 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gamba_warp.batch import progress_bar
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.runtime.system import end_signals
 from gamba_warp.model.checkpoint import save_model
@@ -27,7 +24,7 @@ from .checkpoint import STATE_VERSION, read_length, read_run, read_weights_of, s
 from .config import LengthConfig, TrainConfig
 from .data.samples import Batch
 from .ddp import World
-from .log import Quiet, RunLog, say
+from .log import RunLog, run_bar, say
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views, radial_weight
 from .step import collapse_reason, compute_gradients, health, validate
 
@@ -243,7 +240,8 @@ class Trainer:
             UserError: as ``train_step``, or the run folder cannot be written.
         """
         batches = self._queue()
-        bar = self._bar()
+        length = self.total, self.config.length.minutes
+        bar = run_bar(*length, self.step, self.elapsed / 60, self.world.main)
         began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
         try:
@@ -267,15 +265,6 @@ class Trainer:
             best = self.ema.model if self.ema else self.model
             save_model(self.config.run.out / "model.safetensors", best)
         return 0
-
-    def _bar(self) -> tqdm:
-        """The bar of the run: of its minutes if they are limited, or else of its steps."""
-        file = Quiet(sys.stderr if self.world.main else io.StringIO())  # a terminal, or no bar
-        if (minutes := self.config.length.minutes) is None:
-            return progress_bar(total=self.total, initial=self.step, unit="step", file=file)
-        form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:g} min{postfix}"
-        began = min(minutes, self.elapsed / 60)
-        return progress_bar(total=minutes, initial=began, bar_format=form, file=file)
 
     def _agree(self, clock: float, received: list[int]) -> tuple[float, float]:
         """Returns elapsed seconds and stop signal (0: none), the same on all processes."""

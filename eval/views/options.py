@@ -13,6 +13,7 @@ from gamba_warp.conventions import DEFAULT_DISTANCE, DeviceChoice, Precision
 from gamba_warp.errors import UserError
 from gamba_warp.fitting.config import FitConfig, Steps
 from gamba_warp.untrusted.ranges import check_options, option
+from gamba_warp.versions import require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +85,7 @@ class ViewsOptions:
 
         Raises:
             UserError: a number is out of its range; the message names the option.
+            ModuleNotFoundError: an option needs a library that is not installed.
         """
         check_options(self)
         if self.protocol != "default":
@@ -96,3 +98,5 @@ class ViewsOptions:
             raise UserError("--save-pictures: needs --out")
         if self.save_retrieval and (self.out is None or not self.baselines):
             raise UserError("--save-retrieval: needs --out, and the baselines")
+        if self.save_retrieval:
+            require("trimesh")

@@ -14,6 +14,7 @@ from msgspec import Meta
 from ..conventions import DeviceChoice
 from ..errors import UserError
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
+from ..versions import NEEDS, require
 
 if TYPE_CHECKING:
     from .jobs import Settings
@@ -91,6 +92,8 @@ def ablate_command(
     _check_inputs(chosen, settings, wanted)
     if threads is None:
         threads = max(1, cores() // jobs)
+    if meshes is not None:
+        require(*NEEDS["eval-geometry"])
     if dry_run:
         from .estimate import print_plan
 

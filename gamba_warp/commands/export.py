@@ -138,6 +138,7 @@ def _run(inputs: tuple[Path, ...], job: ExportJob) -> int:
 
     if not job.suffixes():
         raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
+    job.require()
     files, failures = find_gaussians(inputs)
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))

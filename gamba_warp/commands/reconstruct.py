@@ -116,6 +116,7 @@ def reconstruct_command(
         camera=(camera.elevation, camera.distance, camera.fov),
         inputs=save_inputs,
     )
+    outputs.require()
     reads = (mask, matte_model, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])

@@ -62,9 +62,11 @@ def render_command(
     from ..pages.export import find_gaussians
     from ..surfaces.extract import unit_frame
     from ..trajectories.film import Film, parse_background, parse_size, plan_path, shoot
+    from ..trajectories.movies import require_movie
 
     single = out.suffix.lower() in _SUFFIXES and not out.is_dir()
     kind = _kind(out, kind, single)
+    require_movie(kind)
     if out.suffix.lower() == ".png" and single:
         frames = 1 if frames is None and trajectory in ("turntable", "spiral") else frames
     view = {"elevation": elevation, "distance": distance, "fov": fov}

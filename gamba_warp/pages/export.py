@@ -18,6 +18,7 @@ from ..gaussians import Gaussians
 from ..surfaces.extract import unit_frame
 from ..surfaces.files import mesh_suffixes, write_meshes
 from ..surfaces.options import SurfaceOptions
+from ..trajectories.movies import require_movie
 from ..trajectories.paths import Viewpoint
 from .page import Section, reconstruction_page
 from .turntable import save_turntable, turntable_frames
@@ -63,6 +64,12 @@ class ExportJob:
         found += [splat_suffix(kind) for kind in self.splats]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
         return found + ([".html"] if self.page else [])
+
+    def require(self) -> None:
+        """Refuses what needs a library that is not installed (ModuleNotFoundError)."""
+        require_movie(self.turntable)
+        if self.mesh:
+            self.surface.require(self.texture)
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:

@@ -20,10 +20,13 @@ from ..model.config import GambaConfig
 from ..photo.cutout import CutOut
 from ..surfaces.files import write_meshes
 from ..surfaces.options import BROWSER_FACES, SurfaceOptions
+from ..trajectories.movies import require_movie
 from ..trajectories.paths import Viewpoint, upright
 from .page import Section, reconstruction_page
 from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
+
+_SURFACE = SurfaceOptions(colors=True, faces=BROWSER_FACES)
 
 
 @dataclass
@@ -72,6 +75,12 @@ class Outputs:
         found += ["-input.png"] if self.inputs else []
         return found + ([".html"] if self.page else [])
 
+    def require(self) -> None:
+        """Refuses what needs a library that is not installed (ModuleNotFoundError)."""
+        require_movie(self.turntable)
+        if self.mesh:
+            _SURFACE.require()
+
     def view(self, config: GambaConfig) -> Viewpoint:
         """From where turntable, sheet and viewer look; that of the input, but for the options."""
         return Viewpoint(0.0, config.distance, config.fov).changed(*self.camera)
@@ -115,8 +124,8 @@ def write_outputs(
     if outputs.mesh:  # what takes longest comes last: all else is there to look at
         STAGES.begin("mesh")
         visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
-        options, device = SurfaceOptions(colors=True, faces=BROWSER_FACES), gaussians.means.device
-        mesh = write_meshes(base, visible, outputs.mesh, options, outputs.axes, device)
+        device = gaussians.means.device
+        mesh = write_meshes(base, visible, outputs.mesh, _SURFACE, outputs.axes, device)
         if section is not None:  # the page again, with the mesh in its viewer
             section.mesh = mesh
             reconstruction_page(base.with_name(f"{name}.html"), section)

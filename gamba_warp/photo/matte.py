@@ -15,7 +15,7 @@ from ..data.preprocess import resize_rgba
 from ..errors import UserError, first_line
 from ..images import to_uint8
 from ..untrusted.children import Failed, run_each
-from ..versions import to_install
+from ..versions import require, to_install
 from . import models, network
 
 MAX_MODEL = 2 << 30  # bytes of a model's file; the largest that rembg publishes has 1.1 GB
@@ -47,7 +47,7 @@ class Matte:
     ) -> None:
         if find_spec("onnxruntime") is None:
             if file is not None:
-                raise ModuleNotFoundError("No module named 'onnxruntime'", name="onnxruntime")
+                require("onnxruntime")
             raise NoMatte(f"onnxruntime is not installed: {to_install('photo')}")
         self._given = file is not None
         self.path = Path(file) if file is not None else _published(fetch, say)

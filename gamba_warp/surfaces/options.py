@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from ..untrusted.ranges import check_options
+from ..versions import require
 
 Method = Literal["tsdf", "density", "centers"]
 Voxels = Annotated[int, Meta(ge=8, le=1024)]
@@ -76,3 +77,15 @@ class SurfaceOptions:
             UserError: a number is out of its range; the message names the option.
         """
         check_options(self)
+
+    def require(self, texture: int = 0) -> None:
+        """Refuses a surface whose libraries are not installed, before any work is done for it.
+
+        Args:
+            texture: side of its texture, pixels; 0: none.
+
+        Raises:
+            ModuleNotFoundError: as ``versions.require``.
+        """
+        require("trimesh", "scipy", "pymeshlab", "open3d" if self.method == "tsdf" else "skimage")
+        require(*["xatlas"] * bool(texture))

@@ -21,6 +21,7 @@ from ..files import atomic_folder, atomic_path
 from ..gaussians import Gaussians
 from ..images import to_uint8
 from ..render import render
+from ..versions import require
 from .files import save_path
 
 CAMERAS = "cameras.json"  # in a folder of pictures
@@ -69,6 +70,16 @@ def render_path(
 
 def _known_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
     return torch.where(alpha > 0.5, depth, 0.0)[..., 0].cpu().numpy()
+
+
+def require_movie(kind: str) -> None:
+    """Refuses ``mp4`` where its library is not installed, before any view is rendered.
+
+    Raises:
+        ModuleNotFoundError: as ``versions.require``.
+    """
+    if kind == "mp4":
+        require("imageio_ffmpeg")
 
 
 def save_movie(

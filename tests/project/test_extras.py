@@ -8,9 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.gaussians import some
 from helpers.images import cut_out, disc_on_noise
 
 from gamba_warp import cli, versions
+from gamba_warp.formats.ply import save_ply
 from gamba_warp.images import save_image
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -136,13 +138,32 @@ def test_what_is_missing_is_one_line(arguments, library, extra, tmp_path):
     assert done.stderr == f"gamba: {what}: {versions.to_install(extra)}\n"
 
 
+@pytest.mark.parametrize(
+    "arguments, library, extra",
+    [
+        (["reconstruct", "thing.png", "--mesh", "obj"], "trimesh", "mesh"),
+        (["reconstruct", "thing.png", "--turntable", "mp4"], "imageio_ffmpeg", "video"),
+        (["export", "thing.ply", "--splats", "spz"], "trimesh", "mesh"),  # a mesh by default
+        (["export", "thing.ply", "--mesh", "--turntable", "mp4"], "imageio_ffmpeg", "video"),
+        (["render", "thing.ply", "--kind", "mp4"], "imageio_ffmpeg", "video"),
+    ],
+)
+def test_what_an_option_needs_is_said_before_any_work(arguments, library, extra, tmp_path):
+    cut_out(tmp_path / "thing.png")
+    save_ply(tmp_path / "thing.ply", some(10))
+    arguments[1] = tmp_path / arguments[1]
+    done = in_the_core(*arguments, "--out", tmp_path / "out")
+    what = f"{arguments[0]} needs {library}, which is not installed"
+    assert (done.returncode, done.stderr) == (2, f"gamba: {what}: {versions.to_install(extra)}\n")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_what_only_an_option_needs(tmp_path):
     picture = cut_out(tmp_path / "thing.png")
     save_image(tmp_path / "busy.png", disc_on_noise((60, 80))[0])
     quick = ("--turntable", "none", "--no-page", "--out", tmp_path / "out")
     for options, library, extra in (
-        ((picture, "--mesh", "glb"), "open3d", "mesh"),
         ((picture, "--matte-model", "model.onnx"), "onnxruntime", "photo"),
     ):
         done = in_the_core("reconstruct", *options, *quick)
