@@ -22,7 +22,7 @@ from page_parts import table, with_parts
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
-from gamba_warp.pages.card import METRICS, ModelCard, Row, card_path, read_card
+from gamba_warp.pages.card import METRICS, OF_GROUNDS, ModelCard, Row, card_path, read_card
 from gamba_warp.untrusted.documents import read_document
 
 PAGE = Path(__file__).with_name("model-card.md")
@@ -113,20 +113,21 @@ def readme_of(text: str, card: ModelCard) -> str:
 
 
 def _tables(card: ModelCard) -> list[str]:
-    tables = []
+    tables, first = [], [key for key in METRICS if key not in OF_GROUNDS]
     for views, title in TITLES.items():
         rows = [row for row in card.figures if row.views == views]
-        keys = [key for key in METRICS if any(getattr(row, key) for row in rows)]
-        if not rows:
-            continue
-        header = [f"{title}, {rows[0].objects:,} objects", *(METRICS[key][0] for key in keys)]
-        lines = []
-        for row in rows:
-            cells = [getattr(row, key) for key in keys]
-            texts = [cell.text(METRICS[key][1]) if cell else "–" for key, cell in zip(keys, cells)]
-            name = "**this model**" if row.name == "model" else row.name.replace("_", " ")
-            lines.append([name, *texts])
-        tables.append(table(header, lines))
+        for metrics, where in ((first, ""), (OF_GROUNDS, " on other grounds")):
+            keys = [key for key in metrics if any(getattr(row, key) for row in rows)]
+            if not keys:
+                continue
+            header = [f"{title}{where}, {rows[0].objects:,} objects"]
+            lines = []
+            for row in rows:
+                cells = [(getattr(row, key), METRICS[key][1]) for key in keys]
+                texts = [cell.text(digits) if cell else "–" for cell, digits in cells]
+                name = "**this model**" if row.name == "model" else row.name.replace("_", " ")
+                lines.append([name, *texts])
+            tables.append(table([*header, *(METRICS[key][0] for key in keys)], lines))
     return tables
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gamba_warp.conventions import ON_GROUNDS
 from gamba_warp.errors import UserError
 from gamba_warp.versions import __version__
 
@@ -14,7 +15,10 @@ from .methods import SHAPES, VIEWS, Method, having
 
 FORMAT = "gamba_warp.compare.1"
 # Metrics by kind of report; the names are those of the records.
-METRICS = {VIEWS: ("psnr", "ssim", "lpips", "mask_iou"), SHAPES: ("chamfer", "iou")}
+METRICS = {
+    VIEWS: ("psnr", "ssim", "lpips", "mask_iou", *ON_GROUNDS),
+    SHAPES: ("chamfer", "iou"),
+}
 
 
 def join(methods: list[Method], against: str | None, notes: list[str]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from typing import Any
 
+from gamba_warp.conventions import ON_GROUNDS
 from gamba_warp.errors import one_line
 
 from .averages import LEVEL
@@ -18,18 +19,27 @@ _COLUMNS = {
     "chamfer": ("Chamfer ↓", 4),
     "iou": ("Volume IoU ↑", 4),
 }
+_GROUNDS = {
+    key: (f"{_COLUMNS[metric][0][:-2]} on {ground}{_COLUMNS[metric][0][-2:]}", _COLUMNS[metric][1])
+    for key, (metric, ground) in ON_GROUNDS.items()
+}
 _NAMED = 5  # objects of a method that a line names
 
 Lines = list[list[str]]
 
 
-def _table(rows: list[dict[str, Any]], signed: bool = False) -> Lines:
-    """Cells under the paper's columns; "-" where a method has no such figure."""
-    lines = [["", *(label for label, _ in _COLUMNS.values())]]
-    lines[0] += [] if signed else ["time [s] ↓"]
+def _table(
+    rows: list[dict[str, Any]],
+    columns: dict[str, tuple[str, int]] = _COLUMNS,
+    signed: bool = False,
+    timed: bool = False,
+) -> Lines:
+    """Cells under the columns, the paper's unless told; "-" where a method has no such figure."""
+    lines = [["", *(label for label, _ in columns.values())]]
+    lines[0] += ["time [s] ↓"] if timed else []
     for row in rows:
-        cells = [_figure(row[key], digits, signed) for key, (_, digits) in _COLUMNS.items()]
-        if not signed:
+        cells = [_figure(row[key], digits, signed) for key, (_, digits) in columns.items()]
+        if timed:
             known = row["seconds"] is not None
             cells.append(f"{row['seconds']:.3g} ({row['seconds_from']})" if known else "-")
         lines.append([row["name"], *cells])
@@ -56,7 +66,7 @@ def _texts(joined: dict[str, Any]) -> tuple[str, list[str]]:
     of = "; ".join(f"{', '.join(labels)}: {_count(n)}" for n, labels in counts.items())
     note = (
         f"Means over the objects that every method with the metric has ({of}), with "
-        f"{100 * LEVEL:g} % bootstrap intervals over objects. Views: novel views, each on white. "
+        f"{100 * LEVEL:g} % bootstrap intervals over objects. Views: novel views, on white here. "
         "Lengths: the longest side of the true shape is 1. Time: measured by the evaluation on its "
         "machine (median), or stated by whoever made this table."
     )
@@ -77,9 +87,13 @@ def _count(number: int) -> str:
 def _parts(joined: dict[str, Any], paper: bool) -> list[str | Lines]:
     """Texts and tables in their order."""
     note, lines = _texts(joined)
-    parts: list[str | Lines] = [_table(joined["rows"]), note, *lines]
+    parts: list[str | Lines] = [_table(joined["rows"], timed=True), note, *lines]
     if joined["differences"]:
         parts += ["Differences, object by object:", _table(joined["differences"], signed=True)]
+    if any(joined["common"][key] for key in _GROUNDS):
+        count = _count(len(joined["common"]["psnr_black"]))
+        text = f"The same novel views on black and on grey, of methods with alpha ({count}):"
+        parts += [text, _table(joined["rows"], _GROUNDS)]
     return [*parts, CAVEAT, _paper()] if paper else parts
 
 

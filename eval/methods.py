@@ -28,7 +28,7 @@ _FREE = {
     VIEWS: (
         *("source", "data", "split", "split_version", "uids", "uids_sha256"),
         *("baselines", "contact_sheet", "distance", "rendering", "pictures", "resize_pictures"),
-        *("lpips", "lpips_reason"),
+        *("lpips", "lpips_reason", "grounds"),
     ),
     SHAPES: ("name", "definitions", "frame", "reference", "distance"),
 }
@@ -48,6 +48,10 @@ class ViewsRecord(msgspec.Struct):
     ssim: Number | None = None
     lpips: Number | None = None
     mask_iou: Number | None = None
+    psnr_black: Number | None = None
+    lpips_black: Number | None = None
+    psnr_grey: Number | None = None
+    lpips_grey: Number | None = None
     seconds: dict[str, Number] = {}
 
     @property

@@ -9,6 +9,13 @@ DEFAULT_DISTANCE = 1.5  # of the reference camera from the object's centre, obje
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
+# Grey values of the backgrounds that pictures are compared on: white, and beside it black and grey,
+# because what is right on white may be a white haze on another. Figures on white have a metric's
+# plain name, the others the keys of ON_GROUNDS, which say of which metric and ground they are.
+WHITE = 1.0
+GROUNDS = {"black": 0.0, "grey": 0.5}
+ON_GROUNDS = {f"{m}_{ground}": (m, ground) for ground in GROUNDS for m in ("psnr", "lpips")}
+
 # Axes of a file: x right, y down, z forward; or x right, y up, z backward.
 Axes = Literal["opencv", "opengl"]
 
@@ -32,3 +39,18 @@ def over_background(rgba, background):
     """
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + background * (1 - alpha)
+
+
+def over_another(rgb, alpha, old, new):
+    """Composites anew what is on a background, by its alpha; nothing is clipped.
+
+    Args:
+        rgb: ``[.., H, W, 3]`` on the background ``old``, an array or a tensor.
+        alpha: ``[.., H, W, 1]`` in [0, 1].
+        old: a grey value, or RGB that broadcasts with ``rgb``.
+        new: likewise.
+
+    Returns:
+        ``[.., H, W, 3]`` on the background ``new``.
+    """
+    return rgb + (new - old) * (1 - alpha)

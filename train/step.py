@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from gamba_warp.conventions import over_background
+from gamba_warp.conventions import GROUNDS, WHITE, over_another, over_background
 from gamba_warp.devices import network_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
@@ -221,16 +221,19 @@ def validate(
 
     Args:
         model: the model; it is switched to eval mode, and back.
-        batches: batches of one object each, the input view first, from ``fixed_batches``.
+        batches: batches of one object each on white, the input view first, from
+            ``fixed_batches``.
         weights: weights of the loss terms.
         lpips: as for ``forward``.
         device: the model's device.
 
     Returns:
         ``loss``, and ``psnr`` (dB), ``ssim``, ``mask_iou`` and, if it is given, ``lpips``, all of
-        whole pictures, each with ``_input`` for the input view and ``_novel`` for the mean over the
-        others, where there are any; pictures under 11x11 have no ``ssim``. And rows
-        ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the first objects.
+        whole pictures on white, and ``psnr_black`` and ``psnr_grey`` of them on these (LPIPS there
+        too would nearly triple the time of a validation); each with ``_input`` for the input view
+        and ``_novel`` for the mean over the others, where there are any; pictures under 11x11 have
+        no ``ssim``. And rows ``[V, H, W, 3]`` for ``save_strip``, true above predicted for the
+        first objects.
     """
     was_training = model.training
     model.eval()
@@ -256,9 +259,13 @@ def _quality(
     result: Forward, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
 ) -> dict[str, Tensor]:
     """The measures of a validation's object, each ``[V+1]``."""
-    got, want = result.rendering.rgb[0].clamp(0, 1), result.target[0]
-    masks = (result.rendering.alpha[0, ..., 0] > 0.5, batch.targets[0, ..., 3] > 0.5)
+    rgb, alpha, true = result.rendering.rgb[0], result.rendering.alpha[0], batch.targets[0]
+    got, want = rgb.clamp(0, 1), result.target[0]
+    masks = alpha[..., 0] > 0.5, true[..., 3] > 0.5
     measures = {"psnr": psnr(got, want), "mask_iou": mask_iou(*masks)}
+    for ground, grey in GROUNDS.items():
+        shown = over_another(rgb, alpha, WHITE, grey).clamp(0, 1)
+        measures[f"psnr_{ground}"] = psnr(shown, over_background(true, grey))
     if min(want.shape[-3:-1]) >= SSIM_WINDOW:
         measures["ssim"] = ssim(got, want)
     if lpips is not None:

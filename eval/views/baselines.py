@@ -15,10 +15,11 @@ from torch.nn.functional import adaptive_avg_pool2d, grid_sample
 
 from gamba_warp.batch import progress_bar
 from gamba_warp.cameras import from_opengl, relative_to_reference
+from gamba_warp.conventions import WHITE
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
 
-from .compare import WHITE, Shown, Truth, shown
+from .compare import Shown, Truth, shown
 
 Baseline = Callable[[Truth], Shown | None]
 
@@ -42,15 +43,14 @@ MEANING = {
 
 def background(truth: Truth) -> Shown:
     """An empty picture for every view."""
-    return (
-        torch.full_like(truth.rgb[:1], WHITE).expand_as(truth.rgb),
-        torch.zeros_like(truth.mask),
-    )
+    white = torch.full_like(truth.rgb[:1], WHITE).expand_as(truth.rgb)
+    return Shown(white, torch.zeros_like(truth.images[..., 3]))
 
 
 def input_copy(truth: Truth) -> Shown:
     """The input picture for every view."""
-    return truth.rgb[:1].expand_as(truth.rgb), truth.mask[:1].expand_as(truth.mask)
+    alpha = truth.images[..., 3]
+    return Shown(truth.rgb[:1].expand_as(truth.rgb), alpha[:1].expand_as(alpha))
 
 
 def billboard(truth: Truth) -> Shown:
@@ -85,7 +85,7 @@ def billboard(truth: Truth) -> Shown:
         align_corners=False,
     ).permute(0, 2, 3, 1)
     rgb, alpha = sampled[..., :3], sampled[..., 3:]
-    return (rgb + WHITE * (1 - alpha)).to(truth.rgb), alpha[..., 0] > 0.5
+    return Shown((rgb + WHITE * (1 - alpha)).to(truth.rgb), alpha[..., 0].to(truth.rgb))
 
 
 class Found(NamedTuple):
@@ -182,8 +182,7 @@ class Retrieval:
         images = self.training.load(uid, needed.tolist(), truth.rgb.shape[1]).images
         if images.shape[1:3] != truth.rgb.shape[1:3]:
             raise UserError(f"{uid}: its pictures have another shape")
-        rgb, mask = shown(images[places].to(truth.images.device))
-        return rgb, mask
+        return shown(images[places].to(truth.images.device))
 
 
 def thumbnails(images: Tensor) -> Tensor:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.conventions import over_background
+from gamba_warp.conventions import GROUNDS, ON_GROUNDS, WHITE, over_another, over_background
 from gamba_warp.data.dataset import SPLIT_VERSION, ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
@@ -22,13 +22,33 @@ from gamba_warp.vision.lpips import LPIPS
 
 from ..averages import mean_of
 
-WHITE = 1.0
 BATCH = 4  # views compared at once, which bounds the memory of LPIPS features
-METRICS = ("psnr", "ssim", "lpips", "mask_iou")
+METRICS = ("psnr", "ssim", "lpips", "mask_iou", *ON_GROUNDS)
 NEARLY_EMPTY = 0.01  # share of the picture; see ViewsProtocol
 
-Shown = tuple[Tensor, Tensor]  # rgb [V, H, W, 3] on white in [0, 1], mask [V, H, W] bool
 Values = dict[str, float | None]  # one view's metrics
+
+
+class Shown(NamedTuple):
+    """Pictures that are compared.
+
+    Attributes:
+        rgb: ``[V, H, W, 3]`` on white; what is rendered is not clipped to [0, 1] yet.
+        alpha: ``[V, H, W]`` in [0, 1]; None where nothing says what the object covers.
+    """
+
+    rgb: Tensor
+    alpha: Tensor | None
+
+    def on(self, ground: float = WHITE) -> Tensor:
+        """RGB ``[V, H, W, 3]`` in [0, 1] on a grey value; without alpha on white alone."""
+        if self.alpha is None or ground == WHITE:
+            return self.rgb.clamp(0, 1)
+        return over_another(self.rgb, self.alpha[..., None], WHITE, ground).clamp(0, 1)
+
+    def mask(self) -> Tensor | None:
+        """``[V, H, W]`` bool."""
+        return None if self.alpha is None else self.alpha > 0.5
 
 
 @dataclass(frozen=True)
@@ -44,6 +64,8 @@ class ViewsProtocol:
         lpips_reason: why there is no LPIPS, or None.
         distance: of the input camera from the object's centre, object units.
         background: grey value that both sides are composited on.
+        grounds: grey values of the other backgrounds, by the end of their metrics' names: both
+            sides are composited on them by their alpha, which pictures without alpha do not have.
         region: part of the picture that the picture metrics run over.
         rendering: how predicted values are compared.
         max_psnr: dB, given to equal pictures.
@@ -69,6 +91,7 @@ class ViewsProtocol:
     lpips_reason: str | None
     distance: float
     background: float = WHITE
+    grounds: dict[str, float] = field(default_factory=GROUNDS.copy)
     region: str = "full image"
     rendering: str = "clipped to [0, 1], not rounded to 8 bits"
     max_psnr: float = MAX_PSNR
@@ -93,6 +116,7 @@ class Truth:
         images: ``[V, H, W, 4]`` straight RGBA in [0, 1]; view 0 is the input.
         cameras: V cameras in the input camera's world.
         views: their V indices in the dataset.
+        shown: the pictures as they are compared.
         rgb: ``[V, H, W, 3]``, the pictures on white.
         mask: ``[V, H, W]`` bool.
         coverage: V shares of the picture, in [0, 1], that the object covers: means of alpha.
@@ -105,15 +129,16 @@ class Truth:
     views: list[int]
 
     def __post_init__(self) -> None:
-        self.rgb, self.mask = shown(self.images)
+        self.shown = shown(self.images)
+        self.rgb, self.mask = self.shown.rgb, self.images[..., 3] > 0.5
         self.coverage: list[float] = self.images[..., 3].double().mean((1, 2)).tolist()
         pixels = self.images.cpu().numpy().tobytes()
         self.digest = hashlib.sha256(pixels).hexdigest()[:16]
 
 
 def shown(images: Tensor) -> Shown:
-    """The colours and masks that are compared, of straight RGBA ``[V, H, W, 4]``."""
-    return over_background(images, WHITE), images[..., 3] > 0.5
+    """What is compared of straight RGBA ``[V, H, W, 4]``."""
+    return Shown(over_background(images, WHITE), images[..., 3])
 
 
 def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
@@ -150,30 +175,34 @@ def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: 
 
 
 def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
-    """Renders RGB ``[V, H, W, 3]`` on white, clipped to [0, 1], and masks ``[V, H, W]`` bool."""
+    """Renders on white, once for all backgrounds."""
     with torch.no_grad():
         out = render(gaussians, cameras, background=cameras.viewmats.new_full((3,), WHITE))
-    return out.rgb.clamp(0, 1), out.alpha[..., 0] > 0.5
+    return Shown(out.rgb, out.alpha[..., 0])
 
 
-def compare(
-    candidates: Mapping[str, tuple[Tensor, Tensor | None]], truth: Truth
-) -> dict[str, list[Values]]:
-    """Computes PSNR, SSIM and mask IoU of each view for each candidate; LPIPS is None yet.
+def compare(candidates: Mapping[str, Shown], truth: Truth) -> dict[str, list[Values]]:
+    """Computes ``METRICS`` of each view for each candidate; LPIPS is None yet.
 
-    Besides, ``mse``: the mean squared error that the PSNR states. Mask IoU is None where a
-    candidate has no masks.
+    Besides, ``mse``: the mean squared error that the PSNR on white states. Mask IoU and figures on
+    other backgrounds are None where a candidate has no alpha.
     """
     result: dict[str, list[Values]] = {}
-    for name, (rgb, mask) in candidates.items():
+    for name, pictures in candidates.items():
+        rgb, mask = pictures.on(), pictures.mask()
         decibels, nothing = psnr(rgb, truth.rgb), [None] * len(rgb)
         values = {
             "psnr": decibels.tolist(),
             "ssim": ssim(rgb, truth.rgb).tolist(),
             "lpips": nothing,
             "mask_iou": nothing if mask is None else mask_iou(mask, truth.mask).tolist(),
+            **dict.fromkeys(ON_GROUNDS, nothing),
             "mse": (10 ** (-decibels / 10)).tolist(),
         }
+        if pictures.alpha is not None:
+            for ground, grey in GROUNDS.items():
+                found = psnr(pictures.on(grey), truth.shown.on(grey))
+                values[f"psnr_{ground}"] = found.tolist()
         result[name] = [dict(zip(values, row)) for row in zip(*values.values())]
     return result
 
@@ -181,25 +210,31 @@ def compare(
 @torch.no_grad()
 def add_lpips(
     values: dict[str, list[Values]],
-    candidates: Mapping[str, tuple[Tensor, Tensor | None]],
+    candidates: Mapping[str, Shown],
     truth: Truth,
     lpips: LPIPS,
 ) -> None:
-    """Adds LPIPS to what ``compare`` returned.
+    """Adds LPIPS, on every background, to what ``compare`` returned.
 
     Nearly all the time goes into the features. They are computed once for the truth, and once for
     a candidate that shows the same picture (an expanded tensor) in every view.
     """
-    fixed = {
-        name: lpips.features(rgb[0]) for name, (rgb, _) in candidates.items() if not rgb.stride(0)
-    }
-    for start in range(0, len(truth.rgb), BATCH):
-        part = slice(start, start + BATCH)
-        features = lpips.features(truth.rgb[part])
-        for name, (rgb, _) in candidates.items():
-            found = fixed[name] if name in fixed else lpips.features(rgb[part])
-            for row, value in zip(values[name][part], lpips.distance(found, features).tolist()):
-                row["lpips"] = value
+    for key, grey in {
+        "lpips": WHITE,
+        **{f"lpips_{g}": grey for g, grey in GROUNDS.items()},
+    }.items():
+        known = {n: c for n, c in candidates.items() if c.alpha is not None or grey == WHITE}
+        shown = {name: pictures.on(grey) for name, pictures in known.items()}
+        fixed = {n: lpips.features(shown[n][0]) for n, c in known.items() if not c.rgb.stride(0)}
+        true = truth.shown.on(grey)
+        for start in range(0, len(true), BATCH):
+            part = slice(start, start + BATCH)
+            features = lpips.features(true[part])
+            for name, rgb in shown.items():
+                found = fixed[name] if name in fixed else lpips.features(rgb[part])
+                distances = lpips.distance(found, features).tolist()
+                for row, value in zip(values[name][part], distances):
+                    row[key] = value
 
 
 def summary(views: list[Values], coverage: list[float]) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def pictures_of(predicted: Gaussians | Pictures, truth: Truth) -> Pictures:
     """What is under test as pictures of the true views: as it is, or rendered."""
     if isinstance(predicted, Pictures):
         return predicted
-    return Pictures(*render_views(predicted, truth.cameras))
+    return Pictures(render_views(predicted, truth.cameras))
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def evaluate_object(job: Job, uid: str, files: Files = Files()) -> dict[str, Any
     predicted = mark(job.predict(truth))
     pictures = mark(pictures_of(predicted, truth))
     baselines = mark(job.shown(truth))
-    candidates = {"": (pictures.rgb, pictures.mask)} | baselines
+    candidates = {"": pictures.shown} | baselines
     by_view = mark(compare(candidates, truth))
     if job.network:
         add_lpips(by_view, candidates, truth, job.network)
@@ -161,14 +161,14 @@ def _write(
     """Writes what is asked for of one object."""
     uid = truth.uid
     if files.strips is not None:
-        save_strips(files.strips / f"{uid}.png", pictures.rgb, truth)
+        save_strips(files.strips / f"{uid}.png", pictures.shown.on(), truth)
     if files.gaussians is not None and isinstance(predicted, Gaussians):
         path = files.gaussians / f"{uid}.ply"
         path.parent.mkdir(parents=True, exist_ok=True)
         save_ply(path, predicted)
     if files.pictures is not None:
-        masked = {} if pictures.mask is None else {"model": (pictures.rgb, pictures.mask)}
-        for name, candidate in (masked | baselines).items():
+        model = {} if pictures.shown.alpha is None else {"model": pictures.shown}
+        for name, candidate in (model | baselines).items():
             where = files.pictures / name / uid
             save_pictures(where, job.dataset.files(uid), truth.views, candidate)
     found = job.retrieval.found.get(uid) if job.retrieval else None
@@ -234,7 +234,7 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         record = done[rank]
         try:
             truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
-            rgb = pictures_of(job.predict(truth), truth).rgb
+            rgb = pictures_of(job.predict(truth), truth).shown.on()
         except ERRORS:  # a file that went bad meanwhile; the report has what it was
             continue
         views = choose_views(len(rgb), 0, SHEET_VIEWS + 1)[1:]

@@ -22,13 +22,14 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from gamba_warp.conventions import WHITE, over_another
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.data.layouts import LAYOUTS, PICTURES, ObjectFiles
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256_of_all, visible
 from gamba_warp.images import load_rgba8, open_picture, save_image
 
-from .compare import WHITE, Shown, Truth, shown
+from .compare import Shown, Truth, shown
 
 TRANSFORMS = "transforms.json"
 CAMERA = 1e-3  # radians; share of the camera's distance; share of the picture's side
@@ -48,14 +49,12 @@ class Pictures:
     """What is shown in place of the views of an object.
 
     Attributes:
-        rgb: ``[V, H, W, 3]`` on white in [0, 1].
-        mask: ``[V, H, W]`` bool; None where nothing says what the object covers.
-        has_input: whether there is a picture of view 0; where not, it is white in ``rgb``.
+        shown: the pictures.
+        has_input: whether there is a picture of view 0; where not, it is white.
         record: how they were found, for the object's record.
     """
 
-    rgb: Tensor
-    mask: Tensor | None
+    shown: Shown
     has_input: bool = True
     record: dict[str, Any] = field(default_factory=dict)
 
@@ -126,14 +125,16 @@ class PicturePredictions:
         opaque = bool((rgba[[view in found for view in truth.views], ..., 3] == 1).all())
         if opaque:
             _check_white(folder, rgba[..., :3], truth, [view in found for view in truth.views])
-        rgb, mask = shown(rgba.to(self.device))
         record = {
             "matched_by": by,
             "unused": given - len(found),
             "resized": resized,
             "alpha": not opaque,
         }
-        return Pictures(rgb, None if opaque else mask, truth.views[0] in found, record)
+        pictures = shown(rgba.to(self.device))
+        if opaque:
+            pictures = Shown(pictures.rgb, None)
+        return Pictures(pictures, truth.views[0] in found, record)
 
     def _fitted(
         self,
@@ -296,15 +297,12 @@ def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> 
 def save_pictures(folder: Path, files: ObjectFiles, views: Sequence[int], pictures: Shown) -> None:
     """Writes pictures as ``PicturePredictions`` reads them, named as the true files are.
 
-    What a viewer sees over white is ``rgb``, and alpha > 1/2 is the mask. Alpha says no more: it is
-    1 in the mask, just under 1/2 for colour outside of it, and 0 for white.
-
     Args:
         folder: of one object; made if need be.
         files: of the true views, whose names the pictures get, or their numbers where two true
             files have one name.
         views: numbers of the views.
-        pictures: rgb ``[V, H, W, 3]`` on white, mask ``[V, H, W]``.
+        pictures: with alpha.
 
     Raises:
         UserError: a file cannot be written.
@@ -312,9 +310,9 @@ def save_pictures(folder: Path, files: ObjectFiles, views: Sequence[int], pictur
     folder.mkdir(parents=True, exist_ok=True)
     stems = [path.stem for path in files.images]
     names = stems if len(set(stems)) == len(stems) else [str(i) for i in range(len(stems))]
-    rgb, mask = (x.cpu() for x in pictures)
-    outside = torch.where((rgb < 1).any(-1), 127 / 255, 0.0)
-    alpha = torch.where(mask, 1.0, outside)[..., None]
-    straight = torch.where(alpha > 0, (rgb - (1 - alpha)) / alpha.clamp(min=1e-6), 1.0)
+    assert pictures.alpha is not None
+    alpha = pictures.alpha[..., None].cpu()
+    premultiplied = over_another(pictures.rgb.cpu(), alpha, WHITE, 0.0)
+    straight = torch.where(alpha > 0, premultiplied / alpha.clamp(min=1e-6), 1.0)
     for view, picture in zip(views, torch.cat([straight.clamp(0, 1), alpha], -1)):
         save_image(folder / f"{names[view]}.png", picture.numpy())

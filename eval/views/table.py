@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from gamba_warp.conventions import ON_GROUNDS
+
 from ..averages import LEVEL, bootstrap, minus, summary_of
 from ..tables import cell, markdown
 from .compare import METRICS, NEARLY_EMPTY
@@ -15,7 +17,8 @@ Records = dict[str, Record]  # uid -> what summary() returns
 KINDS = ("novel", "input")
 MEAN_ERROR = "psnr_of_mean_error"
 _LABELS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "mask IoU"}
-_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "mask_iou": 3, MEAN_ERROR: 2}
+_GROUNDS = {key: f"{metric.upper()} on {ground}" for key, (metric, ground) in ON_GROUNDS.items()}
+_DIGITS = {key: 2 if key.startswith("psnr") else 3 for key in (*METRICS, MEAN_ERROR)}
 
 
 def _decibels(errors: np.ndarray) -> np.ndarray:
@@ -97,16 +100,19 @@ def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
     }
 
 
-def means(rows: list[dict[str, Any]], signed: bool = False) -> str:
+def means(
+    rows: list[dict[str, Any]], signed: bool = False, labels: dict[str, str] = _LABELS
+) -> str:
     """A Markdown table of the rows' means, with their intervals.
 
     Args:
         rows: those of ``table_of`` or ``differences_of``.
         signed: whether positive means get a plus sign.
+        labels: of the metrics shown; those on white unless told.
     """
-    lines = [["views", "", "objects", *_LABELS.values()]]
+    lines = [["views", "", "objects", *labels.values()]]
     for row in rows:
-        cells = [cell(row[k]["mean"], row[k]["interval"], _DIGITS[k], signed) for k in METRICS]
+        cells = [cell(row[k]["mean"], row[k]["interval"], _DIGITS[k], signed) for k in labels]
         lines.append([row["views"], row["name"], str(row["objects"]), *cells])
     return markdown(lines)
 
@@ -118,11 +124,16 @@ def medians(rows: list[dict[str, Any]], signed: bool = False) -> str:
     for row in rows:
         error = row[MEAN_ERROR]
         cells = [cell(error["value"], error["interval"], _DIGITS[MEAN_ERROR], signed)]
-        for key in METRICS:
+        for key in _LABELS:
             value, ends = row[key]["median"], row[key]["median_interval"]
             cells.append(cell(value, ends, _DIGITS[key], signed))
         lines.append([row["views"], row["name"], str(row["objects"]), *cells])
     return markdown(lines)
+
+
+def on_grounds(rows: list[dict[str, Any]], signed: bool = False) -> str:
+    """As ``means``: of the figures on black and on grey."""
+    return means(rows, signed, _GROUNDS)
 
 
 def _first_kind(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -152,8 +163,11 @@ def page(report: dict[str, Any]) -> str:
         f"Means over objects of means over views, with {share} bootstrap intervals over objects. "
         "LPIPS: less is better." + (f" LPIPS left out: {lpips}." if lpips else "")
     ]
-    tables = [(medians, report["table"], report["differences"])]
-    titles = ["PSNR of the mean squared error over all views and objects; medians over objects:"]
+    tables = [(show, report["table"], report["differences"]) for show in (on_grounds, medians)]
+    titles = [
+        "The same on black and on grey, both sides composited by their alpha; means:",
+        "PSNR of the mean squared error over all views and objects; medians over objects:",
+    ]
     if counts["views"]:
         parts[-1] += f" {nearly_empty_line(counts)} They count in these tables."
         rest = report["without_nearly_empty"]

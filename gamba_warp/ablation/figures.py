@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ..conventions import GROUNDS, ON_GROUNDS, WHITE, over_background
 from ..errors import UserError
 from ..pages.run_log import read_lines
 from ..untrusted.documents import read_document
@@ -16,7 +17,7 @@ from .jobs import Settings, gaussians_of, stages
 from .plan import Plan, Row
 from .record import Record, changed, new_record, read_record, row_folder
 
-VIEW_METRICS = ("psnr", "ssim", "lpips", "mask_iou")
+VIEW_METRICS = ("psnr", "ssim", "lpips", "mask_iou", *ON_GROUNDS)
 SHAPE_METRICS = ("chamfer", "iou")
 Objects = dict[str, dict[str, float]]  # metrics by object
 
@@ -203,8 +204,9 @@ def _read_fit(found: SeedResult, report: dict[str, Any]) -> None:
     found.size = protocol.get("size") if isinstance(protocol, dict) else None
     times: list[float] = []
     for record in _records(report):
-        named = {"psnr": record.get("psnr_held_out"), "ssim": record.get("ssim_held_out")}
-        found.objects[record["name"]] = _numbers(named, ("psnr", "ssim"))
+        names = ("psnr", "ssim", *(f"psnr_{ground}" for ground in GROUNDS))
+        named = {name: record.get(f"{name}_held_out") for name in names}
+        found.objects[record["name"]] = _numbers(named, names)
         steps = record.get("steps")
         if type(steps) is int and steps > 0:
             times += [value / steps for value in _numbers(record, ("seconds",)).values()]
@@ -233,7 +235,6 @@ def empty_psnr(data: Path, result: SeedResult) -> dict[str, float]:
     """
     import torch
 
-    from ..conventions import over_background
     from ..data.dataset import open_dataset
     from ..image_metrics import psnr
 
@@ -245,7 +246,7 @@ def empty_psnr(data: Path, result: SeedResult) -> dict[str, float]:
             images = dataset.load(name, views=views, size=result.size).images
         except UserError:
             continue
-        truth = over_background(images, 1.0)
+        truth = over_background(images, WHITE)
         found[name] = float(psnr(torch.ones_like(truth), truth).double().mean())
     return found
 

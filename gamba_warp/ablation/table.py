@@ -6,12 +6,13 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
+from ..conventions import ON_GROUNDS
 from .figures import SHAPE_METRICS, VIEW_METRICS, RowResult
 from .jobs import Settings
 from .plan import Plan
 from .series import DEFINITION, SHARES, series_of
 
-METRICS = (*VIEW_METRICS, *SHAPE_METRICS)
+METRICS = (*VIEW_METRICS, *SHAPE_METRICS)  # of which LABELS are in the table itself
 LABELS = {
     "psnr": "PSNR [dB]",
     "ssim": "SSIM",
@@ -20,7 +21,8 @@ LABELS = {
     "chamfer": "Chamfer",
     "iou": "Volume IoU",
 }
-_DIGITS = {"psnr": 2, "chamfer": 4}
+_GROUNDS = {key: f"{metric.upper()} on {ground}" for key, (metric, ground) in ON_GROUNDS.items()}
+_DIGITS = {**{key: 2 for key in METRICS if key.startswith("psnr")}, "chamfer": 4}
 Empty = Mapping[str, Mapping[str, float]]  # by row, PSNR of an empty picture by object
 
 
@@ -219,7 +221,7 @@ def main_lines(table: dict[str, Any]) -> list[list[str]]:
     """The table itself, the head first."""
     lines = [["", *LABELS.values(), "seconds a step", "memory", "parameters", "paper"]]
     for row in table["rows"]:
-        cells = [_mean_cell(row["figures"].get(m), m) for m in METRICS]
+        cells = [_mean_cell(row["figures"].get(m), m) for m in LABELS]
         if not row["figures"]:
             cells[0] = row["status"]
         lines.append([_label(row), *cells, *_cost_cells(row), _paper_cell(row["paper"])])
@@ -253,15 +255,21 @@ def _paper_cell(paper: dict[str, float]) -> str:
 
 
 def extra_tables(table: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """Titles and lines of the other tables: differences, seeds, numbers of Gaussians."""
+    """Titles and lines of the other tables: grounds, differences, seeds, numbers of Gaussians."""
     found = []
+    if any(key in row["figures"] for row in table["rows"] for key in _GROUNDS):
+        lines = [["", *_GROUNDS.values()]]
+        for row in table["rows"]:
+            cells = [_mean_cell(row["figures"].get(key), key) for key in _GROUNDS]
+            lines.append([row["title"], *cells])
+        found.append(("On black and on grey, both sides composited by their alpha", lines))
     head, titles = ["", *LABELS.values()], {r["name"]: r["title"] for r in table["rows"]}
     differing = [row for row in table["rows"] if row["difference"]]
     if differing:
         lines = [head]
         for row in differing:
             figures = row["difference"]["figures"]
-            cells = [_mean_cell(figures.get(m), m, True) for m in METRICS]
+            cells = [_mean_cell(figures.get(m), m, True) for m in LABELS]
             lines.append([f"{row['title']} - {titles[row['difference']['to']]}", *cells])
         found.append(("Differences, object by object", lines))
     several = [row for row in table["rows"] if len(row["seeds"]) > 1 and row["figures"]]
@@ -269,7 +277,7 @@ def extra_tables(table: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         lines = [head]
         for row in several:
             cells = []
-            for metric in METRICS:
+            for metric in LABELS:
                 figure = row["figures"].get(metric)
                 spread = None if figure is None else figure["spread"]
                 cells.append("-" if spread is None else f"{spread:.{_DIGITS.get(metric, 3) + 1}f}")

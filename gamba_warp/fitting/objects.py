@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..batch import for_each, progress_bar
 from ..cameras import Cameras, relative_to_reference
-from ..conventions import DEFAULT_DISTANCE, over_background
+from ..conventions import DEFAULT_DISTANCE, GROUNDS, WHITE, over_another, over_background
 from ..data.dataset import ObjectViews, ViewDataset
 from ..errors import UserError
 from ..files import output_folder, write_json, write_text
@@ -26,9 +26,9 @@ from ..versions import used_versions
 from .config import FitConfig
 from .optimize import fit
 
-WHITE = 1.0
 PROTOCOL = {
     "background": WHITE,
+    "grounds": GROUNDS,
     "region": "full image",
     "rendering": "clipped to [0, 1], not rounded to 8 bits",
     "averaging": "views, then objects",
@@ -36,6 +36,7 @@ PROTOCOL = {
 }
 _TABLE = (
     ("held-out PSNR [dB]", "psnr_held_out", "{:.2f}"),
+    *((f"held-out PSNR on {g} [dB]", f"psnr_{g}_held_out", "{:.2f}") for g in GROUNDS),
     ("held-out SSIM", "ssim_held_out", "{:.4f}"),
     ("train PSNR [dB]", "psnr_train", "{:.2f}"),
     ("seconds", "seconds", "{:.1f}"),
@@ -168,8 +169,13 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
     with torch.no_grad():
         white = images.new_full((3,), WHITE)
         mode = job.config.rasterize_mode
-        rgb = render(result.gaussians, cameras, white, rasterize_mode=mode).rgb.clamp(0, 1)
-    truth = over_background(images, WHITE)
+        out = render(result.gaussians, cameras, white, rasterize_mode=mode)
+    rgb, truth = out.rgb.clamp(0, 1), over_background(images, WHITE)
+    grounds = {}
+    for ground, grey in GROUNDS.items():
+        got = over_another(out.rgb, out.alpha, WHITE, grey)[kept].clamp(0, 1)
+        found = psnr(got, over_background(images[kept], grey))
+        grounds[f"psnr_{ground}_held_out"] = _mean(found.tolist())
     by_view = psnr(rgb, truth).tolist()
     large = min(rgb.shape[1:3]) >= SSIM_WINDOW  # in smaller pictures it is not defined
     similar = ssim(rgb[kept], truth[kept]).tolist() if kept and large else []
@@ -180,6 +186,7 @@ def fit_object(job: FitJob, uid: str) -> dict[str, Any]:
         "size": [cameras.width, cameras.height],
         "psnr_train": _mean([by_view[v] for v in fitted]),
         "psnr_held_out": _mean([by_view[v] for v in kept]),
+        **grounds,
         "ssim_held_out": _mean(similar),
         "psnr_by_view": by_view,
         "gaussians": result.gaussians.num,

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from ..conventions import ON_GROUNDS
 from ..errors import UserError
 from ..untrusted.documents import read_document
 
@@ -21,9 +22,10 @@ _Text = Annotated[str, Meta(max_length=2000)]
 _Count = Annotated[int, Meta(ge=0, le=10**12)]
 _Name = Annotated[str, Meta(max_length=80)]
 OF_PICTURES = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "mask IoU"}
+OF_GROUNDS = {key: f"{metric.upper()} on {ground}" for key, (metric, ground) in ON_GROUNDS.items()}
 # How each metric is called, and with how many digits it is shown.
 METRICS = {
-    **{key: (name, 2 if key == "psnr" else 3) for key, name in OF_PICTURES.items()},
+    **{k: (n, 2 if k.startswith("psnr") else 3) for k, n in (OF_PICTURES | OF_GROUNDS).items()},
     "chamfer": ("Chamfer", 4),
     "normal_consistency": ("normal consistency", 3),
     "iou": ("Volume IoU", 3),
@@ -64,6 +66,10 @@ class Row(msgspec.Struct, frozen=True, omit_defaults=True):
     ssim: Figure | None = None
     lpips: Figure | None = None
     mask_iou: Figure | None = None
+    psnr_black: Figure | None = None
+    lpips_black: Figure | None = None
+    psnr_grey: Figure | None = None
+    lpips_grey: Figure | None = None
     chamfer: Figure | None = None
     normal_consistency: Figure | None = None
     iou: Figure | None = None
@@ -151,7 +157,7 @@ def _in_short(card: ModelCard) -> Iterator[tuple[str, str]]:
             value = getattr(own, key)
             if value is None:
                 continue
-            pick = min if key in ("lpips", "chamfer") else max
+            pick = min if key.startswith(("lpips", "chamfer")) else max
             known = [(figure.mean, row.name) for row in others if (figure := getattr(row, key))]
             best = pick(known, default=None)
             name, bracket, unit = name.partition(" [")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..conventions import GROUNDS
 from .page import ticks
 from .run_log import RunRecord, Series
 
@@ -58,6 +59,10 @@ def _held_out(measure: str) -> dict[str, str]:
 _CHARTS = (
     Chart("Loss", {"training": "train.loss", "held out": "val.loss"}, True),
     Chart("PSNR, dB", {"training, all views": "train.psnr", **_held_out("psnr")}),
+    Chart(
+        "PSNR of novel views on other grounds, dB, held out",
+        {f"on {ground}": f"val.psnr_{ground}_novel" for ground in GROUNDS},
+    ),
     Chart("SSIM, held out", _held_out("ssim")),
     Chart("LPIPS, held out (lower is better)", _held_out("lpips")),
     Chart("Mask IoU, held out", _held_out("mask_iou")),

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..conventions import over_background
+from ..conventions import WHITE, over_background
 from ..data.preprocess import prepare
 from ..errors import UserError
 from ..formats.ply import load_ply
 from ..gaussians import Gaussians
 from ..images import load_rgba
-from .card import OF_PICTURES, about_model, read_card
+from .card import OF_GROUNDS, OF_PICTURES, about_model, read_card
 from .curves import draw_curves
 from .page import Section, demo_page
 from .run_log import read_run_log
@@ -76,7 +76,7 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
     held_out = [_held_out(strip, results.views, views) for strip in strips]
     sections = [
         _first(icons, held_out),
-        _numbers(views, _report(results.shapes), here),
+        *_numbers(views, _report(results.shapes), here),
         Section("The shipped model", table=about_model(results.shipped)),
         *_trained_here(results, strips if here else []),
         *held_out,
@@ -114,31 +114,38 @@ def _around(section: Section) -> np.ndarray:
     frames = section.turntable[:: len(section.turntable) // _SHOWN][:_SHOWN] / 255.0
     flat = section.picture
     if flat.shape[-1] == 4:
-        flat = over_background(flat, 1.0)
+        flat = over_background(flat, WHITE)
     side = frames.shape[1]
     nearest = (np.arange(side) + 0.5) * len(flat) / side
     index = nearest.astype(int)
     return np.concatenate([flat[index][:, index][None], frames])
 
 
-def _numbers(views: dict, shapes: dict, here: dict) -> Section:
-    """Metrics of the models beside those of the baselines."""
+def _numbers(views: dict, shapes: dict, here: dict) -> list[Section]:
+    """Metrics of the models beside those of the baselines, on white and on other grounds."""
     models = {"the shipped model": views["mean"]}
     if here:
         models["the model trained here"] = here["mean"]
     others = {_BASELINES.get(name, name): m for name, m in views["baselines"].items()}
-    rows = [
-        [label, which, *(_cell(values.get(key)) for key in OF_PICTURES)]
+    figures = [
+        (label, which, mean if which == "new views" else mean["input"])
         for which, candidates in (("new views", models | others), ("input view", models))
         for label, mean in candidates.items()
-        for values in (mean if which == "new views" else mean["input"],)
     ]
     geometry = shapes.get("mean", {})
     keys = ("chamfer", "normal_consistency", "iou")
     found = [f"{key.replace('_', ' ')} {_cell(geometry[key])}" for key in keys if key in geometry]
     text = f"Means over {views['num_ok']} held-out objects; LPIPS is better the lower it is. "
     text += f"Shape, by the shipped model: {', '.join(found)}." if found else "No geometry."
-    return Section("Numbers", text, header=["", "views", *OF_PICTURES.values()], table=rows)
+    haze = "What has white haze around it is right on white, and wrong here."
+    sections = []
+    for title, said, names in (
+        ("Numbers", text, OF_PICTURES),
+        ("Numbers on black and on grey", haze, OF_GROUNDS),
+    ):
+        rows = [[label, which, *(_cell(v.get(k)) for k in names)] for label, which, v in figures]
+        sections.append(Section(title, said, header=["", "views", *names.values()], table=rows))
+    return sections
 
 
 def _trained_here(results: DemoResults, strips: list[Path]) -> list[Section]:

@@ -64,7 +64,7 @@ def views(words, out):
     objects = [
         {
             **{"name": name, "status": "ok", "views": [0, 1, 2], "psnr": psnr + 100 * rate + seed},
-            **{"ssim": 0.5, "lpips": None, "mask_iou": 0.25},
+            **{"ssim": 0.5, "lpips": None, "mask_iou": 0.25, "psnr_black": psnr - 3},
         }
         for name, psnr in OBJECTS.items()
     ]
@@ -89,6 +89,7 @@ def fit(words, out):
     objects = [
         {
             **{"name": name, "psnr_held_out": psnr + number / 100, "ssim_held_out": None},
+            "psnr_grey_held_out": psnr - 1,
             **{"seconds": 10.0, "steps": 5, "views_held_out": [5]},
         }
         for name, psnr in OBJECTS.items()

@@ -92,6 +92,7 @@ def test_rows_run_once_and_their_figures_are_these(gamba, tmp_path, capsys):
     text = (tmp_path / "out" / "table.md").read_text()
     assert "| 23.00 [21.00, 25.00]" in text and "PSNR [dB] 12.72" in text and "b: Why." in text
     assert "| b - a | +1.00 [1.00, 1.00]" in text and "1.414" in text
+    assert "On black and on grey" in text and "| a | 19.00 [17.00, 21.00] | -" in text
     page = (tmp_path / "out" / "index.html").read_text()
     assert page.count("<svg") == 4 and "23.00 [21.00, 25.00]" in page
     assert made["evaluation"]["views"] == 4 and made["budget"] == {"steps": 4}
@@ -177,6 +178,7 @@ def test_fits_shapes_and_a_series(gamba, tmp_path, monkeypatch):
     made, found = table(tmp_path)
     assert found["a"]["absent"] == [0], "its commands were others"
     assert found["f100"]["figures"]["psnr"]["mean"] == pytest.approx(23)
+    assert found["f100"]["figures"]["psnr_grey"]["mean"] == pytest.approx(21)
     assert found["f100"]["step_seconds"] == pytest.approx(2)
     series = made["series"]["fits"]
     # Gains over the empty picture: means of 2, 3, 3 dB and of 5, 6, 6 dB.

@@ -105,6 +105,7 @@ def test_reports_become_figures(tool, model, tmp_path, monkeypatch):
     readme.write_text("\n".join(marks("docs/model_card.py", "results")))
     monkeypatch.setattr(tool, "README", readme)
     metrics = {"psnr": {"mean": 21.0, "interval": [20.0, 22.0]}, "lpips": {"mean": None}}
+    metrics["psnr_black"] = {"mean": 17.0, "interval": [16.0, 18.0]}
     line = {"views": "novel", "name": "model", "objects": 9, **metrics}
     (tmp_path / "views.json").write_text(json.dumps({"table": [line]}))
     shape = {"num_ok": 4, "mean": {"chamfer": 0.05, "iou": 0.4}, "interval": {"iou": [0.3, 0.5]}}
@@ -113,6 +114,8 @@ def test_reports_become_figures(tool, model, tmp_path, monkeypatch):
     tool.main()  # again: nothing is lost
     text = page.read_text()
     assert "| **this model** | 21.00 [20.00, 22.00] |" in text and "LPIPS" not in text
+    assert "| New views on other grounds, 9 objects | PSNR on black |" in text
+    assert "| **this model** | 17.00 [16.00, 18.00] |" in text
     assert "| **this model** | 0.0500 | 0.400 [0.300, 0.500] |" in text
     assert "| **shipped model** | 21.00 | – | – | – | 0.0500 | 0.400 |" in readme.read_text()
     assert text.startswith("# Top\n") and text.endswith("\nlast\n") and "seven cubes" in text

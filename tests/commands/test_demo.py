@@ -41,6 +41,7 @@ def test_demo(starter, tmp_path):
         "the shipped model",
         "the model trained here",
         "the input as a flat cut-out",
+        "PSNR on black",
         "Trained on",
         "Trained here",
         "toaster: shipped, trained here, and true",

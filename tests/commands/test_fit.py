@@ -10,7 +10,7 @@ from helpers.micro import cloud, photograph, views_around, write_object
 
 from gamba_warp.cli import run
 from gamba_warp.commands.fit import fit_command
-from gamba_warp.conventions import over_background
+from gamba_warp.conventions import GROUNDS, over_background
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views import compare
 from gamba_warp.eval.views.compare import ViewsProtocol, load_truth, render_views
@@ -265,12 +265,15 @@ def test_command_measures_as_eval_views_does(dataset, tmp_path):
     source = PlyPredictions(out / "gaussians", 1.5, "cpu")
     protocol = ViewsProtocol("all", 0, None, None, None, None, source.distance)
     truth = load_truth(opened, "ball", protocol, "cpu")
-    rgb, _ = render_views(source.gaussians(opened, "ball", 0), truth.cameras)
-    got = psnr(rgb, truth.rgb)
+    shown = render_views(source.gaussians(opened, "ball", 0), truth.cameras)
+    got = psnr(shown.on(), truth.rgb)
     # another world and back, and the .ply's logits: float32 noise
     torch.testing.assert_close(
         got, torch.tensor(record["psnr_by_view"], dtype=got.dtype), rtol=0, atol=0.01
     )
+    for ground, grey in GROUNDS.items():
+        got = psnr(shown.on(grey), truth.shown.on(grey))[[2, 5]].mean()
+        assert record[f"psnr_{ground}_held_out"] == pytest.approx(float(got), abs=0.01)
 
 
 def test_one_failure_does_not_stop_the_rest(dataset, tmp_path, capsys):

@@ -122,6 +122,21 @@ def other_truth(report):
     return changed
 
 
+def test_other_grounds_have_a_table_of_their_own(files):
+    """Pictures without alpha have no such figures, and an older report lacks them too."""
+    hazy = change(views_report(1.0), grounds={"black": 0.0, "grey": 0.5})
+    for record in hazy["objects"]:
+        record |= {"psnr_black": record["psnr"] - 4, "psnr_grey": None, "lpips_black": 0.25}
+    first = files.add("one", views_report())
+    code, said, joined = files.run(f"old={first}", f"hazy={files.add('two', hazy)}")
+    assert code == 0 and "of methods with alpha (4 objects)" in said.out
+    lines = said.out.partition("black and on grey")[2].splitlines()
+    assert "PSNR on black ↑" in lines[2] and lines[4].count(" - ") == 4
+    assert "20.00 [" in lines[5] and "0.250 [" in lines[5]
+    assert joined["rows"][1]["psnr_black"]["mean"] == 20
+    assert "on grey" not in files.run(f"old={first}", "--seconds", "old=3")[1].out
+
+
 V, S = views_report(), shapes_report()
 
 

@@ -9,6 +9,7 @@ from helpers.micro import to_opengl
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
+from gamba_warp.conventions import ON_GROUNDS
 from gamba_warp.eval.averages import bootstrap, median_of, minus, summary_of
 from gamba_warp.eval.views.compare import NEARLY_EMPTY, Truth, summary
 from gamba_warp.eval.views.evaluate import count_nearly_empty
@@ -21,7 +22,8 @@ SIZE = 40  # 16 of its pixels are exactly 1 %
 
 
 def values(psnr, ssim=0.5):
-    return {"psnr": psnr, "ssim": ssim, "lpips": None, "mask_iou": 0.5, "mse": 10 ** (-psnr / 10)}
+    measured = {"psnr": psnr, "ssim": ssim, "mask_iou": 0.5, "mse": 10 ** (-psnr / 10)}
+    return {"lpips": None, **dict.fromkeys(ON_GROUNDS), **measured}
 
 
 def test_means_with_and_without():
@@ -84,9 +86,9 @@ def test_tables():
     }
     text = page(report)
     assert "1 of 4 views, of 1 of 2 objects, are nearly empty" in text
-    assert text.count("| novel | model | ") == 1 + 1 + 1  # means, medians, and means without
+    assert text.count("| novel | model | ") == 2 + 1 + 1  # means, medians, and means without
     blank = page(report | {"nearly_empty": counts | {"views": 0}})
-    assert "None of the 4 views" in blank and blank.count("| novel | model | ") == 2
+    assert "None of the 4 views" in blank and blank.count("| novel | model | ") == 3
 
 
 def test_a_report_has_both(tmp_path, capsys):

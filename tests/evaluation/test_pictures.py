@@ -12,7 +12,7 @@ from PIL import Image
 from gamba_warp.cameras import intrinsics, orbit
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+from gamba_warp.eval.views.compare import Shown, ViewsProtocol, load_truth, shown
 from gamba_warp.eval.views.pictures import PicturePredictions, save_pictures
 from gamba_warp.train.sources.pack import PackSettings, write_pack
 
@@ -111,7 +111,8 @@ def test_a_pack_has_no_names_so_pictures_of_it_go_by_number(data):
     dataset = open_dataset(data / "data")
     one = Image.open(data / "files" / "a" / "view0.png")
     rgb = torch.from_numpy(np.asarray(one)[..., :3] / np.float32(255))[None]
-    save_pictures(data / "saved", dataset.files("a"), [2], (rgb, torch.ones(1, SIZE, SIZE) > 0))
+    shown = Shown(rgb, torch.ones(1, SIZE, SIZE))
+    save_pictures(data / "saved", dataset.files("a"), [2], shown)
     assert [path.name for path in (data / "saved").iterdir()] == ["2.png"]
 
 
@@ -123,6 +124,7 @@ def test_pictures_without_alpha_have_no_mask(data):
     code, report = evaluate(data)
     assert code == 0
     assert report["mean"]["psnr"] == 100 and report["mean"]["mask_iou"] is None
+    assert report["mean"]["psnr_black"] is None and report["protocol"]["grounds"]["grey"] == 0.5
     assert "absent" in (data / "out" / "table.md").read_text()
     # An alpha that is 1 everywhere says nothing either.
     Image.open(data / "pred" / "a" / "view1.png").convert("RGBA").save(
@@ -258,17 +260,17 @@ def test_what_cannot_start(data, case, said, capsys):
 
 
 def test_what_is_written_is_read_as_it_was(data, tmp_path):
-    """Colour to a rounding of 8 bits (twice one, where alpha is a half), masks exactly."""
+    """Colours on each background to a rounding of 8 bits in each of colour and alpha; masks."""
     dataset = open_dataset(data / "data")
     protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
     truth = load_truth(dataset, "a", protocol, "cpu")
     generator = torch.Generator().manual_seed(0)
-    mask = torch.rand(VIEWS, SIZE, SIZE, generator=generator) > 0.4
-    rgb = torch.rand(VIEWS, SIZE, SIZE, 3, generator=generator)
-    rgb[~mask] = 0.51 + 0.49 * rgb[~mask]  # what alpha under a half leaves of white
-    rgb[:, :4] = 1.0
-    mask[:, :4] = False
-    save_pictures(tmp_path / "saved" / "a", dataset.files("a"), truth.views, (rgb, mask))
-    found = PicturePredictions(tmp_path / "saved", 1.5, "cpu").pictures(dataset, truth)
-    assert found.mask is not None and torch.equal(found.mask, mask)
-    assert (found.rgb - rgb).abs().max() <= 1 / 255
+    images = torch.rand(VIEWS, SIZE, SIZE, 4, generator=generator)
+    images[:, :4, :, 3] = 0.0
+    there = shown(images)
+    save_pictures(tmp_path / "saved" / "a", dataset.files("a"), truth.views, there)
+    found = PicturePredictions(tmp_path / "saved", 1.5, "cpu").pictures(dataset, truth).shown
+    clear = (images[..., 3] - 0.5).abs() > 1 / 255
+    assert torch.equal(found.mask()[clear], there.mask()[clear])
+    for ground in (1.0, 0.5, 0.0):
+        assert (found.on(ground) - there.on(ground)).abs().max() <= 1 / 255 + 1e-6

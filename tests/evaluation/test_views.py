@@ -14,7 +14,7 @@ from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.pairs import out_of_reference
 from gamba_warp.eval.views import evaluate as module
-from gamba_warp.eval.views.compare import choose_views
+from gamba_warp.eval.views.compare import Shown, choose_views
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import save_image
@@ -42,7 +42,7 @@ def paint(gaussians, views):
         x, y = (seen[:2] / seen[2]).floor().long().tolist()
         rgb[v, max(0, y - 4) : y + 5, max(0, x - 4) : x + 5] = gaussians.colors[0]
         mask[v, max(0, y - 4) : y + 5, max(0, x - 4) : x + 5] = True
-    return rgb, mask
+    return Shown(rgb, mask.float())
 
 
 def one(point):
@@ -57,11 +57,11 @@ def one(point):
 
 def write_object(folder, point, views=None, drawer=paint):
     views = cameras() if views is None else views
-    rgb, mask = drawer(one(point), views)
+    rgb, alpha = drawer(one(point), views)
     folder.mkdir(parents=True)
     frames = []
     for v, pose in enumerate(to_opengl(views.viewmats)):
-        pixels = torch.cat([rgb[v], mask[v, ..., None].float()], -1)
+        pixels = torch.cat([rgb[v], alpha[v, ..., None]], -1)
         save_image(folder / f"{v}.png", pixels.numpy())
         frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
     focal = float(views.Ks[0, 0, 0])
@@ -149,8 +149,8 @@ def test_failures_are_listed(data, painted, monkeypatch):
     (data / "data" / "group" / "b" / "2.png").write_bytes(b"")
 
     def nan_where_c(gaussians, views):
-        rgb, mask = paint(gaussians, views)
-        return torch.full_like(rgb, torch.nan), mask
+        rgb, alpha = paint(gaussians, views)
+        return Shown(torch.full_like(rgb, torch.nan), alpha)
 
     monkeypatch.setattr(module, "render_views", nan_where_c)
     code, report = evaluate(data, "--no-lpips")
@@ -196,7 +196,8 @@ def test_lpips_with_weights(data, painted):
     _, report = evaluate(data, "--limit", "1", "--views", "2")
     assert report["protocol"]["lpips"] == "VGG16, version 0.1"
     # a prediction that differs by rounding, against an empty picture
-    assert report["mean"]["lpips"] < 1e-3 < report["baselines"]["background"]["lpips"]
+    for key in ("lpips", "lpips_black", "lpips_grey"):
+        assert report["mean"][key] < 1e-3 < report["baselines"]["background"][key]
 
 
 @pytest.mark.parametrize("case", ["pred", "data", "empty", "limit", "distance", "split"])

@@ -173,6 +173,7 @@ def test_overfit_learns_and_writes_everything(data, tmp_path):
     records = lines(tmp_path, "val")
     assert [record["step"] for record in records] == [60, 120]
     assert records[-1]["psnr_novel"] > 20 and records[-1]["psnr_input"] > 20
+    assert records[-1]["psnr_grey_novel"] > 15 < records[-1]["psnr_black_input"]
     train_records = lines(tmp_path, "train")
     wanted = "loss loss_rgb loss_mask loss_rdist lr grad_norm views_per_second mean_alpha "
     assert set((wanted + "visible_share spread psnr epoch skipped").split()) <= set(
