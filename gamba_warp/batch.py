@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -132,6 +133,8 @@ def plan_outputs(
 ) -> dict[str, Path]:
     """A name for each input: its stem, with a number where two inputs would share an output.
 
+    ``.compressed.ply`` is one suffix: the other formats are not compressed in its way.
+
     Two names that differ in capitals only are one name to many file systems, and so they are here.
 
     Args:
@@ -153,10 +156,11 @@ def plan_outputs(
         return {normalize("NFC", name + suffix).casefold() for suffix in (*suffixes, "")}
 
     for path in inputs:
-        name, number = path.stem, 1
+        stem = Path(re.sub(r"(?i)(?<=.)\.compressed(?=\.ply$)", "", path.name)).stem
+        name, number = stem, 1
         while outputs_of(name) & taken:
             number += 1
-            name = f"{path.stem}-{number}"
+            name = f"{stem}-{number}"
         taken |= outputs_of(name)
         names[name] = path
     targets = (folder / f"{name}{suffix}" for name in names for suffix in suffixes)

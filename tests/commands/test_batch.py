@@ -74,6 +74,12 @@ def test_no_two_inputs_share_an_output(tmp_path):
     assert plan(["\u00e9.png", "e\u0301.png"], ".ply") == ["\u00e9", "e\u0301-2"]
 
 
+def test_a_name_does_not_say_that_a_file_is_compressed():
+    names = ["a.compressed.ply", "b.Compressed.PLY", "c.compressed.png", ".compressed.ply", "a.spz"]
+    found = planned([Path(name) for name in names], [".ply"], Path("out"))
+    assert found == ["a", "b", "c.compressed", ".compressed", "a-2"]
+
+
 def test_what_is_read_is_never_an_output(tmp_path):
     photo, mask, out = tmp_path / "photo.gif", tmp_path / "photo.html", tmp_path / "out"
     photo.touch(), mask.touch(), out.mkdir()
