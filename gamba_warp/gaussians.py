@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .kernels.rasterize.constants import ALPHA_MIN
 from .kernels.rasterize.harmonics import harmonics_basis
 
 SH_C0 = 0.28209479177387814  # value of the degree-0 spherical harmonic
@@ -72,6 +73,15 @@ class Gaussians:
     def select(self, keep: Tensor) -> Gaussians:
         """Returns the Gaussians of one object (no batch dimension) that ``keep [N]`` selects."""
         return self.map(lambda value: value[keep])
+
+    def drawn(self, least: float | None = None) -> Gaussians:
+        """Returns the Gaussians of one object that can be seen; what is not finite stays.
+
+        Args:
+            least: opacity under which a Gaussian is left out. None: 1/255, under which the
+                rasterizer draws nothing, so that every picture keeps all its bits.
+        """
+        return self.select(~(self.opacities < (ALPHA_MIN if least is None else least)))
 
     def to(self, *args, **kwargs) -> Gaussians:
         """Moves or converts every tensor, with the arguments of ``torch.Tensor.to``."""

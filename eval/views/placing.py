@@ -60,4 +60,4 @@ class TrainingMeshes:
         """Writes what ``place`` returns as a ``.ply``; the errors are those of both."""
         surface = self.place(found, distance)
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_mesh(path, surface)
+        save_mesh(path, surface, "opencv")

@@ -80,7 +80,7 @@ def write(made: Made, kind: str, folder: Path, device: str = "cpu") -> tuple[Pat
         device: device that renders.
 
     Returns:
-        The file, and a sentence about what the format cannot hold, or None.
+        The file, and of Gaussians what of them it holds, in words.
 
     Raises:
         UserError: the kind is not known, the object has no surface, a library is missing, or the
@@ -90,9 +90,11 @@ def write(made: Made, kind: str, folder: Path, device: str = "cpu") -> tuple[Pat
         raise UserError(f"no such kind of file: {kind}")
     path, note = folder / f"{made.name}{KINDS[kind][1]}", None
     if kind in GAUSSIANS:
-        from ..formats.gaussians.files import write_gaussians
+        from ..formats.gaussians.files import to_be_written, write_gaussians
 
-        note = write_gaussians(path, made.gaussians, kind)  # type: ignore[arg-type]
+        gaussians, count = to_be_written(made.gaussians)
+        lost = write_gaussians(path, gaussians, kind)  # type: ignore[arg-type]
+        note = f"{lost} {count}" if lost else count
     elif kind in MESHES:
         _write_mesh(path, made, device)
     elif kind == "gif":

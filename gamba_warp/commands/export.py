@@ -53,7 +53,7 @@ def export_command(
     largest: bool = False,
     smooth: Smoothing = 0,
     frame: Axes = "opengl",
-    min_opacity: Opacity = 0.0,
+    min_opacity: Opacity | None = None,
     size: Side = 256,
     frames: Frames = 48,
     elevation: Elevation = 0.0,
@@ -86,8 +86,9 @@ def export_command(
         min_component: Remove parts with a smaller share of the faces.
         largest: Keep the largest part only.
         smooth: Number of smoothing steps.
-        frame: Axes of .ply, .obj and .stl files; opengl is y up, opencv y down as in the input.
-        min_opacity: Leave out Gaussians fainter than this.
+        frame: Axes of meshes but .glb; opengl is y up, opencv y down as files of Gaussians are.
+        min_opacity: Leave out Gaussians fainter than this; 1/255 if not given, below which they
+            are never drawn. 0 keeps all.
         size: Side of the turntable's frames in pixels.
         frames: Number of views in the turntable.
         elevation: Degrees by which the camera of turntable and 3D viewer stands above the object.

@@ -62,8 +62,8 @@ def reconstruct_command(
     matte_model: Path | None = None,
     sam: Path | None = None,
     save_inputs: bool = False,
-    ply_frame: Axes = "opencv",
-    min_opacity: Opacity = 0.0,
+    frame: Axes = "opengl",
+    min_opacity: Opacity | None = None,
     device: DeviceChoice = "auto",
     precision: Precision = "float32",
     times: bool = False,
@@ -87,8 +87,9 @@ def reconstruct_command(
         matte_model: ISNet or U2-Net (.onnx) that cuts objects out; else rembg's is used or fetched.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
         save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
-        ply_frame: Axes of the .ply; opencv (y down) is what viewers assume.
-        min_opacity: Leave out Gaussians fainter than this.
+        frame: Axes of meshes but .glb; opengl is y up, opencv y down as files of Gaussians are.
+        min_opacity: Leave out Gaussians fainter than this; 1/255 if not given, below which they
+            are never drawn. 0 keeps all.
         device: Device that computes; auto is the GPU if there is one.
         precision: That of the network's products; auto is bfloat16 where that is faster.
         times: Print what each stage took.
@@ -109,7 +110,7 @@ def reconstruct_command(
         size=size,
         frames=frames,
         page=page,
-        axes=ply_frame,
+        axes=frame,
         min_opacity=min_opacity,
         checkpoint=checkpoint,
         about=about_model(file),

@@ -22,7 +22,7 @@ def view_command(
     /,
     out: Path | None = None,
     mesh: Path | None = None,
-    mesh_frame: Axes | None = None,
+    mesh_frame: Axes = "opengl",
     serve: bool = False,
     port: Annotated[int, Meta(ge=0, le=65535)] = 8000,
     open_browser: bool = True,
@@ -36,8 +36,7 @@ def view_command(
         file: Gaussians (.ply, .splat, .spz, .glb), or the folder of a training run.
         out: File for the page; a temporary file if not given.
         mesh: A mesh of the same object, to be shown too (.glb, .obj, .ply, .stl).
-        mesh_frame: Axes of the mesh; if not given, opengl (y up) of .glb and .gltf, and opencv of
-            others. The .obj, .ply and .stl of gamba export are opengl unless asked for otherwise.
+        mesh_frame: Axes of the mesh; opengl is y up, as gamba writes meshes unless asked otherwise.
         serve: Serve it on this machine until Ctrl-C, for a browser at the other end of a tunnel.
         port: Port of --serve; 0 picks a free one.
         open_browser: Open the browser.

@@ -178,7 +178,7 @@ def jobs(world: Path) -> list[Job]:
                 *(world / "pictures", "--checkpoint", model, "--out", out, *small),
                 *("--splats", "ply", "splat", "glb", "--device", "cpu"),
             ],
-            ("--ply-frame", "opengl"),
+            ("--elevation", 20),
         ),
         Job(
             "export",

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..conventions import Axes
 from ..errors import UserError
 from ..files import atomic_path
 from ..gaussians import SH_C0, Gaussians
@@ -25,7 +24,7 @@ from .headers import open_shape
 from .ply_data import read_ply
 from .ply_header import ORDERS, PlyElement, PlyHeader, read_ply_header
 
-OPENGL_COMMENT = "frame opengl"
+TURNED = "frame opengl"  # the comment of files with y up, which earlier versions could write
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
 MAX_FILE = 4 << 30  # bytes; 17 million Gaussians with all their harmonics
 _GROUPS = {
@@ -44,25 +43,20 @@ def save_ply(
     path: str | Path,
     gaussians: Gaussians,
     *,
-    axes: Axes = "opencv",
-    min_opacity: float = 0.0,
     comments: Iterable[str] = (),
 ) -> None:
-    """Writes one object as binary little-endian 3DGS ``.ply``, atomically.
+    """Writes one object as binary little-endian 3DGS ``.ply`` in OpenCV's axes, atomically.
 
     Args:
         path: file to write.
         gaussians: one object, no batch dimension.
-        axes: ``opencv`` (y down, what ``.ply`` viewers assume) or ``opengl`` (y up); the latter is
-            noted in a comment, by which ``load_ply`` turns it back.
-        min_opacity: Gaussians below it are left out.
         comments: lines for the header.
 
     Raises:
-        UserError: a value is not finite, nothing is left, or the file cannot be written.
-        ValueError: there is a batch dimension, or the axes are not known.
+        UserError: a value is not finite, there is no Gaussian, or the file cannot be written.
+        ValueError: there is a batch dimension.
     """
-    arrays = export_arrays(path, gaussians, axes, min_opacity)
+    arrays = export_arrays(path, gaussians)
     count = len(arrays["opacities"])
     opacities = arrays["opacities"].astype(np.float64)
     opacities = opacities.clip(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
@@ -76,18 +70,16 @@ def save_ply(
         _GROUPS["scales"]: np.log(arrays["scales"].clip(MIN_SCALE)),
         _GROUPS["quats"]: arrays["quats"],
     }
-    lines = [*header_lines(axes, comments), f"element vertex {count}"]
+    lines = [*header_lines(comments), f"element vertex {count}"]
     lines += [f"property float {name}" for names in columns for name in names]
     body = np.hstack(list(columns.values())).astype("<f4").tobytes()
     with atomic_path(path) as temporary:
         temporary.write_bytes(ended_header(lines) + body)
 
 
-def header_lines(axes: Axes, comments: Iterable[str]) -> list[str]:
-    """The first lines of a ``.ply`` of Gaussians: format, comments, the axes if they are turned."""
-    notes = [f"gamba_warp {__version__}", *comments]
-    if axes == "opengl":
-        notes.append(OPENGL_COMMENT)
+def header_lines(comments: Iterable[str]) -> list[str]:
+    """The first lines of a ``.ply`` of Gaussians: format, version, and each comment once."""
+    notes = dict.fromkeys([f"gamba_warp {__version__}", *comments])
     lines = ["ply", "format binary_little_endian 1.0"]
     return lines + [f"comment {' '.join(note.split())}" for note in notes]
 
@@ -122,7 +114,7 @@ def load_ply(path: str | Path) -> Gaussians:
             file.seek(header.start)
             arrays = _activated(path, _from_bytes(path, header, file.read()))
     gaussians = sound_gaussians(path, arrays)
-    return flip_axes(gaussians) if OPENGL_COMMENT in header.comments else gaussians
+    return flip_axes(gaussians) if TURNED in header.comments else gaussians
 
 
 def _activated(path: Path, vertices: Columns) -> dict[str, np.ndarray]:

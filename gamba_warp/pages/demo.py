@@ -33,7 +33,6 @@ _ICON = "Icon: "
 _FIRST = 6  # pictures in the first section
 _TURN = 24  # views of a turntable
 _SHOWN = 5  # of these in the first section
-_FAINT = 1 / 255  # the rasterizer passes over what is fainter, so the page can do without
 
 
 @dataclass(frozen=True)
@@ -189,7 +188,7 @@ def _tiles(strip: Path) -> np.ndarray:
 def _held_out(strip: Path, views: Path, report: dict) -> Section:
     """One object with its predicted and its true views, by the shipped model."""
     tiles = _tiles(strip)
-    gaussians = _visible(load_ply(views / "gaussians" / f"{strip.stem}.ply"))
+    gaussians = load_ply(views / "gaussians" / f"{strip.stem}.ply").drawn()
     record = next(o for o in report["objects"] if o["name"] == strip.stem)
     return Section(
         _name(strip.stem),
@@ -207,7 +206,7 @@ def _icons(results: DemoResults) -> list[Section]:
     for icon in sorted(results.icons.glob("*.png")):
         ply = results.results / f"{icon.stem}.ply"
         if ply.exists():
-            gaussians = _visible(load_ply(ply))
+            gaussians = load_ply(ply).drawn()
             sections.append(
                 Section(
                     f"{_ICON}{_name(icon.stem)}",
@@ -223,10 +222,6 @@ def _icons(results: DemoResults) -> list[Section]:
 def _name(stem: str) -> str:
     """The name of an object without that of its library."""
     return _LIBRARY.sub("", stem)
-
-
-def _visible(gaussians: Gaussians) -> Gaussians:
-    return gaussians.select(gaussians.opacities >= _FAINT)
 
 
 def _turntable(gaussians: Gaussians) -> np.ndarray:

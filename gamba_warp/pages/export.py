@@ -12,7 +12,13 @@ import torch
 
 from ..conventions import Axes
 from ..errors import UserError
-from ..formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
+from ..formats.gaussians.files import (
+    comments_of,
+    read_gaussians,
+    splat_kind,
+    to_be_written,
+    write_gaussians,
+)
 from ..formats.names import SPLAT_SUFFIXES, MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..surfaces.extract import unit_frame
@@ -36,8 +42,8 @@ class ExportJob:
         turntable: ``gif``, ``mp4`` or ``none``.
         surface: how the mesh is made.
         texture: side of its texture, pixels; 0: none.
-        axes: axes of ``.ply, .obj, .stl``.
-        min_opacity: fainter Gaussians are left out.
+        axes: axes of the meshes, but of .glb.
+        min_opacity: fainter Gaussians are left out; None: those that are never drawn.
         size: side of the turntable's frames, pixels.
         frames: views of one turn.
         device: device that renders.
@@ -52,7 +58,7 @@ class ExportJob:
     surface: SurfaceOptions
     texture: int
     axes: Axes
-    min_opacity: float
+    min_opacity: float | None
     size: int
     frames: int
     device: torch.device
@@ -125,24 +131,21 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     Raises:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
     """
-    gaussians = read_gaussians(path)
-    gaussians = gaussians.select(gaussians.opacities >= job.min_opacity)
-    if gaussians.num == 0:
-        raise UserError(f"no Gaussian has an opacity of {job.min_opacity:g} or more")
-    lost = []
+    gaussians, count = to_be_written(read_gaussians(path), job.min_opacity)
+    said, comments = [f"{name}: {count}"], comments_of(path)
     for kind in job.splats:
         target = job.folder / (name + splat_suffix(kind))
-        lost += [write_gaussians(target, gaussians, kind, axes=job.axes)]
+        said += filter(None, [write_gaussians(target, gaussians, kind, comments=comments)])
     _write_pictures(name, gaussians, job)
     if not job.mesh:
-        return " ".join([f"{name}: {gaussians.num:,} Gaussians.", *filter(None, lost)])
+        return " ".join(said)
     start = time.perf_counter()
     base, options = job.folder / name, job.surface
     found = write_meshes(base, gaussians, job.mesh, options, job.axes, job.device, job.texture)
     closed = "closed" if found.is_watertight() else "open"
     counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
     seconds = time.perf_counter() - start
-    return " ".join([f"{name}: {counts}, {seconds:.1f} s.", *filter(None, lost)])
+    return " ".join([*said, f"Mesh: {counts}, {seconds:.1f} s."])
 
 
 def _write_pictures(name: str, gaussians: Gaussians, job: ExportJob) -> None:

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from ..batch import STAGES
+from ..batch import STAGES, say
 from ..conventions import Axes
-from ..formats.gaussians.files import write_gaussians
+from ..formats.gaussians.files import to_be_written, write_gaussians
 from ..formats.names import MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
 from ..images import save_image
@@ -41,8 +41,8 @@ class Outputs:
         size: side of the turntable's frames, pixels.
         frames: views of one turn.
         page: whether a self-contained HTML page is written, too.
-        axes: axes of the ``.ply`` and of meshes.
-        min_opacity: fainter Gaussians are left out of the files.
+        axes: axes of the meshes, but of .glb.
+        min_opacity: fainter Gaussians are left out; None: those that are never drawn.
         checkpoint: the model's file, named in the ``.ply``.
         about: labels and texts for the page, of the model.
         sheet: gets a row of each picture, or None.
@@ -60,7 +60,7 @@ class Outputs:
     frames: int
     page: bool
     axes: Axes
-    min_opacity: float
+    min_opacity: float | None
     checkpoint: Path
     about: Sequence[tuple[str, str]] = ()
     sheet: Sheet | None = None
@@ -108,6 +108,8 @@ def write_outputs(
         UserError: a file cannot be written, or no Gaussian can be.
     """
     base, view = outputs.folder / name, outputs.view(config)
+    gaussians, count = to_be_written(gaussians, outputs.min_opacity)
+    say(f"{name}: {count}")
     if view.elevation:
         turn = upright(view.elevation).to(gaussians.means)
         gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
@@ -123,9 +125,8 @@ def write_outputs(
         section = _write_pictures(base, cut, gaussians, outputs, view, about)
     if outputs.mesh:  # what takes longest comes last: all else is there to look at
         STAGES.begin("mesh")
-        visible = gaussians.select(gaussians.opacities >= outputs.min_opacity)
         device = gaussians.means.device
-        mesh = write_meshes(base, visible, outputs.mesh, _SURFACE, outputs.axes, device)
+        mesh = write_meshes(base, gaussians, outputs.mesh, _SURFACE, outputs.axes, device)
         if section is not None:  # the page again, with the mesh in its viewer
             section.mesh = mesh
             reconstruction_page(base.with_name(f"{name}.html"), section)
@@ -169,9 +170,7 @@ def _write_pictures(
 def _write_gaussians(base: Path, gaussians: Gaussians, outputs: Outputs) -> None:
     comments = [f"from {base.name} by {outputs.checkpoint.name}"]
     for kind in outputs.splats:
-        path, least = base.with_name(base.name + splat_suffix(kind)), outputs.min_opacity
-        lost = write_gaussians(
-            path, gaussians, kind, axes=outputs.axes, min_opacity=least, comments=comments
-        )
+        path = base.with_name(base.name + splat_suffix(kind))
+        lost = write_gaussians(path, gaussians, kind, comments=comments)
         if lost is not None:
             tqdm.write(lost)

@@ -119,20 +119,21 @@ def near_and_visible(gaussians: Gaussians) -> Gaussians:
 def unit_frame(gaussians: Gaussians) -> tuple[Tensor, float]:
     """The centre ``[3]`` and the longest side of an object anywhere.
 
-    Of the visible Gaussians' centres, half a percent at each end of each axis is left out, so that
-    what floats far from the object does not count.
+    Only visible Gaussians count. Of their centres, half a percent at each end of each axis is left
+    out, so that what floats far from the object does not count.
 
     Raises:
         UserError: a value is not finite, no Gaussian is visible, or all are at one point.
     """
-    means = gaussians.means[gaussians.opacities > VISIBLE].double().cpu()
+    visible = gaussians.select(gaussians.opacities > VISIBLE)
+    means = visible.means.double().cpu()
     if not gaussians.means.isfinite().all():
         raise UserError("a Gaussian's position is not finite")
     if len(means) == 0:
         raise UserError(f"no Gaussian has an opacity above {VISIBLE}")
     ends = np.quantile(means.numpy(), [0.005, 0.995], axis=0)
     # A single Gaussian has an extent as well.
-    width = float(gaussians.scales.median())
+    width = float(visible.scales.median())
     side = float((ends[1] - ends[0]).max()) + 4 * width
     if not 0 < side < float("inf"):
         raise UserError("the Gaussians have no extent")

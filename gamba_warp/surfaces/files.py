@@ -22,17 +22,16 @@ from .options import SurfaceOptions
 from .texture import Texture
 
 
-def save_mesh(path: str | Path, surface: Surface) -> None:
+def save_mesh(path: str | Path, surface: Surface, axes: Axes = "opengl") -> None:
     """Writes a surface, atomically, with vertex colours where the format has them (not .stl).
 
     A texture is embedded in ``.glb``; beside an ``.obj`` it is NAME.png, which NAME.mtl names; the
-    others have the vertex colours. The axes are left as they are, except in ``.glb``: it is turned
-    from OpenCV's (y down) to glTF's (y up), as ``save_glb`` does, and its vertex colours are linear
-    light, as the format asks.
+    others have the vertex colours. Those of a ``.glb`` are linear light, as the format asks.
 
     Args:
         path: ends in .obj, .glb, .ply or .stl.
-        surface: what to write.
+        surface: what to write, in OpenCV's axes (y down), as the Gaussians.
+        axes: those of the file; a ``.glb`` has OpenGL's (y up) in any case, as the format asks.
 
     Raises:
         UserError: another suffix, or the file cannot be written.
@@ -44,9 +43,10 @@ def save_mesh(path: str | Path, surface: Surface) -> None:
     if kind not in MESH_FORMATS:
         raise UserError(f"{path}: a mesh is a {', '.join('.' + name for name in MESH_FORMATS)}")
     vertices, colors = surface.vertices, surface.colors
-    if kind == "glb":
+    if kind == "glb" or axes == "opengl":
         vertices = vertices * [1.0, -1.0, -1.0]
-        colors = None if colors is None else to_linear(colors)
+    if kind == "glb" and colors is not None:
+        colors = to_linear(colors)
     if surface.texture is not None and kind in ("glb", "obj"):
         return _save_textured(Path(path), replace(surface, vertices=vertices), surface.texture)
     mesh = trimesh.Trimesh(vertices, surface.faces, process=False)
@@ -130,8 +130,5 @@ def write_meshes(
     """
     found = surface_of(gaussians, options, device, texture)
     for kind in formats:
-        turned = found
-        if axes == "opengl" and kind != "glb":
-            turned = replace(found, vertices=found.vertices * [1.0, -1.0, -1.0])
-        save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), turned)
+        save_mesh(base.with_name(f"{base.name}-mesh.{kind}"), found, axes)
     return found

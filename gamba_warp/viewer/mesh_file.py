@@ -11,7 +11,7 @@ from ..conventions import Axes
 from ..formats.materials import to_linear
 from ..formats.meshes import TexturedMesh, load_mesh, to_display
 
-_LINEAR = (".glb", ".gltf")  # the format's colours of vertices are linear light, and up is +y
+_LINEAR = (".glb", ".gltf")  # the format's colours of vertices are linear light
 
 
 @dataclass
@@ -29,23 +29,21 @@ class ViewedMesh:
     colors: np.ndarray
 
 
-def read_viewed_mesh(path: str | Path, axes: Axes | None = None) -> ViewedMesh:
+def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
     """Reads a mesh file for the viewer, which shows OpenCV's axes (y down).
 
     A texture is seen as its colours at the corners.
 
     Args:
         path: the file.
-        axes: those of the file. None: OpenGL's (y up) of a ``.glb`` or ``.gltf``, as the format
-            says, and OpenCV's of others, as ``gamba reconstruct`` writes them.
+        axes: those of the file; OpenGL's (y up) are what ``save_mesh`` writes.
 
     Raises:
         UserError: as ``load_mesh``.
     """
     mesh = load_mesh(path)
     linear = Path(path).suffix.lower() in _LINEAR
-    is_up = linear if axes is None else axes == "opengl"
-    vertices = mesh.vertices * ([1.0, -1.0, -1.0] if is_up else 1.0)
+    vertices = mesh.vertices * ([1.0, -1.0, -1.0] if axes == "opengl" else 1.0)
     paint = (255 * _corner_colors(mesh, linear) + 0.5).astype(np.int64)
     # A vertex that has several colours becomes several.
     keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]

@@ -19,7 +19,6 @@ from ..errors import UserError
 from ..gaussians import Gaussians
 from ..images import to_uint8
 
-VISIBLE = 1 / 255  # opacity from which the rasterizer draws a Gaussian
 _COUNTS = 0.05  # opacity from which a Gaussian counts for the object's extent
 _MOST = 6e4  # float16 ends at 65504
 
@@ -85,7 +84,7 @@ def visible(gaussians: Gaussians, name: str) -> Gaussians:
     if bad.any():
         count = int(bad.sum())
         raise UserError(f"{name}: {count} of {gaussians.num} Gaussians are not finite")
-    gaussians = gaussians.select(gaussians.opacities >= VISIBLE)
+    gaussians = gaussians.drawn()
     if gaussians.num == 0:
         raise UserError(f"{name}: no Gaussian has an opacity of 1/255 or more")
     widest = gaussians.scales.sort(-1).values

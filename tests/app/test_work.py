@@ -144,9 +144,10 @@ def test_every_kind_of_file(made, tmp_path):
     assert len(set(suffixes.values())) == len(suffixes), "no two files have one name"
     assert {"ply", "splat", "spz", "glb", "compressed-ply", "gif", "html"} < set(suffixes)
     for kind in work.GAUSSIANS:
-        path, _ = work.write(made, kind, tmp_path)
+        path, note = work.write(made, kind, tmp_path)
         assert path.name == "My-thing-v2" + suffixes[kind]
-        assert 0 < read_gaussians(path).num <= made.gaussians.num
+        assert read_gaussians(path).num == made.gaussians.drawn().num > 0
+        assert f"{made.gaussians.drawn().num:,} Gaussians" in note
     path, _ = work.write(made, "html", tmp_path)
     assert "<canvas" in path.read_text(encoding="utf-8")
     with pytest.raises(UserError, match="no such kind of file: exe"):
@@ -176,7 +177,8 @@ def test_a_mesh(made, tmp_path, monkeypatch):
     for kind, suffix in (("mesh-stl", ".stl"), ("mesh-glb", ".glb")):
         path, _ = work.write(made, kind, tmp_path)
         assert path.name == f"My-thing-v2-mesh{suffix}"
-        assert len(trimesh.load(path, force="mesh").faces) == 4
+        mesh = trimesh.load(path, force="mesh")
+        assert len(mesh.faces) == 4 and mesh.bounds[:, 1].tolist() == [-1, 0]  # y up
     assert asked == [(made.gaussians.num, True, "cpu")] * 2
 
 

@@ -168,10 +168,11 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     source = (out / "thing.html").read_text()
     assert "<h1>thing</h1>" in source and "model.safetensors" in source and ">64<" in source
     assert "not known: this model has no card" in source
-    assert "1 pictures, 0 failures" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "thing: 64 Gaussians.\n" in said and "1 pictures, 0 failures" in said
 
 
-@pytest.mark.parametrize("frame", ["opencv", "opengl"])
+@pytest.mark.parametrize("frame", ["opencv", "opengl", None])
 def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeypatch, frame):
     ends = torch.tensor([0.35, -0.1, 0.0])
     stick = Gaussians(
@@ -182,7 +183,8 @@ def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeyp
         colors=torch.tensor([0.9, 0.1, 0.1]).expand(64, 3),
     )
     monkeypatch.setattr(predict, "reconstruct", lambda *_: stick)
-    options = [*quick(checkpoint, tmp_path), "--mesh", "ply", "--ply-frame", frame]
+    options = [*quick(checkpoint, tmp_path), "--mesh", "ply"]
+    options += ["--frame", frame] if frame else []
     assert run_reconstruct(picture, *options) == 0
     mesh = load_mesh(tmp_path / "thing-mesh.ply")
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
@@ -206,16 +208,18 @@ def test_the_precision_reaches_the_network(tmp_path, picture, checkpoint, monkey
     assert "precision" in capsys.readouterr().err and not (tmp_path / "no").exists()
 
 
-def test_options_reach_the_files(tmp_path, picture, checkpoint):
+def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     arguments = [picture, "--checkpoint", checkpoint, "--out", tmp_path, "--no-page"]
     assert run_reconstruct(*arguments, "--turntable", "mp4", "--size", 16, "--frames", 2) == 0
     assert (tmp_path / "thing.mp4").stat().st_size > 0 and not (tmp_path / "thing.html").exists()
     plain = load_ply(tmp_path / "thing.ply")
     limit = plain.opacities.median().item()
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--min-opacity", limit) == 0
-    assert 0 < load_ply(tmp_path / "thing.ply").num < 64
-    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--ply-frame", "opengl") == 0
-    assert b"comment frame opengl" in (tmp_path / "thing.ply").read_bytes()
+    few = load_ply(tmp_path / "thing.ply").num
+    assert (
+        0 < few < 64 and f"thing: {few} Gaussians, {64 - few} left out" in capsys.readouterr().out
+    )
+    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--frame", "opencv") == 0
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
 
 

@@ -111,7 +111,7 @@ def test_textured_files_are_read_back(tmp_path, baked, kind):
     assert not again.warnings and len(again.faces) == len(mesh.faces)
     (material,) = again.materials
     assert material.texture is not None and material.texture.shape == (256, 256, 4)
-    got = again.vertices * ([1, -1, -1] if kind == "glb" else [1, 1, 1])
+    got = again.vertices * [1, -1, -1]
     want = mesh.vertices[mesh.faces]
     np.testing.assert_allclose(got[again.faces], want, atol=1e-6)
     back = Texture(again.uvs.astype(np.float64), material.texture[..., :3] / 255)

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from gamba_warp import cli
 from gamba_warp.errors import UserError
-from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
 from gamba_warp.model import released
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.config import PRESETS, GambaConfig
@@ -97,7 +97,7 @@ def test_equals_the_public_code(golden, monkeypatch):
 
 
 def test_the_ply_file_equals_theirs(golden, monkeypatch, tmp_path):
-    save_ply(tmp_path / "ours.ply", _gaussians(golden, monkeypatch), axes="opengl")
+    save_ply(tmp_path / "ours.ply", flip_axes(_gaussians(golden, monkeypatch)))
     vertex = PlyData.read(tmp_path / "ours.ply")["vertex"]
     raw = golden["gaussians"][0].numpy()  # in their world: y up
     file = {
@@ -115,7 +115,7 @@ def test_the_ply_file_equals_theirs(golden, monkeypatch, tmp_path):
     turns = np.stack([vertex[f"rot_{i}"] for i in range(4)], -1)
     assert np.abs(turns - [0, 1, 0, 0]).max() < 1e-6
     back = load_ply(tmp_path / "ours.ply")
-    assert torch.allclose(back.means, _theirs(golden)["means"].float(), atol=1e-5)
+    assert torch.allclose(flip_axes(back).means, _theirs(golden)["means"].float(), atol=1e-5)
 
 
 def test_config_is_the_preset_at_their_sizes(golden):

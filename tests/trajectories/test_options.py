@@ -52,7 +52,7 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
     plain, turned = tmp_path / "plain", tmp_path / "turned"
     common = [picture, "--checkpoint", model, "--size", 48, "--frames", 4]
     assert run_reconstruct(*common, "--out", plain) == 0
-    options = ["--elevation", 30, "--mesh", "ply", "--ply-frame", "opencv"]
+    options = ["--elevation", 30, "--mesh", "ply"]
     assert run_reconstruct(*common, "--out", turned, *options) == 0
     before, after = load_ply(plain / "thing.ply"), load_ply(turned / "thing.ply")
     want = before.transformed(upright(30.0), torch.zeros(3))

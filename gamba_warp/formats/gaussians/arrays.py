@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import torch
@@ -25,30 +24,29 @@ def flip_axes(gaussians: Gaussians) -> Gaussians:
 
 
 def export_arrays(
-    path: str | Path, gaussians: Gaussians, axes: Axes = "opencv", min_opacity: float = 0.0
+    path: str | Path, gaussians: Gaussians, axes: Axes = "opencv"
 ) -> dict[str, np.ndarray]:
     """One object's Gaussians as float32 arrays fit to be written: finite, quaternions normalised.
 
     Args:
         path: named in errors.
         gaussians: one object, no batch dimension.
-        axes: in which the values are returned; those of ``gaussians`` are OpenCV's.
-        min_opacity: Gaussians below it are left out.
+        axes: those of the format; those of ``gaussians`` are OpenCV's.
 
     Returns:
         ``means [N, 3]``, ``quats [N, 4]`` wxyz, ``scales [N, 3]``, ``opacities [N]``,
         ``colors [N, 3]``, ``harmonics [N, K, 3]``, K of 0, 3, 8 or 15; activated values.
 
     Raises:
-        ValueError: there is a batch dimension, or the axes are not known.
-        UserError: a value is not finite, or no Gaussian is left.
+        ValueError: there is a batch dimension.
+        UserError: a value is not finite, or there is no Gaussian.
     """
     if gaussians.opacities.dim() != 1:
         raise ValueError(
             f"one object expected, got leading shape {tuple(gaussians.opacities.shape[:-1])}"
         )
-    if axes not in get_args(Axes):
-        raise ValueError(f"axes are {axes!r}, expected one of {', '.join(get_args(Axes))}")
+    if gaussians.num == 0:
+        raise UserError(f"{path}: not written, there is no Gaussian")
     gaussians = gaussians.detach().to("cpu", torch.float32)
     if axes == "opengl":
         gaussians = flip_axes(gaussians)
@@ -63,13 +61,8 @@ def export_arrays(
     if np.any(bad):
         count = np.count_nonzero(bad)
         raise UserError(f"{path}: not written, {count} of {gaussians.num} Gaussians are not finite")
-    keep = arrays["opacities"] >= min_opacity
-    if not keep.any():
-        raise UserError(
-            f"{path}: not written, no Gaussian has an opacity of {min_opacity:g} or more"
-        )
-    arrays = {name: np.ascontiguousarray(value[keep]) for name, value in arrays.items()}
-    arrays["quats"] /= np.linalg.norm(arrays["quats"], axis=1, keepdims=True).clip(1e-12)
+    lengths = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+    arrays["quats"] = arrays["quats"] / lengths.clip(1e-12)
     return arrays
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from ...conventions import Axes
 from ...errors import UserError
 from ...files import atomic_path
 from ...gaussians import Gaussians
 from ..headers import open_shape
 from ..names import SPLAT_FORMATS, SPLAT_SUFFIXES, SplatFormat
-from ..ply import MAX_FILE, ended_header, header_lines, load_ply, save_ply
+from ..ply import MAX_FILE, TURNED, ended_header, header_lines, load_ply, save_ply
 from ..ply_header import read_ply_header
 from .arrays import export_arrays
 from .compressed import WORDS, is_compressed, packed
@@ -87,54 +86,82 @@ def read_gaussians(path: str | Path) -> Gaussians:
     raise UserError(f"{path}: not Gaussians ({', '.join(SPLAT_SUFFIXES)})")
 
 
+def comments_of(path: str | Path) -> list[str]:
+    """What the comments of a ``.ply`` say, such as from what it was made; none in other formats.
+
+    At most 32 lines of 200 characters, so that a file with all of them is read again.
+
+    Raises:
+        UserError: as for ``splat_kind``.
+    """
+    path = Path(path)
+    with open_shape(path, MAX_FILE) as (file, _):
+        if file.read(3) != b"ply":
+            return []
+        file.seek(0)
+        found = read_ply_header(path, file).comments
+    return [line[:200] for line in found if line != TURNED][:32]
+
+
+def to_be_written(gaussians: Gaussians, least: float | None = None) -> tuple[Gaussians, str]:
+    """What a command writes of one object: what is never drawn is left out, and counted.
+
+    Args:
+        gaussians: one object, no batch dimension.
+        least: as for ``Gaussians.drawn``.
+
+    Returns:
+        The Gaussians, and a sentence that says how many those are, and how many are left out.
+
+    Raises:
+        UserError: none is left.
+    """
+    kept = gaussians.drawn(least)
+    limit = "1/255" if least is None else f"{least:g}"
+    if kept.num == 0:
+        raise UserError(f"no Gaussian has an opacity of {limit} or more")
+    lost = gaussians.num - kept.num
+    why = f"opacity under {limit}" + (", never drawn" if least is None else "")
+    return kept, f"{kept.num:,} Gaussians" + (f", {lost:,} left out ({why})." if lost else ".")
+
+
 def write_gaussians(
     path: str | Path,
     gaussians: Gaussians,
     kind: SplatFormat,
     *,
-    axes: Axes = "opencv",
-    min_opacity: float = 0.0,
     comments: Iterable[str] = (),
 ) -> str | None:
-    """Writes one object's Gaussians, atomically.
+    """Writes one object's Gaussians, atomically, in OpenCV's axes or those that the format has.
 
     Args:
         path: file to write.
         gaussians: one object, no batch dimension, OpenCV's axes.
         kind: the format.
-        axes: of ``ply`` and ``compressed-ply``; the other formats have axes of their own.
-        min_opacity: Gaussians below it are left out.
-        comments: lines for the header of a ``.ply``.
+        comments: lines for the header of a ``.ply``, compressed or not.
 
     Returns:
         A sentence about what the format cannot hold, or None.
 
     Raises:
-        UserError: a value is not finite, nothing is left, or the file cannot be written.
+        UserError: a value is not finite, there is no Gaussian, or the file cannot be written.
         ValueError: there is a batch dimension, or the format is not known.
     """
     if kind not in SPLAT_FORMATS:
         raise ValueError(f"the format is {kind!r}, expected one of {', '.join(SPLAT_FORMATS)}")
     if kind == "ply":
-        save_ply(path, gaussians, axes=axes, min_opacity=min_opacity, comments=comments)
+        save_ply(path, gaussians, comments=comments)
         return None
     if kind == "compressed-ply":
-        return _save_compressed(path, gaussians, axes, min_opacity, comments)
+        return _save_compressed(path, gaussians, comments)
     if kind == "glb":
-        save_glb(path, gaussians, min_opacity=min_opacity)
+        save_glb(path, gaussians)
         return None
-    save = {"splat": save_splat, "spz": save_spz}[kind]
-    return save(path, gaussians, min_opacity=min_opacity)
+    return {"splat": save_splat, "spz": save_spz}[kind](path, gaussians)
 
 
-def _save_compressed(
-    path: str | Path,
-    gaussians: Gaussians,
-    axes: Axes,
-    min_opacity: float,
-    comments: Iterable[str],
-) -> str | None:
-    lines, body, clipped = packed(export_arrays(path, gaussians, axes, min_opacity))
+def _save_compressed(path: str | Path, gaussians: Gaussians, comments: Iterable[str]) -> str | None:
+    lines, body, clipped = packed(export_arrays(path, gaussians))
     with atomic_path(path) as temporary:
-        temporary.write_bytes(ended_header([*header_lines(axes, comments), *lines]) + body)
+        temporary.write_bytes(ended_header([*header_lines(comments), *lines]) + body)
     return f"{path}: the format clips harmonics to ±4." if clipped else None

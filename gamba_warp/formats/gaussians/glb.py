@@ -36,19 +36,18 @@ def harmonic_names(degree: int) -> list[str]:
     ]
 
 
-def save_glb(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0) -> None:
+def save_glb(path: str | Path, gaussians: Gaussians) -> None:
     """Writes one object as ``.glb``, turned to glTF's axes (+y up, front towards +z), atomically.
 
     Args:
         path: file to write.
         gaussians: one object, no batch dimension.
-        min_opacity: Gaussians below it are left out.
 
     Raises:
-        UserError: a value is not finite, nothing is left, or the file cannot be written.
+        UserError: a value is not finite, there is no Gaussian, or the file cannot be written.
         ValueError: there is a batch dimension.
     """
-    arrays = export_arrays(path, gaussians, "opengl", min_opacity)
+    arrays = export_arrays(path, gaussians, "opengl")
     harmonics = arrays["harmonics"]
     rgb = arrays["colors"] if harmonics.shape[1] else arrays["colors"].clip(0, 1)
     opacities = arrays["opacities"].clip(0, 1)[:, None]

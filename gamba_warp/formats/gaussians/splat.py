@@ -23,21 +23,18 @@ RECORD = np.dtype(
 )
 
 
-def splat_bytes(
-    gaussians: Gaussians, *, min_opacity: float = 0.0, name: str | Path = "splat"
-) -> bytes:
+def splat_bytes(gaussians: Gaussians, name: str | Path = "splat") -> bytes:
     """The content of a ``.splat`` file of one object, with OpenCV's axes, without its harmonics.
 
     Args:
         gaussians: one object, no batch dimension.
-        min_opacity: Gaussians below it are left out.
         name: named in errors.
 
     Raises:
-        UserError: a value is not finite, or no Gaussian is left.
+        UserError: a value is not finite, or there is no Gaussian.
         ValueError: there is a batch dimension.
     """
-    arrays = export_arrays(name, gaussians, min_opacity=min_opacity)
+    arrays = export_arrays(name, gaussians)
     weight = arrays["scales"].prod(1) * arrays["opacities"]
     records = np.empty(len(weight), RECORD)
     records["means"], records["scales"] = arrays["means"], arrays["scales"]
@@ -46,7 +43,7 @@ def splat_bytes(
     return records[np.argsort(-weight, kind="stable")].tobytes()
 
 
-def save_splat(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0) -> str | None:
+def save_splat(path: str | Path, gaussians: Gaussians) -> str | None:
     """Writes one object as ``.splat``, atomically; arguments and errors as ``splat_bytes``.
 
     Returns:
@@ -55,7 +52,7 @@ def save_splat(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0
     Raises:
         UserError: also where the file cannot be written.
     """
-    data = splat_bytes(gaussians, min_opacity=min_opacity, name=path)
+    data = splat_bytes(gaussians, path)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     if gaussians.harmonics is None:

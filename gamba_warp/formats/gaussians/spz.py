@@ -35,23 +35,22 @@ _COLOR = 0.15  # of a degree-0 coefficient, so that colours outside [0, 1] have 
 _HALF = 511  # largest of the 9 bits of a rotation's number
 
 
-def save_spz(path: str | Path, gaussians: Gaussians, *, min_opacity: float = 0.0) -> str | None:
+def save_spz(path: str | Path, gaussians: Gaussians) -> str | None:
     """Writes one object as ``.spz``, version 3, turned to the format's axes, atomically.
 
     Args:
         path: file to write.
         gaussians: one object, no batch dimension.
-        min_opacity: Gaussians below it are left out.
 
     Returns:
         A sentence about what is lost beyond the format's precision, or None.
 
     Raises:
-        UserError: a value is not finite, nothing is left, positions are out of the format's range,
-            or the file cannot be written.
+        UserError: a value is not finite, there is no Gaussian, positions are out of the format's
+            range, or the file cannot be written.
         ValueError: there is a batch dimension.
     """
-    arrays = export_arrays(path, gaussians, "opengl", min_opacity)
+    arrays = export_arrays(path, gaussians, "opengl")
     count, harmonics = len(arrays["opacities"]), arrays["harmonics"]
     reach = float(np.abs(arrays["means"]).max())
     bits = next((b for b in range(_FRACTION, -1, -1) if round(reach * 2**b) < 1 << 23), None)

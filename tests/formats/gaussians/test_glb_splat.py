@@ -7,6 +7,7 @@ import torch
 import trimesh
 from helpers.gaussians import some
 from helpers.judges.npm import npm_package, run_node
+from helpers.judges.splats import attributes, covariances, read_glb
 
 from gamba_warp.formats.gaussians.glb import save_glb
 from gamba_warp.formats.gaussians.splat import save_splat
@@ -15,48 +16,6 @@ from gamba_warp.formats.ply import SH_C0
 from gamba_warp.hostile.seeds.shapes import glb
 
 KHR = "KHR_gaussian_splatting"
-
-
-def read_glb(path):
-    data = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON" and size % 4 == 0
-    document = json.loads(data[20 : 20 + size])
-    binary_size, kind = struct.unpack_from("<I4s", data, 20 + size)
-    binary = data[28 + size :]
-    assert kind == b"BIN\0" and binary_size == len(binary) and binary_size % 4 == 0
-    assert document["buffers"] == [{"byteLength": len(binary)}]
-    return document, binary
-
-
-def attributes(document, binary):
-    (primitive,) = document["meshes"][0]["primitives"]
-    out = {}
-    for name, index in primitive["attributes"].items():
-        accessor = document["accessors"][index]
-        view = document["bufferViews"][accessor["bufferView"]]
-        size = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        assert accessor["componentType"] == 5126
-        assert view["byteLength"] == accessor["count"] * size * 4 and view["byteOffset"] % 4 == 0
-        values = np.frombuffer(binary, "<f4", accessor["count"] * size, view["byteOffset"])
-        out[name.removeprefix("KHR_gaussian_splatting:")] = values.reshape(-1, size)
-    return primitive, out
-
-
-def covariances(quats_wxyz, scales):
-    w, x, y, z = np.moveaxis(np.asarray(quats_wxyz, np.float64), -1, 0)
-    rotation = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
-    half = rotation * np.asarray(scales, np.float64)[:, None, :]
-    return half @ half.swapaxes(1, 2)
 
 
 def unit(quats):

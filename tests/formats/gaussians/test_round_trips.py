@@ -7,9 +7,14 @@ from helpers.gaussians import some
 from helpers.judges.splats import check, differences
 
 from gamba_warp.errors import UserError
-from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
+from gamba_warp.formats.gaussians.files import (
+    comments_of,
+    read_gaussians,
+    splat_kind,
+    write_gaussians,
+)
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
-from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
 from gamba_warp.gaussians import Gaussians
 
 HOLD_HARMONICS = [kind for kind in SPLAT_FORMATS if kind != "splat"]
@@ -44,12 +49,33 @@ def test_one_gaussian_without_rotation(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["ply", "compressed-ply"])
-def test_axes_are_turned_and_turned_back(tmp_path, kind):
+def test_files_of_older_versions_are_turned_back(tmp_path, kind):
+    """Those could have y up, and said so in a comment; it is of the axes, and does not go on."""
     gaussians = some(300, degree=2)
-    path, _ = written(tmp_path, gaussians, kind, axes="opengl", comments=["two\nlines"])
+    comments = ["two\nlines", "frame opengl"]
+    path, _ = written(tmp_path, flip_axes(gaussians), kind, comments=comments)
     head = path.read_bytes()[:900]
     assert b"comment frame opengl" in head and b"comment two lines" in head
     check(kind, gaussians, read_gaussians(path))
+    assert comments_of(path)[1:] == ["two lines"]
+
+
+@pytest.mark.parametrize("kind", SPLAT_FORMATS)
+def test_what_comments_say(tmp_path, kind):
+    """No more of them than the header of a file may hold."""
+    path, _ = written(tmp_path, some(), kind, comments=["from a chair", *map(str, range(40))])
+    found = comments_of(path)
+    if "ply" not in kind:
+        assert found == []
+        return
+    assert found[0].startswith("gamba_warp ") and found[1:] == [
+        "from a chair",
+        *map(str, range(30)),
+    ]
+    head, end, rest = path.read_bytes().partition(b"comment from a chair\n")
+    path.write_bytes(head + b"comment " + b"x" * 60_000 + b"\n" + end + rest)
+    again, _ = written(tmp_path, read_gaussians(path), kind, comments=comments_of(path))
+    assert again.read_bytes().count(b"x") < 260 and "from a chair" in comments_of(again)
 
 
 @pytest.mark.parametrize("kind", HOLD_HARMONICS)
@@ -106,12 +132,10 @@ def test_spz_far_and_wide(tmp_path):
 @pytest.mark.parametrize("kind", SPLAT_FORMATS)
 def test_refusals(tmp_path, kind):
     gaussians = some(degree=1)
-    path, _ = written(tmp_path, gaussians, kind, min_opacity=0.5)
-    keep = gaussians.opacities >= 0.5
-    assert read_gaussians(path).num == int(keep.sum())
+    path, _ = written(tmp_path, gaussians, kind)
     before = path.read_bytes()
-    with pytest.raises(UserError, match="no Gaussian has an opacity"):
-        written(tmp_path, gaussians, kind, min_opacity=2)
+    with pytest.raises(UserError, match="a.*: not written, there is no Gaussian"):
+        written(tmp_path, some(0), kind)
     gaussians.harmonics[1, 1] = float("inf")
     with pytest.raises(UserError, match="not written, 1 of 37"):
         written(tmp_path, gaussians, kind)
@@ -137,7 +161,7 @@ def as_text(data):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_text_is_read(tmp_path, degree):
     gaussians = some(degree=degree)
-    save_ply(tmp_path / "a.ply", gaussians, axes="opengl")
+    save_ply(tmp_path / "a.ply", gaussians, comments=["frame opengl"])
     (tmp_path / "b.ply").write_bytes(as_text((tmp_path / "a.ply").read_bytes()))
     check("ply", load_ply(tmp_path / "a.ply"), read_gaussians(tmp_path / "b.ply"))
     assert splat_kind(tmp_path / "b.ply") == "ply"
