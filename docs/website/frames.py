@@ -28,7 +28,7 @@ GREY, DARK = (0.62, 0.62, 0.62), (0.25, 0.25, 0.25)
 # Title, and where x, y and z point in the frame of the input's camera (x right, y down, z forward).
 PANELS = (
     ("opencv: Gaussians, .ply, .splat", ((1, 0, 0), (0, 1, 0), (0, 0, 1))),
-    ("opengl: .glb, gamba export", ((1, 0, 0), (0, -1, 0), (0, 0, -1))),
+    ("opengl: meshes, .glb, .spz", ((1, 0, 0), (0, -1, 0), (0, 0, -1))),
     ("datasets: z up", ((1, 0, 0), (0, 0, 1), (0, -1, 0))),
 )
 Line = tuple[tuple[float, ...], tuple[float, ...], tuple[float, float, float]]
