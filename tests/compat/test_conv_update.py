@@ -5,7 +5,13 @@ import torch
 import torch.nn.functional as F
 from helpers import assert_rel_rms
 
-from gamba_warp.compat.causal_conv1d import causal_conv1d_fn, causal_conv1d_update
+from gamba_warp.compat.causal_conv1d import (
+    causal_conv1d_fn,
+    causal_conv1d_ref,
+    causal_conv1d_update,
+    causal_conv1d_update_ref,
+)
+from gamba_warp.compat.causal_conv1d.causal_conv1d_varlen import causal_conv1d_varlen_states
 
 LIMITS = {torch.float32: 5e-7, torch.float16: 5e-4, torch.bfloat16: 4e-3}  # half an ulp
 
@@ -22,7 +28,8 @@ def whole(tokens, weight, bias, activation):
 @pytest.mark.parametrize("ring", [False, True])
 @pytest.mark.parametrize("width, size", [(2, 1), (3, 3), (4, 4), (4, 3), (3, 9)])
 @pytest.mark.parametrize("bias, activation", [(True, "silu"), (False, None)])
-def test_pieces_make_the_whole(width, size, ring, bias, activation, dtype):
+@pytest.mark.parametrize("update", [causal_conv1d_update, causal_conv1d_update_ref])
+def test_pieces_make_the_whole(width, size, ring, bias, activation, dtype, update):
     batch, channels, pieces = 3, 5, (1, 1, 4, 2, 1, 11, 1)
     tokens = torch.randn(batch, channels, sum(pieces)).to(dtype)
     weight = torch.randn(channels, width)
@@ -32,13 +39,47 @@ def test_pieces_make_the_whole(width, size, ring, bias, activation, dtype):
     for piece in tokens.split(pieces, -1):
         at = torch.full((batch,), seen, dtype=torch.int32) if ring else None
         piece = piece[..., 0] if piece.shape[2] == 1 else piece
-        out = causal_conv1d_update(piece, state, weight, bias, activation, cache_seqlens=at)
+        out = update(piece, state, weight, bias, activation, cache_seqlens=at)
         assert out.shape == piece.shape and out.dtype == dtype
         outs.append(out.view(batch, channels, -1))
         seen += outs[-1].shape[2]
     assert_rel_rms(torch.cat(outs, -1), whole(tokens, weight, bias, activation), LIMITS[dtype], "")
     columns = [t % size if ring else t - seen + size for t in range(seen - size, seen)]
     assert torch.equal(state[..., columns], tokens[..., seen - size :])
+
+
+@pytest.mark.parametrize("states, activation", [(False, None), (True, "swish")])
+def test_the_reference(states, activation):
+    """In float64 and any number of taps; its gradient flows."""
+    x, weight = torch.randn(2, 3, 11).double().requires_grad_(), torch.randn(3, 6).double()
+    bias, first = torch.randn(3).double(), torch.randn(2, 3, 5).double()
+    before = first if states else torch.zeros_like(first)
+    out, final = causal_conv1d_ref(
+        x, weight, bias, first if states else None, True, activation=activation
+    )
+    padded = torch.cat([before, x], -1)
+    want = whole(padded, weight, bias, activation)[..., 5:]
+    assert torch.allclose(out, want, atol=1e-12) and torch.equal(final, padded[..., -5:])
+    given = torch.empty_like(first)
+    assert (
+        causal_conv1d_ref(x, weight, return_final_states=True, final_states_out=given)[1] is given
+    )
+    grads = [torch.autograd.grad(y.sum(), x, retain_graph=True)[0] for y in (out, want)]
+    assert torch.allclose(*grads, atol=1e-12)
+    for wrong in ({"activation": "relu"}, {"seq_idx": torch.zeros(2, 11)}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            causal_conv1d_ref(x, weight, **wrong)
+
+
+@pytest.mark.parametrize("lengths", [(3, 1, 7), (0, 4, 0), (0, 0)])
+def test_the_states_of_packed_sequences(lengths):
+    x = torch.randn(sum(lengths), 5)
+    ends = torch.tensor([0, *lengths]).cumsum(0).int()
+    got = causal_conv1d_varlen_states(x, ends, 4)
+    want = [F.pad(part.T, (4, 0))[:, -4:] for part in x.split(lengths)]
+    assert torch.equal(got, torch.stack(want))
+    with pytest.raises(ValueError, match="cu_seqlens"):
+        causal_conv1d_varlen_states(x[None], ends, 4)
 
 
 def test_each_ring_has_its_own_place():

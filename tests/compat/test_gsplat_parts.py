@@ -263,5 +263,3 @@ def test_refusals():
     lists = torch.zeros(1, 1, 1, dtype=torch.int32), torch.tensor([3], dtype=torch.int32)
     with pytest.raises(ValueError, match="flatten_ids has 3 to 3 of 3 rows"):
         compat.rasterize_to_pixels(*parts, 4, 4, 16, *lists)
-    with pytest.raises(AttributeError, match="rasterization_2dgs is not here"):
-        compat.rasterization_2dgs  # noqa: B018

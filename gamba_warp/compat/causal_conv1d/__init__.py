@@ -1,5 +1,27 @@
-"""causal-conv1d's public names over our convolution."""
+"""causal-conv1d's public names over our convolution, and its reference functions."""
 
-from .causal_conv1d_interface import causal_conv1d_fn, causal_conv1d_update
+from ..absent import complete
+from .causal_conv1d_interface import (
+    causal_conv1d_fn,
+    causal_conv1d_ref,
+    causal_conv1d_update,
+    causal_conv1d_update_ref,
+)
 
-__all__ = ["causal_conv1d_fn", "causal_conv1d_update"]
+__all__ = [
+    "causal_conv1d_fn",
+    "causal_conv1d_ref",
+    "causal_conv1d_update",
+    "causal_conv1d_update_ref",
+]
+
+ABSENT = complete(
+    __name__,
+    "causal-conv1d",
+    "causal_conv1d_fn and causal_conv1d_update are",
+    {
+        "causal_conv1d_interface": "CausalConv1dFn",
+        "cpp_functions": "causal_conv1d_bwd_function causal_conv1d_fwd_function "
+        "causal_conv1d_update_function",
+    },
+)

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...kernels.causal_conv1d import causal_conv1d_fn
+from ...kernels.causal_conv1d.reference import causal_conv1d_reference
 from ...kernels.selective_scan.cpu.step import conv_step
 from ..states import (
     check_dtype,
@@ -17,7 +18,12 @@ from ..states import (
     without_gradient,
 )
 
-__all__ = ["causal_conv1d_fn", "causal_conv1d_update"]
+__all__ = [
+    "causal_conv1d_fn",
+    "causal_conv1d_ref",
+    "causal_conv1d_update",
+    "causal_conv1d_update_ref",
+]
 
 ACTIVATIONS = (None, "silu", "swish")
 
@@ -76,6 +82,89 @@ def causal_conv1d_update(
     if conv_state_indices is not None:
         out = put_rows(conv_state, conv_state_indices, state, out)
     return out.to(x.dtype)
+
+
+def causal_conv1d_ref(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    initial_states: Tensor | None = None,
+    return_final_states: bool = False,
+    final_states_out: Tensor | None = None,
+    activation: str | None = None,
+    seq_idx: None = None,
+) -> Tensor | tuple[Tensor, Tensor]:
+    """The convolution in plain torch and the dtype of ``weight``, to compare with.
+
+    Args:
+        x: ``[B, D, L]``, any real float dtype, as ``causal_conv1d_fn``; likewise the others.
+        weight: ``[D, W]``, any W.
+        bias: ``[D]``, or None for 0.
+        initial_states: ``[B, D, W-1]``, or None for 0.
+        return_final_states: also return the last W - 1 tokens, ``[B, D, W-1]``.
+        final_states_out: where to write them, or None.
+        activation: None, "silu" or "swish" (the same).
+        seq_idx: must be None.
+
+    Returns:
+        The shape and dtype of x, and the final states if asked for.
+
+    Raises:
+        ValueError: another ``activation``, or a ``seq_idx``.
+    """
+    if seq_idx is not None:
+        raise ValueError("seq_idx is given; packed sequences are not supported")
+    if activation not in ACTIVATIONS:
+        raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")
+    first = None if initial_states is None else initial_states.mT.to(weight.dtype)
+    out, final = causal_conv1d_reference(x.mT.to(weight.dtype), weight, bias, first, activation)
+    out, final = out.mT.to(x.dtype), final.mT.to(x.dtype)
+    if final_states_out is not None:
+        final = final_states_out.copy_(final)
+    return (out, final) if return_final_states else out
+
+
+def causal_conv1d_update_ref(
+    x: Tensor,
+    conv_state: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    activation: str | None = None,
+    cache_seqlens: Tensor | None = None,
+) -> Tensor:
+    """``causal_conv1d_update`` in plain torch and the dtype of ``weight``, to compare with.
+
+    Args:
+        x: ``[B, D]`` or ``[B, D, L]``, any real float dtype.
+        conv_state: ``[B, D, S]``, S at least W - 1; the tokens are written into it.
+        weight: ``[D, W]``, any W.
+        bias: ``[D]``, or None for 0.
+        activation: None, "silu" or "swish" (the same).
+        cache_seqlens: ``[B]`` integers; with it the state is a ring, as in
+            ``causal_conv1d_update``.
+
+    Returns:
+        The shape and dtype of x.
+
+    Raises:
+        ValueError: another ``activation``.
+    """
+    tokens = x[..., None] if x.dim() == 2 else x
+    size, before = conv_state.shape[2], weight.shape[1] - 1
+    if cache_seqlens is None:
+        every = torch.cat([conv_state, tokens.to(conv_state.dtype)], -1)
+        seen = conv_state[..., size - before :].clone()
+        conv_state.copy_(every[..., every.shape[2] - size :])
+    else:
+        places = cache_seqlens.long()[:, None] + torch.arange(-before, 0, device=x.device)
+        columns = places.remainder(size)[:, None].expand(-1, conv_state.shape[1], -1)
+        seen = conv_state.gather(2, columns)
+        for t in range(tokens.shape[2]):
+            at = (cache_seqlens.long() + t).remainder(size)[:, None, None]
+            token = tokens[..., t : t + 1].to(conv_state.dtype)
+            conv_state.scatter_(2, at.expand_as(token), token)
+    out = causal_conv1d_ref(tokens, weight, bias, seen, activation=activation)
+    return out[..., 0] if x.dim() == 2 else out
 
 
 def _check(x, conv_state, weight, bias, activation, cache_seqlens, indices) -> Tensor:

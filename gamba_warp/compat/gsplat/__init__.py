@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..absent import complete
 from .checks import RollingShutterType
 from .pixels import rasterize_to_pixels
 from .projection import fully_fused_projection
@@ -34,19 +35,56 @@ __all__ = [
 
 _OF_STRATEGY = ("DefaultStrategy", "MCMCStrategy", "Strategy")
 _OF_GSPLAT = ("PngCompression", "export_splats")
-_NOT_HERE = (
-    "SelectiveAdam",
-    "accumulate",
-    "accumulate_2dgs",
-    "fully_fused_projection_2dgs",
-    "fully_fused_projection_with_ut",
-    "rasterization_2dgs",
-    "rasterization_2dgs_inria_wrapper",
-    "rasterization_inria_wrapper",
-    "rasterize_to_indices_in_range",
-    "rasterize_to_indices_in_range_2dgs",
-    "rasterize_to_pixels_2dgs",
-    "rasterize_to_pixels_eval3d",
+# Names of gsplat 1.5.3, in the first place those of later versions behind them.
+ABSENT = complete(
+    __name__,
+    "gsplat",
+    "only its pinhole path of 3DGS is",
+    {
+        "": "SelectiveAdam accumulate accumulate_2dgs fully_fused_projection_2dgs "
+        "fully_fused_projection_with_ut rasterization_2dgs rasterization_2dgs_inria_wrapper "
+        "rasterization_inria_wrapper rasterize_to_indices_in_range "
+        "rasterize_to_indices_in_range_2dgs rasterize_to_pixels_2dgs rasterize_to_pixels_eval3d "
+        "CameraModel ExternalDistortionModelMeta ExternalDistortionModelParameters "
+        "FusedGaussianLosses LidarTiling RasterizeMode RenderMode RendererConfig "
+        "RendererConfig_MixedBatch RendererConfig_ParallelBatch "
+        "RowOffsetStructuredSpinningLidarModelParameters "
+        "RowOffsetStructuredSpinningLidarModelParametersExt SpinningDirection "
+        "build_sparse_tile_layout color_correct_affine color_correct_quadratic "
+        "compute_lidar_angles_to_columns_map compute_lidar_tiling create_ssim_window depth_l1_loss "
+        "gaussian_density_reg gaussian_scale_reg gaussian_z_scale_reg has_2dgs has_3dgs has_3dgut "
+        "has_adam has_camera_wrappers has_losses has_reloc isect_tiles_lidar isect_tiles_sparse "
+        "l1_loss lidar_background_loss lidar_distance_loss lidar_intensity_loss "
+        "lidar_raydrop_loss mse_loss opacity_reg_loss out_of_bound_loss "
+        "rasterize_contributing_gaussian_ids rasterize_contributing_gaussian_ids_sparse "
+        "rasterize_num_contributing_gaussians rasterize_num_contributing_gaussians_sparse "
+        "rasterize_to_pixels_sparse rasterize_top_contributing_gaussian_ids "
+        "rasterize_top_contributing_gaussian_ids_sparse scale_reg_loss spherical_harmonics_l0 "
+        "spherical_harmonics_l1_plus ssim_loss torch_ssim_loss total_variation_loss",
+        "compression": "PngCompression",
+        "compression.png_compression": "PngCompression",
+        "compression.sort": "sort_splats",
+        "cuda._torch_impl": "accumulate",
+        "cuda._torch_impl_2dgs": "accumulate_2dgs",
+        "cuda._wrapper": "FThetaCameraDistortionParameters FThetaPolynomialType RollingShutterType "
+        "UnscentedTransformParameters adam fully_fused_projection fully_fused_projection_2dgs "
+        "fully_fused_projection_with_ut isect_offset_encode isect_tiles persp_proj proj "
+        "quat_scale_to_covar_preci rasterize_to_indices_in_range "
+        "rasterize_to_indices_in_range_2dgs rasterize_to_pixels rasterize_to_pixels_2dgs "
+        "rasterize_to_pixels_eval3d spherical_harmonics world_to_cam",
+        "distributed": "all_gather_int32 all_gather_tensor_list all_to_all_int32 "
+        "all_to_all_tensor_list cli",
+        "exporter": "export_splats sh2rgb sort_centers splat2ply_bytes "
+        "splat2ply_bytes_compressed splat2splat_bytes",
+        "optimizers": "SelectiveAdam",
+        "optimizers.selective_adam": "SelectiveAdam",
+        "profile": "profiler timeit",
+        "rendering": "rasterization_2dgs rasterization_2dgs_inria_wrapper "
+        "rasterization_inria_wrapper",
+        "utils": "depth_to_normal depth_to_points get_projection_matrix inverse_log_transform "
+        "log_transform normalized_quat_to_rotmat save_ply",
+    },
+    (*_OF_STRATEGY, *_OF_GSPLAT),
 )
 
 
@@ -59,6 +97,4 @@ def __getattr__(name: str) -> Any:
         import gsplat
 
         return getattr(gsplat, name)
-    if name in _NOT_HERE:
-        raise AttributeError(f"gsplat's {name} is not here: only its pinhole path of 3DGS is")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,102 @@
+"""Names of other packages that are not here: importable, one line when used, and in the pages."""
+
+import importlib
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Optional
+
+import pytest
+import torch
+
+from gamba_warp.compat import causal_conv1d, gsplat, mamba_ssm
+
+DOCS = Path(__file__).parents[2] / "docs"
+PACKAGES = {"gsplat": gsplat, "mamba": mamba_ssm, "causal_conv1d": causal_conv1d}
+NAMES = [
+    pytest.param(package, path, names, id=f"{key}.{path}")
+    for key, package in PACKAGES.items()
+    for path, names in package.ABSENT.items()
+]
+
+
+@pytest.mark.parametrize("package, path, names", NAMES)
+def test_each_is_imported_and_says_so_when_used(package, path, names):
+    module = f"{package.__name__}.{path}".rstrip(".")
+    space: dict = {}
+    exec(f"from {module} import {', '.join(names)}\nimport {module}", space)
+    for name in names:
+        absent = space[name]
+        assert Optional[absent] == absent | None  # noqa: UP045
+        uses = (
+            lambda: absent(1, device="cpu"),  # noqa: B023
+            lambda: isinstance("", (int, absent)),  # noqa: B023
+            lambda: issubclass(torch.nn.Linear, absent),  # noqa: B023
+            lambda: type("Mine", (torch.nn.Module, absent), {}),  # noqa: B023
+            lambda: absent.from_pretrained,  # noqa: B023
+        )
+        for use in uses:
+            with pytest.raises(NotImplementedError, match=f"^.*'s {name} is not here: .*$"):
+                use()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from gamba_warp.compat.gsplat import rasterization_3dgs",
+        "from gamba_warp.compat.gsplat.compression import rasterization",
+        "from gamba_warp.compat.mamba_ssm import Mamba4",
+        "from gamba_warp.compat.mamba_ssm.modules.mamba2 import Mamba3",
+        "import gamba_warp.compat.mamba_ssm.modules.mamba4",
+        "import gamba_warp.compat.causal_conv1d.cpp_functions.more",
+    ],
+)
+def test_what_the_original_lacks_too_is_an_import_error(line):
+    with pytest.raises(ImportError):
+        exec(line)
+
+
+def test_names_that_are_here_are_so_under_every_path():
+    wrapper = importlib.import_module("gamba_warp.compat.gsplat.cuda._wrapper")
+    assert wrapper.rasterize_to_pixels is gsplat.rasterize_to_pixels
+    assert gsplat.cuda._wrapper is wrapper
+
+
+@pytest.mark.parametrize(
+    "page, packages",
+    [("drop-in-gsplat.md", [gsplat]), ("drop-in-mamba.md", [mamba_ssm, causal_conv1d])],
+)
+def test_the_pages_list_them_all(page, packages):
+    text = (DOCS / page).read_text(encoding="utf-8")
+    (section,) = re.findall(r"(?s)\n## Names that are not here\n(.*?)\n## ", text)
+    tables = re.findall(r"(?s)\| --- \| --- \|\n(.*?)\n\n", section + "\n\n")
+    for table, package in zip(tables, packages, strict=True):
+        listed = {}
+        for row in table.splitlines():
+            module, names = row.strip("| ").split(" | ")
+            listed[module.strip("`").replace("the package", "")] = re.findall(r"`(\w+)`", names)
+        assert listed == package.ABSENT
+
+
+def test_nothing_of_gsplat_is_missing():
+    """Public names of the package that is installed."""
+    if importlib.util.find_spec("gsplat") is None:
+        pytest.skip("needs the package gsplat (pip install gsplat==1.5.3)")
+    for path in ("", "rendering", "utils", "cuda._wrapper", "distributed", "optimizers"):
+        theirs = importlib.import_module(f"gsplat.{path}".rstrip("."))
+        ours = importlib.import_module(f"{gsplat.__name__}.{path}".rstrip("."))
+        names = {
+            name
+            for name, value in vars(theirs).items()
+            if callable(value) and not name.startswith("_")
+            if (path == "" or value.__module__ == theirs.__name__)
+        }
+        assert {name for name in names if not hasattr(ours, name)} == set()
+
+
+def test_importing_loads_nothing_else():
+    code = "import gamba_warp.compat.gsplat.cuda._wrapper, sys; print('gsplat' in sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout == "False\n"
