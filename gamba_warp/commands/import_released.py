@@ -15,6 +15,7 @@ def import_released_command(
     /,
     out: Path = Path("released"),
     encoder_weights: Path | None = None,
+    depth: int = 14,
 ) -> int:
     """Turns the weights that the authors of Gamba published into a model folder.
 
@@ -22,16 +23,17 @@ def import_released_command(
     quirks of the public code (docs/released.md); nothing in the file is run.
 
     Args:
-        file: Their file (.pth or .safetensors).
+        file: Their file (.pth or .safetensors), in any float dtype.
         out: Folder for the model; files of the same names in it are replaced.
         encoder_weights: DINOv2 ViT with registers: Meta's own file, or timm's; only for a file
             that lacks it.
+        depth: Blocks that the file must hold; 14 are published, fewer would be a part of them.
     """
     from ..model.pretrained import WRITTEN
     from ..model.released import load_released
 
     check_not_read([out / name for name in WRITTEN], [file, encoder_weights])
-    model = load_released(file, encoder_weights)
+    model = load_released(file, encoder_weights, depth)
     model.save_pretrained(out)
     config = model.config
     print(

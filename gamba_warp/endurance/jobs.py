@@ -235,7 +235,7 @@ def _other_jobs(world: Path) -> list[Job]:
             "import-released",
             lambda out: [
                 *(world / "released" / "theirs.pth", "--out", out),
-                *("--encoder-weights", world / "released" / "vit.safetensors"),
+                *("--encoder-weights", world / "released" / "vit.safetensors", "--depth", 1),
             ],
             (),
         ),

@@ -247,7 +247,7 @@ def _released(path: Path, out: Path) -> Any:
     from ..model.encoders import read_state
     from ..model.released import convert_released
 
-    return convert_released(read_state(path), str(path))
+    return convert_released(read_state(path), str(path), 1)
 
 
 def _sam(path: Path, out: Path) -> Any:

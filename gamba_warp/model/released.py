@@ -20,6 +20,7 @@ from .config import PRESETS, GambaConfig
 from .encoders import Weights, outline_encoder, read_state
 from .gamba import Gamba
 
+DEPTH = PRESETS["released"].depth  # blocks of the published network
 _ROOT, _ENCODER = "model.", "model.map_image.model."
 _BLOCK = "transformer.layers.{}."
 # Theirs to ours, of a block and of the rest.
@@ -51,6 +52,7 @@ for _theirs, _ours in (
     for _end in ("weight", "bias"):
         _NAMES[f"decoder.{_theirs}.{_end}"] = f"decoder.{_ours}.{_end}"
 _COORDS = "decoder.coords"
+_WRAPPERS = re.compile(r"(?<![^.])(?:module|_orig_mod)\.")
 # DINOv2 with registers, by the channels of its tokens.
 _VITS = {
     channels: f"vit_{size}_patch14_reg4_dinov2"
@@ -60,13 +62,16 @@ _VITS = {
 _TURNED = [4, 5, 7, 8]
 
 
-def load_released(path: str | Path, encoder_weights: Weights | None = None) -> Gamba:
+def load_released(
+    path: str | Path, encoder_weights: Weights | None = None, depth: int = DEPTH
+) -> Gamba:
     """Reads the authors' file of weights as a model with the quirks of their code.
 
     Args:
-        path: what their training writes, with DINOv2's weights under ``model.map_image`` or
-            without.
+        path: what their training writes, in any float dtype, with DINOv2's weights under
+            ``model.map_image`` or without.
         encoder_weights: as for ``build_encoder``, in place of those in the file.
+        depth: the number of blocks that the file must hold.
 
     Returns:
         The model, float32 on the CPU, in eval mode.
@@ -76,13 +81,13 @@ def load_released(path: str | Path, encoder_weights: Weights | None = None) -> G
             given.
     """
     path = Path(path)
-    state = read_state(path)
+    state = _plain_names(read_state(path), str(path))
     encoder = {
-        name.removeprefix(_ENCODER): value
+        name.removeprefix(_ENCODER): value.float() if isinstance(value, Tensor) else value
         for name, value in state.items()
         if name.startswith(_ENCODER)
     }
-    config, weights = convert_released(state, str(path))
+    config, weights = convert_released(state, str(path), depth)
     if encoder_weights is None and not encoder:
         raise UserError(
             f"{path}: has no image encoder (model.map_image); name a file of DINOv2's weights"
@@ -92,31 +97,45 @@ def load_released(path: str | Path, encoder_weights: Weights | None = None) -> G
     return model.eval()
 
 
-def convert_released(state: dict[str, Any], path: str) -> tuple[GambaConfig, dict[str, Tensor]]:
+def convert_released(
+    state: dict[str, Any], path: str, depth: int = DEPTH
+) -> tuple[GambaConfig, dict[str, Tensor]]:
     """The configuration that a state dict of theirs means, and the same weights by our names.
 
     Args:
-        state: theirs, by names that begin with ``model.``; what belongs to the image encoder and
-            to losses is passed over.
+        state: theirs, by names that begin with ``model.``, or none does; what belongs to the image
+            encoder and to losses is passed over. ``module.`` and ``_orig_mod.``, which training on
+            several GPUs and torch's compiler put into names, are left out.
         path: for the error message.
+        depth: the number of blocks that it must hold: nothing else in it tells whether the last
+            ones are missing.
 
     Returns:
-        The preset ``released`` at the sizes of the tensors, and what ``load_stored_state`` takes.
+        The preset ``released`` at the sizes of the tensors, and what ``load_stored_state`` takes,
+        float32.
 
     Raises:
         UserError: a tensor is missing, unknown, not finite or of an impossible shape.
     """
     found: dict[str, Tensor] = {}
-    for name, value in state.items():
+    stored = torch.float32
+    for name, value in _plain_names(state, path).items():
         if not name.startswith(_ROOT) or name.startswith(_ENCODER):
             continue
         if not isinstance(value, Tensor) or not value.is_floating_point():
             raise UserError(f"{path}: '{name[:100]}' is no tensor of floating-point numbers")
+        stored = value.dtype if name == _ROOT + _COORDS else stored
+        value = value.float()
         if not value.isfinite().all():
             raise UserError(f"{path}: '{name[:100]}' has numbers that are not finite")
-        found[name.removeprefix(_ROOT)] = value.float()
+        found[name.removeprefix(_ROOT)] = value
     try:
-        config = _config(found)
+        config = _config(found, stored)
+        if config.depth != depth:
+            raise UserError(
+                f"holds {config.depth} blocks, not {depth}: a part is missing, or it is another "
+                f"network, which --depth {config.depth} takes as it is"
+            )
         weights = _renamed(found, config.depth)
         with torch.device("meta"):  # before anything takes memory that the file does not hold
             outline = Gamba(config, encoder=outline_encoder(config))
@@ -131,6 +150,16 @@ def convert_released(state: dict[str, Any], path: str) -> tuple[GambaConfig, dic
         first = sorted(found)[0][:100]
         raise UserError(f"{path}: has an unknown tensor '{_ROOT}{first}' ({len(found)} such)")
     return config, weights
+
+
+def _plain_names(state: dict[str, Any], path: str) -> dict[str, Any]:
+    """The same by the names of their code: without wrappers' parts, and below ``model.``."""
+    plain = {_WRAPPERS.sub("", name): value for name, value in state.items()}
+    if len(plain) < len(state):
+        raise UserError(f"{path}: has a tensor twice, with 'module.' or '_orig_mod.' and without")
+    if any(name.startswith(_ROOT) for name in plain):
+        return plain
+    return {_ROOT + name: value for name, value in plain.items()}
 
 
 def released_names(depth: int) -> dict[str, str]:
@@ -148,8 +177,8 @@ def _shape(found: dict[str, Tensor], name: str, axes: int) -> list[int]:
     return shape
 
 
-def _config(found: dict[str, Tensor]) -> GambaConfig:
-    """The preset at the sizes of the tensors, with those points of the position."""
+def _config(found: dict[str, Tensor], stored: torch.dtype) -> GambaConfig:
+    """The preset at the sizes of the tensors, with those points, stored in that dtype."""
     width, _, patch, _ = _shape(found, "stem_layer.weight", 4)
     tokens, _ = _shape(found, "transformer.pos_embed", 2)
     block = _BLOCK.format(0)
@@ -160,9 +189,13 @@ def _config(found: dict[str, Tensor]) -> GambaConfig:
     hidden, _ = _shape(found, "decoder.mlp_net.layers.0.weight", 2)
     bins = _shape(found, _COORDS, 2)[1]
     points = found.pop(_COORDS)
-    limit = float(points[0, -1]) if points.numel() else 0.0
+    limit = _decimal(points[0, -1].to(stored)) if points.numel() else 0.0
     even = torch.linspace(-limit, limit, bins)
-    if points.shape[0] != 3 or bins < 2 or not torch.allclose(points, even, atol=1e-6):
+    # Even points are even no more once each is rounded: by half a unit of the last place of the
+    # largest at most, 0.0016 in bfloat16 at 0.4, where the points are 0.04 apart. 1e-6 is for the
+    # sum by which a float32 point was made.
+    near = max(1e-6, limit * torch.finfo(stored).eps)
+    if points.shape[0] != 3 or bins < 2 or not torch.allclose(points, even, rtol=0, atol=near):
         raise ValueError(f"'{_COORDS}' is not the same even points on three axes")
     grid = round((tokens / 4) ** 0.5)
     if tokens != 4 * grid**2 or not grid:
@@ -183,9 +216,15 @@ def _config(found: dict[str, Tensor]) -> GambaConfig:
         "encoder": _VITS[channels],
         "decoder_width": hidden,
         "position_bins": bins,
-        "position_range": round(limit, 6),
+        "position_range": limit,
     }
     return GambaConfig(**fields)
+
+
+def _decimal(value: Tensor) -> float:
+    """The shortest decimal number that is stored as this one: 0.4 for bfloat16's 0.400390625."""
+    numbers = (float(f"{float(value):.{digits}g}") for digits in range(1, 18))
+    return next(x for x in numbers if float(torch.tensor(x).to(value.dtype)) == float(value))
 
 
 def _renamed(found: dict[str, Tensor], depth: int) -> dict[str, Tensor]:

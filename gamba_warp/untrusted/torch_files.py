@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 import zipfile
 from pathlib import Path
@@ -52,6 +53,10 @@ def read_torch(path: str | Path, advice: str = "damaged, or not torch's") -> Any
     except UserError:
         raise
     except Exception as error:  # pickle, zip and torch raise errors of a dozen classes
+        refused = re.search(r"GLOBAL (\S+)", str(error))
+        if refused:  # torch says it behind lines that advise to let the file run
+            named = f"it holds {refused[1][:100]!r}, of which torch reads none"
+            raise UserError(f"{path}: {advice} ({named})") from error
         lines = str(error).strip().splitlines()
         reason = lines[0][:200] if lines else type(error).__name__
         raise UserError(f"{path}: {advice} ({reason})") from error

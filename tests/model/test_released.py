@@ -1,5 +1,8 @@
 """The authors' public network: what it computes at a small size, each of its quirks, their file."""
 
+import inspect
+import os
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +17,7 @@ from timm.models.vision_transformer import _create_vision_transformer
 from torch.nn import functional as F
 
 from gamba_warp import cli
+from gamba_warp.commands.import_released import import_released_command
 from gamba_warp.errors import UserError
 from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
 from gamba_warp.model import released
@@ -24,7 +28,7 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.decoder import GaussianDecoder
 from gamba_warp.model.parts.tokens import scan_orders
 from gamba_warp.model.posing import reference_cameras
-from gamba_warp.model.released import convert_released, load_released
+from gamba_warp.model.released import DEPTH, convert_released, load_released
 
 # What their code computed, with random weights: their state dict, its inputs and its output.
 GOLDEN = Path(__file__).with_name("released_small.npz")
@@ -67,7 +71,7 @@ class _Given(torch.nn.Module):
 
 def _gaussians(golden, monkeypatch):
     """Ours from the golden inputs, which are turned into our world."""
-    config, weights = convert_released(_state(golden), "golden")
+    config, weights = convert_released(_state(golden), "golden", 2)
     model = Gamba(config, encoder=_Given(golden["condition_tokens"]))
     model.load_stored_state(weights)
     pixels = golden["image_and_rays"].clone()
@@ -119,7 +123,7 @@ def test_the_ply_file_equals_theirs(golden, monkeypatch, tmp_path):
 
 
 def test_config_is_the_preset_at_their_sizes(golden):
-    config, _ = convert_released(_state(golden), "golden")
+    config, _ = convert_released(_state(golden), "golden", 2)
     small = {"image_size": 64, "width": 64, "depth": 2, "dt_rank": 4}
     assert config == replace(PRESETS["released"], **small)
 
@@ -147,9 +151,9 @@ def wide(monkeypatch):
 
 def test_the_command_makes_a_folder_that_loads(golden, tmp_path, wide, capsys):
     path, out = _file(golden, tmp_path), tmp_path / "released"
-    assert cli.run("import-released", [str(path), "--out", str(out)]) == 0
+    assert cli.run("import-released", [str(path), "--out", str(out), "--depth", "2"]) == 0
     assert "2 blocks of 64 channels, 256 Gaussians" in capsys.readouterr().out
-    model, want = load_model(out), load_released(path)
+    model, want = load_model(out), load_released(path, depth=2)
     assert model.config == want.config and not model.training
     images, cameras = torch.rand(1, 64, 64, 3), reference_cameras(model.config, 1)
     with torch.no_grad():
@@ -164,13 +168,82 @@ def test_the_command_makes_a_folder_that_loads(golden, tmp_path, wide, capsys):
 
 
 def test_encoder_from_a_file_of_its_own(golden, tmp_path, wide):
-    whole = load_released(_file(golden, tmp_path))
+    whole = load_released(_file(golden, tmp_path), depth=2)
     save_file(whole.encoder.weights(), tmp_path / "vit.safetensors")
     path = _file(golden, tmp_path, encoder=False)
-    model = load_released(path, tmp_path / "vit.safetensors")
+    model = load_released(path, tmp_path / "vit.safetensors", 2)
     assert model.encoder.fingerprint == whole.encoder.fingerprint
     with pytest.raises(UserError, match=r"theirs.pth: has no image encoder"):
-        load_released(path)
+        load_released(path, depth=2)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
+def test_any_float_dtype(golden, tmp_path, wide, dtype):
+    """The points of the position are even no more once they are rounded."""
+    path = _file(golden, tmp_path)
+    content = torch.load(path)["model"]
+    rounded = {name: value.to(dtype) for name, value in content.items()}
+    torch.save(rounded, path)
+    got = load_released(path, depth=2)
+    points = content["model.decoder.coords"]
+    weights = {k: v.float() for k, v in rounded.items()} | {"model.decoder.coords": points}
+    torch.save(weights, path)
+    want = load_released(path, depth=2)
+    assert got.config == want.config and got.config.position_range == 0.4
+    assert all(x.dtype == torch.float32 for x in got.parameters())
+    for (name, a), b in zip(got.state_dict().items(), want.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    for wrong in (points.square(), points + 0.02, points * torch.tensor([[1], [1], [1.02]])):
+        state = rounded | {"model.decoder.coords": wrong.to(dtype)}
+        with pytest.raises(UserError, match="not the same even points"):
+            convert_released(state, "wrong", 2)
+
+
+@pytest.mark.parametrize("depth, found", [(2, 1), (14, 2), (1, 2)])
+def test_a_file_without_its_last_blocks_is_refused(golden, tmp_path, depth, found):
+    state = _state(golden)
+    part = {
+        k: v for k, v in state.items() if "layers.1.mamba" not in k and "layers.1.cond" not in k
+    }
+    words = f"a: holds {found} blocks?, not {depth}: a part .* --depth {found} takes"
+    with pytest.raises(UserError, match=words):
+        convert_released(part if found == 1 else state, "a", depth)
+    assert DEPTH == PRESETS["released"].depth == 14
+    assert inspect.signature(import_released_command).parameters["depth"].default == DEPTH
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda name: "module." + name,
+        lambda name: "module._orig_mod." + name,
+        lambda name: name.replace("model.", "model._orig_mod.", 1),
+        lambda name: name.removeprefix("model."),
+        lambda name: "_orig_mod." + name.removeprefix("model."),
+    ],
+)
+def test_wrappers_names_are_left_out(golden, tmp_path, wide, change):
+    path = _file(golden, tmp_path)
+    content = {k: v for k, v in torch.load(path)["model"].items() if k.startswith("model.")}
+    want = load_released(path, depth=2)
+    torch.save({change(name): value for name, value in content.items()}, path)
+    got = load_released(path, depth=2)
+    assert got.config == want.config and got.encoder.fingerprint == want.encoder.fingerprint
+    assert torch.equal(got.decoder.position.weight, want.decoder.position.weight)
+    torch.save(content | {"module." + name: value for name, value in content.items()}, path)
+    with pytest.raises(UserError, match="has a tensor twice, with 'module.'"):
+        load_released(path, depth=2)
+
+
+@pytest.mark.parametrize(
+    "thing, name", [(Namespace(lr=1), "argparse.Namespace"), (os.system, "posix.system")]
+)
+def test_an_object_in_the_file_is_named(golden, tmp_path, thing, name):
+    path = tmp_path / "theirs.pth"
+    torch.save({"model": _state(golden), "args": thing}, path)
+    with pytest.raises(UserError, match=rf"it holds '{name}', of which torch reads none") as caught:
+        load_released(path, depth=2)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +267,7 @@ def test_encoder_from_a_file_of_its_own(golden, tmp_path, wide):
 def test_other_networks_are_one_line(golden, tmp_path, name, value, words):
     path = _file(golden, tmp_path, encoder=False, **{name: value})
     with pytest.raises(UserError, match=words) as caught:
-        load_released(path, "random" if "embedding" in words else None)
+        load_released(path, "random" if "embedding" in words else None, 2)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
