@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from gamba_warp.eval.shapes import occupancy
 from gamba_warp.eval.shapes.compare import compare, shape_iou
 from gamba_warp.eval.shapes.drift import doubled, drift, known_shapes, with_flips, with_hole
 from gamba_warp.eval.shapes.flags import tidied
@@ -79,7 +80,7 @@ def test_holes_and_flips_are_what_they_say():
     assert len(tidied(doubled(ball))[0].faces) == len(ball.faces)
 
 
-def test_open_sheets_hold_nothing():
+def test_open_sheets_hold_nothing(monkeypatch):
     """In one plane, and beside closed parts; what faces another sheet is another matter."""
     corners = np.array([[-0.4, -0.4, 0.0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]])
     square = np.array([[0, 1, 2], [0, 2, 3]])
@@ -87,13 +88,20 @@ def test_open_sheets_hold_nothing():
     sheets = [corners, corners + [0.9, 0, 0]]
     both = Mesh(np.concatenate(sheets) @ turn.T, np.concatenate([square, square + 4]))
     grid = grid_around(both, resolution=24)
+    voters, real = [], occupancy._majority_at
+    monkeypatch.setattr(
+        occupancy, "_majority_at", lambda mesh, points: voters.append(mesh) or real(mesh, points)
+    )
     assert len(connected_parts(both)) == 2 and not solid(both, grid).any()
+    assert voters == [both], "a flat part alone takes no rays"
     small = cube(side=0.25)
     beside = Mesh(
         np.concatenate([small.vertices, corners + [0, 0, 0.3]]),
         np.concatenate([small.faces, square + 8]),
     )
     assert solid(beside, grid_around(beside, resolution=24)).sum() == 6**3
+    empty = shape_iou(both, both, replace(PRESETS["default"], iou_voxels=16))
+    assert empty["iou"] is None and empty["iou_reason"] == "neither shape fills a voxel"
 
 
 @pytest.mark.parametrize("shift", [(0.25, 0, 0), (0.5, 0.25, 0), (0.3, 0.2, 0.1), (1.5, 0, 0)])

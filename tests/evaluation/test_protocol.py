@@ -3,6 +3,7 @@
 import json
 import math
 import stat
+from dataclasses import replace
 
 import pytest
 
@@ -39,6 +40,12 @@ def test_protocols_out_of_range_are_one_line(tmp_path, change, reason):
     with pytest.raises(UserError) as caught:
         read_protocol(str(path))
     assert reason in str(caught.value) and str(caught.value).startswith(f"{path}: ")
+
+
+def test_changes_name_what_is_nested_too():
+    surface = replace(PRESETS["gso"].surface, voxels=100)
+    changed = replace(PRESETS["gso"], seed=3, surface=surface)
+    assert changed.changes() == ["seed", "surface.voxels"] and not PRESETS["gso"].changes()
 
 
 def test_presets_are_in_range():

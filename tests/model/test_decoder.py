@@ -16,6 +16,8 @@ def test_ranges_and_shapes_for_wild_tokens():
     assert gaussians.means.shape == (2, 33, 3) and gaussians.means.abs().max() <= 0.5
     assert gaussians.quats.shape == (2, 33, 4)
     assert (gaussians.scales > 0).all()
+    torch.nn.init.constant_(decoder.scale.bias, -1000)
+    assert (decoder(torch.randn(1, 5, 48)).scales == 1e-6).all(), "files store a logarithm"
     for values in (gaussians.opacities, gaussians.colors):
         assert (values >= 0).all() and (values <= 1).all()
 
@@ -36,6 +38,8 @@ def test_start_values_follow_the_config():
     gaussians = decoder(torch.randn(1, 4000, 48))
     # The heads' small random weights add a little spread around the biases.
     assert 0.025 < gaussians.scales.median() < 0.035
+    large = GaussianDecoder(_config(scale_init=0.1, scale_factor=0.05))(torch.randn(1, 999, 48))
+    assert 0.095 < large.scales.median() < 0.105
     assert 0.25 < gaussians.opacities.median() < 0.35
     assert 0.45 < gaussians.colors.median() < 0.55
     assert gaussians.quats[..., 0].min() > 0.5

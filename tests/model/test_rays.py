@@ -214,6 +214,24 @@ def test_gaussians_follow_the_formulas(rotation):
         assert made.quats is None
 
 
+def test_wild_sizes_and_almost_empty_cells_have_limits():
+    model, (rgba, cameras) = Gamba(rays()), cut_outs([(slice(4, 6), slice(4, 6))])
+    rgba[0, 4:6, 6:8] = torch.tensor([0.6, 0.6, 0.6, 5e-4])  # the cell beside, of the same patch
+    decoder = model.decoder
+    assert isinstance(decoder, RayDecoder)
+    with torch.no_grad():
+        decoder.head.weight.zero_()
+        decoder.head.bias.view(3, -1)[:, 5:8] = torch.tensor([50.0, -50.0, 0.0])
+        made = model(rgba, cameras)
+    footprint = 2 * cameras.viewmats[0, :3, 3].norm() / cameras.Ks[0, 1, 1]
+    want = footprint * torch.tensor([3.0, -4.0]).exp()
+    torch.testing.assert_close(made.scales[0, :, :2], want.expand(made.num, 2))
+    # Under an alpha of 0.001 a colour fades to black: what has none is no quotient of nothing.
+    faint = made.colors[0].view(4, 3, 3)
+    torch.testing.assert_close(faint[1], torch.full((3, 3), 0.3), rtol=1e-4, atol=0)
+    torch.testing.assert_close(faint[2], torch.full((3, 3), 0.01), rtol=1e-4, atol=0)
+
+
 def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
     """A coloured disc with a soft rim as five cameras around it see a flat picture of it."""
     x = torch.linspace(-1, 1, size)

@@ -46,9 +46,9 @@ def test_scan_orders_are_permutations_with_inverses():
 
 def test_camera_numbers_known_answer_and_size_independent():
     viewmat = torch.arange(16.0).reshape(1, 4, 4)
-    K = torch.tensor([[[20.0, 0, 5], [0, 30, 6], [0, 0, 1]]])
+    K = torch.tensor([[[20.0, 0, 4], [0, 30, 6], [0, 0, 1]]])
     cameras = Cameras(viewmat, K, width=10, height=12)
-    want = torch.tensor([[*range(12), 2.0, 2.5, 0.5, 0.5]])
+    want = torch.tensor([[*range(12), 2.0, 2.5, 0.4, 0.5]])
     assert torch.equal(camera_numbers(cameras), want)
     # Rescaling multiplies and divides in float32.
     assert torch.allclose(camera_numbers(cameras.resized(30, 6)), want, rtol=1e-6)

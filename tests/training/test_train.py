@@ -201,6 +201,16 @@ def test_validation_is_on_held_out_objects(data, tmp_path, monkeypatch):
     assert [uids for training, uids in seen if not training] == [("cloudc",)] * 2
 
 
+def test_a_validation_is_of_pictures_in_range(monkeypatch):
+    target = torch.ones(1, 2, 4, 4, 3)
+    shown = SimpleNamespace(rgb=target + 5, alpha=target[..., :1])
+    batch = SimpleNamespace(targets=torch.ones(1, 2, 4, 4, 4), to=lambda device: batch)
+    result = SimpleNamespace(loss=torch.zeros(()), rendering=shown, target=target, terms={})
+    monkeypatch.setattr(step, "forward", lambda *_: result)
+    figures, _ = step.validate(torch.nn.Identity(), [batch], {}, None, torch.device("cpu"))
+    assert figures["psnr_input"] == figures["psnr_novel"] == 100
+
+
 def test_non_finite_step_is_skipped_and_counted(data, tmp_path, monkeypatch, capsys):
     real, calls = step.forward, []
 

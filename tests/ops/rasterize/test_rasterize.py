@@ -50,6 +50,18 @@ def test_antialiased(mode):
     compare(make(1, 2, size=0.025, num=300, width=53), mode, antialiased=True)
 
 
+def test_antialiasing_leaves_a_two_hundredth_of_what_is_tiny():
+    """The factor has a floor, where it has no gradient: sqrt(det Σ) would have an infinite one."""
+    scene = make(1, 1, num=5, width=21, height=18)
+    scene["means"][:], scene["opacities"][:], scene["scales"][:] = 0.0, 0.9, 1e-6
+    got = leaves(scene, torch.float32)
+    opacities = rasterization(**got, rasterize_mode="antialiased")[2]["opacities"]
+    torch.testing.assert_close(opacities, torch.full((1, 1, 5), 0.9 * 0.005))
+    opacities.sum().backward()
+    torch.testing.assert_close(got["opacities"].grad, torch.full((1, 5), 0.005))
+    assert (got["scales"].grad == 0).all()
+
+
 @pytest.mark.parametrize("channels, views, batch", [(1, 1, 1), (2, 1, 3), (5, 2, 1), (17, 1, 1)])
 def test_channels_and_batches(channels, views, batch):
     compare(make(batch, views, channels=channels, width=21, height=18))
