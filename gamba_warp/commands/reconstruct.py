@@ -61,6 +61,7 @@ def reconstruct_command(
     mask: Path | None = None,
     matte_model: Path | None = None,
     sam: Path | None = None,
+    recenter: bool = True,
     save_inputs: bool = False,
     frame: Axes = "opengl",
     min_opacity: Opacity | None = None,
@@ -86,6 +87,8 @@ def reconstruct_command(
         mask: Picture that is white where the object is (for a single image).
         matte_model: ISNet or U2-Net (.onnx) that cuts objects out; else rembg's is used or fetched.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
+        recenter: Bring the object into the middle of the picture, at the size of training; else it
+            stays where and as large as it is in a square picture.
         save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
         frame: Axes of meshes but .glb; opengl is y up, opencv y down as files of Gaussians are.
         min_opacity: Leave out Gaussians fainter than this; 1/255 if not given, below which they
@@ -123,7 +126,7 @@ def reconstruct_command(
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
-    ways = Ways(mask, matte_model, sam, chosen).checked()
+    ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
     output_folder(out)
 
     one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision)

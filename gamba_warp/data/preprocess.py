@@ -147,15 +147,16 @@ def without_specks(alpha: np.ndarray) -> np.ndarray:
     return np.where(sizes[parts] >= 0.01 * sizes.max(), alpha, 0.0)
 
 
-def recenter(rgba: np.ndarray, border_ratio: float = BORDER_RATIO) -> np.ndarray:
+def recenter(rgba: np.ndarray, border_ratio: float | None = BORDER_RATIO) -> np.ndarray:
     """Puts the object's bounding box in the middle of a square, without resampling.
 
     Args:
         rgba: ``[H, W, 4]`` in [0, 1].
-        border_ratio: share of the square's side that the box's longer side leaves free, [0, 1).
+        border_ratio: share of the square's side that the box's longer side leaves free, [0, 1);
+            None puts the whole picture there in place of the box.
 
     Returns:
-        ``[S, S, 4]`` float32; S = longer side / (1 - border_ratio).
+        ``[S, S, 4]`` float32; S = longer side / (1 - border_ratio), or the picture's longer side.
 
     Raises:
         ValueError: hardly any pixel is opaque.
@@ -168,6 +169,8 @@ def recenter(rgba: np.ndarray, border_ratio: float = BORDER_RATIO) -> np.ndarray
         )
     rows, columns = np.flatnonzero(present.any(1)), np.flatnonzero(present.any(0))
     box = rgba[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    if border_ratio is None:
+        box, border_ratio = rgba, 0.0
     height, width = box.shape[:2]
     side = math.ceil(max(height, width) / (1 - border_ratio))
     out = np.zeros((side, side, 4), np.float32)

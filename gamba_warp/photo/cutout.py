@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from ..data.preprocess import (
+    BORDER_RATIO,
     WORKING_SIZE,
     SamSegmenter,
     has_alpha,
@@ -60,6 +61,8 @@ class Ways:
         mask: picture of the same size, white (or opaque) on the object.
         matte_model: an ISNet or U2-Net in ONNX; if None, one of rembg's that is kept, or fetched.
         sam: a checkpoint of Segment Anything, used in place of the matting model.
+        recenter: whether the object is brought into the middle, its longer side ``0.8`` of the
+            square; else the picture keeps its frame, filled up to a square.
         device: device of Segment Anything; the matting model runs on the CPU.
         fetch: whether a matting model may be fetched.
         say: gets a line before anything is fetched.
@@ -68,6 +71,7 @@ class Ways:
     mask: str | Path | None = None
     matte_model: str | Path | None = None
     sam: str | Path | None = None
+    recenter: bool = True
     device: str | torch.device = "cpu"
     fetch: bool = True
     say: Callable[[str], None] = to_stderr
@@ -114,7 +118,7 @@ class CutOut:
 
     Attributes:
         rgba: ``[S, S, 4]`` float32 in [0, 1]: the object in the middle, its longer side
-            ``0.8 · S``.
+            ``0.8 · S``; without ``Ways.recenter`` the object where it is.
         method: the way in which it was found.
         how: that in a sentence.
         source_rgb: the picture, ``[H, W, 3]`` float32 in [0, 1], at most 1024 pixels a side.
@@ -165,7 +169,7 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     if ways.mask is None and not has_alpha(rgba):
         method, rgba, why = _found(path, source, ways)
     try:
-        centred = recenter(rgba)
+        centred = recenter(rgba, BORDER_RATIO if ways.recenter else None)
     except ValueError as error:
         raise UserError(f"{ways.mask or path}: {error}") from error
     model = ways.matte() if method == "matte" else None

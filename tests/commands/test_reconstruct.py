@@ -25,6 +25,7 @@ from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.predict import reconstruct
 from gamba_warp.pages.turntable import save_turntable, turntable_frames
+from gamba_warp.photo import cutout
 from gamba_warp.render import render
 
 
@@ -221,6 +222,12 @@ def test_options_reach_the_files(tmp_path, picture, checkpoint, capsys):
     )
     assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--frame", "opencv") == 0
     torch.testing.assert_close(load_ply(tmp_path / "thing.ply").means, plain.means)
+    assert run_reconstruct(*quick(checkpoint, tmp_path), picture, "--no-recenter") == 0
+    kept = cutout.cut_out(picture, cutout.Ways(recenter=False)).rgba
+    want = reconstruct(load_model(checkpoint), kept).means
+    got = load_ply(tmp_path / "thing.ply").means
+    torch.testing.assert_close(got, want.detach(), atol=1e-5, rtol=0)  # the file's rounding
+    assert not torch.allclose(got, plain.means, atol=1e-3)
 
 
 def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers.images import disc_on_noise
+from PIL import Image
 
 from gamba_warp.data.preprocess import recenter
 from gamba_warp.errors import UserError
@@ -97,6 +98,23 @@ def test_what_no_way_cuts_is_one_line(tmp_path):
         cut_out(path)
     for word in (str(path), "cannot tell object", "GrabCut", "--mask", "--matte-model", "--sam"):
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("height, width", [(60, 60), (40, 60)])
+def test_an_object_may_stay_where_it_is(tmp_path, height, width):
+    pixels = np.zeros((height, width, 4), np.uint8)
+    pixels[5:15, 30:50] = 200, 90, 30, 255
+    path = tmp_path / "off.png"
+    Image.fromarray(pixels).save(path)
+    kept = cut_out(path, Ways(recenter=False)).rgba
+    top = (60 - height) // 2
+    assert kept.shape == (60, 60, 4)
+    np.testing.assert_array_equal(kept[top : top + height] * 255, pixels)
+    assert not kept[:top].any() and not kept[top + height :].any()
+    assert cut_out(path).rgba.shape == (25, 25, 4)
+    Image.fromarray(np.zeros((60, 60, 4), np.uint8)).save(path)
+    with pytest.raises(UserError, match="no object found"):
+        cut_out(path, Ways(recenter=False))
 
 
 def test_the_cut_out_can_be_mended_and_given_again(tmp_path, network, busy):
