@@ -18,6 +18,7 @@ from gamba_warp.viewer.page import write_viewer
 
 CAMERA = (1.5, 49.1, 0.0)
 WIDE, HIGH = 201, 150
+FOCAL = HIGH / 2 / math.tan(math.radians(CAMERA[1]) / 2)  # pixels
 
 
 def colourful(n=400, coefficients=None):
@@ -90,6 +91,23 @@ def test_its_picture_is_that_of_the_rasterizer(viewer, one_thread, coefficients)
     assert wanted.std() > 0.1 and not opened.messages
 
 
+def test_its_limits_are_those_of_the_rasterizer(viewer, one_thread):
+    """An opaque Gaussian lets a hundredth through; one beside the picture reaches into it."""
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, -1.1]]),
+        quats=None,
+        scales=torch.tensor([[0.1], [0.3]]).expand(2, 3).contiguous(),
+        opacities=torch.tensor([1.0, 0.9]),
+        colors=torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+    )
+    opened = viewer(gaussians)
+    poses = orbit(torch.zeros(1), 0.0, CAMERA[0])
+    cameras = Cameras(poses, intrinsics(WIDE, HIGH, CAMERA[1])[None], WIDE, HIGH)
+    wanted = render(gaussians, cameras, torch.ones(3)).rgb[0].clamp(0, 1).numpy()
+    assert wanted[HIGH // 2, WIDE // 2, 1] < 0.02 and wanted[HIGH // 2, -1, 1] < 0.98
+    assert np.abs(canvas(opened) - wanted).max() < 1.5 / 255 and not opened.messages
+
+
 def test_hands(viewer):
     opened = viewer(colourful(), has_touch=True)
     page, mouse = opened.page, opened.page.mouse
@@ -124,6 +142,9 @@ def test_hands(viewer):
 
     mouse.wheel(0, 120)
     opened.until(f"gambaViewer.camera.distance > {pinched['distance']}")
+    for way in (1, -1):  # never over the pole, where left and right change sides
+        page.evaluate(f"gambaViewer.act.turn(0, {way * 1e5})")
+        assert state(page)["elevation"] == way * 1.55
     page.keyboard.press("r")
     opened.promised("gambaViewer.rest()")
     assert state(page) == before
@@ -141,19 +162,39 @@ def ball(x, y, z, colour):
     )
 
 
+def double_click(opened, x, y):
+    """Clicks where the camera rests, and waits until it has gone where that leads."""
+    opened.promised("gambaViewer.rest()")
+    opened.page.mouse.dblclick(x, y)
+    opened.until("gambaViewer.picks.size === 0")
+    opened.promised("gambaViewer.rest()")
+
+
 @pytest.mark.parametrize("mode", ["1", "2"])
 def test_a_double_click_looks_at_the_point_below(viewer, mode):
     opened = viewer(ball(0.2, 0.1, -0.1, [0.0, 0.0, 1.0]))
     opened.page.keyboard.press(mode)
-    focal = HIGH / 2 / math.tan(math.radians(CAMERA[1]) / 2)
-    x, y = (half + focal * at / 1.4 for half, at in ((WIDE / 2, 0.2), (HIGH / 2, 0.1)))
-    opened.page.mouse.dblclick(x, y)
-    opened.until("gambaViewer.camera.target[0] > 0.1")
+    x, y = (half + FOCAL * at / 1.4 for half, at in ((WIDE / 2, 0.2), (HIGH / 2, 0.1)))
+    for away in (6, 3, 0):  # pixels; a centre is 4 wide, and so is half of the ball
+        opened.page.keyboard.press("r")
+        double_click(opened, x, y + away)
+        assert (state(opened.page)["target"][0] > 0.1) == (away < 4)
     # Along the ray the ball is densest at its centre; half a pixel is 0.005 of the object.
     assert state(opened.page)["target"] == pytest.approx([0.2, 0.1, -0.1], abs=0.02)
-    opened.page.mouse.dblclick(5, 5)  # nothing is below
-    opened.page.wait_for_timeout(50)
+    double_click(opened, 5, 5)  # nothing is below
     assert state(opened.page)["target"][0] > 0.1 and not opened.messages
+
+
+def test_a_double_click_finds_the_rim_of_many(viewer):
+    """At 3.2 deviations each of 200 blocks 1/176, still over 1/255, and all of them two thirds."""
+    many = ball(0.0, 0.0, 0.0, [0.0, 0.0, 1.0])
+    for name in ("means", "scales", "opacities", "colors"):
+        value = getattr(many, name)
+        setattr(many, name, value.repeat(200, *[1] * (value.ndim - 1)))
+    many.scales[:] = 0.1
+    opened = viewer(many)
+    double_click(opened, WIDE / 2 + FOCAL * math.tan(math.asin(0.32 / 1.5)), HIGH / 2)
+    assert state(opened.page)["target"][0] > 0.25
 
 
 def test_what_it_shows(viewer):

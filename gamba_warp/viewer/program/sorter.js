@@ -111,7 +111,7 @@ function sorterProgram(post) {
         ab += u * v;
         bb += v * v;
       }
-      const alpha = Math.min(0.99, halves[w[3] & 65535] * Math.exp(-0.5 * (aa - ab * ab / bb)));
+      const alpha = halves[w[3] & 65535] * Math.exp(-0.5 * (aa - ab * ab / bb));
       if (alpha > 1 / 255) hits.push([-ab / bb, alpha]);
     }
     hits.sort((one, other) => one[0] - other[0]);
