@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import tyro
 from msgspec import Meta
 
 from ..conventions import DeviceChoice
@@ -16,7 +17,7 @@ def app_command(
     *,
     checkpoint: Path | None = None,
     encoder_weights: Path | None = None,
-    matte_model: Path | None = None,
+    matte_model: Annotated[str | None, tyro.conf.arg(metavar="FILE|URL")] = None,
     port: Annotated[int, Meta(ge=0, le=65535)] = 7860,
     open_browser: bool = True,
     max_upload_mb: Annotated[int, Meta(ge=1, le=1024)] = 30,
@@ -27,8 +28,9 @@ def app_command(
     Args:
         checkpoint: Trained model (.safetensors); the shipped model if not given.
         encoder_weights: The image encoder's weights, where the model has a pretrained one.
-        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out; if not given, one that
-            rembg keeps on this machine, or it is fetched once (179 MB).
+        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out, or the address of a copy
+            of one of rembg's; if not given, one that rembg keeps on this machine, or it is fetched
+            once (179 MB).
         port: Port of 127.0.0.1; 0 picks a free one.
         open_browser: Open the browser; the address is printed in any case.
         max_upload_mb: Largest picture file, MB.

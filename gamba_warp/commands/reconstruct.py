@@ -59,7 +59,7 @@ def reconstruct_command(
     page: bool = True,
     sheet: Path | None = None,
     mask: Path | None = None,
-    matte_model: Path | None = None,
+    matte_model: Annotated[str | None, tyro.conf.arg(metavar="FILE|URL")] = None,
     sam: Path | None = None,
     recenter: bool = True,
     save_inputs: bool = False,
@@ -85,7 +85,8 @@ def reconstruct_command(
         page: Write an HTML page with the input, the turntable and a 3D viewer.
         sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
         mask: Picture that is white where the object is (for a single image).
-        matte_model: ISNet or U2-Net (.onnx) that cuts objects out; else rembg's is used or fetched.
+        matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or the address of a copy of one
+            of rembg's; else rembg's is used or fetched.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
         recenter: Bring the object into the middle of the picture, at the size of training; else it
             stays where and as large as it is in a square picture.
@@ -121,7 +122,8 @@ def reconstruct_command(
         inputs=save_inputs,
     )
     outputs.require()
-    reads = (mask, matte_model, sam, file, encoder_weights)
+    network = None if matte_model is None else Path(matte_model)
+    reads = (mask, network, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
     STAGES.begin("model")

@@ -59,13 +59,14 @@ class Ways:
 
     Attributes:
         mask: picture of the same size, white (or opaque) on the object.
-        matte_model: an ISNet or U2-Net in ONNX; if None, one of rembg's that is kept, or fetched.
+        matte_model: an ISNet or U2-Net in ONNX, or the address of a copy of one of rembg's; if
+            None, one of rembg's that is kept, or fetched.
         sam: a checkpoint of Segment Anything, used in place of the matting model.
         recenter: whether the object is brought into the middle, its longer side ``0.8`` of the
             square; else the picture keeps its frame, filled up to a square.
         device: device of Segment Anything; the matting model runs on the CPU.
         fetch: whether a matting model may be fetched.
-        say: gets a line before anything is fetched.
+        say: gets a line before anything is fetched, and one if there is no matting model.
     """
 
     mask: str | Path | None = None
@@ -77,7 +78,7 @@ class Ways:
     say: Callable[[str], None] = to_stderr
     _segmenter: SamSegmenter | None = field(default=None, init=False, repr=False)
     _matte: Matte | None = field(default=None, init=False, repr=False)
-    _no_matte: str = field(default="", init=False, repr=False)
+    _no_matte: bool = field(default=False, init=False, repr=False)
 
     def checked(self) -> Ways:
         """Opens what was given, so that a bad file is told before any picture; returns itself.
@@ -99,17 +100,14 @@ class Ways:
         return self._segmenter
 
     def matte(self) -> Matte | None:
-        """The matting model, opened once; None where there is none, and ``why_no_matte`` why."""
+        """The matting model, opened once; None where there is none, of which ``say`` gets why."""
         if self._matte is None and not self._no_matte:
             try:
                 self._matte = Matte(self.matte_model, self.fetch, self.say)
             except NoMatte as error:
-                self._no_matte = str(error)
+                self._no_matte = True
+                self.say(str(error))
         return self._matte
-
-    def why_no_matte(self) -> str:
-        """Why there is no matting model, or ""."""
-        return self._no_matte
 
 
 @dataclass(frozen=True)
@@ -198,7 +196,7 @@ def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.nd
     try:
         matte = ways.matte()
         alpha = None if matte is None else matte(rgb)
-        fault = ways.why_no_matte() if alpha is None else fault_of(alpha)
+        fault = "no matting model" if alpha is None else fault_of(alpha)
     except NoMatte as error:
         alpha, fault = None, str(error)
     if alpha is not None and fault is None:

@@ -31,13 +31,13 @@ class Matte:
     """A matting network.
 
     Args:
-        file: an ISNet or U2-Net in ONNX; if None, one of rembg's that is kept on this machine, or
-            else is fetched.
+        file: an ISNet or U2-Net in ONNX, or the address of a copy of one of rembg's, which is
+            fetched; if None, one of rembg's that is kept on this machine, or else is fetched.
         fetch: whether the network may be asked.
         say: gets a line before anything is fetched.
 
     Raises:
-        UserError: ``file`` is missing, or no matting model.
+        UserError: ``file`` is missing, cannot be fetched, or is no matting model.
         ModuleNotFoundError: ``file`` is given, and onnxruntime is not installed.
         NoMatte: nothing is given, and there is no model, or no onnxruntime.
     """
@@ -50,7 +50,10 @@ class Matte:
                 require("onnxruntime")
             raise NoMatte(f"onnxruntime is not installed: {to_install('photo')}")
         self._given = file is not None
-        self.path = Path(file) if file is not None else _published(fetch, say)
+        if file is None:
+            self.path = _published(fetch, say)
+        else:
+            self.path = _from_web(str(file), say) if models.is_address(file) else Path(file)
         self._version = _version_of(self.path) if self._given else (0, 0)
         if self._given:
             self._run(None)
@@ -98,16 +101,35 @@ def _published(fetch: bool, say: Callable[[str], None]) -> Path:
     if path is not None:
         return path
     model = models.PUBLISHED[0]
-    how = f"no matting model is here; give --matte-model FILE, such as {model.address}"
+    how = f"no matting model is here; give --matte-model a copy or its address, of {model.address}"
     if not fetch or not models.may_fetch():
         raise NoMatte(how)
     if find_spec("pooch") is None:
         raise NoMatte(f"pooch, which fetches it, is not installed: {to_install('photo')}")
-    say(f"fetching a matting model once, {model.megabytes} MB, from {model.address}")
     try:
-        return models.fetch()
+        return _fetched(model, model.address, say)
     except models.NotFetched as error:
         raise NoMatte(f"{how} ({error})") from error
+
+
+def _from_web(address: str, say: Callable[[str], None]) -> Path:
+    """The file at an address that was given. Raises UserError."""
+    model = models.published(address)
+    if model is None:
+        names = ", ".join(f"{known.name}.onnx" for known in models.PUBLISHED)
+        raise UserError(f"--matte-model {address}: an address must end in one of {names}")
+    if not models.may_fetch():
+        raise UserError(f"--matte-model {address}: GAMBA_OFFLINE forbids to fetch it")
+    require("pooch")
+    try:
+        return _fetched(model, address, say)
+    except models.NotFetched as error:
+        raise UserError(f"--matte-model {address}: {error}") from error
+
+
+def _fetched(model: models.Published, address: str, say: Callable[[str], None]) -> Path:
+    say(f"fetching a matting model once, {model.megabytes} MB, from {address}")
+    return models.fetch(model, address)
 
 
 def to_stderr(line: str) -> None:

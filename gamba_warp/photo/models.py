@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
+from ..batch import progress_bar
 from ..errors import first_line
 
 _FROM = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
@@ -75,10 +77,25 @@ def may_fetch() -> bool:
     return os.environ.get("GAMBA_OFFLINE", "0") in ("", "0")
 
 
-def fetch() -> Path:
-    """Fetches the first of ``PUBLISHED`` into rembg's folder, with its progress on stderr.
+def is_address(file: str | Path | None) -> bool:
+    """Whether this is an address of the web, and not the name of a file."""
+    return str(file).startswith(("https://", "http://"))
+
+
+def published(address: str) -> Published | None:
+    """The model whose file an address names; None for any other file, whose digest nobody knows."""
+    name = urlsplit(address).path.rpartition("/")[2]
+    return next((model for model in PUBLISHED if name == f"{model.name}.onnx"), None)
+
+
+def fetch(model: Published, address: str) -> Path:
+    """Fetches a model into rembg's folder, with its progress on stderr.
 
     The file has its name only when all of it is there and its digest is right.
+
+    Args:
+        model: which one.
+        address: of the file; any copy will do, for its digest is compared.
 
     Raises:
         ModuleNotFoundError: pooch is not installed.
@@ -86,26 +103,26 @@ def fetch() -> Path:
     """
     import pooch
 
-    model = PUBLISHED[0]
     pooch.get_logger().setLevel("ERROR")
+    bar = progress_bar(total=model.megabytes * 10**6, unit="B", unit_scale=True)
     # Any: pooch's own type of it knows no arguments by name.
-    downloader: Any = pooch.HTTPDownloader(progressbar=True, timeout=_SECONDS)
+    downloader: Any = pooch.HTTPDownloader(progressbar=bar, timeout=_SECONDS)
     try:
         found = pooch.retrieve(
-            model.address,
+            address,
             known_hash=f"md5:{model.md5}",
             fname=f"{model.name}.onnx",
             path=_homes()[0] / "models" / model.name,
             downloader=downloader,
         )
     except Exception as error:  # of requests, of urllib3, of the disk, and a ValueError of pooch
-        raise NotFetched(_short(error)) from error
+        raise NotFetched(_short(error, address)) from error
     return Path(found)
 
 
-def _short(error: Exception) -> str:
+def _short(error: Exception, address: str) -> str:
     """Why it could not be fetched; requests puts several errors into one another."""
     names = {type(error).__name__, type(error.__context__).__name__}
     if names & {"ConnectionError", "ConnectTimeout", "ReadTimeout", "ProxyError", "SSLError"}:
-        return "github.com cannot be reached"
+        return f"{urlsplit(address).hostname} cannot be reached"
     return first_line(error)[:200]

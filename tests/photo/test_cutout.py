@@ -1,10 +1,16 @@
 """The ways to an object, in their order; each says what it did, and its result can be mended."""
 
+import functools
+import hashlib
+import threading
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
 import numpy as np
 import pytest
 from helpers.images import disc_on_noise
 from PIL import Image
 
+from gamba_warp import versions
 from gamba_warp.data.preprocess import recenter
 from gamba_warp.errors import UserError
 from gamba_warp.hostile.seeds.networks import matting_network
@@ -55,9 +61,11 @@ def test_each_way_in_its_order(tmp_path, network, busy):
         assert found.rgba.shape[0] == found.rgba.shape[1] and found.rgba.dtype == np.float32
         assert found.note.startswith(found.how) and "--save-inputs" in found.note
     assert "red.onnx" in found.how
-    found = cut_out(path)  # conftest.py forbids the network, and no model is kept
+    said: list[str] = []
+    found = cut_out(path, Ways(say=said.append))  # conftest.py forbids the network; none is kept
     assert found.method == "grabcut" and iou(found.mask, alpha) > 0.85
-    assert "no matting model is here" in found.how and models.PUBLISHED[0].address in found.how
+    assert found.how.endswith(" (no matting model).") and len(said) == 1
+    assert "no matting model is here" in said[0] and models.PUBLISHED[0].address in said[0]
     for file in (path, transparent, plain):  # a mask is somebody's word
         found = cut_out(file, Ways(mask=mask, matte_model=network))
         assert found.method == "mask" and iou(found.mask, half) > 0.99 and "mask.png" in found.how
@@ -197,16 +205,60 @@ def test_the_network_is_asked_only_once_and_never_in_silence(tmp_path, monkeypat
 
     monkeypatch.setattr(pooch, "retrieve", retrieve)
     assert cut_out(path, Ways(say=said.append)).method == "grabcut"
-    assert not asked and not said  # GAMBA_OFFLINE
+    assert not asked and "no matting model is here" in said.pop()  # GAMBA_OFFLINE
     monkeypatch.setenv("GAMBA_OFFLINE", "0")
     assert cut_out(path, Ways(fetch=False, say=said.append)).method == "grabcut" and not asked
+    assert "no matting model is here" in said.pop() and not said
     ways = Ways(say=said.append)
     for _ in range(2):
         found = cut_out(path, ways)
-        assert found.method == "grabcut" and "github.com cannot be reached" in found.how
+        assert found.method == "grabcut" and found.how.endswith(" (no matting model).")
     ((address, digest, before),) = asked
     assert address == models.PUBLISHED[0].address and digest.startswith("md5:")
     assert len(before) == 1 and address in before[0] and "179 MB" in before[0]
+    assert len(said) == 2 and "github.com cannot be reached" in said[1]  # once, of two pictures
+
+
+@pytest.fixture
+def mirror(tmp_path, monkeypatch):
+    """A host of one's own with copies, of which one is right; and rembg's folder, empty."""
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("pooch")
+    folder = tmp_path / "mirror"
+    folder.mkdir()
+    (folder / "u2netp.onnx").write_bytes(matting_network(size=352))
+    (folder / "silueta.onnx").write_bytes(b"another file")
+    right = hashlib.md5((folder / "u2netp.onnx").read_bytes()).hexdigest()
+    known = [m._replace(md5=right) if m.name == "u2netp" else m for m in models.PUBLISHED]
+    monkeypatch.setattr(models, "PUBLISHED", tuple(known))
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path / "rembg"))
+    monkeypatch.setenv("GAMBA_OFFLINE", "0")
+    handler = functools.partial(SimpleHTTPRequestHandler, directory=folder)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def test_a_model_comes_from_the_address_of_a_copy(tmp_path, monkeypatch, busy, mirror):
+    said = []
+    ways = Ways(matte_model=f"{mirror}/u2netp.onnx?download=true", say=said.append).checked()
+    assert cut_out(busy[0], ways).how == "The matting model u2netp.onnx cut the object out."
+    assert len(said) == 1 and f"from {mirror}" in said[0] and models.kept() is not None
+    for name, reason in (
+        ("silueta.onnx", "hash"),  # another content
+        ("isnet-general-use.onnx", "404"),
+        ("own.onnx", "must end in one of isnet-general-use.onnx, u2net.onnx"),
+    ):
+        with pytest.raises(UserError, match=reason) as caught:
+            Ways(matte_model=f"{mirror}/{name}", say=said.append).checked()
+        assert "\n" not in str(caught.value) and f"--matte-model {mirror}/{name}: " in str(
+            caught.value
+        )
+    assert [path.name for path in (tmp_path / "rembg").rglob("*.*")] == ["u2netp.onnx"]
+    monkeypatch.setenv("GAMBA_OFFLINE", "1")
+    with pytest.raises(UserError, match="GAMBA_OFFLINE"):
+        Ways(matte_model=f"{mirror}/u2netp.onnx").checked()
 
 
 def test_a_kept_model_that_is_damaged_gives_way(tmp_path, monkeypatch, busy):
@@ -218,9 +270,10 @@ def test_a_kept_model_that_is_damaged_gives_way(tmp_path, monkeypatch, busy):
 
 
 def test_without_the_extra_colours_alone_cut(monkeypatch, busy):
-    for module in (cutout, matte):
+    for module in (cutout, matte, versions):
         monkeypatch.setattr(module, "find_spec", lambda name: None)
-    found = cut_out(busy[0])
-    assert found.method == "grabcut" and "pip install '.[photo]'" in found.how
+    said = []
+    found = cut_out(busy[0], Ways(say=said.append))
+    assert found.method == "grabcut" and len(said) == 1 and "pip install '.[photo]'" in said[0]
     with pytest.raises(ModuleNotFoundError, match="onnxruntime"):
         Ways(matte_model="model.onnx").checked()

@@ -172,4 +172,4 @@ def test_what_only_an_option_needs(tmp_path):
         ), done.stderr
     done = in_the_core("reconstruct", tmp_path / "busy.png", *quick)
     assert done.returncode == 0 and "Colours alone (GrabCut)" in done.stdout, done.stderr
-    assert versions.to_install("photo") in done.stdout
+    assert versions.to_install("photo") in done.stderr
