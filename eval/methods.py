@@ -30,10 +30,10 @@ _FREE = {
         *("baselines", "contact_sheet", "distance", "rendering", "pictures", "resize_pictures"),
         *("lpips", "lpips_reason", "grounds"),
     ),
-    SHAPES: ("name", "definitions", "frame", "reference", "distance"),
+    SHAPES: ("name", "definitions", "frame", "pred_axes", "reference", "distance"),
 }
 # Of those, what is worth a line where methods differ in it.
-_NOTED = {VIEWS: ("split", "resize_pictures", "rendering", "lpips"), SHAPES: ("frame",)}
+_NOTED = {VIEWS: ("split", "resize_pictures", "rendering", "lpips"), SHAPES: ("frame", "pred_axes")}
 
 Number = Annotated[float, msgspec.Meta(ge=-1e30, le=1e30)]
 

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gamba_warp.errors import UserError
 from gamba_warp.versions import import_open3d
 
-from .shape import Points, Similarity
+from .load import Evaluated, centers
+from .metrics import surface_metrics
+from .protocol import GeometryProtocol
+from .sample import sample
+from .shape import Mesh, Points, Similarity
 
 # How far correspondences reach in each round of ICP; the truth's longest side is 1.
 ICP_DISTANCES = (0.2, 0.1, 0.05)
+
+# Turns that files are mistaken by: half ones, and quarter ones about x between y-up and z-up.
+TURNS = {
+    "180 degrees about x": np.diag([1.0, -1, -1]),
+    "180 degrees about y": np.diag([-1.0, 1, -1]),
+    "180 degrees about z": np.diag([-1.0, -1, 1]),
+    "90 degrees about x": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "-90 degrees about x": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+}
+FAR_BETTER = 0.6  # share of the Chamfer distance that a wrong turn's undoing leaves at most
+_FEW = 20_000  # points that are enough to tell
 
 
 def match_moments(predicted: Points, truth: Points) -> Similarity:
@@ -67,3 +84,35 @@ def icp(predicted: Points, truth: Points) -> tuple[Similarity, dict[str, float]]
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     motion = Similarity(matrix[:3, :3] / scale, np.array(matrix[:3, 3]), scale)
     return motion, {"fitness": result.fitness, "inlier_rmse": result.inlier_rmse}
+
+
+def better_turn(
+    predicted: Evaluated, truth: Evaluated, protocol: GeometryProtocol
+) -> dict[str, Any] | None:
+    """Finds a turn of the prediction's file that would better its Chamfer distance by far.
+
+    The turns are about the origin of the file, whose axes may have been taken for others. Of
+    Gaussians the centres are compared, because their surface is looked for near the truth alone.
+
+    Args:
+        predicted: before any alignment.
+        truth: the true shape.
+        protocol: says the seed; where it aligns, centroids and sizes are matched first.
+
+    Returns:
+        ``turn`` (a key of ``TURNS``), ``chamfer`` after it, and ``instead_of``, the distance
+        without it, both of few points; None where none leaves less than ``FAR_BETTER``.
+    """
+    true = sample(truth.shape, _FEW, protocol.seed)
+    draw = sample if isinstance(predicted.source, Mesh | Points) else centers
+    points, found = draw(predicted.source, _FEW, protocol.seed + 1).positions, {}
+    for name, turn in {"": np.eye(3), **TURNS}.items():
+        turned = Points(predicted.motion.after(turn).points(points))
+        if protocol.align != "none":
+            turned = match_moments(turned, true).apply(turned)
+        found[name] = surface_metrics(turned, Points(true.positions), ())["chamfer"]
+    straight = found.pop("")
+    best = min(found, key=lambda name: found[name])
+    if found[best] >= FAR_BETTER * straight:
+        return None
+    return {"turn": best, "chamfer": found[best], "instead_of": straight}

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,9 +44,12 @@ def eval_geometry_command(
 
     protocol = chosen_protocol(options)
     report = evaluate_shapes(options, protocol)
+    parts = [report, *report["baselines"].values()]
+    for name, part in zip(("", *report["baselines"]), parts):
+        for text in part["warnings"]:
+            print(f"warning: {name}{': ' if name else ''}{text}", file=sys.stderr)
     if json or csv:
         print(json_of(report) if json else csv_of(report), end="")
-        parts = [report, *report["baselines"].values()]
         return 1 if any(part["failures"] for part in parts) else 0
     return _print_summary(report, protocol, options.out)
 
@@ -57,10 +61,13 @@ def _print_summary(report: dict[str, Any], protocol: GeometryProtocol, out: Path
 
     changes = f", changed: {', '.join(protocol.changes())}" if protocol.changes() else ""
     print(f"protocol {protocol.name}{changes}")
-    for side, counts in report["flags"].items():
-        if counts:
-            text = ", ".join(f"{count} {flag}" for flag, count in counts.items())
-            print(f"{side + ' flags':<24} {text} of {report['num_ok']}")
+    for key in ("axes", "flags"):
+        for side, counts in report[key].items():
+            if counts:
+                text = ", ".join(f"{count} {word}" for word, count in counts.items())
+                print(f"{side + ' ' + key:<24} {text} of {report['num_ok']}")
+    if any("unknown" in counts for counts in report["axes"].values()):
+        print(f"{'':<24} unknown axes: coordinates are used as they are (--pred-axes, --up)")
     code = print_summary(report, out)
     if report["baselines"]:
         print("\n" + page(report), end="")

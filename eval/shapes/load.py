@@ -33,6 +33,15 @@ HUGE = 1e18  # the squares of larger coordinates overflow float32
 ROUNDED = 1e-3  # how far the rotations of a catalogue, texts of few digits, may be from one
 FAR = 1e6  # units of the truth's longest side; farther out float32 holds nothing of a shape
 KINDS = {Gaussians: "gaussians", Mesh: "mesh", Points: "points"}
+UNKNOWN = "unknown"  # axes
+# From a file's axes to z-up, by their names.
+TO_Z_UP = {
+    "opencv": Y_TO_Z_UP * [1.0, -1.0, -1.0],
+    "opengl": Y_TO_Z_UP,
+    "z-up": np.eye(3),
+}
+# Those of the frames that predictions may be in; those of the truth's file depend on the file.
+FRAME_AXES = {"unit": "z-up", "reference": "opencv"}
 
 
 @dataclass
@@ -40,16 +49,23 @@ class Evaluated:
     """A shape as it is compared.
 
     Attributes:
+        source: as the file holds it.
         shape: in the truth's unit frame.
-        kind: what the file holds: "gaussians", "mesh" or "points".
         flags: of the mesh (for Gaussians: of their surface), names from ``flags.FLAGS``.
         motion: what brought the file's coordinates into the unit frame.
+        axes: of the file, a key of ``TO_Z_UP`` or ``UNKNOWN``.
     """
 
+    source: Shape
     shape: Mesh | Points
-    kind: str
     flags: list[str]
     motion: Similarity
+    axes: str
+
+    @property
+    def kind(self) -> str:
+        """What the file holds: "gaussians", "mesh" or "points"."""
+        return KINDS[type(self.source)]
 
     def is_closed(self) -> bool | None:
         """Whether the mesh is closed, as ``Mesh.is_closed`` says it; None for points."""
@@ -74,52 +90,83 @@ def load_truth(
     if isinstance(shape, Gaussians):
         raise UserError(f"{path}: Gaussians, the truth must be a mesh or a point cloud")
     try:
-        up = default_up(path) if protocol.up == "auto" else protocol.up
-        motion = unit_motion(shape, up, rotation)
-        return _evaluated(motion.apply(shape), KINDS[type(shape)], motion, protocol)
+        axes = {"y": "opengl", "z": "z-up"}.get(protocol.up) or axes_of(path, shape)
+        motion = unit_motion(shape, axes, rotation)
+        return _evaluated(shape, motion.apply(shape), motion, axes, protocol)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 
 
-def load_prediction(path: Path, motion: Similarity, protocol: GeometryProtocol) -> Evaluated:
-    """Reads a predicted shape, moves it, and turns Gaussians into a surface.
+def axes_of(path: Path, shape: Shape) -> str:
+    """The axes of a shape's file by its format, or by the comment "axes NAME" of a ``.ply``.
+
+    ``UNKNOWN`` where neither says them.
+    """
+    if isinstance(shape, Gaussians):
+        return "opencv"
+    if path.suffix.lower() == ".ply":
+        with open_shape(path) as (file, _):
+            said = {f"axes {axes}": axes for axes in TO_Z_UP}
+            found = [said[c] for c in read_ply_header(path, file).comments if c in said]
+        return found[0] if found else UNKNOWN
+    return "opengl" if default_up(path) == "y" else UNKNOWN
+
+
+def turn_between(axes: str, frame: str) -> np.ndarray:
+    """``[3, 3]`` from a file's axes to a frame's; none where one of them is not known."""
+    if UNKNOWN in (axes, frame):
+        return np.eye(3)
+    return TO_Z_UP[frame].T @ TO_Z_UP[axes]
+
+
+def load_prediction(
+    path: Path, motion: Similarity, frame_axes: str, protocol: GeometryProtocol
+) -> Evaluated:
+    """Reads a predicted shape, turns and moves it, and turns Gaussians into a surface.
 
     Args:
         path: file.
-        motion: from the file's coordinates into the truth's unit frame.
-        protocol: says how Gaussians become a surface, and which flags are refused.
+        motion: from the frame of the predictions into the truth's unit frame.
+        frame_axes: of that frame, a key of ``TO_Z_UP`` or ``UNKNOWN``.
+        protocol: says how the file's axes lie, how Gaussians become a surface, and which flags are
+            refused.
 
     Raises:
         UserError: it cannot be read, has no surface, or lies far away.
     """
-    shape = motion.apply(load_shape(path))
-    kind = KINDS[type(shape)]
+    source, axes = load_shape(path), protocol.pred_axes
+    if axes == "auto" and protocol.frame != "unit":
+        axes = axes_of(path, source)
+    if axes in ("auto", "frame"):
+        axes = frame_axes
+    motion = motion.after(turn_between(axes, frame_axes))
+    shape = motion.apply(source)
     reach = float(np.abs(_positions(shape)).max())
     if not reach <= FAR:
         raise UserError(f"{path}: reaches {reach:.3g} times the truth's longest side")
     try:
         if isinstance(shape, Gaussians):
             shape = to_surface(shape, protocol.surface, protocol.seed, protocol.num_points)
-        return _evaluated(shape, kind, motion, protocol)
+        return _evaluated(source, shape, motion, axes, protocol)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 
 
 def unit_motion(
-    shape: Mesh | Points, up: str, rotation: list[list[float]] | None = None
+    shape: Mesh | Points, axes: str, rotation: list[list[float]] | None = None
 ) -> Similarity:
     """The motion after which a shape is z-up and centred, with a longest side of 1.
 
     Args:
         shape: at least two places.
-        up: the axis that points up, "y" or "z".
+        axes: of the shape, a key of ``TO_Z_UP``; others are taken for z-up.
         rotation: ``[3, 3]``, applied first; or None.
 
     Raises:
         UserError: it has no extent, or is so far from the origin that its numbers cannot hold it;
             or ``rotation`` also stretches or mirrors.
     """
-    turn = Y_TO_Z_UP if up == "y" else np.eye(3)
+    turn = TO_Z_UP.get(axes, np.eye(3))
     if rotation is not None:
         turn = turn @ np.asarray(rotation, np.float64)
         if abs(turn @ turn.T - np.eye(3)).max() > ROUNDED or np.linalg.det(turn) < 0:
@@ -140,17 +187,17 @@ def _positions(shape: Shape) -> np.ndarray:
 
 
 def _evaluated(
-    shape: Mesh | Points, kind: str, motion: Similarity, protocol: GeometryProtocol
+    source: Shape, shape: Mesh | Points, motion: Similarity, axes: str, protocol: GeometryProtocol
 ) -> Evaluated:
     if isinstance(shape, Points):
-        return Evaluated(shape, kind, [], motion)
+        return Evaluated(source, shape, [], motion, axes)
     mesh, flags = tidied(shape)
     if len(mesh.faces) == 0:
         raise UserError("the mesh has no area")
     refused = [flag for flag in flags if flag in STRICT]
-    if protocol.strict and kind == "mesh" and refused:
+    if protocol.strict and isinstance(source, Mesh) and refused:
         raise UserError(f"--strict: {', '.join(refused)}")
-    return Evaluated(mesh, kind, flags, motion)
+    return Evaluated(source, mesh, flags, motion, axes)
 
 
 def load_shape(path: Path) -> Shape:

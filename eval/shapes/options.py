@@ -18,6 +18,7 @@ from gamba_warp.untrusted.ranges import Seed, check_options
 Align = Literal["none", "scale", "icp"]
 Frame = Literal["gt", "unit", "reference"]
 Up = Literal["auto", "y", "z"]
+PredAxes = Literal["auto", "opencv", "opengl", "z-up", "frame"]
 PointRule = Literal["area", "views"]
 GridRule = Literal["around", "lattice"]
 OccupancyRule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
@@ -52,7 +53,12 @@ class ShapesOptions:
     """Frame of the predictions: that of the GT file, its unit frame (z-up, longest side 1,
     centred), or the reference camera's (needs --data)."""
     up: Up | None = None
-    """Upward axis of GT files; auto goes by the suffix."""
+    """Upward axis of GT files; auto goes by the format: y of .obj, .glb and .gltf; of others it is
+    not known, and taken for z."""
+    pred_axes: PredAxes | None = None
+    """Axes of PRED files: opencv (y down), opengl (y up), z-up, or frame: those of --frame already.
+    auto goes by the format: opencv of Gaussians, opengl of .obj, .glb and .gltf; where those of
+    PRED or GT are not known, coordinates are used as they are, and the report says so."""
     data: Path | None = None
     """Dataset whose objects have the same names, for --frame reference."""
     reference: Reference | None = None

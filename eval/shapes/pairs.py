@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -50,7 +51,11 @@ SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES
 PAIR_SECONDS = 3600.0  # a pair takes seconds, the slowest protocol on a huge shape minutes
 PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch")
 # entries of the records that have no meaningful mean
-_NO_MEAN = ("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed")
+_NO_MEAN = (
+    *("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed"),
+    "better_turned",
+)
+_NAMED = 3  # objects that a warning names
 
 
 class Pair(NamedTuple):
@@ -241,14 +246,17 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
+    from .alignment import better_turn
     from .compare import compare
-    from .load import load_prediction, load_truth
+    from .load import FRAME_AXES, load_prediction, load_truth
 
     start = time.perf_counter()
     truth = load_truth(pair.gt, protocol, pair.rotation)
-    predicted = load_prediction(pair.pred, truth.motion if motion is None else motion, protocol)
+    into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
+    predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     loaded = time.perf_counter()
     metrics = check_finite(compare(predicted.shape, truth.shape, protocol))
+    turned = better_turn(predicted, truth, protocol)
     return {
         "name": pair.name,
         "status": OK,
@@ -258,6 +266,9 @@ def evaluate_pair(
         "gt_closed": truth.is_closed(),
         "pred_flags": predicted.flags,
         "gt_flags": truth.flags,
+        "pred_axes": predicted.axes,
+        "gt_axes": truth.axes,
+        **({"better_turned": turned} if turned else {}),
         "pred_sha256": sha256(pair.pred),
         "gt_sha256": sha256(pair.gt),
         "gt_normalization": truth.motion.record(),
@@ -340,7 +351,7 @@ def report_of(
     inputs: dict[str, str | None],
     baselines: dict[str, list[dict[str, Any]]],
 ) -> dict[str, Any]:
-    """The report: what ``make_report`` returns, ``inputs`` and ``flags``.
+    """The report: what ``make_report`` returns, ``inputs``, ``flags``, ``axes`` and ``warnings``.
 
     Args:
         protocol: what was done.
@@ -360,22 +371,46 @@ def report_of(
         used,
         left_out=_NO_MEAN,
         inputs=inputs,
-        flags=flag_counts(objects),
+        **summaries(objects),
         baselines={},
         differences={},
     )
     for name, records in baselines.items():
-        other = over_objects(records, _NO_MEAN)
-        other["flags"] = flag_counts(records)
+        other = over_objects(records, _NO_MEAN) | summaries(records)
         report["baselines"][name] = finite_or_none(other)
         report["differences"][name] = differences_of(report["objects"], other["objects"])
     return report
 
 
-def flag_counts(objects: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """Counts, for each side, how many of the evaluated shapes have which flag."""
+def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
+    """What a report says of the evaluated shapes besides metrics.
+
+    Returns:
+        ``flags`` and ``axes``: for each side how many shapes have which; and ``warnings``: of turns
+        that would better the score by far.
+    """
     done = [record for record in objects if record["status"] == OK]
-    return {
-        side: dict(Counter(flag for record in done for flag in record[f"{side}_flags"]))
-        for side in ("pred", "gt")
-    }
+    flags, axes = (
+        {
+            side: dict(Counter(chain.from_iterable(words(r[f"{side}_{key}"]) for r in done)))
+            for side in ("pred", "gt")
+        }
+        for key, words in (("flags", list), ("axes", lambda axes: [axes]))
+    )
+    turned: dict[str, list[dict[str, Any]]] = {}
+    for record in done:
+        if "better_turned" in record:
+            turned.setdefault(record["better_turned"]["turn"], []).append(record)
+    warnings = []
+    for turn, records in turned.items():
+        some = [
+            f"{r['name']} {r['better_turned']['chamfer']:.3g} in place of "
+            f"{r['better_turned']['instead_of']:.3g}"
+            for r in records[:_NAMED]
+        ]
+        warnings.append(
+            f"{len(records)} of {len(done)} predictions would have a far smaller Chamfer distance "
+            f"turned by {turn} ({'; '.join(some)}{'; ...' if len(records) > _NAMED else ''}); "
+            f"are the axes right? (--pred-axes, --up, --frame)"
+        )
+    return {"flags": flags, "axes": axes, "warnings": warnings}

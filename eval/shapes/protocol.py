@@ -23,12 +23,13 @@ from .options import (
     GridRule,
     OccupancyRule,
     PointRule,
+    PredAxes,
     Reference,
     ShapesOptions,
     Up,
 )
 
-VERSION = 2  # goes up whenever the same protocol would give other numbers
+VERSION = 3  # goes up whenever the same protocol would give other numbers
 
 POINTS: dict[PointRule, str] = {
     "area": "area-uniform on the whole surface, inner faces included; faces given twice and faces "
@@ -45,6 +46,8 @@ GRIDS: dict[GridRule, str] = {
 }
 DEFINITIONS = {
     "normalization": "truth centred on its bounding box, longest side 1, turned to z-up",
+    "axes": "of a file: asked for, else those of its format (Gaussians: opencv; .obj, .glb, .gltf: "
+    "opengl), else unknown; a prediction is turned into those of its frame where both are known",
     "chamfer": "mean of the two mean nearest distances between points, not squared",
     "chamfer_squared": "mean of the two mean squared nearest distances",
     "accuracy": "mean nearest distance from predicted to true points",
@@ -74,6 +77,7 @@ class GeometryProtocol:
             are those of another protocol.
         frame: the frame that predictions are in (see the command).
         up: the upward axis of the truth's files.
+        pred_axes: the axes of the predictions' files (see the command).
         reference: index of the input view, for the frame "reference".
         distance: distance of the input camera in the model's world, for the frame "reference".
         strict: whether meshes count as failures that are not manifold, cut themselves, are turned
@@ -92,6 +96,7 @@ class GeometryProtocol:
     align: Align = "none"
     frame: Frame = "gt"
     up: Up = "auto"
+    pred_axes: PredAxes = "auto"
     reference: Reference = 0
     distance: Distance = DEFAULT_DISTANCE
     strict: bool = False
@@ -164,6 +169,7 @@ def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
         "align": options.align,
         "frame": options.frame,
         "up": options.up,
+        "pred_axes": options.pred_axes,
         "reference": options.reference,
         "distance": options.distance,
         "strict": options.strict or None,

@@ -124,6 +124,10 @@ class Similarity:
         )
         return shape.transformed(rotation, translation, self.scale)
 
+    def after(self, turn: np.ndarray) -> Similarity:
+        """This motion after a rotation ``[3, 3]`` about the origin."""
+        return Similarity(self.rotation @ turn, self.translation, self.scale)
+
     def record(self) -> dict:
         """Returns the motion for a report: ``scale, rotation, translation`` as plain numbers."""
         return {

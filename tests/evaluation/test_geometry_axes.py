@@ -1,0 +1,151 @@
+"""Files whose axes differ: turned where both are known, told where not, warned of where wrong."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from gamba_warp.cli import run
+from gamba_warp.eval.shapes.protocol import PRESETS
+from gamba_warp.formats.ply import save_ply
+from gamba_warp.gaussians import Gaussians
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+BEAR = Path(__file__).parents[2] / "starter" / "meshes" / "blendswap-cc-0-teddybear.ply"
+Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+Y_DOWN = np.diag([1.0, -1, -1, 1])
+LIFT = [0.2, 0.6, -0.1]  # the object does not lie about the origin of its file
+
+
+def bear(*turns):
+    """A real object, whose file is z-up, after turns."""
+    mesh = trimesh.load_mesh(BEAR)
+    mesh.apply_translation(LIFT)
+    for turn in turns:
+        mesh.apply_transform(turn)
+    return mesh
+
+
+def save_gaussians(path, mesh, count=6000):
+    """Small Gaussians on the surface of a mesh, in its axes."""
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
+    save_ply(
+        path,
+        Gaussians(
+            means=torch.tensor(np.asarray(points), dtype=torch.float32),
+            quats=None,
+            scales=torch.full((count, 3), 0.006),
+            opacities=torch.full((count,), 0.95),
+            colors=torch.full((count, 3), 0.5),
+        ),
+    )
+
+
+def evaluate(capfd, *words):
+    protocol = words[0].with_name("protocol.json")  # fewer points and voxels: it is faster
+    protocol.write_text('{"num_points": 8000, "iou_voxels": 24}')
+    code = run("eval-geometry", [*map(str, words), "--protocol", str(protocol), "--json"])
+    out, err = capfd.readouterr()
+    assert code == 0
+    return json.loads(out), err
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Gaussians in OpenCV's axes, and the mesh that they were made of, y-up."""
+    bear(Z_TO_Y_UP).export(tmp_path / "true.obj")
+    bear(Z_TO_Y_UP).export(tmp_path / "true.glb")
+    bear().export(tmp_path / "true.ply")
+    save_gaussians(tmp_path / "made.ply", bear(Z_TO_Y_UP, Y_DOWN))
+    return tmp_path
+
+
+CENTERS = ("--surface", "centers")  # the fastest; whole surfaces are made in the first test
+
+
+def test_gaussians_of_a_mesh_against_the_mesh(files, capfd):
+    words = ["--voxels", "64", "--views", "32", "--pixels", "128"]
+    report, err = evaluate(capfd, files / "made.ply", files / "true.obj", *words)
+    assert report["mean"]["chamfer"] < 0.016 and report["mean"]["iou"] > 0.88
+    assert report["axes"] == {"pred": {"opencv": 1}, "gt": {"opengl": 1}}
+    assert report["warnings"] == [] and "warning" not in err
+    assert report["objects"][0]["pred_axes"] == "opencv"
+    assert report["protocol"]["pred_axes"] == report["protocol"]["up"] == "auto"
+    report, _ = evaluate(capfd, files / "made.ply", files / "true.glb", *CENTERS)
+    assert report["mean"]["chamfer"] < 0.016 and report["axes"]["gt"] == {"opengl": 1}
+
+
+def test_misstated_axes_are_warned_of(files, capfd):
+    """ICP does not find back, and is warned of as well."""
+    for align in ("none", "icp"):
+        words = [files / "made.ply", files / "true.obj", "--align", align, "--pred-axes", "frame"]
+        report, err = evaluate(capfd, *words, *CENTERS)
+        assert report["mean"]["chamfer"] > 0.025
+        (said,) = report["warnings"]
+        assert said.startswith("1 of 1 predictions") and "by 180 degrees about x" in said
+        assert f"warning: {said}" in err and err.count("warning:") == 1
+        turned = report["objects"][0]["better_turned"]
+        assert (
+            turned["chamfer"] < 0.6 * turned["instead_of"] and "better_turned" not in report["mean"]
+        )
+
+
+def test_what_is_not_known_is_used_as_it_is_and_told(files, capfd):
+    """A .ply does not say which way is up, unless by a comment; then it may be asked for."""
+    report, err = evaluate(capfd, files / "true.obj", files / "true.ply")
+    assert report["axes"] == {"pred": {"opengl": 1}, "gt": {"unknown": 1}}
+    assert report["mean"]["chamfer"] > 0.05 and "90 degrees about x" in report["warnings"][0]
+    names = [str(files / name) for name in ("true.obj", "true.ply")]
+    assert run("eval-geometry", [*names, "--protocol", str(files / "protocol.json")]) == 0
+    out, err = capfd.readouterr()
+    assert "unknown axes: coordinates are used as they are" in out and "warning: 1 of 1" in err
+    asked, _ = evaluate(capfd, files / "made.ply", files / "true.ply", "--up", "z", *CENTERS)
+    assert asked["mean"]["chamfer"] < 0.02 and asked["axes"]["gt"] == {"z-up": 1}
+    content = (
+        (files / "true.ply").read_bytes().replace(b"\nelement", b"\ncomment axes z-up\nelement", 1)
+    )
+    (files / "said.ply").write_bytes(content)
+    told, _ = evaluate(capfd, files / "made.ply", files / "said.ply", *CENTERS)
+    assert told["mean"]["chamfer"] == asked["mean"]["chamfer"] and told["warnings"] == []
+    y_up, _ = evaluate(capfd, files / "said.ply", files / "true.obj")
+    assert y_up["mean"]["chamfer"] < 0.01
+
+
+def test_axes_can_be_asked_for(files, capfd):
+    """Of the predictions, and by the frame: in the unit frame coordinates are z-up."""
+    bear(Z_TO_Y_UP, Y_DOWN).export(files / "down.stl")
+    report, _ = evaluate(capfd, files / "down.stl", files / "true.obj", "--pred-axes", "opencv")
+    assert report["mean"]["iou"] == 1 and report["axes"]["pred"] == {"opencv": 1}
+    unit = bear()
+    unit.apply_translation(-unit.bounds.mean(0))
+    unit.apply_scale(1 / unit.extents.max())
+    unit.export(files / "unit.obj")
+    report, _ = evaluate(capfd, files / "unit.obj", files / "true.obj", "--frame", "unit")
+    assert report["mean"]["iou"] > 0.99 and report["axes"]["pred"] == {"z-up": 1}
+    unit.apply_transform(Z_TO_Y_UP)
+    unit.export(files / "unit.obj")
+    words = ["--frame", "unit", "--pred-axes", "opengl"]
+    report, _ = evaluate(capfd, files / "unit.obj", files / "true.obj", *words)
+    assert report["mean"]["iou"] > 0.99
+
+
+def test_good_shapes_are_not_warned_of(tmp_path, capfd):
+    """A cube is the same from all sides, and a poor prediction is not better turned."""
+    trimesh.creation.box().export(tmp_path / "cube.obj")
+    trimesh.creation.icosphere(3, 0.6).export(tmp_path / "ball.obj")
+    for pred in ("cube.obj", "ball.obj"):
+        assert evaluate(capfd, tmp_path / pred, tmp_path / "cube.obj")[0]["warnings"] == []
+
+
+def test_every_protocol_states_the_axes():
+    for preset in PRESETS.values():
+        values = preset.to_json()
+        assert (
+            values["up"]
+            and values["pred_axes"] == "auto"
+            and "unknown" in (values["definitions"]["axes"])
+        )
