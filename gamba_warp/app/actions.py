@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import html
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,10 @@ from ..errors import UserError, first_line
 from ..images import save_image
 from ..versions import advice
 from . import work
-from .cutting import Cut, cut_picture, editor_picture, mended, restarted
+from .cutting import Cut, cut_picture, editor_picture, mended, read_strokes, restarted
 from .examples import examples
+from .guard import VISITOR
+from .shelf import Shelf
 from .turns import MainThread
 
 if TYPE_CHECKING:
@@ -63,18 +64,18 @@ class Actions:
     Args:
         model: the network.
         ways: how objects may be cut out.
-        folder: for files; it is gradio's own cache, from which they go when they are old.
+        shelf: for files.
         device: device that renders.
         turns: who computes.
     """
 
     def __init__(
-        self, model: Gamba, ways: Ways, folder: Path, device: str, turns: MainThread
+        self, model: Gamba, ways: Ways, shelf: Shelf, device: str, turns: MainThread
     ) -> None:
         self._turns = turns
         self._model = model
         self._ways = ways
-        self._folder = folder
+        self._shelf = shelf
         self._device = device
         for name in ("take", "leave", "example", "mend", "restart", "make"):
             setattr(self, name, plainly(getattr(self, name)))
@@ -82,9 +83,10 @@ class Actions:
     def take(
         self,
         given: dict[str, Any] | None,
+        request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
-        """A picture that was dropped or pasted."""
+        """A picture that was dropped or pasted; the guard knows that it is this visitor's."""
         if not given or not given.get("path"):
             return self.leave()
         name = given.get("orig_name") or "picture"
@@ -94,32 +96,36 @@ class Actions:
         except UserError as error:
             gr.Warning(html.escape(str(error)), title="This is no picture for us")
             return self.leave()
-        return *self._shown(cut), gr.skip()
+        return *self._shown(cut, request), gr.skip()
 
     def leave(self) -> tuple:
         """The picture was taken away; what was made of it stays."""
         return None, gr.update(visible=False), None, "", None
 
-    def example(self, event: gr.SelectData) -> tuple:
+    def example(self, event: gr.EventData, request: gr.Request) -> tuple:
         """A picture of the gallery."""
-        path, title = examples()[int(event.index)]
+        found, index = examples(), event._data["index"]
+        if type(index) is not int or not 0 <= index < len(found):
+            raise UserError(f"there are {len(found)} examples, and this is none of them")
+        path, title = found[index]
         cut = self._turns.call(cut_picture, path, title, self._ways)
-        return *self._shown(cut), str(path)
+        return *self._shown(cut, request), str(path)
 
-    def mend(self, cut: Cut | None, painted: dict[str, Any] | None) -> tuple:
+    def mend(self, cut: Cut | None, painted: dict[str, Any] | None, request: gr.Request) -> tuple:
         """The strokes become part of the mask."""
         cut = mended(_given(cut), _layers(painted))
-        return cut, self._editor(cut)
+        return cut, self._editor(cut, request)
 
-    def restart(self, cut: Cut | None) -> tuple:
+    def restart(self, cut: Cut | None, request: gr.Request) -> tuple:
         """The mask as it was found, without strokes."""
         cut = restarted(_given(cut))
-        return cut, self._editor(cut)
+        return cut, self._editor(cut, request)
 
     def make(
         self,
         cut: Cut | None,
         painted: dict[str, Any] | None,
+        request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
         """The object in 3D, and its viewer; strokes that nobody applied count, too."""
@@ -130,40 +136,45 @@ class Actions:
         progress(0.8, "The viewer is made")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)
-        editor = gr.skip() if after is before else self._editor(after)
+        editor = gr.skip() if after is before else self._editor(after, request)
         files = gr.update(value=None, visible=False)
-        return after, editor, made, frame, gr.update(visible=True), files
+        return after, editor, (made, []), frame, gr.update(visible=True), files
 
     def writer(self, kind: str) -> Callable:
         """The function that writes files of one kind, and adds them to those that are there."""
 
         def write(
-            made: work.Made | None,
-            files: list[dict[str, Any]] | None,
+            state: tuple[work.Made, list[Path]] | None,
+            request: gr.Request,
             progress: gr.Progress = gr.Progress(),  # noqa: B008
-        ) -> Any:
-            if made is None:
+        ) -> tuple:
+            if state is None:
                 raise UserError("make the object first; it may have been kept for too long")
+            made, older = state
             progress(0.2, f"Writing {work.KINDS[kind][1]}")
-            folder = Path(tempfile.mkdtemp(dir=self._folder))
+            folder = self._place(request)
             path, note = self._turns.call(work.write, made, kind, folder, self._device)
             if note:
                 gr.Info(html.escape(note.removeprefix(f"{path}: ")))
-            older = [file["path"] for file in files or ()]
-            kept = [name for name in older if Path(name).name != path.name and Path(name).is_file()]
-            return gr.update(value=[*kept, str(path)], visible=True)
+            files = [*(old for old in older if old.name != path.name and old.is_file()), path]
+            return (made, files), gr.update(value=[str(file) for file in files], visible=True)
 
         return plainly(write)
 
-    def _shown(self, cut: Cut) -> tuple:
+    def _shown(self, cut: Cut, request: gr.Request) -> tuple:
         note = f"<p>{html.escape(cut.note)}</p>"
-        return cut, gr.update(visible=True), self._editor(cut), note
+        return cut, gr.update(visible=True), self._editor(cut, request), note
 
-    def _editor(self, cut: Cut) -> dict[str, Any]:
+    def _place(self, request: gr.Request) -> Path:
+        asked = request.request
+        assert asked is not None  # gradio has one for every event
+        return self._shelf.place(asked.scope[VISITOR])
+
+    def _editor(self, cut: Cut, request: gr.Request) -> dict[str, Any]:
         """The editor's value. gradio would write the same picture to the same file once more, in
         the middle of the browser's reading it; each of ours is a new one.
         """
-        path = Path(tempfile.mkdtemp(dir=self._folder)) / "cut-out.png"
+        path = self._place(request) / "cut-out.png"
         save_image(path, editor_picture(cut) / 255.0)
         return {"background": str(path), "layers": [], "composite": str(path)}
 
@@ -175,4 +186,5 @@ def _given(cut: Cut | None) -> Cut:
 
 
 def _layers(painted: dict[str, Any] | None) -> list:
-    return [] if painted is None else painted["layers"]
+    """The strokes; the guard knows that the files are this visitor's."""
+    return [read_strokes(Path(file["path"])) for file in (painted or {"layers": ()})["layers"]]

@@ -48,8 +48,9 @@ def app_command(
         quiet(folder)
         from .actions import Actions
         from .interface import build
+        from .shelf import Shelf
         from .turns import MainThread
 
-        turns = MainThread()
-        page = build(Actions(model, ways, folder, str(chosen), turns))
-        serve(page, port, max_upload_mb, open_browser, turns)
+        turns, shelf = MainThread(), Shelf(folder)
+        page = build(Actions(model, ways, shelf, str(chosen), turns))
+        serve(page, shelf, port, max_upload_mb, open_browser, turns)

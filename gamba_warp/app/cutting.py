@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SIDE = 720  # longer side of the picture that is painted on, pixels
 KEEP, REMOVE = "#2f6fed", "#e8590c"  # colours of the brush: blue and orange, told apart by all eyes
 STROKE = 0.6  # opacity of a stroke, so that the picture shows through
+MAX_STROKES = 4 << 20  # pixels of a layer; the page's own have SIDE x SIDE
 _TILE = 12  # side of the checkerboard's squares, pixels
 _LIGHT, _DARK = 0.97, 0.86
 _GHOST = 0.22  # how much of what is cut away still shows, so that it can be painted back
@@ -126,6 +127,21 @@ def painted_size(cut: Cut) -> tuple[int, int]:
     height, width = cut.mask.shape
     factor = SIDE / max(height, width)
     return max(1, round(height * factor)), max(1, round(width * factor))
+
+
+def read_strokes(path: Path) -> np.ndarray:
+    """One layer of the editor as the page sends it.
+
+    Returns:
+        ``[h, w, 4]`` uint8, straight alpha.
+
+    Raises:
+        UserError: it is no PNG, or larger than any canvas.
+    """
+    from ..images import open_picture
+
+    with open_picture(path, "the strokes", MAX_STROKES, ("PNG",)) as image:
+        return np.asarray(image.convert("RGBA"))
 
 
 def mended(cut: Cut, layers: Sequence[np.ndarray]) -> Cut:

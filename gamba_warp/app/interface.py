@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gradio as gr
 
 from . import work
 from .actions import Actions
 from .cutting import KEEP, REMOVE, SIDE, STROKE
-from .examples import examples
+from .examples import FOLDER, examples
+from .guard import GivenFile, Painted
+from .shelf import KEPT
 
-KEPT = 3600  # seconds that pictures and results of a page are kept, once nothing is done with them
 WAITING = 16  # requests that wait for their turn; further ones are told to come back
 _TITLE = """<h1>Gamba</h1>
 <p>One picture becomes a 3D object. All of it is computed on this machine, and nothing is sent
@@ -38,9 +39,8 @@ _FETCH = """(files) => {
 
 def build(actions: Actions) -> gr.Blocks:
     """Makes the page; ``server.serve`` serves it."""
-    page = gr.Blocks(
-        title="Gamba", analytics_enabled=False, delete_cache=(KEPT // 6, KEPT), fill_width=True
-    )
+    gr.set_static_paths([FOLDER])
+    page = gr.Blocks(title="Gamba", analytics_enabled=False, fill_width=True)
     with page:
         gr.HTML(_TITLE, elem_id="title")
         states = gr.State(None, time_to_live=KEPT), gr.State(None, time_to_live=KEPT)
@@ -54,6 +54,18 @@ def build(actions: Actions) -> gr.Blocks:
         _connect(actions, states, picture, gallery, parts, stage, files_part)
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
+
+
+def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
+    """Of which type the page sends each input, by the function's number; it sends no states."""
+    kinds = {
+        gr.State: None,
+        gr.Image: GivenFile | None,
+        gr.ImageEditor: Painted | None,
+        gr.Radio: Literal[tuple(_BRUSHES)],  # type: ignore[invalid-type-form]
+    }
+    ours = {number: fn.inputs for number, fn in page.fns.items() if fn.fn is not None}
+    return {number: [kinds[type(block)] for block in given] for number, given in ours.items()}
 
 
 def _picture_part() -> tuple[gr.Image, gr.Gallery]:
@@ -170,11 +182,15 @@ def _connect(
     stage: gr.HTML,
     files_part: _FilesPart,
 ) -> None:
-    """Which action each event calls; one at a time over all pages, for they share the device."""
+    """Which action each event calls; one at a time over all pages, for they share the device.
+
+    gradio preprocesses nothing: it would decode pictures itself, and differently, without limits.
+    """
     cut, made = states
     one: dict[str, Any] = {
         "concurrency_id": "gamba",
         "concurrency_limit": 1,
+        "preprocess": False,
         "api_visibility": "private",
     }
     # On the editor the sign that something is going on would stay: gradio shows it once more when
@@ -182,13 +198,13 @@ def _connect(
     quick = {**one, "show_progress": "hidden"}
     taking = {**one, "show_progress_on": picture}
     shown = [cut, parts.group, parts.editor, parts.note, picture]
-    # gradio would decode the picture itself, and differently: the file is read by us alone. (Its
-    # event ``input`` comes with the old picture when that is taken away.)
-    picture.upload(actions.take, picture, shown, preprocess=False, **taking)
+    # (The event ``input`` comes with the old picture when that is taken away.)
+    picture.upload(actions.take, picture, shown, **taking)
     picture.clear(actions.leave, None, shown, **quick)
     gallery.select(actions.example, None, shown, **taking)
     mask = [cut, parts.editor]
-    parts.brush.change(_painting, parts.brush, parts.editor, queue=False, **quick)
+    # Waits for no other: it has a turn of its own.
+    parts.brush.change(_painting, parts.brush, parts.editor, **{**quick, "concurrency_id": "brush"})
     parts.mend.click(actions.mend, mask, mask, **quick)
     parts.restart.click(actions.restart, cut, mask, **quick)
     parts.make.click(
@@ -202,9 +218,8 @@ def _connect(
     for kind, button in files_part.buttons.items():
         button.click(
             actions.writer(kind),
+            made,
             [made, files_part.files],
-            files_part.files,
             show_progress_on=files_part.files,
-            preprocess=False,
             **one,
         ).success(None, files_part.files, None, js=_FETCH, api_visibility="private")

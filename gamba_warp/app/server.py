@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import UserError
 from ..files import only_process
+from .shelf import Shelf
 from .turns import MainThread
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ def _remove_unheld(folder: Path) -> None:
 
 def quiet(folder: Path) -> None:
     """Tells gradio, before it is imported, to ask no other machine and where to put its files."""
+    for name in [name for name in os.environ if name.startswith("GRADIO_")]:
+        del os.environ[name]  # one would share the page, another start servers of its own
     os.environ |= {
         "GRADIO_TEMP_DIR": str(folder),
         "GRADIO_ANALYTICS_ENABLED": "False",
@@ -64,8 +67,6 @@ def quiet(folder: Path) -> None:
         # gradio asks its own server whether it is there, and must not ask a proxy.
         "NO_PROXY": ",".join(filter(None, (os.environ.get("NO_PROXY"), HOST, "localhost"))),
     }
-    for name in ("GRADIO_ALLOWED_PATHS", "GRADIO_ROOT_PATH", "GRADIO_WATCH_DIRS"):
-        os.environ.pop(name, None)
 
 
 def free_port(port: int) -> int:
@@ -84,11 +85,14 @@ def free_port(port: int) -> int:
         return probe.getsockname()[1]
 
 
-def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool, turns: MainThread) -> None:
+def serve(
+    page: gr.Blocks, shelf: Shelf, port: int, max_mb: int, open_browser: bool, turns: MainThread
+) -> None:
     """Serves the page until Ctrl-C or SIGTERM.
 
     Args:
         page: of ``interface.build``.
+        shelf: for the visitors' files.
         port: a free one.
         max_mb: largest upload, MB.
         open_browser: whether the browser is opened; where there is none, the address is printed.
@@ -102,10 +106,11 @@ def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool, turns: Ma
 
     from starlette.middleware import Middleware
 
-    from .examples import FOLDER
     from .guard import Guard
+    from .interface import inputs
     from .look import LOOK, theme
 
+    guard = Middleware(Guard, shelf=shelf, inputs=inputs(page), max_bytes=max_mb << 20)
     try:
         page.launch(
             server_name=HOST,
@@ -117,7 +122,6 @@ def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool, turns: Ma
             show_error=False,
             max_threads=4,
             max_file_size=max_mb << 20,
-            allowed_paths=[str(FOLDER)],
             state_session_capacity=_PAGES,
             footer_links=[],
             run_history=False,
@@ -126,13 +130,14 @@ def serve(page: gr.Blocks, port: int, max_mb: int, open_browser: bool, turns: Ma
             pwa=False,
             mcp_server=False,
             strict_cors=True,
-            app_kwargs={"middleware": [Middleware(Guard)], "docs_url": None, "redoc_url": None},
+            app_kwargs={"middleware": [guard]},
             theme=theme(),
             css_paths=LOOK,
         )
     except OSError as error:
         raise UserError(f"--port {port}: Address already in use") from error
     logging.getLogger("uvicorn.error").addFilter(_is_ours)
+    logging.getLogger("python_multipart").setLevel(logging.ERROR)  # it warns of damaged uploads
     address = f"http://{HOST}:{port}/"
     print(f"{address} (Ctrl-C ends it)", flush=True)
     signal.signal(signal.SIGTERM, _end)

@@ -5,13 +5,34 @@ from __future__ import annotations
 import http.server
 import socket
 import threading
+from collections.abc import Mapping
 from typing import Any
 
 from ..errors import UserError
 
+HOSTS = ("127.0.0.1", "localhost")
 _CONNECTIONS = 16  # at once; a browser opens six
 _READ_SECONDS = 10.0  # a request must be there within them, and each piece of the page be taken
 _PIECE = 1 << 16  # bytes
+
+
+def is_foreign(headers: Mapping[str, str]) -> bool:
+    """Whether a request to a server on 127.0.0.1 is not of its own page, nor of the user.
+
+    A foreign web page in the same browser can send requests there, and even read the answers once
+    it has given its own name that address (DNS rebinding). The browser says so in these headers.
+
+    Args:
+        headers: by names in small letters.
+    """
+    host, site = headers.get("host", ""), headers.get("sec-fetch-site")
+    name, colon, port = host.partition(":")
+    if name not in HOSTS or (colon and not port.isdecimal()):
+        return True
+    if headers.get("origin") not in (None, f"http://{host}"):
+        return True
+    followed = headers.get("sec-fetch-mode") == "navigate"  # a link, whose page sees no answer
+    return not followed and site not in (None, "none", "same-origin")
 
 
 class PageServer(http.server.ThreadingHTTPServer):
@@ -62,7 +83,10 @@ def page_server(content: bytes, port: int) -> http.server.HTTPServer:
 
 
 def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
-    """A request handler that answers ``/`` with one page, and everything else with 404."""
+    """A request handler that answers ``/`` with one page, and everything else with 404.
+
+    Requests for another host's name or from another page are refused (421).
+    """
 
     class Handler(http.server.BaseHTTPRequestHandler):
         timeout = _READ_SECONDS  # of each single read and write
@@ -80,6 +104,9 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
 
         def do_GET(self) -> None:
             self.reading.cancel()
+            if is_foreign({name.lower(): value for name, value in self.headers.items()}):
+                self.send_error(421)
+                return
             if self.path != "/":
                 self.send_error(404)
                 return

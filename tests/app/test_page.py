@@ -2,66 +2,29 @@
 
 import io
 import os
-import re
 import signal
 import subprocess
-import sys
 import time
-import urllib.error
-import urllib.request
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.app import FORM, MEGABYTES, Program, command, form, serving
 from PIL import Image
 
-from gamba_warp.files import STARTER
 from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.images import save_image
 
-MEGABYTES = 1  # the limit on uploads here
 PATIENCE = 90  # seconds, on a machine that does much else
 RED = (0.8, 0.1, 0.1)
 
 
-@dataclass
-class Served:
-    """A running ``gamba app``."""
-
-    process: subprocess.Popen
-    address: str
-    temporary: Path
-
-    def folders(self) -> list[str]:
-        return sorted(p.name for p in self.temporary.glob("gamba-app-*"))
-
-
-def command(*options):
-    shared = ["--no-open-browser", "--checkpoint", str(STARTER / "tiny.safetensors")]
-    return [sys.executable, "-m", "gamba_warp", "app", *shared, *map(str, options)]
-
-
 @pytest.fixture(scope="module")
 def served(browser, tmp_path_factory):
-    """The command as users start it, in a folder for temporary files of its own."""
     pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
-    temporary = tmp_path_factory.mktemp("tmp")
-    environment = {**os.environ, "TMPDIR": str(temporary), "HTTP_PROXY": "http://127.0.0.1:9"}
-    process = subprocess.Popen(
-        command("--port", 0, "--max-upload-mb", MEGABYTES, "--device", "cpu"),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    )
-    line = process.stdout.readline()
-    match = re.match(r"(http://127\.0\.0\.1:\d+/) \(Ctrl-C ends it\)$", line)
-    assert match, line + process.communicate(timeout=10)[1]
-    yield Served(process, match[1], temporary)
-    process.kill()
-    process.communicate()
+    with serving(tmp_path_factory.mktemp("tmp")) as made:
+        yield made
 
 
 @dataclass
@@ -210,33 +173,10 @@ def test_too_large_an_upload_is_refused(opened, served, tmp_path):
     assert "exceed the maximum allowed size" in toast(page)
     opened.complaints.clear()  # gradio's page logs that it has no picture to show
     # The server itself refuses it, too.
-    edge = "edge"
-    head = f'--{edge}\r\nContent-Disposition: form-data; name="files"; filename="b.png"\r\n\r\n'
-    body = head.encode() + big.read_bytes() + f"\r\n--{edge}--\r\n".encode()
-    kind = {"Content-Type": f"multipart/form-data; boundary={edge}"}
-    assert status(served, "gradio_api/upload", body, kind) == 413
+    program = Program(served.host).opened()
+    assert program.ask("/gradio_api/upload", form(big.read_bytes()), **FORM).status == 413
     left = [p for p in served.temporary.rglob("*") if p.is_file() and p.stat().st_size > 1 << 20]
     assert not left, "nothing of it is kept"
-
-
-def status(served, place, body=None, headers=None):
-    """The status of an answer, asked for without a browser and without a proxy."""
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    request = urllib.request.Request(served.address + place, body, headers or {})
-    try:
-        with opener.open(request, timeout=20) as answer:
-            return answer.status
-    except urllib.error.HTTPError as error:
-        return error.code
-
-
-def test_what_is_closed(served):
-    assert status(served, "") == 200
-    assert status(served, "", headers={"Host": "evil.example"}) == 421
-    assert status(served, "gradio_api/file=/etc/passwd") == 403
-    assert status(served, f"gradio_api/file={Path(__file__).resolve()}") == 403
-    for place in ("docs", "redoc", "monitoring/summary", "gradio_api/call/take"):
-        assert status(served, place) in (403, 404, 405), place
 
 
 def test_a_port_in_use_and_a_bad_model_are_one_line(served, tmp_path):

@@ -1,32 +1,44 @@
 """What the page's server lets in, leaves behind, and computes on."""
 
 import asyncio
+import json
 import logging
 import os
 import threading
 import time
+from pathlib import Path
 
 import pytest
+from helpers.app import FORM, form
 
 from gamba_warp.app import guard, server
+from gamba_warp.app import shelf as shelves
+from gamba_warp.app.shelf import Shelf
 from gamba_warp.app.turns import MainThread
 from gamba_warp.errors import UserError
 
 
-def answered(host, kind="http"):
-    """What the guard answers to a request for a host: the messages, and whether it let it in."""
+def answered(host, kind="http", path="/", method="GET", shelf=None, body=b"", token=None):
+    """What the guard answers to a request: the messages, and whether it let it in."""
     sent, inside = [], []
 
     async def app(scope, receive, send):
-        inside.append(scope["type"])
+        inside.append(scope)
         await send({"type": "http.response.start", "status": 200, "headers": [(b"a", b"b")]})
         await send({"type": "http.response.body", "body": b""})
+
+    async def receive():
+        return {"type": "http.request", "body": body}
 
     async def send(message):
         sent.append(message)
 
     headers = [] if host is None else [(b"host", host.encode())]
-    asyncio.run(guard.Guard(app)({"type": kind, "headers": headers}, None, send))
+    headers += [(b"content-type", FORM["Content-Type"].encode())]
+    headers += [(b"content-length", str(len(body)).encode())]
+    headers += [(b"cookie", f"gamba-visitor={token}".encode())] if token else []
+    scope = {"type": kind, "headers": headers, "path": path, "method": method}
+    asyncio.run(guard.Guard(app, shelf, {}, 1 << 20)(scope, receive, send))
     return sent, bool(inside)
 
 
@@ -41,13 +53,98 @@ def test_our_own_names_are_let_in(host):
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:7860", "127.0.0.1.evil.example:80", "", None, "[::1]:80"]
+    "host",
+    [
+        *("evil.example", "evil.example:7860", "127.0.0.1.evil.example:80", "", None, "[::1]:80"),
+        *("127.0.0.1:80:80", "127.0.0.1:", "localhost.", "127.0.0.1 evil.example"),
+    ],
 )
 def test_other_names_are_refused(host):
     sent, inside = answered(host)
     assert not inside and sent[0]["status"] == 421
     sent, inside = answered(host, "websocket")
     assert not inside and sent == [{"type": "websocket.close", "code": 1008}]
+
+
+def test_a_cookie_is_given_once_and_is_the_visitor():
+    def cookie(token):
+        return dict(answered("localhost", token=token)[0][0]["headers"]).get(b"set-cookie")
+
+    first, second = cookie(None), cookie("../../etc")
+    assert second and first != second and b"; HttpOnly; SameSite=Lax; Path=/" in first
+    assert cookie(first.decode().partition("=")[2].partition(";")[0]) is None
+
+
+def test_all_uploads_together_are_bounded(tmp_path):
+    """A megabyte each; the first ones go."""
+    shelf, paths = Shelf(tmp_path, limit=4 << 20), []
+    for k in range(9):
+        body = form(bytes([k]) * (1 << 20))
+        request = {"path": "/gradio_api/upload", "method": "POST", "body": body}
+        sent, _ = answered("localhost", shelf=shelf, token="a" * 32, **request)
+        assert sent[0]["status"] == 200
+        paths.append(Path(json.loads(sent[1]["body"])[0]))
+        os.utime(paths[-1], (time.time() - 100 + k,) * 2)
+        kept = [path for path in tmp_path.rglob("*") if path.is_file()]
+        assert sum(path.stat().st_size for path in kept) <= shelf.limit
+    assert [path.is_file() for path in paths] == [False] * 6 + [True] * 3
+    assert not paths[0].parent.exists()
+
+
+def test_what_comes_in_at_once_is_bounded(tmp_path):
+    """Of four that dawdle with a megabyte each, the fourth is sent away."""
+    sent = [[] for _ in range(4)]
+
+    async def receive():
+        await asyncio.sleep(60)
+
+    async def come():
+        layer = guard.Guard(None, Shelf(tmp_path, limit=7 << 19), {}, 1 << 20)
+        headers = [(b"host", b"localhost"), (b"cookie", b"gamba-visitor=" + b"a" * 32)]
+        headers += [(b"content-length", b"1048576")]
+        headers += [(b"content-type", FORM["Content-Type"].encode())]
+        scope = {"type": "http", "method": "POST", "path": "/gradio_api/upload"}
+
+        async def ask(k):
+            async def send(message):
+                sent[k].append(message.get("status"))
+
+            await layer({**scope, "headers": list(headers)}, receive, send)
+
+        tasks = [asyncio.create_task(ask(k)) for k in range(4)]
+        await asyncio.wait(tasks, timeout=10, return_when=asyncio.FIRST_COMPLETED)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        assert layer._coming == 0, "who leaves makes room"
+
+    asyncio.run(come())
+    assert sent == [[], [], [], [503, None]]
+
+
+def test_old_files_go_by_themselves(tmp_path, monkeypatch):
+    monkeypatch.setattr(guard, "KEPT", 0.06)
+    monkeypatch.setattr(shelves, "KEPT", 0.06)
+    shelf = Shelf(tmp_path)
+    path = shelf.place("a") / "picture.png"
+    path.write_bytes(b"x")
+
+    async def lives(scope, receive, send):
+        await asyncio.sleep(0.3)
+
+    assert path.exists()
+    asyncio.run(guard.Guard(lives, shelf, {}, 1)({"type": "lifespan"}, None, None))
+    assert not path.exists() and not path.parent.exists()
+
+
+def test_nothing_of_the_environment_opens_the_server(monkeypatch, tmp_path):
+    for name in ("GRADIO_SHARE", "GRADIO_NUM_WORKERS", "GRADIO_ROOT_PATH", "GRADIO_ANYTHING"):
+        monkeypatch.setenv(name, "7")
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    server.quiet(tmp_path)
+    ours = {name: value for name, value in os.environ.items() if name.startswith("GRADIO_")}
+    assert ours.pop("GRADIO_TEMP_DIR") == str(tmp_path)
+    assert set(ours.values()) == {"False"}
 
 
 def test_the_folder_goes_and_so_do_those_of_the_killed(tmp_path, monkeypatch):

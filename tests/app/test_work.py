@@ -17,7 +17,7 @@ from gamba_warp.formats.gaussians.files import read_gaussians
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.photo.cutout import Ways
-from gamba_warp.surfaces import extract
+from gamba_warp.surfaces import extract, files  # noqa: F401 (it must not find the stand-in)
 
 RED, GREEN = (0.8, 0.1, 0.1), (0.1, 0.6, 0.2)
 

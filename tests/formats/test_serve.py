@@ -65,3 +65,38 @@ def test_connections_are_bounded_and_come_back(address):
         client.close()
     time.sleep(0.2)
     assert read(address).startswith(b"hello")
+
+
+def status(address, *headers) -> int:
+    """Of ``GET /`` with these headers and no others."""
+    with socket.create_connection(address) as client:
+        client.settimeout(5)
+        client.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).encode())
+        return int(client.makefile("rb").readline().split()[1])
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        [],
+        ["Host: evil.example"],
+        ["Host: evil.example:{port}"],
+        ["Host: 127.0.0.1.evil.example:{port}"],
+        ["Host: [::1]:{port}"],
+        ["Host: 127.0.0.1:{port}", "Origin: http://evil.example"],
+        ["Host: 127.0.0.1:{port}", "Origin: null"],
+        ["host: localhost:{port}", "Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: no-cors"],
+    ],
+    ids=range(8),
+)
+def test_foreign_names_and_pages_are_refused(address, headers):
+    """A foreign page can give its own name the address 127.0.0.1, and read what it is answered."""
+    assert status(address, *(header.format(port=address[1]) for header in headers)) == 421
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:{port}", "localhost:9000"])
+def test_its_own_names_and_links_to_it_are_answered(address, host):
+    host = f"Host: {host.format(port=address[1])}"
+    assert status(address, host) == 200
+    followed = "Sec-Fetch-Site: cross-site", "Sec-Fetch-Mode: navigate"
+    assert status(address, host, *followed) == 200

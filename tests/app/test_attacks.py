@@ -1,0 +1,281 @@
+"""What programs of the machine and foreign web pages try on ``gamba app``, by raw requests."""
+
+import io
+import json
+import signal
+from pathlib import Path
+
+import pytest
+from helpers.app import FORM, MEGABYTES, Program, form, serving
+from PIL import Image
+
+from gamba_warp.app.examples import examples
+
+TAKE, EXAMPLE, BRUSH, MEND, RESTART = 0, 2, 3, 4, 5  # numbers of functions
+ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    pytest.importorskip("gradio", reason="needs gradio: pip install '.[app]'")
+    with serving(tmp_path_factory.mktemp("tmp")) as made:
+        yield made
+        made.process.send_signal(signal.SIGINT)
+        _, err = made.process.communicate(timeout=30)
+        assert err == "gamba: interrupted\n", "no attack of this file leaves more than that"
+
+
+@pytest.fixture
+def bare(served):
+    return Program(served.host)
+
+
+@pytest.fixture
+def program(served):
+    return Program(served.host).opened()
+
+
+@pytest.fixture
+def private(tmp_path):
+    """A picture of the user, outside the app's folder."""
+    path = tmp_path / "private.png"
+    path.write_bytes(encoded(Image.new("RGB", (60, 60), "white")))
+    return path
+
+
+def encoded(image, kind="PNG"):
+    content = io.BytesIO()
+    image.save(content, kind)
+    return content.getvalue()
+
+
+def given(path, **more):
+    return {"path": str(path), "orig_name": "a.png", **more}
+
+
+def test_a_program_that_does_as_the_page_does(program, private):
+    path = program.upload(private.read_bytes())
+    output = program.result(TAKE, [given(path)])
+    note = output["data"][3]
+    assert "No object was found" in note
+    shown = output["data"][2]["background"]["path"]
+    assert program.ask(f"/gradio_api/file={shown}").status == 200
+    layer = Image.new("RGBA", (720, 720), (0, 0, 255, 255))
+    painted = {"layers": [given(program.upload(encoded(layer)))], "background": {"path": "/"}}
+    after = program.result(MEND, [None, painted])["data"][1]["background"]["path"]
+    assert Path(after).read_bytes() != Path(shown).read_bytes()
+
+
+@pytest.mark.parametrize("meta", [None, {"_type": "gradio.FileData"}])
+def test_only_files_of_the_visitor_are_taken(served, program, private, meta):
+    """And nobody is told which files there are."""
+    other = Program(served.host).opened()
+    theirs, mine = other.upload(private.read_bytes()), program.upload(private.read_bytes())
+    link = Path(mine).with_name("link.png")
+    link.symlink_to(private)
+    (example, _), *_ = examples()
+    lines = {}
+    for path in (
+        *(private, private.with_name("none.png"), "/etc/passwd", "/dev/zero", "/", "", "a\0b"),
+        *(theirs, link, example, Path(mine).parent, Path(mine).parents[1], "../" * 9 + mine),
+        *(f"{Path(mine).parent}/../{Path(mine).parent.name}/a.png", f"/{mine}", "x" * 4000),
+        *("http://127.0.0.1/", "file:///etc/passwd", next(served.temporary.iterdir()) / ".lock"),
+    ):
+        for item in (given(path, meta=meta), {"layers": [given(path, meta=meta)]}):
+            data = [item] if "path" in item else [None, item]
+            answer = program.join(TAKE if "path" in item else MEND, data)
+            lines[str(path), len(data)] = answer.status, answer.line
+    assert len(set(lines.values())) == 1, lines
+    assert set(lines.values()) == {
+        (400, "this file is not here, or no longer; give the picture once more")
+    }
+    for item in (str(private), [given(private)], {"url": str(private)}, 1, {"a": given(private)}):
+        for number, data in ((TAKE, [item]), (MEND, [None, item]), (MEND, [item, None])):
+            assert program.join(number, data).status == 400, (number, data)
+
+
+def test_a_session_is_that_of_its_visitor(served, program, private):
+    """A page's picture is not another's, who knows what its browser calls itself."""
+    assert "data" in program.result(TAKE, [given(program.upload(private.read_bytes()))])
+    assert "data" in program.result(RESTART, [None])
+    other = Program(served.host, session=program.session).opened()
+    assert other.result(RESTART, [None])["error"].startswith("give a picture first")
+
+
+def test_only_files_of_the_visitor_are_shown(served, program, private):
+    other = Program(served.host).opened()
+    path = other.upload(private.read_bytes())
+    assert other.ask(f"/gradio_api/file={path}").body == private.read_bytes()
+    asked = (path, private, "/etc/passwd", "/etc", "/none", Path(__file__).resolve(), "http://a/")
+    answers = [program.ask(f"/gradio_api/file={asked}") for asked in asked]
+    assert {answer.status for answer in answers} == {403}
+    assert len({answer.line for answer in answers}) == 1
+    (example, _), *_ = examples()
+    assert program.ask(f"/gradio_api/file={example}").status == 200
+
+
+@pytest.mark.parametrize(
+    "content, reason",
+    [
+        (encoded(Image.new("1", (9000, 9000))), "9000x9000 is over 4 megapixels"),
+        (encoded(Image.new("RGB", (50, 50)), "EPS"), "not a picture that can be read"),
+        (encoded(Image.new("RGB", (50, 50)), "TIFF"), "not a picture that can be read"),
+        (encoded(Image.new("RGB", (500, 50)))[:70], "cannot be decoded"),
+        (b"", "the file is empty"),
+    ],
+    ids=range(5),
+)
+def test_strokes_go_through_our_reader(program, private, content, reason):
+    assert "data" in program.result(TAKE, [given(program.upload(private.read_bytes()))])
+    painted = {"layers": [given(program.upload(content))]}
+    output = program.result(MEND, [None, painted])
+    assert output["error"].startswith("the strokes: ") and reason in output["error"]
+
+
+def test_more_layers_than_the_editor_has(program):
+    painted = {"layers": [given(program.upload(b"x"))] * 5}
+    assert program.join(MEND, [None, painted]).line.startswith("the call: Expected `array`")
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:80"},
+        {"Host": "127.0.0.1.evil.example:80"},
+        {"Host": "127.0.0.1:80@evil.example"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Origin": "https://{host}"},
+        {"Sec_Fetch_Site": "cross-site"},
+        {"Sec_Fetch_Site": "same-site", "Sec_Fetch_Mode": "cors"},
+        {"Origin": "null", "Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"},
+    ],
+    ids=range(11),
+)
+def test_foreign_pages_get_nothing(served, program, headers):
+    """By a form, a request of a script, or a name that is given the address 127.0.0.1."""
+    headers = {name: value.format(host=served.host) for name, value in headers.items()}
+    before = sorted(served.temporary.rglob("*"))
+    for route in ROUTES:
+        assert program.ask(f"/{route}", **headers).status == 421, route
+    for route in ("gradio_api/upload", "gradio_api/queue/join", "gradio_api/run/predict"):
+        answer = program.ask(f"/{route}", form(b"x"), **FORM, **headers)
+        assert answer.status == 421 and answer.line, route
+    assert sorted(served.temporary.rglob("*")) == before, "nothing of it is kept"
+
+
+def test_our_own_pages_and_links_to_them_are_let_in(served, program):
+    name = f"localhost:{served.host.rpartition(':')[2]}"
+    for headers in (
+        {"Origin": f"http://{served.host}", "Sec_Fetch_Site": "same-origin"},
+        {"Host": name, "Origin": f"http://{name}"},
+        {"Sec_Fetch_Site": "none"},
+        {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"},
+    ):
+        assert program.ask("/", **headers).status == 200, headers
+
+
+def test_forwarded_names_are_ignored(bare):
+    for name in ("X_Forwarded_Host", "X_Forwarded_Server", "Forwarded", "X_Gradio_Server"):
+        answer = bare.ask("/", **{name: "evil.example", "X_Forwarded_Proto": "https"})
+        assert answer.status == 200
+        assert b"evil.example" not in answer.body and b"https://127" not in answer.body
+
+
+def test_what_is_closed(served, program):
+    for route in (
+        *("docs", "redoc", "openapi.json", "gradio_api/openapi.json", "gradio_api/info", "config"),
+        *("monitoring", "monitoring/summary", "gradio_api/app_id", "gradio_api/proxy=http://a/"),
+        *("gradio_api/file", "gradio_api/runs", "gradio_api/queue/status", "manifest.json"),
+        *("gradio_api/call/take/1", "gradio_api/vibe-code", "gradio_api/deep_link", "nothing"),
+    ):
+        answer = program.ask(f"/{route}")
+        assert (answer.status, answer.line) == (404, "there is nothing here"), route
+    for route in (
+        *("run/predict", "api/take", "call/take", "call/v2/take", "cancel", "reset"),
+        *("component_server", "component_server/", "process_recording", "vibe-edit", "stream/1"),
+    ):
+        assert program.ask(f"/gradio_api/{route}", b"{}").status == 404, route
+    for method in ("PUT", "DELETE", "OPTIONS", "PATCH"):
+        assert program.ask("/gradio_api/upload", b"x", method).status == 404
+    for route in ("assets/../../../../../../etc/passwd", "static/%2e%2e/%2e%2e/__init__.py"):
+        assert program.ask(f"/{route}").status in (403, 404), route
+    # gradio would read a file by this name.
+    assert program.ask("/?deep_link=../../../etc/passwd").status == 200
+
+
+@pytest.mark.parametrize("number", [-1, 7, 99, 1 << 70, 1.5, "0", None, [0]])
+def test_no_such_function_is_one_line(program, number):
+    answer = program.join(number, [None])
+    assert answer.status == 400 and answer.line
+
+
+@pytest.mark.parametrize(
+    "number, data", [(TAKE, []), (TAKE, [None, None]), (BRUSH, ["Paint it black"]), (BRUSH, [0])]
+)
+def test_other_inputs_are_one_line(program, number, data):
+    answer = program.join(number, data)
+    assert answer.status == 400 and answer.line
+
+
+@pytest.mark.parametrize("index", [-1, 10**6, 1.0, "0", None, [0, 1], True, {"a": 1}])
+def test_no_such_example_is_one_line(program, index):
+    output = program.result(EXAMPLE, [], event_data={"index": index, "value": 1})
+    assert "and this is none of them" in output["error"]
+
+
+@pytest.mark.parametrize(
+    "body, status",
+    [
+        (b"", 400),
+        (b"{", 400),
+        (b"[" * 100_000, 400),
+        (b'{"fn_index":0,"data":[' + b"[" * 500 + b"]" * 500 + b'],"session_hash":"a"}', 400),
+        (b'{"fn_index":0,"data":[null],"session_hash":"../../a"}', 400),
+        (b'{"fn_index":0,"data":[null]}', 400),
+        (b'{"fn_index":0,"data":[null],"session_hash":null}', 400),
+        (b" " * ((1 << 20) + 1), 413),
+    ],
+    ids=range(8),
+)
+def test_a_call_that_is_none_is_one_line(program, body, status):
+    answer = program.ask("/gradio_api/queue/join", body)
+    assert answer.status == status and answer.line
+
+
+def test_uploads_are_bounded(served, program, bare):
+    large = form(bytes((MEGABYTES << 20) + 1))
+    huge = form(bytes((MEGABYTES << 20) + (1 << 17)))
+    head = b'--edge\r\nContent-Disposition: form-data; name="files"; filename="a"\r\n\r\nx\r\n'
+    field = b'--edge\r\nContent-Disposition: form-data; name="files"\r\n\r\nx\r\n--edge--\r\n'
+    for body, headers, status in (
+        (large, FORM, 413),
+        (huge, FORM, 413),
+        (form(b"x"), {}, 400),
+        (b"nothing", FORM, 400),
+        (head * 5 + b"--edge--\r\n", FORM, 400),
+        (field, FORM, 400),
+        (iter([form(b"x")]), FORM, 411),
+    ):
+        answer = program.ask("/gradio_api/upload", body, **headers)
+        assert answer.status == status and answer.line, (body[:80], status)
+    answer = bare.ask("/gradio_api/upload", form(b"x"), **FORM)
+    assert answer.status == 403 and "open the page first" in answer.line
+    kept = [path for path in served.temporary.rglob("*") if path.is_file()]
+    assert all(path.stat().st_size <= MEGABYTES << 20 for path in kept)
+
+
+def test_the_name_of_an_upload_is_not_its_own(served, program):
+    for name in ("../../../evil.png", "/etc/evil.PNG", "a\\..\\evil.png", "evil.html", ".png"):
+        path = Path(program.upload(b"x", name))
+        assert path.name in ("picture.png", "picture")
+        assert path.is_relative_to(served.temporary)
+    assert not [path for path in served.temporary.rglob("*") if "evil" in path.name]
+
+
+def test_a_session_is_told_in_json(program):
+    answer = program.join(99, [])
+    assert answer.headers["content-type"].startswith("application/json")
+    assert json.loads(answer.body) == {"detail": "the page has no such function (number 99)"}

@@ -1,0 +1,130 @@
+"""A running ``gamba app``, and programs that talk to it without a browser."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import re
+import secrets
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gamba_warp.files import STARTER
+
+MEGABYTES = 1  # the limit on uploads here
+EDGE = "edge"
+FORM = {"Content-Type": f"multipart/form-data; boundary={EDGE}"}
+
+
+@dataclass
+class Served:
+    """A running ``gamba app``."""
+
+    process: subprocess.Popen
+    address: str
+    temporary: Path
+
+    @property
+    def host(self) -> str:
+        return self.address.removeprefix("http://").rstrip("/")
+
+    def folders(self) -> list[str]:
+        return sorted(p.name for p in self.temporary.glob("gamba-app-*"))
+
+
+def command(*options) -> list[str]:
+    shared = ["--no-open-browser", "--checkpoint", str(STARTER / "tiny.safetensors")]
+    return [sys.executable, "-m", "gamba_warp", "app", *shared, *map(str, options)]
+
+
+@contextmanager
+def serving(temporary: Path) -> Iterator[Served]:
+    """The command as users start it, in a folder for temporary files of its own."""
+    environment = {**os.environ, "TMPDIR": str(temporary), "HTTP_PROXY": "http://127.0.0.1:9"}
+    process = subprocess.Popen(
+        command("--port", 0, "--max-upload-mb", MEGABYTES, "--device", "cpu"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    line = process.stdout.readline()
+    match = re.match(r"(http://127\.0\.0\.1:\d+/) \(Ctrl-C ends it\)$", line)
+    assert match, line + process.communicate(timeout=10)[1]
+    yield Served(process, match[1], temporary)
+    process.kill()
+    process.communicate()
+
+
+@dataclass
+class Answer:
+    """What came back."""
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def line(self) -> str:
+        """The one line of a refusal."""
+        text = self.body.decode()
+        assert text.count("\n") == 1 and text.endswith("\n"), text
+        return json.loads(text)["detail"] if text.startswith("{") else text.strip()
+
+
+def form(content: bytes, name: str = "a.png") -> bytes:
+    """The body of an upload."""
+    head = f'--{EDGE}\r\nContent-Disposition: form-data; name="files"; filename="{name}"\r\n\r\n'
+    return head.encode() + content + f"\r\n--{EDGE}--\r\n".encode()
+
+
+@dataclass
+class Program:
+    """A program on the same machine that asks as it likes; it keeps its cookie."""
+
+    host: str
+    headers: dict[str, str] = field(default_factory=dict)
+    session: str = field(default_factory=lambda: secrets.token_hex(5))
+
+    def ask(self, place: str, body: bytes | None = None, method: str = "", **headers) -> Answer:
+        """One request; names of headers have ``_`` for ``-``."""
+        link = http.client.HTTPConnection(self.host, timeout=30)
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        sent = {name: value for name, value in {**self.headers, **named}.items() if value}
+        link.request(method or ("GET" if body is None else "POST"), place, body, sent)
+        got = link.getresponse()
+        answer = Answer(got.status, {k.lower(): v for k, v in got.getheaders()}, got.read())
+        link.close()
+        return answer
+
+    def opened(self) -> Program:
+        """Asks for the page first, as a browser does."""
+        self.headers["Cookie"] = self.ask("/").headers["set-cookie"].partition(";")[0]
+        return self
+
+    def upload(self, content: bytes, name: str = "a.png") -> str:
+        """The path that the page is told."""
+        answer = self.ask("/gradio_api/upload", form(content, name), **FORM)
+        assert answer.status == 200, answer
+        return json.loads(answer.body)[0]
+
+    def join(self, number: Any, data: list, **more) -> Answer:
+        """Asks for a call of a function; what it gives comes by ``result``."""
+        call = {"fn_index": number, "data": data, "session_hash": self.session, **more}
+        kind = {"Content-Type": "application/json"}
+        return self.ask("/gradio_api/queue/join", json.dumps(call).encode(), **kind)
+
+    def result(self, number: int, data: list, **more) -> dict:
+        """The output of a call: ``data``, or an ``error``."""
+        answer = self.join(number, data, **more)
+        assert answer.status == 200, answer
+        events = self.ask(f"/gradio_api/queue/data?session_hash={self.session}").body.decode()
+        found = [json.loads(line[6:]) for line in events.splitlines() if line.startswith("data: ")]
+        [output] = [event["output"] for event in found if event["msg"] == "process_completed"]
+        return output
