@@ -59,7 +59,8 @@ def progress_bar(items: Iterable[Item] | None = None, **options: Any) -> tqdm[It
     """
     from tqdm import tqdm
 
-    return tqdm(items, disable=None, **options)
+    bar: Any = tqdm(items, disable=None, **options)  # without items nothing says of what it is
+    return bar
 
 
 def say(line: str) -> None:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import is_dataclass
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from .devices import keep_memory, share_cores
 from .errors import UserError
@@ -163,7 +163,7 @@ def _joined(arguments: list[str], command: Callable) -> list[str]:
     return [word for group in groups for word in group]
 
 
-def _options(kind: Callable) -> Iterator[tuple[str, tuple[str, bool]]]:
+def _options(kind: Any) -> Iterator[tuple[str, tuple[str, bool]]]:
     """Of a command or class of options: each option, what it is an alias of, if it is a list."""
     noted = get_type_hints(kind, include_extras=True)
     for name, hint in get_type_hints(kind).items():

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from gamba_warp.errors import UserError
+from gamba_warp.gaussians import Gaussians
 from gamba_warp.versions import import_open3d
 
 from .load import Evaluated, centers
 from .metrics import surface_metrics
 from .protocol import GeometryProtocol
 from .sample import sample
-from .shape import Mesh, Points, Similarity
+from .shape import Points, Similarity
 
 # How far correspondences reach in each round of ICP; the truth's longest side is 1.
 ICP_DISTANCES = (0.2, 0.1, 0.05)
@@ -104,8 +105,10 @@ def better_turn(
         without it, both of few points; None where none leaves less than ``FAR_BETTER``.
     """
     true = sample(truth.shape, _FEW, protocol.seed)
-    draw = sample if isinstance(predicted.source, Mesh | Points) else centers
-    points, found = draw(predicted.source, _FEW, protocol.seed + 1).positions, {}
+    few = (_FEW, protocol.seed + 1)
+    source, found = predicted.source, {}
+    of = centers(source, *few) if isinstance(source, Gaussians) else sample(source, *few)
+    points = of.positions
     for name, turn in {"": np.eye(3), **TURNS}.items():
         turned = Points(predicted.motion.after(turn).points(points))
         if protocol.align != "none":

@@ -104,8 +104,8 @@ def fetch(model: Published, address: str) -> Path:
     import pooch
 
     pooch.get_logger().setLevel("ERROR")
-    bar = progress_bar(total=model.megabytes * 10**6, unit="B", unit_scale=True)
-    # Any: pooch's own type of it knows no arguments by name.
+    bar: Any = progress_bar(total=model.megabytes * 10**6, unit="B", unit_scale=True)
+    # Any: pooch's own types know no such bar, and no arguments by name.
     downloader: Any = pooch.HTTPDownloader(progressbar=bar, timeout=_SECONDS)
     try:
         found = pooch.retrieve(

@@ -164,6 +164,7 @@ def causal_conv1d_update_ref(
             token = tokens[..., t : t + 1].to(conv_state.dtype)
             conv_state.scatter_(2, at.expand_as(token), token)
     out = causal_conv1d_ref(tokens, weight, bias, seen, activation=activation)
+    assert isinstance(out, Tensor)
     return out[..., 0] if x.dim() == 2 else out
 
 
