@@ -22,7 +22,6 @@ import sys
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -155,8 +154,7 @@ def empty(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     if pool is None or pool.most == 0 or size < LARGE:
         return torch.empty(*shape, dtype=dtype)
     # Not a view: autograd lets nobody change a view in place that was made inside an operator.
-    made: Any = torch.empty(0, dtype=dtype)  # torch's own types know no such ``set_``
-    return made.set_(pool.take(size).untyped_storage(), 0, tuple(shape))
+    return torch.empty(0, dtype=dtype).set_(pool.take(size).untyped_storage()).resize_(shape)
 
 
 def release() -> None:

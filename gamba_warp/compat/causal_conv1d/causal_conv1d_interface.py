@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -163,8 +165,7 @@ def causal_conv1d_update_ref(
             at = (cache_seqlens.long() + t).remainder(size)[:, None, None]
             token = tokens[..., t : t + 1].to(conv_state.dtype)
             conv_state.scatter_(2, at.expand_as(token), token)
-    out = causal_conv1d_ref(tokens, weight, bias, seen, activation=activation)
-    assert isinstance(out, Tensor)
+    out = cast(Tensor, causal_conv1d_ref(tokens, weight, bias, seen, activation=activation))
     return out[..., 0] if x.dim() == 2 else out
 
 
