@@ -108,6 +108,11 @@ class Stages:
 STAGES = Stages()
 
 
+def counted(count: int, unit: str) -> str:
+    """A number of things: ``1 picture``, ``2 pictures``."""
+    return f"{count:,} {unit}" + ("" if count == 1 else "s")
+
+
 def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: Path) -> int:
     """Says what failed, and where the results are.
 
@@ -122,7 +127,7 @@ def report(count: int, unit: str, failures: Sequence[tuple[object, str]], out: P
     """
     for item, reason in failures:
         print(f"gamba: failed: {item}: {reason}", file=sys.stderr)
-    print(f"{count} {unit}s, {len(failures)} failures, results in {out}")
+    print(f"{counted(count, unit)}, {counted(len(failures), 'failure')}, results in {out}")
     return 1 if failures else 0
 
 
@@ -135,6 +140,7 @@ def plan_outputs(
     """A name for each input: its stem, with a number where two inputs would share an output.
 
     ``.compressed.ply`` is one suffix: the other formats are not compressed in its way.
+    A name that is not its input's stem is said.
 
     Two names that differ in capitals only are one name to many file systems, and so they are here.
 
@@ -166,6 +172,9 @@ def plan_outputs(
         names[name] = path
     targets = (folder / f"{name}{suffix}" for name in names for suffix in suffixes)
     check_not_read(targets, [*inputs, *reads])
+    for name, path in names.items():
+        if name != path.stem:
+            say(f"{path}: its results are named {name}")
     return names
 
 

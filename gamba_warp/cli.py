@@ -117,7 +117,9 @@ def run(name: str, arguments: list[str]) -> int:
         arguments = _joined(arguments, command)
         expand = getattr(sys.modules.get(command.__module__), "expand", None)
         arguments = expand(arguments) if expand else arguments
-        return tyro.cli(command, args=arguments, prog=f"gamba {name}") or 0
+        # An option that is left out is None; the word is no value of it.
+        plain = (tyro.conf.DisallowNone,)
+        return tyro.cli(command, args=arguments, prog=f"gamba {name}", config=plain) or 0
     except BrokenPipeError:
         raise  # the reader of the output left; see ``main``
     except KeyboardInterrupt:

@@ -89,7 +89,8 @@ class LossConfig:
     mask_weight: _Weight = 1.0
     """Weight of the alpha channel's squared error."""
     lpips: Literal["auto", "on", "off"] = "auto"
-    """Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" demands them."""
+    """Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" demands them. On a CPU it
+    multiplies a step's time (docs/train-your-own.md)."""
     lpips_weight: _Weight = 0.5
     """Weight of LPIPS."""
     lpips_after: _Every = 0

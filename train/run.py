@@ -72,7 +72,7 @@ def _train(
             if there:
                 held.enter_context(lock)
             checkpoint = find_checkpoint(run.out, run.resume, damaged.append)
-        lpips, warning = open_lpips(config)
+        lpips, warning = open_lpips(config, world.device.type)
     world.agree(lambda: _facts(config, data, world, lpips is not None))
     _refuse_newer(world, run.out, run.resume, checkpoint)
     torch.manual_seed(run.seed)

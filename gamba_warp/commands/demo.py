@@ -35,7 +35,7 @@ def demo_command(
         out: Folder for everything; OUT/index.html is the page.
         minutes: Training time.
         starter: The starter set's folder.
-        lpips: Fetch the LPIPS weights (59 MB) for the evaluation, if they are not there.
+        lpips: Fetch the LPIPS weights (64 MB) for the evaluation, if they are not there.
         fresh: Remove what an earlier demo made in OUT, and start anew.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT

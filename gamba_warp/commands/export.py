@@ -12,7 +12,7 @@ from ..conventions import Axes, DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
-from ..formats.names import MeshFormat, SplatFormat
+from ..formats.names import MeshChoice, SplatFormat, mesh_formats
 from ..surfaces.options import (
     BROWSER_FACES,
     TEXTURED_FACES,
@@ -37,7 +37,7 @@ def export_command(
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
     /,
     out: Path = Path("out"),
-    mesh: tuple[MeshFormat, ...] = ("glb",),
+    mesh: tuple[MeshChoice, ...] = ("glb",),
     splats: tuple[SplatFormat, ...] = (),
     page: bool = False,
     turntable: Literal["gif", "mp4", "none"] = "none",
@@ -69,7 +69,7 @@ def export_command(
     Args:
         inputs: Gaussians (.ply, .splat, .spz, .glb), or folders of them.
         out: Folder for the results.
-        mesh: Files of the surface; give it without a value for none.
+        mesh: Files of the surface.
         splats: Files of the Gaussians.
         page: Write an HTML page with a 3D viewer.
         turntable: Moving picture of one turn.
@@ -115,7 +115,7 @@ def export_command(
     )
     job = ExportJob(
         folder=out,
-        mesh=mesh,
+        mesh=mesh_formats(mesh),
         splats=splats,
         page=page,
         turntable=turntable,

@@ -15,7 +15,7 @@ from ..conventions import Axes, DeviceChoice, Precision
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
-from ..formats.names import MeshFormat, SplatFormat
+from ..formats.names import MeshChoice, SplatFormat, mesh_formats
 from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, ranged
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def reconstruct_command(
     encoder_weights: Path | None = None,
     out: Path = Path("out"),
     splats: tuple[SplatFormat, ...] = ("ply",),
-    mesh: tuple[MeshFormat, ...] = (),
+    mesh: tuple[MeshChoice, ...] = (),
     turntable: Literal["gif", "mp4", "none"] = "gif",
     size: Side = 256,
     frames: Frames = 48,
@@ -109,7 +109,7 @@ def reconstruct_command(
     outputs = Outputs(
         folder=out,
         splats=splats,
-        mesh=mesh,
+        mesh=mesh_formats(mesh),
         turntable=turntable,
         size=size,
         frames=frames,
@@ -122,8 +122,7 @@ def reconstruct_command(
         inputs=save_inputs,
     )
     outputs.require()
-    network = None if matte_model is None else Path(matte_model)
-    reads = (mask, network, sam, file, encoder_weights)
+    reads = (mask, Path(matte_model) if matte_model else None, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads)
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
     STAGES.begin("model")

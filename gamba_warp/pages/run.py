@@ -46,8 +46,8 @@ def write_run_page(run: Path, path: Path | None = None) -> Path:
         *_warnings(record),
         *_configuration(record),
     ]
-    name = run.resolve().name
-    demo_page(path, sections, title=f"Training run {name}", text=_state(record))
+    name = "/".join(run.resolve().parts[-2:])  # many a run lies in a folder that is called run
+    demo_page(path, sections, title=f"Training of {name}", text=_state(record))
     return path
 
 

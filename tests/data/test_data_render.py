@@ -231,7 +231,7 @@ def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
         os.utime(path, (path.stat().st_mtime - 2 * 86400,) * 2)
     assert len(open_dataset(out)) == 2
     assert data_render_command(meshes, out, **options) == 0
-    assert "2 of 3 objects are already" in capsys.readouterr().out
+    assert "2 of 3 objects already in" in capsys.readouterr().out
     assert contents(out) == before
     for name, time in times.items():
         assert (out / name / "000.webp").stat().st_mtime_ns == time
@@ -392,7 +392,7 @@ def test_a_damaged_object_in_the_dataset_stops_no_other(meshes, tmp_path, capsys
     shutil.rmtree(out / "b")
     assert data_render_command(meshes, out, **options) == 1
     captured = capsys.readouterr()
-    assert "1 of 3 objects are already" in captured.out and "rendered 1 objects" in captured.out
+    assert "1 of 3 objects already in" in captured.out and "rendered 1 object into" in captured.out
     assert "failed: a: " in captured.err and "remove" in captured.err
     parts = json.loads((out / "split.json").read_text())
     assert sorted(sum((parts[name] for name in ("train", "val", "test")), [])) == ["b", "sub-c"]

@@ -144,7 +144,7 @@ def test_the_command_goes_on_where_it_was_stopped(data, tmp_path, monkeypatch, c
     first = (out / "shard-00000.bin").stat().st_mtime_ns
     (out / "shard-00007.bin").write_bytes(b"of a killed run")
     assert cli.run("data pack", words) == 0
-    assert "2 objects were in" in capsys.readouterr().out
+    assert "2 objects in" in capsys.readouterr().out
     assert sorted(p.name for p in out.glob("shard*")) == [f"shard-0000{n}.bin" for n in range(3)]
     assert (out / "shard-00000.bin").stat().st_mtime_ns == first
     for uid in UIDS:

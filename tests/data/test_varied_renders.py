@@ -65,7 +65,7 @@ def test_without_the_new_options_nothing_changes_and_older_sets_go_on(boxes, tmp
         del values["settings"][name]
     path.write_text(json.dumps(values))
     assert data_render_command(boxes, out, **QUICK) == 0
-    assert "2 of 2 objects are already" in capsys.readouterr().out
+    assert "2 of 2 objects already in" in capsys.readouterr().out
     with pytest.raises(UserError, match="rendered with other settings"):
         data_render_command(boxes, out, stretch=1.2, **QUICK)
 

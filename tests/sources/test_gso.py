@@ -91,7 +91,7 @@ def test_views_and_meshes_of_a_copy_of_the_set(tmp_path, capsys):
     shutil.rmtree(tmp_path / "set" / FIRST)
     write_model(tmp_path / "set", THIRD)
     assert run("data gso", words[2:]) == 0
-    assert "rendered 1 objects" in capsys.readouterr().out
+    assert "rendered 1 object into" in capsys.readouterr().out
     other = [word if word != "24" else "16" for word in words[2:]]
     assert run("data gso", other) == 2
     assert "rendered with other settings" in capsys.readouterr().err

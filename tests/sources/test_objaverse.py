@@ -80,7 +80,7 @@ def test_a_local_copy_in_all_its_forms(published, tmp_path, capsys, copy):
     assert names == {"00003.png", "00003.json"}
     assert not [path for path in out.rglob(f"{PART}*")]
     assert data(*words, "--min-views", 3) == 0
-    assert "1 objects put into" in capsys.readouterr().out
+    assert "1 object put into" in capsys.readouterr().out
     assert open_dataset(out).num_views("0/10013") == 3
 
 
@@ -109,7 +109,7 @@ def test_shards_and_a_run_that_goes_on(published, tmp_path, capsys):
     assert open_dataset(tmp_path / "out").uids == ["0/10011", "0/10013"]
     assert (tmp_path / "out" / "objaverse.1-2.json").exists()
     assert data(*words, "--limit", 2) == 0
-    assert "1 objects put into" in capsys.readouterr().out.splitlines()[-2]
+    assert "1 object put into" in capsys.readouterr().out.splitlines()[-2]
     assert open_dataset(tmp_path / "out").uids == ["0/10010", "0/10011", "0/10013"]
     # A link whose goal has moved is made again; what is somebody's own stays.
     link = tmp_path / "out" / "0" / "10010" / "campos_512_v4"

@@ -9,6 +9,7 @@ import re
 import signal
 import sys
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -381,6 +382,15 @@ def test_lpips_is_real_or_absent(data, tmp_path, monkeypatch):
     warnings = [record["message"] for record in lines(tmp_path / "auto", "warning")]
     assert len(warnings) == 1 and "no LPIPS weights" in warnings[0]
     assert "loss_lpips" not in lines(tmp_path / "auto", "train")[0]
+
+    config = micro.options(data, tmp_path, loss={"lpips": "auto"})
+    monkeypatch.setattr(losses, "lpips_available", lambda: True)
+    monkeypatch.setattr(losses, "load_lpips", lambda: "real")
+    assert losses.open_lpips(config, "cuda") == ("real", None)
+    assert losses.open_lpips(config, "cpu") == ("real", losses.COST)
+    crop = replace(config, loss=replace(config.loss, lpips_crop=16))
+    chosen = replace(config, loss=replace(config.loss, lpips="on"))
+    assert losses.open_lpips(crop, "cpu") == losses.open_lpips(chosen, "cpu") == ("real", None)
 
     class Half(torch.nn.Module):
         def forward(self, got, want):

@@ -42,7 +42,7 @@ def test_a_turntable_of_pictures_with_its_cameras(thing, tmp_path, capsys):
     path, gaussians = thing
     options = ["--kind", "png", "--size", "40x24", "--frames", 3, "--elevation", 20, "--depth"]
     assert shoot(path, "--out", tmp_path / "out", *options) == 0
-    assert "1 files, 0 failures" in capsys.readouterr().out
+    assert "1 file, 0 failures" in capsys.readouterr().out
     folder = tmp_path / "out" / "thing"
     moved = gaussians.in_unit(*unit_frame(gaussians))
     cameras = turntable(3, 20.0, size=(40, 24))
@@ -105,7 +105,7 @@ def test_several_files_and_a_bad_one(thing, tmp_path, capsys):
     bad.write_bytes(b"ply\nnothing")
     options = ["--size", "16", "--frames", 2]
     assert shoot(path, bad, "--out", tmp_path / "out", *options) == 1
-    assert "2 files, 1 failures" in capsys.readouterr().out
+    assert "2 files, 1 failure," in capsys.readouterr().out
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["thing.gif"]
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from msgspec import Meta
 
+from gamba_warp.batch import counted
 from gamba_warp.conventions import DEFAULT_FOV
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder
@@ -92,7 +93,7 @@ def data_render_command(
     out = output_folder(out)
     todo, damaged = still_missing(meshes, out, settings)
     if done := len(meshes) - len(todo) - len(damaged):
-        print(f"{done} of {len(meshes)} objects are already in {out}")
+        print(f"{done} of {counted(len(meshes), 'object')} already in {out}")
     warnings, failures = render_meshes(todo, out, settings, workers, groups)
     return _say(len(todo) - len(failures), out, warnings, failures | damaged)
 
@@ -101,7 +102,7 @@ def _say(rendered: int, out: Path, warnings: dict[str, list[str]], failures: dic
     """Prints what was done; returns the exit code."""
     for uid, lines in sorted(warnings.items()):
         print(f"warning: {uid}: {'; '.join(lines)}")
-    print(f"rendered {rendered} objects into {out}, {len(failures)} failed")
+    print(f"rendered {counted(rendered, 'object')} into {out}, {len(failures)} failed")
     for uid, reason in sorted(failures.items()):
         print(f"failed: {uid}: {reason}", file=sys.stderr)
     return 1 if failures else 0

@@ -180,8 +180,19 @@ def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Ten
     return torch.stack([weights[name] * term.mean() for name, term in terms.items()]).sum()
 
 
-def open_lpips(config: TrainConfig) -> tuple[LPIPS | None, str | None]:
-    """Loads LPIPS as ``--lpips`` says; the second value tells the user if it is missing.
+# From docs/train-your-own.md, which has the command.
+COST = (
+    "LPIPS of whole pictures makes a step on a CPU 5 to 15 times as long: --lpips off leaves "
+    "it out, --lpips-crop 64 compares a part"
+)
+
+
+def open_lpips(config: TrainConfig, device: str) -> tuple[LPIPS | None, str | None]:
+    """Loads LPIPS as ``--lpips`` says; the second value tells the user what "auto" came to.
+
+    Args:
+        config: of the run.
+        device: type of the device that trains, ``cpu`` or ``cuda``.
 
     Raises:
         UserError: ``--lpips on`` was given and the weights are missing.
@@ -193,4 +204,5 @@ def open_lpips(config: TrainConfig) -> tuple[LPIPS | None, str | None]:
         return None, "training without LPIPS, which needs --size 16 or more"
     if loss.lpips == "auto" and not lpips_available():
         return None, "no LPIPS weights: training without (gamba weights lpips fetches them)"
-    return load_lpips(), None
+    found, slow = load_lpips(), loss.lpips == "auto" and device == "cpu" and not loss.lpips_crop
+    return found, COST if slow else None

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from msgspec import Meta
 
+from gamba_warp.batch import counted
 from gamba_warp.files import output_folder
 from gamba_warp.untrusted.ranges import ranged
 
@@ -49,7 +50,8 @@ def data_gso_command(
     for uid, lines in sorted(warnings.items()):
         print(f"warning: {uid}: {'; '.join(lines)}")
     failures |= failed
-    print(f"rendered {made} objects into {out / 'views'}, {len(failures)} of {len(names)} missing")
+    missing = f"{len(failures)} of {len(names)} missing"
+    print(f"rendered {counted(made, 'object')} into {out / 'views'}, {missing}")
     for name, reason in sorted(failures.items()):
         print(f"missing: {name}: {reason}", file=sys.stderr)
     views, meshes = out / "views", out / "meshes"

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from msgspec import Meta
 
+from gamba_warp.batch import counted
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
 from gamba_warp.untrusted.ranges import ranged
@@ -82,7 +83,8 @@ def data_objaverse_command(
     record |= {"objaverse": known, "left_out": failures}
     write_json(out / f"objaverse{mark}.json", record)
     there = len(names) - taken - len(failures)
-    print(f"{taken:,} objects put into {out}, {there:,} were there, {len(failures):,} left out")
+    found = f"{there:,} were there, {len(failures):,} left out"
+    print(f"{counted(taken, 'object')} put into {out}, {found}")
     for name, reason in list(failures.items())[:_SHOWN]:
         print(f"left out: {name}: {reason}", file=sys.stderr)
     if len(failures) > _SHOWN:

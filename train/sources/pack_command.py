@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from msgspec import Meta
 
+from gamba_warp.batch import counted
 from gamba_warp.untrusted.ranges import ranged
 
 
@@ -45,8 +46,9 @@ def data_pack_command(
     settings = PackSettings(size, split, format, shard_mb << 20)
     done = write_pack(data, out, settings, workers or cores(), limit)
     if done.there:
-        print(f"{done.there} objects were in {out} already")
-    print(f"packed {done.written} objects into {out}, {done.shards} shards", end="")
+        print(f"{counted(done.there, 'object')} in {out} already")
+    made = counted(done.written, "object"), counted(done.shards, "shard")
+    print(f"packed {made[0]} into {out}, {made[1]}", end="")
     print(f", {len(done.failures)} failed")
     for uid, reason in sorted(done.failures.items()):
         print(f"failed: {uid}: {reason}", file=sys.stderr)
