@@ -139,8 +139,8 @@ def plan_outputs(
 ) -> dict[str, Path]:
     """A name for each input: its stem, with a number where two inputs would share an output.
 
-    ``.compressed.ply`` is one suffix: the other formats are not compressed in its way.
-    A name that is not its input's stem is said.
+    ``.compressed.ply`` is one suffix: the other formats are not compressed in its way. A name with
+    a number is said.
 
     Two names that differ in capitals only are one name to many file systems, and so they are here.
 
@@ -158,6 +158,7 @@ def plan_outputs(
     """
     names: dict[str, Path] = {}
     taken: set[str] = set()
+    renamed: list[str] = []
 
     def outputs_of(name: str) -> set[str]:
         return {normalize("NFC", name + suffix).casefold() for suffix in (*suffixes, "")}
@@ -170,11 +171,12 @@ def plan_outputs(
             name = f"{stem}-{number}"
         taken |= outputs_of(name)
         names[name] = path
+        if number > 1:
+            renamed.append(f"{path}: its results are named {name}")
     targets = (folder / f"{name}{suffix}" for name in names for suffix in suffixes)
     check_not_read(targets, [*inputs, *reads])
-    for name, path in names.items():
-        if name != path.stem:
-            say(f"{path}: its results are named {name}")
+    for line in renamed:
+        say(line)
     return names
 
 

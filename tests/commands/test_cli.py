@@ -3,8 +3,8 @@ import re
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import Annotated
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 import tyro
