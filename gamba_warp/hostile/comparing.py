@@ -76,8 +76,8 @@ def shown(path: Path, out: Path) -> Any:
 
 
 def seen(result: Any, path: Path, out: Path) -> str | None:
-    """Pictures in place of true views: colours in [0, 1], and masks of their size or none."""
-    rgb, mask = result.rgb, result.mask
+    """Pictures in place of true views: colours in [0, 1], and alpha of their size or none."""
+    rgb, alpha = result.shown.on(), result.shown.alpha
     if not (rgb.isfinite().all() and rgb.min() >= 0 and rgb.max() <= 1):
         return "a colour outside of [0, 1]"
-    return "masks of another size" if mask is not None and mask.shape != rgb.shape[:3] else None
+    return "alpha of another size" if alpha is not None and alpha.shape != rgb.shape[:3] else None

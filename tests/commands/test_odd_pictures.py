@@ -105,7 +105,9 @@ def test_a_picture_without_an_object_is_one_line(tmp_path, checkpoints, capsys, 
     path = save(tmp_path, name, alpha)
     out = tmp_path / "out"
     assert reconstruct(path, "--checkpoint", checkpoints / "rays.safetensors", "--out", out) == 1
-    (line,) = [s for s in capsys.readouterr().err.splitlines() if s.startswith("gamba: ")]
+    said = [s for s in capsys.readouterr().err.splitlines() if s.startswith("gamba: ")]
+    *_, line = said
+    assert len([s for s in said if "gamba: no matting model" not in s]) == 1
     assert line.startswith(f"gamba: failed: {path}: ") and reason in line
     assert not any(out.iterdir())
 

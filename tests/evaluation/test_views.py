@@ -98,8 +98,9 @@ def painted(monkeypatch):
 
 def evaluate(folder, *options, pred="pred"):
     places = ["--checkpoint", str(folder / pred), "--data", str(folder / "data")]
-    arguments = [*places, "--out", str(folder / "out"), "--split", "all", "--device", "cpu"]
-    code = run("eval-views", [*arguments, *options])
+    arguments = [*places, "--out", str(folder / "out"), "--device", "cpu"]
+    split = [] if "--split" in options else ["--split", "all"]
+    code = run("eval-views", [*arguments, *split, *options])
     path = folder / "out" / "report.json"
     return code, json.loads(path.read_text()) if path.exists() else None
 

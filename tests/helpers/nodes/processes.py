@@ -39,12 +39,12 @@ def environment(**more: object) -> dict[str, str]:
 
 
 def words(data: Path, out: Path, *more: object) -> list[str]:
-    """Arguments of ``gamba train`` for a quick run of a narrow network."""
-    quick = ["--preset", "tiny", "--set", *micro.MODEL, "--lpips", "off", "--device", "cpu"]
-    quick += ["--size", micro.SIZE, "--views-first", 1, "--views-last", 3, "--batch-size", 2]
-    quick += ["--warmup-steps", 1, "--val-every", 0, "--log-every", 1, "--no-tensorboard"]
-    quick += ["--threads", 1, "--out", out]
-    return [*map(str, [data, *quick, *more])]
+    """Arguments of ``gamba train`` for a quick run of a narrow network; ``more`` replaces them."""
+    quick = {"--preset": "tiny", "--lpips": "off", "--device": "cpu", "--size": micro.SIZE}
+    quick |= {"--views-first": 1, "--views-last": 3, "--batch-size": 2, "--warmup-steps": 1}
+    quick |= {"--val-every": 0, "--log-every": 1, "--threads": 1, "--out": out}
+    kept = [word for pair in quick.items() if pair[0] not in more for word in pair]
+    return [*map(str, [data, "--set", *micro.MODEL, "--no-tensorboard", *kept, *more])]
 
 
 def train_all(arguments: list[list[str]], patch: dict[int, str] | None = None) -> list[End]:
