@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from gamba_warp.errors import UserError
@@ -21,13 +19,13 @@ ICP_DISTANCES = (0.2, 0.1, 0.05)
 
 # Turns that files are mistaken by: half ones, and quarter ones about x between y-up and z-up.
 TURNS = {
+    "as it is": np.eye(3),
     "180 degrees about x": np.diag([1.0, -1, -1]),
     "180 degrees about y": np.diag([-1.0, 1, -1]),
     "180 degrees about z": np.diag([-1.0, -1, 1]),
     "90 degrees about x": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
     "-90 degrees about x": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
-FAR_BETTER = 0.6  # share of the Chamfer distance that a wrong turn's undoing leaves at most
 _FEW = 20_000  # points that are enough to tell
 
 
@@ -87,13 +85,13 @@ def icp(predicted: Points, truth: Points) -> tuple[Similarity, dict[str, float]]
     return motion, {"fitness": result.fitness, "inlier_rmse": result.inlier_rmse}
 
 
-def better_turn(
+def chamfer_by_turn(
     predicted: Evaluated, truth: Evaluated, protocol: GeometryProtocol
-) -> dict[str, Any] | None:
-    """Finds a turn of the prediction's file that would better its Chamfer distance by far.
+) -> dict[str, float]:
+    """Measures how the Chamfer distance changes if the prediction's file has other axes.
 
-    The turns are about the origin of the file, whose axes may have been taken for others. Of
-    Gaussians the centres are compared, because their surface is looked for near the truth alone.
+    The turns are about the origin of the file. Of Gaussians the centres are compared, because their
+    surface is looked for near the truth alone.
 
     Args:
         predicted: before any alignment.
@@ -101,21 +99,16 @@ def better_turn(
         protocol: says the seed; where it aligns, centroids and sizes are matched first.
 
     Returns:
-        ``turn`` (a key of ``TURNS``), ``chamfer`` after it, and ``instead_of``, the distance
-        without it, both of few points; None where none leaves less than ``FAR_BETTER``.
+        Distances between few points, by the key of ``TURNS``.
     """
-    true = sample(truth.shape, _FEW, protocol.seed)
+    true = Points(sample(truth.shape, _FEW, protocol.seed).positions)
     few = (_FEW, protocol.seed + 1)
     source, found = predicted.source, {}
     of = centers(source, *few) if isinstance(source, Gaussians) else sample(source, *few)
     points = of.positions
-    for name, turn in {"": np.eye(3), **TURNS}.items():
+    for name, turn in TURNS.items():
         turned = Points(predicted.motion.after(turn).points(points))
         if protocol.align != "none":
             turned = match_moments(turned, true).apply(turned)
-        found[name] = surface_metrics(turned, Points(true.positions), ())["chamfer"]
-    straight = found.pop("")
-    best = min(found, key=lambda name: found[name])
-    if found[best] >= FAR_BETTER * straight:
-        return None
-    return {"turn": best, "chamfer": found[best], "instead_of": straight}
+        found[name] = surface_metrics(turned, true, ())["chamfer"]
+    return found

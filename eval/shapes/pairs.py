@@ -11,7 +11,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,6 +27,7 @@ from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.versions import __version__, installed
 
+from ..averages import mean_of
 from ..paired import PREDICTED, differences_of, page
 from ..report import (
     OK,
@@ -53,8 +53,12 @@ PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "num
 # entries of the records that have no meaningful mean
 _NO_MEAN = (
     *("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed"),
-    "better_turned",
+    "chamfer_turned",
 )
+# A turn is warned of where it leaves at most such shares of the Chamfer distance: of one object's,
+# or of the mean of many.
+FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
+AS_IS = "as it is"  # among the turns
 _NAMED = 3  # objects that a warning names
 
 
@@ -246,7 +250,7 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
-    from .alignment import better_turn
+    from .alignment import chamfer_by_turn
     from .compare import compare
     from .load import FRAME_AXES, load_prediction, load_truth
 
@@ -256,7 +260,7 @@ def evaluate_pair(
     predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     loaded = time.perf_counter()
     metrics = check_finite(compare(predicted.shape, truth.shape, protocol))
-    turned = better_turn(predicted, truth, protocol)
+    turned = check_finite(chamfer_by_turn(predicted, truth, protocol))
     return {
         "name": pair.name,
         "status": OK,
@@ -268,7 +272,7 @@ def evaluate_pair(
         "gt_flags": truth.flags,
         "pred_axes": predicted.axes,
         "gt_axes": truth.axes,
-        **({"better_turned": turned} if turned else {}),
+        "chamfer_turned": turned,
         "pred_sha256": sha256(pair.pred),
         "gt_sha256": sha256(pair.gt),
         "gt_normalization": truth.motion.record(),
@@ -390,27 +394,41 @@ def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
         that would better the score by far.
     """
     done = [record for record in objects if record["status"] == OK]
-    flags, axes = (
-        {
-            side: dict(Counter(chain.from_iterable(words(r[f"{side}_{key}"]) for r in done)))
-            for side in ("pred", "gt")
-        }
-        for key, words in (("flags", list), ("axes", lambda axes: [axes]))
-    )
-    turned: dict[str, list[dict[str, Any]]] = {}
+    sides = ("pred", "gt")
+    return {
+        "flags": {s: dict(Counter(f for r in done for f in r[f"{s}_flags"])) for s in sides},
+        "axes": {s: dict(Counter(r[f"{s}_axes"] for r in done)) for s in sides},
+        "warnings": turn_warnings(done),
+    }
+
+
+def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
+    """Says which turns of the predictions' files would better the score by far.
+
+    One turn that betters the mean of many objects is one warning; else each turn that betters
+    single objects by ``FAR_BETTER`` is one.
+
+    Args:
+        done: records of the evaluated objects.
+    """
+    ask = "are the axes right? (--pred-axes, --up, --frame)"
+    if len(done) >= MANY:
+        means = mean_of([record["chamfer_turned"] for record in done])
+        straight, best = means.pop(AS_IS), min(means, key=means.__getitem__)
+        if means[best] <= BETTER * straight:
+            return [
+                f"the mean Chamfer distance of {len(done)} predictions would be {means[best]:.3g} "
+                f"in place of {straight:.3g} if all were turned by {best}; {ask}"
+            ]
+    found: dict[str, list[str]] = {}
     for record in done:
-        if "better_turned" in record:
-            turned.setdefault(record["better_turned"]["turn"], []).append(record)
-    warnings = []
-    for turn, records in turned.items():
-        some = [
-            f"{r['name']} {r['better_turned']['chamfer']:.3g} in place of "
-            f"{r['better_turned']['instead_of']:.3g}"
-            for r in records[:_NAMED]
-        ]
-        warnings.append(
-            f"{len(records)} of {len(done)} predictions would have a far smaller Chamfer distance "
-            f"turned by {turn} ({'; '.join(some)}{'; ...' if len(records) > _NAMED else ''}); "
-            f"are the axes right? (--pred-axes, --up, --frame)"
-        )
-    return {"flags": flags, "axes": axes, "warnings": warnings}
+        values = dict(record["chamfer_turned"])
+        straight, best = values.pop(AS_IS), min(values, key=values.__getitem__)
+        if values[best] < FAR_BETTER * straight:
+            text = f"{record['name']} {values[best]:.3g} in place of {straight:.3g}"
+            found.setdefault(best, []).append(text)
+    return [
+        f"{len(texts)} of {len(done)} predictions would have a far smaller Chamfer distance turned "
+        f"by {turn} ({'; '.join(texts[:_NAMED])}{'; ...' if len(texts) > _NAMED else ''}); {ask}"
+        for turn, texts in found.items()
+    ]

@@ -9,6 +9,7 @@ import torch
 import trimesh
 
 from gamba_warp.cli import run
+from gamba_warp.eval.shapes.pairs import turn_warnings
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
@@ -88,10 +89,9 @@ def test_misstated_axes_are_warned_of(files, capfd):
         (said,) = report["warnings"]
         assert said.startswith("1 of 1 predictions") and "by 180 degrees about x" in said
         assert f"warning: {said}" in err and err.count("warning:") == 1
-        turned = report["objects"][0]["better_turned"]
-        assert (
-            turned["chamfer"] < 0.6 * turned["instead_of"] and "better_turned" not in report["mean"]
-        )
+        turned = report["objects"][0]["chamfer_turned"]
+        assert turned["180 degrees about x"] < 0.2 * turned["as it is"]
+        assert "chamfer_turned" not in report["mean"]
 
 
 def test_what_is_not_known_is_used_as_it_is_and_told(files, capfd):
@@ -139,6 +139,21 @@ def test_good_shapes_are_not_warned_of(tmp_path, capfd):
     trimesh.creation.icosphere(3, 0.6).export(tmp_path / "ball.obj")
     for pred in ("cube.obj", "ball.obj"):
         assert evaluate(capfd, tmp_path / pred, tmp_path / "cube.obj")[0]["warnings"] == []
+
+
+def test_one_turn_of_many_is_one_warning():
+    """Poor predictions, none of which is far better turned, all of which are a little."""
+
+    def record(straight, turned):
+        values = {"as it is": straight, "180 degrees about x": turned, "180 degrees about y": 0.2}
+        return {"name": "a", "chamfer_turned": values}
+
+    (said,) = turn_warnings([record(0.06, 0.045)] * 4 + [record(0.05, 0.05)])
+    assert "of 5 predictions would be 0.046 in place of 0.058 if all were turned by 180" in said
+    assert turn_warnings([record(0.06, 0.045)] * 4) == []
+    assert turn_warnings([record(0.06, 0.058)] * 9) == []
+    (said,) = turn_warnings([record(0.05, 0.06)] * 9 + [record(0.06, 0.03)])
+    assert said.startswith("1 of 10 predictions") and "a 0.03 in place of 0.06" in said
 
 
 def test_every_protocol_states_the_axes():
