@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from tqdm import tqdm
 
@@ -24,7 +23,7 @@ from ..photo.cutout import CutOut
 from ..surfaces.files import write_meshes
 from ..surfaces.options import BROWSER_FACES, SurfaceOptions
 from ..trajectories.movies import require_movie
-from ..trajectories.paths import Viewpoint, upright
+from ..trajectories.paths import Viewpoint, set_up
 from .page import Section, index_page, reconstruction_page
 from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
@@ -127,9 +126,7 @@ def write_outputs(
     base, view = outputs.folder / name, outputs.view(config)
     gaussians, count = to_be_written(gaussians, outputs.min_opacity)
     say(f"{name}: {count}")
-    if view.elevation:
-        turn = upright(view.elevation).to(gaussians.means)
-        gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
+    gaussians = set_up(gaussians, view.elevation)
     if outputs.inputs:
         save_image(base.with_name(f"{name}-input.png"), cut.editable)
     STAGES.begin("Gaussians")
