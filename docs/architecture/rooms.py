@@ -154,7 +154,6 @@ ONLY_INSIDE_FUNCTIONS = {"open3d", "pymeshlab"}
 # harmonics in torch, which is itself their kernels' oracle).
 ORACLES = ("kernels.stress.oracles", "reference")
 ORACLES_MAY = ("constants", "harmonics.formula", "kernels.stress.core", "kernels.stress.oracles")
-MOST_FILES = 13
 
 
 def short(module: str) -> str:
