@@ -1,7 +1,8 @@
-"""Predicted shapes beside those of baselines: paired differences, and the table of both."""
+"""What a report of shapes says beside means: flags, axes, warnings, differences to baselines."""
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 from .averages import LEVEL, intervals_of, mean_of, median, median_of, minus
@@ -21,6 +22,11 @@ METRICS = (
 )
 _SHOWN = {"iou": "Volume IoU", "chamfer": "Chamfer", "normal_consistency": "normal consistency"}
 _DIGITS = 4
+# A turn is warned of where it leaves at most such shares of the Chamfer distance: of one object's,
+# or of the mean of many.
+FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
+AS_IS = "as it is"  # among the turns
+_NAMED = 3  # objects that a warning names
 
 
 def differences_of(objects: list[dict[str, Any]], others: list[dict[str, Any]]) -> dict[str, Any]:
@@ -80,3 +86,51 @@ def _columns(report: dict[str, Any]) -> dict[str, str]:
     thresholds = sorted(report["protocol"]["thresholds"])
     middle = thresholds[len(thresholds) // 2]
     return _SHOWN | {f"fscore.{middle}": f"F-score at {middle:g}"}
+
+
+def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
+    """What a report says of the evaluated shapes besides metrics.
+
+    Returns:
+        ``flags`` and ``axes``: for each side how many shapes have which; and ``warnings``: of turns
+        that would better the score by far.
+    """
+    done = [record for record in objects if record["status"] == OK]
+    sides = ("pred", "gt")
+    return {
+        "flags": {s: dict(Counter(f for r in done for f in r[f"{s}_flags"])) for s in sides},
+        "axes": {s: dict(Counter(r[f"{s}_axes"] for r in done)) for s in sides},
+        "warnings": turn_warnings(done),
+    }
+
+
+def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
+    """Says which turns of the predictions' files would better the score by far.
+
+    One turn that betters the mean of many objects is one warning; else each turn that betters
+    single objects by ``FAR_BETTER`` is one.
+
+    Args:
+        done: records of the evaluated objects.
+    """
+    ask = "are the axes right? (--pred-axes, --up, --frame)"
+    if len(done) >= MANY:
+        means = mean_of([record["chamfer_turned"] for record in done])
+        straight, best = means.pop(AS_IS), min(means, key=means.__getitem__)
+        if means[best] <= BETTER * straight:
+            return [
+                f"the mean Chamfer distance of {len(done)} predictions would be {means[best]:.3g} "
+                f"in place of {straight:.3g} if all were turned by {best}; {ask}"
+            ]
+    found: dict[str, list[str]] = {}
+    for record in done:
+        values = dict(record["chamfer_turned"])
+        straight, best = values.pop(AS_IS), min(values, key=values.__getitem__)
+        if values[best] < FAR_BETTER * straight:
+            text = f"{record['name']} {values[best]:.3g} in place of {straight:.3g}"
+            found.setdefault(best, []).append(text)
+    return [
+        f"{len(texts)} of {len(done)} predictions would have a far smaller Chamfer distance turned "
+        f"by {turn} ({'; '.join(texts[:_NAMED])}{'; ...' if len(texts) > _NAMED else ''}); {ask}"
+        for turn, texts in found.items()
+    ]

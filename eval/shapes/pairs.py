@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,8 +26,7 @@ from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.versions import __version__, installed
 
-from ..averages import mean_of
-from ..paired import PREDICTED, differences_of, page
+from ..paired import PREDICTED, differences_of, page, summaries
 from ..report import (
     OK,
     check_finite,
@@ -55,11 +53,6 @@ _NO_MEAN = (
     *("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed"),
     "chamfer_turned",
 )
-# A turn is warned of where it leaves at most such shares of the Chamfer distance: of one object's,
-# or of the mean of many.
-FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
-AS_IS = "as it is"  # among the turns
-_NAMED = 3  # objects that a warning names
 
 
 class Pair(NamedTuple):
@@ -384,51 +377,3 @@ def report_of(
         report["baselines"][name] = finite_or_none(other)
         report["differences"][name] = differences_of(report["objects"], other["objects"])
     return report
-
-
-def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a report says of the evaluated shapes besides metrics.
-
-    Returns:
-        ``flags`` and ``axes``: for each side how many shapes have which; and ``warnings``: of turns
-        that would better the score by far.
-    """
-    done = [record for record in objects if record["status"] == OK]
-    sides = ("pred", "gt")
-    return {
-        "flags": {s: dict(Counter(f for r in done for f in r[f"{s}_flags"])) for s in sides},
-        "axes": {s: dict(Counter(r[f"{s}_axes"] for r in done)) for s in sides},
-        "warnings": turn_warnings(done),
-    }
-
-
-def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
-    """Says which turns of the predictions' files would better the score by far.
-
-    One turn that betters the mean of many objects is one warning; else each turn that betters
-    single objects by ``FAR_BETTER`` is one.
-
-    Args:
-        done: records of the evaluated objects.
-    """
-    ask = "are the axes right? (--pred-axes, --up, --frame)"
-    if len(done) >= MANY:
-        means = mean_of([record["chamfer_turned"] for record in done])
-        straight, best = means.pop(AS_IS), min(means, key=means.__getitem__)
-        if means[best] <= BETTER * straight:
-            return [
-                f"the mean Chamfer distance of {len(done)} predictions would be {means[best]:.3g} "
-                f"in place of {straight:.3g} if all were turned by {best}; {ask}"
-            ]
-    found: dict[str, list[str]] = {}
-    for record in done:
-        values = dict(record["chamfer_turned"])
-        straight, best = values.pop(AS_IS), min(values, key=values.__getitem__)
-        if values[best] < FAR_BETTER * straight:
-            text = f"{record['name']} {values[best]:.3g} in place of {straight:.3g}"
-            found.setdefault(best, []).append(text)
-    return [
-        f"{len(texts)} of {len(done)} predictions would have a far smaller Chamfer distance turned "
-        f"by {turn} ({'; '.join(texts[:_NAMED])}{'; ...' if len(texts) > _NAMED else ''}); {ask}"
-        for turn, texts in found.items()
-    ]

@@ -13,7 +13,7 @@ from .run import Task
 # Seconds on one core of a desktop of about 2020, one row alone. They are fits by eye to a few runs,
 # and a machine, an encoder or LPIPS in the loss may differ by a factor of three.
 _STEP, _TOKEN, _PIXEL = 0.05, 1.2e-7, 8e-7
-_VIEW, _SHAPE, _FIT, _START = 0.6, 9.0, 4e-6, 15.0
+_VIEW, _SHAPE, _FIT, _START = 1.3, 9.0, 4e-6, 15.0
 _GAIN = 0.7  # n threads are n^0.7 times as fast as one
 
 

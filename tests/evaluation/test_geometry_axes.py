@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from gamba_warp.cli import run
-from gamba_warp.eval.shapes.pairs import turn_warnings
+from gamba_warp.eval.paired import turn_warnings
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
