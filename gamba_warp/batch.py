@@ -136,11 +136,12 @@ def plan_outputs(
     suffixes: Sequence[str],
     folder: Path = Path("."),
     reads: Iterable[Path | None] = (),
+    own: Sequence[str] = (),
 ) -> dict[str, Path]:
     """A name for each input: its stem, with a number where two inputs would share an output.
 
-    ``.compressed.ply`` is one suffix: the other formats are not compressed in its way. A name with
-    a number is said.
+    ``.compressed.ply`` is one suffix: the other formats are not compressed in its way. Whose name
+    has a number is said.
 
     Two names that differ in capitals only are one name to many file systems, and so they are here.
 
@@ -149,6 +150,7 @@ def plan_outputs(
         suffixes: what follows the name in each output, such as ``-mesh.glb``.
         folder: of the outputs; it need not be there yet.
         reads: other files, and folders, that the command reads; None is passed over.
+        own: names of files in the folder that the command writes of no one input.
 
     Returns:
         The inputs by name, in their order. The outputs are ``folder / (name + suffix)``.
@@ -157,7 +159,7 @@ def plan_outputs(
         UserError: an output would overwrite something that is read.
     """
     names: dict[str, Path] = {}
-    taken: set[str] = set()
+    taken = {name.casefold() for name in own}
     renamed: list[str] = []
 
     def outputs_of(name: str) -> set[str]:
@@ -169,11 +171,11 @@ def plan_outputs(
         while outputs_of(name) & taken:
             number += 1
             name = f"{stem}-{number}"
+        renamed += [f"{path}: its results are named {name}"] * (number > 1)
         taken |= outputs_of(name)
         names[name] = path
-        if number > 1:
-            renamed.append(f"{path}: its results are named {name}")
-    targets = (folder / f"{name}{suffix}" for name in names for suffix in suffixes)
+    made = [name + suffix for name in names for suffix in suffixes]
+    targets = (folder / name for name in (*made, *own))
     check_not_read(targets, [*inputs, *reads])
     for line in renamed:
         say(line)

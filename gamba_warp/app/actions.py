@@ -125,6 +125,7 @@ class Actions:
         self,
         cut: Cut | None,
         painted: dict[str, Any] | None,
+        elevation: float,
         request: gr.Request,
         progress: gr.Progress = gr.Progress(),  # noqa: B008
     ) -> tuple:
@@ -132,7 +133,7 @@ class Actions:
         before = _given(cut)
         after = mended(before, _layers(painted))
         progress(0.1, "The network looks at the picture")
-        made = self._turns.call(work.solve, self._model, after)
+        made = self._turns.call(work.solve, self._model, after, elevation)
         progress(0.8, "The viewer is made")
         document = html.escape(work.viewer(made), quote=True)
         frame = _FRAME.format(name=html.escape(made.name, quote=True), document=document)

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import gradio as gr
 
+from ..untrusted.ranges import Elevation
 from . import work
 from .actions import Actions
 from .cutting import KEEP, REMOVE, SIDE, STROKE
@@ -62,6 +63,7 @@ def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
         gr.State: None,
         gr.Image: GivenFile | None,
         gr.ImageEditor: Painted | None,
+        gr.Slider: Elevation,
         gr.Radio: Literal[tuple(_BRUSHES)],  # type: ignore[invalid-type-form]
     }
     ours = {number: fn.inputs for number, fn in page.fns.items() if fn.fn is not None}
@@ -101,6 +103,7 @@ class _CutPart:
     brush: gr.Radio
     mend: gr.Button
     restart: gr.Button
+    elevation: gr.Slider
     make: gr.Button
 
 
@@ -146,8 +149,17 @@ def _cut_part() -> _CutPart:
         with gr.Row():
             mend = gr.Button("Apply strokes", size="md", min_width=120)
             restart = gr.Button("Start over", size="md", min_width=120)
+        elevation = gr.Slider(
+            -30,
+            90,
+            value=0,
+            step=1,
+            label="Camera above the object, degrees",
+            info="Where it looked down, this makes the object stand upright.",
+            elem_id="elevation",
+        )
         make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
-    return _CutPart(group, editor, note, brush, mend, restart, make)
+    return _CutPart(group, editor, note, brush, mend, restart, elevation, make)
 
 
 @dataclass
@@ -209,7 +221,7 @@ def _connect(
     parts.restart.click(actions.restart, cut, mask, **quick)
     parts.make.click(
         actions.make,
-        [cut, parts.editor],
+        [cut, parts.editor, parts.elevation],
         [cut, parts.editor, made, stage, files_part.group, files_part.files],
         show_progress_on=stage,
         **one,

@@ -29,7 +29,7 @@ class Made:
 
     Attributes:
         name: stem of its files.
-        gaussians: ``[N]`` on the CPU, in the reference camera's frame, OpenCV's axes.
+        gaussians: ``[N]`` on the CPU, upright, OpenCV's axes.
         camera: distance (object units), field of view and elevation (degrees) of the input's.
         seconds: how long the model took.
     """
@@ -40,23 +40,26 @@ class Made:
     seconds: float
 
 
-def solve(model: Gamba, cut: Cut) -> Made:
+def solve(model: Gamba, cut: Cut, elevation: float = 0.0) -> Made:
     """One forward pass.
 
     Args:
         model: on any device.
         cut: the object.
+        elevation: of the picture's camera above the object, degrees; what is made stands upright.
 
     Raises:
         UserError: the mask is empty.
     """
     from ..model.predict import reconstruct
+    from ..trajectories.paths import set_up
 
     rgba = model_picture(cut)
     started = time.perf_counter()
     gaussians = reconstruct(model, rgba).to("cpu")
     seconds = time.perf_counter() - started
-    return Made(cut.name, gaussians, (model.config.distance, model.config.fov, 0.0), seconds)
+    camera = model.config.distance, model.config.fov, elevation
+    return Made(cut.name, set_up(gaussians, elevation), camera, seconds)
 
 
 def viewer(made: Made) -> str:
@@ -100,12 +103,10 @@ def write(made: Made, kind: str, folder: Path, device: str = "cpu") -> tuple[Pat
     elif kind == "gif":
         from ..pages.turntable import save_turntable, turntable_frames
 
-        distance, fov, _ = made.camera
+        distance, fov, elevation = made.camera
+        view = {"distance": distance, "fov": fov, "elevation": elevation}
         gaussians = made.gaussians.to(device)
-        save_turntable(
-            path,
-            turntable_frames(gaussians, size=SIZE, frames=FRAMES, distance=distance, fov=fov),
-        )
+        save_turntable(path, turntable_frames(gaussians, size=SIZE, frames=FRAMES, **view))
     else:
         from ..viewer.page import write_viewer
 

@@ -85,8 +85,7 @@ def reconstruct_command(
         page: Write an HTML page with the input, the turntable and a 3D viewer.
         sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
         mask: Picture that is white where the object is (for a single image).
-        matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or the address of a copy of one
-            of rembg's; else rembg's is used or fetched.
+        matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or an address of rembg's.
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
         recenter: Bring the object into the middle of the picture, at the size of training; else it
             stays where and as large as it is in a square picture.
@@ -123,16 +122,15 @@ def reconstruct_command(
     )
     outputs.require()
     reads = (mask, Path(matte_model) if matte_model else None, sam, file, encoder_weights)
-    names = plan_outputs(pictures, outputs.suffixes(), out, reads)
+    names = plan_outputs(pictures, outputs.suffixes(), out, reads, outputs.own(len(pictures)))
     outputs.sheet = _sheet(sheet, [*pictures, *reads])
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
     output_folder(out)
-
     one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision)
     for_each(names, one, "reconstruct", "picture", failures)
-    _end(outputs.sheet, times)
+    _end(outputs, times)
     return report(len(pictures), "picture", failures, out)
 
 
@@ -167,10 +165,11 @@ def _forward(model: Gamba, rgba: np.ndarray, precision: Precision) -> tuple[Gaus
     return gaussians, time.perf_counter() - started
 
 
-def _end(sheet: Sheet | None, times: bool) -> None:
-    """Writes the sheet, and prints what the stages took."""
-    if sheet is not None:
-        sheet.write()
+def _end(outputs: Outputs, times: bool) -> None:
+    """Writes the sheet and the page of all results, and prints what the stages took."""
+    if outputs.sheet is not None:
+        outputs.sheet.write()
+    outputs.write_index()
     if times:
         print(STAGES.table())
 

@@ -136,28 +136,33 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     for kind in job.splats:
         target = job.folder / (name + splat_suffix(kind))
         said += filter(None, [write_gaussians(target, gaussians, kind, comments=comments)])
-    _write_pictures(name, gaussians, job)
+    page = job.folder / f"{name}.html"
+    section = _write_pictures(page, gaussians, job)
     if not job.mesh:
         return " ".join(said)
     start = time.perf_counter()
     base, options = job.folder / name, job.surface
     found = write_meshes(base, gaussians, job.mesh, options, job.axes, job.device, job.texture)
+    if section is not None:  # the page again, which leads to the meshes, too
+        section.files = [*section.files, *(name + s for s in mesh_suffixes(job.mesh, job.texture))]
+        reconstruction_page(page, section)
     closed = "closed" if found.is_watertight() else "open"
     counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
     seconds = time.perf_counter() - start
     return " ".join([*said, f"Mesh: {counts}, {seconds:.1f} s."])
 
 
-def _write_pictures(name: str, gaussians: Gaussians, job: ExportJob) -> None:
+def _write_pictures(page: Path, gaussians: Gaussians, job: ExportJob) -> Section | None:
     """The page and the turntables, of the object at the origin with longest side 1."""
     if not job.page and job.turntable == "none":
-        return
+        return None
+    files = [page.stem + splat_suffix(kind) for kind in job.splats]
     moved = gaussians.in_unit(*unit_frame(gaussians)).to(job.device)
     turn = turntable_frames(moved, size=job.size, frames=job.frames, **asdict(job.view))
     if job.turntable != "none":
-        save_turntable(job.folder / f"{name}.{job.turntable}", turn)
-    if job.page:
-        write_page(job.folder / f"{name}.html", name, gaussians, turn, job.view)
+        files.append(f"{page.stem}.{job.turntable}")
+        save_turntable(page.with_name(files[-1]), turn)
+    return write_page(page, page.stem, gaussians, turn, job.view, files) if job.page else None
 
 
 def write_page(
@@ -166,7 +171,8 @@ def write_page(
     gaussians: Gaussians,
     turntable: np.ndarray | None = None,
     view: Viewpoint | None = None,
-) -> None:
+    files: Sequence[str] = (),
+) -> Section:
     """Writes a page with a 3D viewer, of an object of any size anywhere.
 
     Args:
@@ -175,6 +181,10 @@ def write_page(
         gaussians: one object.
         turntable: frames ``[T, S, S, 3]`` uint8 of one turn, or None.
         view: where the viewer starts, in units of the object's longest side.
+        files: names of files beside the page, which it offers for download.
+
+    Returns:
+        What is on it.
 
     Raises:
         UserError: the object has no extent, or the file cannot be written.
@@ -182,5 +192,8 @@ def write_page(
     moved = gaussians.in_unit(*unit_frame(gaussians))
     table = [("Gaussians", f"{gaussians.num:,}")]
     camera = asdict(view or Viewpoint())
-    section = Section(title, turntable=turntable, gaussians=moved, table=table, **camera)
+    section = Section(
+        title, turntable=turntable, gaussians=moved, table=table, files=files, **camera
+    )
     reconstruction_page(path, section)
+    return section

@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
+import numpy as np
+from PIL import Image
 from tqdm import tqdm
 
 from ..batch import STAGES, say
 from ..conventions import Axes
+from ..data.preprocess import composite
 from ..formats.gaussians.files import to_be_written, write_gaussians
 from ..formats.names import MeshFormat, SplatFormat, splat_suffix
 from ..gaussians import Gaussians
-from ..images import save_image
+from ..images import save_image, to_uint8
 from ..model.config import GambaConfig
 from ..photo.cutout import CutOut
 from ..surfaces.files import write_meshes
 from ..surfaces.options import BROWSER_FACES, SurfaceOptions
 from ..trajectories.movies import require_movie
-from ..trajectories.paths import Viewpoint, upright
-from .page import Section, reconstruction_page
+from ..trajectories.paths import Viewpoint, set_up
+from .page import Section, index_page, reconstruction_page
 from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
 
+INDEX = "index.html"  # leads to the pages of several results
+_SMALL = (320, 160)  # size there of an input and its result together, pixels
 _SURFACE = SurfaceOptions(colors=True, faces=BROWSER_FACES)
 
 
@@ -50,6 +54,7 @@ class Outputs:
             upright); distance and field of view, degrees, of the camera of turntable, sheet and
             viewer, of which None is the model's.
         inputs: whether each cut-out is written, too, as ``NAME-input.png``.
+        made: by name a small picture of each result that has a page.
     """
 
     folder: Path
@@ -66,6 +71,7 @@ class Outputs:
     sheet: Sheet | None = None
     camera: tuple[float, float | None, float | None] = (0.0, None, None)
     inputs: bool = False
+    made: dict[str, np.ndarray] = field(default_factory=dict, init=False)
 
     def suffixes(self) -> list[str]:
         """What follows the name of a picture in each of its files."""
@@ -80,6 +86,16 @@ class Outputs:
         require_movie(self.turntable)
         if self.mesh:
             _SURFACE.require()
+
+    def own(self, count: int) -> list[str]:
+        """Names of files that are of no one of so many pictures."""
+        return [INDEX] if self.page and count > 1 else []
+
+    def write_index(self) -> None:
+        """Writes the page that leads to the results, where there are several."""
+        if len(self.made) > 1:
+            title = f"{len(self.made):,} reconstructions"
+            index_page(self.folder / INDEX, title, self.made)
 
     def view(self, config: GambaConfig) -> Viewpoint:
         """From where turntable, sheet and viewer look; that of the input, but for the options."""
@@ -110,9 +126,7 @@ def write_outputs(
     base, view = outputs.folder / name, outputs.view(config)
     gaussians, count = to_be_written(gaussians, outputs.min_opacity)
     say(f"{name}: {count}")
-    if view.elevation:
-        turn = upright(view.elevation).to(gaussians.means)
-        gaussians = gaussians.transformed(turn, torch.zeros_like(turn[0]))
+    gaussians = set_up(gaussians, view.elevation)
     if outputs.inputs:
         save_image(base.with_name(f"{name}-input.png"), cut.editable)
     STAGES.begin("Gaussians")
@@ -128,7 +142,7 @@ def write_outputs(
         device = gaussians.means.device
         mesh = write_meshes(base, gaussians, outputs.mesh, _SURFACE, outputs.axes, device)
         if section is not None:  # the page again, with the mesh in its viewer
-            section.mesh = mesh
+            section.mesh, section.files = mesh, _files(name, outputs.suffixes())
             reconstruction_page(base.with_name(f"{name}.html"), section)
     STAGES.begin("rest")
 
@@ -161,10 +175,20 @@ def _write_pictures(
         turntable=turn,
         gaussians=gaussians,
         table=table,
+        files=_files(name, [end for end in outputs.suffixes() if not end.startswith("-mesh.")]),
         **dataclasses.asdict(view),
     )
     reconstruction_page(base.with_name(f"{name}.html"), section)
+    flat = to_uint8(composite(cut.rgba, turn.shape[1]).numpy())
+    small = Image.fromarray(np.hstack([flat, turn[len(turn) // 8]]))  # turned a little
+    small.thumbnail(_SMALL)
+    outputs.made[name] = np.asarray(small)
     return section
+
+
+def _files(name: str, suffixes: Sequence[str]) -> list[str]:
+    """Names of the files beside the page."""
+    return [name + end for end in suffixes if end != ".html"]
 
 
 def _write_gaussians(base: Path, gaussians: Gaussians, outputs: Outputs) -> None:

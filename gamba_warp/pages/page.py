@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from PIL import Image
@@ -44,6 +45,7 @@ class Section:
         header: names of the table's columns.
         curves: ``(x, y)`` points by label, drawn as one chart.
         curves_label: label of the chart's vertical axis.
+        files: names of files beside the page, which it offers for download.
         fragment: HTML that is set as it is, such as that of ``curves.draw_curves``.
         distance: distance of the viewer's camera from the origin, object units.
         fov: field of view of the viewer's camera, degrees.
@@ -61,6 +63,7 @@ class Section:
     header: Sequence[str] = ()
     curves: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict)
     curves_label: str = ""
+    files: Sequence[str] = ()
     fragment: str = ""
     distance: float = DEFAULT_DISTANCE
     fov: float = DEFAULT_FOV
@@ -68,7 +71,7 @@ class Section:
 
 
 def reconstruction_page(path: str | Path, section: Section) -> None:
-    """Writes the page of one reconstruction atomically; its viewer starts by itself.
+    """Writes the page of one reconstruction atomically; its viewer is large, and starts by itself.
 
     Raises:
         UserError: the file cannot be written.
@@ -85,6 +88,26 @@ def demo_page(
         UserError: the file cannot be written.
     """
     _write(path, title, text, sections, auto=False)
+
+
+def index_page(path: str | Path, title: str, results: Mapping[str, np.ndarray]) -> None:
+    """Writes, atomically, a page that leads to the pages of many reconstructions beside it.
+
+    Args:
+        path: the file.
+        title: heading of the page.
+        results: by name a small picture ``[H, W, 3]`` uint8; NAME.html is the page.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    links = (
+        f'<a href="{quote(name)}.html">{_figure(_animation(small[None]), html.escape(name))}</a>'
+        for name, small in results.items()
+    )
+    fragment = f'<div class="index">{"".join(links)}</div>'
+    text = "Of each, what was given and what was made of it."
+    _write(path, title, text, [Section(title, fragment=fragment)], auto=True)
 
 
 def _write(
@@ -114,13 +137,18 @@ def _write(
 
 def _section(section: Section, name: str, auto: bool) -> str:
     figures = []
+    if section.gaussians is not None and auto:
+        viewer = _viewer(section, section.gaussians, name, auto, "")
+        figures.append(_figure(viewer, _VIEWER_CAPTION, "wide"))
     if section.picture is not None:
         figures.append(_figure(_image(section.picture, "frame", "input"), "Input"))
     turning = "" if section.turntable is None else _animation(section.turntable)
     if turning and (auto or section.gaussians is None):
         figures.append(_figure(f'<div class="frame">{turning}</div>', "Turntable"))
         turning = ""
-    if section.gaussians is not None:  # a viewer that waits to be started shows the turntable
+    if (
+        section.gaussians is not None and not auto
+    ):  # a viewer that waits to be started shows the turntable
         figures.append(
             _figure(_viewer(section, section.gaussians, name, auto, turning), _VIEWER_CAPTION)
         )
@@ -129,6 +157,7 @@ def _section(section: Section, name: str, auto: bool) -> str:
         _paragraph(section.text),
         f'<div class="media">{"".join(figures)}</div>' if figures else "",
         _views(section.views) if section.views else "",
+        _downloads(section.files) if section.files else "",
         _table(section.header, section.table) if section.table else "",
         svg_chart(section.curves, section.curves_label) if section.curves else "",
         section.fragment,
@@ -140,8 +169,14 @@ def _paragraph(text: str) -> str:
     return f"<p>{html.escape(text)}</p>" if text else ""
 
 
-def _figure(content: str, caption: str) -> str:
-    return f"<figure>{content}<figcaption>{caption}</figcaption></figure>"
+def _figure(content: str, caption: str, css: str = "") -> str:
+    kind = f' class="{css}"' if css else ""
+    return f"<figure{kind}>{content}<figcaption>{caption}</figcaption></figure>"
+
+
+def _downloads(names: Sequence[str]) -> str:
+    links = (f'<a href="{quote(name)}" download>{html.escape(name)}</a>' for name in names)
+    return f'<p class="files">Files beside this page: {" ".join(links)}</p>'
 
 
 def data_uri(content: bytes, kind: str) -> str:
@@ -164,7 +199,8 @@ def _animation(frames: np.ndarray) -> str:
     first.save(
         content, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, quality=90
     )
-    return f'<img alt="turntable" src="{data_uri(content.getvalue(), "image/webp")}">'
+    label = "turntable" if len(frames) > 1 else "input and result"
+    return f'<img alt="{label}" src="{data_uri(content.getvalue(), "image/webp")}">'
 
 
 def _viewer(section: Section, gaussians: Gaussians, name: str, auto: bool, poster: str) -> str:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, orbit
 from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
+from ..gaussians import Gaussians
 from .files import load_path
 
 SWING = 30.0  # degrees by which a spiral rises above its elevation, and falls below it
@@ -144,6 +145,14 @@ def upright(elevation: float) -> Tensor:
         -y: there the camera is that of ``orbit([0], elevation)``.
     """
     return orbit(torch.zeros(1), elevation)[0, :3, :3].T.contiguous()
+
+
+def set_up(gaussians: Gaussians, elevation: float) -> Gaussians:
+    """An object in the axes of a camera of this elevation, degrees, made ``upright``."""
+    if not elevation:
+        return gaussians
+    turn = upright(elevation).to(gaussians.means)
+    return gaussians.transformed(turn, torch.zeros_like(turn[0]))
 
 
 def placed(cameras: Cameras, center: Tensor, side: float) -> Cameras:

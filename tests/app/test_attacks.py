@@ -11,7 +11,7 @@ from PIL import Image
 
 from gamba_warp.app.examples import examples
 
-TAKE, EXAMPLE, BRUSH, MEND, RESTART = 0, 2, 3, 4, 5  # numbers of functions
+TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]
 
 
@@ -213,7 +213,11 @@ def test_no_such_function_is_one_line(program, number):
 
 
 @pytest.mark.parametrize(
-    "number, data", [(TAKE, []), (TAKE, [None, None]), (BRUSH, ["Paint it black"]), (BRUSH, [0])]
+    "number, data",
+    [
+        *[(TAKE, []), (TAKE, [None, None]), (BRUSH, ["Paint it black"]), (BRUSH, [0])],
+        *[(MAKE, [None, None]), *((MAKE, [None, None, value]) for value in (91, "up", None))],
+    ],
 )
 def test_other_inputs_are_one_line(program, number, data):
     answer = program.join(number, data)

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import signal
 import subprocess
 import time
@@ -95,6 +96,8 @@ def test_the_whole_way(opened, served, tmp_path):
     page.wait_for_selector("#editor canvas")
     until(lambda: middle(page)[1] < 60, "the cut-out is seen, red in the middle")
     assert "plain background" in page.locator("#note").inner_text()
+    wraps = "note => getComputedStyle(note).overflowWrap"  # an address in a message is long
+    assert page.locator("#note p").evaluate(wraps) == "anywhere"
 
     page.get_by_text("Paint what to remove").click()
     page.wait_for_selector("#brush label.selected:has-text('remove')")
@@ -118,10 +121,12 @@ def test_the_whole_way(opened, served, tmp_path):
     page.get_by_role("button", name="Start over").click()
     until(lambda: middle(page)[1] < 60, "the middle is back")
 
+    page.locator("#elevation input[type=number]").fill("25")
     page.locator("#make").click()
     frame = page.wait_for_selector("iframe.stage")
     viewer = frame.content_frame()
     viewer.wait_for_selector("#message", state="hidden")
+    assert re.search(r'"elevation": 0\.436', viewer.content())  # radians
     assert viewer.locator("#name").inner_text() == "my-square"
 
     def drawn():

@@ -6,14 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from helpers.images import bad_files, cut_out
+from helpers.model import quick, run_reconstruct
 from PIL import Image
 
 from gamba_warp.app import cutting, work
 from gamba_warp.app.examples import examples
+from gamba_warp.cameras import orbit
 from gamba_warp.errors import UserError
 from gamba_warp.files import STARTER
 from gamba_warp.formats.gaussians.files import read_gaussians
+from gamba_warp.formats.ply import load_ply
 from gamba_warp.images import save_image
 from gamba_warp.model.checkpoint import load_model
 from gamba_warp.photo.cutout import Ways
@@ -38,6 +42,25 @@ def made(tmp_path_factory):
     picture = cut_out(tmp_path_factory.mktemp("made") / "thing.png")
     cut = cutting.cut_picture(picture, "My  thing.v2.png", Ways())
     return work.solve(load_model(STARTER / "tiny.safetensors"), cut)
+
+
+def test_a_picture_from_above_stands_upright(tmp_path, made):
+    """As ``reconstruct --elevation`` turns it, in the viewer's camera and in every file."""
+    picture = cut_out(tmp_path / "thing.png")
+    cut = cutting.cut_picture(picture, "thing.png", Ways())
+    above = work.solve(load_model(STARTER / "tiny.safetensors"), cut, 30.0)
+    turn = orbit(torch.zeros(1), 30.0)[0, :3, :3]
+    torch.testing.assert_close(above.gaussians.means @ turn.T, made.gaussians.means)
+    assert above.camera == (*made.camera[:2], 30.0) and made.camera[2] == 0
+    path, _ = work.write(above, "ply", tmp_path)
+    assert (
+        run_reconstruct(
+            picture, *quick(STARTER / "tiny.safetensors", tmp_path / "out"), "--elevation", 30
+        )
+        == 0
+    )
+    theirs = load_ply(tmp_path / "out" / "thing.ply")
+    torch.testing.assert_close(load_ply(path).means, theirs.means)
 
 
 def stroke(shape, box, color):

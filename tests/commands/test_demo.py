@@ -55,6 +55,7 @@ def test_demo(starter, tmp_path):
     # what was shipped comes before what was trained here, and the page says which is which
     assert page.index("never seen</h2>") < page.index("Numbers") < page.index("Trained here</h2>")
     assert "nothing of it was trained on this machine" in page
+    assert re.search(r"test objects of the README the shipped model has 21\.9 dB", page)
     assert json.loads((out / "geometry" / "report.json").read_text())["num_ok"] == 1
 
 

@@ -1,5 +1,7 @@
 import io
+import re
 from types import SimpleNamespace
+from urllib.parse import unquote
 
 import imageio_ffmpeg
 import numpy as np
@@ -241,13 +243,34 @@ def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):
     code = run_reconstruct(*quick(checkpoint, out), first, *(path for path, _ in cases), last)
     assert code == 1
     assert sorted(path.name for path in out.iterdir()) == ["aa.ply", "zz.ply"]
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gamba: ")]
-    note = [line for line in errors if line.startswith("gamba: no matting model")]
-    errors = [line for line in errors if line not in note]
-    assert len(errors) == len(cases) and len(note) == 1  # once, not with each picture
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gamba: ")]
+    errors = [line for line in said if "no matting model is here" not in line]
+    assert len(errors) == len(cases) == len(said) - 1
     for line, (path, reason) in zip(errors, cases):
         assert line.startswith(f"gamba: failed: {path}: ") and reason in line
         assert line.count(str(path)) == 1
+
+
+def test_a_folder_has_one_page_that_leads_to_every_result(tmp_path, checkpoint, capsys):
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    for name in ("index.png", "a b.png", "a b.webp"):
+        cut_out(folder / name)
+    (folder / "bad.png").write_bytes(b"no picture")
+    options = ["--checkpoint", checkpoint, "--out", out, "--size", 16, "--frames", 2]
+    assert run_reconstruct(folder, *options) == 1
+    said = capsys.readouterr().out
+    assert f"{folder / 'a b.webp'}: its results are named a b-2\n" in said
+    assert f"{folder / 'index.png'}: its results are named index-2\n" in said
+    page = (out / "index.html").read_text()
+    links = re.findall(r'<a href="([^"]+)">', page)
+    assert links == ["a%20b.html", "a%20b-2.html", "index-2.html"] and "3 reconstructions" in page
+    assert all((out / unquote(link)).is_file() for link in links)
+    result = (out / "a b.html").read_text()
+    assert re.findall(r'href="([^"]+)" download', result) == ["a%20b.ply", "a%20b.gif"]
+    options[3] = tmp_path / "one"
+    assert run_reconstruct(folder / "index.png", *options) == 0
+    assert "<h1>index</h1>" in (tmp_path / "one" / "index.html").read_text()
 
 
 def test_folders_are_searched(tmp_path, checkpoint, capsys):

@@ -4,6 +4,7 @@ import base64
 import html.parser
 import json
 import re
+import urllib.parse
 
 import numpy as np
 import pytest
@@ -191,3 +192,22 @@ def test_degenerate_charts_stay_finite(values):
 def test_a_page_that_cannot_be_written():
     with pytest.raises(UserError, match=r"cannot write /dev/null/a\.html"):
         demo_page("/dev/null/a.html", [])
+
+
+def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):
+    path, names = tmp_path / "a.html", ["a b#1.ply", "a<b>.gif"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"ply\nformat binary_little_endian 1.0\n" + bytes(range(256)))
+    section = Section("a", picture=pictures(9, 9, 4), gaussians=some(20), files=names)
+    reconstruction_page(path, section)
+    links = [link for link in Page(path).all("a") if "download" in link]
+    assert [urllib.parse.unquote(link["href"]) for link in links] == names
+    opened = browser_page(path, 1280, 900, accept_downloads=True)
+    box = opened.page.query_selector(".viewer").bounding_box()
+    assert box["width"] > 1000 and 600 < box["height"] < 900, box
+    with opened.page.expect_download() as download:
+        opened.page.click(".files a")
+    assert download.value.suggested_filename == names[0]
+    phone = browser_page(path, 390, 800).page
+    assert phone.query_selector(".viewer").bounding_box()["width"] > 300
+    assert phone.evaluate("document.documentElement.scrollWidth <= innerWidth")

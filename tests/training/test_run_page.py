@@ -1,5 +1,6 @@
 """The run's page and its curves: made of what the log holds, whatever state that is in."""
 
+import html
 import json
 import math
 import re
@@ -80,6 +81,8 @@ def test_a_page_in_the_middle_says_so(tmp_path):
     log += [line("train", 10, 60, loss=0.5), line("warning", 10, 61, message="<img> odd")]
     write(out / "log.jsonl", *log)
     text = write_run_page(out).read_text()
+    name = "/".join(out.resolve().parts[-2:])  # "Training run run" it was in many a folder
+    assert f"<title>Training of {html.escape(name)}</title>" in text
     assert "Step 10 of 900, 1.0 minutes of training: in training, or cut off." in text
     assert "&lt;img&gt; odd" in text and "<img" not in text
     assert "<script>" not in text and "<i>" not in text and "a <b>" not in text
