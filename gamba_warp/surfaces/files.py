@@ -26,7 +26,8 @@ def save_mesh(path: str | Path, surface: Surface, axes: Axes = "opengl") -> None
     """Writes a surface, atomically, with vertex colours where the format has them (not .stl).
 
     A texture is embedded in ``.glb``; beside an ``.obj`` it is NAME.png, which NAME.mtl names; the
-    others have the vertex colours. Those of a ``.glb`` are linear light, as the format asks.
+    others have the vertex colours. Those of a ``.glb`` are linear light, as the format asks. A
+    ``.ply`` says its axes in a comment, which ``eval-geometry`` reads.
 
     Args:
         path: ends in .obj, .glb, .ply or .stl.
@@ -53,7 +54,10 @@ def save_mesh(path: str | Path, surface: Surface, axes: Axes = "opengl") -> None
     if colors is not None and kind != "stl":
         opaque = np.ones((len(colors), 1), np.float32)
         mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(np.hstack([colors, opaque])))
-    _write(Path(path), cast("bytes | str", mesh.export(file_type=kind)))  # a dict: other kinds
+    data = cast("bytes | str", mesh.export(file_type=kind))  # a dict: other kinds
+    if isinstance(data, bytes) and kind == "ply":  # what no .ply says by itself
+        data = data.replace(b"\nelement", f"\ncomment axes {axes}\nelement".encode(), 1)
+    _write(Path(path), data)
 
 
 def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:

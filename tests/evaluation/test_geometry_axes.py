@@ -13,6 +13,8 @@ from gamba_warp.eval.paired import turn_warnings
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.surfaces.extract import Surface
+from gamba_warp.surfaces.files import save_mesh
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -113,6 +115,15 @@ def test_what_is_not_known_is_used_as_it_is_and_told(files, capfd):
     assert told["mean"]["chamfer"] == asked["mean"]["chamfer"] and told["warnings"] == []
     y_up, _ = evaluate(capfd, files / "said.ply", files / "true.obj")
     assert y_up["mean"]["chamfer"] < 0.01
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl"])
+def test_our_own_mesh_files_say_their_axes(files, capfd, axes):
+    """A surface is y down as the Gaussians are; each file of it lies on the truth."""
+    mesh = bear(Z_TO_Y_UP, Y_DOWN)
+    save_mesh(files / "ours.ply", Surface(mesh.vertices, mesh.faces, None), axes)
+    report, err = evaluate(capfd, files / "ours.ply", files / "true.obj")
+    assert report["axes"]["pred"] == {axes: 1} and report["mean"]["chamfer"] < 0.01 and err == ""
 
 
 def test_axes_can_be_asked_for(files, capfd):
