@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import is_dataclass
 from typing import Any, get_args, get_type_hints
 
-from .devices import keep_memory, share_cores
+from .devices import keep_memory, quiet_warp, share_cores
 from .errors import UserError
 from .files import DISK_ERRORS
 from .versions import __version__, advice, missing
@@ -47,9 +47,11 @@ COMMANDS = {
     "doctor": "Say what this machine can run.",
 }
 # Commands that a person waits for; trainings and measurements keep torch's own way of waiting.
-SHARING = {"reconstruct", "export", "view", "render", "app"}
+SHARING = {"reconstruct", "export", "render", "app"}
 # Those that run the network or fit, whose tensors are made and freed again and again.
 KEEPING = {"reconstruct", "app", "train", "ablate", "bench", "demo", "fit", "eval-views"}
+# Those that launch kernels.
+LAUNCHING = KEEPING | {"export", "render", "stress", "gpu-check", "doctor"}
 MODULES = {
     "app": "gamba_warp.app.app_command",
     "train": "gamba_warp.train.command",
@@ -106,13 +108,16 @@ def run(name: str, arguments: list[str]) -> int:
     try:
         import tyro
 
-        reason = None if {"-h", "--help"} & {*arguments} else missing(name)
+        helps = bool({"-h", "--help"} & {*arguments})
+        reason = None if helps else missing(name)
         if reason is not None:
             raise UserError(reason)
         if name in SHARING:
             share_cores()
         if name in KEEPING:
             keep_memory()
+        if name in LAUNCHING and not helps:
+            quiet_warp()
         command = load_command(name)
         arguments = _joined(arguments, command)
         expand = getattr(sys.modules.get(command.__module__), "expand", None)

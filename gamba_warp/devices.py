@@ -80,6 +80,18 @@ def keep_memory() -> None:
             mallopt(ctypes.c_int(option), ctypes.c_int(value))
 
 
+def quiet_warp() -> None:
+    """Has Warp say its warnings alone, and not its start and each module that it loads.
+
+    That is a setting of the whole process, so only commands call it; a level that somebody chose
+    stays.
+    """
+    import warp
+
+    if warp.config.log_level == warp.LOG_INFO:
+        warp.config.log_level = warp.LOG_WARNING
+
+
 def pick_precision(name: Precision, device: torch.device, width: int) -> torch.dtype:
     """The dtype of the option ``--precision``.
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from gamba_warp.batch import progress_bar
 from gamba_warp.data import gso
+from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, sha256, visible, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
@@ -321,6 +322,7 @@ def _attempt(
 
     if threads is not None:
         torch.set_num_threads(threads)
+    quiet_warp()  # the process is ours alone
     try:
         return evaluate(pair, protocol, _into_unit_frame(pair.name, protocol, dataset))
     except UserError as error:

@@ -13,11 +13,8 @@ def doctor_command(warm_up: bool = False) -> int:
     Args:
         warm_up: Also compile the kernels for this machine's devices, and print the time.
     """
-    import warp
-
     from ..measure import health
 
-    warp.config.log_level = warp.LOG_WARNING
     _print("Versions", used_versions().items())
     _print("Devices", health.devices())
     _print("Folders", health.folders())

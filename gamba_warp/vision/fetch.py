@@ -11,14 +11,12 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from ..errors import UserError, first_line
-from ..kernels.runtime.cache import writable_folder
 from ..untrusted.arrays import plain_array
 
 _MAX_PICKLE = 512 << 20  # bytes; that of LPIPS takes 59 MB
@@ -30,26 +28,22 @@ def cache_folder() -> Path:
 
     That is ``~/.cache/gamba_warp`` on Linux, and everywhere if it is there; else
     ``~/Library/Caches/gamba_warp`` on macOS, ``%LOCALAPPDATA%``'s ``gamba_warp/Cache`` on Windows.
-    Where there is no home, or nothing can be made in it, a temporary folder.
+
+    Raises:
+        UserError: there is no home folder, and the variable is not set.
     """
     chosen = os.environ.get("GAMBA_CACHE")
     if chosen:
         return Path(chosen).expanduser()
     try:
         wanted = Path.home() / ".cache" / "gamba_warp"
-        if sys.platform != "linux" and not wanted.is_dir():
-            from platformdirs import user_cache_path
+    except RuntimeError as error:
+        raise UserError("there is no home folder; let GAMBA_CACHE name one for weights") from error
+    if sys.platform != "linux" and not wanted.is_dir():
+        from platformdirs import user_cache_path
 
-            wanted = user_cache_path("gamba_warp", appauthor=False)
-    except RuntimeError:  # the system knows no home of this user
-        wanted = None
-    return wanted if wanted is not None and wanted.is_dir() else _usable(wanted)
-
-
-@cache
-def _usable(wanted: Path | None) -> Path:
-    """``writable_folder``, asked and said once."""
-    return writable_folder(wanted, "gamba-warp-weights")
+        return user_cache_path("gamba_warp", appauthor=False)
+    return wanted
 
 
 @contextmanager

@@ -76,7 +76,10 @@ def store_weights(vgg16: Path | None = None, archive: Path | None = None) -> Pat
             written.
     """
     path = weights_file()
-    output_folder(path.parent)
+    try:
+        output_folder(path.parent)
+    except UserError as error:
+        raise UserError(f"{error}; GAMBA_CACHE names another folder") from error
     if vgg16 is not None:
         source, state = "torchvision vgg16 + lpips 0.1.4", read_torchvision(vgg16) | _read_heads()
     elif archive is not None:

@@ -13,19 +13,8 @@ import warp as wp
 from torch import Tensor
 
 from . import team
-from .cache import prepare_cache
 from .recording import recorder
-from .start import start_without_gpu
-from .views import view
-
-if wp.config.log_level == wp.LOG_INFO:  # Warp's default; a level that somebody chose stays
-    wp.config.log_level = wp.LOG_WARNING
-
-
-prepare_cache()
-if not torch.cuda.is_available():
-    start_without_gpu()
-
+from .views import unkept, view
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -87,7 +76,10 @@ def parallel_launch(
         dims = [(end - begin, *dim[1:]) for begin, end in zip(cuts[:-1], cuts[1:])]
         if team.run(kernel, dims, arguments, threads):
             return
-    kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
+    try:
+        kernel.module.load(wp.get_device("cpu"), 1)  # compile once, before the threads
+    except OSError as error:
+        raise unkept(error) from error
     todo = iter(list(zip(cuts[:-1], cuts[1:])))
 
     def work() -> None:
@@ -139,7 +131,10 @@ def cuda_launch(
     target: dict[str, Any] = {"device": "cpu"}
     if device.type == "cuda":
         target = {"stream": wp.stream_from_torch(torch.cuda.current_stream(device))}
-    wp.launch(kernel, dim, arguments, block_dim=block_dim, record_tape=False, **target)
+    try:
+        wp.launch(kernel, dim, arguments, block_dim=block_dim, record_tape=False, **target)
+    except OSError as error:
+        raise unkept(error) from error
 
 
 def launch(kernel: Any, dim: int | Sequence[int], inputs, outputs, device: torch.device) -> None:

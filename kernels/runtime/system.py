@@ -6,18 +6,13 @@ import os
 import signal
 
 
-def user() -> int | None:
-    """The number of this process's user; None on Windows, which has no such numbers."""
-    return os.geteuid() if hasattr(os, "geteuid") else None
-
-
 def is_own(found: os.stat_result) -> bool:
-    """Whether a file is of this user; always where users have no numbers.
+    """Whether a file is of this user; always on Windows, whose users have no numbers.
 
     Args:
         found: what ``os.stat`` says of the file.
     """
-    return user() in (None, found.st_uid)
+    return not hasattr(os, "geteuid") or os.geteuid() == found.st_uid
 
 
 def end_signals() -> list[signal.Signals]:

@@ -15,6 +15,8 @@ from typing import Any
 
 import warp as wp
 
+from .views import unkept
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -147,7 +149,10 @@ def _entry(kernel: Any, dim: tuple[int, ...], arguments: list) -> _Entry | None:
     the same kinds of them.
     """
     if kernel not in _entries:
-        command = wp.launch(kernel, dim, arguments, device="cpu", record_cmd=True)
+        try:
+            command = wp.launch(kernel, dim, arguments, device="cpu", record_cmd=True)
+        except OSError as error:
+            raise unkept(error) from error
         try:
             _entries[kernel] = _Entry(kernel, command, dim, arguments)
         except (AttributeError, TypeError) as error:

@@ -26,6 +26,7 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
     Raises:
         TypeError: the dtype has no Warp counterpart or is not the one asked for.
         ValueError: too many dimensions, a broken vector dimension, or over 2^31 bytes per stride.
+        OSError: Warp's folder of compiled kernels cannot be made.
     """
     if recorder() is not None:
         return None
@@ -46,7 +47,21 @@ _MOST_DESCRIPTORS = 4096
 _descriptors: dict[tuple, Any] = {}  # one for each dtype, shape and strides
 
 
+def unkept(error: OSError) -> OSError:
+    """The error of Warp's folder of compiled kernels, which also says how to choose another."""
+    advice = "WARP_CACHE_PATH names another folder for compiled kernels"
+    return OSError(error.errno, f"{error.strerror}; {advice}", error.filename)
+
+
+def _start() -> None:
+    try:
+        wp.init()
+    except OSError as error:
+        raise unkept(error) from error
+
+
 def _describe(tensor: Tensor, dtype, name: str) -> Any:
+    _start()
     reach = max((s * tensor.element_size() for s in tensor.stride()), default=0)
     if max(reach, *tensor.shape, 0) > _INT32_MAX:
         raise ValueError(
@@ -68,6 +83,7 @@ def array(tensor: Tensor, dtype=None) -> Any:
     """A Warp array of a tensor, for a field of a Warp struct; None in a dry run, as ``view``."""
     if recorder() is not None:
         return None
+    _start()
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

@@ -40,7 +40,9 @@ def runs(data, tmp_path_factory):
     ends = train_all([words(data, folder / name, *OPTIONS) for name in ("two", "not-there")])
     assert [end.code for end in ends] == [0, 0], ends
     assert not (folder / "not-there").exists()  # only the first process writes
-    assert ends[1].out == "" and ends[1].err == ""
+    assert ends[1].out == ""
+    # Warp itself says in every process that there is no driver.
+    assert all(line.startswith("Warp CUDA warning") for line in ends[1].err.splitlines())
     return folder
 
 

@@ -25,12 +25,13 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import PART, STARTER, atomic_folder, only_process, sweep, write_json
 from gamba_warp.gpu_check.check import run_python
 from gamba_warp.kernels.bench.core.measure import peak_bytes
-from gamba_warp.kernels.runtime import cache, memory, system, team
+from gamba_warp.kernels.runtime import memory, system, team
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.train.loop import stop_signals
 from gamba_warp.untrusted import children
 from gamba_warp.untrusted.names import inside, parts_of
 from gamba_warp.vision.fetch import cache_folder
+from gamba_warp.vision.weights import store_weights
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = ("resource", "fcntl", "pwd", "grp", "termios", "pty")
@@ -137,22 +138,6 @@ def test_what_killed_commands_left_is_swept_without_users(no_users, tmp_path):
     part.mkdir()
     sweep(tmp_path, age=0)
     assert not part.exists()
-
-
-def test_a_cache_in_the_folder_of_temporary_files_without_users(no_users, tmp_path, monkeypatch):
-    monkeypatch.setattr(cache.tempfile, "tempdir", str(tmp_path))
-    folder = cache.writable_folder(None, "kernels")
-    assert folder == tmp_path / "kernels" and folder.is_dir()
-    folder.chmod(0o777)  # what Windows says of every folder
-    assert cache.writable_folder(None, "kernels") == folder
-
-
-def test_damaged_kernels_are_removed_on_windows(windows, tmp_path):
-    module = tmp_path / "wp_module"
-    module.mkdir()
-    (module / "code.o").touch()
-    cache._remove(module)
-    assert [*tmp_path.iterdir()] == []
 
 
 def test_launches_without_openmp_and_huge_pages(windows, monkeypatch):
@@ -273,12 +258,27 @@ def test_where_weights_are_kept(tmp_path, monkeypatch):
     assert cache_folder() == old
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.delitem(sys.modules, "platformdirs", raising=False)
-    assert cache_folder() == old  # the line before made it: what was fetched is found again
+    old.mkdir(parents=True)
+    assert cache_folder() == old  # what was fetched there is found again
     old.rmdir()
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert cache_folder() == tmp_path / "Library" / "Caches" / "gamba_warp"
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "chosen"))
     assert cache_folder() == tmp_path / "chosen"
+
+
+def test_without_a_home_weights_need_a_folder(tmp_path, monkeypatch):
+    def nowhere():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("GAMBA_CACHE", raising=False)
+    monkeypatch.setattr(Path, "home", nowhere)
+    with pytest.raises(UserError, match="no home folder; let GAMBA_CACHE name one"):
+        cache_folder()
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "file"))
+    with pytest.raises(UserError, match="file: .*; GAMBA_CACHE names another folder"):
+        store_weights()
 
 
 @pytest.mark.parametrize("name", ["ab:c.obj", "Con", "nul.png", "a/lpt1.t", "a?", "b.", "b ", "<"])

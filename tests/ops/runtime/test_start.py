@@ -29,4 +29,4 @@ print("done")
 
 def test_an_operator_loads_no_compiler_and_compiles_when_asked():
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout == "done\n", done.stderr
+    assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stderr
