@@ -50,14 +50,12 @@ EXTRA_OF = {
     "tensorboard": "train",
     "timm": "train",
     "trimesh": "mesh",
-    "webdataset": "train",
     "xatlas": "mesh",
 }
 OWN = {
     "ablate": "all",
     "app": "app",
     "demo": "all",
-    "data pack": "train",
     "data primitives": "mesh",
     "data render": "mesh",
     "data gso": "mesh",
@@ -73,7 +71,7 @@ OWN = {
 _SHAPES = ("kornia", "open3d", "pymeshlab", "scipy", "skimage", "trimesh")
 HOLDS = {
     "photo": {"kornia", "onnxruntime", "pillow_heif", "pooch", "skimage"},
-    "train": {"kornia", "tensorboard", "timm", "webdataset"},
+    "train": {"kornia", "tensorboard", "timm"},
     "mesh": {*_SHAPES, "xatlas"},
     "eval": {*_SHAPES, "xatlas"},
     "fit": {"gsplat", "kornia"},

@@ -5,7 +5,6 @@ import os
 import pickle
 import struct
 import zlib
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -77,8 +76,7 @@ def assert_same(got, want):
     assert (got.cameras.width, got.cameras.height) == (want.cameras.width, want.cameras.height)
 
 
-TAR = pytest.mark.skipif(find_spec("webdataset") is None, reason="webdataset is not installed")
-SHARDS = pytest.mark.parametrize("shards", ["arrays", pytest.param("webdataset", marks=TAR)])
+SHARDS = pytest.mark.parametrize("shards", ["arrays", "webdataset"])
 
 
 @SHARDS

@@ -299,32 +299,27 @@ def _write_arrays(path: Path, blocks: Iterator[_Block], number: int) -> list[Ent
 
 def _write_tar(path: Path, blocks: Iterator[_Block], number: int) -> list[Entry]:
     """Writes a shard as a WebDataset: of each object ``NUMBER.json`` and a ``.npy`` an array."""
-    from webdataset import TarWriter  # pyright: ignore[reportAttributeAccessIssue]: made late
+    entries = []
+    with (
+        atomic_path(path) as temporary,
+        open(temporary, "wb") as file,
+        tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar,
+    ):
 
-    entries: dict[str, Entry] = {}
-    starts: dict[str, dict[str, int]] = {}
-    with atomic_path(path) as temporary:
-        with (
-            open(temporary, "wb") as file,
-            TarWriter(file, "gamba", "gamba", encoder=False, mtime=0) as tar,
-        ):
-            for key, block in zip((f"{number + n:08d}" for n in itertools.count()), blocks):
-                entry = block.entry
-                about = {name: getattr(entry, name) for name in _ABOUT}
-                arrays = {f"{kind}.npy": _npy(array) for kind, array in block.arrays.items()}
-                tar.write({"__key__": key, "json": json.dumps(about).encode(), **arrays})
-                entries[key] = msgspec.structs.replace(entry, shard=path.name)
-                starts[key] = {kind: -array.nbytes for kind, array in block.arrays.items()}
-        with tarfile.open(temporary, "r:") as written:  # where the arrays end in it
-            for member in written:
-                key, _, name = member.name.partition(".")
-                if name != "json":
-                    starts[key][name.removesuffix(".npy")] += member.offset_data + member.size
-    return [msgspec.structs.replace(entries[key], **starts[key]) for key in entries]
+        def add(name: str, content: bytes) -> None:
+            member = tarfile.TarInfo(name)
+            member.size, member.mode = len(content), 0o444
+            tar.addfile(member, io.BytesIO(content))
 
-
-def _npy(array: np.ndarray) -> bytes:
-    """The bytes of a ``.npy`` file, whose last ones are those of the array."""
-    content = io.BytesIO()
-    np.save(content, np.ascontiguousarray(array))
-    return content.getvalue()
+        for key, block in zip((f"{number + n:08d}" for n in itertools.count()), blocks):
+            starts = {}
+            for kind, array in sorted(block.arrays.items()):
+                npy = io.BytesIO()
+                np.save(npy, np.ascontiguousarray(array))
+                # The array is the last part of what follows the header.
+                starts[kind] = file.tell() + tarfile.BLOCKSIZE + npy.tell() - array.nbytes
+                add(f"{key}.{kind}.npy", npy.getvalue())
+            about = {name: getattr(block.entry, name) for name in _ABOUT}
+            add(f"{key}.json", json.dumps(about).encode())
+            entries.append(msgspec.structs.replace(block.entry, shard=path.name, **starts))
+    return entries
