@@ -36,8 +36,8 @@ _Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=10**12)]
 
 
-class _State(msgspec.Struct, forbid_unknown_fields=True):
-    """The fields of ``state.pt`` (``Trainer.state``)."""
+class State(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """The fields of ``state.pt``: all that a continued run needs beside the weights."""
 
     version: int
     config: dict[str, Any]
@@ -54,11 +54,16 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     new_length: NewLength = NewLength()  # older versions have none
 
 
+def step_of(checkpoint: Path) -> int:
+    """The step of a checkpoint of ``list_checkpoints``, by its name."""
+    return int(checkpoint.name.split("_")[1])
+
+
 def list_checkpoints(run: Path) -> list[Path]:
     """Lists the run's checkpoints, oldest first."""
     folder = run / "checkpoints"
     found = [p for p in folder.iterdir() if _NAME.fullmatch(p.name)] if folder.is_dir() else []
-    return sorted(found, key=lambda p: int(p.name.split("_")[1]))
+    return sorted(found, key=step_of)
 
 
 def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict, keep: int) -> Path:
@@ -84,30 +89,22 @@ def save_checkpoint(run: Path, step: int, models: dict[str, Gamba], state: dict,
     with atomic_folder(target, replace=True) as temporary:
         for name, model in models.items():
             save_model(temporary / f"{name}.safetensors", model)
-        _save_state(temporary / "state.pt", state)
+        try:
+            torch.save(state, temporary / "state.pt")
+        except RuntimeError as error:  # of its writer of zip files
+            reason = f"state.pt cannot be written whole, is the disk full? ({reason_of(error)})"
+            raise OSError(reason) from error
         write_json(temporary / CHECKSUMS, {p.name: sha256(p) for p in sorted(temporary.iterdir())})
     write_json(run / "latest.json", {"checkpoint": f"checkpoints/{target.name}", "step": step})
     done = list_checkpoints(run)
     # Those of later steps are another branch, or damaged: they must not push out this one.
     older = done[: done.index(target)]
     for old in older[: max(0, len(older) + 1 - keep)]:
-        _remove(old)
+        try:
+            remove_folder(old)
+        except OSError as error:
+            raise UserError(f"cannot remove {old}: {error.strerror or error}") from error
     return target
-
-
-def _save_state(path: Path, state: dict) -> None:
-    try:
-        torch.save(state, path)
-    except RuntimeError as error:  # of its writer of zip files
-        reason = f"state.pt cannot be written whole, is the disk full? ({reason_of(error)})"
-        raise OSError(reason) from error
-
-
-def _remove(checkpoint: Path) -> None:
-    try:
-        remove_folder(checkpoint)
-    except OSError as error:
-        raise UserError(f"cannot remove {checkpoint}: {error.strerror or error}") from error
 
 
 def find_checkpoint(
@@ -193,14 +190,14 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
-def check_state(state: dict[str, Any], source: str) -> None:
+def check_state(state: dict[str, Any], source: str) -> State:
     """Checks kinds and ranges of what ``Trainer.state`` made; the optimizer's part has its own.
 
     Raises:
         UserError: a field is missing, unknown, of another kind or out of its range.
     """
     try:
-        fields = msgspec.convert(state, _State)
+        fields = msgspec.convert(state, State)
         msgspec.json.encode(fields.config)  # plain values alone, which can be compared
         for rng in (fields.rng, *fields.rng_cuda):
             if not isinstance(rng, torch.Tensor) or rng.dtype != torch.uint8 or rng.ndim != 1:
@@ -209,10 +206,13 @@ def check_state(state: dict[str, Any], source: str) -> None:
     except (ValueError, TypeError, RuntimeError, AttributeError) as error:
         # msgspec's is a ValueError, but it takes a tensor for a mapping without keys
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
+    return fields
 
 
-def read_run(checkpoint: Path, config: TrainConfig, others: dict[str, Any]) -> dict[str, Any]:
-    """Reads ``state.pt`` of a run that goes on, after it is checked.
+def read_run(
+    checkpoint: Path, config: TrainConfig, others: dict[str, Any]
+) -> tuple[State, LengthConfig]:
+    """Reads ``state.pt`` of a run that goes on, after it is checked, and how long that was to be.
 
     Args:
         checkpoint: the checkpoint's folder.
@@ -223,32 +223,22 @@ def read_run(checkpoint: Path, config: TrainConfig, others: dict[str, Any]) -> d
         UserError: the state is damaged, or of a run with other options, data or number of
             processes; the message names what differs, and how to go on all the same.
     """
-    state = read_state(checkpoint)
-    version = state.get("version")
+    stored, source = read_state(checkpoint), str(checkpoint / "state.pt")
+    version = stored.get("version")
     if type(version) is not int or version != STATE_VERSION:  # a tensor has no plain truth
         raise UserError(f"{checkpoint}: state of version {str(version)[:40]!r}")
-    check_state(state, str(checkpoint / "state.pt"))
-    differing = config_differences(state["config"], config.to_dict())
+    state = check_state(stored, source)
+    differing = config_differences(state.config, config.to_dict())
     for name, value in others.items():
-        if state[name] != value:
-            differing.append(f"{name} ({str(state[name])[:80]} there, {value} here)")
+        if getattr(state, name) != value:
+            differing.append(f"{name} ({str(getattr(state, name))[:80]} there, {value} here)")
     if differing:
         raise UserError(
             f"{checkpoint}: is of another run: {', '.join(differing[:20])}; to go on from its "
             f"weights alone: --init {checkpoint}, and another --out"
         )
-    return state
-
-
-def read_length(state: dict[str, Any], source: str) -> tuple[LengthConfig, NewLength]:
-    """Returns how long a checked state's run was to be, and where that last changed.
-
-    Raises:
-        UserError: the configuration in it has no such values.
-    """
     try:
-        length = msgspec.convert(state["config"].get("length"), LengthConfig)
-        return length, msgspec.convert(state.get("new_length", {}), NewLength)
+        return state, msgspec.convert(state.config.get("length"), LengthConfig)
     except ValueError as error:
         raise UserError(f"{source}: damaged, {first_line(error)}") from error
 
@@ -291,15 +281,14 @@ def initial_differences(path: Path, config: TrainConfig, objects: str) -> list[s
     """
     try:
         if (path.parent / "state.pt").is_file():
-            state = read_state(path.parent)
-            check_state(state, str(path.parent / "state.pt"))
+            state = check_state(read_state(path.parent), str(path.parent / "state.pt"))
+            stored, theirs = state.config, state.objects
         else:
-            known = read_document(path.parent / "config.json", dict[str, Any])
-            state = {"config": known, "objects": objects}
-        differing = config_differences(state["config"], config.to_dict(), free=True)
+            stored, theirs = read_document(path.parent / "config.json", dict[str, Any]), objects
+        differing = config_differences(stored, config.to_dict(), free=True)
     except (UserError, AttributeError, TypeError):  # weights alone are what was asked for
         return None
-    return differing + (["the list of objects"] if state["objects"] != objects else [])
+    return differing + (["the list of objects"] if theirs != objects else [])
 
 
 def read_weights_of(path: Path, model: Gamba) -> dict[str, torch.Tensor]:

@@ -6,25 +6,20 @@ alone is done inside ``World.together``, and who waits for one that is gone lear
 
 from __future__ import annotations
 
-import hashlib
 import inspect
-import json
 import os
 import re
 import secrets
 import socket
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
 from torch.distributed import PrefixStore, Store, TCPStore  # pyright: ignore[reportPrivateImportUsage]
 from torch.nn import Module
 from torch.nn.parallel import DistributedDataParallel
@@ -32,10 +27,9 @@ from torch.nn.parallel import DistributedDataParallel
 from gamba_warp.conventions import Precision
 from gamba_warp.devices import pick_precision
 from gamba_warp.errors import UserError, first_line
-from gamba_warp.files import sha256, why_not_written
 
 _MEETING = timedelta(minutes=5)  # processes start at different times
-_PIECE = 64 << 20  # bytes of a file that are sent at once
+_LONGEST = timedelta(minutes=30)  # for which they wait for one another later
 _SHOWN = 4  # names of a list that a message shows
 # What gloo and NCCL say where another process has gone; of a defect they say other things.
 _GONE = re.compile(
@@ -85,22 +79,18 @@ class World:
         return {name: value / self.size for name, value in zip(names, sums)}
 
     def gather(self, value: Any) -> list[Any]:
-        """Gives every process what each of them has, by rank.
+        """Gives every process what each of them has, by rank; what torch can pickle."""
+        found = [value] * self.size
+        if self.size > 1:
+            dist.all_gather_object(found, value)
+        return found
 
-        Args:
-            value: what JSON can hold.
-        """
-        if self.size == 1:
-            return [value]
-        text = torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
-        sizes = [torch.zeros(1, dtype=torch.int64) for _ in range(self.size)]
-        dist.all_gather(sizes, torch.tensor([len(text)]))
-        longest = max(int(size) for size in sizes)
-        padded = torch.nn.functional.pad(text, (0, longest - len(text)))
-        texts = [torch.empty_like(padded) for _ in range(self.size)]
-        dist.all_gather(texts, padded)
-        pairs = zip(texts, sizes)
-        return [json.loads(bytes(got[: int(size)].numpy()).decode()) for got, size in pairs]
+    def first(self, value: Any) -> Any:
+        """Gives every process what the main one has; what torch can pickle, tensors too."""
+        held = [value]
+        if self.size > 1:
+            dist.broadcast_object_list(held, 0)
+        return held[0]
 
     @contextmanager
     def together(self) -> Iterator[None]:
@@ -141,10 +131,6 @@ class World:
             options["process_group"] = dist.new_group(backend="nccl")
         return DistributedDataParallel(model, **options)
 
-    def barrier(self) -> None:
-        """Waits for all processes."""
-        self.total(0.0)
-
     def agree(self, facts: Callable[[], Mapping[str, Mapping[str, object]]]) -> None:
         """Refuses processes that would not do the same work.
 
@@ -157,118 +143,34 @@ class World:
         """
         if self.size == 1:
             return
-        mine: dict[str, dict[str, Any]] = {}
+        mine: Mapping[str, Mapping[str, object]] = {}
         with self.together():
-            mine = json.loads(json.dumps(facts(), default=str))
-        digests = {subject: _digest(known) for subject, known in mine.items()}
-        hosts, seen = zip(*self.gather([socket.gethostname(), digests]))
-        subjects = [s for s in mine if any(found[s] != seen[0][s] for found in seen)]
-        others = [rank for rank in range(self.size) if seen[rank] != seen[0]]
+            mine = facts()
+        known = self.gather((socket.gethostname(), mine))
+        host, here = known[0]
+        others = [rank for rank, (_, found) in enumerate(known) if found != here]
         if not others:
             return
-        whole = self.gather({subject: mine[subject] for subject in subjects})
-        first = others[0]
-        parts = [_difference(s, whole[0].get(s, {}), whole[first].get(s, {})) for s in subjects]
-        who = f"process {first} on {hosts[first]}"
+        (name, there), parts = known[others[0]], []
+        for subject, values in here.items():
+            a, b = values, there[subject]
+            differing = sorted(key for key in {*a, *b} if key not in a or a[key] != b.get(key))
+            shown = []
+            for key in differing[:_SHOWN]:
+                if key not in a or key not in b:
+                    shown.append(f"{key} is {'added' if key not in a else 'missing'}")
+                elif re.fullmatch("[0-9a-f]{64}", str(a[key])):  # a hash says nothing to people
+                    shown.append(f"{key} is another")
+                else:
+                    shown.append(f"{key} is {str(b[key])[:60]}, not {str(a[key])[:60]}")
+            if len(differing) > _SHOWN:
+                shown[-1] += f" and {len(differing) - _SHOWN} more"
+            if shown:
+                parts.append(f"{subject}: {', '.join(shown)}")
+        who = f"process {others[0]} on {name}"
         if len(others) > 1:
             who += f", like {len(others) - 1} more,"
-        raise UserError(
-            f"{who} is not set up as process 0 on {hosts[0]}: {'; '.join(filter(None, parts))}"
-        )
-
-    @contextmanager
-    def copied(self, folder: Path | None) -> Iterator[Path | None]:
-        """Gives all processes the files of a folder that the main one sees.
-
-        Who has the same files in a folder of that name, as on a shared disk, gets that name; the
-        others get a copy, which goes in the end. So the processes need no disk in common.
-
-        Args:
-            folder: of the main process, with plain files alone; None: there is none. What the other
-                processes pass does not count.
-
-        Raises:
-            UserError: the folder cannot be read, or a copy of it cannot be written.
-        """
-        if self.size == 1:
-            yield folder
-            return
-        files: dict[str, list[Any]] = {}
-        with self.together():
-            if self.main and folder is not None:
-                found = sorted(path for path in folder.iterdir() if path.is_file())
-                files = {path.name: [path.stat().st_size, sha256(path)] for path in found}
-        name, files = self.gather([None if folder is None else str(folder), files])[0]
-        if name is None:
-            yield None
-            return
-        there = self.main or _holds(Path(name), files)
-        if all(self.gather(there)):
-            yield Path(name)
-            return
-        with tempfile.TemporaryDirectory(prefix="gamba-") as place:
-            self._send(Path(name), files, None if there else Path(place))
-            yield Path(name) if there else Path(place)
-
-    def _send(self, source: Path, files: dict[str, list[Any]], place: Path | None) -> None:
-        """Sends files from the main process to all, which write them where they have a place."""
-        failed: OSError | None = None
-        for name, (size, _) in files.items():
-            reader: BinaryIO | None = open(source / name, "rb") if self.main else None
-            for start in range(0, size, _PIECE):
-                piece = torch.empty(min(_PIECE, size - start), dtype=torch.uint8)
-                if reader is not None:
-                    piece = torch.frombuffer(bytearray(reader.read(len(piece))), dtype=torch.uint8)
-                dist.broadcast(piece, 0)
-                try:  # a full disk here must not stop what the others receive
-                    if place is not None and failed is None:
-                        _append(place / name, piece)
-                except OSError as error:
-                    failed = error
-            if reader is not None:
-                reader.close()
-        with self.together():
-            if failed is not None:
-                reason = why_not_written(failed) or str(failed)
-                raise UserError(f"cannot write a copy of {source}: {reason}")
-
-
-def _append(path: Path, piece: Tensor) -> None:
-    with open(path, "ab") as file:
-        file.write(piece.numpy().tobytes())
-
-
-def _holds(folder: Path, files: Mapping[str, list[Any]]) -> bool:
-    """Whether a folder has just these files, by their sizes and SHA-256."""
-    try:
-        return all(
-            (folder / name).stat().st_size == size and sha256(folder / name) == digest
-            for name, (size, digest) in files.items()
-        )
-    except (OSError, UserError):
-        return False
-
-
-def _digest(values: object) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-def _difference(subject: str, main: dict[str, Any], other: dict[str, Any]) -> str:
-    """What differs in one subject, in a few words; "" where nothing does."""
-    names = sorted(name for name in {*main, *other} if main.get(name) != other.get(name))
-    if not names:
-        return ""
-    shown = []
-    for name in names[:_SHOWN]:
-        here, there = main.get(name), other.get(name)
-        if name not in other or name not in main:
-            shown.append(f"{name} is {'missing' if name in main else 'added'}")
-        elif re.fullmatch("[0-9a-f]{64}", str(here)):  # a hash says nothing to people
-            shown.append(f"{name} is another")
-        else:
-            shown.append(f"{name} is {str(there)[:60]}, not {str(here)[:60]}")
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return f"{subject}: {', '.join(shown)}{more}"
+        raise UserError(f"{who} is not set up as process 0 on {host}: {'; '.join(parts)}")
 
 
 @contextmanager
@@ -299,8 +201,8 @@ def world(device: str = "auto") -> Iterator[World]:
     try:
         # What is small (stop flags, errors) goes through gloo; ``wrap`` takes NCCL for gradients
         # on GPUs, after it is known that all processes have one.
-        store = _meet(rank, size)
-        dist.init_process_group("gloo", store=store, rank=rank, world_size=size)
+        store = _fresh_store(rank, size)
+        dist.init_process_group("gloo", store=store, rank=rank, world_size=size, timeout=_LONGEST)
         yield World(rank, size, chosen)
     except RuntimeError as error:
         text = re.sub(r"\[[^][]*\.(cc|cpp):\d+\] ", "", first_line(error))
@@ -316,37 +218,24 @@ def world(device: str = "auto") -> Iterator[World]:
             dist.destroy_process_group()
 
 
-def _meet(rank: int, size: int) -> Store:
-    """Joins the processes that were started with this one, and gives them a store of their own.
+def _fresh_store(rank: int, size: int) -> Store:
+    """A store of these processes alone, without what processes before them have left.
 
-    torchrun's store outlives the processes that it starts anew, and holds addresses of dead ones.
-    torch tells them apart by the number of restarts, which each machine counts for itself, so that
-    machines wait for one another in vain. Here each process has a random name, to which rank 0
-    answers with that of the group.
+    torchrun's own store outlives the processes that it starts anew, and holds the addresses of dead
+    ones, for which torch waits in vain: tried with torch 2.15. torch 2.6 tells them apart by the
+    number of restarts, which each machine counts for itself. Here each process has a random name,
+    and they go on when all have seen the same names.
     """
     host, port = os.environ.get("MASTER_ADDR", "127.0.0.1"), os.environ.get("MASTER_PORT", "29500")
-    held = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # by torchrun itself
-    store = TCPStore(
-        host, int(port), None, rank == 0 and not held, timeout=_MEETING, wait_for_workers=False
-    )
-    mine = secrets.token_hex(8)
-    store.set(f"gamba/name/{rank}", mine)
-    if rank:
-        group = store.get(f"gamba/group-of/{mine}").decode()
-        store.set(f"gamba/{group}/knows/{rank}", "")
-        return PrefixStore(f"gamba/{group}", store)
-    told: dict[int, bytes] = {}
-    limit, missing = time.monotonic() + _MEETING.total_seconds(), set(range(1, size))
-    while missing:
-        for other in [*missing]:
-            if store.check([f"gamba/{mine}/knows/{other}"]):
-                missing.remove(other)
-            elif store.check([f"gamba/name/{other}"]):
-                name = store.get(f"gamba/name/{other}")
-                if told.get(other) != name:  # the first may be of a dead one
-                    store.set(f"gamba/group-of/{name.decode()}", mine)
-                    told[other] = name
-        if time.monotonic() > limit:
-            raise UserError(f"processes {sorted(missing)} of {size} have not come to {host}:{port}")
+    served = rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+    store = TCPStore(host, int(port), None, served, timeout=_MEETING, wait_for_workers=False)
+    names, seen = ([f"gamba/{what}/{r}" for r in range(size)] for what in ("name", "seen"))
+    store.set(names[rank], secrets.token_hex(8))
+    limit = time.monotonic() + _MEETING.total_seconds()
+    while time.monotonic() < limit:
+        group = store.multi_get(names)  # waits for who has not come at all
+        store.set(seen[rank], b",".join(group))
+        if {*store.multi_get(seen)} == {b",".join(group)}:
+            return PrefixStore(f"gamba/{group[0].decode()}", store)
         time.sleep(0.02)
-    return PrefixStore(f"gamba/{mine}", store)
+    raise UserError(f"not all of {size} processes have come to {host}:{port}")

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
 from .batches import BatchQueue, BatchSource, TrainingData, fixed_batches
-from .checkpoint import STATE_VERSION, read_length, read_run, read_weights_of, save_checkpoint
+from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
 from .data.samples import Batch
 from .ddp import World
@@ -367,24 +368,31 @@ class Trainer:
             UserError: the checkpoint is damaged, or belongs to a run with another configuration,
                 data or number of processes; the message names the differing fields.
         """
-        mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
-        state = read_run(checkpoint, self.config, mine)
-        length, since = read_length(state, str(checkpoint / "state.pt"))
-        old = replace(self._schedule(length), since=since)
-        moments = checked_moments(self.optimizer, state["optimizer"], checkpoint / "state.pt")
-        # Everything is read and checked before any of it is loaded.
-        weights = read_weights_of(checkpoint / "model.safetensors", self.model)
+        held: Any = None
+        with self.world.together():
+            if self.world.main:
+                mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
+                state, length = read_run(checkpoint, self.config, mine)
+                moments = checked_moments(self.optimizer, state.optimizer, checkpoint / "state.pt")
+                weights = read_weights_of(checkpoint / "model.safetensors", self.model)
+                averages = None
+                if self.ema is not None:
+                    averages = read_weights_of(checkpoint / "ema.safetensors", self.ema.model)
+                held = state, length, moments, weights, averages
+        # Everything was read and checked before any of it is loaded. The processes need no disk in
+        # common: the main one reads.
+        state, length, moments, weights, averages = self.world.first(held)
         if self.ema is not None:
-            averages = read_weights_of(checkpoint / "ema.safetensors", self.ema.model)
             self.ema.model.load_stored_state(averages)
-            self.ema.updates = state["ema_updates"]
+            self.ema.updates = state.ema_updates
         self.model.load_stored_state(weights)
         self.optimizer.load_state_dict(moments)
-        self.step, self.skipped = state["step"], state["skipped"]
-        self.skipped_in_row, self.elapsed = state["skipped_in_row"], state["elapsed"]
+        self.step, self.skipped = state.step, state.skipped
+        self.skipped_in_row, self.elapsed = state.skipped_in_row, state.elapsed
+        old = replace(self._schedule(length), since=state.new_length)
         self.schedule, note = self.schedule.after(old, self.step, self.elapsed)
         self._saved = self.step if checkpoint.parent.parent == self.config.run.out else -1
-        torch.set_rng_state(state["rng"])
-        if len(state["rng_cuda"]) == torch.cuda.device_count():
-            torch.cuda.set_rng_state_all(state["rng_cuda"])
+        torch.set_rng_state(state.rng)
+        if len(state.rng_cuda) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state.rng_cuda)
         return note

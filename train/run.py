@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 
 from gamba_warp.batch import EXPECTED
 from gamba_warp.errors import UserError
-from gamba_warp.files import only_process, output_folder, sha256, sweep, write_json
+from gamba_warp.files import only_process, output_folder, sweep, write_json
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.versions import installed
+from gamba_warp.versions import __version__, installed
 
 from .batches import TrainingData, kept_on, open_data
 from .boards import check_boards
@@ -26,6 +25,7 @@ from .checkpoint import (
     initial_differences,
     list_checkpoints,
     load_weights,
+    step_of,
 )
 from .config import TrainConfig, command_line, options_of_all
 from .ddp import World
@@ -33,7 +33,6 @@ from .log import RunLog, say
 from .loop import Trainer
 from .objective.losses import open_lpips
 
-_PARTS = ("", ".kernels", ".train", ".eval")  # of the package; they lie apart in a checkout
 _COMPUTE = ("torch", "warp-lang", "numpy", "pillow", "kornia", "timm")
 _PYTHON = ".".join(map(str, sys.version_info[:2]))
 _PICTURES = 16  # objects whose first picture is compared between processes
@@ -52,54 +51,48 @@ def train(config: TrainConfig, world: World) -> int:
     Raises:
         UserError: bad data, options or run folder, or the processes do not have the same.
     """
+    run, notes, started = config.run, [], ""
+    checkpoint = log = None
+    there = run.out.is_dir()  # one that is not there is made only when nothing is bad
     with contextlib.ExitStack() as held:
         with world.together():
             data = kept_on(world.device, config, open_data(config))
-        return _train(config, world, data, held)
-
-
-def _train(
-    config: TrainConfig, world: World, data: TrainingData, held: contextlib.ExitStack
-) -> int:
-    run = config.run
-    lock = only_process(run.out, "trains")
-    there = run.out.is_dir()  # one that is not there is made only when nothing is bad
-    damaged: list[str] = []
-    checkpoint = None
-    with world.together():
-        if world.main:  # the others go by what it finds
-            check_boards(run.log)
-            if there:
-                held.enter_context(lock)
-            checkpoint = find_checkpoint(run.out, run.resume, damaged.append)
-        lpips, warning = open_lpips(config, world.device.type)
-    world.agree(lambda: _facts(config, data, world, lpips is not None))
-    _refuse_newer(world, run.out, run.resume, checkpoint)
-    torch.manual_seed(run.seed)
-    # TF32 where there is a GPU; no effect on a CPU. It is meant for the network's products, forward
-    # and backward; geometry makes none (cameras.exact_product), SSIM's keep all digits.
-    torch.set_float32_matmul_precision("high")
-    started = ""
-    with world.together():
-        model = Gamba(config.model_config(), run.encoder_weights)
-        model.recompute = run.recompute
-        if run.init is not None and checkpoint is None and world.main:  # ``wrap`` sends it around
-            started = _load_initial(config, data, model, damaged.append)
-    model.to(world.device)
-    if lpips is not None:
-        lpips.to(world.device)
-    log = None
-    try:
+            if world.main:  # the others go by what it finds
+                check_boards(run.log)
+                if there:
+                    held.enter_context(only_process(run.out, "trains"))
+                checkpoint = find_checkpoint(run.out, run.resume, notes.append)
+            lpips, warning = open_lpips(config, world.device.type)
+        world.agree(lambda: _facts(config, data, world, lpips is not None))
+        checkpoint = world.first(checkpoint)
+        _refuse_newer(world, run.out if run.resume == "auto" else None, checkpoint)
+        torch.manual_seed(run.seed)
+        # TF32 where there is a GPU; no effect on a CPU. It is meant for the network's products,
+        # forward and backward; geometry makes none (cameras.exact_product), SSIM's keep all digits.
+        torch.set_float32_matmul_precision("high")
         with world.together():
+            model = Gamba(config.model_config(), run.encoder_weights)
+            model.recompute = run.recompute
+            if run.init is not None and checkpoint is None and world.main:  # ``wrap`` sends it
+                started = _load_initial(run.init, config, data, model, notes)
+            model.to(world.device)
+            if lpips is not None:
+                lpips.to(world.device)
             if world.main:
-                log = _open_log(config, lock if not there else None, held)
+                output_folder(run.out / "samples")
+                if not there:
+                    held.enter_context(only_process(run.out, "trains"))
+                    if list_checkpoints(run.out):
+                        raise UserError(
+                            f"{run.out}: another process trained here meanwhile; start again"
+                        )
+                for folder in (run.out, run.out / "samples", run.out / "checkpoints"):
+                    sweep(folder, age=0)
+                log = held.enter_context(contextlib.closing(RunLog(run.out, run.boards)))
         trainer = Trainer(config, model, data, world, log, lpips)
-        notes = [*damaged, *([warning] if warning else [])]
-        with world.copied(checkpoint) as seen, world.together():
-            if seen is not None:
-                changed = trainer.restore(seen)
-                notes += [changed] if changed else []
+        changed = None if checkpoint is None else trainer.restore(checkpoint)
         if log is not None:
+            notes = [*data.notes, *notes, *filter(None, (warning, changed))]
             _announce(trainer, log, checkpoint, notes)
             if started:
                 say(started)
@@ -108,45 +101,17 @@ def _train(
         if log is not None:
             _report(trainer, log, code, failures)
         return code or int(bool(failures))
-    finally:
-        if log is not None:
-            log.close()
-
-
-def _open_log(
-    config: TrainConfig, lock: contextlib.AbstractContextManager | None, held: contextlib.ExitStack
-) -> RunLog:
-    """Makes the run folder, if need be, and holds it for this process alone."""
-    run = config.run
-    output_folder(run.out / "samples")
-    if lock is not None:
-        held.enter_context(lock)
-        if list_checkpoints(run.out):
-            raise UserError(f"{run.out}: another process trained here meanwhile; start again")
-    for folder in (run.out, run.out / "samples", run.out / "checkpoints"):
-        sweep(folder, age=0)
-    return RunLog(run.out, run.boards)
 
 
 def _facts(
     config: TrainConfig, data: TrainingData, world: World, lpips: bool
 ) -> Mapping[str, Mapping[str, object]]:
-    """What all processes must have in common, see ``World.agree``."""
-    options = options_of_all(config.to_dict())
-    known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
-    return {
-        "options": {**options, **known},
-        "data": _contents(data),
-        "versions": {"python": _PYTHON, **installed(*_COMPUTE)},
-        "code": _sources(),
-    }
+    """What all processes must have in common, see ``World.agree``.
 
-
-def _contents(data: TrainingData) -> dict[str, str]:
-    """SHA-256 by object, of its cameras and, of some objects, of the first picture."""
-    chosen = sorted(set(data.objects))
+    Of the data: SHA-256 by object, of its cameras and, of some objects, of the first picture.
+    """
+    chosen, contents = sorted(set(data.objects)), {}
     read = set(chosen[:: max(1, len(chosen) // _PICTURES)])
-    found = {}
     for index in chosen:
         files = data.train.files(index)
         kinds = f"{len(files.images)} {files.depths is None} {files.backs is None}"
@@ -156,35 +121,26 @@ def _contents(data: TrainingData) -> dict[str, str]:
         if index in read:
             with contextlib.suppress(*EXPECTED):  # the training says so where it matters
                 digest.update(data.train.load(index, [0], depths=0).images.numpy().tobytes())
-        found[data.train.uids[index]] = digest.hexdigest()
-    return found
+        contents[data.train.uids[index]] = digest.hexdigest()
+    known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
+    return {
+        "options": {**options_of_all(config.to_dict()), **known},
+        "data": contents,
+        "versions": {"gamba-warp": __version__, "python": _PYTHON, **installed(*_COMPUTE)},
+    }
 
 
-def _sources() -> dict[str, str]:
-    """SHA-256 of the package's own modules, by their names."""
-    found = {}
-    for part in _PARTS:
-        name = f"gamba_warp{part}"
-        folder = Path(str(importlib.import_module(name).__file__)).parent
-        for path in folder.rglob("*.py"):
-            module = ".".join([name, *path.relative_to(folder).with_suffix("").parts])
-            found[module] = sha256(path)
-    return found
-
-
-def _refuse_newer(world: World, out: Path, resume: str, checkpoint: Path | None) -> None:
+def _refuse_newer(world: World, out: Path | None, checkpoint: Path | None) -> None:
     """Refuses to go back where another process sees a newer checkpoint than the main one.
 
     Without a shared disk this is so when the processes are counted in another order than before.
     """
-    if resume != "auto":
-        return
-    steps = {int(path.name.split("_")[1]): str(path) for path in list_checkpoints(out)}
-    taken = -1 if checkpoint is None else int(checkpoint.name.split("_")[1])
-    seen = world.gather([socket.gethostname(), list(steps.items()), taken])
-    host, known, taken = seen[0]
-    for rank, (other, found, _) in enumerate(seen):
-        newer = [path for step, path in found if step > taken and step not in dict(known)]
+    taken = -1 if checkpoint is None else step_of(checkpoint)
+    seen = world.gather((socket.gethostname(), list_checkpoints(out) if out else []))
+    host, known = seen[0]
+    steps = {step_of(path) for path in known}
+    for rank, (other, found) in enumerate(seen):
+        newer = [p for p in found if step_of(p) > taken and step_of(p) not in steps]
         if newer:
             raise UserError(
                 f"process {rank} on {other} sees {newer[-1]}, process 0 on {host} does not: start "
@@ -193,11 +149,10 @@ def _refuse_newer(world: World, out: Path, resume: str, checkpoint: Path | None)
 
 
 def _load_initial(
-    config: TrainConfig, data: TrainingData, model: Gamba, warn: Callable[[str], None]
+    init: Path, config: TrainConfig, data: TrainingData, model: Gamba, notes: list[str]
 ) -> str:
     """Loads what ``--init`` means into the model, and returns a line about it."""
-    assert config.run.init is not None
-    path = find_initial(config.run.init, warn)
+    path = find_initial(init, notes.append)
     load_weights(path, model)
     differing = initial_differences(path, config, data.fingerprint)
     if differing is None:
@@ -227,7 +182,7 @@ def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: lis
         f"{trainer.schedule}, {facts['device']}, products in {facts['precision']} -> "
         f"{config.run.out}"
     )
-    for note in [*data.notes, *notes]:
+    for note in notes:
         log.warn(trainer.step, note)
     if checkpoint is not None:
         say(f"resumed {checkpoint} at step {trainer.step}")

@@ -13,7 +13,6 @@ from safetensors.torch import load_file
 
 from gamba_warp import versions
 from gamba_warp.files import PART
-from gamba_warp.train import run as run_module
 from gamba_warp.train.checkpoint import damage, list_checkpoints
 
 FULL = 20_000  # bytes: the log has room, a checkpoint has not
@@ -57,7 +56,6 @@ def ends(data, tmp_path_factory):
     step("goes on", "run", 6)
     begin("far")
     far = (root / "far", root / "elsewhere")
-    step("no copy", "far", 6, outs=far, limits=(None, FULL))
     step("copied", "far", 6, outs=far)
     step("newer", "far", 7, outs=(root / "far", root / "later"))
     step("spoilt", "spoilt", 6, data=(data, spoilt), more=FIVE)
@@ -103,13 +101,6 @@ def test_processes_without_a_common_disk_get_the_checkpoint_sent(ends):
     assert not (root / "elsewhere").exists()
 
 
-def test_a_full_disk_under_the_copy_ends_all(ends):
-    _, found = ends
-    (main, other) = found["no copy"]
-    assert other[0] == 2 and "cannot write a copy of" in other[1]
-    assert main[0] == 2 and main[1].startswith("process 1 on ") and main[1].endswith(other[1])
-
-
 def test_a_newer_checkpoint_elsewhere_is_not_thrown_away(ends):
     root, found = ends
     (main, other) = found["newer"]
@@ -126,15 +117,14 @@ def test_pictures_that_only_another_process_cannot_read_are_named(ends):
 
 
 def test_processes_that_differ_are_refused_with_the_difference(data, tmp_path):
-    """Options, data, a library's version and the package's own code, in one line on each."""
+    """Options, data, the package's and a library's version, in one line on each."""
     other = tmp_path / "clouds"
     shutil.copytree(data, other)
     shutil.copy(other / "cloudb" / "001.png", other / "cloudb" / "000.png")
     patch = (
         "import gamba_warp.train.run as r\n"
-        "a, b = r.installed, r._sources\n"
+        "a, r.__version__ = r.installed, '9.8'\n"
         "r.installed = lambda *names: {**a(*names), 'torch': '9.9'}\n"
-        "r._sources = lambda: {**b(), 'gamba_warp.train.loop': '0' * 64}\n"
     )
     arguments = [words(folder, tmp_path / "out", "--steps", 2) for folder in (data, other)]
     ends = train_all([arguments[0], [*arguments[1], "--lr", "0.01"]], {1: patch})
@@ -145,15 +135,9 @@ def test_processes_that_differ_are_refused_with_the_difference(data, tmp_path):
         "gamba: process 1 on",
         "options: optim.lr is 0.01, not 0.001;",
         "data: cloudb is another;",
-        f"versions: torch is 9.9, not {versions.installed('torch')['torch']};",
-        "code: gamba_warp.train.loop is another",
+        f"versions: gamba-warp is 9.8, not {versions.__version__},",
+        f"torch is 9.9, not {versions.installed('torch')['torch']}",
     ):
         assert part in line, line
     for word in ("run.out", "clouda", "numpy"):
         assert word not in line
-
-
-def test_every_module_of_the_package_counts():
-    found = run_module._sources()
-    for name in ("gamba_warp.cli", "gamba_warp.train.loop", "gamba_warp.kernels.lazy"):
-        assert found[name] != found["gamba_warp.render"]

@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from gamba_warp.errors import UserError
-from gamba_warp.train import ddp
+from gamba_warp.train import loop
 from gamba_warp.train.config import TrainConfig
 from gamba_warp.train.ddp import world
 from gamba_warp.train.run import train
@@ -25,8 +25,10 @@ from helpers.disk import full_at
 def main() -> None:
     plan, result = map(Path, sys.argv[1:])
     torch.set_num_threads(1)
-    ends, holds = {}, ddp._holds
+    ends = {}
     with world("cpu") as place:
+        if not place.main:  # as if each had its own disk: only the first can read a checkpoint
+            loop.read_run = None
         for name, arguments, limits in json.loads(plan.read_text()):
             if name == "copy":
                 with place.together():
@@ -37,10 +39,6 @@ def main() -> None:
             full = contextlib.nullcontext() if limit is None else full_at(limit)
             kind = tyro.conf.OmitArgPrefixes[TrainConfig]
             config = tyro.cli(kind, args=arguments[place.rank])
-            own = config.run.out  # it sees no other run's folder, as if each had its own disk
-            ddp._holds = lambda folder, files, own=own: (
-                own in folder.parents and holds(folder, files)
-            )
             try:
                 with full:
                     ends[name] = [train(config, place), ""]
