@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -171,6 +172,7 @@ class BatchQueue:
         """
         self.source, self.workers, self.novel = source, workers, novel
         self.world, self.last = world, last
+        self.waited = 0.0  # seconds in ``take``, until it is set to 0
         self._threads: Prefetcher[Prepared, Prepared] = Prefetcher(workers)
 
     def take(self, number: int) -> Batch:
@@ -179,14 +181,16 @@ class BatchQueue:
         Raises:
             UserError: as ``BatchSource.sample``.
         """
-        end = number + self.workers + 1
+        began, end = time.perf_counter(), number + self.workers + 1
         for following in range(number, end if self.last is None else min(end, self.last)):
             if following not in self._threads:
                 numbers = self.source.numbers(following, self.world.rank, self.world.size)
                 novel = self.novel(following)
                 parts = [partial(self.source.prepare, n, novel) for n in numbers]
                 self._threads.submit(following, parts, self._joined)
-        return self.source.counted(self._threads.take(number)).to(self.world.device)
+        batch = self.source.counted(self._threads.take(number)).to(self.world.device)
+        self.waited += time.perf_counter() - began
+        return batch
 
     def close(self) -> None:
         """Drops what has not begun; what has begun ends with a sample of each thread."""

@@ -9,7 +9,7 @@ import secrets
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import msgspec
 
@@ -17,16 +17,6 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import write_json
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.versions import to_install
-
-
-class Board(Protocol):
-    """What ``RunLog`` writes to beside its own file."""
-
-    def write(self, event: str, step: int, values: Mapping[str, object]) -> None:
-        """Takes one line of the log; it may raise anything."""
-
-    def close(self) -> None:
-        """Writes what is left; it may raise anything."""
 
 
 def check_boards(names: Sequence[str]) -> None:
@@ -39,11 +29,11 @@ def check_boards(names: Sequence[str]) -> None:
         raise UserError(f"--log wandb: it is not installed: {to_install('wandb')}")
 
 
-def open_board(name: str, run: Path) -> Board | None:
+def open_board(name: str, run: Path) -> TensorBoard | Wandb | None:
     """Opens "tensorboard" or "wandb" for a run's folder; None if TensorBoard is not installed.
 
     Raises:
-        Exception: whatever stops it.
+        Exception: whatever stops it; so may what is made, in ``write`` and ``close``.
     """
     if name == "wandb":
         return Wandb(run)

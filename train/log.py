@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import TextIO
 
 import torch
 from torch import Tensor
@@ -23,9 +23,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import reason_of
 from gamba_warp.images import save_image
 
-from .boards import Board, open_board
-
-_READ = 1 << 16  # bytes read at once in search of the last whole line
+from .boards import TensorBoard, Wandb, open_board
 
 
 class RunLog:
@@ -47,12 +45,14 @@ class RunLog:
         try:
             # Without a buffer, what could not be written is known at once and nowhere kept.
             self._file = open(run / "log.jsonl", "a+b", buffering=0)
-            self._cut(_whole_lines(self._file))
+            size = self._file.seek(0, os.SEEK_END)  # 0 of a device, which would never end
+            self._file.seek(0)
+            self._cut(self._file.read(size).rfind(b"\n") + 1)
         except OSError as error:
             raise UserError(f"cannot write {run / 'log.jsonl'}: {error.strerror}") from error
         self._run = run
         self._said: set[str] = set()
-        self._boards: dict[str, Board] = {}
+        self._boards: dict[str, TensorBoard | Wandb] = {}
         for name in boards:
             with self._guarded(name):
                 board = open_board(name, run)
@@ -147,19 +147,6 @@ class Quiet:
         """Flushes, or does nothing."""
         with suppress(OSError):
             self._stream.flush()
-
-
-def _whole_lines(file: BinaryIO) -> int:
-    """Size up to the end of the last whole line, bytes."""
-    size = file.seek(0, os.SEEK_END)
-    while size:
-        start = max(0, size - _READ)
-        file.seek(start)
-        end = file.read(size - start).rfind(b"\n")
-        if end >= 0:
-            return start + end + 1
-        size = start
-    return 0
 
 
 def _plain(value: object) -> object:

@@ -23,10 +23,10 @@ from gamba_warp.model.gamba import Gamba
 from .batches import BatchQueue, BatchSource, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
-from .data.samples import Batch
 from .ddp import World
 from .log import RunLog, run_bar, say
-from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views, radial_weight
+from .objective.losses import Moment, term_weights
+from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
 from .step import collapse_reason, compute_gradients, health, validate
 
 
@@ -112,10 +112,6 @@ class Trainer:
                 self._named.add(uid)
                 self.log.warn(self.step, f"{uid} is skipped: {reason}")
 
-    def learning_rate(self) -> float:
-        """Returns the learning rate of the next step."""
-        return self.config.optim.lr * self.schedule.share(self.step, self.elapsed)
-
     def novel_views(self, step: int) -> int:
         """Returns V, the number of novel views at a step."""
         views = self.config.views
@@ -124,26 +120,11 @@ class Trainer:
         done = self.schedule.progress(step, self.elapsed)
         return novel_views(done, views.views_first, views.views_last)
 
-    def weights(self, constant: bool = False) -> dict[str, float]:
-        """Returns the weights of the loss terms at the next step, and that of the novel views.
-
-        Args:
-            constant: those of a validation, which do not change over the run: LPIPS from the start,
-                neither the radial mask constraint nor depth.
-        """
-        loss = self.config.loss
+    def weights(self, validates: bool = False) -> dict[str, float]:
+        """Returns ``term_weights`` at the next step, or for a validation."""
         epochs = self.step / self.steps_per_epoch
         done = self.schedule.progress(self.step, self.elapsed)
-        use_lpips = self.lpips is not None and (constant or self.step >= loss.lpips_after)
-        return {
-            "rgb": 1.0,
-            "mask": loss.mask_weight,
-            "lpips": loss.lpips_weight if use_lpips else 0.0,
-            "ssim": loss.ssim_weight,
-            "novel": loss.novel_weight,
-            "depth": 0.0 if constant else loss.depth_weight,
-            "rdist": 0.0 if constant else radial_weight(loss, self.step, epochs, done),
-        }
+        return term_weights(self.config.loss, Moment(self.step, epochs, done, validates))
 
     def train_step(self, batches: BatchQueue) -> dict[str, float]:
         """Makes one optimizer step; returns its figures, some of them those of its last batch.
@@ -156,14 +137,14 @@ class Trainer:
             UserError: there are too many such steps in a row, or data cannot be read.
         """
         started = time.perf_counter()
-        rate, weights = self.learning_rate(), self.weights()
+        rate = self.config.optim.lr * self.schedule.share(self.step, self.elapsed)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        waits: list[float] = []
+        weights, first, batches.waited = self.weights(), self.step * self.accumulate, 0.0
         made = compute_gradients(
             self.wrapped,
             self.optimizer,
-            self._take(batches, waits),
+            map(batches.take, range(first, first + self.accumulate)),
             weights,
             clip=self.config.optim.clip,
             count=self.accumulate,
@@ -176,7 +157,7 @@ class Trainer:
         seconds = time.perf_counter() - started
         views = made.batch.cameras.viewmats[..., 0, 0].numel() * self.accumulate * self.world.size
         figures = {"loss": loss, "grad_norm": norm, "lr": rate}
-        figures |= {"seconds": seconds, "wait_share": sum(waits) / seconds}
+        figures |= {"seconds": seconds, "wait_share": batches.waited / seconds}
         figures["views_per_second"] = views / seconds
         if self.step % self.config.run.log_every == 0:
             terms = made.result.terms.items()
@@ -184,24 +165,6 @@ class Trainer:
             known = health(made.result, made.batch).items()
             figures |= self.world.mean(own | {name: value.item() for name, value in known})
         return figures
-
-    def _take(self, batches: BatchQueue, waits: list[float]) -> Iterator[Batch]:
-        """Yields this step's batches on the device, and appends the seconds waited for each."""
-        for micro in range(self.accumulate):
-            before = time.perf_counter()
-            batch = batches.take(self.step * self.accumulate + micro)
-            waits.append(time.perf_counter() - before)
-            yield batch
-
-    def _queue(self) -> BatchQueue:
-        """All batches of the run, prepared ahead."""
-        return BatchQueue(
-            self._source,
-            self.config.views.workers,
-            lambda number: self.novel_views(number // self.accumulate),
-            self.world,
-            last=None if self.total is None else self.total * self.accumulate,
-        )
 
     def _apply(self, loss: float, norm: float) -> float:
         """Updates the weights or skips the step, on all processes alike, and counts the step.
@@ -240,17 +203,27 @@ class Trainer:
         Raises:
             UserError: as ``train_step``, or the run folder cannot be written.
         """
-        batches = self._queue()
-        length = self.total, self.config.length.minutes
-        bar = run_bar(*length, self.step, self.elapsed / 60, self.world.main)
+        minutes = self.config.length.minutes
+        batches = BatchQueue(
+            self._source,
+            self.config.views.workers,
+            lambda number: self.novel_views(number // self.accumulate),
+            self.world,
+            last=None if self.total is None else self.total * self.accumulate,
+        )
+        bar = run_bar(self.total, minutes, self.step, self.elapsed / 60, self.world.main)
         began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
         try:
             with stop_signals() as received:
                 while True:
-                    clock = before + time.monotonic() - began
-                    self.elapsed, stop = self._agree(clock, received)
-                    if stop or self._finished():
+                    # Elapsed seconds and signal are the same on all processes.
+                    clock = (before + time.monotonic() - began) / self.world.size
+                    signals = float(received[0] if received else 0), float(bool(received))
+                    self.elapsed, stop, senders = self.world.total(clock, *signals)
+                    stop /= max(1.0, senders)
+                    late = minutes is not None and self.elapsed >= 60 * minutes
+                    if stop or late or (self.total is not None and self.step >= self.total):
                         break
                     figures = self.train_step(batches)
                     self._after_step(figures, bar)
@@ -266,20 +239,6 @@ class Trainer:
             best = self.ema.model if self.ema else self.model
             save_model(self.config.run.out / "model.safetensors", best)
         return 0
-
-    def _agree(self, clock: float, received: list[int]) -> tuple[float, float]:
-        """Returns elapsed seconds and stop signal (0: none), the same on all processes."""
-        signals = [float(received[0] if received else 0)]
-        clock, total, senders = self.world.total(
-            clock / self.world.size, *signals, float(bool(received))
-        )
-        return clock, total / senders if senders else 0.0
-
-    def _finished(self) -> bool:
-        minutes = self.config.length.minutes
-        if minutes is not None and self.elapsed >= 60 * minutes:
-            return True
-        return self.total is not None and self.step >= self.total
 
     def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
         run, minutes = self.config.run, self.config.length.minutes
@@ -318,7 +277,7 @@ class Trainer:
                     self.config.views.size,
                     self._unread,
                 )
-                weights, device = self.weights(constant=True), self.world.device
+                weights, device = self.weights(validates=True), self.world.device
                 figures, rows = validate(model, held_out, weights, self.lpips, device)
                 self._name_failures()
                 if rows:

@@ -16,7 +16,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba
 
-from .config import LossConfig, OptimConfig
+from .config import OptimConfig
 
 # A learning rate under this share of what a run of the new length has at that step is no rate to
 # go on with; it rises over this share of what is left.
@@ -55,32 +55,28 @@ def checked_moments(
     Raises:
         UserError: a moment is unknown, of another shape or kind, or not finite.
     """
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    moments = stored.get("state")
     try:
-        _check_moments(optimizer, stored.get("state"))
+        if not isinstance(moments, dict):
+            raise ValueError("the optimizer has no state")
+        for index, entry in moments.items():
+            if type(index) is not int or not 0 <= index < len(parameters):
+                raise ValueError(f"the optimizer has a state of parameter {str(index)[:40]!r}")
+            names = set(entry) if isinstance(entry, dict) else set()
+            if names != {"step", "exp_avg", "exp_avg_sq"}:
+                raise ValueError(f"the optimizer's state of parameter {index} has other fields")
+            for name, value in entry.items():
+                wanted = torch.Size() if name == "step" else parameters[index].shape
+                if not isinstance(value, Tensor) or value.dtype != torch.float32:
+                    raise ValueError(f"{name} of parameter {index} is no float32 tensor")
+                if value.shape != wanted:
+                    raise ValueError(f"{name} of parameter {index} is {tuple(value.shape)}")
+                if not value.isfinite().all() or (name != "exp_avg" and bool((value < 0).any())):
+                    raise ValueError(f"{name} of parameter {index} is not finite, or negative")
     except ValueError as error:
         raise UserError(f"{source}: damaged, {error}") from error
-    return {"state": stored["state"], "param_groups": optimizer.state_dict()["param_groups"]}
-
-
-def _check_moments(optimizer: torch.optim.AdamW, moments: object) -> None:
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    if not isinstance(moments, dict):
-        raise ValueError("the optimizer has no state")
-    for index, entry in moments.items():
-        if type(index) is not int or not 0 <= index < len(parameters):
-            raise ValueError(f"the optimizer has a state of parameter {str(index)[:40]!r}")
-        names = set(entry) if isinstance(entry, dict) else set()
-        if names != {"step", "exp_avg", "exp_avg_sq"}:
-            raise ValueError(f"the optimizer's state of parameter {index} has other fields")
-        shape = parameters[index].shape
-        for name, value in entry.items():
-            wanted = torch.Size() if name == "step" else shape
-            if not isinstance(value, Tensor) or value.dtype != torch.float32:
-                raise ValueError(f"{name} of parameter {index} is no float32 tensor")
-            if value.shape != wanted:
-                raise ValueError(f"{name} of parameter {index} is {tuple(value.shape)}")
-            if not value.isfinite().all() or (name != "exp_avg" and bool((value < 0).any())):
-                raise ValueError(f"{name} of parameter {index} is not finite, or negative")
+    return {"state": moments, "param_groups": optimizer.state_dict()["param_groups"]}
 
 
 class Ema:
@@ -121,25 +117,6 @@ def novel_views(progress: float, first: int, last: int) -> int:
     if last < first:
         return last
     return min(last, first + int(progress * (last - first + 1)))
-
-
-def radial_weight(loss: LossConfig, step: int, epochs: float, done: float) -> float:
-    """Returns the radial mask constraint's weight, which falls linearly to 0.
-
-    It falls over ``rdist_steps``, or else over ``rdist_epochs``, but in ``rdist_share`` of the run
-    at most; 0 without the constraint.
-
-    Args:
-        loss: the options.
-        step: optimizer steps done.
-        epochs: the same in passes over the objects.
-        done: share of the run that is done, 0 to 1.
-    """
-    spans = [(epochs, loss.rdist_epochs), (done, loss.rdist_share)]
-    if loss.rdist_steps is not None:
-        spans = [(step, loss.rdist_steps)]
-    left = min(1.0 - now / span if span > 0 else 0.0 for now, span in spans)
-    return loss.rdist_weight * max(0.0, left) if loss.radial_mask else 0.0
 
 
 def ema_decay(updates: int, decay: float) -> float:

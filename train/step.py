@@ -20,8 +20,8 @@ from gamba_warp.render import Rendering, render
 from gamba_warp.vision.lpips import LPIPS
 
 from .data.samples import Batch
-from .objective.losses import depth_loss, rendered_psnr, total_loss, view_losses
-from .objective.radial_mask import NEAR, contour_distances, project_means, radial_mask_loss
+from .objective.losses import Seen, loss_terms, rendered_psnr, total_loss
+from .objective.radial_mask import NEAR, project_means
 
 VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more than two steps
 STRIP_VIEWS, STRIP_OBJECTS = 6, 4  # views and objects of a validation's sample pictures
@@ -59,42 +59,34 @@ def forward(
     Args:
         model: ``Gamba`` or a wrapper of it.
         batch: a batch on the model's device.
-        weights: weights of the terms ``rgb``, ``mask``, ``lpips``, ``ssim``, ``depth`` and
-            ``rdist``; the last four are not computed at weight 0. ``novel``, if it is there, is
-            the weight of each novel view against the input view, in all terms that have one value
-            per view.
+        weights: those of ``term_weights``; a name that is not there has weight 0, and ``novel``,
+            the weight of each novel view against the input view in all terms that have one value
+            per view, 1.
         lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
         precision: dtype of the products in the network, and of those in LPIPS that bear it; all
             else is float32.
-        lpips_crop: as for ``view_losses``.
+        lpips_crop: as for ``Seen``.
     """
     with network_products(batch.inputs.device, precision):
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
     target = over_background(batch.targets, batch.background[..., None, None, :])
-    target_alpha = batch.targets[..., 3:]
-    terms = view_losses(
+    seen = Seen(
         rendering.rgb,
         rendering.alpha,
         target,
-        target_alpha,
-        _in(precision, lpips) if lpips is not None and weights.get("lpips") else None,
+        batch.targets[..., 3:],
+        partial(lpips, precision=precision) if isinstance(lpips, LPIPS) else lpips,
         lpips_crop,
-        bool(weights.get("ssim")),
+        gaussians,
+        batch.cameras,
+        batch.input_cameras,
+        batch.surfaces,
+        getattr(getattr(model, "module", model), "config", None),  # DDP has it inside
     )
-    if weights.get("depth") and batch.surfaces is not None:
-        layers = getattr(model, "module", model).config.ray_layers  # DDP has it inside
-        terms["depth"] = depth_loss(gaussians, layers, batch.input_cameras, batch.surfaces)
-    if weights.get("rdist"):
-        contours = contour_distances(target_alpha[..., 0])
-        terms["rdist"] = radial_mask_loss(gaussians.means, batch.cameras, contours)
+    terms = loss_terms(seen, weights)
     weighted = weigh_views(terms, weights.get("novel", 1.0), target.shape[1])
     return Forward(total_loss(weighted, weights), terms, gaussians, rendering, target)
-
-
-def _in(precision: torch.dtype, lpips: Callable) -> Callable[[Tensor, Tensor], Tensor]:
-    """LPIPS with the products of a precision; another measure as it is."""
-    return partial(lpips, precision=precision) if isinstance(lpips, LPIPS) else lpips
 
 
 def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str, Tensor]:
@@ -155,7 +147,7 @@ def compute_gradients(
         clip: largest norm of the gradient.
         count: number of batches, >= 1.
         lpips: see above.
-        lpips_crop: as for ``view_losses``.
+        lpips_crop: as for ``Seen``.
         precision: see above.
     """
     optimizer.zero_grad(set_to_none=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import numpy as np
 import torch
@@ -12,10 +13,6 @@ from torch import Tensor
 from ..batch import EXPECTED, progress_bar
 from ..errors import UserError
 from .dataset import ViewDataset
-from .layouts import ObjectFiles
-from .prefetch import Prefetcher
-
-_Pictures = tuple[np.ndarray, np.ndarray]  # those of ViewDataset.pictures
 
 
 class ResidentViews(ViewDataset):
@@ -46,64 +43,41 @@ class ResidentViews(ViewDataset):
         Raises:
             UserError: the device, a GPU, has no room for them.
         """
-        super().__init__({}, dataset.layout, False, dataset.split_version, dataset.packed_size)
-        self.uids, self._dataset = dataset.uids, dataset
+        self.__dict__ |= vars(dataset)  # its files are read once for both
         # Its own tensor: a GPU would divide by a plain number by multiplying with its inverse,
         # whose last bit is another.
         self._most = torch.tensor(255.0, device=device)
         self._kept: dict[tuple[str, int], tuple[Tensor, np.ndarray]] = {}
-        self._check_room(objects, sizes, device)
-        self._fill(objects, sizes, device, workers)
+        if device.type == "cuda":
+            views = sum(dataset.num_views(index) for index in objects)
+            needed = sum(4 * views * size**2 for size in sizes)
+            free, _ = torch.cuda.mem_get_info(device)
+            if needed > free:
+                raise UserError(
+                    f"--cache-device: {views} views take {needed / 2**30:.1f} GB, of which the GPU "
+                    f"has {free / 2**30:.1f} free"
+                )
 
-    def _check_room(
-        self, objects: Sequence[int], sizes: Sequence[int], device: torch.device
-    ) -> None:
-        if device.type != "cuda":
-            return
-        views = sum(self._dataset.num_views(index) for index in objects)
-        needed = sum(4 * views * size**2 for size in sizes)
-        free, _ = torch.cuda.mem_get_info(device)
-        if needed > free:
-            raise UserError(
-                f"--cache-device: {views} views take {needed / 2**30:.1f} GB, of which the GPU has "
-                f"{free / 2**30:.1f} free"
-            )
-
-    def _fill(
-        self, objects: Sequence[int], sizes: Sequence[int], device: torch.device, workers: int
-    ) -> None:
-        threads: Prefetcher[_Pictures, _Pictures] = Prefetcher(workers)
-        keys = [(self.uids[index], size) for index in objects for size in sizes]
-        try:
-            for number, key in enumerate(progress_bar(keys, desc="decoding", unit="object")):
-                for uid, size in keys[number : number + workers + 1]:
-                    if (uid, size) not in threads:
-                        part = partial(self._dataset.pictures, uid, None, size)
-                        threads.submit((uid, size), [part], lambda made: made[0])
-                try:
-                    pixels, Ks = threads.take(key)
-                except EXPECTED:
-                    continue
+        def keep(key: tuple[str, int]) -> None:
+            with suppress(*EXPECTED):
+                pixels, Ks = dataset.pictures(key[0], None, key[1])
                 self._kept[key] = torch.from_numpy(pixels).to(device), Ks
-        finally:
-            threads.close()
 
-    def files(self, index: int | str) -> ObjectFiles:
-        """Those of the other dataset."""
-        return self._dataset.files(index)
-
-    def _uid(self, index: int | str) -> str:
-        return self._dataset._uid(index)
+        keys = [(self.uids[index], size) for index in objects for size in sizes]
+        with ThreadPoolExecutor(workers) as pool:
+            done = pool.map(keep, keys)
+            for _ in progress_bar(done, total=len(keys), desc="decoding", unit="object"):
+                pass
 
     def _images(
         self, uid: str, views: Sequence[int] | None, size: int | None
     ) -> tuple[Tensor, np.ndarray]:
         kept = None if size is None else self._kept.get((uid, size))
         if kept is None:
-            return self._dataset._images(uid, views, size)
+            return super()._images(uid, views, size)
         pixels, Ks = kept
         wanted = list(range(len(Ks))) if views is None else [int(v) for v in views]
         if not wanted or not all(0 <= v < len(Ks) for v in wanted):
-            return self._dataset._images(uid, views, size)  # it says what is wrong
+            return super()._images(uid, views, size)  # it says what is wrong
         chosen = pixels[torch.tensor(wanted, device=pixels.device)]
         return chosen.float() / self._most, Ks[wanted]

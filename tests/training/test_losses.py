@@ -9,12 +9,13 @@ from gamba_warp.conventions import over_background
 from gamba_warp.image_metrics import ssim
 from gamba_warp.kernels.ssim import products
 from gamba_warp.train.objective.losses import (
+    Seen,
+    loss_terms,
     mse,
     random_crops,
     rendered_psnr,
     structure,
     total_loss,
-    view_losses,
 )
 
 
@@ -38,10 +39,11 @@ def test_mse_and_psnr():
     assert (rendered_psnr(want - 5, want) == 100).all(), "out-of-range values are clamped first"
 
 
-def test_view_losses_and_weights():
+def test_loss_terms_and_weights():
     rgb, target = torch.zeros(2, 3, 8, 8, 3), torch.full((2, 3, 8, 8, 3), 0.5)
     alpha, target_alpha = torch.ones(2, 3, 8, 8, 1), torch.zeros(2, 3, 8, 8, 1)
-    terms = view_losses(rgb, alpha, target, target_alpha, lambda a, b: (b - a).mean((-3, -2, -1)))
+    seen = Seen(rgb, alpha, target, target_alpha, lambda a, b: (b - a).mean((-3, -2, -1)))
+    terms = loss_terms(seen, {"lpips": 0.5})
     assert {name: tuple(term.shape) for name, term in terms.items()} == {
         "rgb": (2, 3),
         "mask": (2, 3),
@@ -49,7 +51,7 @@ def test_view_losses_and_weights():
     }
     loss = total_loss(terms, {"rgb": 1.0, "mask": 2.0, "lpips": 0.5})
     assert loss.item() == pytest.approx(0.25 + 2.0 + 0.25)
-    assert set(view_losses(rgb, alpha, target, target_alpha)) == {"rgb", "mask"}
+    assert set(loss_terms(seen, {})) == {"rgb", "mask"}
     with pytest.raises(KeyError, match="lpips"):
         total_loss(terms, {"rgb": 1.0, "mask": 1.0})
 
@@ -129,7 +131,7 @@ def test_crops_are_of_one_place_in_both_and_lie_inside():
     assert seen == {(v, y, x) for v in range(3) for y in range(2) for x in range(3)}
 
 
-def test_view_losses_have_the_terms_that_are_asked_for():
+def test_loss_terms_have_the_terms_that_are_asked_for():
     torch.manual_seed(0)
     rgb, alpha = torch.rand(2, 3, 16, 16, 3), torch.rand(2, 3, 16, 16, 1)
     shapes: list = []
@@ -138,7 +140,8 @@ def test_view_losses_have_the_terms_that_are_asked_for():
         shapes.append(got.shape)
         return (got - want).square().mean((-3, -2, -1))
 
-    terms = view_losses(rgb, alpha, rgb, alpha, lpips, lpips_crop=8, ssim=True)
+    seen, weights = Seen(rgb, alpha, rgb, alpha, lpips, lpips_crop=8), {"lpips": 1.0, "ssim": 1.0}
+    terms = loss_terms(seen, weights)
     assert {name: tuple(term.shape) for name, term in terms.items()} == {
         "rgb": (2, 3),
         "mask": (2, 3),
@@ -147,4 +150,4 @@ def test_view_losses_have_the_terms_that_are_asked_for():
     }
     assert shapes == [(2, 8, 8, 3)]
     assert all(term.abs().max() < 1e-6 for term in terms.values())
-    assert set(view_losses(rgb, alpha, rgb, alpha)) == {"rgb", "mask"}
+    assert set(loss_terms(seen._replace(lpips=None), {"lpips": 1.0})) == {"rgb", "mask"}

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from gamba_warp.train.config import LossConfig, OptimConfig
-from gamba_warp.train.optim import Schedule, ema_decay, novel_views, radial_weight
+from gamba_warp.train.objective.losses import Moment, radial_weight
+from gamba_warp.train.optim import Schedule, ema_decay, novel_views
 
 SHAPES = ("cosine", "trapezoid")
 
@@ -131,19 +132,21 @@ def test_novel_views_grow_from_first_to_last_in_equal_shares():
 
 def test_radial_weight_falls_to_zero_in_steps():
     loss = LossConfig(rdist_weight=0.1, rdist_steps=40)
-    assert radial_weight(loss, 0, 0, 0) == 0.1
-    assert radial_weight(loss, 20, 9, 0.9) == pytest.approx(0.05)  # epochs and share do not count
-    assert radial_weight(loss, 40, 0, 0) == radial_weight(loss, 400, 0, 0) == 0
-    assert radial_weight(replace(loss, rdist_steps=0), 0, 0, 0) == 0
-    assert radial_weight(replace(loss, radial_mask=False), 0, 0, 0) == 0
+    assert radial_weight(loss, Moment(0, 0, 0)) == 0.1
+    # Epochs and share do not count.
+    assert radial_weight(loss, Moment(20, 9, 0.9)) == pytest.approx(0.05)
+    assert radial_weight(loss, Moment(40, 0, 0)) == radial_weight(loss, Moment(400, 0, 0)) == 0
+    assert radial_weight(replace(loss, rdist_steps=0), Moment(0, 0, 0)) == 0
+    assert radial_weight(replace(loss, radial_mask=False), Moment(0, 0, 0)) == 0
 
 
 def test_radial_weight_falls_in_epochs_or_a_share_of_the_run():
     """The paper's 10 of 400 epochs stay as they are; of 20 epochs a quarter is 5."""
     loss = LossConfig(rdist_weight=0.1)
     for epochs, run, want in ((0, 400, 0.1), (5, 400, 0.05), (10, 400, 0), (2.5, 20, 0.05)):
-        assert radial_weight(loss, 7, epochs, epochs / run) == pytest.approx(want, abs=1e-12)
-    assert radial_weight(loss, 7, 5, 0.25) == radial_weight(loss, 7, 19, 0.95) == 0
+        got = radial_weight(loss, Moment(7, epochs, epochs / run))
+        assert got == pytest.approx(want, abs=1e-12)
+    assert radial_weight(loss, Moment(7, 5, 0.25)) == radial_weight(loss, Moment(7, 19, 0.95)) == 0
 
 
 def test_ema_decay_is_short_at_first():

@@ -6,7 +6,7 @@ Every term has one value per view, ``[.., V]``; ``total_loss`` weighs and averag
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,8 +22,8 @@ from gamba_warp.kernels.ssim import dissimilarity
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from ..config import TrainConfig
-from .radial_mask import project_means
+from ..config import LossConfig, TrainConfig
+from .radial_mask import contour_distances, project_means, radial_mask_loss
 
 DEPTH_BEND = 0.02  # object units; see ``depth_loss``
 
@@ -82,41 +82,6 @@ def rendered_psnr(got: Tensor, want: Tensor) -> Tensor:
     return psnr(got.clamp(0, 1), want)
 
 
-def view_losses(
-    rgb: Tensor,
-    alpha: Tensor,
-    target_rgb: Tensor,
-    target_alpha: Tensor,
-    lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
-    lpips_crop: int = 0,
-    ssim: bool = False,
-) -> dict[str, Tensor]:
-    """Computes the terms of pictures: ``rgb`` and ``mask`` (MSE), ``lpips``, ``ssim`` (1 - SSIM).
-
-    Each is ``[.., V]``, but ``lpips`` of crops is ``[..]``. The marks are for a profile.
-
-    Args:
-        rgb: ``[.., V, H, W, 3]``, on the background of ``target_rgb``.
-        alpha: ``[.., V, H, W, 1]``.
-        target_rgb: as ``rgb``.
-        target_alpha: as ``alpha``.
-        lpips: ``(got, want) -> [.., V]``, or None to leave this term out.
-        lpips_crop: if not 0, side of the square that it sees, of one view of each object; see
-            ``random_crops``.
-        ssim: whether that term is computed.
-    """
-    with record_function("MSE and mask"):
-        terms = {"rgb": mse(rgb, target_rgb), "mask": mse(alpha, target_alpha)}
-    if lpips is not None:
-        with record_function("LPIPS"):
-            pair = random_crops(rgb, target_rgb, lpips_crop) if lpips_crop else (rgb, target_rgb)
-            terms["lpips"] = lpips(*pair)
-    if ssim:
-        with record_function("SSIM"):
-            terms["ssim"] = structure(rgb, target_rgb)
-    return terms
-
-
 def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Tensor) -> Tensor:
     """How far the first layer of ``rays`` is from the first surface, and the last from the last.
 
@@ -169,6 +134,139 @@ def random_crops(got: Tensor, want: Tensor, size: int) -> tuple[Tensor, Tensor]:
         for p in (got, want)
     ]
     return crops[0], crops[1]
+
+
+class Seen(NamedTuple):
+    """What the terms of a batch are computed from.
+
+    Attributes:
+        rgb: ``[B, V+1, H, W, 3]``, rendered on the background of ``target``; the input view first.
+        alpha: ``[B, V+1, H, W, 1]``, rendered.
+        target: as ``rgb``, true.
+        target_alpha: as ``alpha``, true.
+        lpips: ``(got, want) -> [..]``; None leaves this term out.
+        lpips_crop: if not 0, side of the square that it sees, of one view of each object; see
+            ``random_crops``.
+        gaussians: predicted, ``[B]``.
+        cameras: ``[B, V+1]``.
+        input_cameras: ``[B]``.
+        surfaces: as for ``depth_loss``; None leaves this term out.
+        config: of the model.
+    """
+
+    rgb: Tensor
+    alpha: Tensor
+    target: Tensor
+    target_alpha: Tensor
+    lpips: Callable[[Tensor, Tensor], Tensor] | None = None
+    lpips_crop: int = 0
+    gaussians: Any = None
+    cameras: Any = None
+    input_cameras: Any = None
+    surfaces: Tensor | None = None
+    config: Any = None
+
+
+class Moment(NamedTuple):
+    """Where a run stands.
+
+    Attributes:
+        step: optimizer steps done.
+        epochs: the same in passes over the objects.
+        done: share of the run that is done, 0 to 1.
+        validates: whether it is asked for a validation, whose weights are the same all along:
+            LPIPS from the start, neither the radial mask constraint nor depth.
+    """
+
+    step: int
+    epochs: float
+    done: float
+    validates: bool = False
+
+
+class Term(NamedTuple):
+    """A term of the loss.
+
+    Attributes:
+        weight: by the options, at a moment.
+        value: ``[B, V+1]``, or ``[B]`` where it is not of views; None where it cannot be computed.
+        mark: its name in a profile.
+        always: whether it is computed at weight 0, too, for the log.
+    """
+
+    weight: Callable[[LossConfig, Moment], float]
+    value: Callable[[Seen], Tensor | None]
+    mark: str
+    always: bool = False
+
+
+def radial_weight(loss: LossConfig, at: Moment) -> float:
+    """Returns the radial mask constraint's weight, which falls linearly to 0.
+
+    It falls over ``rdist_steps``, or else over ``rdist_epochs``, but in ``rdist_share`` of the run
+    at most; 0 without the constraint, and in a validation.
+    """
+    spans = [(at.epochs, loss.rdist_epochs), (at.done, loss.rdist_share)]
+    if loss.rdist_steps is not None:
+        spans = [(at.step, loss.rdist_steps)]
+    left = min(1.0 - now / span if span > 0 else 0.0 for now, span in spans)
+    return loss.rdist_weight * max(0.0, left) if loss.radial_mask and not at.validates else 0.0
+
+
+def _lpips(seen: Seen) -> Tensor | None:
+    pair = seen.rgb, seen.target
+    if seen.lpips_crop and seen.lpips is not None:
+        pair = random_crops(*pair, seen.lpips_crop)
+    return None if seen.lpips is None else seen.lpips(*pair)
+
+
+def _depth(seen: Seen) -> Tensor | None:
+    if seen.surfaces is None:
+        return None
+    return depth_loss(seen.gaussians, seen.config.ray_layers, seen.input_cameras, seen.surfaces)
+
+
+def _radial(seen: Seen) -> Tensor:
+    contours = contour_distances(seen.target_alpha[..., 0])
+    return radial_mask_loss(seen.gaussians.means, seen.cameras, contours)
+
+
+# In the order in which they are added up. A new term is one entry here, and its weight an option.
+TERMS: dict[str, Term] = {
+    "rgb": Term(lambda loss, at: 1.0, lambda s: mse(s.rgb, s.target), "MSE and mask", True),
+    "mask": Term(
+        lambda loss, at: loss.mask_weight,
+        lambda s: mse(s.alpha, s.target_alpha),
+        "MSE and mask",
+        True,
+    ),
+    "lpips": Term(
+        lambda loss, at: loss.lpips_weight if at.validates or at.step >= loss.lpips_after else 0.0,
+        _lpips,
+        "LPIPS",
+    ),
+    "ssim": Term(lambda loss, at: loss.ssim_weight, lambda s: structure(s.rgb, s.target), "SSIM"),
+    "depth": Term(lambda loss, at: 0.0 if at.validates else loss.depth_weight, _depth, "depth"),
+    "rdist": Term(radial_weight, _radial, "radial mask"),
+}
+
+
+def term_weights(loss: LossConfig, at: Moment) -> dict[str, float]:
+    """Returns the weight of each of ``TERMS``, and as ``novel`` that of the novel views."""
+    weights = {name: term.weight(loss, at) for name, term in TERMS.items()}
+    return weights | {"novel": loss.novel_weight}
+
+
+def loss_terms(seen: Seen, weights: Mapping[str, float]) -> dict[str, Tensor]:
+    """Computes the terms whose weight is not 0, and those that are always computed."""
+    found = {}
+    for name, term in TERMS.items():
+        if term.always or weights.get(name):
+            with record_function(term.mark):
+                value = term.value(seen)
+            if value is not None:
+                found[name] = value
+    return found
 
 
 def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
