@@ -17,16 +17,15 @@ import numpy as np
 import torch
 
 from gamba_warp.batch import EXPECTED
-from gamba_warp.data.dataset import ViewDataset, open_dataset
+from gamba_warp.data.dataset import ViewDataset, evenly, open_dataset
 from gamba_warp.data.prefetch import Prefetcher
 from gamba_warp.data.resident import ResidentViews
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.model.config import GambaConfig
 
 from .config import DataConfig, TrainConfig
-from .data.augment import draw_change
 from .data.poses import front_views
-from .data.samples import Batch, choose_views, join, load_sample
+from .data.samples import Batch, choose_views, draw_change, join, load_sample
 from .ddp import World
 
 _TRIES = 100  # objects tried one after the other until one can be read
@@ -221,9 +220,7 @@ def fixed_batches(
     for index in objects:
         try:
             count = dataset.num_views(index)
-            others = list(range(1, count))
-            if novel is not None and novel < len(others):
-                others = [others[i * len(others) // novel] for i in range(novel)]
+            others = evenly(range(1, count), count if novel is None else novel)
             batch = load_sample(dataset, index, [0, *others], size, config, torch.ones(3))
         except EXPECTED as error:
             failures[dataset.uids[index]] = first_line(error)
@@ -312,8 +309,7 @@ def _open_all(config: TrainConfig) -> TrainingData:
         validation = open_dataset(config.data, "val")
         bad = validation.check()
         good = [i for i, uid in enumerate(validation.uids) if uid not in bad]
-        share = min(run.val_objects, len(good))
-        held_out = [good[k * len(good) // share] for k in range(share)]
+        held_out = evenly(good, run.val_objects)
     except UserError as error:
         notes.append(f"no validation: {error}")
     return TrainingData(

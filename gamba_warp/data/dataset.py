@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -29,6 +30,7 @@ from .packs import INDEX, PackedObject, open_pack
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of what is written; 1 had fewer objects in one group
+Item = TypeVar("Item")
 MAX_LOADED = 128 << 20  # pixels of all views of an object that are loaded together: 2 GB
 
 
@@ -54,6 +56,12 @@ class ObjectViews:
     depths: Tensor | None
     attribution: dict[str, str]
     backs: Tensor | None = None
+
+
+def evenly(items: Sequence[Item], count: int) -> list[Item]:
+    """Chooses ``count`` items, evenly spaced from the first on; all of them if there are fewer."""
+    count = min(count, len(items))
+    return [items[k * len(items) // count] for k in range(count)]
 
 
 def split_of(key: str) -> str:
@@ -337,7 +345,11 @@ class ViewDataset:
             picture, Ks[number] = self._view(files, v, size)
             height, width = picture.shape[:2]
             if pixels is None:
-                _check_room(len(wanted), width, height, uid)
+                if len(wanted) * width * height > MAX_LOADED:
+                    raise UserError(
+                        f"{uid}: {len(wanted)} views of {width}x{height} are over "
+                        f"{MAX_LOADED >> 20} megapixels; ask for smaller pictures"
+                    )
                 pixels = np.empty((len(wanted), height, width, 4), np.uint8)
             if picture.shape != pixels.shape[1:]:
                 got, others = f"{width}x{height}", f"{pixels.shape[2]}x{pixels.shape[1]}"
@@ -388,12 +400,3 @@ class ViewDataset:
         from_size = (1.0, 1.0) if files.sizes[view] is None else original
         factor = [picture.shape[1] / from_size[0], picture.shape[0] / from_size[1], 1.0]
         return picture, files.Ks[view] * np.array(factor)[:, None]
-
-
-def _check_room(count: int, width: int, height: int, uid: str) -> None:
-    """Refuses views that together have more pixels than are kept in memory at once."""
-    if count * width * height > MAX_LOADED:
-        raise UserError(
-            f"{uid}: {count} views of {width}x{height} are over {MAX_LOADED >> 20} megapixels; "
-            "ask for smaller pictures"
-        )

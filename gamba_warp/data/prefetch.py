@@ -43,7 +43,7 @@ class Prefetcher(Generic[Part, Result]):
         # The threads take their work in this order. So when a thread comes to the joining, others
         # have begun all parts that are not done, and it waits for no thread that waits for it.
         futures = [self._pool.submit(part) for part in parts]
-        self._waiting[key] = self._pool.submit(_joined, join, futures)
+        self._waiting[key] = self._pool.submit(lambda: join([part.result() for part in futures]))
 
     def take(self, key: Hashable) -> Result:
         """Waits for a result; an error of its parts, or of the joining, is raised here."""
@@ -52,7 +52,3 @@ class Prefetcher(Generic[Part, Result]):
     def close(self) -> None:
         """Drops what has not begun, and waits for the parts that have."""
         self._pool.shutdown(cancel_futures=True)
-
-
-def _joined(join: Callable, parts: list[Future]) -> object:
-    return join([part.result() for part in parts])

@@ -7,7 +7,7 @@ from helpers.gaussians import some
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.data.dataset import ObjectViews
 from gamba_warp.render import render
-from gamba_warp.train.data.augment import MAX_GAMMA, Change, draw_change, mirrored
+from gamba_warp.train.data.samples import MAX_GAMMA, Change, draw_change, mirrored
 
 
 def views(seed: int = 0) -> ObjectViews:

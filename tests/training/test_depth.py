@@ -14,8 +14,8 @@ from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.train.batches import load_sample
-from gamba_warp.train.data.augment import Change
 from gamba_warp.train.data.render_command import data_render_command
+from gamba_warp.train.data.samples import Change
 from gamba_warp.train.objective.losses import DEPTH_BEND, depth_loss
 
 SIDES = (1.0, 0.4, 0.6)

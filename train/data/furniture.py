@@ -94,24 +94,26 @@ def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) 
         counts = Counter(entry["uid"] for entry in objects)
         if repeated := next((uid for uid, count in counts.items() if count > 1), None):
             raise UserError(f"two models are called {repeated}")
-        _add_groups(objects, scratch / "new")
-        try:
-            _put_in_place(scratch, out, list(libraries))
+        named = []
+        for entry in objects:
+            textures = textures_of(scratch / "new" / entry["model"])
+            library = entry["model"].split("/")[0]
+            named.append(Named(entry["uid"], library, entry["name"], textures))
+        groups = split_groups(named)
+        for entry in objects:
+            entry["group"] = groups[entry["uid"]]
+        try:  # those of an earlier run give way
+            for library in libraries:
+                if (out / library).exists():
+                    os.replace(out / library, scratch / "old" / library)
+                os.replace(scratch / "new" / library, out / library)
+            icons = output_folder(out / "icons")
+            for icon in (scratch / "icons").iterdir():
+                os.replace(icon, icons / icon.name)
         except OSError as error:
             raise UserError(f"cannot write into {out}: {error.strerror or error}") from error
     write_json(out / CATALOGUE, {"objects": sorted(objects, key=lambda entry: entry["uid"])})
     return len(objects)
-
-
-def _add_groups(objects: list[dict], folder: Path) -> None:
-    """Adds ``group`` to the entries of models that are unpacked in ``folder``."""
-    named = []
-    for entry in objects:
-        library, textures = entry["model"].split("/")[0], textures_of(folder / entry["model"])
-        named.append(Named(entry["uid"], library, entry["name"], textures))
-    groups = split_groups(named)
-    for entry in objects:
-        entry["group"] = groups[entry["uid"]]
 
 
 def library_name(path: Path) -> str:
@@ -140,17 +142,6 @@ def _check_replaceable(folder: Path) -> None:
     strange = sorted({path.relative_to(folder).as_posix() for path in found} - {*ours.files, _MARK})
     if strange:
         raise UserError(f"{folder / strange[0]}: is not of the library; move it away")
-
-
-def _put_in_place(scratch: Path, out: Path, libraries: list[str]) -> None:
-    """Moves the unpacked libraries and icons into ``out``; those of an earlier run give way."""
-    for library in libraries:
-        if (out / library).exists():
-            os.replace(out / library, scratch / "old" / library)
-        os.replace(scratch / "new" / library, out / library)
-    icons = output_folder(out / "icons")
-    for icon in (scratch / "icons").iterdir():
-        os.replace(icon, icons / icon.name)
 
 
 def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields
 from functools import partial
@@ -217,13 +217,22 @@ def render_meshes(
     """
     warnings: dict[str, list[str]] = {}
     failures: dict[str, str] = {}
-    found = _run(meshes, out, settings, workers)
-    for mesh, result in progress_bar(found, total=len(meshes), unit="object"):
-        if isinstance(result, str):
+    workers = min(workers or os.cpu_count() or 1, len(meshes))
+    threads = 1 if workers > 1 else torch.get_num_threads()
+    attempt = partial(_attempt, out=out, settings=settings, threads=threads)
+    found = run_each(attempt, meshes, workers=workers)
+    for index, result in progress_bar(found, total=len(meshes), unit="object"):
+        mesh = meshes[index]
+        if isinstance(result, Failed):
+            failures[mesh.uid] = f"{mesh.path}: {result.reason}"
+        elif isinstance(result, str):
             failures[mesh.uid] = result
         elif result:
             warnings[mesh.uid] = result
-    stored = _groups(out)
+    stored = {}
+    for path in sorted(out.glob("[!.]*/transforms.json")):
+        with suppress(UserError):  # readers of the dataset say so, each time
+            stored[path.parent.name] = read_document(path, _Stored).group or path.parent.name
     changed = {uid: group for uid, group in (groups or {}).items() if uid in stored}
     write_split(out, stored | changed)
     return warnings, failures
@@ -239,29 +248,6 @@ def parse_shard(shard: str) -> tuple[int, int]:
     if not match or not int(match[1]) < int(match[2]):
         raise UserError(f"--shard {shard[:40]}: expected i/n with 0 <= i < n, such as 0/4")
     return int(match[1]), int(match[2])
-
-
-def _groups(out: Path) -> dict[str, str]:
-    """The group of each sound object that is there, by uid."""
-    groups = {}
-    for path in sorted(out.glob("[!.]*/transforms.json")):
-        with suppress(UserError):  # readers of the dataset say so, each time
-            groups[path.parent.name] = read_document(path, _Stored).group or path.parent.name
-    return groups
-
-
-def _run(
-    meshes: Sequence[Mesh], out: Path, settings: Settings, workers: int
-) -> Iterator[tuple[Mesh, list[str] | str]]:
-    """Yields each mesh with its warnings, or with the reason why it failed, when it is ready."""
-    workers = min(workers or os.cpu_count() or 1, len(meshes))
-    threads = 1 if workers > 1 else torch.get_num_threads()
-    attempt = partial(_attempt, out=out, settings=settings, threads=threads)
-    for index, result in run_each(attempt, meshes, workers=workers):
-        mesh = meshes[index]
-        if isinstance(result, Failed):
-            result = f"{mesh.path}: {result.reason}"
-        yield mesh, result
 
 
 def _attempt(mesh: Mesh, out: Path, settings: Settings, threads: int) -> list[str] | str:

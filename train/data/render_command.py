@@ -95,13 +95,9 @@ def data_render_command(
     if done := len(meshes) - len(todo) - len(damaged):
         print(f"{done} of {counted(len(meshes), 'object')} already in {out}")
     warnings, failures = render_meshes(todo, out, settings, workers, groups)
-    return _say(len(todo) - len(failures), out, warnings, failures | damaged)
-
-
-def _say(rendered: int, out: Path, warnings: dict[str, list[str]], failures: dict[str, str]) -> int:
-    """Prints what was done; returns the exit code."""
     for uid, lines in sorted(warnings.items()):
         print(f"warning: {uid}: {'; '.join(lines)}")
+    rendered, failures = len(todo) - len(failures), failures | damaged
     print(f"rendered {counted(rendered, 'object')} into {out}, {len(failures)} failed")
     for uid, reason in sorted(failures.items()):
         print(f"failed: {uid}: {reason}", file=sys.stderr)

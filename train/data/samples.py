@@ -15,7 +15,66 @@ from gamba_warp.errors import UserError
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.posing import posed_input, relative_cameras
 
-from .augment import Change
+MAX_GAMMA = 1.5  # colours become value^gamma, gamma between 1 / MAX_GAMMA and this
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is done with the views of one sample.
+
+    Attributes:
+        mirror: whether left and right are exchanged.
+        channels: the order of the colour channels.
+        gamma: exponent of the colours, > 0.
+    """
+
+    mirror: bool = False
+    channels: tuple[int, int, int] = (0, 1, 2)
+    gamma: float = 1.0
+
+    def __call__(self, views: ObjectViews) -> ObjectViews:
+        """Returns the changed views."""
+        if self.mirror:
+            views = mirrored(views)
+        if self.channels == (0, 1, 2) and self.gamma == 1.0:
+            return views  # most samples of most trainings
+        color = views.images[..., list(self.channels)] ** self.gamma
+        return replace(views, images=torch.cat([color, views.images[..., 3:]], -1))
+
+
+def draw_change(rng: np.random.Generator, mirror: float, recolor: float) -> Change:
+    """Draws a change.
+
+    Args:
+        rng: source of chance.
+        mirror: chance that the object is mirrored.
+        recolor: chance that its colours change.
+    """
+    # As many numbers whatever the chances, so that one does not change what the other draws.
+    first, second, power = rng.random(3)
+    order = rng.permutation(3)
+    change = Change(mirror=bool(first < mirror))
+    if second < recolor:
+        gamma = float(MAX_GAMMA ** (2 * power - 1))
+        change = replace(
+            change, channels=(int(order[0]), int(order[1]), int(order[2])), gamma=gamma
+        )
+    return change
+
+
+def mirrored(views: ObjectViews) -> ObjectViews:
+    """The views of the object's mirror image: x of the world and of every picture turned round.
+
+    A point p at the pixel (x, y) becomes M p at (W - x, y), M = diag(-1, 1, 1): with the viewmat
+    M R M, M t and the principal point W - cx. Both R and M R M are rotations.
+    """
+    cameras = views.cameras
+    flip = cameras.viewmats.new_tensor([-1.0, 1.0, 1.0, 1.0]).diag()
+    Ks = cameras.Ks.clone()
+    Ks[..., 0, 2] = cameras.width - Ks[..., 0, 2]
+    made = Cameras(flip @ cameras.viewmats @ flip, Ks, cameras.width, cameras.height)
+    depths, backs = (None if d is None else d.flip(-1) for d in (views.depths, views.backs))
+    return replace(views, images=views.images.flip(-2), cameras=made, depths=depths, backs=backs)
 
 
 @dataclass
@@ -110,6 +169,11 @@ def load_sample(
             sides = f"{cameras.width}x{cameras.height}"
             raise UserError(f"{target.uid}: pictures are {sides}, training needs square ones")
     inputs, input_cameras = posed_input(source, config)
+    found = None
+    if surfaces:
+        empty = torch.zeros(source.images.shape[1:3])
+        both = torch.stack([empty if d is None else d[0] for d in (source.depths, source.backs)])
+        found = both[None] * (config.distance / source.cameras.viewmats[0, :3, 3].norm())
     return Batch(
         uids=[target.uid],
         inputs=inputs,
@@ -117,15 +181,8 @@ def load_sample(
         targets=target.images[None],
         cameras=relative_cameras(target.cameras, config.distance)[None],
         background=background.reshape(1, 1, 3),
-        surfaces=_surfaces(source, config.distance) if surfaces else None,
+        surfaces=found,
     )
-
-
-def _surfaces(views: ObjectViews, distance: float) -> Tensor:
-    """Those of ``Batch``, of the first view: ``[1, 2, h, w]``."""
-    empty = torch.zeros(views.images.shape[1:3])
-    found = [empty if d is None else d[0] for d in (views.depths, views.backs)]
-    return torch.stack(found)[None] * (distance / views.cameras.viewmats[0, :3, 3].norm())
 
 
 def join(samples: list[Batch]) -> Batch:

@@ -75,6 +75,8 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
         furniture: what `gamba data furniture` made.
         out: the folder to make, afresh.
     """
+    import trimesh
+
     made = [out / name for name in ("data", "meshes", "icons")]
     if not (out / "ATTRIBUTION.md").is_file():
         for folder in made:
@@ -100,25 +102,16 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
         render_object(meshes[uid], out / "data", SETTINGS)
     write_split(out / "data", groups)
     for uid in held_out:
-        _write_geometry(meshes[uid], out / "meshes" / f"{uid}.ply")
+        mesh = meshes[uid]  # its triangles in the frame of its views
+        model, _, _ = load_mesh(mesh.path).normalized(default_up(mesh.path), mesh.rotation)
+        bare = trimesh.Trimesh(model.vertices, model.faces, process=True)  # merges equal vertices
+        with atomic_path(out / "meshes" / f"{uid}.ply") as temporary:
+            bare.export(temporary, vertex_normal=False)
     for uid in ICONS:
-        _copy_icon(furniture / "icons" / f"{uid}.png", out / "icons" / f"{uid}.png")
-
-
-def _write_geometry(mesh: Mesh, path: Path) -> None:
-    """The model's triangles in the frame of its views."""
-    import trimesh
-
-    model, _, _ = load_mesh(mesh.path).normalized(default_up(mesh.path), mesh.rotation)
-    bare = trimesh.Trimesh(model.vertices, model.faces, process=True)  # merges equal vertices
-    with atomic_path(path) as temporary:
-        bare.export(temporary, vertex_normal=False)
-
-
-def _copy_icon(source: Path, path: Path) -> None:
-    if load_rgba(source)[..., 3].min() > 0:
-        raise UserError(f"{source}: has no transparent background")
-    shutil.copyfile(source, path)
+        source = furniture / "icons" / f"{uid}.png"
+        if load_rgba(source)[..., 3].min() > 0:
+            raise UserError(f"{source}: has no transparent background")
+        shutil.copyfile(source, out / "icons" / source.name)
 
 
 def _row(mesh: Mesh) -> str:
