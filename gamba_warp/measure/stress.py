@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from random import Random
-
 import torch
 from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, orbit, plucker_rays
-from ..kernels.stress import Case, Op, Outcome, generator, judge
-from ..kernels.stress.cases.scan import gradients_of, repeated
+from ..kernels.stress import Case, Op, Option, Outcome, Runs, generator
 from ..kernels.stress.core.rounding import SAMPLES, Rounding, samples_of
 from ..kernels.stress.oracles.scan import EXP_ULPS, conv, scan
 from ..model.config import GambaConfig
@@ -24,53 +21,25 @@ KINDS = (
 )  # fmt: skip
 _BFLOAT16 = 2.0**16  # half the last bit of bfloat16, in last bits of float32
 _IMAGE_CHANNELS = 6
-_PLAIN = {
-    "batch": 1, "patches": 1, "patch_size": 1, "width": 1, "depth": 1, "state_size": 1,
-    "conv_size": 2, "expand": 1, "dt_rank": 1, "norm": "rms", "discretization": "mamba",
-    "additive_image_tokens": False, "camera_token": False, "image_tokens": 0,
-    "predict_rotation": False, "position_bins": 2, "autocast": False,
-}  # fmt: skip
-_CHOICES = {"norm": ("layer", "rms"), "discretization": ("mamba", "bilinear", "zoh")}
-
-
-def draw(rng: Random, kind: str) -> dict:
-    """Draws random options; each kind takes the same ones."""
-    flag = lambda chance=0.5: rng.random() < chance  # noqa: E731
-    return valid(dict(
-        batch=rng.choice((1, 2, 3)), patches=rng.choice((1, 2, 3, 4)),
-        patch_size=rng.choice((1, 2, 4)), width=rng.choice((4, 8, 12, 16, 20, 24)),
-        depth=rng.choice((1, 1, 2, 3)), state_size=rng.choice((1, 2, 4, 5, 16)),
-        conv_size=rng.choice((2, 3, 4, 4)), expand=rng.choice((1, 2, 2)),
-        dt_rank=rng.choice((1, 2, 3)), norm=rng.choice(_CHOICES["norm"]),
-        discretization=rng.choice(("mamba", *_CHOICES["discretization"])),
-        additive_image_tokens=flag(0.8), camera_token=flag(0.7),
-        image_tokens=rng.choice((0, 1, 3, 9)), predict_rotation=flag(0.3),
-        position_bins=rng.choice((2, 5, 21)), autocast=flag(0.3),
-    ))  # fmt: skip
-
-
-def valid(options: dict) -> dict:
-    """Returns the options with all sizes brought within the limits."""
-    least = {k: 1 for k in ("patches", "patch_size", "width", "depth", "expand", "dt_rank")}
-    least |= {"state_size": 1, "conv_size": 2, "position_bins": 2}
-    most = {"state_size": 16, "conv_size": 4, "position_bins": 21, "width": 32, "depth": 4,
-            "patches": 6, "patch_size": 4, "expand": 3, "dt_rank": 4, "batch": 4,
-            "image_tokens": 16}  # fmt: skip
-    o = {k: max(v, least.get(k, 0)) for k, v in options.items() if k in most} | {
-        k: v for k, v in options.items() if k not in most
-    }
-    return {k: min(o[k], most[k]) if k in most else o[k] for k in options}
-
-
-def _config(o: dict) -> GambaConfig:
-    names = (
-        "patch_size", "width", "depth", "state_size", "conv_size", "expand", "dt_rank", "norm",
-        "discretization", "additive_image_tokens", "camera_token", "predict_rotation",
-        "position_bins",
-    )  # fmt: skip
-    prepend = o["camera_token"]
-    size = o["patches"] * o["patch_size"]
-    return GambaConfig(**{k: o[k] for k in names}, image_size=size, encoder="none", prepend=prepend)
+OPTIONS = {
+    "batch": Option(1, (1, 2, 3), span=(0, 4)),
+    "patches": Option(1, (1, 2, 3, 4), span=(1, 6)),
+    "patch_size": Option(1, (1, 2, 4), span=(1, 4)),
+    "width": Option(1, (4, 8, 12, 16, 20, 24), span=(1, 32)),
+    "depth": Option(1, (1, 1, 2, 3), span=(1, 4)),
+    "state_size": Option(1, (1, 2, 4, 5, 16), span=(1, 16)),
+    "conv_size": Option(2, (2, 3, 4, 4), span=(2, 4)),
+    "expand": Option(1, (1, 2, 2), span=(1, 3)),
+    "dt_rank": Option(1, (1, 2, 3), span=(1, 4)),
+    "norm": Option("rms", ("layer", "rms")),
+    "discretization": Option("mamba", ("mamba", "mamba", "bilinear", "zoh")),
+    "additive_image_tokens": Option(False, 0.8),
+    "camera_token": Option(False, 0.7),
+    "image_tokens": Option(0, (0, 1, 3, 9), span=(0, 16)),
+    "predict_rotation": Option(False, 0.3),
+    "position_bins": Option(2, (2, 5, 21), span=(2, 21)),
+    "autocast": Option(False, 0.3),
+}
 
 
 def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], Cameras]:
@@ -78,7 +47,13 @@ def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], C
     o, kind = case.options, case.kind
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(case.seed)
-        config = _config(o)
+        others = "batch", "patches", "image_tokens", "autocast"
+        config = GambaConfig(
+            **{k: v for k, v in o.items() if k not in others},
+            image_size=o["patches"] * o["patch_size"],
+            encoder="none",
+            prepend=o["camera_token"],
+        )
         model = Gamba(config)
         if o["image_tokens"]:  # the blocks take image tokens although there is no encoder
             camera = config.width if config.camera_token else 0
@@ -267,18 +242,10 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     oracle = _Oracle(case, model, trial)
     samples = {k: samples_of(x) for k, x in inputs.items()}
     truths = oracle.run(samples, cameras)
-    cotangents = {
-        k: torch.randn(t.shape[1:], generator=generator(case, f"v_{k}")) for k, t in truths.items()
-    }
-    results, grads, faults = repeated(
-        lambda: _run(model, case.options, inputs, cameras), cotangents, leaves
-    )
-    true_grads = gradients_of(truths, samples | oracle.weights, cotangents)
-    made = [judge(k, x, truths[k], tuple(range(x.dim()))) for k, x in results.items()]
-    made += [
-        judge(f"gradient of {k}", g, true_grads[k], tuple(range(g.dim()))) for k, g in grads.items()
-    ]
-    return Outcome(made, faults)
+    run = lambda: _run(model, case.options, inputs, cameras)  # noqa: E731
+    runs = Runs(case, run, leaves, truths, samples | oracle.weights)
+    sizes = {k: x.dim() for k, x in (*leaves.items(), *runs.results.items())}
+    return runs.outcome({k: tuple(range(n)) for k, n in sizes.items()})
 
 
-OP = Op("model", KINDS, _PLAIN, _CHOICES, draw, valid, evaluate)
+OP = Op("model", dict.fromkeys(KINDS, {}), OPTIONS, dict, evaluate)

@@ -18,17 +18,13 @@ from ..kernels.stress import (
     Case,
     Op,
     Outcome,
-    Tally,
-    document,
-    failure_text,
-    markdown,
+    draw_cases,
     read_reproducer,
     reproducer,
     run_case,
-    run_cases,
     shrink,
-    table,
 )
+from ..kernels.stress.core.report import Tally, document, failure_text, markdown, table
 from ..untrusted.documents import read_document
 from ..versions import __version__, installed
 
@@ -96,12 +92,14 @@ class StressRun:
         """
         began, interrupted, worst = time.monotonic(), False, 0.0
         total = count if seconds == math.inf else None
-        seed = self.about["seed"]
         with progress_bar(total=total, unit="case", desc="stress") as bar:
             try:
-                found = run_cases(self._ops, seed, self._device, count=count, seconds=seconds)
-                for op, case, outcome, spent in found:
-                    self.tally.add(case, outcome, spent)
+                for index, (op, case) in enumerate(draw_cases(self._ops, self.about["seed"])):
+                    started = time.monotonic()
+                    if index == count or started >= began + seconds:
+                        break
+                    outcome = run_case(op, case, self._device)
+                    self.tally.add(case, outcome, time.monotonic() - started)
                     failure = outcome.failure()
                     if failure is not None:
                         bar.set_postfix_str(f"{op.name}: a failure, made small")

@@ -2,38 +2,31 @@
 
 from __future__ import annotations
 
-from random import Random
-
 import torch
 from torch import Tensor
 
 from ...causal_conv1d import causal_conv1d, causal_conv1d_fn
-from ..core.case import DTYPES, Case, Op, Outcome, fitted, generator
-from ..core.ranges import RANGES, fill
+from ..core.case import Case, Op, Option, Outcome, Runs, fitted, generator
+from ..core.ranges import COTANGENTS, DTYPES, RANGES, fill
 from ..core.rounding import Rounding, samples_of
 from ..oracles import scan as scan_oracle
-from .scan import LAYOUTS, compared, gradients_of, laid, repeated
+from .scan import LAYOUTS, laid
 
-_LENGTHS = (0, 1, 2, 3, 4, 15, 16, 17, 63, 64, 65, 129, 300)
-_CHANNELS = (1, 2, 5, 15, 16, 17, 31, 33, 65)
-_PLAIN = {
-    "api": "conv", "batch": 1, "length": 1, "channels": 1, "width": 2, "dtype": "float32",
-    "layout": "dense", "silu": False, "use_bias": False, "use_state": False, "final": False,
-    "weight": "normal", "cotangent": "normal",
-}  # fmt: skip
-
-
-def draw(rng: Random, kind: str) -> dict:
-    """Random options."""
-    flag = lambda chance=0.5: rng.random() < chance  # noqa: E731
-    return dict(
-        api=rng.choice(("conv", "causal-conv1d")), batch=rng.choice((1, 2, 3)),
-        length=rng.choice(_LENGTHS), channels=rng.choice(_CHANNELS), width=rng.choice((2, 3, 4)),
-        dtype=rng.choice(("float32", "float32", "bfloat16", "float16")),
-        layout=rng.choice(LAYOUTS), silu=flag(0.7), use_bias=flag(), use_state=flag(),
-        final=flag(), weight=rng.choice(RANGES) if flag(0.3) else "normal",
-        cotangent=rng.choice(("normal", "normal", "ones", "spikes", "zeros")),
-    )  # fmt: skip
+OPTIONS = {
+    "api": Option("conv", ("conv", "causal-conv1d")),
+    "batch": Option(1, (1, 2, 3)),
+    "length": Option(1, (0, 1, 2, 3, 4, 15, 16, 17, 63, 64, 65, 129, 300)),
+    "channels": Option(1, (1, 2, 5, 15, 16, 17, 31, 33, 65)),
+    "width": Option(2, (2, 3, 4), span=(2, 4)),
+    "dtype": Option("float32", ("float32", "float32", "bfloat16", "float16")),
+    "layout": Option("dense", LAYOUTS),
+    "silu": Option(False, 0.7),
+    "use_bias": Option(False, 0.5),
+    "use_state": Option(False, 0.5),
+    "final": Option(False, 0.5),
+    "weight": Option("normal", RANGES, 0.3),
+    "cotangent": Option("normal", COTANGENTS, others=RANGES),
+}
 
 
 def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
@@ -76,32 +69,18 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the operator and compares output, final state and all gradients with float64."""
-    o = case.options
-    x = build(case, device)
-    leaves = {k: t for k, t in x.items() if t is not None}
+    o, x = case.options, build(case, device)
     samples = {k: samples_of(t) for k, t in x.items()}
     r = Rounding(case.seed, trial)
     out, final = scan_oracle.conv(samples, o["silu"], DTYPES[o["dtype"]], r)
-    truths = {"out": out, "final": final}
-    cotangents = {
-        n: fill(t.shape[1:], o["cotangent"], generator(case, f"v_{n}")).to(DTYPES[o["dtype"]])
-        for n, t in truths.items()
-    }
-    results, grads, faults = repeated(lambda: _run(o, x), cotangents, leaves)
-    named = {n: truths[n] for n in results}
-    true_leaves = {k: t for k, t in samples.items() if t is not None}
-    true_grads = gradients_of(named, true_leaves, cotangents)
-    parts = {"out": (1,), "x": (1,), "final": (), "initial_state": ()}
-    return Outcome(compared(results, grads, named, true_grads, parts), faults)
+    leaves = {k: t for k, t in x.items() if t is not None}
+    truths, true_leaves = {"out": out, "final": final}, {k: samples[k] for k in leaves}
+    runs = Runs(case, lambda: _run(o, x), leaves, truths, true_leaves)
+    return runs.outcome({"out": (1,), "x": (1,)})
 
 
-def _valid(options: dict) -> dict:
-    o = options | {"width": min(4, max(2, options["width"]))}
-    return fitted(o, ("batch", "length", "channels"), 60_000)  # more than draw can give
+def _fit(options: dict) -> dict:
+    return fitted(options, ("batch", "length", "channels"), 60_000)  # more than draw can give
 
 
-_CHOICES = {
-    "api": ("conv", "causal-conv1d"), "dtype": tuple(DTYPES), "layout": LAYOUTS,
-    "weight": RANGES, "cotangent": RANGES,
-}  # fmt: skip
-OP = Op("conv", RANGES, _PLAIN, _CHOICES, draw, _valid, evaluate)
+OP = Op("conv", dict.fromkeys(RANGES, {}), OPTIONS, _fit, evaluate)

@@ -3,69 +3,51 @@
 from __future__ import annotations
 
 import math
-from random import Random
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ...rasterize import Skip, rasterization
-from ..core import case as core
-from ..core.case import DTYPES, FACTOR, Case, Comparison, Op, Outcome, fitted, generator, judge
-from ..core.ranges import RANGES, fill
-from ..core.rounding import SAMPLES, UNIT, Rounding, samples_of
-from ..oracles.raster import Lens, render_view
-from .raster_scene import GAUSSIAN, KINDS, LEADS, build, poisoned
-from .scan import gradients_of, repeated
+from ..core.case import Case, Op, Option, Outcome, Runs, fits, fitted, gradients_of
+from ..core.ranges import COTANGENTS, RANGES
+from ..core.rounding import SAMPLES, Rounding, samples_of
+from ..oracles.raster import Lens, View, render_view
+from .raster_scene import GAUSSIAN, KINDS, LEADS, build, gaussians_axis, poisoned
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _SIDES = (1, 2, 3, 5, 8, 15, 16, 17, 18, 23, 31, 33, 40, 48)
 _LARGEST = 100_000  # most pairs of pixel and Gaussian, times channels
-_PLAIN = {
-    "lead": "none", "views": 1, "num": 1, "width": 1, "height": 1, "channels": 1,
-    "dtype": "float32", "mode": "RGB", "antialiased": False, "sh_degree": "none",
-    "backgrounds": False, "colors_per_view": False, "use_quats": False, "skip": 127,
-    "alpha_min": 1 / 255, "alpha_max": 0.99, "eps2d": 0.3, "radius_clip": 0.0, "poison": 0,
-    "colors": "uniform", "cotangent": "normal",
-}  # fmt: skip
-_CHOICES = {
-    "lead": tuple(LEADS), "dtype": tuple(DTYPES), "mode": MODES, "sh_degree": ("none", "1", "3"),
-    "alpha_min": (1 / 255, 1e-4, 0.02), "alpha_max": (0.99, 0.999, 0.9), "eps2d": (0.3, 0.1, 1.0),
-    "radius_clip": (0.0, 2.0), "colors": RANGES, "cotangent": RANGES,
-}  # fmt: skip
+OPTIONS = {
+    "lead": Option("none", ("none", "none", *LEADS)),
+    "views": Option(1, (1, 1, 2, 3)),
+    "num": Option(1, (1, 2, 3, 10, 30, 64, 100, 200, 300)),
+    "width": Option(1, _SIDES, span=(1, 10**6)),
+    "height": Option(1, _SIDES, span=(1, 10**6)),
+    "channels": Option(1, (1, 2, 3, 3, 3, 4, 5, 7, 16, 33), span=(1, 10**6)),
+    "dtype": Option("float32", ("float32", "float32", "float32", "bfloat16", "float16")),
+    "mode": Option("RGB", ("RGB", *MODES)),
+    "antialiased": Option(False, 0.3),
+    "sh_degree": Option("none", ("none", "1", "3"), 0.3),
+    "backgrounds": Option(False, 0.5),
+    "colors_per_view": Option(False, 0.2),
+    "use_quats": Option(False, 0.8),
+    "skip": Option(127, range(128), 0.2, span=(0, 127)),
+    "alpha_min": Option(1 / 255, (1 / 255, 1e-4, 0.02), 0.3),
+    "alpha_max": Option(0.99, (0.99, 0.999, 0.9), 0.3),
+    "eps2d": Option(0.3, (0.3, 0.1, 1.0), 0.3),
+    "radius_clip": Option(0.0, (0.0, 2.0), 0.3),
+    "poison": Option(0, span=(0, 100)),
+    "colors": Option("uniform", RANGES, 0.2),
+    "cotangent": Option("normal", COTANGENTS, others=RANGES),
+}
 
 
-def draw(rng: Random, kind: str) -> dict:
-    """Random options."""
-    flag = lambda chance=0.5: rng.random() < chance  # noqa: E731
-    pick = lambda name: rng.choice(_CHOICES[name]) if flag(0.3) else _PLAIN[name]  # noqa: E731
-    options = dict(
-        lead=rng.choice(("none", "none", *LEADS)), views=rng.choice((1, 1, 2, 3)),
-        num=rng.choice((1, 2, 3, 10, 30, 64, 100, 200, 300)), width=rng.choice(_SIDES),
-        height=rng.choice(_SIDES), channels=rng.choice((1, 2, 3, 3, 3, 4, 5, 7, 16, 33)),
-        dtype=rng.choice(("float32", "float32", "float32", "bfloat16", "float16")),
-        mode=rng.choice(("RGB", *MODES)), antialiased=flag(0.3), sh_degree=pick("sh_degree"),
-        backgrounds=flag(), colors_per_view=flag(0.2), use_quats=flag(0.8),
-        skip=rng.randrange(128) if flag(0.2) else 127, alpha_min=pick("alpha_min"),
-        alpha_max=pick("alpha_max"), eps2d=pick("eps2d"), radius_clip=pick("radius_clip"),
-        poison=rng.choice((1, 2, 9)) if kind == "not finite" else 0,
-        colors=rng.choice(RANGES) if flag(0.2) else "uniform",
-        cotangent=rng.choice(("normal", "normal", "ones", "spikes", "zeros")),
-    )  # fmt: skip
-    if kind == "empty":
-        options[rng.choice(("num", "views"))] = 0
-    if kind == "odd quaternions":
-        options |= {"use_quats": True, "dtype": "float32"}
-    return valid(options)
-
-
-def valid(options: dict) -> dict:
+def _fit(options: dict) -> dict:
     """Sizes that the oracle can hold, options that go together."""
     o = dict(options)
-    o |= {k: max(1, o[k]) for k in ("width", "height", "channels")}
     if o["sh_degree"] != "none":
         o |= {"channels": 3, "colors_per_view": False}
-    o["skip"] = min(o["skip"], 127)
     each = max(1, math.prod(LEADS[o["lead"]])) * max(1, o["views"]) * (o["channels"] + 2)
     while each * o["num"] * o["width"] * o["height"] > _LARGEST:
         names = [name for name in ("width", "height", "num") if o[name] > 1]
@@ -73,110 +55,66 @@ def valid(options: dict) -> dict:
             break
         largest = max(names, key=lambda k: o[k] / (8 if k == "num" else 1))
         o[largest] = (o[largest] + 1) // 2
-    o["poison"] = min(o["poison"], 100)
     return fitted(o, ("views", "num", "width", "height", "channels"), 5 * _LARGEST)
 
 
-def _options(o: dict) -> dict:
-    """The options that ``rasterization`` is called with."""
-    names = ("alpha_min", "alpha_max", "eps2d", "radius_clip", "width", "height")
-    return {name: o[name] for name in names} | dict(
-        render_mode=o["mode"], rasterize_mode="antialiased" if o["antialiased"] else "classic",
-        sh_degree=None if o["sh_degree"] == "none" else int(o["sh_degree"]),
-        skip=Skip.from_bits(o["skip"]),
-    )  # fmt: skip
+def truth(case: Case, x: dict[str, Tensor | None], trial: int = 0) -> tuple[dict, View]:
+    """The leaves by name, and all views in float64, as ``rasterization`` renders them.
 
-
-class _Pixels(NamedTuple):
-    """A view's pixels, ``[H W, C]``.
-
-    Attributes:
-        renders: ``[SAMPLES, H W, C]``, as ``rasterization`` renders them.
-        alphas: ``[SAMPLES, H W, 1]``.
-        extra: by how much an undecided pixel of the picture may differ besides.
-        extra_alpha: likewise of alpha.
-        undecided: whether a cut or an order is within rounding.
-        loose: or a clamp is, so that no gradient is asked for.
+    Each of the view's tensors is ``[.., *lead, V, H, W, C + 1]``; the last channel is alpha.
     """
+    o, r, lead = case.options, Rounding(case.seed, trial), LEADS[case.options["lead"]]
+    leaves = {k: samples_of(t) for k, t in x.items() if t is not None and k != "Ks"}
+    if not o["views"]:
+        colors = 3 if o["sh_degree"] != "none" else o["channels"]
+        channels = {"RGB": colors, "D": 1, "ED": 1}.get(o["mode"], colors + 1) + 1
+        blank = torch.zeros(SAMPLES, *lead, 0, o["height"], o["width"], channels)
+        none = blank[0, ..., :1] > 0
+        return leaves, View(blank, blank[0], none, none)
+    count = math.prod(lead)
+    objects = {k: t.reshape(SAMPLES, count, *t.shape[1 + len(lead) :]) for k, t in leaves.items()}
+    Ks = x["Ks"]
+    assert Ks is not None
+    Ks = Ks.detach().cpu().double().reshape(count, o["views"], 3, 3)
+    made = [
+        _view(o, {k: t[:, b] for k, t in objects.items()}, v, Ks[b, v], r)
+        for b in range(count)
+        for v in range(o["views"])
+    ]
+    shape = *lead, o["views"], o["height"], o["width"]
+    stacked = [torch.stack(parts, int(i == 0)) for i, parts in enumerate(zip(*made))]
+    return leaves, View(*(t.reshape(*t.shape[: t.dim() - 3], *shape, t.shape[-1]) for t in stacked))
 
-    renders: Tensor
-    alphas: Tensor
-    extra: Tensor
-    extra_alpha: Tensor
-    undecided: Tensor
-    loose: Tensor
+
+def _view(o: dict, x: dict[str, Tensor], v: int, K: Tensor, r: Rounding) -> View:
+    """One object in one view: the channels of the mode on the background, and alpha."""
+    gaussians: dict[str, Any] = {k: x.get(k) for k in GAUSSIAN}
+    if o["colors_per_view"]:
+        gaussians["colors"] = gaussians["colors"][:, v]
+    names = ("width", "height", "alpha_min", "alpha_max", "eps2d", "radius_clip", "antialiased")
+    lens = Lens(**{k: o[k] for k in names}, sh_degree=_degree(o))
+    W, w = x["viewmats"][:, v, :3, :3], x["viewmats"][:, v, :3, 3]
+    view = render_view(gaussians, W, w, K, lens, r)
+    parts = [view.blended.shape[-1] - 3, 1, 1, 1]
+    color, depth, weight, alpha = view.blended.split(parts, dim=-1)
+    more, more_depth, more_weight, more_alpha = view.allowance.split(parts, dim=-1)
+    if "backgrounds" in x:
+        background = x["backgrounds"][:, v][:, None]
+        color = r(color + r(r(1 - alpha) * background))
+        more = more + more_alpha * background[0].detach().abs()
+    if o["mode"].endswith("ED"):
+        depth = r(depth / weight.clamp_min(1e-10))
+        least = (weight[0].detach() - more_weight).clamp_min(1e-10)
+        more_depth = (more_depth + depth[0].detach() * more_weight) / least
+        more_depth = more_depth * view.undecided
+    words = o["mode"].split("+")
+    blended = [color] * (words[0] == "RGB") + [depth] * (words[-1] != "RGB") + [alpha]
+    slack = [more] * (words[0] == "RGB") + [more_depth] * (words[-1] != "RGB") + [more_alpha]
+    return view._replace(blended=torch.cat(blended, -1), allowance=torch.cat(slack, -1))
 
 
-class _Truth:
-    """The picture in float64, sample by sample, and where rounding decides."""
-
-    def __init__(self, case: Case, x: dict[str, Tensor | None], trial: int = 0) -> None:
-        self.o, lead = case.options, LEADS[case.options["lead"]]
-        self.lead, self.batch, self.views = lead, math.prod(lead), self.o["views"]
-        self.leaves = {k: samples_of(t) for k, t in x.items() if t is not None and k != "Ks"}
-        self.flat = {
-            k: t.reshape(len(t), self.batch, *t.shape[1 + len(lead) :])
-            for k, t in self.leaves.items()
-        }
-        Ks = x["Ks"]
-        assert Ks is not None
-        self.Ks = Ks.detach().cpu().double().reshape(self.batch, self.views, 3, 3)
-        names = ("width", "height", "alpha_min", "alpha_max", "eps2d", "radius_clip", "antialiased")
-        degree = None if self.o["sh_degree"] == "none" else int(self.o["sh_degree"])
-        self.lens = Lens(**{k: self.o[k] for k in names}, sh_degree=degree)
-        self.round = Rounding(case.seed, trial)
-        pairs = [(b, v) for b in range(self.batch) for v in range(self.views)]
-        made = [self._view(b, v) for b, v in pairs] or [self._blank()]
-        self.renders = self._together([view.renders for view in made], sampled=True)
-        self.alphas = self._together([view.alphas for view in made], sampled=True)
-        self.extra = self._together([view.extra for view in made])
-        self.extra_alpha = self._together([view.extra_alpha for view in made])
-        self.undecided = self._together([view.undecided for view in made])
-        self.loose = self._together([view.loose for view in made])
-
-    def _together(self, parts: list[Tensor], sampled: bool = False) -> Tensor:
-        """All views ``[.., H W, C]`` as one tensor ``[.., *lead, V, H, W, C]``."""
-        stacked = torch.stack(parts, int(sampled))
-        if not self.views:
-            stacked = stacked.narrow(int(sampled), 0, 0)
-        shape = (*self.lead, self.views, self.o["height"], self.o["width"], stacked.shape[-1])
-        return stacked.reshape(*stacked.shape[: int(sampled)], *shape)
-
-    def _blank(self) -> _Pixels:
-        """An empty view, in the form of ``_view``."""
-        color = 3 if self.o["sh_degree"] != "none" else self.o["channels"]
-        size = {"RGB": color, "D": 1, "ED": 1}.get(self.o["mode"], color + 1)
-        pixels = self.o["height"] * self.o["width"]
-        picture, one = torch.zeros(SAMPLES, pixels, size), torch.zeros(SAMPLES, pixels, 1)
-        none = one[0] > 0
-        return _Pixels(picture, one, picture[0], one[0], undecided=none, loose=none)
-
-    def _view(self, b: int, v: int) -> _Pixels:
-        r, x = self.round, {k: t[:, b] for k, t in self.flat.items()}
-        gaussians: dict[str, Any] = {k: x.get(k) for k in GAUSSIAN}
-        if self.o["colors_per_view"]:
-            gaussians["colors"] = gaussians["colors"][:, v]
-        W, w = x["viewmats"][:, v, :3, :3], x["viewmats"][:, v, :3, 3]
-        view, top = render_view(gaussians, W, w, self.Ks[b, v], self.lens, r)
-        parts = [view.blended.shape[-1] - 3, 1, 1, 1]
-        color, depth, weight, alpha = view.blended.split(parts, dim=-1)
-        slack = view.allowance + FACTOR * UNIT * torch.cat([top, torch.ones(1)])
-        more, more_depth, more_weight, more_alpha = slack.split(parts, dim=-1)
-        if "backgrounds" in x:
-            background = x["backgrounds"][:, v][:, None]
-            color = r(color + r(r(1 - alpha) * background))
-            more = more + more_alpha * background[0].detach().abs()
-        if self.o["mode"].endswith("ED"):
-            depth = r(depth / weight.clamp_min(1e-10))
-            least = (weight[0].detach() - more_weight).clamp_min(1e-10)
-            more_depth = (more_depth + depth[0].detach() * more_weight) / least
-            more_depth = more_depth * view.undecided[:, None]
-        if "+" in self.o["mode"]:
-            color, more = torch.cat([color, depth], -1), torch.cat([more, more_depth], -1)
-        elif self.o["mode"] != "RGB":
-            color, more = depth, more_depth
-        undecided, loose = view.undecided[:, None], view.loose[:, None]
-        return _Pixels(color, alpha, more, more_alpha, undecided=undecided, loose=loose)
+def _degree(o: dict) -> int | None:
+    return None if o["sh_degree"] == "none" else int(o["sh_degree"])
 
 
 # The dimensions of a gradient that are taken together: the entries of one Gaussian.
@@ -188,46 +126,48 @@ _PARTS = {
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the operator; pictures pixel by pixel, gradients Gaussian by Gaussian."""
-    x = build(case, device)
+    o, x = case.options, build(case, device)
     leaves = {k: t for k, t in x.items() if t is not None and k != "Ks"}
-    truth = _Truth(case, x, trial)
-    cotangents = {}
-    for name, like in (("renders", truth.renders), ("alphas", truth.alphas)):
-        values = fill(like.shape[1:], case.options["cotangent"], generator(case, f"v_{name}"))
-        cotangents[name] = torch.where(truth.loose, 0.0, values) if like.numel() else values
+    samples, picture = truth(case, x, trial)
+    names = ("alpha_min", "alpha_max", "eps2d", "radius_clip", "width", "height")
 
     def run(x: dict = x) -> dict[str, Tensor]:
-        renders, alphas, _ = rasterization(**x, **_options(case.options))
+        renders, alphas, _ = rasterization(
+            **x,
+            **{name: o[name] for name in names},
+            render_mode=o["mode"],
+            rasterize_mode="antialiased" if o["antialiased"] else "classic",
+            sh_degree=_degree(o),
+            skip=Skip.from_bits(o["skip"]),
+        )
         return {"renders": renders, "alphas": alphas}
 
-    results, grads, faults = repeated(run, cotangents, leaves)
-    named = {"renders": truth.renders, "alphas": truth.alphas}
-    true_grads = gradients_of(named, truth.leaves, cotangents)
-    made: list[Comparison] = [
-        judge("renders", results["renders"], truth.renders, (), truth.extra, ~truth.undecided),
-        judge("alphas", results["alphas"], truth.alphas, (), truth.extra_alpha, ~truth.undecided),
-    ]
-    made += [judge(f"gradient of {k}", g, true_grads[k], _PARTS[k]) for k, g in grads.items()]
-    if case.options["poison"]:
-        faults += _poison_faults(case, x, run, results, grads, true_grads, cotangents)
-    return Outcome(made, faults, truth.undecided.numel(), int(truth.undecided.sum()))
+    truths = {"renders": picture.blended[..., :-1], "alphas": picture.blended[..., -1:]}
+    runs = Runs(case, run, leaves, truths, samples, without=picture.loose)
+    outcome = runs.outcome(
+        _PARTS,
+        renders={"extra": picture.allowance[..., :-1], "shown": ~picture.undecided},
+        alphas={"extra": picture.allowance[..., -1:], "shown": ~picture.undecided},
+    )
+    if o["poison"]:
+        outcome.faults += _poison_faults(case, x, run, runs)
+    outcome.pixels, outcome.undecided = picture.undecided.numel(), int(picture.undecided.sum())
+    return outcome
 
 
-def _poison_faults(case: Case, x, run, results, grads, true_grads, cotangents) -> list[str]:
+def _poison_faults(case: Case, x: dict, run, runs: Runs) -> list[str]:
     """Gaussians that are not finite must change no bit of the picture, nor of the gradients."""
     bad, old = poisoned(case, x)
     again = run(bad)
-    leaves = {k: bad[k] for k in grads}
-    others = gradients_of(again, leaves, cotangents)
-    faults = [f"{n} changed by Gaussians that are not finite" for n in results
-              if not torch.equal(results[n], again[n])]  # fmt: skip
-    lead = len(LEADS[case.options["lead"]])
-    for name, gradient in grads.items():
+    others = gradients_of(again, {k: bad[k] for k in runs.grads}, runs.cotangents)
+    faults = [f"{n} changed by Gaussians that are not finite" for n, x in runs.results.items()
+              if not torch.equal(x, again[n])]  # fmt: skip
+    for name, gradient in runs.grads.items():
         other, of_gaussian = others[name], name in GAUSSIAN
-        axis = lead + (1 if name == "colors" and case.options["colors_per_view"] else 0)
+        axis = gaussians_axis(case.options, name)
         kept = other.index_select(axis, old.to(other.device)) if of_gaussian else other
         # A gradient beyond its dtype's range is infinite, beside whatever Gaussians.
-        beyond = ~core.fits(true_grads[name][0], kept.dtype).to(kept.device)
+        beyond = ~fits(runs.true_grads[name][0], kept.dtype).to(kept.device)
         allowed = int((beyond & ~kept.isfinite()).sum())
         if int((~other.isfinite()).sum()) > allowed:
             faults.append(f"gradient of {name} not finite beside Gaussians that are not")
@@ -236,12 +176,4 @@ def _poison_faults(case: Case, x, run, results, grads, true_grads, cotangents) -
     return faults
 
 
-OP = Op(
-    name="raster",
-    kinds=KINDS,
-    plain=_PLAIN,
-    choices=_CHOICES,
-    draw=draw,
-    valid=valid,
-    evaluate=evaluate,
-)
+OP = Op("raster", KINDS, OPTIONS, _fit, evaluate)

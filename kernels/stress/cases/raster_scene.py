@@ -7,14 +7,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..core.case import DTYPES, Case, generator
-from ..core.ranges import fill
+from ..core.case import Case, generator
+from ..core.ranges import DTYPES, fill
 
-KINDS = (
+_PLAIN_KINDS = (
     "uniform", "needles", "discs", "points", "all sizes", "huge on screen", "around the camera",
     "near plane", "opaque", "faint", "equal depths", "close depths", "heap", "far away", "off axis",
-    "odd quaternions", "edge of range", "not finite", "empty",
 )  # fmt: skip
+# kind -> options that it fixes or draws
+KINDS: dict[str, dict] = {
+    **dict.fromkeys(_PLAIN_KINDS, {}),
+    "odd quaternions": {"use_quats": True, "dtype": "float32"},
+    "edge of range": {},
+    "not finite": {"poison": (1, 2, 9)},
+    "empty": {"num": (0, 0, 10), "views": (0, 1)},
+}
 LEADS = {"none": (), "one": (1,), "two": (2,), "two by one": (2, 1)}
 GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
 _DISTANCE = 1.6
@@ -143,29 +150,31 @@ def poisoned(case: Case, x: dict[str, Tensor | None]) -> tuple[dict[str, Tensor 
         The leaves with ``poison`` Gaussians strewn in, and where the old ones are, ``[N]``.
     """
     o, g = case.options, generator(case, "poison")
-    lead, num, more = len(LEADS[o["lead"]]), o["num"], o["poison"]
+    num, more = o["num"], o["poison"]
     place = torch.randperm(num + more, generator=g)
     fresh, old = place[num:], place[:num].sort().values
-    known = {k: t for k in GAUSSIAN if (t := x[k]) is not None}
-    names = list(known)
-    made: dict[str, Any] = {**x}
-    for name in names:
-        axis = lead + (1 if name == "colors" and o["colors_per_view"] else 0)
-        before = known[name].detach().cpu().movedim(axis, 0)
-        after = torch.full((num + more, *before.shape[1:]), 0.5, dtype=before.dtype)
-        after[old] = before
-        made[name] = after
+    rows: dict[str, Tensor] = {}  # the axis of the Gaussians first
+    for name in GAUSSIAN:
+        if (known := x[name]) is not None:
+            before = known.detach().cpu().movedim(gaussians_axis(o, name), 0)
+            rows[name] = torch.full((num + more, *before.shape[1:]), 0.5, dtype=before.dtype)
+            rows[name][old] = before
+    names = list(rows)
     for i in fresh.tolist():  # the same entry in all objects and views
         name = names[torch.randint(len(names), (), generator=g)]
-        row = made[name][i]
+        row = rows[name][i]
         if name != "opacities":
             row = row[..., torch.randint(row.shape[-1], (), generator=g)]
         if name == "colors" and o["sh_degree"] != "none":
             row = row[..., 0]  # the first coefficient is always used
         row.fill_((torch.nan, torch.inf, -torch.inf)[torch.randint(3, (), generator=g)])
-    for name in names:
-        axis = lead + (1 if name == "colors" and o["colors_per_view"] else 0)
-        made[name] = (
-            made[name].movedim(0, axis).contiguous().to(known[name].device).requires_grad_()
-        )
+    made: dict[str, Any] = {**x}
+    for name, row in rows.items():
+        row = row.movedim(0, gaussians_axis(o, name)).contiguous()
+        made[name] = row.to(made[name].device).requires_grad_()
     return made, old
+
+
+def gaussians_axis(o: dict, name: str) -> int:
+    """The dimension of a leaf along which the Gaussians lie."""
+    return len(LEADS[o["lead"]]) + (name == "colors" and o["colors_per_view"])

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import math
-from random import Random
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ...selective_scan import selective_scan, selective_scan_fn, selective_scan_state
-from ..core.case import DTYPES, Case, Comparison, Op, Outcome, fitted, generator, judge
-from ..core.ranges import RANGES, fill
+from ..core.case import Case, Op, Option, Outcome, Runs, fitted, generator
+from ..core.ranges import COTANGENTS, DTYPES, RANGES, fill
 from ..core.rounding import Rounding, samples_of
 from ..oracles import scan as scan_oracle
 
 DISCRETIZATIONS = ("mamba", "bilinear", "zoh")
 APIS = ("scan", "state", "prefix", "mamba-ssm")
 LAYOUTS = ("dense", "expanded", "channels first", "part")
-_LENGTHS = (0, 1, 2, 3, 4, 15, 16, 17, 63, 64, 65, 100, 127, 129, 200, 300, 577)
-_CHANNELS = (1, 2, 3, 5, 8, 15, 16, 17, 31, 32, 33, 48, 65, 130)
-_STATES = (1, 2, 3, 4, 5, 8, 16, 16, 17, 32, 33, 64, 128, 255, 256)
 _LARGEST = 60_000  # B L D N: the oracle holds some dozen of these eight times
 
-# kind -> options that it fixes; ranges of u, B, C: of ranges.py; of delta and A: see _steps, _rates
-_KINDS: dict[str, dict] = {
+# kind -> options that it fixes or draws; the ranges of delta and A: see _steps, _rates
+KINDS: dict[str, dict] = {
     "uniform": {},
     "tiny": {"u": "tiny", "B": "tiny"},
     "huge": {"u": "huge", "B": "huge"},
@@ -42,43 +38,45 @@ _KINDS: dict[str, dict] = {
     "steps at 20": {"delta": "at 20", "softplus": True},
     "steps on": {"delta": "on"},
     "signed steps": {"delta": "signed", "A": "model", "softplus": False},
-    "long": {"batch": 1, "groups": 1, "layout": "dense"},
-}
-_PLAIN = {
-    "api": "scan", "batch": 1, "length": 1, "channels": 1, "states": 1, "groups": 1,
-    "dtype": "float32", "delta_dtype": "float32", "layout": "dense", "discretization": "mamba",
-    "softplus": False, "use_D": False, "use_z": False, "use_bias": False, "use_state": False,
-    "last": False, "split": 0, "constant_B": False, "u": "normal", "delta": "steps", "A": "model",
-    "B": "normal", "C": "normal", "cotangent": "normal",
+    "long": {
+        "length": (2049, 5000, 16961, 20000), "states": 1, "channels": (1, 2, 3),
+        "A": ("model", "slow", "zero"), "delta": ("steps", "constant"),
+        "batch": 1, "groups": 1, "layout": "dense",
+    },
 }  # fmt: skip
+OPTIONS = {
+    "dtype": Option("float32", ("float32", "float32", "bfloat16", "float16")),
+    "api": Option("scan", APIS),
+    "batch": Option(1, (1, 1, 2, 3)),
+    "length": Option(1, (0, 1, 2, 3, 4, 15, 16, 17, 63, 64, 65, 100, 127, 129, 200, 300, 577)),
+    "channels": Option(1, (1, 2, 3, 5, 8, 15, 16, 17, 31, 32, 33, 48, 65, 130)),
+    "states": Option(1, (1, 2, 3, 4, 5, 8, 16, 16, 17, 32, 33, 64, 128, 255, 256)),
+    "groups": Option(1, (1, 1, 2, 3)),
+    "delta_dtype": Option(
+        "float32", lambda rng, o: "float32" if rng.random() < 0.2 else o["dtype"], others=[*DTYPES]
+    ),
+    "layout": Option("dense", LAYOUTS),
+    "discretization": Option("mamba", ("mamba", *DISCRETIZATIONS)),
+    "softplus": Option(False, 0.6),
+    "use_D": Option(False, 0.5),
+    "use_z": Option(False, 0.5),
+    "use_bias": Option(False, 0.5),
+    "use_state": Option(False, 0.5),
+    "last": Option(False, 0.5),
+    "split": Option(0, range(577)),
+    "constant_B": Option(False, 0.2),
+    "u": Option("normal", RANGES, 0.3),
+    "delta": Option(
+        "steps", ("steps", "steps", "wide", "constant"), others=("off", "on", "at 20", "signed")
+    ),
+    "A": Option("model", ("model", "model", "wide", "slow"), others=("zero", "fast")),
+    "B": Option("normal", others=RANGES),
+    "C": Option("normal", RANGES, 0.2),
+    "cotangent": Option("normal", COTANGENTS, others=RANGES),
+}
 
 
-def draw(rng: Random, kind: str) -> dict:
-    """Random options."""
-    flag = lambda chance=0.5: rng.random() < chance  # noqa: E731
-    dtype = rng.choice(("float32", "float32", "bfloat16", "float16"))
-    options = dict(
-        api=rng.choice(APIS), batch=rng.choice((1, 1, 2, 3)), length=rng.choice(_LENGTHS),
-        channels=rng.choice(_CHANNELS), states=rng.choice(_STATES), groups=rng.choice((1, 1, 2, 3)),
-        dtype=dtype, delta_dtype="float32" if flag(0.2) else dtype, layout=rng.choice(LAYOUTS),
-        discretization=rng.choice(("mamba", *DISCRETIZATIONS)), softplus=flag(0.6), use_D=flag(),
-        use_z=flag(), use_bias=flag(), use_state=flag(), last=flag(),
-        split=rng.randrange(_LENGTHS[-1]), constant_B=flag(0.2),
-        u=rng.choice(RANGES) if flag(0.3) else "normal",
-        delta=rng.choice(("steps", "steps", "wide", "constant")),
-        A=rng.choice(("model", "model", "wide", "slow")),
-        B="normal", C=rng.choice(RANGES) if flag(0.2) else "normal",
-        cotangent=rng.choice(("normal", "normal", "ones", "spikes", "zeros")),
-    )  # fmt: skip
-    if kind == "long":
-        options |= dict(
-            length=rng.choice((2049, 5000, 16961, 20000)), states=1, channels=rng.choice((1, 2, 3)),
-            A=rng.choice(("model", "slow", "zero")), delta=rng.choice(("steps", "constant")),
-        )  # fmt: skip
-    return valid(options | _KINDS[kind])
-
-
-def valid(options: dict) -> dict:
+def _fit(options: dict) -> dict:
     """Sizes that fit each other and the oracle; options that the API takes."""
     o = dict(options)
     while math.prod(o[k] for k in ("batch", "length", "channels", "states")) > _LARGEST:
@@ -219,79 +217,20 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
     return {"out": result}
 
 
-def _oracle(case: Case, x: dict, trial: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Results and leaves, ``[SAMPLES, ..]``."""
-    o, leaves = case.options, {name: samples_of(t) for name, t in x.items()}
-    used, r = dict(leaves), Rounding(case.seed, trial)
-    if o["constant_B"]:  # every channel is a group of its own
-        used["B"] = scan_oracle.over_tokens(r(leaves["B"]), leaves["u"], r)
-    out, last = scan_oracle.scan(used, o["softplus"], o["discretization"], r)
-    results = {"out": out[:, :, o["split"] :], "last": last}
-    return results, {k: t for k, t in leaves.items() if t is not None}
-
-
-# which dimensions of a result are taken together: tokens
-_PARTS = {"out": (1,), "u": (1,), "delta": (1,), "z": (1,), "B": (1,), "C": (1,)}
-
-
-def gradients_of(results: dict, leaves: dict, cotangents: dict) -> dict[str, Tensor]:
-    """Gradients by leaf; zeros where a result does not depend on it."""
-    names = [n for n in results if results[n].requires_grad and results[n].numel()]
-    if not names:
-        return {k: torch.zeros_like(x) for k, x in leaves.items()}
-    grads = torch.autograd.grad(
-        [results[n] for n in names], list(leaves.values()),
-        [cotangents[n].to(results[n]).expand_as(results[n]) for n in names], allow_unused=True,
-    )  # fmt: skip
-    return {k: torch.zeros_like(x) if g is None else g for (k, x), g in zip(leaves.items(), grads)}
-
-
-def repeated(run, cotangents: dict, leaves: dict) -> tuple[dict, dict, list[str]]:
-    """Results and gradients of ``run()``, and what differs between two runs."""
-    (first, grads), (again, others) = (
-        (results := run(), gradients_of(results, leaves, cotangents)) for _ in range(2)
-    )
-    pairs = [(n, first[n], again[n]) for n in first]
-    pairs += [(f"gradient of {n}", grads[n], others[n]) for n in grads]
-    faults = [
-        f"two runs differ in {name}"
-        for name, a, b in pairs
-        if not torch.equal(a.nan_to_num(1.5), b.nan_to_num(1.5))
-    ]
-    return first, grads, faults
-
-
-def compared(results, grads, truths, true_grads, parts) -> list[Comparison]:
-    """All results, then all gradients."""
-    together = {name: parts.get(name, ()) for name in (*results, *grads)}
-    made = [judge(n, x, truths[n], together[n]) for n, x in results.items()]
-    return made + [
-        judge(f"gradient of {n}", x, true_grads[n], together[n]) for n, x in grads.items()
-    ]
-
-
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the operator and compares outputs and all gradients with float64."""
-    o = case.options
-    x = build(case, device)
+    o, r, x = case.options, Rounding(case.seed, trial), build(case, device)
+    samples = {name: samples_of(t) for name, t in x.items()}
+    used = dict(samples)
+    if o["constant_B"]:  # every channel is a group of its own
+        used["B"] = scan_oracle.over_tokens(r(samples["B"]), samples["u"], r)
+    out, last = scan_oracle.scan(used, o["softplus"], o["discretization"], r)
     leaves = {k: t for k, t in x.items() if t is not None}
-    truths, true_leaves = _oracle(case, x, trial)
-    dtypes = {"out": DTYPES[o["dtype"]], "last": torch.float32}
-    cotangents = {
-        n: fill(t.shape[1:], o["cotangent"], generator(case, f"v_{n}")).to(dtypes[n])
-        for n, t in truths.items()
-    }
-    results, grads, faults = repeated(lambda: _run(o, x), cotangents, leaves)
-    named = {n: truths[n] for n in results}
-    true_grads = gradients_of(named, true_leaves, cotangents)
-    parts = dict(_PARTS, B=()) if o["constant_B"] else _PARTS
-    return Outcome(compared(results, grads, named, true_grads, parts), faults)
+    truths = {"out": out[:, :, o["split"] :], "last": last}
+    runs = Runs(case, lambda: _run(o, x), leaves, truths, {k: samples[k] for k in leaves})
+    # the tokens of a channel are taken together
+    parts = dict.fromkeys(("out", "u", "delta", "z", "B", "C"), (1,))
+    return runs.outcome(parts | {"B": ()} if o["constant_B"] else parts)
 
 
-_CHOICES = {
-    "api": APIS, "dtype": tuple(DTYPES), "delta_dtype": tuple(DTYPES), "layout": LAYOUTS,
-    "discretization": DISCRETIZATIONS, "u": RANGES, "B": RANGES, "C": RANGES, "cotangent": RANGES,
-    "delta": ("steps", "wide", "constant", "off", "on", "at 20", "signed"),
-    "A": ("model", "slow", "zero", "fast", "wide"),
-}  # fmt: skip
-OP = Op("scan", tuple(_KINDS), _PLAIN, _CHOICES, draw, valid, evaluate)
+OP = Op("scan", KINDS, OPTIONS, _fit, evaluate)

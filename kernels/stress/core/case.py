@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from random import Random
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from .ranges import fill
 from .rounding import UNDERFLOW, UNIT
 
 FACTOR = 8.0  # largest error, as a multiple of what rounding does to the formula
@@ -23,7 +25,6 @@ _STORED = {
     torch.bfloat16: (2.0**-8, UNDERFLOW),
     torch.float16: (2.0**-11, 2.0**-25),
 }
-DTYPES = {str(d).removeprefix("torch."): d for d in _STORED}
 
 
 @dataclass(frozen=True)
@@ -64,11 +65,6 @@ class Comparison:
     counts: bool = True
     noise: bool = False
 
-    @property
-    def is_gradient(self) -> bool:
-        """Whether the result is a gradient, and not a forward result."""
-        return self.name.startswith("gradient")
-
 
 @dataclass
 class Outcome:
@@ -98,20 +94,53 @@ class Outcome:
         """The comparison that is nearest to its limit, or farthest beyond it."""
         return max(self.comparisons, key=lambda c: c.ratio, default=None)
 
+    @property
+    def over(self) -> bool:
+        """Whether a result is over its limit, and nothing else is wrong."""
+        failure = self.failure()
+        return failure is not None and failure["what"] == "limit"
+
     def failure(self) -> dict | None:
         """Returns the failure's ``what``, ``name``, ``error`` and ``ratio``, or None.
 
         ``what`` is "fault", "not finite" or "limit".
         """
+        nothing = {"error": None, "ratio": None}
         if self.faults:
-            return {"what": "fault", "name": self.faults[0], "error": None, "ratio": None}
+            return {"what": "fault", "name": self.faults[0], **nothing}
         worst = self.worst
         if worst is None or worst.ratio <= 1:
             return None
-        bad = next((c for c in self.comparisons if c.nonfinite), None)
-        if bad:
-            return {"what": "not finite", "name": bad.name, "error": None, "ratio": None}
+        if bad := next((c for c in self.comparisons if c.nonfinite), None):
+            return {"what": "not finite", "name": bad.name, **nothing}
         return {"what": "limit", "name": worst.name, "error": worst.error, "ratio": worst.ratio}
+
+
+class Option(NamedTuple):
+    """One option of an op's cases.
+
+    Attributes:
+        plain: its simplest value, at which the shrinking of a case aims.
+        drawn: values of which one is drawn; the chance of a switch; or a function of the source of
+            chance and the options before it. Without any it is always plain.
+        chance: how often it is drawn and not plain.
+        others: values, besides those drawn, of an option that is neither a number nor a switch.
+        span: least and largest value of a size.
+    """
+
+    plain: Any
+    drawn: Sequence | float | Callable[[Random, dict], Any] = ()
+    chance: float = 1.0
+    others: Sequence = ()
+    span: tuple[int, int] = (0, 10**6)
+
+    def draw(self, rng: Random, before: dict) -> Any:
+        """Draws a value."""
+        if self.drawn == () or (self.chance < 1 and rng.random() >= self.chance):
+            return self.plain
+        if isinstance(self.drawn, float):
+            return rng.random() < self.drawn
+        return self.drawn(rng, before) if callable(self.drawn) else rng.choice(self.drawn)
 
 
 @dataclass(frozen=True)
@@ -120,21 +149,50 @@ class Op:
 
     Attributes:
         name: name of the op.
-        kinds: kinds of values; the first is the plain one.
-        plain: simplest value of every option, at which the shrinking of a case aims.
-        choices: allowed values of those options that are neither a number nor a switch.
-        draw: function that draws random options for a kind.
-        valid: function that returns the nearest options that make sense together.
+        fixed: what each kind of values asks of options, a tuple being drawn from; the first kind is
+            the plain one.
+        options: its options, drawn and shrunk in this order.
+        fit: function that returns the nearest options that make sense together.
         evaluate: function that runs a case on a device; each trial has other random roundings.
     """
 
     name: str
-    kinds: tuple[str, ...]
-    plain: dict
-    choices: dict[str, tuple]
-    draw: Callable[[Random, str], dict]
-    valid: Callable[[dict], dict]
+    fixed: dict[str, dict]
+    options: dict[str, Option]
+    fit: Callable[[dict], dict]
     evaluate: Callable[[Case, torch.device, int], Outcome]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of values."""
+        return tuple(self.fixed)
+
+    @property
+    def plain(self) -> dict:
+        """The simplest value of every option."""
+        return {name: option.plain for name, option in self.options.items()}
+
+    @property
+    def choices(self) -> dict[str, set]:
+        """The allowed values of those options that are neither a size nor a switch."""
+        found = {k: o for k, o in self.options.items() if not isinstance(o.plain, int)}
+        drawn = {k: () if callable(o.drawn) else o.drawn for k, o in found.items()}
+        return {k: {o.plain, *drawn[k], *o.others} for k, o in found.items()}
+
+    def draw(self, rng: Random, kind: str) -> dict:
+        """Draws random options for a kind."""
+        made: dict[str, Any] = {}
+        for name, option in self.options.items():
+            made[name] = option.draw(rng, made)
+        for name, value in self.fixed[kind].items():
+            made[name] = rng.choice(value) if isinstance(value, tuple) else value
+        return self.valid(made)
+
+    def valid(self, options: dict) -> dict:
+        """Returns the nearest options that are within their spans and make sense together."""
+        sizes = {k: o.span for k, o in self.options.items() if type(o.plain) is int}
+        held = {k: max(low, min(options[k], high)) for k, (low, high) in sizes.items()}
+        return self.fit(options | held)
 
 
 def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
@@ -144,50 +202,32 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
     is steep, up to ``STEEP_TRIALS`` count, each result by its widest limit. README.md says why.
     """
     try:
-        outcome = op.evaluate(case, device, 0)
-        if not _over(outcome):
-            return outcome
-        found = [outcome, *(op.evaluate(case, device, trial) for trial in range(1, TRIALS))]
+        found = [op.evaluate(case, device, 0)]
+        if not found[0].over:
+            return found[0]
+        found += [op.evaluate(case, device, trial) for trial in range(1, TRIALS)]
         found.sort(key=lambda o: o.worst.ratio if o.worst else 0.0)
+        bad = next((o for o in found if o.faults or o.nonfinite), None)
+        by_result = list(zip(*(o.comparisons for o in found)))
+        steep = any(c.noise and c.ratio > 1 for results in by_result for c in results)
+        for ratios in ([c.ratio for c in results] for results in by_result):
+            steep |= max(ratios) > max(1.0, STEEP_RANGE * min(ratios))
         middle = found[TRIALS // 2]
-        if bad := [o for o in found if o.faults or o.nonfinite]:
-            return bad[0]
-        steep = _over(middle) and _is_steep(found)
-        return _widest(op, case, device, found) if steep else middle
+        if bad or not (middle.over and steep):
+            return bad or middle
+        least = replace(middle, steep=True)
+        more = (op.evaluate(case, device, trial) for trial in range(TRIALS, STEEP_TRIALS))
+        for other in chain(found, more):
+            if other.faults or other.nonfinite:
+                return other
+            pairs = zip(least.comparisons, other.comparisons)
+            least.comparisons = [replace(c, ratio=min(c.ratio, o.ratio)) for c, o in pairs]
+            if not least.over:
+                break
+        return least
     except Exception as error:
         text = str(error).strip().splitlines() or [""]
         return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
-
-
-def _over(outcome: Outcome) -> bool:
-    failure = outcome.failure()
-    return failure is not None and failure["what"] == "limit"
-
-
-def _is_steep(found: list[Outcome]) -> bool:
-    """Whether a result that is over its limit is noise, or its limit differs much by trial."""
-    ratios: dict[str, list[float]] = {}
-    for c in (c for o in found for c in o.comparisons):
-        if c.noise and c.ratio > 1:
-            return True
-        ratios.setdefault(c.name, []).append(c.ratio)
-    return any(max(r) > max(1.0, STEEP_RANGE * min(r)) for r in ratios.values())
-
-
-def _widest(op: Op, case: Case, device: torch.device, found: list[Outcome]) -> Outcome:
-    """What is left over its widest limit, in the trials found and as many more as it takes."""
-    least = replace(found[0], steep=True)
-    more = (op.evaluate(case, device, trial) for trial in range(len(found), STEEP_TRIALS))
-    for other in chain(found, more):
-        if other.faults or other.nonfinite:
-            return other
-        ratios = {c.name: c.ratio for c in other.comparisons}
-        least.comparisons = [
-            replace(c, ratio=min(c.ratio, ratios[c.name])) for c in least.comparisons
-        ]
-        if not _over(least):
-            break
-    return least
 
 
 def fitted(options: dict, sizes: tuple[str, ...], largest: int) -> dict:
@@ -268,3 +308,72 @@ def judge(
     counts = got.dtype == torch.float32 and total > 1e-30 and spread < 1e-3 * total
     error = rms(difference).item() / total if total else 0.0
     return Comparison(name, error, ratios[worst].item(), 0, counts, noise)
+
+
+def gradients_of(results: dict, leaves: dict, cotangents: dict) -> dict[str, Tensor]:
+    """Gradients by leaf; zeros where a result does not depend on it."""
+    names = [n for n in results if results[n].requires_grad and results[n].numel()]
+    if not names:
+        return {k: torch.zeros_like(x) for k, x in leaves.items()}
+    grads = torch.autograd.grad(
+        [results[n] for n in names], list(leaves.values()),
+        [cotangents[n].to(results[n]).expand_as(results[n]) for n in names], allow_unused=True,
+    )  # fmt: skip
+    return {k: torch.zeros_like(x) if g is None else g for (k, x), g in zip(leaves.items(), grads)}
+
+
+class Runs:
+    """Two runs of a case, their gradients, and the samples of the formula.
+
+    Args:
+        case: its option "cotangent" names the range of the cotangents.
+        run: returns the results by name.
+        leaves: what gradients are asked of, by name.
+        truths: the formula's results, and perhaps more, ``[SAMPLES, ..]``.
+        samples: the formula's leaves.
+        without: mask of the results of which no gradient is asked.
+    """
+
+    def __init__(
+        self,
+        case: Case,
+        run: Callable[[], dict[str, Tensor]],
+        leaves: dict[str, Tensor],
+        truths: dict[str, Tensor],
+        samples: dict[str, Tensor],
+        without: Tensor | None = None,
+    ) -> None:
+        self.results, self.cotangents = run(), {}
+        for n, x in self.results.items():
+            v = fill(x.shape, case.options.get("cotangent", "normal"), generator(case, f"v_{n}"))
+            v = v if without is None else torch.where(without, 0.0, v)
+            self.cotangents[n] = v.to(x.dtype)
+        self.grads = gradients_of(self.results, leaves, self.cotangents)
+        again = run()
+        others = gradients_of(again, leaves, self.cotangents)
+        pairs = [(n, x, again[n]) for n, x in self.results.items()]
+        pairs += [(f"gradient of {k}", g, others[k]) for k, g in self.grads.items()]
+        self.faults = [
+            f"two runs differ in {name}"
+            for name, a, b in pairs
+            if not torch.equal(a.nan_to_num(1.5), b.nan_to_num(1.5))
+        ]
+        self.truths = {n: truths[n] for n in self.results}
+        self.true_grads = gradients_of(self.truths, samples, self.cotangents)
+
+    def outcome(self, parts: dict[str, tuple[int, ...]], **extra: dict[str, Any]) -> Outcome:
+        """Judges all results, then all gradients.
+
+        Args:
+            parts: of ``judge`` by name; () where there is none.
+            extra: further arguments of ``judge`` by name of the result.
+        """
+        made = [
+            judge(n, x, self.truths[n], parts.get(n, ()), **extra.get(n, {}))
+            for n, x in self.results.items()
+        ]
+        made += [
+            judge(f"gradient of {k}", g, self.true_grads[k], parts.get(k, ()))
+            for k, g in self.grads.items()
+        ]
+        return Outcome(made, self.faults)

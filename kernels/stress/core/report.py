@@ -1,12 +1,11 @@
-"""Reports: a run's findings as tables, and a failing case as the content of a file."""
+"""A run's findings as tables, and a failing case as the content of a file."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 from .case import Case, Op, Outcome
-from .runner import Row, Tally
 
 FORMAT = "gamba_warp.stress.1"
 _HEAD = (
@@ -15,24 +14,89 @@ _HEAD = (
 )  # fmt: skip
 
 
-def _error(value: float) -> str:
-    return f"{value:.1e}" if value else "0"
+@dataclass
+class Row:
+    """What the cases of one kind found so far.
+
+    Attributes:
+        op: name of the op.
+        kind: kind of values.
+        cases: number of cases that were run.
+        forward: largest relative rms error of a forward result in float32, and its name.
+        gradient: largest relative rms error of a gradient, and its name.
+        ratio: largest error over its limit; infinite if something was not finite.
+        nonfinite: count of numbers that are not finite and should be.
+        failures: number of cases that failed in any way.
+        pixels: number of pixels compared (rasterizer).
+        undecided: number of those pixels in which rounding decides a cut or an order.
+        steep: number of cases that are judged by the widest limit of many trials.
+        seconds: time spent.
+    """
+
+    op: str
+    kind: str
+    cases: int = 0
+    forward: tuple[float, str] = (0.0, "")
+    gradient: tuple[float, str] = (0.0, "")
+    ratio: float = 0.0
+    nonfinite: int = 0
+    failures: int = 0
+    pixels: int = 0
+    undecided: int = 0
+    steep: int = 0
+    seconds: float = 0.0
+
+    def add(self, outcome: Outcome, seconds: float) -> None:
+        """Counts one case."""
+        self.cases += 1
+        self.seconds += seconds
+        self.nonfinite += outcome.nonfinite
+        self.failures += outcome.failure() is not None
+        self.pixels += outcome.pixels
+        self.undecided += outcome.undecided
+        self.steep += outcome.steep
+        for c in outcome.comparisons:
+            self.ratio = max(self.ratio, c.ratio)
+            which = "gradient" if c.name.startswith("gradient") else "forward"
+            if c.counts:
+                setattr(self, which, max(getattr(self, which), (c.error, c.name)))
 
 
-def _cells(row: Row) -> list[str]:
-    share = f"{row.undecided / row.pixels:.2%}" if row.pixels else ""
-    return [
-        row.op, row.kind, str(row.cases), _error(row.forward[0]), row.forward[1],
-        _error(row.gradient[0]), row.gradient[1].removeprefix("gradient of "), f"{row.ratio:.2f}",
-        share, str(row.steep), str(row.nonfinite), str(row.failures),
-    ]  # fmt: skip
+class Tally:
+    """Rows by op and kind, in the order in which they first appeared."""
+
+    def __init__(self) -> None:
+        self._rows: dict[tuple[str, str], Row] = {}
+
+    def add(self, case: Case, outcome: Outcome, seconds: float) -> None:
+        """Counts one case, in the row of its kind and in that of its op."""
+        for key in ((case.op, "all"), (case.op, case.kind)):
+            self._rows.setdefault(key, Row(*key)).add(outcome, seconds)
+
+    def totals(self) -> list[Row]:
+        """Returns one row per op, of kind "all"."""
+        return [row for row in self._rows.values() if row.kind == "all"]
+
+    def sorted(self) -> list[Row]:
+        """Returns all other rows, with those of an op together."""
+        rows = [row for row in self._rows.values() if row.kind != "all"]
+        ops = [row.op for row in self.totals()]
+        return sorted(rows, key=lambda row: ops.index(row.op))
 
 
 def table(rows: list[Row]) -> str:
     """Returns a Markdown table with its columns aligned for a terminal."""
-    cells = [list(_HEAD), *(_cells(row) for row in rows)]
-    widths = [max(len(line[i]) for line in cells) for i in range(len(_HEAD))]
-    lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths)) + " |" for line in cells]
+    error = lambda value: f"{value:.1e}" if value else "0"  # noqa: E731
+    cells = [list(_HEAD)]
+    for r in rows:
+        cells.append([
+            r.op, r.kind, str(r.cases), error(r.forward[0]), r.forward[1], error(r.gradient[0]),
+            r.gradient[1].removeprefix("gradient of "), f"{r.ratio:.2f}",
+            f"{r.undecided / r.pixels:.2%}" if r.pixels else "", str(r.steep), str(r.nonfinite),
+            str(r.failures),
+        ])  # fmt: skip
+    widths = [max(map(len, column)) for column in zip(*cells)]
+    lines = ["| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in cells]
     lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
     return "\n".join(lines)
 
@@ -42,18 +106,18 @@ def plain_number(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def _record(row: Row) -> dict:
-    record = asdict(row)
-    for name in ("forward", "gradient"):
-        record[name] = {"error": plain_number(record[name][0]), "of": record[name][1]}
-    return record | {"ratio": plain_number(row.ratio), "seconds": round(row.seconds, 3)}
-
-
 def document(tally: Tally, about: dict, failures: list[dict]) -> dict:
     """Returns the whole run as JSON values."""
-    rows = [_record(row) for row in tally.sorted()]
-    totals = [_record(row) for row in tally.totals()]
-    return {"format": FORMAT, **about, "totals": totals, "rows": rows, "failures": failures}
+    content: dict = {"format": FORMAT, **about, "totals": [], "rows": [], "failures": failures}
+    for name, rows in (("totals", tally.totals()), ("rows", tally.sorted())):
+        for row in rows:
+            errors = {
+                k: {"error": plain_number(error), "of": of}
+                for k, (error, of) in (("forward", row.forward), ("gradient", row.gradient))
+            }
+            rest = {"ratio": plain_number(row.ratio), "seconds": round(row.seconds, 3)}
+            content[name].append(asdict(row) | errors | rest)
+    return content
 
 
 def markdown(tally: Tally, about: dict, failures: list[dict]) -> str:

@@ -6,7 +6,7 @@ sample comes near a decision, the pixel is undecided: README.md, "Cuts".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,8 +20,7 @@ from .scan import EXP_ULPS
 _RANGE = 3.4e38  # largest float32
 
 
-@dataclass(frozen=True)
-class Lens:
+class Lens(NamedTuple):
     """What ``rasterization`` takes besides tensors and modes, under the same names."""
 
     width: int
@@ -36,15 +35,15 @@ class Lens:
     sh_degree: int | None = None
 
 
-@dataclass
-class View:
+class View(NamedTuple):
     """One object in one view.
 
     Attributes:
         blended: ``[SAMPLES, H W, C + 3]``: colours, depth Σ w z, weight Σ w, alpha.
-        allowance: ``[H W, C + 3]``: by how much an undecided pixel may differ besides.
-        undecided: ``[H W]``: a cut or an order is within rounding.
-        loose: ``[H W]``: or a slope (a clamp) is: no gradient is asked of these pixels.
+        allowance: ``[H W, C + 3]``: by how much a pixel may differ besides, if it is undecided, and
+            by the scale of its rounding.
+        undecided: ``[H W, 1]``: a cut or an order is within rounding.
+        loose: ``[H W, 1]``: or a slope (a clamp) is: no gradient is asked of these pixels.
     """
 
     blended: Tensor
@@ -92,10 +91,9 @@ def _jacobian(t: Tensor, K: Tensor, lens: Lens, r: Rounding) -> tuple[Tensor, Te
         focal, center = K[axis, axis].item(), K[axis, 2].item()
         margin = FRUSTUM_MARGIN * 0.5 * size / focal
         slope = r(t[..., axis] / t[..., 2])
-        for bound in (-(center / focal + margin), (size - center) / focal + margin):
-            # the bound is itself rounded
-            at_clamp |= (slope[0].detach() - bound).abs() <= _band(slope) + 32 * UNIT * abs(bound)
         low, high = -(center / focal + margin), (size - center) / focal + margin
+        for bound in (low, high):  # the bound is itself rounded
+            at_clamp |= (slope[0].detach() - bound).abs() <= _band(slope) + 32 * UNIT * abs(bound)
         f = r(focal / t[..., 2])
         row = [torch.zeros_like(f), torch.zeros_like(f), r(-f * r(slope.clamp(low, high)))]
         row[axis] = f
@@ -103,8 +101,7 @@ def _jacobian(t: Tensor, K: Tensor, lens: Lens, r: Rounding) -> tuple[Tensor, Te
     return torch.stack(rows, -2), at_clamp
 
 
-@dataclass
-class _Splats:
+class _Splats(NamedTuple):
     """Gaussians of a view, front to back; ``[SAMPLES, n, ..]``, the last four ``[n]``.
 
     Channels are colours, depth and a channel of ones, whose sum is the weight.
@@ -158,17 +155,7 @@ def _splats(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -
     center = torch.stack([r(scaled[i] + r.constant(K[i, 2])) for i in (0, 1)], -1)
     depth = t[..., 2]
     channels = torch.cat([channels, depth[..., None], torch.ones_like(depth)[..., None]], -1)
-    return _Splats(
-        center=center,
-        conic=conic,
-        opacity=opacity,
-        depth=depth,
-        channels=channels,
-        seen=seen & fits,
-        unsure=unsure,
-        loose=loose,
-        index=index,
-    )
+    return _Splats(center, conic, opacity, depth, channels, seen & fits, unsure, loose, index)
 
 
 def _order_swaps(s: _Splats, weight: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,36 +206,31 @@ def _blend(s: _Splats, pixels: Tensor, lens: Lens, r: Rounding) -> View:
     left = torch.cumprod(torch.where(on & going, r(1 - alpha), 1.0), -1)[..., -1]
     alphas = alphas + (r(1 - left) - alphas).detach()
     blended = torch.cat([blended, alphas[..., None]], -1)
-    with torch.no_grad():
+    with torch.no_grad():  # what rounding decides, and what may come of it
         stops = (on & ~going).any(-1)
-        return _decisions(s, lens, blended, before[0], after, value, band, on, stops)
+        reached = before[0] > T_MIN * (1 - FACTOR * len(s.seen) * UNIT) - _band(after).amax()
+        cut = (value - lens.alpha_min).abs() <= band
+        cut |= s.unsure & (value >= lens.alpha_min - band)
+        cut &= reached & (s.seen | s.unsure)
+        stop = on & reached & ((after[0] - T_MIN).abs() <= _band(after))
+        # a Gaussian that comes or goes changes what it covers by its own share, and shows or hides
+        # what lies behind; so does a stop with all the light that is left
+        share = (before[0] * value * cut).sum(-1) + (before[0] * stop).amax(-1)
+        top = torch.cat([s.channels[0].abs().amax(0), torch.ones(1, dtype=share.dtype)])
+        allowance = 2 * share[:, None] * top
+        swap, swapped = _order_swaps(s, before[0] * value.clamp_max(lens.alpha_max), on & reached)
+        allowance[:, :-1] += 2 * swap
+        undecided = cut.any(-1) | stop.any(-1) | swapped
+        # what is undecided before a stop may move the stop: this light at most is then left
+        elsewhere = undecided & (stops | stop.any(-1))
+        allowance[elsewhere] += 2 * T_MIN / (1 - lens.alpha_max) * top
+        bend = on & ((value - lens.alpha_max).abs() <= band) | (on & s.loose)
+        allowance += FACTOR * UNIT * top
+        loose = undecided | (bend & reached).any(-1)
+        return View(blended, allowance, undecided[:, None], loose[:, None])
 
 
-def _decisions(s, lens, blended, before, after, value, band, on, stops) -> View:
-    """What rounding decides, and what may come of it."""
-    reached = before > T_MIN * (1 - FACTOR * len(s.seen) * UNIT) - _band(after).amax()
-    cut = (value - lens.alpha_min).abs() <= band
-    cut |= s.unsure & (value >= lens.alpha_min - band)
-    cut &= reached & (s.seen | s.unsure)
-    stop = on & reached & ((after[0] - T_MIN).abs() <= _band(after))
-    # a Gaussian that comes or goes changes what it covers by its own share, and shows or hides
-    # what lies behind; so does a stop with all the light that is left
-    share = (before * value * cut).sum(-1) + (before * stop).amax(-1)
-    top = torch.cat([s.channels[0].abs().amax(0), torch.ones(1, dtype=share.dtype)])
-    allowance = 2 * share[:, None] * top
-    swap, swapped = _order_swaps(s, before * value.clamp_max(lens.alpha_max), on & reached)
-    allowance[:, :-1] += 2 * swap
-    undecided = cut.any(-1) | stop.any(-1) | swapped
-    # what is undecided before a stop may move the stop: this light at most is then left
-    elsewhere = undecided & (stops | stop.any(-1))
-    allowance[elsewhere] += 2 * T_MIN / (1 - lens.alpha_max) * top
-    bend = on & ((value - lens.alpha_max).abs() <= band) | (on & s.loose)
-    return View(blended, allowance, undecided, undecided | (bend & reached).any(-1))
-
-
-def render_view(
-    x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding
-) -> tuple[View, Tensor]:
+def render_view(x: dict, W: Tensor, w: Tensor, K: Tensor, lens: Lens, r: Rounding) -> View:
     """One object in one view.
 
     Args:
@@ -259,9 +241,6 @@ def render_view(
         K: ``[3, 3]`` float64.
         lens: the rest.
         r: rounds.
-
-    Returns:
-        The view, and the largest of each channel in it, ``[C + 2]``: the scale of its rounding.
     """
     x = {name: None if t is None else r(t) for name, t in x.items()}
     bent = None
@@ -273,14 +252,15 @@ def render_view(
             bent = (colors[0] <= _band(colors) + 1e-6).any(-1) & (colors[0] >= 0).any(-1)
     s = _splats(x, r(W), r(w), K, lens, r)
     if bent is not None:
-        s.loose = s.loose | bent[s.index]
+        s = s._replace(loose=s.loose | bent[s.index])
     rows, columns = torch.meshgrid(
         torch.arange(lens.height), torch.arange(lens.width), indexing="ij"
     )
     pixels = torch.stack([columns, rows], -1).reshape(-1, 2).double() + 0.5
-    if not len(s.seen):
-        channels = x["colors"].shape[-1]
-        blank = x["means"].new_zeros(len(W), len(pixels), channels + 3)
-        none = torch.zeros(len(pixels), dtype=torch.bool)
-        return View(blank, blank[0], none, none), blank[0, 0, :-1]
-    return _blend(s, pixels, lens, r), s.channels[0].detach().abs().amax(0)
+    if len(s.seen):
+        return _blend(s, pixels, lens, r)
+    blank = x["means"].new_zeros(len(W), len(pixels), x["colors"].shape[-1] + 3)
+    allowance = blank[0].clone()
+    allowance[:, -1] = FACTOR * UNIT
+    none = torch.zeros(len(pixels), 1, dtype=torch.bool)
+    return View(blank, allowance, none, none)

@@ -58,7 +58,7 @@ def test_short_run(name):
 
 @pytest.mark.parametrize("discretization", scan.DISCRETIZATIONS)
 def test_scan_oracle_is_the_reference(discretization):
-    case = Case("scan", "uniform", 5, scan.valid(scan.OP.plain | dict(
+    case = Case("scan", "uniform", 5, scan.OP.valid(scan.OP.plain | dict(
         batch=2, length=29, channels=6, states=3, groups=2, use_D=True, use_z=True, use_bias=True,
         use_state=True, softplus=True,
     )))  # fmt: skip
@@ -101,18 +101,19 @@ def test_raster_oracle_is_the_reference(antialiased):
     ))  # fmt: skip
     x = raster.build(case, CPU)
     leaves = {k: t.double().detach().requires_grad_(k != "Ks") for k, t in x.items()}
-    truth = raster._Truth(case, x)
+    samples, picture = raster.truth(case, x)
+    renders, alphas = picture.blended.split([4, 1], -1)
     color, depth, alpha = rasterization_reference(
         **leaves, width=13, height=9, antialiased=antialiased
     )
     want = torch.cat([color, depth], -1)
-    assert_rel_rms(truth.renders[0], want, 1e-12, "renders")
-    assert_rel_rms(truth.alphas[0], alpha, 1e-12, "alphas")
-    assert truth.alphas[0].mean() > 0.1 and truth.undecided.double().mean() < 0.02
+    assert_rel_rms(renders[0], want, 1e-12, "renders")
+    assert_rel_rms(alphas[0], alpha, 1e-12, "alphas")
+    assert alphas[0].mean() > 0.1 and picture.undecided.double().mean() < 0.02
     v, v_alpha = torch.randn_like(want), torch.randn_like(alpha)
     del leaves["Ks"]
-    total = (truth.renders * v).sum() + (truth.alphas * v_alpha).sum()
-    grads = torch.autograd.grad(total, [truth.leaves[k] for k in leaves])
+    total = (renders * v).sum() + (alphas * v_alpha).sum()
+    grads = torch.autograd.grad(total, [samples[k] for k in leaves])
     wants = torch.autograd.grad((want * v).sum() + (alpha * v_alpha).sum(), [*leaves.values()])
     for name, got, expected in zip(leaves, grads, wants):
         assert_rel_rms(got[0], expected, 1e-10, name)
@@ -196,7 +197,7 @@ def test_a_failing_case_is_made_small(broken_scan):
         length=40, channels=5, states=4, groups=5, use_z=True, use_D=True, last=True, softplus=True,
         layout="part", batch=2, A="wide",
     )  # fmt: skip
-    case = Case("scan", "long", 1, scan.valid(options))
+    case = Case("scan", "long", 1, scan.OP.valid(options))
     small, outcome, tried = shrink(scan.OP, case, CPU, seconds=120)
     assert outcome.failure()["what"] == "limit" and tried < 60
     changed = {k for k, v in small.options.items() if v != scan.OP.plain[k]}
