@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from ..gpu_check.plan import MINUTES, StepName
+from ..gpu_check import MINUTES, StepName
 from ..untrusted.ranges import Minutes, ranged
 
 
@@ -18,7 +18,7 @@ def gpu_check_command(
     minutes: Minutes = MINUTES,
     steps: tuple[StepName, ...] = (),
 ) -> int:
-    """Runs kernel checks, GPU tests, full-size inference and the benchmark on this machine.
+    """Runs kernel checks, full-size inference and the benchmark on this machine.
 
     Writes gpu-check.json and gpu-check.md after every item, and says what it could not do. The
     exit code is 0 if all that could be run passed, 1 if something failed, 2 without a CUDA device.

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import json
 import os
 import signal
@@ -19,7 +18,6 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from xml.etree import ElementTree
 
 import torch
 
@@ -27,7 +25,7 @@ from ..errors import UserError
 from ..files import CHECKOUT, atomic_path, output_folder, write_json
 from ..kernels.bench import Settings
 from ..kernels.bench.peers import PACKAGES, versions
-from .plan import MINUTES, STEPS, Step
+from . import MINUTES, STEPS, Step
 from .report import headline, machine_facts, page
 
 FORMAT = "gamba_warp.gpu_check.1"
@@ -42,7 +40,7 @@ def run_gpu_check(
     minutes: float = MINUTES,
     steps: Sequence[str] = (),
 ) -> int:
-    """Runs kernel checks, GPU tests, full-size inference and the benchmark on this machine.
+    """Runs kernel checks, full-size inference and the benchmark on this machine.
 
     Args:
         device: "cuda"; or "cpu", which tries the command itself.
@@ -103,21 +101,19 @@ class Run:
         It is ``{format, verdict, machine, settings, steps, results, failures, not_done, bench}``;
         the last is one document as ``gamba bench`` writes it, inference included.
         """
-        parts = list(self.parts.values())
-        results = {
-            name: {key: value for key, value in part["result"].items() if key != "bench"}
-            for name, part in self.parts.items()
-        }
+        parts = self.parts.values()
+        results = {name: dict(part["result"]) for name, part in self.parts.items()}
+        benches = [found.pop("bench") for found in results.values() if "bench" in found]
         return {
             "format": FORMAT,
             "verdict": self.verdict,
             "machine": self.machine,
             "settings": {"device": self.settings.device.type, "level": self.settings.level},
             "steps": self.steps,
-            "results": {name: result for name, result in results.items() if result},
+            "results": {name: found for name, found in results.items() if found},
             "failures": [failure for part in parts for failure in part["failures"]],
             "not_done": [row for part in parts for row in part["not_done"]],
-            "bench": join_benches([p["result"]["bench"] for p in parts if "bench" in p["result"]]),
+            "bench": join_benches(benches),
         }
 
     def write(self) -> None:
@@ -134,11 +130,10 @@ class Run:
         document = self.document()
         rows = headline(document)
         width = min(60, max(len(name) for name, _ in rows))
-        print("\n".join(f"{name:<{width}}  {value}" for name, value in rows))
-        for name in ("failures", "not_done"):
-            for row in document[name]:
-                text = row if isinstance(row, str) else f"{row['what']}: {row['reason']}"
-                print(f"{name.replace('_', ' ').replace('failures', 'failed')}: {text}")
+        lines = [f"{name:<{width}}  {value}" for name, value in rows]
+        lines += [f"failed: {text}" for text in document["failures"]]
+        lines += [f"not done: {row['what']}: {row['reason']}" for row in document["not_done"]]
+        print("\n".join(lines))
         print(f"{verdict}; wrote {self.folder / 'gpu-check.json'} and gpu-check.md")
 
     def do(self, step: Step, seconds: float) -> None:
@@ -154,10 +149,17 @@ class Run:
             row["reason"] = f"not installed: {', '.join(step.packages)}"
         elif seconds < _LEAST:
             row["reason"] = "time was up"
-        elif step.name == "tests":
-            self._tests(row, seconds)
         else:
-            self._child(row, seconds)
+            code, said = self._child(step.name, seconds)
+            part = self.parts[step.name]
+            row["status"] = "passed"
+            if code is None:
+                row.update(status="stopped", reason=f"its {seconds:.0f} s were up")
+            elif not part["whole"]:
+                row["reason"] = f"ended with code {code}: {said}"
+                part["failures"].append(f"step {step.name} {row['reason']}")
+            if part["failures"]:
+                row["status"] = "failed"
         row["seconds"] = time.time() - started
         if row["status"] in ("not done", "stopped"):
             rest = "the rest of " if row["status"] == "stopped" else ""
@@ -166,9 +168,8 @@ class Run:
         reason = f" ({row['reason']})" if row["reason"] else ""
         print(f"{step.name:<10} {row['status']}{reason}, {row['seconds']:.0f} s", flush=True)
 
-    def _child(self, row: dict, seconds: float) -> None:
+    def _child(self, name: str, seconds: float) -> tuple[int | None, str]:
         """Runs a step of ``steps``; what it writes is taken over while it runs."""
-        name = row["name"]
         until = time.time() + max(seconds - _GRACE, seconds / 2)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "part.json"
@@ -183,36 +184,7 @@ class Run:
             command = ["-m", "gamba_warp.gpu_check", "--child", name, "--out", str(path)]
             command += ["--device", self.settings.device.type, "--until", str(until)]
             command += ["--quick"] * (self.settings.level == "quick")
-            code, said = run_python(command, seconds, look)
-        self._judge(row, code, said, seconds)
-
-    def _judge(self, row: dict, code: int | None, said: str, seconds: float) -> None:
-        part = self.parts[row["name"]]
-        row["status"] = "passed"
-        if code is None:
-            row.update(status="stopped", reason=f"its {seconds:.0f} s were up")
-        elif not part["whole"]:
-            row["reason"] = f"ended with code {code}: {said}"
-            part["failures"].append(f"step {row['name']} {row['reason']}")
-        if part["failures"]:
-            row["status"] = "failed"
-
-    def _tests(self, row: dict, seconds: float) -> None:
-        """Runs the tests that are marked gpu, where pytest and a checkout are there."""
-        part = self.parts["tests"]
-        ours = (CHECKOUT / "setup.cfg").is_file()  # else a neighbour's tests in site-packages
-        files = gpu_test_files(CHECKOUT / "tests") if ours else []
-        if not files or importlib.util.find_spec("pytest") is None:
-            row["reason"] = "pytest is not installed" if files else "no checkout, so no tests"
-            return
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "junit.xml"
-            command = ["-m", "pytest", "-m", "gpu", "-q", "-p", "no:cacheprovider"]
-            command += ["--continue-on-collection-errors", f"--junitxml={path}", *map(str, files)]
-            code, said = run_python(command, seconds, lambda: None, cwd=CHECKOUT)
-            if path.exists():
-                part.update(read_junit(path.read_text(encoding="utf-8")), whole=True)
-        self._judge(row, code, said, seconds)
+            return run_python(command, seconds, look)
 
 
 def join_benches(documents: list[dict]) -> dict:
@@ -236,7 +208,7 @@ def new_part() -> dict:
 
 
 def run_python(
-    arguments: list[str], seconds: float, look: Callable[[], None], cwd: Path | None = None
+    arguments: list[str], seconds: float, look: Callable[[], None]
 ) -> tuple[int | None, str]:
     """Runs Python, and ends it with all that it started when its time is up.
 
@@ -244,7 +216,6 @@ def run_python(
         arguments: of Python.
         seconds: time limit.
         look: called every tenth of a second, and at the end.
-        cwd: working directory; None for that of this process.
 
     Returns:
         The exit code, None if it was ended, and the last line that it printed.
@@ -256,7 +227,7 @@ def run_python(
         process = subprocess.Popen(
             [sys.executable, *arguments],
             **{"stdout": said, "stderr": subprocess.STDOUT, "stdin": subprocess.DEVNULL},
-            **{"cwd": cwd, "env": environment, "start_new_session": True},
+            **{"env": environment, "start_new_session": True},
         )
         try:
             while process.poll() is None and time.time() < ends:
@@ -290,39 +261,6 @@ def end_tree(process: subprocess.Popen) -> None:
             )
     process.kill()  # does nothing if it is gone; else at least the process itself ends
     process.wait()
-
-
-def gpu_test_files(folder: Path) -> list[Path]:
-    """The files in a folder of tests that have a test marked gpu."""
-    files = sorted(folder.rglob("test_*.py"))
-    return [path for path in files if "@pytest.mark.gpu" in path.read_text(encoding="utf-8")]
-
-
-def read_junit(xml: str) -> dict:
-    """A part as ``new_part`` makes it, from pytest's XML.
-
-    A test that fails because a package is not installed counts as not done.
-    """
-    part, counts = new_part(), {"passed": 0, "failed": 0, "skipped": 0}
-    for case in ElementTree.fromstring(xml).iter("testcase"):
-        name = ".".join(filter(None, (case.get("classname"), case.get("name"))))
-        wrong = [case.find(kind) for kind in ("failure", "error")]
-        wrong = next((element for element in wrong if element is not None), None)
-        skipped = case.find("skipped")
-        if skipped is not None:
-            counts["skipped"] += 1
-            part["not_done"].append({"what": name, "reason": skipped.get("message", "")})
-        elif wrong is None:
-            counts["passed"] += 1
-        elif "ModuleNotFoundError" in (text := wrong.text or ""):
-            line = next(x for x in text.splitlines() if "ModuleNotFoundError" in x)
-            part["not_done"].append({"what": name, "reason": line.removeprefix("E").strip()})
-        else:
-            counts["failed"] += 1
-            message = (wrong.get("message") or "").strip().splitlines() or [""]
-            part["failures"].append(f"{name}: {message[0]}")
-    part["result"] = {"counts": counts}
-    return part
 
 
 def main(arguments: list[str] | None = None) -> int:

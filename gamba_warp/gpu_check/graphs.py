@@ -14,19 +14,42 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians
-from ..kernels.bench import Settings, compare
+from ..kernels.bench import Error, Settings, compare
 from ..kernels.bench.cases.raster_scene import orbit_cameras, shell
 from ..kernels.rasterize import lists_outgrown, rasterization
 from ..measure.inference import build_model
 from ..model.posing import reference_cameras
 from ..render import render
-from .faults import same, within
 
 _Result = TypeVar("_Result")
 # Under capture torch may choose other kernels for a product; Adam's first steps go by the sign of
 # a gradient, so where that is a rounding, weights go apart.
 LOSS_LIMIT, CHANGE_LIMIT = 1e-4, 0.05
 _STEPS = 4
+
+
+def within(error: Error, limit: float) -> str:
+    """Returns an error in words.
+
+    Raises:
+        AssertionError: it is over the limit, or not a number.
+    """
+    if not error.rel_rms <= limit:
+        raise AssertionError(
+            f"{error.worst}: relative rms error {error.rel_rms:.2g}, allowed {limit:.2g}"
+        )
+    return f"{error.rel_rms:.1e}"
+
+
+def same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
+    """Compares results bit by bit.
+
+    Raises:
+        AssertionError: one differs.
+    """
+    for i, (a, b) in enumerate(zip(first, second)):
+        if not a.equal(b):
+            raise AssertionError(f"result {i} differs by up to {(a - b).abs().max().item():.2g}")
 
 
 def captured(run: Callable[[], _Result], device: torch.device) -> tuple[Any, _Result]:

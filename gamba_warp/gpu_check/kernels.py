@@ -22,8 +22,7 @@ from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.cuda.tuning import Tuning, use_tuning
-from .faults import same, within
-from .graphs import no_wait, raster_graph, step_graph
+from .graphs import captured, no_wait, raster_graph, same, step_graph, within
 
 # Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
 # rounds inputs and outputs, and a few pixels may cross the cut at the faintest alpha.
@@ -208,14 +207,7 @@ def _graph(device: torch.device) -> str:
     """Checks that a replay gives the bits of a plain run, also with inputs changed meanwhile."""
     layer, inputs = _layer(_problem((1, 577, 70, 16, 1), device))
     with torch.no_grad():
-        stream = torch.cuda.Stream(device)
-        stream.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(stream):
-            layer(*inputs)
-        torch.cuda.current_stream(device).wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            out = layer(*inputs)
+        graph, out = captured(lambda: layer(*inputs), device)
         for scale in (1.0, 0.5):
             inputs[0].mul_(scale)
             out.fill_(torch.nan)

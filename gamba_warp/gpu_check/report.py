@@ -32,45 +32,35 @@ def machine_facts(settings: Settings) -> dict:
 
 def headline(document: dict) -> list[tuple[str, str]]:
     """Returns what was found, in rows of a name and a value."""
-    facts = document["machine"] | {"packages": _joined(document["machine"]["packages"])}
+    joined = lambda values: ", ".join(f"{k} {v}" for k, v in values.items())  # noqa: E731
+    facts = document["machine"] | {"packages": joined(document["machine"]["packages"])}
     rows = [(name.replace("_", " "), str(value)) for name, value in facts.items() if value]
     for step in document["steps"]:
         reason = f": {step['reason']}" if step["reason"] else ""
         rows.append((f"step {step['name']}", f"{step['status']}, {step['seconds']:.0f} s{reason}"))
-    compiled = document["results"].get("compile", {})
-    if "seconds" in compiled:
-        text = f"{compiled['kernels']} of {compiled['of']} in {compiled['seconds']:.1f} s"
+    results = {
+        name: document["results"].get(name, {}) for name in ("compile", "checks", "inference")
+    }
+    if found := results["compile"]:
+        text = f"{found['kernels']} of {found['of']} in {found['seconds']:.1f} s"
         rows.append(("kernels compiled or loaded", text))
-    for name in ("checks", "tests"):
-        result = document["results"].get(name, {})
-        counts = _counts(result.get("checks", [])) if name == "checks" else result.get("counts")
-        if counts:
-            text = ", ".join(f"{count} {word}" for word, count in counts.items())
-            rows.append(("checks of the kernels" if name == "checks" else "GPU tests", text))
-    inference = document["results"].get("inference", {})
-    for name, value in inference.get("ceilings", {}).items():
+    if words := [check["status"] for check in results["checks"].get("checks", [])]:
+        counts = (f"{words.count(word)} {word}" for word in dict.fromkeys(words))
+        rows.append(("checks of the kernels", ", ".join(counts)))
+    for name, value in results["inference"].get("ceilings", {}).items():
         rows.append((name.replace("_per_", "/").replace("_", " "), f"{value:.3g}"))
-    if "reserved_gib" in inference:
-        text = f"{inference['reserved_gib']:.1f} GiB, graphs and both precisions together"
+    if "reserved_gib" in results["inference"]:
+        reserved = results["inference"]["reserved_gib"]
+        text = f"{reserved:.1f} GiB, graphs and both precisions together"
         rows.append(("inference, memory taken", text))
     for record in document["bench"]["records"]:
-        if record["op"] != "inference":
-            continue
-        rows.append((f"inference, {record['variant']}", _time(record)))
+        if record["op"] == "inference":
+            rows.append((f"inference, {record['variant']}", _time(record)))
     for target in document["bench"]["targets"]:
         words = {True: "reached", False: "missed", None: "not measured"}[target["reached"]]
         value = "" if target["value"] is None else f"{target['value']:.3g}, "
         rows.append((f"{target['op']}: {target['text']}", f"{value}{target['wanted']}: {words}"))
     return rows
-
-
-def _joined(values: dict) -> str:
-    return ", ".join(f"{name} {value}" for name, value in values.items())
-
-
-def _counts(checks: list[dict]) -> dict[str, int]:
-    words = [check["status"] for check in checks]
-    return {word: words.count(word) for word in dict.fromkeys(words)}
 
 
 def _time(record: dict) -> str:
@@ -89,20 +79,15 @@ def page(document: dict) -> str:
     title = document["verdict"]
     lines = ["# gamba gpu-check", "", f"Written by `gamba gpu-check`, not by hand. **{title}**", ""]
     lines += _table(("what", "found"), headline(document))
-    for name, rows in (("Failed", document["failures"]), ("Not done", _reasons(document))):
+    not_done = [f"{row['what']}: {row['reason']}" for row in document["not_done"]]
+    for name, rows in (("Failed", document["failures"]), ("Not done", not_done)):
         if rows:
             lines += ["", f"## {name}", "", *(f"- {row}" for row in rows)]
-    records = document["bench"]["records"]
-    for op, cases in groups({"records": records}).items():
+    for op, cases in groups({"records": document["bench"]["records"]}).items():
         for case, found in cases.items():
-            header, cells = table(found)
             lines += ["", f"## {op}: {case}", "", f"{found[0]['text']} {oracles(found)}", ""]
-            lines += _table(header, cells)
+            lines += _table(*table(found))
     return "\n".join([*lines, ""])
-
-
-def _reasons(document: dict) -> list[str]:
-    return [f"{row['what']}: {row['reason']}" for row in document["not_done"]]
 
 
 def _table(header, rows) -> list[str]:

@@ -15,11 +15,11 @@ from helpers.kernels import Watch
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.files import write_json
+from gamba_warp.gpu_check import STEPS, StepName
 from gamba_warp.gpu_check import check as gpu_check
 from gamba_warp.gpu_check import kernels as gpu_kernels
 from gamba_warp.gpu_check import steps as gpu_steps
 from gamba_warp.gpu_check.check import main, make_settings, new_part, run_gpu_check
-from gamba_warp.gpu_check.plan import STEPS, StepName
 from gamba_warp.gpu_check.steps import Part, run_step
 from gamba_warp.kernels.bench.static import dry_run
 from gamba_warp.measure import inference as bench_inference
@@ -112,7 +112,7 @@ def test_torch_and_warp_are_enough(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(HIDE.format(names=OTHERS))
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "OMP_NUM_THREADS": "1"}
     out = tmp_path / "out"
-    command = "-m gamba_warp.gpu_check --device cpu --quick --steps inference tests --out".split()
+    command = "-m gamba_warp.gpu_check --device cpu --quick --steps compile inference --out".split()
     done = subprocess.run(
         [sys.executable, *command, out], cwd=ROOT, env=environment, capture_output=True, text=True
     )
@@ -120,18 +120,18 @@ def test_torch_and_warp_are_enough(tmp_path):
     document = json.loads((out / "gpu-check.json").read_text())
     assert document["verdict"] == "all that could be run passed" and document["failures"] == []
     assert [(s["name"], s["status"]) for s in document["steps"]] == [
+        ("compile", "not done"),
         ("inference", "passed"),
-        ("tests", "not done"),
     ]
     records = {record["variant"]: record for record in document["bench"]["records"]}
     assert {r["status"] for r in records.values()} == {"ok"}
     assert 0 < records["eager, bfloat16"]["rel_rms_error"] < 0.03
     assert "given tokens" in records["eager, bfloat16"]["parameters"]["encoder"]
     reasons = {row["what"]: row["reason"] for row in document["not_done"]}
-    assert reasons["inference from a CUDA graph"] == reasons["step tests"] == "needs CUDA"
+    assert reasons["inference from a CUDA graph"] == reasons["step compile"] == "needs CUDA"
     page = (out / "gpu-check.md").read_text()
     assert "| inference, eager, bfloat16 |" in page and "## Not done" in page
-    assert "inference, eager, float32" in done.stdout and "not done: step tests" in done.stdout
+    assert "inference, eager, float32" in done.stdout and "not done: step compile" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_the_compile_step(monkeypatch, tmp_path):
 def child(part, code, said=""):
     """Stands for a process that writes a part and ends with a code; None: its time was up."""
 
-    def run(arguments, seconds, look, cwd=None):
+    def run(arguments, seconds, look):
         write_json(arguments[arguments.index("--out") + 1], part)
         look()
         return code, said
@@ -269,14 +269,13 @@ def test_the_whole_run_ends_in_its_time(monkeypatch, tmp_path):
     """Steps that take all they are given leave nothing for the last ones, which are told."""
     now, given = [0.0], []
 
-    def run(arguments, seconds, look, cwd=None):
+    def run(arguments, seconds, look):
         now[0] += seconds
         given.append(seconds)
         return None, ""
 
     monkeypatch.setattr(gpu_check.time, "time", lambda: now[0])
     monkeypatch.setattr(gpu_check, "run_python", run)
-    monkeypatch.setattr(gpu_check, "gpu_test_files", lambda folder: [Path("test_x.py")])
     monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gpu_check, "versions", lambda: dict.fromkeys(gpu_check.PACKAGES, "1"))
@@ -284,7 +283,7 @@ def test_the_whole_run_ends_in_its_time(monkeypatch, tmp_path):
     assert given[:4] == [step.seconds for step in gpu_check.STEPS[:4]] and len(given) == 5
     assert 8 * 60 - 5 < now[0] < 8 * 60
     document = json.loads((tmp_path / "gpu-check.json").read_text())
-    assert [step["status"] for step in document["steps"]] == 5 * ["stopped"] + 3 * ["not done"]
+    assert [step["status"] for step in document["steps"]] == 5 * ["stopped"] + 2 * ["not done"]
     assert {step["reason"] for step in document["steps"][5:]} == {"time was up"}
     now[0], given[:] = 0.0, []
     assert run_gpu_check(out=tmp_path, minutes=0.2) == 0
@@ -297,7 +296,7 @@ def test_peers_have_steps_of_their_own(monkeypatch, tmp_path):
     part["result"] = {"bench": document_of(("conv", "operator", "default", 1.0), target=None)}
     runs = []
 
-    def run(arguments, seconds, look, cwd=None):
+    def run(arguments, seconds, look):
         name = arguments[arguments.index("--child") + 1]
         runs.append(name)
         if name == "peers-scan":
@@ -353,43 +352,3 @@ def test_a_process_that_crashes():
     assert gpu_check.run_python(["-c", crash], 30, lambda: None) == (-11, "nothing was printed")
     code, said = gpu_check.run_python(["-c", "1 / 0"], 30, lambda: None)
     assert code == 1 and said == "ZeroDivisionError: division by zero"
-
-
-TESTS = """
-import pytest
-@pytest.mark.gpu
-def test_right(): pass
-@pytest.mark.gpu
-@pytest.mark.parametrize("n", [1, 2])
-def test_wrong(n): assert n == 1, "n is wrong"
-@pytest.mark.gpu
-def test_absent(): pytest.skip("no such thing")
-def test_other(): raise SystemExit
-"""
-
-
-def test_pytests_results_are_read(monkeypatch, tmp_path):
-    tests = tmp_path / "tests"
-    tests.mkdir()
-    (tests / "test_a.py").write_text(TESTS)
-    (tests / "test_b.py").write_text("import no_such_package\n@pytest.mark.gpu\ndef test_b(): pass")
-    (tests / "test_c.py").write_text("def test_c(): raise SystemExit")
-    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = gpu: x")
-    assert [path.stem for path in gpu_check.gpu_test_files(tests)] == ["test_a", "test_b"]
-    (tmp_path / "setup.cfg").touch()  # a checkout has it
-    monkeypatch.setattr(gpu_check, "CHECKOUT", tmp_path)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
-    assert run_gpu_check(out=tmp_path / "out", steps=("tests",)) == 1
-    document = json.loads((tmp_path / "out" / "gpu-check.json").read_text())
-    assert document["results"]["tests"]["counts"] == {"passed": 2, "failed": 1, "skipped": 1}
-    (failure,) = document["failures"]
-    assert "test_wrong[2]" in failure and "n is wrong" in failure
-    reasons = [row["reason"] for row in document["not_done"]]
-    assert "no such thing" in reasons
-    assert any("no_such_package" in reason for reason in reasons)
-
-
-def test_the_repositorys_gpu_tests_are_found():
-    found = {path.name for path in gpu_check.gpu_test_files(ROOT / "tests")}
-    assert {"test_rasterize_cuda.py", "test_selective_scan_cuda.py"} <= found
