@@ -100,10 +100,9 @@ class StressRun:
                         break
                     outcome = run_case(op, case, self._device)
                     self.tally.add(case, outcome, time.monotonic() - started)
-                    failure = outcome.failure()
-                    if failure is not None:
+                    if outcome.failure() is not None:
                         bar.set_postfix_str(f"{op.name}: a failure, made small")
-                        self._keep_failure(op, case, outcome, failure)
+                        self._keep_failure(op, case, outcome)
                     worst = max(worst, outcome.worst.ratio if outcome.worst else 0.0)
                     failed = f"{len(self.failures)} failures"
                     bar.set_postfix_str(f"worst {worst:.2f} of its limit, {failed}")
@@ -113,28 +112,26 @@ class StressRun:
         minutes = round((time.monotonic() - began) / 60, 2)
         self.about |= {"minutes": minutes, "interrupted": interrupted}
 
-    def _keep_failure(self, op: Op, case: Case, outcome: Outcome, failure: dict) -> None:
+    def _keep_failure(self, op: Op, case: Case, outcome: Outcome) -> None:
         name = f"failure-{op.name}-{len(self.failures) + 1}.json"
-        # It is written as it is first, because making it small may be interrupted.
-        self._write_case(name, case, outcome)
-        self.failures.append({"file": name, "text": failure_text(case, failure)})
+        self.failures.append({"file": name})
+
+        def keep(case: Case, outcome: Outcome) -> None:
+            write_json(self._folder / name, reproducer(case, outcome, versions()))
+            self.failures[-1]["text"] = failure_text(case, outcome)
+
+        keep(case, outcome)  # as it is first, because making it small may be interrupted
         if len(self.failures) <= _SHRUNK:
             small, found, _ = shrink(op, case, self._device, self._shrink_seconds)
-            still = found.failure()
-            if still is not None:
-                self._write_case(name, small, found)
-                self.failures[-1]["text"] = failure_text(small, still)
-
-    def _write_case(self, name: str, case: Case, outcome: Outcome) -> None:
-        write_json(self._folder / name, reproducer(case, outcome, versions()))
+            if found.failure() is not None:
+                keep(small, found)
 
     def write(self) -> None:
         """Writes stress.json and stress.md."""
-        content = document(self.tally, self.about, self.failures)
-        write_json(self._folder / "stress.json", content)
+        content = self.tally, self.about, self.failures
+        write_json(self._folder / "stress.json", document(*content))
         with atomic_path(self._folder / "stress.md") as temporary:
-            text = markdown(self.tally, self.about, self.failures)
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_text(markdown(*content), encoding="utf-8")
 
     def summary(self) -> str:
         """The table of the cases, and a line for each failure."""
@@ -154,23 +151,21 @@ def replay(paths: Sequence[Path], device: torch.device) -> Iterator[tuple[bool, 
         UserError: no such file, not JSON, damaged, or from another version.
     """
     ops = {op.name: op for op in choose_ops(("all",))}
-    cases = [(path, _read_case(path, ops)) for path in paths]
+    cases = []
+    for path in paths:
+        content = read_document(path, Any, limit=1 << 20)
+        try:
+            cases.append((path, read_reproducer(content, ops)))
+        except ValueError as error:
+            raise UserError(f"{path}: {error}") from error
     for path, case in cases:
         outcome = run_case(ops[case.op], case, device)
-        failure, worst = outcome.failure(), outcome.worst
-        if failure is None:
+        passes, worst = outcome.failure() is None, outcome.worst
+        if passes:
             ratio = f"{worst.name} {worst.ratio:.2f} of its limit" if worst else "nothing compared"
             lines = [f"{path}: passes; {case.op}, {case.kind}: {ratio}"]
         else:
-            lines = [f"{path}: fails; {failure_text(case, failure)}"]
+            lines = [f"{path}: fails; {failure_text(case, outcome)}"]
         for c in outcome.comparisons:
             lines.append(f"  {c.name:<28} error {c.error:.2e}, {c.ratio:.3g} of its limit")
-        yield failure is None, "\n".join(lines)
-
-
-def _read_case(path: Path, ops: dict[str, Op]) -> Case:
-    content = read_document(path, Any, limit=1 << 20)
-    try:
-        return read_reproducer(content, ops)
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from error
+        yield passes, "\n".join(lines)

@@ -47,24 +47,18 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
 
 
 def _run(o: dict, x: dict) -> dict[str, Tensor]:
-    activation = "silu" if o["silu"] else None
-    if o["api"] == "conv":
-        result = causal_conv1d(
-            x["x"], x["weight"], x["bias"], activation=activation,
-            initial_state=x["initial_state"], return_final_state=o["final"],
-        )  # fmt: skip
-        if isinstance(result, tuple):
-            return {"out": result[0], "final": result[1]}
-        return {"out": result}
+    """The results by name, channels last."""
+    values, rest = (x["weight"], x["bias"]), {"activation": "silu" if o["silu"] else None}
     state = x["initial_state"]
-    result = causal_conv1d_fn(
-        x["x"].transpose(1, 2), x["weight"], x["bias"], activation=activation,
-        initial_states=None if state is None else state.transpose(1, 2),
-        return_final_states=o["final"],
-    )  # fmt: skip
-    if isinstance(result, tuple):
-        return {"out": result[0].transpose(1, 2), "final": result[1].transpose(1, 2)}
-    return {"out": result.transpose(1, 2)}
+    if o["api"] == "conv":
+        rest |= dict(initial_state=state, return_final_state=o["final"])
+        result = causal_conv1d(x["x"], *values, **rest)
+    else:
+        state = None if state is None else state.mT
+        rest |= dict(initial_states=state, return_final_states=o["final"])
+        result = causal_conv1d_fn(x["x"].mT, *values, **rest)
+    results = result if isinstance(result, tuple) else (result,)
+    return {k: t if o["api"] == "conv" else t.mT for k, t in zip(("out", "final"), results)}
 
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:

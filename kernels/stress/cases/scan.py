@@ -185,18 +185,12 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
     """The results by name, channels last."""
     common: dict[str, Any] = dict(delta_softplus=o["softplus"])
     if o["api"] == "mamba-ssm":
-        u, delta = (x[name].transpose(1, 2) for name in ("u", "delta"))
-        z = None if x["z"] is None else x["z"].transpose(1, 2)
-        B, C = (t if t.dim() == 2 else t.permute(0, 2, 3, 1) for t in (x["B"], x["C"]))
-        if o["groups"] == 1:
-            B, C = (t if t.dim() == 2 else t[:, 0] for t in (B, C))
-        result = selective_scan_fn(
-            u, delta, x["A"], B, C, x["D"], z, x["delta_bias"],
-            return_last_state=o["last"], **common,
-        )  # fmt: skip
-        if isinstance(result, tuple):
-            return {"out": result[0].transpose(1, 2), "last": result[1]}
-        return {"out": result.transpose(1, 2)}
+        u, delta, z = (None if x[k] is None else x[k].mT for k in ("u", "delta", "z"))
+        B, C = (t if t.dim() == 2 else t.permute(0, 2, 3, 1).squeeze(1) for t in (x["B"], x["C"]))
+        more = dict(return_last_state=o["last"], **common)
+        result = selective_scan_fn(u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], **more)
+        out, *last = result if isinstance(result, tuple) else (result,)
+        return {"out": out.mT} | dict(zip(["last"], last))
     common["discretization"] = o["discretization"]
     state = x["initial_state"]
     k = o["length"] if o["api"] == "state" else o["split"]
@@ -212,9 +206,7 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
         u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], initial_state=state,
         return_last_state=o["last"], **common,
     )  # fmt: skip
-    if isinstance(result, tuple):
-        return {"out": result[0], "last": result[1]}
-    return {"out": result}
+    return dict(zip(("out", "last"), result if isinstance(result, tuple) else (result,)))
 
 
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:

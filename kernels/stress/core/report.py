@@ -123,25 +123,19 @@ def document(tally: Tally, about: dict, failures: list[dict]) -> dict:
 def markdown(tally: Tally, about: dict, failures: list[dict]) -> str:
     """Returns the whole run as a Markdown page."""
     run = ", ".join(f"{name} {value}" for name, value in about.items())
-    parts = [
-        "# Numerical stress test",
-        run,
-        table(tally.totals()),
-        table(tally.sorted()),
-    ]
+    parts = ["# Numerical stress test", run, table(tally.totals()), table(tally.sorted())]
     if failures:
         parts += ["## Failures", "\n".join(f"- {f['file']}: {f['text']}" for f in failures)]
     return "\n\n".join(parts) + "\n"
 
 
-def failure_text(case: Case, failure: dict) -> str:
+def failure_text(case: Case, outcome: Outcome) -> str:
     """Describes a failure in one line."""
-    title, name = f"{case.op}, {case.kind}", failure["name"]
-    if failure["what"] == "limit":
-        return f"{title}: {name} is {failure['ratio']:.3g} times its limit off"
-    if failure["what"] == "not finite":
-        return f"{title}: {name} is not finite"
-    return f"{title}: {name}"
+    failure = outcome.failure()
+    assert failure is not None
+    ratio = "" if failure["ratio"] is None else f"{failure['ratio']:.3g}"
+    words = {"limit": f" is {ratio} times its limit off", "not finite": " is not finite"}
+    return f"{case.op}, {case.kind}: {failure['name']}{words.get(failure['what'], '')}"
 
 
 def reproducer(case: Case, outcome: Outcome, versions: dict) -> dict:

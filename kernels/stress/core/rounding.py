@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import overload
 
 import torch
@@ -15,61 +16,17 @@ UNIT = 2.0**-24  # half of float32's last bit, relative
 UNDERFLOW = 2.0**-124
 
 
-def _softplus(x: Tensor) -> Tensor:
-    return torch.logaddexp(x, torch.zeros_like(x))
+class _Step(torch.autograd.Function):
+    """A function of one tensor, and what makes its gradient."""
 
-
-class _Round(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, rounding: Rounding, ulps: float, back: float) -> Tensor:
-        ctx.rounding, ctx.back = rounding, back
-        return rounding.rounded(x, ulps)
+    def forward(ctx, x: Tensor, function: Callable, back: Callable) -> Tensor:
+        ctx.back = back
+        return function(x)
 
     @staticmethod
     def backward(ctx, gradient: Tensor):
-        return ctx.rounding.rounded(gradient, ctx.back, up=False), None, None, None
-
-
-class _Map(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, function, slope, rounding: Rounding, ulps: float) -> Tensor:
-        ctx.rounding = rounding
-        y = rounding.rounded(function(x), ulps)
-        ctx.save_for_backward(rounding.rounded(slope(x, y), ulps))
-        return y
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor):
-        rounded = ctx.rounding.rounded(gradient * ctx.saved_tensors[0], 1.0, up=False)
-        return rounded, None, None, None, None
-
-
-class _Sum(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, dims: tuple[int, ...], rounding: Rounding) -> Tensor:
-        ctx.shape, ctx.dims = x.shape, dims
-        return rounding.added(x, dims)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor):
-        for dim in sorted(ctx.dims):
-            gradient = gradient.unsqueeze(dim)
-        return gradient.expand(ctx.shape), None, None
-
-
-class _Share(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, shape: tuple[int, ...], rounding: Rounding) -> Tensor:
-        pairs = enumerate(zip(x.shape, shape))
-        ctx.dims, ctx.rounding = tuple(d for d, (a, b) in pairs if a != b), rounding
-        return x.expand(shape)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor):
-        total = ctx.rounding.added(gradient, ctx.dims)
-        for dim in ctx.dims:
-            total = total.unsqueeze(dim)
-        return total, None, None
+        return ctx.back(gradient), None, None
 
 
 class Rounding:
@@ -95,7 +52,9 @@ class Rounding:
             ulps: size of the rounding, in last bits.
             back: size of the gradient's rounding, in last bits.
         """
-        return _Round.apply(x, self, ulps, back)
+        return _Step.apply(
+            x, lambda x: self.rounded(x, ulps), lambda v: self.rounded(v, back, up=False)
+        )
 
     def drift(self, x: Tensor, steps: Tensor) -> Tensor:
         """Rounds ``x [S, .., n]`` as if computed from the last entry to the first; no gradient.
@@ -114,30 +73,42 @@ class Rounding:
 
     def stored(self, x: Tensor, dtype: torch.dtype) -> Tensor:
         """Returns ``x`` as it is, but rounds its gradient on this path to ``dtype``."""
-        return _Round.apply(x, self, 0.0, torch.finfo(dtype).eps / 2 / UNIT)
+        return self(x, 0.0, torch.finfo(dtype).eps / 2 / UNIT)
 
     def exp(self, x: Tensor, ulps: float) -> Tensor:
         """Computes the exponential of ``x``, with a relative error of |x| times ``ulps``."""
         share = self.side.double().view(-1, *[1] * (x.dim() - 1))
         x = x + x.abs() * share * (ulps * UNIT)
-        return _Map.apply(self(x), torch.exp, lambda _, y: y, self, 1.0)
+        return self._mapped(self(x), torch.exp, lambda _, y: y, 1.0)
 
     def softplus(self, x: Tensor, ulps: float) -> Tensor:
         """Computes log(1 + e^x), and its slope, the sigmoid, to ``ulps``."""
-        return _Map.apply(x, _softplus, lambda v, _: v.sigmoid(), self, ulps)
+        zero = torch.zeros((), dtype=x.dtype)
+        return self._mapped(x, lambda v: torch.logaddexp(v, zero), lambda v, _: v.sigmoid(), ulps)
 
     def sum(self, x: Tensor, dim: int) -> Tensor:
         """Adds up a dimension; rounds as ``added`` does, and not the total."""
-        return _Sum.apply(x, (dim % x.dim(),), self)
+        dim %= x.dim()
+        back = lambda v: v.unsqueeze(dim).expand(x.shape)  # noqa: E731
+        return _Step.apply(x, lambda x: self.added(x, (dim,)), back)
 
     def share(self, x: Tensor, *shape: int) -> Tensor:
         """Expands ``x`` to a shape (-1 keeps a size); its gradient is a sum as of ``added``."""
         sizes = tuple(a if b < 0 else b for a, b in zip(x.shape, shape, strict=True))
-        return _Share.apply(x, sizes, self)
+        dims = tuple(d for d, (a, b) in enumerate(zip(x.shape, sizes)) if a != b)
+        back = lambda v: self.added(v, dims).reshape(x.shape)  # noqa: E731
+        return _Step.apply(x, lambda x: x.expand(sizes), back)
 
     def sigmoid(self, x: Tensor, ulps: float) -> Tensor:
         """Computes 1 / (1 + e^-x) to ``ulps``."""
-        return _Map.apply(x, torch.sigmoid, lambda _, y: y * (1 - y), self, ulps)
+        return self._mapped(x, torch.sigmoid, lambda _, y: y * (1 - y), ulps)
+
+    def _mapped(self, x: Tensor, function: Callable, slope: Callable, ulps: float) -> Tensor:
+        with torch.no_grad():
+            y = self.rounded(function(x), ulps)
+            rate = self.rounded(slope(x, y), ulps)
+        back = lambda v: self.rounded(v * rate, 1.0, up=False)  # noqa: E731
+        return _Step.apply(x, lambda _: y, back)
 
     def rounded(self, x: Tensor, ulps: float, up: bool = True) -> Tensor:
         """Rounds as the call does, without a gradient.
