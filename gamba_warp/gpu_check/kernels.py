@@ -9,9 +9,8 @@ from __future__ import annotations
 import importlib.util
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -52,8 +51,7 @@ class LeftOut(Exception):
     """Raised by a check that cannot be done here; ``str(error)`` says why."""
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """Something that must hold on a device.
 
     Attributes:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 import warp as wp
 
+from ..errors import first_line
 from ..files import write_json
 from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.cases import conv, raster, scan
@@ -22,6 +25,7 @@ from ..kernels.bench.static.report import find_kernels
 from ..measure import blocks, inference
 from .kernels import LeftOut, checks
 
+_Item = TypeVar("_Item")
 _SUITES = (raster, scan, conv, blocks)
 # These cases are timed first, since the time may end before the list does; all others follow.
 _FIRST = [
@@ -69,9 +73,14 @@ class Part:
         """Records that something is not done, and why."""
         self.not_done.append({"what": what, "reason": reason})
 
-    def time_is_up(self) -> bool:
-        """Tells whether no further item may begin."""
-        return time.time() > self.until or os.getppid() != self.parent
+    def in_time(self, items: Iterable[_Item], name: Callable[[_Item], str]) -> Iterator[_Item]:
+        """Yields items while there is time and somebody waits, and writes after each."""
+        for item in items:
+            if time.time() > self.until or os.getppid() != self.parent:
+                self.leave_out(name(item), "time was up")
+            else:
+                yield item
+                self.write()
 
 
 def run_step(name: str, part: Part, settings: Settings) -> None:
@@ -94,45 +103,31 @@ def _compile(part: Part, settings: Settings) -> None:
     device = wp.device_from_torch(settings.device)
     entries = find_kernels()
     part.result = {"kernels": 0, "of": len(entries), "seconds": 0.0}
-    for entry in entries:
-        if part.time_is_up():
-            part.leave_out(f"compile {entry.name}, {entry.case}", "time was up")
-            continue
+    for entry in part.in_time(entries, lambda e: f"compile {e.name}, {e.case}"):
         started = time.perf_counter()
         kernel, block = entry.launch.kernel, entry.launch.block
         if not kernel.module.load(device, block):
             part.failures.append(f"{entry.name}, {entry.case}: does not load on {device}")
         part.result["kernels"] += 1
         part.result["seconds"] += time.perf_counter() - started
-        part.write()
 
 
 def _checks(part: Part, settings: Settings) -> None:
     found = part.result["checks"] = []
-    for check in checks(settings.level == "quick"):
-        if check.cuda and settings.device.type != "cuda":
-            part.leave_out(check.name, "needs CUDA")
-            continue
-        if part.time_is_up():
-            part.leave_out(check.name, "time was up")
-            continue
+    for check in part.in_time(checks(settings.level == "quick"), lambda check: check.name):
         started = time.perf_counter()
-        row = {"name": check.name, "status": "passed"}
+        row: dict[str, Any] = {"name": check.name, "status": "passed"}
         try:
+            if check.cuda and settings.device.type != "cuda":
+                raise LeftOut("needs CUDA")
             row["found"] = check.run(settings.device)
         except LeftOut as reason:
             part.leave_out(check.name, str(reason))
             continue
         except Exception as error:  # a broken kernel may raise anything, and that is a finding
-            row |= {"status": "failed", "found": _first_line(error)}
+            row |= {"status": "failed", "found": f"{type(error).__name__}: {first_line(error)}"}
             part.failures.append(f"{check.name}: {row['found']}")
         found.append(row | {"seconds": time.perf_counter() - started})
-        part.write()
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def _inference(part: Part, settings: Settings) -> None:
@@ -146,26 +141,25 @@ def _inference(part: Part, settings: Settings) -> None:
 
 def _ceilings(settings: Settings) -> dict[str, float]:
     """Measures what the device does at best, to judge times by: a copy and a matrix product."""
-    count = 1 << (20 if settings.level == "quick" else 30)
-    side = 256 if settings.level == "quick" else 8192
+    count, side = (1 << 20, 256) if settings.level == "quick" else (1 << 30, 8192)
     source = torch.ones(count // 4, device=settings.device)
-    target = torch.empty_like(source)
     a = torch.randn(side, side, device=settings.device).bfloat16()
+    target = torch.empty_like(source)
+
+    def seconds(run: Callable[[], object]) -> float:
+        spans = []
+        for _ in range(5):
+            started = time.perf_counter()
+            run()
+            if settings.device.type == "cuda":
+                torch.cuda.synchronize(settings.device)
+            spans.append(time.perf_counter() - started)
+        return min(spans)
+
     return {
-        "copy_gb_per_s": 2 * count / _seconds(lambda: target.copy_(source), settings) / 1e9,
-        "bfloat16_tflop_per_s": 2 * side**3 / _seconds(lambda: a @ a, settings) / 1e12,
+        "copy_gb_per_s": 2 * count / seconds(lambda: target.copy_(source)) / 1e9,
+        "bfloat16_tflop_per_s": 2 * side**3 / seconds(lambda: a @ a) / 1e12,
     }
-
-
-def _seconds(run, settings: Settings, rounds: int = 5) -> float:
-    best = float("inf")
-    for _ in range(rounds):
-        started = time.perf_counter()
-        run()
-        if settings.device.type == "cuda":
-            torch.cuda.synchronize(settings.device)
-        best = min(best, time.perf_counter() - started)
-    return best
 
 
 def _bench(
@@ -189,23 +183,15 @@ def _bench(
 def _measure(part: Part, settings: Settings, cases: list[Case], targets: list[Target]) -> None:
     """Measures case after case; a fault of ours is a failure, a fault of a peer only a note."""
     document = part.result["bench"] = measure([], settings)
-    for case in cases:
-        if part.time_is_up():
-            part.leave_out(f"{case.op}: {case.name}", "time was up")
-            continue
+    for case in part.in_time(cases, lambda case: f"{case.op}: {case.name}"):
         records = measure([case], settings)["records"]
         document["records"] += records
         document["targets"] = judge(targets, document["records"])
-        for record in records:
-            _note(part, record)
-        part.write()
-
-
-def _note(part: Part, record: dict) -> None:
-    name = f"{record['op']}: {record['case']}: {record['variant']}, {record['direction']}"
-    if record["status"] == "ok":
-        return
-    if record["is_peer"] or record["status"].startswith("not"):
-        part.leave_out(name, record["status"])
-    else:
-        part.failures.append(f"{name}: {record['status']}")
+        for r in records:
+            name = f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}"
+            if r["status"] == "ok":
+                continue
+            if r["is_peer"] or r["status"].startswith("not"):
+                part.leave_out(name, r["status"])
+            else:
+                part.failures.append(f"{name}: {r['status']}")
