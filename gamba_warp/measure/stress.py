@@ -63,7 +63,16 @@ def build(case: Case, device: torch.device) -> tuple[Gamba, dict[str, Tensor], C
         size, batch = config.image_size, o["batch"]
         images = torch.rand(batch, size, size, 3)
         angles = 360 * torch.rand(batch)
-    images = _picture(kind, images)
+    if kind in ("white", "black"):
+        images = torch.full_like(images, float(kind == "white"))
+    elif kind == "checkerboard":
+        lines = torch.arange(size)
+        images = images * 0 + ((lines[:, None] + lines) % 2)[:, :, None]
+    elif kind == "one pixel":
+        images = torch.zeros_like(images)
+        images[:, 0, 0] = 1
+    elif kind == "out of range":
+        images = images * 1e3
     inputs = {"images": images}
     if o["image_tokens"]:
         shape = batch, o["image_tokens"], _IMAGE_CHANNELS
@@ -88,18 +97,6 @@ def _change(model: Gamba, kind: str) -> None:
     if kind == "saturated heads":
         for head in (model.decoder.position, model.decoder.opacity, model.decoder.scale):
             head.weight *= 300
-
-
-def _picture(kind: str, images: Tensor) -> Tensor:
-    if kind in ("white", "black"):
-        return torch.full_like(images, float(kind == "white"))
-    if kind == "checkerboard":
-        rows, columns = (torch.arange(n) for n in images.shape[1:3])
-        return images * 0 + ((rows[:, None] + columns) % 2)[:, :, None]
-    if kind == "one pixel":
-        images = torch.zeros_like(images)
-        images[:, 0, 0] = 1
-    return images * 1e3 if kind == "out of range" else images
 
 
 class _Oracle:

@@ -27,36 +27,6 @@ GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
 _DISTANCE = 1.6
 
 
-def _scales(kind: str, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
-    """``[B, N, 3]`` for a kind; else log-normal around 0.06."""
-    uniform, normal = torch.rand(shape, generator=g), torch.randn(shape, generator=g)
-    first = torch.tensor([1.0, 0.0, 0.0]).expand(shape)
-    named = {
-        "needles": 10 ** (-5 + (4.5 + 2 * uniform) * first),
-        "discs": 10 ** (-5 + (4.5 + uniform) * (1 - first)),
-        "points": 1e-9 * torch.exp(normal),
-        "all sizes": 10 ** (-9 + 12 * uniform),
-        "huge on screen": 10 ** (4 * uniform - 1),
-        "edge of range": 10 ** (4 + 12 * uniform),
-        "near plane": 10 ** (2 * uniform - 3),
-        "around the camera": 10 ** (3 * uniform - 4),
-    }
-    return named.get(kind, 0.06 * torch.exp(0.5 * normal))
-
-
-def _opacities(o: dict, kind: str, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
-    uniform = torch.rand(shape, generator=g)
-    if kind == "opaque":  # at the clamp, just below and above it, and at 1
-        return torch.where(uniform < 0.5, o["alpha_max"] + 2e-3 * (uniform - 0.25), 1 - uniform / 9)
-    if kind == "faint":
-        around = o["alpha_min"] * (1 + 10 ** (-7 * uniform))
-        around = torch.where(uniform < 0.3, o["alpha_min"] * (0.9 + uniform), around)
-        return torch.where(uniform > 0.9, torch.full_like(uniform, o["alpha_min"]), around)
-    if kind in ("huge on screen", "edge of range", "heap"):
-        return 0.3 * uniform
-    return 0.99 * uniform + 0.005
-
-
 def _points(kind: str, batch: int, num: int, g: torch.Generator) -> Tensor:
     """Centres ``[B, N, 3]`` in the first camera's frame (float64)."""
     normal = torch.randn(batch, num, 3, generator=g).double()
@@ -100,14 +70,40 @@ def _cameras(o: dict, kind: str, batch: int, g: torch.Generator) -> tuple[Tensor
     return viewmats, Ks
 
 
-def _quats(kind: str, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
-    quats = torch.randn(shape, generator=g)
+def _shapes(o: dict, kind: str, sizes: tuple[int, int], g: dict) -> dict[str, Tensor | None]:
+    """Quaternions, scales (log-normal around 0.06 if the kind asks for nothing), opacities."""
+    quats = torch.randn(*sizes, 4, generator=g["quats"])
     if kind == "odd quaternions":  # of any length, 0 included; some have one entry only
-        uniform = torch.rand(*shape[:-1], 1, generator=g)
+        uniform = torch.rand(*sizes, 1, generator=g["quats"])
         quats = torch.nn.functional.normalize(quats, dim=-1) * 10 ** (60 * uniform - 30)
         quats = torch.where(uniform < 0.1, 0.0, quats)
         quats = torch.where(uniform > 0.8, quats * torch.tensor([0.0, 1, 0, 0]), quats)
-    return quats
+    uniform = torch.rand(*sizes, 3, generator=g["scales"])
+    normal = torch.randn(*sizes, 3, generator=g["scales"])
+    first = torch.tensor([1.0, 0.0, 0.0]).expand(*sizes, 3)
+    scales = {
+        "needles": 10 ** (-5 + (4.5 + 2 * uniform) * first),
+        "discs": 10 ** (-5 + (4.5 + uniform) * (1 - first)),
+        "points": 1e-9 * torch.exp(normal),
+        "all sizes": 10 ** (-9 + 12 * uniform),
+        "huge on screen": 10 ** (4 * uniform - 1),
+        "edge of range": 10 ** (4 + 12 * uniform),
+        "near plane": 10 ** (2 * uniform - 3),
+        "around the camera": 10 ** (3 * uniform - 4),
+    }.get(kind, 0.06 * torch.exp(0.5 * normal))
+    uniform = torch.rand(sizes, generator=g["opacities"])
+    opacities = 0.99 * uniform + 0.005
+    if kind == "opaque":  # at the clamp, just below and above it, and at 1
+        near = o["alpha_max"] + 2e-3 * (uniform - 0.25)
+        opacities = torch.where(uniform < 0.5, near, 1 - uniform / 9)
+    elif kind == "faint":
+        around = o["alpha_min"] * (1 + 10 ** (-7 * uniform))
+        around = torch.where(uniform < 0.3, o["alpha_min"] * (0.9 + uniform), around)
+        opacities = torch.where(uniform > 0.9, torch.full_like(uniform, o["alpha_min"]), around)
+    elif kind in ("huge on screen", "edge of range", "heap"):
+        opacities = 0.3 * uniform
+    quats = quats if o["use_quats"] else None
+    return {"quats": quats, "scales": scales, "opacities": opacities}
 
 
 def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
@@ -125,9 +121,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
         colors = (batch, *([o["views"]] if o["colors_per_view"] else []), num, o["channels"])
     made = {
         "means": points.float(),
-        "quats": _quats(kind, (batch, num, 4), g["quats"]) if o["use_quats"] else None,
-        "scales": _scales(kind, (batch, num, 3), g["scales"]),
-        "opacities": _opacities(o, kind, (batch, num), g["opacities"]),
+        **_shapes(o, kind, (batch, num), g),
         "colors": fill(colors, o["colors"], g["colors"]),
     }
     dtype = DTYPES[o["dtype"]]

@@ -108,33 +108,27 @@ def _fit(options: dict) -> dict:
     return o
 
 
-def _steps(o: dict, shape: tuple[int, ...], g: torch.Generator) -> Tensor:
-    """The steps by the name of its range, before a softplus or as it is used."""
-    uniform = torch.rand(shape, generator=g)
-    normal = torch.randn(shape, generator=g)
-    if o["delta"] == "signed":
-        return 0.02 * normal
+def _steps_and_rates(o: dict, shape: tuple[int, ...], g: dict) -> tuple[Tensor, Tensor]:
+    """The steps, before a softplus or as they are used, and ``A [D, N]``, by their ranges."""
+    uniform = torch.rand(shape, generator=g["delta"])
+    normal = torch.randn(shape, generator=g["delta"])
     if o["softplus"]:
-        named = {
+        steps = {
             "steps": -4 + 1.5 * normal, "wide": 30 * normal, "constant": 0 * normal - 3.3,
             "off": -100 + normal, "on": 100 + normal, "at 20": 20 + 1e-3 * normal,
         }  # fmt: skip
     else:
-        named = {
+        steps = {
             "steps": 10 ** (2 * uniform - 3), "wide": 10 ** (8 * uniform - 6),
             "constant": 0 * uniform + 0.037, "on": 30 + 70 * uniform,
         }  # fmt: skip
-    return named[o["delta"]]
-
-
-def _rates(o: dict, g: torch.Generator) -> Tensor:
-    """``A [D, N]`` by the name of its range."""
-    shape = o["channels"], o["states"]
-    noise = torch.rand(shape, generator=g)
-    if o["A"] == "model":
-        return -torch.arange(1.0, shape[1] + 1) * (0.9 + 0.2 * noise)
-    named = {"slow": 0 * noise + 1e-6, "zero": 0 * noise, "fast": 1e3 * (1 + noise)}
-    return -named.get(o["A"], 10 ** (9 * noise - 6))
+    noise = torch.rand(o["channels"], o["states"], generator=g["A"])
+    rates = {
+        "model": torch.arange(1.0, o["states"] + 1) * (0.9 + 0.2 * noise), "slow": 0 * noise + 1e-6,
+        "zero": 0 * noise, "fast": 1e3 * (1 + noise), "wide": 10 ** (9 * noise - 6),
+    }  # fmt: skip
+    steps["signed"] = 0.02 * normal
+    return steps[o["delta"]], -rates[o["A"]]
 
 
 def laid(x: Tensor, layout: str) -> Tensor:
@@ -155,11 +149,12 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     token, grouped = (batch, length, channels), (batch, length, o["groups"], n)
     g = {name: generator(case, name) for name in ("u", "delta", "A", "B", "C", "z", "rest")}
     rest = lambda *shape: torch.randn(*shape, generator=g["rest"])  # noqa: E731
+    steps, rates = _steps_and_rates(o, token, g)
     B_shape = (channels, n) if o["constant_B"] else grouped
     made = {
         "u": fill(token, o["u"], g["u"]),
-        "delta": _steps(o, token, g["delta"]),
-        "A": _rates(o, g["A"]),
+        "delta": steps,
+        "A": rates,
         "B": fill(B_shape, o["B"], g["B"]),
         "C": fill(grouped, o["C"], g["C"]),
         "D": rest(channels) if o["use_D"] else None,

@@ -24,15 +24,6 @@ def draw_cases(ops: Sequence[Op], seed: int) -> Iterator[tuple[Op, Case]]:
         count += 1
 
 
-def _simpler(op: Op, case: Case, name: str) -> list[Case]:
-    """Cases with one option (or "kind") nearer to its plain value, largest step first."""
-    if name == "kind":
-        return [replace(case, kind=op.kinds[0])]
-    value, plain = case.options[name], op.plain[name]
-    steps = [plain, (value + plain) // 2, value - 1] if type(value) is int else [plain]
-    return [replace(case, options=op.valid(case.options | {name: step})) for step in steps]
-
-
 def _size(op: Op, case: Case) -> float:
     """Measures how far the options are from plain; shrinking only ever lowers it."""
     pairs = [(case.options[name], plain) for name, plain in op.plain.items()]
@@ -54,7 +45,15 @@ def shrink(
     while improved:
         improved = False
         for name in ("kind", *op.plain):
-            for candidate in _simpler(op, case, name):
+            if name == "kind":
+                simpler = [replace(case, kind=op.kinds[0])]
+            else:  # the largest step towards the plain value first
+                value, plain = case.options[name], op.plain[name]
+                whole = type(value) is int
+                steps = [plain, (value + plain) // 2, value - 1] if whole else [plain]
+                options = [op.valid(case.options | {name: step}) for step in steps]
+                simpler = [replace(case, options=o) for o in options]
+            for candidate in simpler:
                 if time.monotonic() >= end:
                     return case, outcome, tried
                 if _size(op, candidate) >= _size(op, case):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.stress import Case, run_case
 from gamba_warp.kernels.stress.cases import raster
 from gamba_warp.kernels.stress.core.case import Comparison, Outcome, judge
@@ -198,3 +199,18 @@ def test_a_gradient_that_is_not_finite_beside_poison_is_a_failure(monkeypatch):
         monkeypatch.setattr(raster, "gradients_of", leaking)
         failure = run_case(raster.OP, case, CPU).failure()
         assert failure and "gradient of scales not finite" in failure["name"], row
+
+
+@pytest.mark.parametrize("kind", ["needles", "all sizes", "huge on screen"])
+def test_the_reference_in_float32_is_far_off(monkeypatch, kind):
+    """So limits come from a formula in the kernels' order: README.md, "Formulas of their own"."""
+
+    def by_reference(render_mode, rasterize_mode, sh_degree, skip, radius_clip, **x):
+        colors, _, alphas = rasterization_reference(**x)
+        return colors, alphas, None
+
+    options = dict(num=30, width=17, height=13, channels=3, use_quats=True)
+    case = Case("raster", kind, 1, raster.OP.plain | options)
+    assert raster.evaluate(case, CPU).worst.ratio < 0.5
+    monkeypatch.setattr(raster, "rasterization", by_reference)
+    assert raster.evaluate(case, CPU).worst.ratio > 100
