@@ -8,7 +8,7 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test bench docs lint format architecture constraints clean
+.PHONY: setup demo test bench study docs lint format architecture constraints clean
 
 setup: $(STAMP)
 
@@ -34,6 +34,10 @@ test: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench
+
+# What the project asks of itself (docs/lab/studies): make study WHAT="growth --quick".
+study: $(STAMP)
+	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
 
 # The site, in site/: a broken link, anchor or docstring is an error.
 docs: $(STAMP)

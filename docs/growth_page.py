@@ -1,8 +1,9 @@
-r"""Writes the tables and pictures of docs/growth.md from docs/benchmarks/cpu-growth.json.
+"""Writes the tables and pictures of docs/growth.md from docs/benchmarks/cpu-growth.json.
 
-After ``gamba bench growth`` in one run or in parts:
+After ``make study WHAT=growth`` in one run or in parts:
 
-    gamba bench --render out/a/bench.json out/b/bench.json --out docs/benchmarks/cpu-growth.json
+    make study WHAT="--render out/a/bench.json out/b/bench.json --out out/growth.json"
+    cp out/growth.json docs/benchmarks/cpu-growth.json
     python docs/growth_page.py
 """
 
@@ -12,14 +13,14 @@ import sys
 from pathlib import Path
 
 import torch
+from lab.studies import growth, growth_errors
+from lab.studies.picture import growth_picture
+from lab.studies.slopes import ERRORS, growth_lines, growth_table
 from page_parts import table, with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
-from gamba_warp.kernels.bench.core.growth import ERRORS, growth_lines, growth_table
-from gamba_warp.kernels.bench.core.picture import growth_picture
 from gamba_warp.kernels.bench.core.report import groups, machine_line
-from gamba_warp.measure import growth, growth_errors
 from gamba_warp.measure.suites import make_settings, read_document
 
 HERE = Path(__file__).parent

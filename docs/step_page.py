@@ -2,8 +2,8 @@ r"""Writes the tables of docs/step.md from docs/benchmarks/cpu-step.json and cpu
 
 After both measurements:
 
-    gamba bench step --threads 1 --data starter/data --out out/step
-    gamba bench model --only precision --out out/model
+    make study WHAT="step --threads 1 --data starter/data --out out/step"
+    make study WHAT="model --out out/model"
     gamba bench --render out/step/bench.json --out docs/benchmarks/cpu-step.json
     gamba bench --render out/model/bench.json --out docs/benchmarks/cpu-precision.json
     python docs/step_page.py
@@ -16,11 +16,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lab.studies.parts import WHOLE, parts_of
 from page_parts import table, with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
-from gamba_warp.kernels.bench.core.parts import WHOLE, parts_of
 from gamba_warp.kernels.bench.core.report import machine_line
 from gamba_warp.measure.suites import read_document
 

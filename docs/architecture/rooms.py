@@ -44,9 +44,7 @@ _RESULTS = (
     "pages",
 )
 _MEASURES = (*_RESULTS, *_BENCH, *_STRESS)
-_TRAIN = (
-    *("train.config", "train.objective", "train", "train.data", "train.sources", "train.bench"),
-)
+_TRAIN = (*("train.config", "train.objective", "train", "train.data", "train.sources"),)
 _EVAL = ("eval", "eval.views", "eval.shapes")
 
 ROOMS = {
@@ -111,10 +109,6 @@ ROOMS = {
         "batches, loop, checkpoints",
         (*_LIBRARY, "train.config", "train.objective", "train.data", "train.sources"),
         ("pages",),
-    ),
-    "train.bench": Room(
-        "benchmarks of a step and of the loader",
-        (*_LIBRARY, *_BENCH, *(room for room in _TRAIN if room != "train.bench")),
     ),
     "eval": Room("the report that both evaluations share", _READERS),
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),

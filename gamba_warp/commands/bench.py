@@ -11,7 +11,6 @@ import tyro
 
 from ..conventions import DeviceChoice
 from ..devices import pick_device
-from ..errors import UserError
 from ..files import output_folder
 from ..untrusted.ranges import Threads, ranged
 
@@ -23,15 +22,7 @@ SUITES = {
     "raster": "gamba_warp.kernels.bench.cases.raster",
     "block": "gamba_warp.measure.blocks",
     "model": "gamba_warp.measure.blocks",
-    "lengths": "gamba_warp.measure.lengths",
-    "step": "gamba_warp.train.bench.step",
-    "growth-scan": "gamba_warp.measure.growth",
-    "growth-raster": "gamba_warp.measure.growth",
-    "growth-errors": "gamba_warp.measure.growth_errors",
-    "loader": "gamba_warp.train.bench.loader",
 }
-# Words for several of them.
-GROUPS = {"growth": ("growth-scan", "growth-raster", "growth-errors"), "all": tuple(SUITES)}
 
 
 @ranged
@@ -49,7 +40,6 @@ def bench_command(
     compare: Path | None = None,
     render: tuple[Path, ...] = (),
     static: bool = False,
-    data: Path | None = None,
     only: tuple[str, ...] = (),
 ) -> int:
     """Measures run time against error, with what is installed beside us.
@@ -58,9 +48,7 @@ def bench_command(
     bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
 
     Args:
-        what: scan, conv, raster, block, model, lengths (a Mamba block against a transformer block
-            over the number of tokens), growth (time, memory and errors over every size, with
-            slopes; growth-scan, growth-raster and growth-errors are its parts), step, or all.
+        what: scan, conv, raster, block, model, or all.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes, many rounds, and the torch loop at full length.
@@ -68,13 +56,12 @@ def bench_command(
         out: Folder for the results. With --render it may be a .md or .html file.
         threads: Number of CPU threads; torch's own number if not given.
         compare: An older bench.json; prints the ratios of the times.
-        render: Measure nothing; make the tables and the page of these JSON files. With an --out
-            that ends in .svg it draws their charts of growth, with .json it joins them.
+        render: Measure nothing; make the tables and the page of these JSON files, or with an --out
+            that ends in .json one of them all.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
             (registers, stack, shared memory, occupancy) to static.json and static.md; with nvdisasm
             (on PATH, in CUDA_HOME or inside Triton) also instructions, and the scan's least times.
-        data: Folder of posed views for step; made-up views if not given.
-        only: Measure only these cases, by their full names, as L or "random, float32".
+        only: Measure only these cases, by their full names, as "one call".
     """
     from ..measure import suites
 
@@ -87,8 +74,8 @@ def bench_command(
         first, *others = suites.write_pages([suites.read_document(path) for path in render], out)
         print(" and ".join([f"wrote {first}", *(path.name for path in others)]))
         return 0
-    chosen = _choose_suites(what)
-    settings = suites.make_settings(pick_device(device), quick, full, peers, threads, data)
+    chosen = suites.choose(what, SUITES, {"all": tuple(SUITES)})
+    settings = suites.make_settings(pick_device(device), quick, full, peers, threads)
     old = suites.read_document(compare) if compare is not None else None
     folder = output_folder(out)
     document = suites.run_suites({op: load_suite(op) for op in chosen}, settings, only)
@@ -99,16 +86,6 @@ def bench_command(
         print("interrupted; what was measured is kept")
         return 130
     return 1 if suites.failed_records(document) else 0
-
-
-def _choose_suites(what: tuple[str, ...]) -> list[str]:
-    """Those of ``SUITES`` that are named. Raises UserError where a name is not known."""
-    unknown = [name for name in what if name not in (*SUITES, *GROUPS)]
-    if unknown:
-        *known, last = *SUITES, *GROUPS
-        raise UserError(f"unknown case '{unknown[0]}'; there are {', '.join(known)} and {last}")
-    named = {part for name in what for part in GROUPS.get(name, (name,))}
-    return [name for name in SUITES if name in named]
 
 
 def load_suite(op: str) -> ModuleType:

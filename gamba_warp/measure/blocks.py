@@ -31,8 +31,6 @@ _PRODUCTS = {
 
 def cases(settings: Settings) -> list[Case]:
     """Returns all cases of blocks and models at the level's sizes."""
-    from .precision import precisions  # which needs this module
-
     builders = [
         ("block", "one block", partial(_blocks, depth=1)),
         ("block", "backbone", partial(_blocks, depth=2 if settings.level == "quick" else 14)),
@@ -40,7 +38,6 @@ def cases(settings: Settings) -> list[Case]:
         ("model", "one picture", pictures),
         ("model", "batch", batches),
         ("model", "background tokens", background_tokens),
-        ("model", "precision", precisions),
     ]
     texts = {
         "one block": "A block of the paper's size on one picture's tokens, beside its matrix "
@@ -52,7 +49,7 @@ def cases(settings: Settings) -> list[Case]:
         "their matrix products alone, and with the condition prepended and dropped in each block.",
     }
     axes = {"one block": "error", "backbone": "error", "compiled": "error", "batch": "B"}
-    axes |= {"background tokens": "error,skipped", "precision": "error"}
+    axes |= {"background tokens": "error,skipped"}
     return [
         Case(
             op=op,
@@ -362,11 +359,9 @@ def compiled(settings: Settings) -> list[Variant]:
 
 def targets(settings: Settings) -> list[Target]:
     """Returns the targets; there are none at a quick run's sizes."""
-    from .precision import precision_targets  # which needs this module
-
     if settings.level == "quick":
         return []
-    blocks = [
+    return [
         Target(
             text=f"{case}, time over that of its matrix products alone",
             times=(Key("block", case, "default"),),
@@ -375,4 +370,3 @@ def targets(settings: Settings) -> list[Target]:
         )
         for case in ("one block", "backbone")
     ]
-    return [*blocks, *precision_targets(settings)]

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from ..batch import progress_bar
 from ..errors import UserError
-from ..files import atomic_path, output_folder, write_json
+from ..files import output_folder, write_json, write_text
 from ..kernels.bench import Case, Settings, Target, measure
-from ..kernels.bench.core.crossing import crossings
 from ..kernels.bench.core.document import check_document
-from ..kernels.bench.core.growth import growth_lines
 from ..kernels.bench.core.page import page
-from ..kernels.bench.core.picture import growth_picture
 from ..kernels.bench.core.report import groups, judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.page import static_markdown
 from ..kernels.bench.static.report import NoCompiler, static_report
 from ..untrusted import documents
+
+Maker = Callable[[Sequence[dict]], str]  # of documents, a page
 
 
 def make_settings(
@@ -50,6 +48,22 @@ def make_settings(
         threads=threads or torch.get_num_threads(),
         data=data,
     )
+
+
+def choose(
+    what: Sequence[str], known: Iterable[str], groups: Mapping[str, Sequence[str]]
+) -> list[str]:
+    """Those of ``known`` that are named, by themselves or by the word for a group, in their order.
+
+    Raises:
+        UserError: a name is not known.
+    """
+    names = [*known, *groups]
+    if unknown := [name for name in what if name not in names]:
+        listed = f"{', '.join(names[:-1])} and {names[-1]}"
+        raise UserError(f"unknown case '{unknown[0]}'; there are {listed}")
+    named = {part for name in what for part in groups.get(name, (name,))}
+    return [name for name in names if name in named]
 
 
 def run_suites(
@@ -79,24 +93,18 @@ def run_suites(
             raise UserError(f"--only {unknown[0]}: no such case; there are {'; '.join(names)}")
         cases = [case for case in cases if case.name in only]
     with progress_bar(total=len(cases), unit="case", desc="bench") as bar:
-        document = measure(cases, settings, _progress(bar))
+        seen: list[str] = []
+
+        def say(case: str, variant: str) -> None:
+            if seen[-1:] not in ([], [case]):
+                bar.update()
+            seen.append(case)
+            bar.set_postfix_str(f"{case}, {variant}")
+
+        document = measure(cases, settings, say)
     document["machine"]["peers"] = versions() if settings.peers else {}
     document["targets"] = judge(targets, document["records"])
-    document["crossings"] = [c._asdict() for c in crossings(document["records"])]
     return document
-
-
-def _progress(bar: tqdm) -> Callable[[str, str], None]:
-    """Shows what is under way; the bar moves on when the case changes."""
-    current: list[str | None] = [None]
-
-    def say(case: str, variant: str) -> None:
-        if current[0] not in (None, case):
-            bar.update()
-        current[0] = case
-        bar.set_postfix_str(f"{case}, {variant}")
-
-    return say
 
 
 def read_document(path: Path) -> dict:
@@ -111,39 +119,43 @@ def read_document(path: Path) -> dict:
         raise UserError(f"{path}: {error}") from error
 
 
-def write_document(document: dict, folder: Path) -> None:
-    """Writes bench.json, bench.md and bench.html."""
+def write_document(
+    document: dict, folder: Path, tables: Maker = markdown, charts: Maker = page
+) -> None:
+    """Writes bench.json, bench.md and bench.html; ``tables`` and ``charts`` make the last two."""
     write_json(folder / "bench.json", document)
-    _write_pages([document], folder)
+    write_pages([document], folder, tables, charts)
 
 
-def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
+def write_pages(
+    documents: Sequence[dict], out: Path, tables: Maker = markdown, charts: Maker = page
+) -> list[Path]:
     """Writes the tables and the page of documents.
 
     Args:
         documents: as ``read_document`` returns them.
-        out: a .md or .html file, or a folder for bench.md and bench.html; a .svg file gets the
-            charts of growth, a .json file all records in one document.
+        out: a .md or .html file, or a folder for bench.md and bench.html; a .json file gets all
+            records in one document.
+        tables: what makes the Markdown.
+        charts: what makes the page.
 
     Returns:
         The files.
 
     Raises:
-        UserError: nothing grows in the documents, or they are not of one machine and level.
+        UserError: the documents are not of one machine and level, or a file cannot be written.
     """
     if out.suffix == ".json":
         write_json(out, join(documents))
         return [out]
-    if out.suffix == ".svg":
-        picture = growth_picture(documents)
-        if not picture:
-            raise UserError(f"--out {out}: these results have no cases of growth to draw")
-        _write(out, picture)
-        return [out]
-    if out.suffix in (".md", ".html"):
-        _write(out, markdown(documents) if out.suffix == ".md" else page(documents))
-        return [out]
-    return _write_pages(documents, output_folder(out))
+    makers = {".md": tables, ".html": charts}
+    if out.suffix in makers:
+        paths = [out]
+    else:
+        paths = [output_folder(out) / f"bench{suffix}" for suffix in makers]
+    for path in paths:
+        write_text(path, makers[path.suffix](documents))
+    return paths
 
 
 def join(documents: Sequence[dict]) -> dict:
@@ -167,19 +179,7 @@ def join(documents: Sequence[dict]) -> dict:
     joined["machine"] = first["machine"] | {"date": documents[-1]["machine"]["date"]}
     joined["interrupted"] = any(document["interrupted"] for document in documents)
     joined["targets"] = [t for document in documents for t in document.get("targets", [])]
-    joined["crossings"] = [c._asdict() for c in crossings(joined["records"])]
     return joined
-
-
-def _write_pages(documents: Sequence[dict], folder: Path) -> list[Path]:
-    _write(folder / "bench.md", markdown(documents))
-    _write(folder / "bench.html", page(documents))
-    return [folder / "bench.md", folder / "bench.html"]
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def write_static(folder: Path) -> int:
@@ -202,7 +202,7 @@ def write_static(folder: Path) -> int:
         except NoCompiler as error:
             raise UserError(f"--static: {error}") from error
     write_json(folder / "static.json", document)
-    _write(folder / "static.md", static_markdown(document))
+    write_text(folder / "static.md", static_markdown(document))
     return len(document["kernels"])
 
 
@@ -218,9 +218,6 @@ def summary(document: dict, old: dict | None) -> str:
         word = {True: "reached", False: "missed", None: "not measured"}[t["reached"]]
         value = "" if t["value"] is None else f"{t['value']:.3g}"
         lines.append(f"{word:<12} {value:>8}  ({t['wanted']})  {t['op']}: {t['text']}")
-    lines += [f"{c.op}: {c.text()}" for c in crossings(document["records"])]
-    for op, cases in groups(document).items():
-        lines += [f"{op}: {line}" for records in cases.values() for line in growth_lines(records)]
     stopped = (r for r in document["records"] if r["status"].startswith("stopped"))
     lines += [f"{r['op']}: {r['variant']}, {r['direction']}: {r['status']}" for r in stopped]
     if old is not None:

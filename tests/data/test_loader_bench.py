@@ -3,8 +3,8 @@
 import pytest
 import torch
 from helpers import micro
+from lab.studies.training import loader
 
-from gamba_warp.commands import bench
 from gamba_warp.kernels.bench import Settings, measure
 
 
@@ -12,8 +12,7 @@ from gamba_warp.kernels.bench import Settings, measure
 def test_the_loader_is_measured(tmp_path, given):
     data = micro.write_dataset(tmp_path / "clouds") if given else None
     settings = Settings(device=torch.device("cpu"), level="quick", data=data)
-    module = bench.load_suite("loader")
-    records = measure(module.cases(settings), settings)["records"]
+    records = measure(loader.cases(settings), settings)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4, records
     names = [r["variant"] for r in records]
     assert names == ["files", "files, --cache", "pack", "pack, --cache-device"]

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from .bars import bars
 from .charts import Axis, Point, Series, chart, pareto
-from .crossing import FIGURES, crossings, series_of
-from .growth import ERRORS, GROWTH, error_charts, growth_charts, growth_lines, growth_table
-from .parts import parts_of, parts_table
-from .report import EXPLANATION, TARGET_HEADER, groups, machine_line, oracles, table, target_rows
+from .report import (
+    EXPLANATION,
+    TARGET_HEADER,
+    More,
+    groups,
+    machine_line,
+    nothing_more,
+    oracles,
+    table,
+    target_rows,
+)
 
 _NUMBER = re.compile(r"[0-9.,e-]+( to [0-9.,e-]+)?")
 _AXES = {
@@ -43,62 +49,22 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
         return [_memory_chart(done)]
     if axis in ("skipped", "switched off"):
         return [_skip_chart(done, axis == "switched off")]
-    if axis == "parts":
-        split = [(r["variant"], {n: sum(t) for n, t in parts_of(r).items()}) for r in done]
-        few = (dict(split[i : i + 3]) for i in range(0, len(split), 3))  # a colour each
-        return [bars(series, "milliseconds of a run") for series in few]
-    if axis == "share":
-        return _share_charts(case, done)
-    if axis == "lengths":
-        return _length_charts(done)
-    if axis == ERRORS:
-        return error_charts(done)
-    if axis.startswith(GROWTH):
-        return growth_charts(done)
-    return [_line_chart(case, done, axis, "ms_p50", "milliseconds")]
+    return [line_chart(case, done, axis, "ms_p50", "milliseconds")]
 
 
-def _share_charts(case: str, records: Sequence[dict]) -> list[str]:
-    """Draws time and memory of each direction, and tokens, against the share of the picture."""
-    made = []
-    for direction in dict.fromkeys(r["direction"] for r in records):
-        found = [r for r in records if r["direction"] == direction]
-        for figure, label, scale in (
-            ("ms_p50", "milliseconds", 1.0),
-            ("peak_bytes", "memory, MiB", 2.0**-20),
-        ):
-            name = f"{label}, {direction}"
-            made.append(_line_chart(case, found, "share", figure, name, scale))
-    first = [r for r in records if r["direction"] == records[0]["direction"]]
-    return [*made, _line_chart(case, first, "share", "tokens", "tokens of a batch")]
-
-
-def _length_charts(records: Sequence[dict]) -> list[str]:
-    """Draws time and memory of each direction and dtype against L, and where two lines cross."""
-    made = []
-    for direction, dtype in dict.fromkeys((r["direction"], r["dtype"]) for r in records):
-        found = [r for r in records if (r["direction"], r["dtype"]) == (direction, dtype)]
-        for figure, (name, unit, _) in FIGURES.items():
-            lines = series_of(found, figure)
-            drawn = [
-                Series(s, [Point(x, y) for x, y in sorted(line.items())], "straight")
-                for s, line in lines.items()
-            ]
-            drawn += [
-                Series("crossing", [Point(c.at, c.value, f"L* = {c.at:,.0f}", "default")])
-                for c in crossings(found)
-                if c.figure == name and c.at is not None and c.value is not None
-            ]
-            ticks = sorted({x for line in lines.values() for x in line})
-            label = f"{unit}, {direction}, {dtype}"
-            made.append(chart(drawn, Axis("tokens L", values=ticks), Axis(label)))
-    return made
-
-
-def _line_chart(
+def line_chart(
     case: str, records: Sequence[dict], axis: str, figure: str, label: str, scale: float = 1.0
 ) -> str:
-    """Draws a figure, of the record or of its work, against a parameter."""
+    """Draws a figure, of the record or of its work, against a parameter.
+
+    Args:
+        case: its name.
+        records: those that were measured.
+        axis: name of the parameter.
+        figure: key of the record or of its work.
+        label: of the figure, with its unit.
+        scale: factor of the figure.
+    """
     series = []
     found = [(r, r.get(figure) or r["work"].get(figure)) for r in records]
     done = [r | {"figure": scale * value} for r, value in found if value]
@@ -215,9 +181,13 @@ td.number { text-align: right; white-space: nowrap; }
 """
 
 
-def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
+def page(
+    documents: Sequence[dict],
+    more: More = nothing_more,
+    charts: Callable[[str, Sequence[dict]], list[str]] = charts_of,
+) -> str:
     """Returns a self-contained HTML page with the tables and the charts."""
-    body = [f"<header><h1>{title}</h1><p>{EXPLANATION}</p>"]
+    body = [f"<header><h1>Benchmarks</h1><p>{EXPLANATION}</p>"]
     body.append("<p>Circle: ours; ring: the default; square: a peer.</p></header>")
     for document in documents:
         head = f"<h2>{html.escape(machine_line(document))}</h2>"
@@ -229,12 +199,10 @@ def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
         for op, cases in groups(document).items():
             for case, records in cases.items():
                 text = html.escape(f"{records[0]['text']} {oracles(records)}")
-                figures = "".join(charts_of(case, records))
+                figures = "".join(charts(case, records))
                 figures = f'<div class="charts">{figures}</div>' if figures else ""
-                rows = _html_table(*table(records))
-                for more in (growth_table(records), parts_table(records)):
-                    rows += _html_table(*more) if more else ""
-                said = [*(c.text() for c in crossings(records)), *growth_lines(records)]
+                said, tables = more(records)
+                rows = "".join(_html_table(*rows) for rows in (table(records), *tables))
                 lines = "".join(f"<p>{html.escape(line)}</p>" for line in said)
                 name = html.escape(f"{op}: {case}")
                 body.append(
@@ -243,7 +211,7 @@ def page(documents: Sequence[dict], title: str = "Benchmarks") -> str:
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{_STYLE}</style></head>\n<body>{''.join(body)}</body></html>\n"
+        f"<title>Benchmarks</title><style>{_STYLE}</style></head>\n<body>{''.join(body)}</body></html>\n"
     )
 
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from .case import Key, Target
-from .crossing import crossings
-from .growth import growth_lines, growth_table
-from .parts import parts_table
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
 
@@ -204,9 +201,19 @@ EXPLANATION = (
 )
 
 
-def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
+Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # header and rows
+# What a study says of the records of one case beside the common table: sentences, and tables.
+More = Callable[[Sequence[dict]], tuple[list[str], list[Table]]]
+
+
+def nothing_more(records: Sequence[dict]) -> tuple[list[str], list[Table]]:
+    """What ``gamba bench`` adds to the table of a case."""
+    return [], []
+
+
+def markdown(documents: Sequence[dict], more: More = nothing_more) -> str:
     """Returns a page of all tables; each document is of one machine."""
-    lines = [f"# {title}", "", "Written by `gamba bench`, not by hand.", "", EXPLANATION, ""]
+    lines = ["# Benchmarks", "", "Written by `gamba bench`, not by hand.", "", EXPLANATION, ""]
     for document in documents:
         lines += [f"## {machine_line(document)}", ""]
         if document["interrupted"]:
@@ -216,10 +223,10 @@ def markdown(documents: Sequence[dict], title: str = "Benchmarks") -> str:
         for op, cases in groups(document).items():
             for case, records in cases.items():
                 lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
-                said = [*(c.text() for c in crossings(records)), *growth_lines(records)]
+                said, tables = more(records)
                 lines += [line for text in said for line in (text, "")]
-                for rows in (table(records), growth_table(records), parts_table(records)):
-                    lines += [*_markdown_table(*rows), ""] if rows else []
+                for rows in (table(records), *tables):
+                    lines += [*_markdown_table(*rows), ""]
     return "\n".join(lines)
 
 

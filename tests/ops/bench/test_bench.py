@@ -11,6 +11,7 @@ from functools import partial
 import pytest
 import torch
 from helpers import rel_rms
+from lab.studies.training import step
 
 from gamba_warp import cli
 from gamba_warp.commands import bench
@@ -447,9 +448,8 @@ def test_raster_cases_run(name):
         assert error["degree 3"] > 10 * error["degree 5"]
 
 
-@pytest.mark.parametrize("op", ["block", "step"])
-def test_model_cases_run(op):
-    module = bench.load_suite(op)
+@pytest.mark.parametrize("op, module", [("block", bench.load_suite("block")), ("step", step)])
+def test_model_cases_run(op, module):
     cases = [c for c in module.cases(QUICK) if c.op == op][:1]
     records = measure(cases, QUICK)["records"]
     assert all(r["status"] == "ok" for r in records), records

@@ -1,4 +1,4 @@
-"""``gamba bench growth``: slopes, what grows faster than its work, and what the words mean."""
+"""``make study WHAT=growth``: slopes, what grows faster than its work, and what the words mean."""
 
 import importlib.util
 import json
@@ -9,17 +9,18 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lab.studies import growth, show
+from lab.studies.__main__ import GROUPS, STUDIES
+from lab.studies.picture import growth_picture
+from lab.studies.show import charts_of, markdown, page
+from lab.studies.slopes import growth_lines, growth_table, growths, slope
 
-from gamba_warp.commands.bench import SUITES, _choose_suites
+from gamba_warp.commands.bench import SUITES
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.bench import Case, Settings, Variant
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from gamba_warp.kernels.bench.core.document import check_document
-from gamba_warp.kernels.bench.core.growth import growth_lines, growth_table, growths, slope
-from gamba_warp.kernels.bench.core.page import charts_of, page
-from gamba_warp.kernels.bench.core.picture import growth_picture
-from gamba_warp.kernels.bench.core.report import markdown
-from gamba_warp.measure import growth, suites
+from gamba_warp.measure import suites
 
 DOCS = Path(__file__).parents[3] / "docs"
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
@@ -134,11 +135,14 @@ def test_charts_show_lines_slopes_and_the_work():
 
 
 def test_words_name_parts():
-    assert _choose_suites(("growth",)) == ["growth-scan", "growth-raster", "growth-errors"]
-    assert _choose_suites(("growth-errors", "scan")) == ["scan", "growth-errors"]
-    assert _choose_suites(("all",)) == list(SUITES)
-    with pytest.raises(UserError, match="unknown case 'growht'.* growth-scan,.* growth and all"):
-        _choose_suites(("growht",))
+    def chosen(*what):
+        return suites.choose(what, STUDIES, GROUPS)
+
+    assert chosen("growth") == ["growth-scan", "growth-raster", "growth-errors"]
+    assert chosen("growth-errors", "step") == ["step", "growth-errors"]
+    assert suites.choose(["all"], SUITES, {"all": tuple(SUITES)}) == list(SUITES)
+    with pytest.raises(UserError, match="unknown case 'growht'.* growth-scan,.* and growth"):
+        chosen("growht")
 
 
 def test_only_measures_the_cases_that_are_named():
@@ -166,15 +170,15 @@ def test_a_run_of_small_sizes(op, only, tmp_path):
             assert r["work"]["units"] == r["work"]["pairs"] + sizes["views"] * sizes["N"]
     for name in only:
         assert f"{op}: {name}" in markdown([found]) and f"{op}: {name}" in page([found])
-    assert "grows faster than its work" in suites.summary(found, None)
+    assert "grows faster than its work" in show.summary(found)
     suites.write_document(found, tmp_path)
     again = suites.read_document(tmp_path / "bench.json")
-    (path,) = suites.write_pages([again, again], tmp_path / "joined.json")
+    (path,) = show.write_pages([again, again], tmp_path / "joined.json")
     assert suites.read_document(path)["records"] == again["records"]
-    (path,) = suites.write_pages([again], tmp_path / "growth.svg")
+    (path,) = show.write_pages([again], tmp_path / "growth.svg")
     assert ET.fromstring(path.read_text(encoding="utf-8")) is not None
     with pytest.raises(UserError, match="no cases of growth"):
-        suites.write_pages([again | {"records": []}], tmp_path / "none.svg")
+        show.write_pages([again | {"records": []}], tmp_path / "none.svg")
 
 
 def test_results_of_two_machines_are_not_joined():

@@ -1,4 +1,4 @@
-"""``gamba bench growth-errors``: its float64 truth, its lines, and what it sees."""
+"""``make study WHAT=growth-errors``: its float64 truth, its lines, and what it sees."""
 
 import json
 import math
@@ -7,14 +7,15 @@ import xml.etree.ElementTree as ET
 import pytest
 import torch
 from helpers import assert_rel_rms
+from lab.studies import growth_errors
+from lab.studies.growth_errors import EPS, KINDS, Problem, Sizes
+from lab.studies.show import charts_of
+from lab.studies.slopes import ERRORS, growth_table
 
 from gamba_warp.kernels.bench import Settings
 from gamba_warp.kernels.bench.core.document import check_document
-from gamba_warp.kernels.bench.core.growth import ERRORS, growth_table
-from gamba_warp.kernels.bench.core.page import charts_of
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
-from gamba_warp.measure import growth_errors, suites
-from gamba_warp.measure.growth_errors import EPS, KINDS, Problem, Sizes
+from gamba_warp.measure import suites
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 CPU = torch.device("cpu")

@@ -1,4 +1,4 @@
-"""``gamba bench lengths``: the crossing of two lines, the limits of a series, its memory."""
+"""``make study WHAT=lengths``: the crossing of two lines, the limits of a series, its memory."""
 
 import json
 import xml.etree.ElementTree as ET
@@ -7,14 +7,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lab.studies import lengths
+from lab.studies.crossing import crossings
+from lab.studies.lengths import ATTENTION, BOTH, MAMBA, Bench, Line, Sizes
+from lab.studies.show import charts_of, markdown, page, summary, with_crossings
 
 from gamba_warp.kernels.bench import Case, Settings
-from gamba_warp.kernels.bench.core.crossing import crossings
 from gamba_warp.kernels.bench.core.document import check_document
-from gamba_warp.kernels.bench.core.page import charts_of, page
-from gamba_warp.kernels.bench.core.report import markdown
-from gamba_warp.measure import lengths, suites
-from gamba_warp.measure.lengths import ATTENTION, BOTH, MAMBA, Bench, Line, Sizes
+from gamba_warp.measure import suites
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 SIZES = Sizes((40, 97), 64, 60.0)  # 97 is no whole number of chunks or segments
@@ -154,7 +154,7 @@ def document(monkeypatch, sizes):
     build = partial(lengths.lines, QUICK, sizes, "forward", torch.float32)
     case = Case("lengths", "forward, float32", "A text.", build, "lengths")
     module = type("Suite", (), {"cases": lambda s: [case], "targets": lambda s: []})
-    return suites.run_suites({"lengths": module}, QUICK)
+    return with_crossings(suites.run_suites({"lengths": module}, QUICK))
 
 
 def test_a_series_ends_at_its_limit_and_says_so(monkeypatch):
@@ -169,7 +169,7 @@ def test_a_series_ends_at_its_limit_and_says_so(monkeypatch):
     assert not suites.failed_records(found)
     check_document(json.loads(json.dumps(found, allow_nan=False)))
     assert found["crossings"][0]["lengths"] == (4, 16)
-    text = suites.summary(found, None)
+    text = summary(found)
     assert "stopped: L 32 would take 0.064 s" in text
     assert "lengths: forward, float32, memory" in text
     assert "stopped: L 32 would" in markdown([found]) and "<svg" in page([found])

@@ -5,16 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from lab.studies import parts
+from lab.studies.__main__ import load_study, study
+from lab.studies.bars import bars
+from lab.studies.show import charts_of, markdown, page
 from torch.profiler import record_function
 
-from gamba_warp.commands import bench
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.bench import Case, Settings, Variant, measure
-from gamba_warp.kernels.bench.core import parts
-from gamba_warp.kernels.bench.core.bars import bars
 from gamba_warp.kernels.bench.core.case import LEVELS, Level
-from gamba_warp.kernels.bench.core.page import charts_of, page
-from gamba_warp.kernels.bench.core.report import markdown
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 
@@ -86,7 +85,7 @@ def test_bars_of_nothing_are_no_chart():
 
 
 def test_a_step_has_its_parts():
-    (steps,) = [c for c in bench.load_suite("step").cases(QUICK) if c.name == "parts"]
+    (steps,) = [c for c in load_study("step").cases(QUICK) if c.name == "parts"]
     records = measure([steps], QUICK)["records"]
     tiny, lower, rays, _, _ = records
     assert (tiny["variant"], lower["variant"]) == ("tiny", "tiny, bfloat16")
@@ -101,7 +100,7 @@ def test_a_step_has_its_parts():
 
 @pytest.mark.parametrize(("op", "name"), [("step", "precision"), ("model", "precision")])
 def test_bfloat16_products_have_their_error_on_the_chart(op, name):
-    (case,) = [c for c in bench.load_suite(op).cases(QUICK) if c.name == name]
+    (case,) = [c for c in load_study(op).cases(QUICK) if c.name == name]
     records = measure([case], QUICK)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4
     for full, lower in zip(records[::2], records[1::2]):
@@ -112,7 +111,7 @@ def test_bfloat16_products_have_their_error_on_the_chart(op, name):
 
 def test_losses_and_optimizer_are_checked_before_they_are_timed():
     names = ("SSIM", "optimizer")
-    cases = [c for c in bench.load_suite("step").cases(QUICK) if c.name in names]
+    cases = [c for c in load_study("step").cases(QUICK) if c.name in names]
     records = measure(cases, QUICK)["records"]
     assert len(records) == 13 and all(r["status"] == "ok" for r in records), records
     ours = [r for r in records if r["variant"].startswith("ours")]
@@ -120,7 +119,7 @@ def test_losses_and_optimizer_are_checked_before_they_are_timed():
 
 
 def test_dropped_patches_are_exact_and_counted():
-    (case,) = [c for c in bench.load_suite("step").cases(QUICK) if c.name == "background"]
+    (case,) = [c for c in load_study("step").cases(QUICK) if c.name == "background"]
     records = measure([case], QUICK)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4
     assert all(r["rel_rms_error"] < 1e-5 for r in records)
@@ -134,5 +133,5 @@ def test_dropped_patches_are_exact_and_counted():
 
 def test_a_step_on_a_folder_that_is_not_there_is_one_line(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
-        bench.bench_command(("step",), quick=True, out=tmp_path, data=tmp_path / "none")
+        study(("step",), quick=True, out=tmp_path, data=tmp_path / "none")
     assert replace(QUICK, data=tmp_path).data == tmp_path

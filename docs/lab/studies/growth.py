@@ -14,13 +14,14 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..kernels.bench import Case, Error, Settings, Variant
-from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from ..kernels.bench.cases.raster_variants import make_pair as raster_pair
-from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
-from ..kernels.bench.cases.scan_variants import make_pair as scan_pair
-from ..kernels.bench.core.growth import GROWTH
-from ..kernels.bench.core.measure import peak_bytes
+from gamba_warp.kernels.bench import Case, Error, Settings, Variant
+from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
+from gamba_warp.kernels.bench.cases.raster_variants import make_pair as raster_pair
+from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs
+from gamba_warp.kernels.bench.cases.scan_variants import make_pair as scan_pair
+from gamba_warp.kernels.bench.core.measure import peak_bytes
+
+from .slopes import GROWTH
 
 SCAN, RASTER = "growth-scan", "growth-raster"
 BOTH = "forward+backward"

@@ -19,12 +19,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from ..kernels.bench import Case, Error, Settings, Stopped, Target, Variant, compare
-from ..kernels.bench.core.measure import peak_bytes, synchronize
-from ..model.config import PRESETS
-from ..model.parts.attention import AttentionBlock
-from ..model.parts.block import GambaBlock, run_blocks
-from .blocks import BACKWARD_LIMIT, BOTH, LIMIT, reference_block
+from gamba_warp.kernels.bench import Case, Error, Settings, Stopped, Target, Variant, compare
+from gamba_warp.kernels.bench.core.measure import peak_bytes, synchronize
+from gamba_warp.measure.blocks import BACKWARD_LIMIT, BOTH, LIMIT, reference_block
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.parts.attention import AttentionBlock
+from gamba_warp.model.parts.block import GambaBlock, run_blocks
 
 OP = "lengths"
 MAMBA, ATTENTION = "Mamba block", "transformer block"

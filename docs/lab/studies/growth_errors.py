@@ -17,10 +17,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..kernels import selective_scan
-from ..kernels.bench import Case, Error, Settings, Variant, compare
-from ..kernels.bench.cases.scan_problem import make_inputs
-from ..kernels.bench.core.growth import ERRORS
+from gamba_warp.kernels import selective_scan
+from gamba_warp.kernels.bench import Case, Error, Settings, Variant, compare
+from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
+
+from .slopes import ERRORS
 
 OP = "growth-errors"
 BOTH = "forward+backward"

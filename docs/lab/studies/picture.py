@@ -5,8 +5,9 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 
-from .charts import HEIGHT, WIDTH
-from .growth import error_charts, growth_charts
+from gamba_warp.kernels.bench.core.charts import HEIGHT, WIDTH
+
+from .slopes import error_charts, growth_charts
 
 _COLUMNS, _GAP, _TITLE = 2, 28, 30
 _STYLE = """

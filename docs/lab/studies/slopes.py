@@ -11,7 +11,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from .charts import Axis, Point, Series, chart
+from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart
+
 from .crossing import FIGURES
 
 GROWTH, ERRORS = "growth ", "growth of error"

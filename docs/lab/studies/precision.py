@@ -9,24 +9,30 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..cameras import Cameras, intrinsics, orbit
-from ..devices import float32_products, network_products
-from ..gaussians import Gaussians
-from ..kernels.bench import Error, Key, Settings, Target, Variant, compare
-from ..model.checkpoint import shipped_model
-from ..model.config import PRESETS, Preset
-from ..model.gamba import Gamba
-from ..model.posing import reference_cameras
-from ..render import render
-from .blocks import Products
-from .pictures import without_encoder
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.devices import float32_products, network_products
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
+from gamba_warp.measure.blocks import Products
+from gamba_warp.measure.pictures import without_encoder
+from gamba_warp.model.checkpoint import shipped_model
+from gamba_warp.model.config import PRESETS, Preset
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.posing import reference_cameras
+from gamba_warp.render import render
 
 PAPER, ALONE, PLAIN = "paper, float32", "products alone", "MKL's products alone"
 # Allowed relative rms errors of the Gaussians: roundings that 14 blocks carry on.
 _LIMITS = {torch.float32: 1e-3, torch.bfloat16: 0.1}
 
 
-def precision_targets(settings: Settings) -> list[Target]:
+def cases(settings: Settings) -> list[Case]:
+    """Returns the case, which counts to those of ``gamba bench model``."""
+    text = " ".join((precisions.__doc__ or "").split())
+    return [Case("model", "precision", text, partial(precisions, settings), "error")]
+
+
+def targets(settings: Settings) -> list[Target]:
     """Returns the targets; there are none at a quick run's sizes or on a GPU."""
     if settings.level == "quick" or settings.device.type != "cpu":
         return []

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from gamba_warp.kernels.bench import Error, Settings, Variant, compare
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.train.config import OptimConfig
+from gamba_warp.train.optim import Ema, build_optimizer
 
-from ..config import OptimConfig
-from ..optim import Ema, build_optimizer
 from .made_up import step_config
 
 TEXT = (

@@ -14,14 +14,14 @@ from gamba_warp.cameras import Cameras
 from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
-from gamba_warp.kernels.bench.core.parts import measure_parts
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.train.config import OptimConfig
+from gamba_warp.train.optim import Ema, build_optimizer
+from gamba_warp.train.step import compute_gradients
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
-from ..config import OptimConfig
-from ..optim import Ema, build_optimizer
-from ..step import compute_gradients
+from ..parts import measure_parts
 from . import losses, optimizer
 from .background import background
 from .made_up import (

@@ -17,9 +17,9 @@ from gamba_warp.kernels.bench.core.measure import peak_bytes
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.patches import foreground_patches
 from gamba_warp.render import render
+from gamba_warp.train.data.samples import Batch
+from gamba_warp.train.step import compute_gradients
 
-from ..data.samples import Batch
-from ..step import compute_gradients
 from .made_up import BOTH, NOVEL, SPREAD, WEIGHTS, step_model, step_source
 
 _SHARES = {"quick": (0.1,), "normal": (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)}

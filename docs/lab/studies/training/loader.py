@@ -18,11 +18,10 @@ from gamba_warp.data.resident import ResidentViews
 from gamba_warp.images import save_image
 from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
 from gamba_warp.model.config import PRESETS
-
-from ..batches import BatchQueue, BatchSource
-from ..config import DataConfig
-from ..ddp import World
-from ..sources.pack import PackSettings, write_pack
+from gamba_warp.train.batches import BatchQueue, BatchSource
+from gamba_warp.train.config import DataConfig
+from gamba_warp.train.ddp import World
+from gamba_warp.train.sources.pack import PackSettings, write_pack
 
 OP = "loader"
 _BATCH, _NOVEL, _SIZE = 4, 3, 128  # as in the cases of a step

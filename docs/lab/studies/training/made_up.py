@@ -15,9 +15,8 @@ from gamba_warp.kernels.bench import Settings
 from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
-
-from ..batches import BatchSource
-from ..config import DataConfig
+from gamba_warp.train.batches import BatchSource
+from gamba_warp.train.config import DataConfig
 
 OP, BOTH = "step", "forward+backward"
 BATCH, NOVEL, SIZE = 4, 3, 128

@@ -1,0 +1,92 @@
+"""``make study WHAT="..."``, or ``python -m lab.studies`` with docs/ on the path of modules."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from gamba_warp.conventions import DeviceChoice
+from gamba_warp.devices import pick_device
+from gamba_warp.errors import UserError
+from gamba_warp.files import output_folder
+from gamba_warp.measure import suites
+from gamba_warp.untrusted.ranges import Threads, ranged
+
+from . import show
+
+# What is studied -> the module with ``cases(settings)`` and ``targets(settings)``.
+STUDIES = {
+    "lengths": ".lengths",
+    "step": ".training.step",
+    "model": ".precision",
+    "growth-scan": ".growth",
+    "growth-raster": ".growth",
+    "growth-errors": ".growth_errors",
+    "loader": ".training.loader",
+}
+GROUPS = {"growth": ("growth-scan", "growth-raster", "growth-errors")}
+
+
+def load_study(op: str):
+    """The module with the cases and targets of one of ``STUDIES``."""
+    return importlib.import_module(STUDIES[op], __package__)
+
+
+@ranged
+def study(
+    what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (),
+    *,
+    device: DeviceChoice = "auto",
+    quick: bool = False,
+    full: bool = False,
+    out: Path = Path("out/study"),
+    threads: Threads | None = None,
+    render: tuple[Path, ...] = (),
+    data: Path | None = None,
+    only: tuple[str, ...] = (),
+) -> int:
+    """Measures what the project wants to know of itself, by the clock of gamba bench.
+
+    Writes bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
+
+    Args:
+        what: lengths (a Mamba block against a transformer block over the number of tokens), step
+            (of training, by parts), model (in both precisions), growth (time, memory and errors
+            over every size, with slopes; growth-scan, growth-raster and growth-errors are its
+            parts), loader.
+        device: Device to measure; auto is the GPU if there is one.
+        quick: Small sizes and a few rounds, which take seconds.
+        full: All sizes and many rounds.
+        out: Folder for the results. With --render it may be a .md or .html file.
+        threads: Number of CPU threads; torch's own number if not given.
+        render: Measure nothing; make the tables and the page of these JSON files, of gamba bench
+            too. With an --out that ends in .svg it draws their charts of growth, with .json it
+            joins them.
+        data: Folder of posed views for step and loader; made-up views if not given.
+        only: Measure only these cases, by their full names, as L or "random, float32".
+    """
+    if render:
+        paths = show.write_pages([suites.read_document(path) for path in render], out)
+        print(f"wrote {', '.join(map(str, paths))}")
+        return 0
+    chosen = suites.choose(what, STUDIES, GROUPS)
+    if not chosen:
+        raise UserError(f"name what to study: {', '.join((*STUDIES, *GROUPS))}")
+    settings = suites.make_settings(pick_device(device), quick, full, False, threads, data)
+    folder = output_folder(out)
+    found = suites.run_suites({op: load_study(op) for op in chosen}, settings, only)
+    document = show.with_crossings(found)
+    suites.write_document(document, folder, show.markdown, show.page)
+    print(f"{show.summary(document)}; wrote {folder / 'bench.json'}, bench.md and bench.html")
+    return 130 if document["interrupted"] else int(bool(suites.failed_records(document)))
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(tyro.cli(study, prog="make study"))
+    except UserError as error:
+        sys.exit(f"study: {error}")

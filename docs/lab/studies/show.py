@@ -1,0 +1,128 @@
+"""What the studies show of their cases beside the table that every case has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gamba_warp.errors import UserError
+from gamba_warp.files import write_json, write_text
+from gamba_warp.kernels.bench.core import page as pages
+from gamba_warp.kernels.bench.core import report
+from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart
+from gamba_warp.kernels.bench.core.page import line_chart
+from gamba_warp.measure import suites
+
+from .bars import bars
+from .crossing import FIGURES, crossings, series_of
+from .parts import parts_of, parts_table
+from .picture import growth_picture
+from .slopes import ERRORS, GROWTH, error_charts, growth_charts, growth_lines, growth_table
+
+
+def more(records: Sequence[dict]) -> tuple[list[str], list[report.Table]]:
+    """Crossings and what grows too fast, in sentences; slopes and parts, in tables."""
+    tables = [rows for rows in (growth_table(records), parts_table(records)) if rows]
+    return [*(c.text() for c in crossings(records)), *growth_lines(records)], tables
+
+
+def charts_of(case: str, records: Sequence[dict]) -> list[str]:
+    """The charts of a study's axis; of any other, those of ``gamba bench``."""
+    axis: str = records[0]["axis"] or ""
+    done = [r for r in records if r["status"] == "ok"]
+    if axis == "parts":
+        split = [(r["variant"], {n: sum(t) for n, t in parts_of(r).items()}) for r in done]
+        few = (dict(split[i : i + 3]) for i in range(0, len(split), 3))  # a colour each
+        return [bars(series, "milliseconds of a run") for series in few]
+    if axis == "share":
+        return _share_charts(case, done)
+    if axis == "lengths":
+        return _length_charts(done)
+    if axis == ERRORS:
+        return error_charts(done)
+    if axis.startswith(GROWTH):
+        return growth_charts(done)
+    return pages.charts_of(case, records)
+
+
+def markdown(documents: Sequence[dict]) -> str:
+    """The tables of studies as Markdown."""
+    return report.markdown(documents, more)
+
+
+def page(documents: Sequence[dict]) -> str:
+    """The tables and charts of studies as a self-contained HTML page."""
+    return pages.page(documents, more, charts_of)
+
+
+def summary(document: dict) -> str:
+    """Lines on targets, crossings, what grows too fast, and failures."""
+    lines = [f"{c.op}: {c.text()}" for c in crossings(document["records"])]
+    for op, cases in report.groups(document).items():
+        lines += [f"{op}: {line}" for records in cases.values() for line in growth_lines(records)]
+    return "\n".join([*lines, suites.summary(document, None)])
+
+
+def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
+    """As ``suites.write_pages``; a .svg file gets the charts of growth.
+
+    Raises:
+        UserError: nothing grows in the documents, or they are not of one machine and level.
+    """
+    if out.suffix == ".json":
+        write_json(out, joined(documents))
+        return [out]
+    if out.suffix != ".svg":
+        return suites.write_pages(documents, out, markdown, page)
+    picture = growth_picture(documents)
+    if not picture:
+        raise UserError(f"--out {out}: these results have no cases of growth to draw")
+    write_text(out, picture)
+    return [out]
+
+
+def joined(documents: Sequence[dict]) -> dict:
+    """As ``suites.join``, with the crossings of all records."""
+    return with_crossings(suites.join(documents))
+
+
+def with_crossings(document: dict) -> dict:
+    """The document with where its lines cross."""
+    return document | {"crossings": [c._asdict() for c in crossings(document["records"])]}
+
+
+def _share_charts(case: str, records: Sequence[dict]) -> list[str]:
+    """Draws time and memory of each direction, and tokens, against the share of the picture."""
+    made = []
+    for direction in dict.fromkeys(r["direction"] for r in records):
+        found = [r for r in records if r["direction"] == direction]
+        for figure, label, scale in (
+            ("ms_p50", "milliseconds", 1.0),
+            ("peak_bytes", "memory, MiB", 2.0**-20),
+        ):
+            name = f"{label}, {direction}"
+            made.append(line_chart(case, found, "share", figure, name, scale))
+    first = [r for r in records if r["direction"] == records[0]["direction"]]
+    return [*made, line_chart(case, first, "share", "tokens", "tokens of a batch")]
+
+
+def _length_charts(records: Sequence[dict]) -> list[str]:
+    """Draws time and memory of each direction and dtype against L, and where two lines cross."""
+    made = []
+    for direction, dtype in dict.fromkeys((r["direction"], r["dtype"]) for r in records):
+        found = [r for r in records if (r["direction"], r["dtype"]) == (direction, dtype)]
+        for figure, (name, unit, _) in FIGURES.items():
+            lines = series_of(found, figure)
+            drawn = [
+                Series(s, [Point(x, y) for x, y in sorted(line.items())], "straight")
+                for s, line in lines.items()
+            ]
+            drawn += [
+                Series("crossing", [Point(c.at, c.value, f"L* = {c.at:,.0f}", "default")])
+                for c in crossings(found)
+                if c.figure == name and c.at is not None and c.value is not None
+            ]
+            ticks = sorted({x for line in lines.values() for x in line})
+            label = f"{unit}, {direction}, {dtype}"
+            made.append(chart(drawn, Axis("tokens L", values=ticks), Axis(label)))
+    return made

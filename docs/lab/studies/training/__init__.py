@@ -1,0 +1,1 @@
+"""Studies of the training: a step by parts, and the loader."""

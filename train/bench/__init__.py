@@ -1,1 +1,0 @@
-"""Benchmark cases of the training: a step by parts, and the loader."""
