@@ -8,7 +8,7 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test bench study docs lint format architecture constraints clean
+.PHONY: setup demo test bench study instructions docs lint format architecture constraints clean
 
 setup: $(STAMP)
 
@@ -38,6 +38,11 @@ bench: $(STAMP)
 # What the project asks of itself (docs/lab/studies): make study WHAT="growth --quick".
 study: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
+
+# docs/benchmarks/static.md: what the CUDA kernels take, and with nvdisasm (on PATH, in CUDA_HOME
+# or inside Triton) their instructions, and the scan's least times.
+instructions: $(STAMP)
+	PYTHONPATH=docs $(BIN)/python -m lab.instructions
 
 # The site, in site/: a broken link, anchor or docstring is an error.
 docs: $(STAMP)

@@ -63,7 +63,7 @@ ROOMS = {
         "one file a subject", (*_KERNELS, "kernels.bench.core", "kernels.bench")
     ),
     "kernels.bench.static": Room(
-        "registers and instructions of the CUDA kernels", (*_KERNELS, "kernels.bench.core")
+        "what the CUDA kernels take, told without a GPU", (*_KERNELS, "kernels.bench.core")
     ),
     "kernels.stress.core": Room("what a case is, the runner, reports", ("versions",)),
     "kernels.stress.oracles": Room(

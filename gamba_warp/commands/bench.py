@@ -59,8 +59,7 @@ def bench_command(
         render: Measure nothing; make the tables and the page of these JSON files, or with an --out
             that ends in .json one of them all.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
-            (registers, stack, shared memory, occupancy) to static.json and static.md; with nvdisasm
-            (on PATH, in CUDA_HOME or inside Triton) also instructions, and the scan's least times.
+            (registers, stack, shared memory, occupancy) to static.json and static.md.
         only: Measure only these cases, by their full names, as "one call".
     """
     from ..measure import suites

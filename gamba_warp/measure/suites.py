@@ -17,8 +17,7 @@ from ..kernels.bench.core.document import check_document
 from ..kernels.bench.core.page import page
 from ..kernels.bench.core.report import groups, judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
-from ..kernels.bench.static.page import static_markdown
-from ..kernels.bench.static.report import NoCompiler, static_report
+from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 from ..untrusted import documents
 
 Maker = Callable[[Sequence[dict]], str]  # of documents, a page

@@ -1,9 +1,7 @@
 """What the CUDA kernels take of a GPU, told without one: ``gamba bench --static``.
 
 The operators say which kernels they would launch (``dry_run.py``), these are compiled ahead of
-time, and the binaries say what they take (``cubin.py``). Where there is a disassembler,
-instructions are counted (``sass.py``), and for the scan a least time follows (``estimate.py``).
-Nothing runs, so no time is measured.
+time, and the binaries say what they take (``cubin.py``). Nothing runs, so no time is measured.
 """
 
 from __future__ import annotations
@@ -27,9 +25,7 @@ from ...rasterize import depth_quantile, rasterization
 from ...rasterize.harmonics import colors_seen_from
 from ...selective_scan import selective_scan, selective_scan_state
 from .cubin import RESERVED, Resources, read_cubin
-from .dry_run import MULTIPROCESSORS, Launch, can_dry_run, launches_of
-from .estimate import DEVICES, Shape, estimate, per_element, scan_work
-from .sass import counts, disassemble, executed, find_nvdisasm, innermost, parse
+from .dry_run import Launch, can_dry_run, launches_of
 
 FORMAT = "gamba_warp.static.2"
 
@@ -161,7 +157,7 @@ def _harmonics(degree: int) -> list[Tensor]:
 
 
 _HALF = {"dtype": torch.bfloat16}
-_SCANS = {
+SCANS = {
     "bfloat16": _HALF,
     "float32": {"dtype": torch.float32},
     "bfloat16, last state alone": _HALF | {"last": True},
@@ -177,18 +173,10 @@ _RASTERS = {
     "32 views, depth alone": {"views": 32, "mode": "D"},
     "32 views, gradients of colours alone": {"views": 32, "geometry": False},
 }
-# The shapes that ``_scan`` makes of these, for the estimates.
-_SHAPES = {
-    name + text: Shape(
-        batch, LENGTH, CHANNELS, o.get("states", 16), o["dtype"].itemsize, not o.get("last")
-    )
-    for name, o in _SCANS.items()
-    for batch, text in ((16, ""), (1, ", in segments"))
-}
 # (op, case) -> a call of the operator; a kernel is listed with the first case that launches it
 CASES: dict[tuple[str, str], Callable[[], list[Tensor]]] = {
-    **{("scan", name): partial(_scan, 16, **options) for name, options in _SCANS.items()},
-    **{("scan", f"{name}, in segments"): partial(_scan, 1, **o) for name, o in _SCANS.items()},
+    **{("scan", name): partial(_scan, 16, **options) for name, options in SCANS.items()},
+    **{("scan", f"{name}, in segments"): partial(_scan, 1, **o) for name, o in SCANS.items()},
     ("conv", "bfloat16"): partial(_conv, torch.bfloat16),
     ("conv", "float32"): partial(_conv, torch.float32),
     **{("raster", name): partial(_raster, **options) for name, options in _RASTERS.items()},
@@ -237,7 +225,7 @@ def binaries(launch: Launch) -> dict[int, Path]:
     return dict(zip(MACHINES, map(Path, paths)))
 
 
-def _symbol(launch: Launch, names: Iterable[str]) -> str:
+def symbol_of(launch: Launch, names: Iterable[str]) -> str:
     """A kernel's symbol in a binary: Warp gives it a hash that depends on the target."""
     pattern = re.compile(re.escape(launch.kernel.key) + "_[0-9a-f]{8}_cuda_kernel_forward")
     (symbol,) = {name for name in names if pattern.fullmatch(name)}
@@ -250,28 +238,8 @@ def compile_kernel(launch: Launch) -> dict[int, tuple[Resources, int]]:
     for architecture, path in binaries(launch).items():
         meta = json.loads((path.parent / f"{path.name.rsplit('.', 2)[0]}.meta").read_bytes())
         taken = read_cubin(path.read_bytes())
-        symbol = _symbol(launch, taken)
+        symbol = symbol_of(launch, taken)
         found[architecture] = taken[symbol], meta.get(f"{symbol}_smem_bytes", 0)
-    return found
-
-
-def _counted(entry: Entry, tool: Path) -> dict[int, dict]:
-    """By architecture ``loop``, what the largest innermost loop holds, and the scan's estimate."""
-    found = {}
-    for arch, path in binaries(entry.launch).items():
-        symbol = _symbol(entry.launch, read_cubin(path.read_bytes()))
-        code = parse(disassemble(tool, path), symbol)
-        found[arch] = {"loop": dict(counts(code, innermost(code)))}
-        if entry.op != "scan":
-            continue
-        device, shape = DEVICES[arch], _SHAPES[entry.case]
-        work = scan_work(entry.name, shape, MULTIPROCESSORS)
-        total = executed(code, work.turns) if work else None
-        if work is None or total is None:
-            continue
-        least = estimate(device, work, total)
-        found[arch]["per_element"] = per_element(work, total)
-        found[arch]["estimate"] = asdict(least) | {"ms": least.ms, "limit": least.limit}
     return found
 
 
@@ -282,10 +250,9 @@ def static_report(say: Callable[[str], None] = lambda kernel: None) -> dict:
         say: called with a kernel's name before it is compiled.
 
     Returns:
-        ``{format, versions, machines, devices, scan, kernels}``, ready for JSON. A kernel has ``op,
-        kernel, case, direction, arch, block`` (threads), the fields of ``Resources``,
-        ``dynamic_shared`` (bytes), the fields of ``Occupancy``, and with a disassembler ``loop``,
-        ``per_element`` and ``estimate``.
+        ``{format, versions, machines, kernels}``, ready for JSON. A kernel has ``op, kernel, case,
+        direction, arch, block`` (threads), the fields of ``Resources``, ``dynamic_shared`` (bytes)
+        and the fields of ``Occupancy``.
 
     Raises:
         NoCompiler: this build of Warp cannot compile for CUDA, or this torch needs a GPU.
@@ -295,24 +262,69 @@ def static_report(say: Callable[[str], None] = lambda kernel: None) -> dict:
         raise NoCompiler("this build of warp-lang cannot compile for CUDA")
     if not can_dry_run():
         raise NoCompiler(f"torch {torch.__version__} needs a GPU for it; torch 2.11 does not")
-    tool = find_nvdisasm()
     rows = []
     for entry in find_kernels():
         say(f"{entry.op}: {entry.name}")
-        counted = _counted(entry, tool) if tool else {}
         for arch, (used, dynamic) in compile_kernel(entry.launch).items():
             block = entry.launch.block
             fit = occupancy(MACHINES[arch], block, used.registers, used.shared + dynamic)
             names = {"op": entry.op, "kernel": entry.name, "case": entry.case}
             names |= {"direction": entry.direction, "arch": f"sm_{arch}", "block": block}
-            row = names | asdict(used) | {"dynamic_shared": dynamic} | asdict(fit)
-            rows.append(row | counted.get(arch, {}))
+            rows.append(names | asdict(used) | {"dynamic_shared": dynamic} | asdict(fit))
     nvrtc = ".".join(map(str, toolkit))
     return {
         "format": FORMAT,
         "versions": {"nvrtc": nvrtc, "warp": wp.__version__, "gamba_warp": __version__},
         "machines": {f"sm_{arch}": asdict(machine) for arch, machine in MACHINES.items()},
-        "devices": {f"sm_{arch}": asdict(device) for arch, device in DEVICES.items()},
-        "scan": {"length": LENGTH, "channels": CHANNELS},
         "kernels": rows,
     }
+
+
+_EXPLANATION = """
+Written by `gamba bench --static`, not by hand: the kernels were compiled ahead of time, and the
+binaries say what they take. Nothing here was run. **Not measured on a GPU.**
+
+Two figures with a stroke are those of {}, in this order; one stands for both.
+**registers** and **stack** are of a thread. Stack is in local memory and holds arrays that are
+indexed at run time as well as registers that were spilled. **spills** counts the instructions that
+fetch from a fixed place of the stack, which is how a spilled register comes back: 0 means that
+nothing is spilled, more is a bound. **shared** is a block's, static and dynamic. **blocks** and
+**warps** are what a multiprocessor holds at a time; **of** is their share of the most warps, and
+**limit** what is used up first.
+"""
+_COLUMNS: dict[str, Callable[[dict], object]] = {
+    "block": lambda row: row["block"],
+    "registers": lambda row: row["registers"],
+    "stack, B": lambda row: row["frame"],
+    "spills": lambda row: row["reloads"],
+    "shared, B": lambda row: row["shared"] + row["dynamic_shared"],
+    "instructions": lambda row: row["instructions"],
+    "blocks": lambda row: row["blocks"],
+    "warps": lambda row: row["warps"],
+    "of": lambda row: f"{row['share']:.0%}",
+    "limit": lambda row: row["limit"],
+}
+
+
+def full_name(row: dict) -> str:
+    """A row's kernel as tables name it."""
+    return f"`{row['kernel']}`" + (" (gradient)" if row["direction"] == "gradient" else "")
+
+
+def static_markdown(document: dict) -> str:
+    """The report as a page with one table per op."""
+    versions = ", ".join(f"{name} {version}" for name, version in document["versions"].items())
+    text = _EXPLANATION.format(" and ".join(document["machines"]))
+    lines = ["# What the CUDA kernels take", text, f"{versions}.", ""]
+    header, columns = ["kernel", "case", *_COLUMNS], _COLUMNS.values()
+    tables: dict[str, dict[tuple, list[dict]]] = {}
+    for row in document["kernels"]:
+        names = full_name(row), row["case"]
+        tables.setdefault(row["op"], {}).setdefault(names, []).append(row)
+    for op, table in tables.items():
+        lines += [f"## {op}", "", f"| {' | '.join(header)} |", "|" + " --- |" * len(header)]
+        for names, rows in table.items():
+            cells = [" / ".join(dict.fromkeys(str(c(row)) for row in rows)) for c in columns]
+            lines.append(f"| {' | '.join([*names, *cells])} |")
+        lines.append("")
+    return "\n".join(lines)

@@ -5,9 +5,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-
-from gamba_warp.kernels.bench.static import sass
-from gamba_warp.kernels.bench.static.estimate import (
+from lab.instructions import sass
+from lab.instructions.estimate import (
     DEVICES,
     Device,
     Shape,
@@ -16,7 +15,7 @@ from gamba_warp.kernels.bench.static.estimate import (
     per_element,
     scan_work,
 )
-from gamba_warp.kernels.bench.static.page import static_markdown
+from lab.instructions.page import markdown
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "benchmarks"
 
@@ -159,5 +158,5 @@ def test_a_page_without_counts_says_so():
     document = json.loads((DOCS / "static.json").read_text())
     for row in document["kernels"]:
         row.pop("loop", None), row.pop("estimate", None)
-    text = static_markdown(document)
+    text = markdown(document)
     assert "No disassembler was found" in text and "Least times" not in text

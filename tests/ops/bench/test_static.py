@@ -11,13 +11,13 @@ import pytest
 import torch
 import warp as wp
 from helpers.kernels import plain_kernel
+from lab.instructions.page import markdown
 
 from gamba_warp.commands.bench import bench_command
 from gamba_warp.kernels.bench.static import report as static
 from gamba_warp.kernels.bench.static.cubin import read_cubin
 from gamba_warp.kernels.bench.static.dry_run import Launch, can_dry_run, dry_run
-from gamba_warp.kernels.bench.static.page import static_markdown
-from gamba_warp.kernels.bench.static.report import MACHINES, occupancy
+from gamba_warp.kernels.bench.static.report import MACHINES, occupancy, static_markdown
 from gamba_warp.kernels.runtime.views import view
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -145,11 +145,11 @@ def test_the_choice_of_kernels_is_the_operators(entries):
 
 
 def test_the_committed_report_is_of_these_kernels(entries):
-    """Made again by ``gamba bench --static --out docs/benchmarks``."""
+    """Made again by ``make instructions``."""
     document = json.loads((DOCS / "static.json").read_text())
     rows = [(r["op"], r["kernel"], r["case"], r["direction"]) for r in document["kernels"]]
     assert rows == [(e.op, e.name, e.case, e.direction) for e in entries for _ in MACHINES]
-    assert (DOCS / "static.md").read_text() == static_markdown(document)
+    assert (DOCS / "static.md").read_text() == markdown(document)
 
 
 # Known from NVIDIA's occupancy calculator.
@@ -242,8 +242,8 @@ def test_the_command_writes_both_files(listed, monkeypatch, tmp_path, capsys):
     }
     text = (tmp_path / "new" / "static.md").read_text()
     row = rows["conv_forward", "forward", "sm_90"]
-    table = text.partition("## Instructions")[0]
-    (line,) = [line for line in table.splitlines() if line.startswith("| `conv_forward` |")]
+    assert text == static_markdown(document)
+    (line,) = [line for line in text.splitlines() if line.startswith("| `conv_forward` |")]
     assert f"{row['registers']} |" in line and f"{row['share']:.0%}" in line
     assert "4 rows" in capsys.readouterr().out
 

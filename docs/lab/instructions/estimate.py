@@ -11,10 +11,11 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ...selective_scan.cuda import backward, forward
-from ...selective_scan.cuda.blocks import MARK, BlockShape, block_shape
-from ...selective_scan.cuda.tokens import SUB, UNROLL
-from ...selective_scan.cuda.tuning import choose
+from gamba_warp.kernels.selective_scan.cuda import backward, forward
+from gamba_warp.kernels.selective_scan.cuda.blocks import MARK, BlockShape, block_shape
+from gamba_warp.kernels.selective_scan.cuda.tokens import SUB, UNROLL
+from gamba_warp.kernels.selective_scan.cuda.tuning import choose
+
 from .sass import Turns
 
 

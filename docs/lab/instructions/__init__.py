@@ -1,0 +1,1 @@
+"""Instructions of the CUDA kernels by a disassembler: ``make instructions``."""

@@ -1,0 +1,89 @@
+"""The report of ``make instructions`` as a page: that of ``gamba bench --static``, and more."""
+
+from __future__ import annotations
+
+from page_parts import table as table_of
+
+from gamba_warp.kernels.bench.static.report import full_name, static_markdown
+
+_NO_DISASSEMBLER = """
+No disassembler was found (nvdisasm on PATH, in CUDA_HOME or inside Triton): instructions are not
+counted here, and no times are estimated.
+"""
+_LOOPS = """
+Instructions in the largest innermost loop of {}, by kind. **memory** counts 32-bit words of a
+thread through the load and store unit. **convert** holds packing; a bfloat16 is widened by a shift,
+which is in **integer** with addresses, comparisons and selections. **multiply** holds integer
+products and moves of constants, which the float unit executes.
+"""
+_KINDS = ("float", "special", "integer", "multiply", "convert", "global", "shared", "local")
+_KINDS += ("shuffle", "barrier", "tensor")
+
+
+def _rows(header: list[str], rows: list[list[object]]) -> str:
+    return table_of(header, [[*map(str, row)] for row in rows])
+
+
+def loops(document: dict) -> list[str]:
+    """What the hottest loop of each kernel holds."""
+    arch = list(document["machines"])[-1]
+    rows = [r for r in document["kernels"] if r["arch"] == arch and "loop" in r]
+    if not rows:
+        return ["## Instructions", _NO_DISASSEMBLER]
+    table: list[list[object]] = []
+    for row in rows:
+        loop = row["loop"]
+        every = sum(loop.values()) - loop.get("passes", 0)
+        kinds = [loop.get(kind, 0) for kind in _KINDS]
+        table.append([full_name(row), row["case"], every, *kinds, loop.get("passes", 0)])
+    header = ["kernel", "case", "all", *_KINDS, "memory"]
+    return ["## Instructions of the hottest loop", _LOOPS.format(arch), _rows(header, table), ""]
+
+
+_ESTIMATES = """
+**Estimates from counts, not measurements.** Each loop turns as often as the shape says, conditions
+are all taken to hold, and every unit works in every cycle; the busiest sets the time, on the
+multiprocessor with the most blocks. Stalls, barriers, bank conflicts and misses are not in it: a
+real time is longer. The shape has {length} tokens and {channels} channels, and 16 sequences, or
+one where it says "in segments". Milliseconds; **memory** is a bound from above, as words that
+threads share count for each of them, and does not set the time. **per element** are instructions of
+a thread for one (batch, token, channel, state).
+
+{devices}
+"""
+_LIMITS = ("issue", "special", "float32", "integer", "dram", "memory")
+
+
+def estimates(document: dict) -> list[str]:
+    """The least times of the scan's kernels; nothing without a disassembler."""
+    rows = [row for row in document["kernels"] if "estimate" in row]
+    if not rows:
+        return []
+    devices = "\n".join(
+        f"- {arch}: {d['name']}, {d['multiprocessors']} multiprocessors of 4 schedulers,"
+        f" {d['float_lanes']} float, 64 integer and 16 special lanes,"
+        f" {d['clock'] / 1e9:.2f} GHz, {d['bandwidth'] / 1e12:.2f} TB/s."
+        for arch, d in document["devices"].items()
+    )
+    header = ["kernel", "case", "arch", "per element", "special", "float", "integer"]
+    header += [f"{name}, ms" for name in _LIMITS] + ["least, ms", "limit"]
+    table: list[list[object]] = []
+    for row in rows:
+        found, each = row["estimate"], row["per_element"]
+        kinds = [f"{each.get(kind, 0):.2f}" for kind in ("all", "special", "float", "integer")]
+        limits = [f"{found[name]:.2f}" for name in _LIMITS]
+        last = [f"**{found['ms']:.2f}**", found["limit"]]
+        table.append([full_name(row), row["case"], row["arch"], *kinds, *limits, *last])
+    text = _ESTIMATES.format(devices=devices, **document["scan"])
+    return [
+        "## Least times of the scan, estimated",
+        text,
+        table_of(header, [[*map(str, row)] for row in table]),
+        "",
+    ]
+
+
+def markdown(document: dict) -> str:
+    """The page of the documents of ``report``."""
+    text = static_markdown(document).replace("gamba bench --static", "make instructions")
+    return "\n".join([text, *loops(document), *estimates(document)])
