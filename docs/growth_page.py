@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 from lab.studies import growth, growth_errors
-from lab.studies.picture import growth_picture
+from lab.studies.draw import growth_picture
 from lab.studies.slopes import ERRORS, growth_lines, growth_table
 from page_parts import table, with_parts
 

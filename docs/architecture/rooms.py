@@ -58,7 +58,7 @@ ROOMS = {
     "kernels.bench.core": Room(
         "what a case is, the clock, reports", ("versions", "kernels.runtime")
     ),
-    "kernels.bench": Room("other packages, a bare loop", (*_KERNELS, "kernels.bench.core")),
+    "kernels.bench": Room("other packages beside ours", (*_KERNELS, "kernels.bench.core")),
     "kernels.bench.cases": Room(
         "one file a subject", (*_KERNELS, "kernels.bench.core", "kernels.bench")
     ),

@@ -20,6 +20,8 @@ from . import show
 
 # What is studied -> the module with ``cases(settings)`` and ``targets(settings)``.
 STUDIES = {
+    "scan": ".scan",
+    "raster": ".raster",
     "lengths": ".lengths",
     "step": ".training.step",
     "model": ".precision",
@@ -54,10 +56,10 @@ def study(
     Writes bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
 
     Args:
-        what: lengths (a Mamba block against a transformer block over the number of tokens), step
-            (of training, by parts), model (in both precisions), growth (time, memory and errors
-            over every size, with slopes; growth-scan, growth-raster and growth-errors are its
-            parts), loader.
+        what: scan and raster (choices inside the kernels), lengths (a Mamba block against a
+            transformer block over the number of tokens), step (of training, by parts), model (in
+            both precisions), growth (time, memory and errors over every size, with slopes;
+            growth-scan, growth-raster and growth-errors are its parts), loader.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes and many rounds.

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from gamba_warp.kernels.bench import Case, Error, Settings, Variant
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from gamba_warp.kernels.bench.cases.raster_variants import make_pair as raster_pair
+from gamba_warp.kernels.bench.cases.raster_scene import make_pair as raster_pair
 from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs
-from gamba_warp.kernels.bench.cases.scan_variants import make_pair as scan_pair
+from gamba_warp.kernels.bench.cases.scan_problem import make_pair as scan_pair
 from gamba_warp.kernels.bench.core.measure import peak_bytes
 
 from .slopes import GROWTH

@@ -13,10 +13,9 @@ from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart
 from gamba_warp.kernels.bench.core.page import line_chart
 from gamba_warp.measure import suites
 
-from .bars import bars
 from .crossing import FIGURES, crossings, series_of
+from .draw import bars, growth_picture
 from .parts import parts_of, parts_table
-from .picture import growth_picture
 from .slopes import ERRORS, GROWTH, error_charts, growth_charts, growth_lines, growth_table
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ...causal_conv1d import causal_conv1d
 from ...causal_conv1d.reference import causal_conv1d_reference
 from .. import peers
-from ..core.case import Case, Error, Key, Settings, Target, Variant, compare
+from ..core.case import Case, Error, Key, Settings, Target, Variant, compare, make_cases
 
 LIMIT = 1e-6
 HALF_LIMITS = {torch.bfloat16: 1e-2, torch.float16: 2e-3}
@@ -24,10 +24,7 @@ _TOKENS = 2048  # that the oracle looks at
 def cases(settings: Settings) -> list[Case]:
     """All cases of the convolution at the level's sizes."""
     builders = [("operator", _operator, None), ("knobs", _knobs, "error")]
-    return [
-        Case("conv", name, " ".join(build.__doc__.split()), partial(build, settings), axis)
-        for name, build, axis in builders
-    ]
+    return make_cases("conv", settings, builders)
 
 
 class _Problem:

@@ -11,8 +11,8 @@ from torch import Tensor
 from ...rasterize.harmonics import colors_seen_from
 from ...rasterize.harmonics.formula import colors_by_formula
 from .. import peers
-from ..core.case import Case, Error, Key, Settings, Target, Variant, compare
-from .raster_variants import BOTH
+from ..core.case import Case, Error, Key, Settings, Target, Variant, compare, make_cases
+from .raster_scene import BOTH
 
 LIMIT = 1e-5
 _DEGREES = (0, 1, 2, 3, 4)
@@ -24,12 +24,7 @@ _Function = Callable[[int, Tensor, Tensor, Tensor], Tensor]
 def cases(settings: Settings) -> list[Case]:
     """The degrees at one size, and the sizes at one degree."""
     builders = [("harmonics by degree", _degrees, "degree"), ("harmonics", _sizes, "N")]
-    return [
-        Case(
-            "raster", name, " ".join((build.__doc__ or "").split()), partial(build, settings), axis
-        )
-        for name, build, axis in builders
-    ]
+    return make_cases("raster", settings, builders)
 
 
 def _gsplat(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:

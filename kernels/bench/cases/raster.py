@@ -3,21 +3,40 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from dataclasses import fields, replace
 from functools import partial
 
 import torch
 
-from ...rasterize import Skip
 from .. import peers
-from ..core.case import Case, Error, Key, Settings, Target, Variant, compare
-from . import harmonics, raster_knobs, raster_large
+from ..core.case import (
+    Case,
+    Error,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    compare,
+    make_cases,
+    over_threads,
+)
+from . import harmonics
 from .raster_parts import Parts
-from .raster_scene import LEAVES, Scene, orbit_cameras, shell
-from .raster_variants import BOTH, COUNT, make_pair, make_scene, make_variant, sizes_of
+from .raster_scene import (
+    BOTH,
+    COUNT,
+    LEAVES,
+    TRADE_LIMIT,
+    Scene,
+    make_pair,
+    make_scene,
+    make_variant,
+    orbit_cameras,
+    shell,
+)
 
+# An alpha or transmittance below these does not show in float64's picture of 16,384 Gaussians.
+_NO_THRESHOLDS = {"alpha_min": 1e-9, "t_min": 1e-30}
 # gsplat's lists of many Gaussians take seconds: a loop in Python.
 _LARGE_PARTS: dict[str, dict[int, tuple[str, ...]]] = {
     "normal": {262144: ("projection", "tile lists")},
@@ -27,37 +46,22 @@ _LARGE_PARTS: dict[str, dict[int, tuple[str, ...]]] = {
 
 def cases(settings: Settings) -> list[Case]:
     """All cases of the rasterizer at the level's sizes."""
-    cpu = settings.device.type == "cpu"
     builders = [
         ("scene", _scenes, None),
-        ("knobs", raster_knobs.trades, "error"),
-        *([("exponential", raster_knobs.exponential, "error")] if cpu else []),
-        *([("tiles", raster_knobs.tiles, "error")] if cpu else []),
+        ("knobs", _knobs, "error"),
         ("skipping", _skipping, "skipped"),
-        ("switches", _switches, "switched off"),
         ("one call", _one_call, None),
         ("Gaussians", _counts, "N"),
         ("pixels", _pixels, "side"),
         ("views", _views, "views"),
         ("batch", _batches, "B"),
     ]
-    if cpu:
-        builders.append(("large scenes", raster_large.large_scenes, "N"))
-        builders.append(("threads", _threads, "threads"))
-        if settings.peers:
-            builders.append(("gsplat's parts", _gsplat_parts, None))
-    else:
+    if settings.device.type == "cuda":
         builders.append(("32 views", _many_views, None))
-    return [
-        Case(
-            op="raster",
-            name=name,
-            text=" ".join(build.__doc__.split()),
-            build=partial(build, settings),
-            axis=axis,
-        )
-        for name, build, axis in builders
-    ] + harmonics.cases(settings)
+    else:
+        builders.append(("threads", _threads, "threads"))
+        builders += [("gsplat's parts", _gsplat_parts, None)] * settings.peers
+    return make_cases("raster", settings, builders) + harmonics.cases(settings)
 
 
 def _scenes(settings: Settings) -> list[Variant]:
@@ -100,7 +104,7 @@ def _peers(scene: Scene, name: str) -> list[Variant]:
                     oracle="our float32 picture",
                     direction=direction,
                     peer=True,
-                    parameters=sizes_of(scene),
+                    parameters=scene.sizes,
                 )
             )
     return made
@@ -136,10 +140,43 @@ def _parts_of(scene: Scene, suffix: str, wanted: Sequence[str]) -> list[Variant]
                     peer=peer,
                     default=not peer,
                     rounds=3 if peer and part == "tile lists" else None,
-                    parameters=sizes_of(scene),
+                    parameters=scene.sizes,
                 )
             )
     return made
+
+
+def _knobs(settings: Settings) -> list[Variant]:
+    """What may be traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
+    threshold of alpha or T and no radius clip. The defaults are what trained Gaussians and other
+    renderers assume.
+    """
+    scene = make_scene(settings, 2).changed(exact=_NO_THRESHOLDS)
+    made = make_pair(scene, "default: alpha 1/255, T 1e-4", limit=TRADE_LIMIT, default=True)
+    quick = settings.level == "quick"
+    for denominator in (64,) if quick else (4096, 1024, 64, 32, 16):
+        made += _trade(scene, f"alpha 1/{denominator}", alpha_min=1 / denominator)
+    for limit in (1e-2,) if quick else (1e-6, 1e-3, 1e-2, 1e-1):
+        made += _trade(scene, f"T {limit:g}", t_min=limit)
+    made += _trade(scene, "alpha 1/4096, T 1e-6", alpha_min=1 / 4096, t_min=1e-6)
+    for radius in (scene.size / 32, scene.size / 16):
+        made += _trade(scene, f"radius clip {radius:g}", radius_clip=radius)
+    for opacity in (0.35, 0.4):
+        kept = scene.gaussians["opacities"] >= opacity
+        pruned = {k: x[kept] for k, x in scene.gaussians.items()}
+        pruned = scene.changed(gaussians=pruned, truth=scene.gaussians)
+        made.append(make_variant(pruned, f"no opacities < {opacity}", limit=TRADE_LIMIT))
+    for dtype in (torch.bfloat16, torch.float16):
+        name = str(dtype).removeprefix("torch.")
+        rounded = {k: x.to(dtype) for k, x in scene.gaussians.items()}
+        rounded = scene.changed(gaussians=rounded, truth=scene.gaussians)
+        made += make_pair(rounded, f"{name} inputs", limit=TRADE_LIMIT)
+        made[-1].dtype = made[-2].dtype = name
+    return made
+
+
+def _trade(scene: Scene, name: str, **options: float) -> list[Variant]:
+    return make_pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
 
 
 def _skipping(settings: Settings) -> list[Variant]:
@@ -150,7 +187,7 @@ def _skipping(settings: Settings) -> list[Variant]:
     made = [make_variant(scene, "all gradients, whole picture", BOTH, default=True)]
     for name in ("colors", "means"):
         made.append(make_variant(scene.changed(wanted=(name,)), f"gradient of {name} alone", BOTH))
-        made[-1].work = partial(_gradients_skipped, scene, 1 - 1 / len(LEAVES))
+        made[-1].work = lambda: scene.work(True) | {"skipped": 1 - 1 / len(LEAVES)}
     half = scene.size // 2
     for name, rows in (("half", scene.size), ("a quarter", half)):
         part = torch.zeros_like(scene.upstream)
@@ -159,46 +196,6 @@ def _skipping(settings: Settings) -> list[Variant]:
         made.append(make_variant(part, f"upstream gradient on {name} of the picture", BOTH))
         made[-1].work = partial(_tiles_skipped, part)
     return made
-
-
-def _switches(settings: Settings) -> list[Variant]:
-    """Every exact skip switched off alone, at scale 2, with an upstream gradient on the left half
-    of the picture and for means alone. Same picture and gradients; what the switch is worth is
-    the difference to the default. Skipped: the share of that switch's own count in the default.
-    """
-    scene = make_scene(settings, 2)
-    part = torch.zeros_like(scene.upstream)
-    part[:, :, : scene.size // 2] = scene.upstream[:, :, : scene.size // 2]
-    scene = scene.changed(cotangent=part, wanted=("means",))
-    made = make_pair(scene, "all skips", default=True)
-    for field in fields(Skip):
-        off = scene.changed(options={"skip": replace(Skip(), **{field.name: False})})
-        pair = make_pair(off, f"without {field.name}")
-        for variant in pair[field.name in ("zero_upstream", "unused", "unasked") :]:
-            variant.work = partial(_share, field.name, scene)
-            made.append(variant)
-    return made
-
-
-def _share(name: str, scene: Scene) -> dict[str, float]:
-    """What the named switch leaves out of its own count, where all are on."""
-    counts = scene.work(True)
-    blocks = 16 * counts["pairs_walked"]
-    none, half = counts["tiles_empty"], counts["tiles"] - counts["tiles_empty"]
-    share = {
-        "tile_test": 1 - counts["pairs"] / counts["pairs_box"],
-        "block_test": 1 - counts["blocks_walked"] / blocks,
-        "stopped": 1 - counts["pairs_walked"] / counts["pairs"],
-        "empty_tiles": none / counts["tiles"],
-        "zero_upstream": (counts["tiles_skipped"] - none) / half,
-        "unused": 1 - counts["blocks_used"] / blocks,
-        "unasked": 1 - len(scene.wanted) / len(LEAVES),
-    }
-    return counts | {"skipped": share[name]}
-
-
-def _gradients_skipped(scene: Scene, share: float) -> dict[str, float]:
-    return scene.work(True) | {"skipped": share}
 
 
 def _tiles_skipped(scene: Scene) -> dict[str, float]:
@@ -228,8 +225,7 @@ def _one_call(settings: Settings) -> list[Variant]:
     for direction in ("forward", BOTH):
         variant = make_variant(single[0], f"{len(single)} calls", direction)
         runs = [s.forward if direction == "forward" else s.backward for s in single]
-        variant.run = partial(_call_all, runs)
-        variant.work = None
+        variant.run, variant.work = partial(_call_all, runs), None
         variant.parameters["views"] = len(single)
         made.append(variant)
     return made
@@ -295,14 +291,7 @@ def _objects(settings: Settings, number: int, views: int, size: int) -> Scene:
 
 def _threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, at scale 2."""
-    cores = os.cpu_count() or 1
-    scene = make_scene(settings, 2)
-    made = []
-    for threads in sorted({1, cores, *(2**i for i in range(1, 10) if 2**i < cores)}):
-        for variant in make_pair(scene, f"{threads} thread{'s' * (threads > 1)}", threads=threads):
-            variant.parameters["threads"] = threads
-            made.append(variant)
-    return made
+    return over_threads(partial(make_pair, make_scene(settings, 2)))
 
 
 def _many_views(settings: Settings) -> list[Variant]:
@@ -311,49 +300,36 @@ def _many_views(settings: Settings) -> list[Variant]:
     return make_pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
 
 
-def _raster(case: str, variant: str, direction: str = "forward", field: str = "ms_p50") -> Key:
-    return Key("raster", case, variant, direction, field)
-
-
 def targets(settings: Settings) -> list[Target]:
     """What should be reached; nothing at a quick run's sizes."""
     if settings.level == "quick":
         return []
-    made = []
+    made, key = [], partial(Key, "raster")
     for scale, bound in ((1, 12), (2, 25), (4, 55)):
-        forward, both = (_raster("scene", f"scale {scale}", d) for d in ("forward", BOTH))
+        forward, both = (key("scene", f"scale {scale}", d) for d in ("forward", BOTH))
         if settings.device.type == "cpu":
             made.append(Target(f"forward, scale {scale}, ms", (forward,), at_most=bound))
         text = f"forward + backward over forward, scale {scale}"
         made.append(Target(text, (both,), (forward,), at_most=3.5))
     for direction in ("forward", BOTH):
-        many, one = (_raster("one call", name, direction) for name in ("32 calls", "one call"))
+        many, one = (key("one call", name, direction) for name in ("32 calls", "one call"))
         text = f"8 objects x 4 views, {direction}, 32 calls over one"
         made.append(Target(text, (many,), (one,), at_least=1.3))
-    made += _growth(settings) + harmonics.targets(settings)
-    cuda = settings.device.type == "cuda"
-    return made + (_cuda_targets() if cuda else raster_large.targets(settings))
-
-
-def _growth(settings: Settings) -> list[Target]:
-    """Time grows no faster than the pairs of Gaussians and tiles."""
-    made = []
     for count in (65536, 262144) if settings.level == "full" else (65536,):
         for direction in ("forward", BOTH):
             few, many = (
-                partial(_raster, "Gaussians", f"{n} Gaussians", direction) for n in (16384, count)
+                partial(key, "Gaussians", f"{n} Gaussians", direction) for n in (16384, count)
             )
             text = f"{direction}, growth of time over growth of pairs, 16384 to {count} Gaussians"
             times, over = (many(), few("pairs")), (few(), many("pairs"))
             made.append(Target(text, times, over, at_most=1.0))
+    made += harmonics.targets(settings)
+    if settings.device.type == "cuda":
+        ours, both = (key("32 views", "ours", d) for d in ("forward", BOTH))
+        peer = key("32 views", "gsplat, 32 views")
+        made += [
+            Target("forward, µs a view of 512²", (ours,), scale=1e3 / 32, at_most=60),
+            Target("forward + backward, µs a view of 512²", (both,), scale=1e3 / 32, at_most=210),
+            Target("forward, gsplat's time over ours", (peer,), (ours,), at_least=1.5),
+        ]
     return made
-
-
-def _cuda_targets() -> list[Target]:
-    ours, both = (_raster("32 views", "ours", d) for d in ("forward", BOTH))
-    peer = _raster("32 views", "gsplat, 32 views")
-    return [
-        Target("forward, µs a view of 512²", (ours,), scale=1e3 / 32, at_most=60),
-        Target("forward + backward, µs a view of 512²", (both,), scale=1e3 / 32, at_most=210),
-        Target("forward, gsplat's time over ours", (peer,), (ours,), at_least=1.5),
-    ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from ...rasterize import rasterization
 from ...rasterize.reference import rasterization_reference
-from ..core.case import Error, compare
+from ..core.case import Error, Settings, Variant, compare
 
 LEAVES = ("means", "quats", "scales", "opacities", "colors")
 WORK = (
@@ -25,6 +26,12 @@ WORK = (
 )
 _HALF_FOV = math.radians(49.1) / 2
 _FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # width and height, pixels
+
+# Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
+FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 10.0
+BOTH = "forward+backward"
+COUNT = 16384
+_SIZE = 512
 
 
 def shell(count: int, scale: float = 1.0, seed: int = 0) -> dict[str, Tensor]:
@@ -101,6 +108,12 @@ class Scene:
         assert self.cotangent is not None  # ``__post_init__`` draws one
         return self.cotangent
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """For tables and charts."""
+        count, views = self.gaussians["opacities"].shape[-1], self.viewmats.shape[:-2].numel()
+        return {"N": count, "side": self.size, "views": views}
+
     def changed(self, **changes) -> Scene:
         """A copy with other attributes."""
         return Scene(**(vars(self) | changes))
@@ -137,14 +150,8 @@ class Scene:
         if backward:
             cotangent = self.upstream[..., : image.shape[-1]]
             torch.autograd.grad(image, list(leaves.values()), cotangent)
-        counts = {}
-        for name in (*WORK, "tiles_skipped") if backward else WORK:
-            try:
-                counts[name] = int(meta[name])
-            except KeyError:  # a count that this version does not have
-                continue
-        counts["gaussians"] = self.gaussians["opacities"].numel()
-        return counts
+        counts = {name: int(meta[name]) for name in (*WORK, *["tiles_skipped"] * backward)}
+        return counts | {"gaussians": self.gaussians["opacities"].numel()}
 
     def oracle(self, backward: bool) -> str:
         """What the check compares with, in words."""
@@ -202,3 +209,40 @@ class Scene:
             grads = torch.autograd.grad(outputs, list(leaves.values()), cotangents)
             named |= {f"gradient of {k}": v for k, v in zip(leaves, grads)}
         return named
+
+
+def make_scene(
+    settings: Settings,
+    scale: float = 1.0,
+    count: int | None = None,
+    size: int | None = None,
+    views: int = 1,
+) -> Scene:
+    """The shell; a quick run has an eighth of the Gaussians and a quarter of the pixels."""
+    quick = settings.level == "quick"
+    count = count or (COUNT // 8 if quick else COUNT)
+    size = size or (_SIZE // 2 if quick else _SIZE)
+    return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
+
+
+def make_variant(
+    scene: Scene, name: str, direction: str = "forward", limit: float | None = None, **changes
+) -> Variant:
+    """A variant that calls the operator on a scene."""
+    backward = direction == BOTH
+    return Variant(
+        name=name,
+        run=scene.backward if backward else scene.forward,
+        check=partial(scene.check, backward),
+        limit=limit or (BACKWARD_LIMIT if backward else FORWARD_LIMIT),
+        oracle=scene.oracle(backward),
+        direction=direction,
+        parameters=scene.sizes,
+        work=partial(scene.work, backward),
+        **changes,
+    )
+
+
+def make_pair(scene: Scene, name: str, **changes) -> list[Variant]:
+    """Forward, and forward with all gradients."""
+    return [make_variant(scene, name, direction, **changes) for direction in ("forward", BOTH)]

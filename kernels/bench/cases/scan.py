@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from functools import partial
 
 import torch
 
 from .. import peers
-from ..core.case import Case, Error, Key, Settings, Target, Variant
-from ..probe import probe_rate, probe_scan
-from . import scan_knobs
-from .scan_problem import ScanProblem, make_inputs
-from .scan_variants import (
+from ..core.case import Case, Error, Key, Settings, Target, Variant, make_cases, over_threads
+from .scan_problem import (
     BOTH,
     HALF_LIMITS,
     SIZES,
+    ScanProblem,
     count_memory,
+    make_inputs,
     make_pair,
     make_problem,
     make_variant,
@@ -31,77 +29,35 @@ def cases(settings: Settings) -> list[Case]:
         ("operator", _operator, None),
         ("reference loop", _reference_loop, None),
         ("knobs", _knobs, "error"),
-        *([("exponential", scan_knobs.exponential, "error")] if cpu else []),
-        *([("boundary spacing", scan_knobs.spacings, "error,memory,spacing")] if cpu else []),
-        ("chunk size", scan_knobs.chunks if cpu else scan_knobs.cuda_tunings, "error"),
         ("length", _lengths, "L"),
         ("batch", _batches, "B"),
         ("states", _states, "N"),
+        ("threads", _threads, "threads") if cpu else ("training batch", _training_batch, None),
     ]
-    if cpu:
-        builders.append(("threads", _threads, "threads"))
-    else:
-        builders.append(("training batch", _training_batch, None))
-    return [
-        Case("scan", name, " ".join(build.__doc__.split()), partial(build, settings), axis)
-        for name, build, axis in builders
-    ]
+    return make_cases("scan", settings, builders)
 
 
 def _operator(settings: Settings) -> list[Variant]:
-    """The whole operator (softplus, bias, skip and gate) beside a bare probe: a native loop over
-    given steps, without gate, skip or gradient, into a given output.
-    """
-    problem = make_problem(settings)
-    made = make_pair(problem, "default", default=True)
-    bare = problem.bare()
-    made.append(make_variant(bare, "given steps, no gate or skip"))
-    if settings.device.type == "cpu":
-        made += [_probe(bare, threads) for threads in sorted({1, settings.threads})]
-    return made
-
-
-def _probe(bare: ScanProblem, threads: int) -> Variant:
-    x = bare.inputs
-    out = torch.empty_like(x["u"][0])
-    run = partial(
-        probe_scan, *(x["u"][0], x["delta"][0], probe_rate(x["A"]), x["B"][0], x["C"][0], out)
-    )
-    _, length, width = x["u"].shape
-    return Variant(
-        f"probe, {threads} thread{'s' * (threads > 1)}",
-        run,
-        lambda: bare.check_output(run()[None]),
-        1e-5,
-        bare.oracle,
-        peer=True,
-        threads=threads,
-        parameters={"B": 1, "L": length, "D": width, "N": 16},
-    )
-
-
-def _loop_length(settings: Settings) -> int:
-    """At 16961 tokens the loop takes seconds and its factors gigabytes."""
-    return 2048 if settings.level == "normal" else SIZES[settings.level][0]
+    """The whole operator: softplus, bias, skip and gate."""
+    return make_pair(make_problem(settings), "default", default=True)
 
 
 def _reference_loop(settings: Settings) -> list[Variant]:
     """The operator against the formula as a torch loop (as Mamba's reference does it), and against
-    peers where they are installed, all on the same input. No target is set on the loop: it too
-    works on all channels at once, so that the bare probe is the limit and the loop is not.
+    peers where they are installed, all on the same input.
     """
-    length, tokens = _loop_length(settings), SIZES[settings.level][2]
-    width = SIZES[settings.level][1]
-    inputs = make_inputs(1, length, width)
-    problem = ScanProblem(inputs, settings.device, tokens)
+    length, width, tokens = SIZES[settings.level]
+    if settings.level == "normal":
+        length = 2048  # at 16961 tokens the loop takes seconds and its factors gigabytes
+    problem = ScanProblem(make_inputs(1, length, width), settings.device, tokens)
     made = [
         make_variant(problem, "default", default=True),
-        _peer(problem, "torch loop", peers.scan_loop, channels_first=True, rounds=2),
+        _peer(problem, "torch loop", peers.scan_loop, rounds=2),
     ]
     if settings.peers:
         made.append(_peer(problem, "mambapy", peers.mambapy_scan, channels_first=False, rounds=3))
         if settings.device.type == "cuda":
-            made.append(_peer(problem, "mamba-ssm", peers.mamba_ssm_scan, channels_first=True))
+            made.append(_peer(problem, "mamba-ssm", peers.mamba_ssm_scan))
     return made
 
 
@@ -109,11 +65,12 @@ def _peer(
     problem: ScanProblem,
     name: str,
     function: Callable,
-    channels_first: bool,
-    rounds: int | None = None,
     dtype: torch.dtype = torch.float32,
     direction: str = "forward",
+    channels_first: bool = True,
+    **changes,
 ) -> Variant:
+    """Another package's scan on the inputs of a problem, laid out as it wants them."""
     inputs = dict(problem.at(dtype))
     if channels_first:  # laid out as the peer wants it, before the clock
         inputs |= {k: inputs[k].mT.contiguous() for k in ("u", "delta", "B", "C", "z")}
@@ -130,7 +87,6 @@ def _peer(
         out = forward()
         return problem.check_output(out.mT if channels_first else out)
 
-    batch, length, width = problem.inputs["u"].shape
     return Variant(
         name,
         forward if direction == "forward" else backward,
@@ -140,8 +96,8 @@ def _peer(
         direction,
         str(dtype).removeprefix("torch."),
         peer=True,
-        rounds=rounds,
-        parameters={"B": batch, "L": length, "D": width, "N": 16},
+        parameters=problem.sizes,
+        **changes,
     )
 
 
@@ -204,16 +160,7 @@ def _states(settings: Settings) -> list[Variant]:
 
 def _threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, from one to the machine's cores."""
-    problem = make_problem(settings)
-    cores = os.cpu_count() or 1
-    counts = sorted({1, cores, *(2**i for i in range(1, 10) if 2**i < cores)})
-    made = []
-    for threads in counts:
-        variants = make_pair(problem, f"{threads} thread{'s' * (threads > 1)}", threads=threads)
-        for variant in variants:
-            variant.parameters["threads"] = threads
-        made += variants
-    return made
+    return over_threads(partial(make_pair, make_problem(settings)))
 
 
 def _training_batch(settings: Settings) -> list[Variant]:
@@ -225,73 +172,39 @@ def _training_batch(settings: Settings) -> list[Variant]:
     single = make_problem(settings)
     made.append(make_variant(single, "one sequence", dtype=torch.bfloat16))
     if settings.peers:
-        made += [
-            _peer(
-                *(problem, "mamba-ssm", peers.mamba_ssm_scan, True),
-                dtype=torch.bfloat16,
-                direction=direction,
-            )
-            for direction in ("forward", BOTH)
-        ]
+        peer = partial(_peer, problem, "mamba-ssm", peers.mamba_ssm_scan, torch.bfloat16)
+        made += [peer(direction) for direction in ("forward", BOTH)]
     return made
-
-
-def _scan(case: str, variant: str, direction: str = "forward", field: str = "ms_p50") -> Key:
-    return Key("scan", case, variant, direction, field)
 
 
 def targets(settings: Settings) -> list[Target]:
     """What should be reached; nothing at a quick run's sizes."""
     if settings.level == "quick":
         return []
-    ours = _scan("operator", "default")
-    made = [
-        Target(
-            "forward + backward over forward",
-            (_scan("operator", "default", BOTH),),
-            (ours,),
-            at_most=5,
-        ),
-    ]
-    long, short = (partial(_scan, "length", f"L {length}") for length in (65536, 4096))
+    key = partial(Key, "scan")
+    ours, both = key("operator", "default"), key("operator", "default", BOTH)
+    made = [Target("forward + backward over forward", (both,), (ours,), at_most=5)]
+    long, short = (partial(key, "length", f"L {length}") for length in (65536, 4096))
     for name, field in (("time", "ms_p50"), ("memory", "peak_bytes")):
         for direction in ("forward", BOTH):
-            made.append(
-                Target(
-                    f"{direction}, {name} per token at L 65536 over L 4096",
-                    (long(direction, field),),
-                    (short(direction, field),),
-                    scale=4096 / 65536,
-                    at_most=1.2 if (name, direction) == ("time", BOTH) else 1.1,
-                )
-            )
-    made.append(
-        Target(
-            "saved for the backward over the state history",
-            (long(BOTH, "saved_bytes"),),
-            (long(BOTH, "state_history_bytes"),),
-            at_most=1 / 64,
-        )
-    )
-    return made + (_cpu_targets(ours) if settings.device.type == "cpu" else _cuda_targets())
-
-
-def _cpu_targets(ours: Key) -> list[Target]:
-    probe = _scan("operator", "probe, 2 threads")
-    made = [Target("forward over the bare probe, 2 threads", (ours,), (probe,), at_most=1.3)]
-    for direction in ("forward", BOTH):
-        one, two = (_scan("threads", name, direction) for name in ("1 thread", "2 threads"))
-        made.append(Target(f"{direction}, 1 thread over 2", (one,), (two,), at_least=1.8))
-    return made
-
-
-def _cuda_targets() -> list[Target]:
-    layer = partial(_scan, "training batch")
+            text = f"{direction}, {name} per token at L 65536 over L 4096"
+            times, over = (long(direction, field),), (short(direction, field),)
+            most = 1.2 if (name, direction) == ("time", BOTH) else 1.1
+            made.append(Target(text, times, over, scale=4096 / 65536, at_most=most))
+    saved, history = (long(BOTH, field) for field in ("saved_bytes", "state_history_bytes"))
+    text = "saved for the backward over the state history"
+    made.append(Target(text, (saved,), (history,), at_most=1 / 64))
+    if settings.device.type == "cpu":
+        for direction in ("forward", BOTH):
+            one, two = (key("threads", name, direction) for name in ("1 thread", "2 threads"))
+            made.append(Target(f"{direction}, 1 thread over 2", (one,), (two,), at_least=1.8))
+        return made
+    layer = partial(key, "training batch")
     ours, both, single = layer("default"), layer("default", BOTH), layer("one sequence")
-    peer = layer("mamba-ssm")
     return [
+        *made,
         Target("forward of a layer, B 16, bfloat16, ms", (ours,), at_most=2.2),
         Target("forward + backward of a layer, B 16, bfloat16, ms", (both,), at_most=6),
         Target("forward of a layer, B 1, bfloat16, ms", (single,), at_most=0.25),
-        Target("forward, mamba-ssm's time over ours", (peer,), (ours,), at_least=1.5),
+        Target("forward, mamba-ssm's time over ours", (layer("mamba-ssm"),), (ours,), at_least=1.5),
     ]

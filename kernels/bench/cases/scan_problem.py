@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,7 +12,18 @@ from torch import Tensor
 
 from ...selective_scan import selective_scan
 from ...selective_scan.reference import selective_scan_reference
-from ..core.case import Error, compare
+from ..core.case import Error, Settings, Variant, compare
+from ..core.measure import peak_bytes, saved_bytes
+
+# The relative rms errors to float64 that are allowed. Those of half precision are explained by the
+# rounding of inputs and output.
+FORWARD_LIMIT, BACKWARD_LIMIT = 1e-6, 1e-5
+CUDA_LIMIT = 1e-5  # of both directions: ex2.approx is off by 2^-22 at every token
+HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
+TRADE_LIMIT = 1.0  # where accuracy is the knob
+BOTH = "forward+backward"
+# Tokens, channels, and tokens that the oracle looks at.
+SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (16961, 1024, 16961)}
 
 
 def make_inputs(
@@ -84,6 +96,12 @@ class ScanProblem:
         if self.tokens < length:
             part += f", first {self.tokens} of {length} tokens"
         return f"float64 loop, {part}"
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """For tables and charts."""
+        batch, length, width = self.inputs["u"].shape
+        return {"B": batch, "L": length, "D": width, "N": self.inputs["A"].shape[1]}
 
     def bare(self) -> ScanProblem:
         """The same with the steps given, and no gate, skip or bias."""
@@ -184,3 +202,52 @@ class ScanProblem:
             truth |= dict(zip(full, grads))
         self._truths[key] = truth
         return truth
+
+
+def make_problem(settings: Settings, **changes) -> ScanProblem:
+    """A problem of the level's size, but for ``changes`` of ``make_inputs``."""
+    length, width, tokens = SIZES[settings.level]
+    inputs = make_inputs(**({"batch": 1, "length": length, "channels": width} | changes))
+    return ScanProblem(inputs, settings.device, tokens)
+
+
+def make_variant(
+    problem: ScanProblem,
+    name: str,
+    direction: str = "forward",
+    dtype: torch.dtype = torch.float32,
+    options: dict | None = None,
+    **changes,
+) -> Variant:
+    """A variant that calls the operator with ``options``."""
+    forward, options = direction == "forward", options or {}
+    limit = FORWARD_LIMIT if forward else BACKWARD_LIMIT
+    if problem.device.type == "cuda":
+        limit = CUDA_LIMIT
+    return Variant(
+        name,
+        partial(problem.forward if forward else problem.backward, dtype, **options),
+        partial(problem.check_forward if forward else problem.check_backward, dtype, **options),
+        HALF_LIMITS.get(dtype, limit),
+        problem.oracle,
+        direction,
+        str(dtype).removeprefix("torch."),
+        parameters=problem.sizes,
+        **changes,
+    )
+
+
+def make_pair(problem: ScanProblem, name: str, **changes) -> list[Variant]:
+    """Forward, and forward with all gradients."""
+    return [make_variant(problem, name, direction, **changes) for direction in ("forward", BOTH)]
+
+
+def count_memory(problem: ScanProblem, direction: str) -> dict[str, int]:
+    """Bytes: of all states, of what is kept for the gradient, and the peak."""
+    run = problem.forward if direction == "forward" else problem.backward
+    counts = {"state_history_bytes": 4 * math.prod(problem.sizes.values())}
+    if direction == BOTH:
+        leaves = problem.leaves()
+        counts["saved_bytes"] = saved_bytes(lambda: problem.call(leaves), leaves.values())
+    peak = peak_bytes(run, problem.device)
+    return counts if peak is None else counts | {"peak_bytes": peak}

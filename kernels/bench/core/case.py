@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -127,25 +129,6 @@ class Variant:
     work: Callable[[], Mapping[str, int | float]] | None = None
 
 
-def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Variant]:
-    """Makes variants run, check and count inside ``use(choice)``, which chooses kernels."""
-
-    def inside(function: Callable) -> Callable:
-        def run():
-            with use(choice):
-                return function()
-
-        return run
-
-    for variant in made:
-        variant.run = inside(variant.run)
-        if variant.check is not None:
-            variant.check = inside(variant.check)
-        if variant.work is not None:
-            variant.work = inside(variant.work)
-    return made
-
-
 @dataclass
 class Case:
     """Variants that are timed in turn, so that their ratios come from one run.
@@ -165,6 +148,32 @@ class Case:
     text: str
     build: Callable[[], list[Variant]]
     axis: str | None = None
+
+
+def make_cases(
+    op: str,
+    settings: Settings,
+    builders: Iterable[tuple[str, Callable[[Settings], list[Variant]], str | None]],
+) -> list[Case]:
+    """The cases of an op from a table of names, builders and axes.
+
+    A builder's docstring is the text of its case.
+    """
+    return [
+        Case(op, name, " ".join((build.__doc__ or "").split()), partial(build, settings), axis)
+        for name, build, axis in builders
+    ]
+
+
+def over_threads(make: Callable[..., list[Variant]]) -> list[Variant]:
+    """``make(name, threads=)``'s variants for one thread, two, four and so on to all cores."""
+    cores = os.cpu_count() or 1
+    made = []
+    for threads in sorted({1, cores, *(2**i for i in range(1, 10) if 2**i < cores)}):
+        for variant in make(f"{threads} thread{'s' * (threads > 1)}", threads=threads):
+            variant.parameters = variant.parameters | {"threads": threads}
+            made.append(variant)
+    return made
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ BLOCK = 4  # pixels, side of the block whose pixels are lanes
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """A choice of the CPU's kernels; ``gamba bench raster`` has what each choice costs.
+    """A choice of the CPU's kernels; ``make study WHAT=raster`` has what each choice costs.
 
     Attributes:
         tile: side in pixels of the squares that have a list each, 8 or 16.

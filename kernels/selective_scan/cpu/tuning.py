@@ -12,7 +12,7 @@ FEW = 8  # states up to which the memory, and not the arithmetic, sets the time
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """A choice of kernels; ``gamba bench scan`` has what each choice costs.
+    """A choice of kernels; ``make study WHAT=scan`` has what each choice costs.
 
     Attributes:
         chunk: tokens between saved states, which the gradient walks at once; a multiple of

@@ -11,6 +11,8 @@ from functools import partial
 import pytest
 import torch
 from helpers import rel_rms
+from lab.studies import raster as raster_study
+from lab.studies import scan as scan_study
 from lab.studies.training import step
 
 from gamba_warp import cli
@@ -30,9 +32,8 @@ from gamba_warp.kernels.bench import (
 from gamba_warp.kernels.bench.cases import conv as conv_suite
 from gamba_warp.kernels.bench.cases import raster as raster_suite
 from gamba_warp.kernels.bench.cases import scan as scan_suite
-from gamba_warp.kernels.bench.cases.raster_variants import make_scene
-from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs
-from gamba_warp.kernels.bench.cases.scan_variants import make_variant
+from gamba_warp.kernels.bench.cases.raster_scene import make_scene
+from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs, make_variant
 from gamba_warp.kernels.bench.core.case import NotInstalled
 from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart, pareto
 from gamba_warp.kernels.bench.core.measure import peak_bytes, saved_bytes
@@ -277,7 +278,7 @@ def test_targets_are_judged():
 
 def test_every_target_names_what_its_suite_measures(monkeypatch):
     """Names only: nothing is run."""
-    for suite in (scan_suite, conv_suite, raster_suite):
+    for suite in (scan_suite, conv_suite, raster_suite, scan_study, raster_study):
         full = Settings(torch.device("cpu"), "full", threads=2)
         names = {c.name for c in suite.cases(full)}
         for target in suite.targets(full):
@@ -417,12 +418,18 @@ def test_quick_scan_and_conv_from_the_command_line(tmp_path, capsys):
     assert code == 0, [r["status"] for r in records if r["status"] != "ok"]
     assert {r["op"] for r in records} == {"scan", "conv"}
     assert all(r["rel_rms_error"] < 5e-2 for r in records)
-    probe = [r for r in records if r["variant"].startswith("probe")]
-    assert len(probe) == 2 and all(r["rel_rms_error"] < 1e-5 for r in probe)
     loop = next(r for r in records if r["variant"] == "torch loop")
     ours = next(r for r in records if r["case"] == loop["case"] and r["variant"] == "default")
     assert ours["peer"] == "torch loop" and ours["peer_ms"] > ours["ms_p50"]
     assert {"bench.json", "bench.md", "bench.html"} == {p.name for p in tmp_path.iterdir()}
+
+
+def test_the_bare_loop_is_right():
+    settings = replace(QUICK, threads=2)
+    (case,) = [c for c in scan_study.cases(settings) if c.name == "bare loop"]
+    records = measure([case], settings)["records"]
+    probe = [r for r in records if r["variant"].startswith("probe")]
+    assert len(probe) == 2 and all(r["rel_rms_error"] < 1e-5 for r in probe)
 
 
 def test_the_scene_and_its_crop():
@@ -437,7 +444,8 @@ def test_the_scene_and_its_crop():
 
 @pytest.mark.parametrize("name", ["one call", "skipping", "batch", "exponential", "harmonics"])
 def test_raster_cases_run(name):
-    chosen = [c for c in raster_suite.cases(QUICK) if c.name == name]
+    every = [*raster_suite.cases(QUICK), *raster_study.cases(QUICK)]
+    chosen = [c for c in every if c.name == name]
     records = measure(chosen, QUICK)["records"]
     assert records and all(r["status"] == "ok" for r in records), records
     if name == "skipping":
@@ -488,7 +496,7 @@ def test_unwritable_result_is_one_line(monkeypatch, tmp_path):
 
 
 def test_kept_states_are_counted_on_their_own_kernels():
-    (case,) = [c for c in scan_suite.cases(QUICK) if c.name == "boundary spacing"]
+    (case,) = [c for c in scan_study.cases(QUICK) if c.name == "boundary spacing"]
     wide, narrow = measure([case], QUICK)["records"][::-1]
     assert narrow["status"] == wide["status"] == "ok" and wide["is_default"]
     assert narrow["work"]["saved_bytes"] == 2 * wide["work"]["saved_bytes"]

@@ -11,7 +11,7 @@ import pytest
 import torch
 from lab.studies import growth, show
 from lab.studies.__main__ import GROUPS, STUDIES
-from lab.studies.picture import growth_picture
+from lab.studies.draw import growth_picture
 from lab.studies.show import charts_of, markdown, page
 from lab.studies.slopes import growth_lines, growth_table, growths, slope
 

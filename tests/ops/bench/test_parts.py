@@ -7,7 +7,7 @@ import pytest
 import torch
 from lab.studies import parts
 from lab.studies.__main__ import load_study, study
-from lab.studies.bars import bars
+from lab.studies.draw import bars
 from lab.studies.show import charts_of, markdown, page
 from torch.profiler import record_function
 

@@ -11,7 +11,7 @@ from typing import no_type_check
 import warp as wp
 from torch import Tensor
 
-from ..runtime.launch import parallel_launch
+from gamba_warp.kernels.runtime.launch import parallel_launch
 
 LANES = STATES = 16
 _LOG2E = 1.4426950408889634

@@ -1,19 +1,33 @@
-"""Large scenes on a CPU: up to a million Gaussians, views of 512² and of 1920 x 1080."""
+"""Studies of the rasterizer: its inner choices, its switches one by one, and large scenes."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ...rasterize import rasterization
-from ..core.case import Key, Settings, Target, Variant
-from .raster_parts import Parts
-from .raster_scene import Scene, orbit_cameras, shell
-from .raster_variants import BOTH, make_variant
+from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
+from gamba_warp.kernels.bench.cases.raster_parts import Parts
+from gamba_warp.kernels.bench.cases.raster_scene import (
+    BOTH,
+    LEAVES,
+    TRADE_LIMIT,
+    Scene,
+    make_pair,
+    make_scene,
+    make_variant,
+    orbit_cameras,
+    shell,
+)
+from gamba_warp.kernels.bench.core.case import make_cases
+from gamba_warp.kernels.rasterize import Skip, rasterization
+from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
+
+from .scan import on_kernels
 
 _FEW = 16384
 _CASE = "large scenes"
@@ -21,6 +35,81 @@ _FRONT = "projection and lists"
 _SUM = "pairs_and_gaussians"
 _MARGIN = 16  # pixels around the crop of the check, within which the oracle sees all Gaussians
 _LEVELS = {"quick": (1024, 40000), "normal": (_FEW, 262144), "full": (_FEW, 262144, 1048576)}
+
+
+def cases(settings: Settings) -> list[Case]:
+    """All studies of the rasterizer at the level's sizes."""
+    builders = [("switches", switches, "switched off")]
+    if settings.device.type == "cpu":
+        builders += [
+            ("exponential", exponential, "error"),
+            ("tiles", tiles, "error"),
+            ("large scenes", large_scenes, "N"),
+        ]
+    return make_cases("raster", settings, builders)
+
+
+def exponential(settings: Settings) -> list[Variant]:
+    """Degree of the polynomial that makes exp in the CPU's kernels, at scale 2. The truth has the
+    same thresholds, so that the polynomial alone is seen: without them ("knobs") their error
+    hides it. Degree 5 errs by float32's own rounding at a price that is hardly to be measured.
+    """
+    scene, default, made = make_scene(settings, 2), Tuning(), []
+    for degree in (3, 5) if settings.level == "quick" else (2, 3, 4, 5):
+        choice = Tuning(degree=degree)
+        pair = make_pair(scene, f"degree {degree}", limit=TRADE_LIMIT, default=choice == default)
+        made += on_kernels(use_tuning, choice, pair)
+    return made
+
+
+def tiles(settings: Settings) -> list[Variant]:
+    """Side of the tiles that have a list, and size of the sub-tiles that an ellipse is tested
+    against in them, of the CPU's kernels, at scale 2. Same picture: a smaller tile makes more
+    pairs, a larger sub-tile more evaluations.
+    """
+    scene, default, made = make_scene(settings, 2), Tuning(), []
+    sizes = [(16, 4, 4), (16, 8, 4), (16, 8, 8), (16, 16, 16), (8, 4, 4), (8, 8, 8)]
+    for tile, width, height in sizes[::4] if settings.level == "quick" else sizes:
+        choice = Tuning(tile=tile, width=width, height=height)
+        pair = make_pair(scene, f"{tile}, {width} x {height}", default=choice == default)
+        made += on_kernels(use_tuning, choice, pair)
+    return made
+
+
+def switches(settings: Settings) -> list[Variant]:
+    """Every exact skip switched off alone, at scale 2, with an upstream gradient on the left half
+    of the picture and for means alone. Same picture and gradients; what the switch is worth is
+    the difference to the default. Skipped: the share of that switch's own count in the default.
+    """
+    scene = make_scene(settings, 2)
+    part = torch.zeros_like(scene.upstream)
+    part[:, :, : scene.size // 2] = scene.upstream[:, :, : scene.size // 2]
+    scene = scene.changed(cotangent=part, wanted=("means",))
+    made = make_pair(scene, "all skips", default=True)
+    for field in fields(Skip):
+        off = scene.changed(options={"skip": replace(Skip(), **{field.name: False})})
+        pair = make_pair(off, f"without {field.name}")
+        for variant in pair[field.name in ("zero_upstream", "unused", "unasked") :]:
+            variant.work = partial(_share, field.name, scene)
+            made.append(variant)
+    return made
+
+
+def _share(name: str, scene: Scene) -> dict[str, float]:
+    """What the named switch leaves out of its own count, where all are on."""
+    counts = scene.work(True)
+    blocks = 16 * counts["pairs_walked"]
+    none, half = counts["tiles_empty"], counts["tiles"] - counts["tiles_empty"]
+    share = {
+        "tile_test": 1 - counts["pairs"] / counts["pairs_box"],
+        "block_test": 1 - counts["blocks_walked"] / blocks,
+        "stopped": 1 - counts["pairs_walked"] / counts["pairs"],
+        "empty_tiles": none / counts["tiles"],
+        "zero_upstream": (counts["tiles_skipped"] - none) / half,
+        "unused": 1 - counts["blocks_used"] / blocks,
+        "unasked": 1 - len(scene.wanted) / len(LEAVES),
+    }
+    return counts | {"skipped": share[name]}
 
 
 def _width(size: int, wide: bool) -> int:
@@ -107,6 +196,8 @@ def large_scenes(settings: Settings) -> list[Variant]:
 
 def targets(settings: Settings) -> list[Target]:
     """Time grows no faster than pairs and Gaussians together; projection and lists are half."""
+    if settings.level == "quick" or settings.device.type != "cpu":
+        return []
     made = []
     for count in _LEVELS[settings.level][1:]:
         few, many = f"{_FEW} Gaussians", f"{count} Gaussians"

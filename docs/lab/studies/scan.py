@@ -1,15 +1,98 @@
-"""Cases of the scan's inner choices, which no caller makes: each is a point on the charts."""
+"""Studies of the scan: its inner choices, which no caller makes, and a bare loop beside it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from ...selective_scan.cpu import tuning as cpu_tuning
-from ...selective_scan.cuda import tuning as cuda_tuning
-from ..core.case import Settings, Variant, on_kernels
-from .scan_problem import ScanProblem
-from .scan_variants import BOTH, TRADE_LIMIT, count_memory, make_pair, make_problem, make_variant
+import torch
+
+from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
+from gamba_warp.kernels.bench.cases.scan_problem import (
+    BOTH,
+    TRADE_LIMIT,
+    ScanProblem,
+    count_memory,
+    make_pair,
+    make_problem,
+    make_variant,
+)
+from gamba_warp.kernels.bench.core.case import make_cases
+from gamba_warp.kernels.selective_scan.cpu import tuning as cpu_tuning
+from gamba_warp.kernels.selective_scan.cuda import tuning as cuda_tuning
+
+from .probe import probe_rate, probe_scan
+
+
+def cases(settings: Settings) -> list[Case]:
+    """All studies of the scan at the level's sizes."""
+    if settings.device.type != "cpu":
+        return make_cases("scan", settings, [("chunk size", cuda_tunings, "error")])
+    builders = [
+        ("bare loop", bare_loop, None),
+        ("exponential", exponential, "error"),
+        ("boundary spacing", spacings, "error,memory,spacing"),
+        ("chunk size", chunks, "error"),
+    ]
+    return make_cases("scan", settings, builders)
+
+
+def targets(settings: Settings) -> list[Target]:
+    """What should be reached; nothing at a quick run's sizes."""
+    if settings.level == "quick" or settings.device.type != "cpu":
+        return []
+    ours, probe = (Key("scan", "bare loop", name) for name in ("default", "probe, 2 threads"))
+    return [Target("forward over the bare probe, 2 threads", (ours,), (probe,), at_most=1.3)]
+
+
+def on_kernels(use: Callable, choice: object, made: list[Variant]) -> list[Variant]:
+    """Makes variants run, check and count inside ``use(choice)``, which chooses kernels."""
+
+    def inside(function: Callable) -> Callable:
+        def run():
+            with use(choice):
+                return function()
+
+        return run
+
+    for variant in made:
+        variant.run = inside(variant.run)
+        if variant.check is not None:
+            variant.check = inside(variant.check)
+        if variant.work is not None:
+            variant.work = inside(variant.work)
+    return made
+
+
+def bare_loop(settings: Settings) -> list[Variant]:
+    """The whole operator (softplus, bias, skip and gate) beside a bare probe: a native loop over
+    given steps, without gate, skip or gradient, into a given output.
+    """
+    problem = make_problem(settings)
+    bare = problem.bare()
+    made = [make_variant(problem, "default", default=True)]
+    made.append(make_variant(bare, "given steps, no gate or skip"))
+    return [*made, *(_probe(bare, threads) for threads in sorted({1, settings.threads}))]
+
+
+def _probe(bare: ScanProblem, threads: int) -> Variant:
+    x = bare.inputs
+    out = torch.empty_like(x["u"][0])
+    run = partial(
+        probe_scan, *(x["u"][0], x["delta"][0], probe_rate(x["A"]), x["B"][0], x["C"][0], out)
+    )
+    _, length, width = x["u"].shape
+    return Variant(
+        f"probe, {threads} thread{'s' * (threads > 1)}",
+        run,
+        lambda: bare.check_output(run()[None]),
+        1e-5,
+        bare.oracle,
+        peer=True,
+        threads=threads,
+        parameters={"B": 1, "L": length, "D": width, "N": 16},
+    )
 
 
 def _shorter(settings: Settings) -> ScanProblem:
