@@ -1,11 +1,11 @@
-r"""Writes the tables of docs/step.md from docs/benchmarks/cpu-step.json and cpu-precision.json.
+"""Writes the tables of docs/step.md from docs/benchmarks/cpu-step.json and cpu-precision.json.
 
 After both measurements:
 
     make study WHAT="step --threads 1 --data starter/data --out out/step"
-    make study WHAT="model --out out/model"
-    gamba bench --render out/step/bench.json --out docs/benchmarks/cpu-step.json
-    gamba bench --render out/model/bench.json --out docs/benchmarks/cpu-precision.json
+    make study WHAT="model --only precision --out out/model"
+    cp out/step/bench.json docs/benchmarks/cpu-step.json
+    cp out/model/bench.json docs/benchmarks/cpu-precision.json
     python docs/step_page.py
 """
 

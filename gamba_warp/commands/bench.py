@@ -56,8 +56,7 @@ def bench_command(
         out: Folder for the results. With --render it may be a .md or .html file.
         threads: Number of CPU threads; torch's own number if not given.
         compare: An older bench.json; prints the ratios of the times.
-        render: Measure nothing; make the tables and the page of these JSON files, or with an --out
-            that ends in .json one of them all.
+        render: Measure nothing; make the tables and the page of these JSON files.
         static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
             (registers, stack, shared memory, occupancy) to static.json and static.md.
         only: Measure only these cases, by their full names, as "one call".

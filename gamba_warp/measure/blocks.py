@@ -1,11 +1,10 @@
-"""Benchmark cases of the blocks, and the list of all cases of blocks and models."""
+"""Benchmark cases of blocks, and of whole models from a picture to Gaussians."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -13,17 +12,20 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ..devices import network_products
-from ..kernels.bench import Case, Error, Key, NotInstalled, Settings, Target, Variant, compare
+from ..kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
+from ..kernels.bench.core.case import make_cases
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
-from ..model.config import PRESETS, GambaConfig
+from ..model.config import PRESETS, GambaConfig, Preset
+from ..model.gamba import Gamba
 from ..model.parts.block import GambaBlock, prefix_states, run_blocks
-from .pictures import background_tokens, batches, pictures
+from ..model.posing import reference_cameras
 
 BOTH = "forward+backward"
 LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # allowed relative rms error to float64
 _IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # those of DINOv2 ViT-B/14 at 336 pixels
-_TOKENS = 128  # number of first tokens that are compared with the oracle
+TOKENS = 128  # number of first tokens that are compared with the oracle
+_REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
 _PRODUCTS = {
     name: getattr(torch.ops.aten, name).default for name in ("mm", "addmm", "bmm", "baddbmm")
 }
@@ -31,35 +33,9 @@ _PRODUCTS = {
 
 def cases(settings: Settings) -> list[Case]:
     """Returns all cases of blocks and models at the level's sizes."""
-    builders = [
-        ("block", "one block", partial(_blocks, depth=1)),
-        ("block", "backbone", partial(_blocks, depth=2 if settings.level == "quick" else 14)),
-        ("block", "compiled", compiled),
-        ("model", "one picture", pictures),
-        ("model", "batch", batches),
-        ("model", "background tokens", background_tokens),
-    ]
-    texts = {
-        "one block": "A block of the paper's size on one picture's tokens, beside its matrix "
-        "products alone, repeated on operands of the same shapes into given outputs. Prefix states "
-        "off: condition prepended and dropped, as the paper has it. For one block alone that costs "
-        "the same; the states of all blocks are computed at once, which pays over the depth "
-        "(backbone).",
-        "backbone": "All blocks of the paper's size, the condition's states included, beside "
-        "their matrix products alone, and with the condition prepended and dropped in each block.",
-    }
-    axes = {"one block": "error", "backbone": "error", "compiled": "error", "batch": "B"}
-    axes |= {"background tokens": "error,skipped"}
-    return [
-        Case(
-            op=op,
-            name=name,
-            text=texts.get(name) or " ".join(build.__doc__.split()),
-            build=partial(build, settings),
-            axis=axes.get(name),
-        )
-        for op, name, build in builders
-    ]
+    blocks = [("one block", one_block, "error"), ("backbone", whole_backbone, "error")]
+    models = [("one picture", pictures, None), ("batch", batches, "B")]
+    return make_cases("block", settings, blocks) + make_cases("model", settings, models)
 
 
 class _Recorder(TorchDispatchMode):
@@ -108,6 +84,10 @@ class Products:
             self._buffers[key] = x.normal_()
         return self._buffers[key]
 
+    def work(self) -> dict[str, int]:
+        """Counts of the products."""
+        return {"products": self.count, "flops": self.flops}
+
     @torch.no_grad()
     def run(self) -> None:
         """Repeats all products, by the library that the model takes; this is what is timed."""
@@ -116,7 +96,7 @@ class Products:
                 call()
 
 
-class _Backbone:
+class Backbone:
     """Blocks of the paper's size with the condition of one image."""
 
     def __init__(self, settings: Settings, depth: int) -> None:
@@ -166,11 +146,29 @@ class _Backbone:
         with network_products(self.device):
             return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
 
+    @property
+    def oracle(self) -> str:
+        """What the check compares with, in words."""
+        tokens = f"first {TOKENS} of {self.length} tokens"
+        return f"float64 with the condition prepended, {tokens}"
+
+    def variant(self, name: str, run: Callable[[], Tensor], default: bool) -> Variant:
+        """A variant that runs the blocks forward in some way."""
+        return Variant(
+            name=name,
+            run=run,
+            check=partial(self.check, run),
+            limit=LIMIT,
+            oracle=self.oracle,
+            default=default,
+            parameters=self.parameters,
+        )
+
     def check(self, forward: Callable[[], Tensor]) -> Error:
         """Measures the error of what is added to the first tokens, which depend on no later one."""
         with torch.no_grad():
-            got = forward()[:, :_TOKENS].double().cpu()
-            first = tokens = self.tokens[:, :_TOKENS].double().cpu()
+            got = forward()[:, :TOKENS].double().cpu()
+            first = tokens = self.tokens[:, :TOKENS].double().cpu()
             for block in self.blocks:
                 tokens = reference_block(block, tokens, self.camera, self.image)
         return compare({"update": got - first}, {"update": tokens - first})
@@ -179,15 +177,15 @@ class _Backbone:
         """Measures the error of the first tokens' gradient, with a cotangent of 0 behind them."""
         tokens = self.tokens.detach().requires_grad_()
         cotangent = self.tokens.clone()
-        cotangent[:, _TOKENS:] = 0
+        cotangent[:, TOKENS:] = 0
         (got,) = torch.autograd.grad(self.run(tokens), [tokens], cotangent)
-        first = self.tokens[:, :_TOKENS].double().cpu().requires_grad_()
+        first = self.tokens[:, :TOKENS].double().cpu().requires_grad_()
         out = first
         for block in self.blocks:
             out = reference_block(block, out, self.camera, self.image)
         (want,) = torch.autograd.grad(out, [first], first.detach())
         return compare(
-            {"gradient of the tokens": got[:, :_TOKENS]}, {"gradient of the tokens": want}
+            {"gradient of the tokens": got[:, :TOKENS]}, {"gradient of the tokens": want}
         )
 
 
@@ -237,123 +235,102 @@ def reference_block(
     return tokens + linear(y, "mamba.out_proj")[:, -tokens.shape[1] :]
 
 
-def _blocks(settings: Settings, depth: int) -> list[Variant]:
-    backbone = _Backbone(settings, depth)
-    products = Products(backbone.forward, settings.device)
-    oracle = f"float64 with the condition prepended, first {_TOKENS} of {backbone.length} tokens"
-    rounds = 3 if depth > 1 and settings.level == "normal" else None  # one takes seconds
-    common: dict[str, Any] = dict(parameters=backbone.parameters, rounds=rounds)
-    checked: dict[str, Any] = dict(oracle=oracle, limit=LIMIT)
-    made = [
-        Variant(
-            name="default",
-            run=backbone.forward,
-            check=partial(backbone.check, backbone.forward),
-            default=True,
-            **checked,
-            **common,
-        ),
-        Variant(
-            name="prefix states off",
-            run=backbone.prepended,
-            check=partial(backbone.check, backbone.prepended),
-            **checked,
-            **common,
-        ),
-        Variant(
-            name="matrix products alone",
-            run=products.run,
-            check=None,
-            work=lambda: {"products": products.count, "flops": products.flops},
-            **common,
-        ),
-    ]
-    if depth == 1:
-        made.append(
-            Variant(
-                name="default",
-                run=backbone.backward,
-                check=backbone.check_backward,
-                limit=BACKWARD_LIMIT,
-                oracle=f"{oracle}, gradient of these tokens",
-                direction=BOTH,
-                default=True,
-                **common,
-            )
-        )
+def one_block(settings: Settings) -> list[Variant]:
+    """A block of the paper's size on one picture's tokens, beside its matrix products alone,
+    repeated on operands of the same shapes into given outputs. Prefix states off: condition
+    prepended and dropped, as the paper has it. For one block alone that costs the same; the states
+    of all blocks are computed at once, which pays over the depth (backbone).
+    """
+    backbone = Backbone(settings, 1)
+    both = Variant(
+        name="default",
+        run=backbone.backward,
+        check=backbone.check_backward,
+        limit=BACKWARD_LIMIT,
+        oracle=f"{backbone.oracle}, gradient of these tokens",
+        direction=BOTH,
+        default=True,
+        parameters=backbone.parameters,
+    )
+    return [*_forwards(backbone, settings), both]
+
+
+def whole_backbone(settings: Settings) -> list[Variant]:
+    """All blocks of the paper's size, the condition's states included, beside their matrix products
+    alone, and with the condition prepended and dropped in each block.
+    """
+    rounds = 3 if settings.level == "normal" else None  # one takes seconds
+    backbone = Backbone(settings, 2 if settings.level == "quick" else 14)
+    made = _forwards(backbone, settings)
+    for variant in made:
+        variant.rounds = rounds
     return made
 
 
-class _Graph:
-    """A function's CUDA launches, captured once; a call replays them."""
-
-    def __init__(self, function: Callable[[], Tensor]) -> None:
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):  # the capture must find kernels compiled and buffers made
-            for _ in range(3):
-                function()
-        torch.cuda.current_stream().wait_stream(stream)
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
-            self._result = function()
-
-    def __call__(self) -> Tensor:
-        self._graph.replay()
-        return self._result
+def _forwards(backbone: Backbone, settings: Settings) -> list[Variant]:
+    """Blocks with prefix states, with the condition prepended, and their products alone."""
+    products = Products(backbone.forward, settings.device)
+    ways = {"default": backbone.forward, "prefix states off": backbone.prepended}
+    checked = [backbone.variant(name, run, name == "default") for name, run in ways.items()]
+    alone = Variant(
+        name="matrix products alone",
+        run=products.run,
+        check=None,
+        parameters=backbone.parameters,
+        work=products.work,
+    )
+    return [*checked, alone]
 
 
-class _Lazy:
-    """Makes a function at its first call, so that a failure there spoils no other variant."""
-
-    def __init__(self, make: Callable[[], Callable[[], Tensor]]) -> None:
-        self._make = make
-        self._function: Callable[[], Tensor] | None = None
-
-    def __call__(self) -> Tensor:
-        if self._function is None:
-            self._function = self._make()
-        return self._function()
+def without_encoder(config: GambaConfig) -> GambaConfig:
+    """The configuration without an image encoder; where only its tokens are prepended, none are."""
+    return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
 
 
-def compiled(settings: Settings) -> list[Variant]:
-    """A block of the paper's size as it is, through torch.compile, and on CUDA as a CUDA graph. The
-    first call includes the compilation. All that it can fuse are a few elementwise operations
-    between the products and our kernels, and no gain is seen, so blocks are not compiled by
-    default.
+def _model_variant(settings: Settings, preset: Preset, count: int, **changes) -> Variant:
+    """A model with fresh weights and no image encoder, on ``count`` pictures."""
+    torch.manual_seed(0)
+    config = without_encoder(PRESETS[preset])
+    model = Gamba(config).to(settings.device).eval()
+    size = config.image_size
+    # Random alpha leaves no background, so that with "rays" every token is computed.
+    images = torch.rand(count, size, size, config.input_channels).to(settings.device)
+    cameras = reference_cameras(config, count).to(settings.device)
+    run = torch.no_grad()(partial(model, images, cameras))
+
+    def check() -> Error:
+        first, second = ({k: x for k, x in vars(run()).items() if x is not None} for _ in range(2))
+        return compare(second, first)
+
+    return Variant(run=run, check=check, limit=0.0, oracle=_REPEATS, **changes)
+
+
+def pictures(settings: Settings) -> list[Variant]:
+    """A posed picture to Gaussians by preset, without the image encoder. The models are whole and
+    have fresh weights; two runs must give the same bits.
     """
-    backbone = _Backbone(settings, 1)
-    (block,) = backbone.blocks
-    with torch.no_grad():
-        (state,) = prefix_states(backbone.blocks, backbone.camera, backbone.image)
-
-    @torch.no_grad()
-    def plain() -> Tensor:
-        return block(backbone.tokens, state)[0]
-
-    def compiled_block() -> Callable[[], Tensor]:
-        if settings.device.type == "cpu" and not any(map(shutil.which, ("g++", "clang++", "c++"))):
-            raise NotInstalled("a C++ compiler")
-        function = torch.compile(block)
-        return torch.no_grad()(lambda: function(backbone.tokens, state)[0])
-
-    runs = {"as it is": plain}
-    if settings.level != "quick":
-        runs["torch.compile"] = _Lazy(compiled_block)
-    if settings.device.type == "cuda":
-        runs["CUDA graph"] = _Lazy(lambda: _Graph(plain))
-    oracle = f"float64 with the condition prepended, first {_TOKENS} of {backbone.length} tokens"
+    presets = ("tiny", "rays") if settings.level == "quick" else PRESETS
     return [
-        Variant(
+        _model_variant(
+            *(settings, name, 1),
             name=name,
-            run=run,
-            check=partial(backbone.check, run),
-            limit=LIMIT,
-            oracle=oracle,
-            default=run is plain,
-            parameters=backbone.parameters,
+            default=True,
+            rounds=10,
+            parameters={"N": PRESETS[name].num_gaussians, "side": PRESETS[name].image_size},
         )
-        for name, run in runs.items()
+        for name in presets
+    ]
+
+
+def batches(settings: Settings) -> list[Variant]:
+    """Cost against the number of pictures in one call, preset tiny."""
+    return [
+        _model_variant(
+            *(settings, "tiny", count),
+            name=f"{count} picture{'s' * (count > 1)}",
+            parameters={"B": count, "N": PRESETS["tiny"].num_gaussians},
+        )
+        for count in ((1, 2) if settings.level == "quick" else (1, 2, 4, 8))
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,13 +13,15 @@ from torch import Tensor, nn
 from ..errors import UserError
 from ..gaussians import Gaussians
 from ..kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
+from ..kernels.bench.core.case import make_cases
 from ..kernels.bench.core.measure import peak_bytes
-from ..model.config import PRESETS, GambaConfig
+from ..model.config import PRESETS
 from ..model.encoders import ImageEncoder
 from ..model.gamba import Gamba
 from ..model.posing import reference_cameras
 from ..render import render
 
+Result = TypeVar("Result")
 OP, CASE = "inference", "one picture"
 HEADLINE = "CUDA graph, bfloat16"
 WANTED_MS = 10.0  # on an H200; the paper states 50 ms on an A100
@@ -70,24 +72,46 @@ def _on(model: Gamba, settings: Settings) -> Gamba:
     return model.to(settings.device).eval()
 
 
+def captured(
+    run: Callable[[], Result], device: torch.device
+) -> tuple[torch.cuda.CUDAGraph, Result, int]:
+    """Captures a function as a CUDA graph.
+
+    Returns:
+        The graph, the function's result, which each ``replay`` fills again, and the bytes kept.
+    """
+    stream = torch.cuda.Stream(device)
+    stream.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(stream):  # torch wants everything set up before the capture
+        for _ in range(3):
+            run()
+    torch.cuda.current_stream(device).wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    torch.cuda.empty_cache()
+    before = torch.cuda.memory_reserved(device)
+    with torch.cuda.graph(graph):
+        result = run()
+    return graph, result, torch.cuda.memory_reserved(device) - before
+
+
 class Inference:
     """A model with one posed picture on its device, run as it is or by a CUDA graph.
 
     Attributes:
         device: device of the model and of the picture.
-        encoder: name of the encoder, in words.
+        parameters: Gaussians, side of the picture and name of the encoder, for tables.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.device = settings.device
-        self.model, self.encoder = build_model(settings)
-        self.config: GambaConfig = self.model.config
-        size = self.config.image_size
+        self.model, encoder = build_model(settings)
+        config = self.model.config
+        size = config.image_size
+        self.parameters = {"N": config.num_gaussians, "side": size, "encoder": encoder}
         g = torch.Generator().manual_seed(1)
         self.image = torch.rand(1, size, size, 3, generator=g).to(self.device)
-        self.cameras = reference_cameras(self.config, 1).to(self.device)
+        self.cameras = reference_cameras(config, 1).to(self.device)
         self._graphs: dict[torch.dtype, tuple] = {}
-        self._graph_bytes: dict[torch.dtype, int] = {}
         self._truths: dict[torch.dtype, Gaussians] = {}
 
     @torch.no_grad()
@@ -98,148 +122,90 @@ class Inference:
             return self.model(self.image, self.cameras)
 
     def graph(self, dtype: torch.dtype) -> Gaussians:
-        """Runs the same by a CUDA graph, which the first call captures.
-
-        Raises:
-            RuntimeError: the device has no CUDA graphs, or the model cannot be captured.
-        """
-        if self.device.type != "cuda":
-            raise RuntimeError("CUDA graphs need CUDA")
+        """Runs the same by a CUDA graph, which the first call captures."""
         if dtype not in self._graphs:
-            self._graphs[dtype] = self._capture(dtype)
-        graph, result = self._graphs[dtype]
+            self._graphs[dtype] = captured(partial(self.eager, dtype), self.device)
+        graph, result, _ = self._graphs[dtype]
         graph.replay()
         return result
-
-    def _capture(self, dtype: torch.dtype) -> tuple[torch.cuda.CUDAGraph, Gaussians]:
-        stream = torch.cuda.Stream(self.device)
-        stream.wait_stream(torch.cuda.current_stream(self.device))
-        with torch.cuda.stream(stream):  # torch wants everything set up before the capture
-            for _ in range(3):
-                self.eager(dtype)
-        torch.cuda.current_stream(self.device).wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        torch.cuda.empty_cache()
-        before = torch.cuda.memory_reserved(self.device)
-        with torch.cuda.graph(graph):
-            result = self.eager(dtype)
-        self._graph_bytes[dtype] = torch.cuda.memory_reserved(self.device) - before
-        return graph, result
 
     def peak(self, function: Callable, dtype: torch.dtype) -> dict[str, int]:
         """Measures memory beside weights and input: the growth of a run, or what a graph keeps."""
         if function == self.graph:
-            return {"peak_bytes": self._graph_bytes[dtype]}
+            return {"peak_bytes": self._graphs[dtype][2]}
         peak = peak_bytes(partial(function, dtype), self.device)
         return {} if peak is None else {"peak_bytes": peak}
 
     @torch.no_grad()
     def view(self, gaussians: Gaussians) -> Tensor:
         """Renders the reference view."""
-        cameras = replace(
-            self.cameras, viewmats=self.cameras.viewmats[:, None], Ks=self.cameras.Ks[:, None]
-        )
-        return render(gaussians, cameras).rgb
-
-    def truth(self, dtype: torch.dtype) -> Gaussians:
-        """Returns what ``eager`` gives, on the CPU; the first call computes it."""
-        if dtype not in self._truths:
-            self._truths[dtype] = self.eager(dtype).to("cpu")
-        return self._truths[dtype]
+        viewmats, Ks = self.cameras.viewmats[:, None], self.cameras.Ks[:, None]
+        return render(gaussians, replace(self.cameras, viewmats=viewmats, Ks=Ks)).rgb
 
     def check(self, run: Callable[[], Gaussians], truth: torch.dtype) -> Error:
         """Measures the error of the Gaussians of ``run`` to those of ``eager`` in ``truth``."""
         got = run()
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
-        return compare(_named(got), _named(self.truth(truth)))
-
-
-def _named(gaussians: Gaussians) -> dict[str, Tensor]:
-    return {name: value for name, value in vars(gaussians).items() if value is not None}
+        if truth not in self._truths:
+            self._truths[truth] = self.eager(truth).to("cpu")
+        got, want = (
+            {name: x for name, x in vars(found).items() if x is not None}
+            for found in (got, self._truths[truth])
+        )
+        return compare(got, want)
 
 
 def cases(settings: Settings) -> list[Case]:
     """Returns the one case, with the variants that the device can run."""
-    text = "A posed picture to Gaussians, forward only, untrained weights; then one view of it."
-    return [Case(op=OP, name=CASE, text=text, build=partial(_variants, settings))]
-
-
-class _Run(NamedTuple):
-    """One way to the Gaussians, and what it is compared with.
-
-    Attributes:
-        function: ``Inference.eager`` or ``Inference.graph``.
-        dtype: dtype of the run.
-        truth: dtype of the ``eager`` run that it is compared with.
-        limit: allowed relative rms error.
-        oracle: name of that run, in words.
-    """
-
-    function: Callable[[torch.dtype], Gaussians]
-    dtype: torch.dtype
-    truth: torch.dtype
-    limit: float
-    oracle: str
+    return make_cases(OP, settings, [(CASE, _variants, None)])
 
 
 def _variants(settings: Settings) -> list[Variant]:
+    """A posed picture to Gaussians, forward only, untrained weights; then one view of it."""
     inference = Inference(settings)
-    size, parameters = inference.config.image_size, {"N": inference.config.num_gaussians}
-    parameters |= {"side": size, "encoder": inference.encoder}
     full, half = torch.float32, torch.bfloat16
-    runs = {
-        "eager, float32": _Run(inference.eager, full, full, REPEAT_LIMITS[full], "a second run"),
-        "eager, bfloat16": _Run(inference.eager, half, full, HALF_LIMIT, "float32"),
+    same, eager, graph = REPEAT_LIMITS, inference.eager, inference.graph
+    # Name: how it runs, in which dtype; the run that it is compared with: dtype, limit and name.
+    ways = {
+        "eager, float32": (eager, full, full, same[full], "a second run"),
+        "eager, bfloat16": (eager, half, full, HALF_LIMIT, "float32"),
     }
     if settings.device.type == "cuda":
-        runs |= {
-            "CUDA graph, float32": _Run(inference.graph, full, full, REPEAT_LIMITS[full], "eager"),
-            HEADLINE: _Run(inference.graph, half, half, REPEAT_LIMITS[half], "eager, bfloat16"),
+        ways |= {
+            "CUDA graph, float32": (graph, full, full, same[full], "eager"),
+            HEADLINE: (graph, half, half, same[half], "eager, bfloat16"),
         }
     made = []
-    for name, way in runs.items():
-        run = partial(way.function, way.dtype)
+    for name, (function, dtype, truth, limit, oracle) in ways.items():
+        run = partial(function, dtype)
         made.append(
             Variant(
                 name=name,
                 run=run,
-                check=partial(inference.check, run, way.truth),
-                limit=way.limit,
-                oracle=f"{way.oracle} (0: the same bits)",
-                dtype=str(way.dtype).removeprefix("torch."),
+                check=partial(inference.check, run, truth),
+                limit=limit,
+                oracle=f"{oracle} (0: the same bits)",
+                dtype=str(dtype).removeprefix("torch."),
                 default=name == HEADLINE,
-                parameters=parameters,
-                work=partial(inference.peak, way.function, way.dtype),
+                parameters=inference.parameters,
+                work=partial(inference.peak, function, dtype),
             )
         )
-    return [*made, *_pictures(inference, parameters)]
-
-
-def _pictures(inference: Inference, parameters: dict) -> list[Variant]:
-    """Makes the variants that end in a picture: Gaussians to a view, and a picture to a view."""
-    gaussians = inference.eager(torch.float32)
-    run = inference.graph if inference.device.type == "cuda" else inference.eager
-    size = inference.config.image_size
-
-    def check(picture: Callable[[], Tensor]) -> Error:
-        return compare({"picture": picture()}, {"picture": picture()})
-
-    runs = {
+    gaussians, size = eager(full), inference.parameters["side"]
+    best = graph if settings.device.type == "cuda" else eager
+    pictures: dict[str, Callable[[], Tensor]] = {
         f"one view of {size} x {size}": partial(inference.view, gaussians),
-        "picture to view, bfloat16": lambda: inference.view(run(torch.bfloat16)),
+        "picture to view, bfloat16": lambda: inference.view(best(half)),
     }
-    return [
-        Variant(
-            name=name,
-            run=picture,
-            check=partial(check, picture),
-            limit=0.0,
-            oracle="a second run",
-            parameters=parameters,
-        )
-        for name, picture in runs.items()
-    ]
+    for name, picture in pictures.items():
+
+        def check(picture=picture) -> Error:
+            return compare({"picture": picture()}, {"picture": picture()})
+
+        oracle, parameters = "a second run", inference.parameters
+        made.append(Variant(name, picture, check, 0.0, oracle, parameters=parameters))
+    return made
 
 
 def targets(settings: Settings) -> list[Target]:

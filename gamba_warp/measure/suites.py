@@ -15,7 +15,7 @@ from ..files import output_folder, write_json, write_text
 from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.core.document import check_document
 from ..kernels.bench.core.page import page
-from ..kernels.bench.core.report import groups, judge, markdown, ratio_table
+from ..kernels.bench.core.report import judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 from ..untrusted import documents
@@ -133,8 +133,7 @@ def write_pages(
 
     Args:
         documents: as ``read_document`` returns them.
-        out: a .md or .html file, or a folder for bench.md and bench.html; a .json file gets all
-            records in one document.
+        out: a .md or .html file, or a folder for bench.md and bench.html.
         tables: what makes the Markdown.
         charts: what makes the page.
 
@@ -142,11 +141,8 @@ def write_pages(
         The files.
 
     Raises:
-        UserError: the documents are not of one machine and level, or a file cannot be written.
+        UserError: a file cannot be written.
     """
-    if out.suffix == ".json":
-        write_json(out, join(documents))
-        return [out]
     makers = {".md": tables, ".html": charts}
     if out.suffix in makers:
         paths = [out]
@@ -155,30 +151,6 @@ def write_pages(
     for path in paths:
         write_text(path, makers[path.suffix](documents))
     return paths
-
-
-def join(documents: Sequence[dict]) -> dict:
-    """One document of the records of several runs; of the same case the last run counts.
-
-    Raises:
-        UserError: they are not of one machine, level and set of versions.
-    """
-    first, *others = documents
-    for other in others:
-        for name, value in first["machine"].items():
-            if name not in ("date", "peers") and other["machine"].get(name) != value:
-                raise UserError(f"--render: {name} is {value} and {other['machine'].get(name)}")
-        if other.get("settings") != first.get("settings"):
-            raise UserError("--render: results of different levels cannot be joined")
-    cases: dict[tuple[str, str], list[dict]] = {}
-    for document in documents:
-        for op, parts in groups(document).items():
-            cases |= {(op, case): records for case, records in parts.items()}
-    joined = first | {"records": [r for records in cases.values() for r in records]}
-    joined["machine"] = first["machine"] | {"date": documents[-1]["machine"]["date"]}
-    joined["interrupted"] = any(document["interrupted"] for document in documents)
-    joined["targets"] = [t for document in documents for t in document.get("targets", [])]
-    return joined
 
 
 def write_static(folder: Path) -> int:

@@ -113,7 +113,7 @@ class Gamba(nn.Module):
             background_margin: drop the 3DGS tokens of patches that are plain background in every
                 picture, except those within this many patches of one that is not; 0 keeps only
                 the object's own patches. This is faster, but the model was not trained for it:
-                ``gamba bench model`` states the error. None drops nothing. On CUDA it reads one
+                ``make study WHAT=model`` states the error. None drops nothing. On CUDA it reads one
                 number back. The decoder ``rays`` is trained on the object's own patches and always
                 keeps only these, each picture its own; None is 0 there.
 

@@ -68,49 +68,28 @@ def scan_loop(
     return (y + D[:, None] * u) * F.silu(z)
 
 
-def mambapy_scan(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor,
-    z: Tensor,
-    delta_bias: Tensor,
-) -> Tensor:
+def mambapy_scan(*, A: Tensor, D: Tensor, z: Tensor, **x: Tensor) -> Tensor:
     """Runs the formula with mambapy's parallel scan; layout ``[B, L, D]``, ``[B, L, N]``.
 
     Raises:
         NotInstalled: mambapy is not installed.
     """
     pscan = load("mambapy.pscan", "mambapy").pscan
-    step = F.softplus(delta + delta_bias)
-    decay = torch.exp(step[..., None] * A)
-    drive = (step * u)[..., None] * B[:, :, None]
-    states = pscan(decay, drive)
-    y = (states @ C[..., None])[..., 0] + D * u
+    step = F.softplus(x["delta"] + x["delta_bias"])
+    drive = (step * x["u"])[..., None] * x["B"][:, :, None]
+    states = pscan(torch.exp(step[..., None] * A), drive)
+    y = (states @ x["C"][..., None])[..., 0] + D * x["u"]
     return y * F.silu(z)
 
 
-def mamba_ssm_scan(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor,
-    z: Tensor,
-    delta_bias: Tensor,
-) -> Tensor:
-    """Runs mamba-ssm's CUDA kernel; layout ``[B, D, L]``, ``[B, N, L]``.
+def mamba_ssm_scan(**inputs: Tensor) -> Tensor:
+    """Runs mamba-ssm's CUDA kernel; arguments and layout of ``scan_loop``.
 
     Raises:
         NotInstalled: mamba-ssm is not installed.
     """
     module = load("mamba_ssm.ops.selective_scan_interface", "mamba-ssm")
-    return module.selective_scan_fn(
-        u, delta, A, B, C, D, z=z, delta_bias=delta_bias, delta_softplus=True
-    )
+    return module.selective_scan_fn(**inputs, delta_softplus=True)
 
 
 def torch_conv(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -138,23 +117,6 @@ def gsplat_rasterization(**arguments) -> tuple[Tensor, Tensor, dict]:
     """
     function = load("gsplat", "gsplat").rasterization
     return function(**arguments, packed=False)
-
-
-def gsplat_projection(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, size: int
-) -> Tensor:
-    """Runs the projection of gsplat's torch code, the only part of gsplat that runs on a CPU.
-
-    Returns:
-        Centres in the picture, ``[V, N, 2]``.
-
-    Raises:
-        NotInstalled: gsplat is not installed.
-    """
-    torch_code = load("gsplat.cuda._torch_impl", "gsplat")
-    covariances, _ = torch_code._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    projected = torch_code._fully_fused_projection(means, covariances, viewmats, Ks, size, size)
-    return projected[1]
 
 
 def gswarp_rasterization(

@@ -24,7 +24,8 @@ STUDIES = {
     "raster": ".raster",
     "lengths": ".lengths",
     "step": ".training.step",
-    "model": ".precision",
+    "block": ".models",
+    "model": ".models",
     "growth-scan": ".growth",
     "growth-raster": ".growth",
     "growth-errors": ".growth_errors",
@@ -56,10 +57,11 @@ def study(
     Writes bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
 
     Args:
-        what: scan and raster (choices inside the kernels), lengths (a Mamba block against a
-            transformer block over the number of tokens), step (of training, by parts), model (in
-            both precisions), growth (time, memory and errors over every size, with slopes;
-            growth-scan, growth-raster and growth-errors are its parts), loader.
+        what: scan and raster (choices inside the kernels), block and model (compiled, in both
+            precisions, without background), lengths (a Mamba block against a transformer block
+            over the number of tokens), step (of training, by parts), growth (time, memory and
+            errors over every size, with slopes; growth-scan, growth-raster and growth-errors are
+            its parts), loader.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes and many rounds.

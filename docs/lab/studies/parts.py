@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from torch.profiler import ProfilerActivity, profile, record_function
 
+from gamba_warp.kernels.bench.core.report import number
+
 _WHOLE = "the whole run"
 _BACKWARD = "autograd::engine::evaluate_function"
 PREFIXES = FORWARD, BACKWARD = "forward: ", "backward: "
@@ -117,11 +119,7 @@ def parts_table(records: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[l
         whole = record["work"].get(WHOLE) or sum(map(sum, parts.values()))
         for part, (forward, backward) in parts.items():
             share = f"{(forward + backward) / whole:.1%}"
-            times = [_number(forward), _number(backward) if backward else ""]
+            times = [number(forward), number(backward) if backward else ""]
             rows.append([record["variant"], part, *times, share])
-        rows.append([record["variant"], f"whole, {WHOLE}", _number(whole), "", ""])
+        rows.append([record["variant"], f"whole, {WHOLE}", number(whole), "", ""])
     return ["variant", "part", "ms forward", "ms backward", "share"], rows
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if value < 1000 else f"{value:,.0f}"

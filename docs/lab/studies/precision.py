@@ -12,9 +12,8 @@ from torch import Tensor
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.devices import float32_products, network_products
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
-from gamba_warp.measure.blocks import Products
-from gamba_warp.measure.pictures import without_encoder
+from gamba_warp.kernels.bench import Error, Key, Settings, Target, Variant, compare
+from gamba_warp.measure.blocks import Products, without_encoder
 from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, Preset
 from gamba_warp.model.gamba import Gamba
@@ -24,12 +23,6 @@ from gamba_warp.render import render
 PAPER, ALONE, PLAIN = "paper, float32", "products alone", "MKL's products alone"
 # Allowed relative rms errors of the Gaussians: roundings that 14 blocks carry on.
 _LIMITS = {torch.float32: 1e-3, torch.bfloat16: 0.1}
-
-
-def cases(settings: Settings) -> list[Case]:
-    """Returns the case, which counts to those of ``gamba bench model``."""
-    text = " ".join((precisions.__doc__ or "").split())
-    return [Case("model", "precision", text, partial(precisions, settings), "error")]
 
 
 def targets(settings: Settings) -> list[Target]:
@@ -149,7 +142,7 @@ def _alone(run: Callable[[], object], kind: str, settings: Settings) -> list[Var
             check=None,
             dtype=kind,
             rounds=5,
-            work=lambda: {"products": products.count, "flops": products.flops},
+            work=products.work,
         )
         for name, ran in runs.items()
     ]

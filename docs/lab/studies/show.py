@@ -63,13 +63,13 @@ def summary(document: dict) -> str:
 
 
 def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
-    """As ``suites.write_pages``; a .svg file gets the charts of growth.
+    """As ``suites.write_pages``; a .svg file gets the charts of growth, a .json file all records.
 
     Raises:
         UserError: nothing grows in the documents, or they are not of one machine and level.
     """
     if out.suffix == ".json":
-        write_json(out, joined(documents))
+        write_json(out, join(documents))
         return [out]
     if out.suffix != ".svg":
         return suites.write_pages(documents, out, markdown, page)
@@ -80,9 +80,28 @@ def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:
     return [out]
 
 
-def joined(documents: Sequence[dict]) -> dict:
-    """As ``suites.join``, with the crossings of all records."""
-    return with_crossings(suites.join(documents))
+def join(documents: Sequence[dict]) -> dict:
+    """One document of the records of several runs; of the same case the last run counts.
+
+    Raises:
+        UserError: they are not of one machine, level and set of versions.
+    """
+    first, *others = documents
+    for other in others:
+        for name, value in first["machine"].items():
+            if name not in ("date", "peers") and other["machine"].get(name) != value:
+                raise UserError(f"--render: {name} is {value} and {other['machine'].get(name)}")
+        if other.get("settings") != first.get("settings"):
+            raise UserError("--render: results of different levels cannot be joined")
+    cases: dict[tuple[str, str], list[dict]] = {}
+    for document in documents:
+        for op, parts in report.groups(document).items():
+            cases |= {(op, case): records for case, records in parts.items()}
+    joined = first | {"records": [r for records in cases.values() for r in records]}
+    joined["machine"] = first["machine"] | {"date": documents[-1]["machine"]["date"]}
+    joined["interrupted"] = any(document["interrupted"] for document in documents)
+    joined["targets"] = [t for document in documents for t in document.get("targets", [])]
+    return with_crossings(joined)
 
 
 def with_crossings(document: dict) -> dict:

@@ -23,7 +23,7 @@ _TOKENS = 2048  # that the oracle looks at
 
 def cases(settings: Settings) -> list[Case]:
     """All cases of the convolution at the level's sizes."""
-    builders = [("operator", _operator, None), ("knobs", _knobs, "error")]
+    builders = [("operator", operator, None), ("knobs", knobs, "error")]
     return make_cases("conv", settings, builders)
 
 
@@ -114,7 +114,7 @@ class _Problem:
 _silu = partial(causal_conv1d, activation="silu")
 
 
-def _operator(settings: Settings) -> list[Variant]:
+def operator(settings: Settings) -> list[Variant]:
     """Convolution and SiLU beside torch's grouped convolution in its own layout."""
     problem = _Problem(settings)
     made = []
@@ -127,7 +127,7 @@ def _operator(settings: Settings) -> list[Variant]:
     return made
 
 
-def _knobs(settings: Settings) -> list[Variant]:
+def knobs(settings: Settings) -> list[Variant]:
     """Half precision is compared with the truth of the float32 inputs."""
     problem = _Problem(settings)
     made = []

@@ -23,7 +23,7 @@ _Function = Callable[[int, Tensor, Tensor, Tensor], Tensor]
 
 def cases(settings: Settings) -> list[Case]:
     """The degrees at one size, and the sizes at one degree."""
-    builders = [("harmonics by degree", _degrees, "degree"), ("harmonics", _sizes, "N")]
+    builders = [("harmonics by degree", degrees, "degree"), ("harmonics", sizes, "N")]
     return make_cases("raster", settings, builders)
 
 
@@ -100,7 +100,11 @@ def _counts(settings: Settings) -> tuple[tuple[int, int], ...]:
     return ((16384, 1), (16384, 4), (262144, 1), (262144, 4))
 
 
-def _degrees(settings: Settings) -> list[Variant]:
+def _suffix(count: int, views: int) -> str:
+    return f"{count} Gaussians, {views} view{'s' * (views > 1)}"
+
+
+def degrees(settings: Settings) -> list[Variant]:
     """Colours of 16,384 Gaussians in one view (2,048 in a quick run) from harmonics of each degree,
     alone and with the gradients of coefficients, means and centres.
     """
@@ -111,12 +115,12 @@ def _degrees(settings: Settings) -> list[Variant]:
     return made
 
 
-def _sizes(settings: Settings) -> list[Variant]:
+def sizes(settings: Settings) -> list[Variant]:
     """Degree 3 with more Gaussians and views, alone and with gradients."""
     made = []
     for count, views in _counts(settings):
         problem = Problem(settings, _DEGREE, count, views)
-        made += problem.variants(settings, f"{count} Gaussians, {views} view{'s' * (views > 1)}")
+        made += problem.variants(settings, _suffix(count, views))
     return made
 
 
@@ -125,10 +129,7 @@ def targets(settings: Settings) -> list[Target]:
     if settings.level == "quick" or not settings.peers:
         return []
     named = [("harmonics by degree", f"degree {degree}") for degree in _DEGREES]
-    named += [
-        ("harmonics", f"{count} Gaussians, {views} view{'s' * (views > 1)}")
-        for count, views in _counts(settings)
-    ]
+    named += [("harmonics", _suffix(*sizes)) for sizes in _counts(settings)]
     return [
         Target(
             f"harmonics, {suffix}, {direction}, gsplat's torch function's time over ours",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -21,10 +20,9 @@ from ..core.case import (
     over_threads,
 )
 from . import harmonics
-from .raster_parts import Parts
+from .raster_parts import gsplat_parts
 from .raster_scene import (
     BOTH,
-    COUNT,
     LEAVES,
     TRADE_LIMIT,
     Scene,
@@ -37,34 +35,29 @@ from .raster_scene import (
 
 # An alpha or transmittance below these does not show in float64's picture of 16,384 Gaussians.
 _NO_THRESHOLDS = {"alpha_min": 1e-9, "t_min": 1e-30}
-# gsplat's lists of many Gaussians take seconds: a loop in Python.
-_LARGE_PARTS: dict[str, dict[int, tuple[str, ...]]] = {
-    "normal": {262144: ("projection", "tile lists")},
-    "full": {262144: ("projection", "tile lists"), 1048576: ("projection",)},
-}
 
 
 def cases(settings: Settings) -> list[Case]:
     """All cases of the rasterizer at the level's sizes."""
     builders = [
-        ("scene", _scenes, None),
-        ("knobs", _knobs, "error"),
-        ("skipping", _skipping, "skipped"),
-        ("one call", _one_call, None),
-        ("Gaussians", _counts, "N"),
-        ("pixels", _pixels, "side"),
-        ("views", _views, "views"),
-        ("batch", _batches, "B"),
+        ("scene", scenes, None),
+        ("knobs", knobs, "error"),
+        ("skipping", skipping, "skipped"),
+        ("one call", one_call, None),
+        ("Gaussians", counts, "N"),
+        ("pixels", pixels, "side"),
+        ("views", views, "views"),
+        ("batch", batches, "B"),
     ]
     if settings.device.type == "cuda":
-        builders.append(("32 views", _many_views, None))
+        builders.append(("32 views", many_views, None))
     else:
-        builders.append(("threads", _threads, "threads"))
-        builders += [("gsplat's parts", _gsplat_parts, None)] * settings.peers
+        builders.append(("threads", by_threads, "threads"))
+        builders += [("gsplat's parts", gsplat_parts, None)] * settings.peers
     return make_cases("raster", settings, builders) + harmonics.cases(settings)
 
 
-def _scenes(settings: Settings) -> list[Variant]:
+def scenes(settings: Settings) -> list[Variant]:
     """The probe scene: 16,384 Gaussians on a shell, one view of 512², whole operator (project,
     sort, bin, blend), with standard deviations of 0.01, 0.02 and 0.04 of the object's size.
     """
@@ -81,72 +74,32 @@ def _scenes(settings: Settings) -> list[Variant]:
 
 
 def _peers(scene: Scene, name: str) -> list[Variant]:
-    """On CUDA gsplat and gswarp, the whole operator; a CPU has ``_gsplat_parts``."""
+    """On CUDA gsplat and gswarp, the whole operator; a CPU has ``gsplat_parts``."""
     if scene.device.type != "cuda":
         return []
-    made = []
-    for package, function in (
-        ("gsplat", peers.gsplat_rasterization),
-        ("gswarp", peers.gswarp_rasterization),
-    ):
+    packages = {"gsplat": peers.gsplat_rasterization, "gswarp": peers.gswarp_rasterization}
 
-        def error(function=function) -> Error:
-            got, want = scene.forward(function)[0], scene.forward()[0]
-            return compare({"picture": got}, {"picture": want})
+    def error(function) -> Error:
+        got, want = scene.forward(function)[0], scene.forward()[0]
+        return compare({"picture": got}, {"picture": want})
 
-        for direction, run in (("forward", scene.forward), (BOTH, scene.backward)):
-            made.append(
-                Variant(
-                    name=f"{package}, {name}",
-                    run=partial(run, function),
-                    check=error,
-                    limit=1e-2,
-                    oracle="our float32 picture",
-                    direction=direction,
-                    peer=True,
-                    parameters=scene.sizes,
-                )
-            )
-    return made
+    return [
+        Variant(
+            name=f"{package}, {name}",
+            run=partial(run, function),
+            check=partial(error, function),
+            limit=1e-2,
+            oracle="our float32 picture",
+            direction=direction,
+            peer=True,
+            parameters=scene.sizes,
+        )
+        for package, function in packages.items()
+        for direction, run in (("forward", scene.forward), (BOTH, scene.backward))
+    ]
 
 
-def _gsplat_parts(settings: Settings) -> list[Variant]:
-    """The torch functions of gsplat that run on a CPU, beside the same part of ours: projection,
-    tile lists (theirs of boxes, ours of ellipses) and harmonics of degree 3. Its compositing needs
-    CUDA. More Gaussians are smaller, so that they cover the same area.
-    """
-    made = _parts_of(make_scene(settings), "", ("projection", "tile lists", "harmonics"))
-    for count, parts in _LARGE_PARTS.get(settings.level, {}).items():
-        scene = make_scene(settings, math.sqrt(COUNT / count), count)
-        made += _parts_of(scene, f", {count} Gaussians", parts)
-    return made
-
-
-def _parts_of(scene: Scene, suffix: str, wanted: Sequence[str]) -> list[Variant]:
-    """Parts of ours and of gsplat on a scene; ``suffix`` ends their names."""
-    made = []
-    pairs = Parts(scene).pairs()
-    for part in wanted:
-        ours, theirs, check = pairs[part]
-        for name, run, peer in (("ours", ours, False), ("gsplat", theirs, True)):
-            made.append(
-                Variant(
-                    name=name + suffix,
-                    run=run,
-                    check=check if peer else None,
-                    limit=1e-4,
-                    oracle="our float32 result" if peer and check else "",
-                    direction=part,
-                    peer=peer,
-                    default=not peer,
-                    rounds=3 if peer and part == "tile lists" else None,
-                    parameters=scene.sizes,
-                )
-            )
-    return made
-
-
-def _knobs(settings: Settings) -> list[Variant]:
+def knobs(settings: Settings) -> list[Variant]:
     """What may be traded for time, at scale 2; the truth has float32 inputs, all Gaussians, no
     threshold of alpha or T and no radius clip. The defaults are what trained Gaussians and other
     renderers assume.
@@ -179,7 +132,7 @@ def _trade(scene: Scene, name: str, **options: float) -> list[Variant]:
     return make_pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
 
 
-def _skipping(settings: Settings) -> list[Variant]:
+def skipping(settings: Settings) -> list[Variant]:
     """What is not computed because nobody needs it, at scale 2, against the same call that needs
     all. Skipped: share of the pairs of Gaussians and tiles, or of the gradients.
     """
@@ -205,7 +158,7 @@ def _tiles_skipped(scene: Scene) -> dict[str, float]:
     return counts | {"skipped": skipped / max(occupied, 1)}
 
 
-def _one_call(settings: Settings) -> list[Variant]:
+def one_call(settings: Settings) -> list[Variant]:
     """8 objects of 4,096 Gaussians in 4 views of 128² each: in one call, and in 32."""
     objects, views, size = (2, 2, 64) if settings.level == "quick" else (8, 4, 128)
     together = _objects(settings, objects, views, size)
@@ -236,7 +189,7 @@ def _call_all(runs: list) -> None:
         run()
 
 
-def _counts(settings: Settings) -> list[Variant]:
+def counts(settings: Settings) -> list[Variant]:
     """Cost against the number of Gaussians, which get smaller so that they cover the same area."""
     counts = {
         "quick": (1024, 4096),
@@ -250,7 +203,7 @@ def _counts(settings: Settings) -> list[Variant]:
     return made
 
 
-def _pixels(settings: Settings) -> list[Variant]:
+def pixels(settings: Settings) -> list[Variant]:
     """Cost against the side of the picture, at scale 2."""
     sides = (64, 128) if settings.level == "quick" else (128, 256, 512, 1024)
     made = []
@@ -259,25 +212,23 @@ def _pixels(settings: Settings) -> list[Variant]:
     return made
 
 
-def _views(settings: Settings) -> list[Variant]:
+def views(settings: Settings) -> list[Variant]:
     """Cost against the number of views of 256² in one call."""
     numbers, size = ((1, 2), 64) if settings.level == "quick" else ((1, 2, 4, 8, 16), 256)
     made = []
     for views in numbers:
-        made += make_pair(
-            make_scene(settings, size=size, views=views), f"{views} view{'s' * (views > 1)}"
-        )
+        scene = make_scene(settings, size=size, views=views)
+        made += make_pair(scene, f"{views} view{'s' * (views > 1)}")
     return made
 
 
-def _batches(settings: Settings) -> list[Variant]:
+def batches(settings: Settings) -> list[Variant]:
     """Cost against the number of objects of 4,096 Gaussians in one call, a view of 256² each."""
     numbers, size = ((1, 2), 64) if settings.level == "quick" else ((1, 2, 4, 8, 16), 256)
     made = []
     for number in numbers:
-        for variant in make_pair(_objects(settings, number, 1, size), f"B {number}"):
-            variant.parameters["B"] = number
-            made.append(variant)
+        made += make_pair(_objects(settings, number, 1, size), f"B {number}")
+        made[-1].parameters["B"] = made[-2].parameters["B"] = number
     return made
 
 
@@ -289,12 +240,12 @@ def _objects(settings: Settings, number: int, views: int, size: int) -> Scene:
     return Scene(gaussians, viewmats, Ks, size, settings.device)
 
 
-def _threads(settings: Settings) -> list[Variant]:
+def by_threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, at scale 2."""
     return over_threads(partial(make_pair, make_scene(settings, 2)))
 
 
-def _many_views(settings: Settings) -> list[Variant]:
+def many_views(settings: Settings) -> list[Variant]:
     """32 views of 512² in one launch, beside gsplat."""
     scene = make_scene(settings, views=32)
     return make_pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)

@@ -1,8 +1,8 @@
-"""Parts of the rasterizer alone, ours and those of gsplat's torch code that a CPU can run."""
+"""Parts of the rasterizer alone, and those of gsplat's torch code that a CPU can run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 
 import torch
 from torch import Tensor
@@ -10,31 +10,25 @@ from torch import Tensor
 from ...rasterize import Skip
 from ...rasterize.constants import ALPHA_MIN, EPS2D, TILE
 from ...rasterize.cpu.tuning import current
-from ...rasterize.harmonics import colors_from_harmonics
 from ...rasterize.ops import bin_op, project
 from ...rasterize.project import LensOptions, Projected
 from .. import peers
-from ..core.case import Error, compare
-from .raster_scene import Scene
-
-_DEGREE = 3
+from ..core.case import Error, Settings, Variant, compare
+from .raster_scene import COUNT, Scene, make_scene
 
 
 class Parts:
-    """Projection, tile lists and harmonics of a scene."""
+    """Projection and tile lists of a scene, ours and gsplat's; each of them is timed."""
 
     def __init__(self, scene: Scene) -> None:
         self.x, self.size = scene.gaussians, scene.size
         self.width, self.height = (scene.arguments()[side] for side in ("width", "height"))
         self.viewmats, self.Ks = scene.viewmats, scene.Ks
-        count = len(self.x["means"])
-        g = torch.Generator().manual_seed(5)
-        self.coefficients = 0.3 * torch.randn(count, (_DEGREE + 1) ** 2, 3, generator=g)
         self.projected = self.project()
 
     @torch.no_grad()
     def project(self) -> Projected:
-        """Our projection, which is timed."""
+        """Our projection."""
         lens = LensOptions(
             width=self.width,
             height=self.height,
@@ -50,61 +44,56 @@ class Parts:
         return Projected(*project(*each, self.viewmats[None], self.Ks[None], lens.numbers()))
 
     def gsplat_project(self) -> Tensor:
-        """The centres that gsplat finds in the picture, ``[V, N, 2]``; this is timed."""
+        """The centres that gsplat finds in the picture, ``[V, N, 2]``."""
+        code = peers.load("gsplat.cuda._torch_impl", "gsplat")
         means, quats, scales = (self.x[k] for k in ("means", "quats", "scales"))
-        return peers.gsplat_projection(means, quats, scales, self.viewmats, self.Ks, self.size)
+        covariances, _ = code._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        lens = self.viewmats, self.Ks, self.size, self.size
+        return code._fully_fused_projection(means, covariances, *lens)[1]
+
+    def check(self) -> Error:
+        """The error of gsplat's centres to ours."""
+        return compare({"centres": self.gsplat_project()}, {"centres": self.project().means2d[0]})
 
     def front(self) -> tuple[Tensor, ...]:
-        """Our projection and tile lists, which are timed."""
+        """Our projection and tile lists."""
         return self.bin(self.project())
 
     def bin(self, projected: Projected | None = None) -> tuple[Tensor, ...]:
-        """Our tile lists, which are timed; of the scene's own projection if none is given."""
+        """Our tile lists; of the scene's own projection if none is given."""
         x = projected or self.projected
         parts = x.means2d, x.conics, x.depths, x.view_opacities, x.extents
-        per_view = [part.flatten(0, 1) for part in parts]
-        means2d, conics, depths, opacities, extents = per_view
         options = self.width, self.height, ALPHA_MIN, Skip().bits(), current().numbers()
-        return bin_op(means2d, conics, depths, opacities, extents, *options)
+        return bin_op(*(part.flatten(0, 1) for part in parts), *options)
 
     def gsplat_bin(self) -> object:
-        """The lists that gsplat makes of the same boxes; this is timed."""
-        tiles = -(-self.size // TILE)
+        """The lists that gsplat makes of the same boxes."""
         code = peers.load("gsplat.cuda._torch_impl", "gsplat")
-        x = self.projected
+        x, tiles = self.projected, -(-self.size // TILE)
         radii = x.extents[0].ceil().int()
         return code._isect_tiles(x.means2d[0], radii, x.depths[0], TILE, tiles, tiles)
 
-    @torch.no_grad()
-    def harmonics(self) -> Tensor:
-        """Our colours ``[1, V, N, 3]``, which are timed."""
-        means, coefficients = self.x["means"][None], self.coefficients[None]
-        return colors_from_harmonics(_DEGREE, coefficients, means, self.viewmats[None])
 
-    @torch.no_grad()
-    def gsplat_harmonics(self) -> Tensor:
-        """The colours of gsplat, with the clamp that its operator has; this is timed."""
-        code = peers.load("gsplat.cuda._torch_impl", "gsplat")
-        centre = torch.linalg.inv(self.viewmats)[0, :3, 3]
-        colors = code._spherical_harmonics(_DEGREE, self.x["means"] - centre, self.coefficients)
-        return (colors + 0.5).clamp_min(0)
-
-    def pairs(self) -> dict[str, tuple[Callable, Callable, Callable[[], Error] | None]]:
-        """By part: ours, gsplat's, and the check of gsplat's by ours; lists differ by design."""
-        return {
-            "projection": (
-                self.project,
-                self.gsplat_project,
-                lambda: compare(
-                    {"centres": self.gsplat_project()}, {"centres": self.project().means2d[0]}
-                ),
-            ),
-            "tile lists": (self.bin, self.gsplat_bin, None),
-            "harmonics": (
-                self.harmonics,
-                self.gsplat_harmonics,
-                lambda: compare(
-                    {"colours": self.gsplat_harmonics()}, {"colours": self.harmonics()[0, 0]}
-                ),
-            ),
-        }
+def gsplat_parts(settings: Settings) -> list[Variant]:
+    """The torch functions of gsplat that run on a CPU, beside the same part of ours: projection and
+    tile lists (theirs of boxes, ours of ellipses). Its compositing needs CUDA. More Gaussians are
+    smaller, so that they cover the same area.
+    """
+    more = {"quick": (), "normal": (262144,), "full": (262144, 1048576)}[settings.level]
+    made = []
+    for count in (None, *more):
+        scene = make_scene(settings, math.sqrt(COUNT / (count or COUNT)), count)
+        parts = Parts(scene)
+        runs = {"projection": (parts.project, parts.gsplat_project)}
+        if count != 1048576:  # gsplat's lists of so many take long: a loop in Python
+            runs["tile lists"] = (parts.bin, parts.gsplat_bin)
+        for part, (ours, theirs) in runs.items():
+            end = f", {count} Gaussians" if count else ""
+            exact = part == "projection"  # lists differ by design
+            both = dict(direction=part, parameters=scene.sizes)
+            made.append(Variant(f"ours{end}", ours, None, default=True, **both))
+            peer = Variant(f"gsplat{end}", theirs, parts.check if exact else None, **both)
+            peer.peer, peer.limit, peer.rounds = True, 1e-4, None if exact else 3
+            peer.oracle = "our float32 result" if exact else ""
+            made.append(peer)
+    return made

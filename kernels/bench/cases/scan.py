@@ -26,23 +26,23 @@ def cases(settings: Settings) -> list[Case]:
     """All cases of the scan at the level's sizes."""
     cpu = settings.device.type == "cpu"
     builders = [
-        ("operator", _operator, None),
-        ("reference loop", _reference_loop, None),
-        ("knobs", _knobs, "error"),
-        ("length", _lengths, "L"),
-        ("batch", _batches, "B"),
-        ("states", _states, "N"),
-        ("threads", _threads, "threads") if cpu else ("training batch", _training_batch, None),
+        ("operator", operator, None),
+        ("reference loop", reference_loop, None),
+        ("knobs", knobs, "error"),
+        ("length", lengths, "L"),
+        ("batch", batches, "B"),
+        ("states", states, "N"),
+        ("threads", by_threads, "threads") if cpu else ("training batch", training_batch, None),
     ]
     return make_cases("scan", settings, builders)
 
 
-def _operator(settings: Settings) -> list[Variant]:
+def operator(settings: Settings) -> list[Variant]:
     """The whole operator: softplus, bias, skip and gate."""
     return make_pair(make_problem(settings), "default", default=True)
 
 
-def _reference_loop(settings: Settings) -> list[Variant]:
+def reference_loop(settings: Settings) -> list[Variant]:
     """The operator against the formula as a torch loop (as Mamba's reference does it), and against
     peers where they are installed, all on the same input.
     """
@@ -101,7 +101,7 @@ def _peer(
     )
 
 
-def _knobs(settings: Settings) -> list[Variant]:
+def knobs(settings: Settings) -> list[Variant]:
     """Every choice that a caller has. Half precision is compared with the truth of the float32
     inputs. The discretisations are different models, each compared with its own formula, so that
     the one of Mamba's weights is the default at any cost.
@@ -121,7 +121,7 @@ def _knobs(settings: Settings) -> list[Variant]:
     return made
 
 
-def _lengths(settings: Settings) -> list[Variant]:
+def lengths(settings: Settings) -> list[Variant]:
     """Cost and memory against the number of tokens. Saved: what the forward pass keeps beside its
     inputs; history: the states of all tokens; peak: growth of memory in forward and backward.
     """
@@ -136,7 +136,7 @@ def _lengths(settings: Settings) -> list[Variant]:
     return made
 
 
-def _batches(settings: Settings) -> list[Variant]:
+def batches(settings: Settings) -> list[Variant]:
     """Cost against the number of sequences, of a small model's width."""
     quick = settings.level == "quick"
     length = 512 if quick else 4096
@@ -148,7 +148,7 @@ def _batches(settings: Settings) -> list[Variant]:
     return made
 
 
-def _states(settings: Settings) -> list[Variant]:
+def states(settings: Settings) -> list[Variant]:
     """Cost against the number of states per channel; 16 is the tuned one."""
     counts = (4, 16) if settings.level == "quick" else (4, 8, 16, 32, 64)
     length = 512 if settings.level == "quick" else 4096
@@ -158,12 +158,12 @@ def _states(settings: Settings) -> list[Variant]:
     return made
 
 
-def _threads(settings: Settings) -> list[Variant]:
+def by_threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, from one to the machine's cores."""
     return over_threads(partial(make_pair, make_problem(settings)))
 
 
-def _training_batch(settings: Settings) -> list[Variant]:
+def training_batch(settings: Settings) -> list[Variant]:
     """A layer of the paper's training: 16 sequences in bfloat16, beside mamba-ssm."""
     batch = 2 if settings.level == "quick" else 16
     problem = make_problem(settings, batch=batch)

@@ -113,11 +113,8 @@ def _run_case(case: Case, settings: Settings, records: list[dict], say: Callable
                 torch.set_num_threads(t.variant.threads or settings.threads)
                 t.record["work"] = t.variant.work()
     finally:  # an interrupt keeps what there is
-        for t in timed:
-            _summarize(t)
-            if t.record["status"] != "not measured":
-                records.append(t.record)
-        _set_peers([t.record for t in timed])
+        _summarize(timed)
+        records += [t.record for t in timed if t.record["status"] != "not measured"]
 
 
 def _record(case: Case, variant: Variant, settings: Settings) -> dict:
@@ -199,29 +196,21 @@ def _clock(ready: list[_Timed], settings: Settings, say: Callable) -> None:
         gc.enable()
 
 
-def _summarize(t: _Timed) -> None:
-    record = t.record
-    if record["status"] == "ok" and not t.seconds:
-        record["status"] = "not measured"
-    if record["status"] != "ok":
-        record.update(dict.fromkeys(_TIMES))
-        return
-    quantiles = np.quantile(t.seconds, [0.2, 0.5, 0.8]) * 1e3
-    record.update(zip(_TIMES, map(float, quantiles)))
-    record["rounds"] = len(t.seconds)
-
-
-def _set_peers(records: list[dict]) -> None:
-    """Names in each record the fastest peer of the same direction and sizes."""
-    for record in records:
-        same = [
-            r
-            for r in records
-            if all(r[k] == record[k] for k in ("direction", "parameters")) and r["ms_p50"]
-        ]
-        peers = [r for r in same if r["is_peer"]]
-        if peers and not record["is_peer"]:
-            fastest = min(peers, key=lambda r: r["ms_p50"])
+def _summarize(timed: list[_Timed]) -> None:
+    """Writes the times into the records, and in each the fastest peer of the same sizes."""
+    for t in timed:
+        if t.record["status"] == "ok" and not t.seconds:
+            t.record["status"] = "not measured"
+        if t.record["status"] != "ok":
+            t.record.update(dict.fromkeys(_TIMES))
+            continue
+        quantiles = np.quantile(t.seconds, [0.2, 0.5, 0.8]) * 1e3
+        t.record.update(zip(_TIMES, map(float, quantiles)), rounds=len(t.seconds))
+    peers = [t.record for t in timed if t.record["is_peer"] and t.record["ms_p50"]]
+    for record in (t.record for t in timed if not t.variant.peer):
+        same = [r for r in peers if all(r[k] == record[k] for k in ("direction", "parameters"))]
+        if same:
+            fastest = min(same, key=lambda r: r["ms_p50"])
             record.update(peer=fastest["variant"], peer_ms=fastest["ms_p50"])
 
 
@@ -236,11 +225,14 @@ def _reason(error: Exception) -> str:
 
 def machine(settings: Settings) -> dict:
     """Returns what decides the figures: processor, threads, versions and day, but no names."""
-    gpu = None
-    if settings.device.type == "cuda":
-        gpu = torch.cuda.get_device_name(settings.device)
+    gpu = torch.cuda.get_device_name(settings.device) if settings.device.type == "cuda" else None
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return {
-        "cpu": _cpu_model(),
+        "cpu": names[0] if names else platform.processor() or platform.machine(),
         "simd": torch.backends.cpu.get_cpu_capability(),
         "cores": os.cpu_count(),
         "threads": settings.threads,
@@ -253,15 +245,6 @@ def machine(settings: Settings) -> dict:
         "gamba_warp": __version__,
         "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
     }
-
-
-def _cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def peak_bytes(run: Callable[[], object], device: torch.device) -> int | None:

@@ -6,6 +6,7 @@ import html
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from .charts import Axis, Point, Series, chart, pareto
 from .report import (
@@ -41,7 +42,8 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
     if axis is None or not done:
         return []
     if "," in axis:
-        return [svg for one in axis.split(",") for svg in charts_of(case, _on_axis(records, one))]
+        each = ([r | {"axis": one} for r in records] for one in axis.split(","))
+        return [svg for part in each for svg in charts_of(case, part)]
     if axis == "error":
         directions = dict.fromkeys(r["direction"] for r in done)
         return [_error_chart([r for r in done if r["direction"] == d], d) for d in directions]
@@ -65,22 +67,19 @@ def line_chart(
         label: of the figure, with its unit.
         scale: factor of the figure.
     """
-    series = []
-    found = [(r, r.get(figure) or r["work"].get(figure)) for r in records]
-    done = [r | {"figure": scale * value} for r, value in found if value]
-    values = [(r, r["parameters"].get(axis)) for r in done]
-    done = [r for r, value in values if type(value) in (int, float) and value > 0]
-    for name in dict.fromkeys(map(_series_of, done)):
-        points = [Point(r["parameters"][axis], r["figure"]) for r in done if _series_of(r) == name]
-        series.append(Series(name, sorted(points, key=lambda p: p.x), "straight"))
-    ticks = sorted({r["parameters"][axis] for r in done})
+    lines: dict[str, list[Point]] = {}
+    for r in records:
+        x, y = r["parameters"].get(axis), r.get(figure) or r["work"].get(figure)
+        if y and type(x) in (int, float) and x > 0:
+            name = r["parameters"].get("series") or r["direction"]
+            lines.setdefault(name, []).append(Point(x, scale * y))
+    series = [
+        Series(name, sorted(points, key=lambda p: p.x), "straight")
+        for name, points in lines.items()
+    ]
+    ticks = sorted({point.x for points in lines.values() for point in points})
     axis_label = case if axis == "N" else _AXES.get(axis, axis)
     return chart(series, Axis(axis_label, values=ticks), Axis(label))
-
-
-def _series_of(record: dict) -> str:
-    """The name of the line that a record lies on."""
-    return record["parameters"].get("series") or record["direction"]
 
 
 def _error_chart(records: Sequence[dict], direction: str) -> str:
@@ -96,10 +95,6 @@ def _error_chart(records: Sequence[dict], direction: str) -> str:
     front = pareto([p for p in points if p.y > 0])
     series = [Series(direction, points), Series("Pareto front", front, "steps")]
     return chart(series, Axis("milliseconds"), Axis("relative rms error"))
-
-
-def _on_axis(records: Sequence[dict], axis: str) -> list[dict]:
-    return [r | {"axis": axis} for r in records]
 
 
 def _marked(record: dict, y: float) -> Point:
@@ -137,48 +132,7 @@ def _skip_chart(records: Sequence[dict], switched_off: bool) -> str:
     return chart(series, Axis("work skipped, %", False), Axis("time saved, %", False))
 
 
-_STYLE = """
-:root {
-  color-scheme: light dark;
-  --back: #f5f5f2; --card: #ffffff; --text: #22252a; --soft: #686d76; --line: #dfe0dc;
-  --s0: #1f6feb; --s1: #d1582b; --s2: #2c8a57; --s3: #8250c4; --good: #2c8a57; --bad: #c03a2b;
-}
-@media (prefers-color-scheme: dark) {
-  :root {
-    --back: #16181c; --card: #202329; --text: #e8e8e6; --soft: #9aa0aa; --line: #343840;
-    --s0: #6ea8ff; --s1: #f08a5d; --s2: #5cc48d; --s3: #b896f0; --good: #5cc48d; --bad: #ff7b6b;
-  }
-}
-* { box-sizing: border-box; }
-body {
-  margin: 0 auto; padding: 2rem 1.25rem 3rem; max-width: 76rem;
-  background: var(--back); color: var(--text); font: 15px/1.5 system-ui, sans-serif;
-}
-h1 { margin: 0; font-size: 1.6rem; font-weight: 650; }
-h2 { margin: 0 0 .5rem; font-size: 1.15rem; font-weight: 600; }
-p { margin: .35rem 0 0; max-width: 52rem; color: var(--soft); }
-section {
-  margin-top: 1.5rem; padding: 1.25rem; background: var(--card);
-  border: 1px solid var(--line); border-radius: 12px;
-}
-.charts { display: grid; gap: 1rem; margin-top: 1rem;
-  grid-template-columns: repeat(auto-fill, minmax(min(100%, 33rem), 1fr)); }
-svg { display: block; width: 100%; max-width: 45rem; height: auto; }
-svg text { fill: var(--text); font: 12px system-ui, sans-serif;
-  paint-order: stroke; stroke: var(--card); stroke-width: 3px; stroke-linejoin: round; }
-svg .axis { fill: var(--soft); font-weight: 600; }
-svg .grid { stroke: var(--line); }
-svg .line { fill: none; stroke-width: 2; stroke-linejoin: round; }
-svg .steps { stroke-dasharray: 5 4; }
-svg .guide { stroke-dasharray: 3 4; }
-svg .ring { fill: none !important; stroke-width: 2; }
-.scroll { overflow-x: auto; margin-top: 1rem; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
-th, td { padding: .25rem 1.2rem .25rem 0; text-align: left; border-bottom: 1px solid var(--line); }
-th { font-weight: 500; color: var(--soft); }
-td.number { text-align: right; white-space: nowrap; }
-.reached { color: var(--good); } .missed { color: var(--bad); }
-"""
+_STYLE = Path(__file__).with_suffix(".css")
 
 
 def page(
@@ -187,6 +141,7 @@ def page(
     charts: Callable[[str, Sequence[dict]], list[str]] = charts_of,
 ) -> str:
     """Returns a self-contained HTML page with the tables and the charts."""
+    style = _STYLE.read_text(encoding="utf-8")
     body = [f"<header><h1>Benchmarks</h1><p>{EXPLANATION}</p>"]
     body.append("<p>Circle: ours; ring: the default; square: a peer.</p></header>")
     for document in documents:
@@ -211,7 +166,7 @@ def page(
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Benchmarks</title><style>{_STYLE}</style></head>\n<body>{''.join(body)}</body></html>\n"
+        f"<title>Benchmarks</title><style>\n{style}</style></head>\n<body>{''.join(body)}</body></html>\n"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 
@@ -38,42 +39,27 @@ def judge(targets: Iterable[Target], records: Sequence[dict]) -> list[dict]:
         and ``reached`` are None if a figure is missing.
     """
     cases = {(r["op"], r["case"]) for r in records}
+    found = {(r["op"], r["case"], r["variant"], r["direction"]): r for r in reversed(records)}
+
+    def figure(key: Key) -> float:
+        r = found.get((key.op, key.case, key.variant, key.direction), {"work": {}})
+        return (r[key.field] if key.field in r else r["work"].get(key.field)) or 0.0
+
     rows = []
     for target in targets:
         keys = (*target.times, *target.over)
         if not all((k.op, k.case) in cases for k in keys):
             continue
-        value, reached = _value(target, records), None
-        if value is not None:
+        below = math.prod(map(figure, target.over))
+        value = target.scale * math.prod(map(figure, target.times)) / below if below else None
+        reached = None
+        if value:
             low = target.at_least is None or value >= target.at_least
             reached = low and (target.at_most is None or value <= target.at_most)
         wanted = f"≥ {target.at_least:.3g}" if target.at_least else f"≤ {target.at_most:.3g}"
-        rows.append(
-            dict(op=keys[0].op, text=target.text, wanted=wanted, value=value, reached=reached)
-        )
+        row = dict(op=keys[0].op, text=target.text, wanted=wanted)
+        rows.append(row | dict(value=value or None, reached=reached))
     return rows
-
-
-def _value(target: Target, records: Sequence[dict]) -> float | None:
-    value = target.scale
-    for key in target.times:
-        value *= _figure(key, records) or 0.0
-    for key in target.over:
-        figure = _figure(key, records)
-        value = value / figure if figure else 0.0
-    return value or None
-
-
-def _figure(key: Key, records: Sequence[dict]) -> float | None:
-    for r in records:
-        if (r["op"], r["case"], r["variant"], r["direction"]) == (
-            key.op,
-            key.case,
-            key.variant,
-            key.direction,
-        ):
-            return r[key.field] if key.field in r else r["work"].get(key.field)
-    return None
 
 
 def identity(record: dict) -> tuple[str, ...]:
@@ -114,7 +100,8 @@ def machine_line(document: dict) -> str:
     return " · ".join([*parts, f"Python {m['python']}", m["system"], m["date"]])
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
+    """Three digits, or a whole number from a thousand on; nothing for None."""
     return "" if value is None else f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
 
 
@@ -123,17 +110,11 @@ def _row(r: dict) -> list[str]:
     name = r["variant"] + (" (default)" if r["is_default"] and r["variant"] != "default" else "")
     if r["status"] != "ok":
         reason = textwrap.shorten(r["status"], 90, placeholder=" …")
-        return [name, r["direction"], r["dtype"], reason, "", "", _number(r["rel_rms_error"])]
-    spread = f"{_number(r['ms_p20'])} to {_number(r['ms_p80'])}"
-    error = _number(r["rel_rms_error"]) or "none"
-    times = [_number(r["ms_p50"]), spread, _number(r["jit_ms"])]
+        return [name, r["direction"], r["dtype"], reason, "", "", number(r["rel_rms_error"])]
+    spread = f"{number(r['ms_p20'])} to {number(r['ms_p80'])}"
+    error = number(r["rel_rms_error"]) or "none"
+    times = [number(r["ms_p50"]), spread, number(r["jit_ms"])]
     return [name, r["direction"], r["dtype"], *times, error]
-
-
-def _peer(r: dict) -> str:
-    if not r["peer_ms"] or not r["ms_p50"]:
-        return ""
-    return f"{_number(r['peer_ms'] / r['ms_p50'])} ({r['peer']})"
 
 
 def _work(r: dict) -> str:
@@ -158,7 +139,9 @@ def _work(r: dict) -> str:
 
 def table(records: Sequence[dict]) -> tuple[list[str], list[list[str]]]:
     """Returns header and rows of one case, without the columns that would be empty."""
-    peers, work = [_peer(r) for r in records], [_work(r) for r in records]
+    compared = [r["peer_ms"] and r["ms_p50"] and r["peer_ms"] / r["ms_p50"] for r in records]
+    peers = [f"{number(x)} ({r['peer']})" if x else "" for x, r in zip(compared, records)]
+    work = [_work(r) for r in records]
     header: list[str] = [*_HEADER]
     rows = [_row(r) for r in records]
     for name, cells in (("peer's time / ours", peers), ("work", work)):
@@ -187,7 +170,7 @@ def target_rows(document: dict) -> list[list[str]]:
     """Returns the targets' cells under ``TARGET_HEADER``."""
     words = {True: "reached", False: "missed", None: "not measured"}
     return [
-        [t["op"], t["text"], t["wanted"], _number(t["value"]), words[t["reached"]]]
+        [t["op"], t["text"], t["wanted"], number(t["value"]), words[t["reached"]]]
         for t in document.get("targets", [])
     ]
 

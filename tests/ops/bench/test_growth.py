@@ -185,9 +185,9 @@ def test_results_of_two_machines_are_not_joined():
     one = suites.run_suites({}, QUICK)
     other = one | {"machine": one["machine"] | {"cpu": "another"}}
     with pytest.raises(UserError, match="cpu is .* and another"):
-        suites.join([one, other])
+        show.join([one, other])
     with pytest.raises(UserError, match="different levels"):
-        suites.join([one, one | {"settings": {"level": "full", "peers": False}}])
+        show.join([one, one | {"settings": {"level": "full", "peers": False}}])
 
 
 def test_the_oracle_of_many_gaussians_sees_all_that_reach_the_crop(monkeypatch):

@@ -1,86 +1,95 @@
-"""Benchmark cases of whole models, from pictures to Gaussians."""
+"""Studies of blocks and models: compiled blocks, and tokens of the background that are dropped."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from ..cameras import Cameras, intrinsics, orbit, reference_viewmat
-from ..gaussians import Gaussians
-from ..kernels.bench import Error, NotInstalled, Settings, Variant, compare
-from ..model.checkpoint import load_model
-from ..model.config import PRESETS, GambaConfig, Preset
-from ..model.gamba import Gamba
-from ..model.posing import reference_cameras
-from ..render import render
+from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
+from gamba_warp.data.preprocess import composite, prepare
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.kernels.bench import Case, Error, NotInstalled, Settings, Target, Variant, compare
+from gamba_warp.kernels.bench.core.case import make_cases
+from gamba_warp.measure.blocks import Backbone
+from gamba_warp.measure.inference import captured
+from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
+from gamba_warp.model.parts.block import prefix_states
+from gamba_warp.model.posing import reference_cameras
+from gamba_warp.render import render
 
-_REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
-
-
-def without_encoder(config: GambaConfig) -> GambaConfig:
-    """The configuration without an image encoder; where only its tokens are prepended, none are."""
-    return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
+from . import precision
 
 
-def _model(preset: Preset, settings: Settings, count: int) -> tuple[Gamba, Callable[[], Gaussians]]:
-    """Makes a model with fresh weights and no image encoder, and its run on ``count`` pictures."""
-    torch.manual_seed(0)
-    config = without_encoder(PRESETS[preset])
-    model = Gamba(config).to(settings.device).eval()
-    size = config.image_size
-    # Random alpha leaves no background, so that with "rays" every token is computed.
-    images = torch.rand(count, size, size, config.input_channels).to(settings.device)
-    cameras = reference_cameras(config, count).to(settings.device)
-    return model, torch.no_grad()(partial(model, images, cameras))
+def cases(settings: Settings) -> list[Case]:
+    """Returns the cases, which count to those of ``gamba bench block model``."""
+    models = [
+        ("background tokens", background_tokens, "error,skipped"),
+        ("precision", precision.precisions, "error"),
+    ]
+    return [
+        *make_cases("block", settings, [("compiled", compiled, "error")]),
+        *make_cases("model", settings, models),
+    ]
 
 
-def _check_repeats(run: Callable[[], Gaussians]) -> Error:
-    first, second = ({k: x for k, x in vars(run()).items() if x is not None} for _ in range(2))
-    return compare(second, first)
+def targets(settings: Settings) -> list[Target]:
+    """Returns those of both precisions."""
+    return precision.targets(settings)
 
 
-def pictures(settings: Settings) -> list[Variant]:
-    """A posed picture to Gaussians by preset, without the image encoder. The models are whole and
-    have fresh weights; two runs must give the same bits.
+class _Lazy:
+    """Makes a function at its first call, so that a failure there spoils no other variant."""
+
+    def __init__(self, make: Callable[[], Callable[[], Tensor]]) -> None:
+        self._make = make
+        self._function: Callable[[], Tensor] | None = None
+
+    def __call__(self) -> Tensor:
+        if self._function is None:
+            self._function = self._make()
+        return self._function()
+
+
+def compiled(settings: Settings) -> list[Variant]:
+    """A block of the paper's size as it is, through torch.compile, and on CUDA as a CUDA graph. The
+    first call includes the compilation. All that it can fuse are a few elementwise operations
+    between the products and our kernels, and no gain is seen, so blocks are not compiled by
+    default.
     """
-    made = []
-    for name in ("tiny", "rays") if settings.level == "quick" else PRESETS:
-        model, run = _model(name, settings, 1)
-        made.append(
-            Variant(
-                name=name,
-                run=run,
-                check=partial(_check_repeats, run),
-                limit=0.0,
-                oracle=_REPEATS,
-                default=True,
-                rounds=10,
-                parameters={"N": model.config.num_gaussians, "side": model.config.image_size},
-            )
-        )
-    return made
+    backbone = Backbone(settings, 1)
+    (block,) = backbone.blocks
+    with torch.no_grad():
+        (state,) = prefix_states(backbone.blocks, backbone.camera, backbone.image)
 
+    @torch.no_grad()
+    def plain() -> Tensor:
+        return block(backbone.tokens, state)[0]
 
-def batches(settings: Settings) -> list[Variant]:
-    """Cost against the number of pictures in one call, preset tiny."""
-    made = []
-    for count in (1, 2) if settings.level == "quick" else (1, 2, 4, 8):
-        model, run = _model("tiny", settings, count)
-        made.append(
-            Variant(
-                name=f"{count} picture{'s' * (count > 1)}",
-                run=run,
-                check=partial(_check_repeats, run),
-                limit=0.0,
-                oracle=_REPEATS,
-                parameters={"B": count, "N": model.config.num_gaussians},
-            )
-        )
-    return made
+    def compiled_block() -> Callable[[], Tensor]:
+        if settings.device.type == "cpu" and not any(map(shutil.which, ("g++", "clang++", "c++"))):
+            raise NotInstalled("a C++ compiler")
+        function = torch.compile(block)
+        return torch.no_grad()(lambda: function(backbone.tokens, state)[0])
+
+    def graph() -> Callable[[], Tensor]:
+        whole, result, _ = captured(plain, settings.device)
+
+        def replay() -> Tensor:
+            whole.replay()
+            return result
+
+        return replay
+
+    runs = {"as it is": plain}
+    if settings.level != "quick":
+        runs["torch.compile"] = _Lazy(compiled_block)
+    if settings.device.type == "cuda":
+        runs["CUDA graph"] = _Lazy(graph)
+    return [backbone.variant(name, run, run is plain) for name, run in runs.items()]
 
 
 class _Pictures:
@@ -89,15 +98,6 @@ class _Pictures:
     """
 
     def __init__(self, settings: Settings) -> None:
-        # These are imported here because they need more packages than torch and warp, which
-        # suffice for all other cases.
-        try:
-            import safetensors  # noqa: F401
-
-            from ..data.preprocess import composite, prepare
-            from ..model.checkpoint import DEFAULT_CHECKPOINT
-        except ModuleNotFoundError as error:
-            raise NotInstalled(str(error.name)) from None
         starter = DEFAULT_CHECKPOINT.parent
         checkpoint = starter / "tiny.safetensors"
         icons = sorted((starter / "icons").glob("*.png"))
