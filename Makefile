@@ -8,7 +8,8 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test bench study instructions docs lint format architecture constraints clean
+.PHONY: setup demo test endurance bench study instructions docs lint format architecture \
+        constraints clean
 
 setup: $(STAMP)
 
@@ -31,6 +32,15 @@ demo: $(STAMP)
 # would, so waiting threads must let go of the core (docs/pace.md).
 test: $(STAMP)
 	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile
+
+# Every writing command killed at random moments (training five times as often), and on a full disk.
+KILLS ?= 20
+FULL ?= 10
+SEED ?= 1
+endurance: $(STAMP)
+	GAMBA_ENDURANCE_KILLS=$(KILLS) GAMBA_ENDURANCE_FULL=$(FULL) GAMBA_ENDURANCE_SEED=$(SEED) \
+		GAMBA_ENDURANCE_NODES=10 $(BIN)/python -m pytest -s tests/endurance \
+		tests/nodes/test_nodes_restart.py
 
 bench: $(STAMP)
 	$(BIN)/gamba bench --peers --out out/bench

@@ -43,7 +43,6 @@ COMMANDS = {
     "gpu-check": "Test and measure on a CUDA machine.",
     "import-released": "The authors' public weights to ours.",
     "weights lpips": "Fetch the LPIPS-VGG weights.",
-    "endurance": "Kill and fill the disk under every command.",
     "doctor": "Say what this machine can run.",
 }
 # Commands that a person waits for; trainings and measurements keep torch's own way of waiting.

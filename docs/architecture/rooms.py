@@ -114,11 +114,6 @@ ROOMS = {
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
     "eval.shapes": Room("Chamfer, IoU, F-score", (*_RESULTS, "eval")),
     "gpu_check": Room("the checks on a CUDA machine", (*_MEASURES, "measure")),
-    "endurance": Room(
-        "kills and full disks under every command",
-        _RESULTS,
-        ("measure", *_TRAIN, *_EVAL),
-    ),
     "ablation": Room(
         "rows that are trained and evaluated alike",
         _RESULTS,
@@ -126,7 +121,7 @@ ROOMS = {
     ),
     "commands": Room(
         "a file a command",
-        (*_MEASURES, "measure", "hostile", "endurance", "ablation", "gpu_check"),
+        (*_MEASURES, "measure", "hostile", "ablation", "gpu_check"),
         (*_TRAIN, *_EVAL),
     ),
     "app": Room("the local web app", _RESULTS),

@@ -20,7 +20,6 @@ from architecture.imports import modules
 import gamba_warp.hostile.run
 import gamba_warp.measure.stress_run  # noqa: F401 (loaded before a test takes something away)
 from gamba_warp.cli import run
-from gamba_warp.endurance.jobs import jobs  # noqa: F401
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, STARTER, atomic_folder, only_process, sweep, write_json
 from gamba_warp.gpu_check.check import run_python
@@ -63,7 +62,7 @@ main(arguments)
 @pytest.mark.slow
 def test_all_modules_load_and_a_picture_is_reconstructed_on_a_bare_system(tmp_path):
     names = [name for name in modules(ROOT) if not name.endswith("__main__")]
-    assert len(names) > 200 and "gamba_warp.endurance.child" in names
+    assert len(names) > 200 and "gamba_warp.hostile.child" in names
     picture = next(iter(sorted((STARTER / "icons").glob("*.png"))))
     command = ("reconstruct", picture, "--size", 16, "--frames", 2, "--out", tmp_path / "out")
     done = subprocess.run(
@@ -239,7 +238,7 @@ def test_cores_without_affinity(monkeypatch):
 
 
 @pytest.mark.parametrize("platform", ["darwin", "win32"])
-@pytest.mark.parametrize("command", [["endurance"], ["stress", "files"]])
+@pytest.mark.parametrize("command", [["stress", "files"]])
 def test_what_only_linux_can_do_is_refused_in_one_line(
     platform, command, monkeypatch, tmp_path, capsys
 ):

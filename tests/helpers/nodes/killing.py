@@ -1,12 +1,9 @@
 """One of two training processes is killed again and again, as torchrun starts them anew."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -15,6 +12,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from helpers.nodes.processes import environment, free_port
 
 _LONGEST = 900.0  # seconds of one run with all its kills
 _STEPS_PER_KILL = 8
@@ -49,7 +48,8 @@ def kill_one_of_two(words: list[str], out: Path, kills: int, rng: random.Random)
     """Trains in two processes, each under a torchrun of its own, as on two machines.
 
     Args:
-        words: options of ``gamba train`` but for the run folder, ``--steps`` and what is saved.
+        words: options of ``gamba train`` but for the run folder, ``--steps`` and what is saved;
+            with ``--log-every 1``, by which the moments are chosen.
         out: the run folder; what the processes say goes into a file beside it.
         kills: how often one of the two is killed.
         rng: of the moments, and of which of the two it is.
@@ -58,7 +58,7 @@ def kill_one_of_two(words: list[str], out: Path, kills: int, rng: random.Random)
         RuntimeError: the run does not end well, or not in time.
     """
     started = time.monotonic()
-    own = ["--out", out, "--steps", steps_for(kills), "--save-every", 3, "--log-every", 1]
+    own = ["--out", out, "--steps", steps_for(kills), "--save-every", 3]
     reaper = _Reaper(out / "log.jsonl", kills, rng)
     # A kill fails both workers: the other has lost it.
     said = _nodes([*words, *map(str, own)], out.with_name(f"{out.name}.txt"), 2 * kills, reaper)
@@ -110,22 +110,18 @@ def _nodes(
     words: list[str], notes: Path, restarts: int, look: Callable[[list[subprocess.Popen]], None]
 ) -> str:
     """Runs two torchruns with one worker each to their end; returns what they said."""
-    with socket.socket() as held:
-        held.bind(("127.0.0.1", 0))
-        port = held.getsockname()[1]
     command = [sys.executable, "-m", "torch.distributed.run", "--nnodes", "2"]
     command += ["--nproc-per-node", "1", "--max-restarts", str(restarts), "--rdzv-id", "gamba"]
-    command += ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}"]
+    command += ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{free_port()}"]
     command += ["--local-addr", "127.0.0.1", "-m", "gamba_warp.train", *words]
-    root = str(Path(__file__).resolve().parents[2])  # where Python finds the package
-    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
-    place = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
     agents: list[subprocess.Popen[Any]] = []
     limit = time.monotonic() + _LONGEST
     with open(notes, "w+", encoding="utf-8", errors="replace") as file:
         try:
             for _ in range(2):
-                agents.append(subprocess.Popen(command, env=place, stdout=file, stderr=file))
+                agents.append(
+                    subprocess.Popen(command, env=environment(), stdout=file, stderr=file)
+                )
                 time.sleep(1.0)  # so that the first is the host, and has the lower rank
             while any(agent.poll() is None for agent in agents):
                 if time.monotonic() > limit:

@@ -1,1 +1,0 @@
-"""Endurance: every writing command killed at random moments, and on a disk that fills up."""

@@ -1,0 +1,104 @@
+"""A command in a process of its own, which may be killed, or find a full disk."""
+
+import multiprocessing
+import os
+import resource
+import runpy
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from typing import NamedTuple
+
+LONGEST = 300.0  # seconds; a command that takes longer hangs
+# A server imports these once, computes nothing, and is forked for each command.
+_FORKS = multiprocessing.get_context("forkserver")
+_FORKS.set_forkserver_preload(
+    [
+        *("timm", "trimesh", "gamba_warp.measure.suites", "gamba_warp.fitting.objects"),
+        *("gamba_warp.eval.shapes.pairs", "gamba_warp.eval.views.evaluate"),
+        *("gamba_warp.model.predict", "gamba_warp.model.released", "gamba_warp.pages.outputs"),
+        *("gamba_warp.pages.export", "gamba_warp.train.run", "gamba_warp.train.data.render"),
+    ]
+)
+
+
+class End(NamedTuple):
+    """How a child ended.
+
+    Attributes:
+        code: exit code; negative: the signal that ended it.
+        said: what it wrote to both outputs.
+        seconds: how long it ran.
+        killed: whether it was killed from here, at the moment that was asked for.
+    """
+
+    code: int
+    said: str
+    seconds: float
+    killed: bool
+
+    @property
+    def is_one_line(self) -> bool:
+        """Whether a failure is told as the command line tells it: no traceback, no native death."""
+        told = "gamba: " in self.said or "failed: " in self.said
+        return self.code in (0, 1, 2) and "Traceback" not in self.said and told
+
+
+def gamba(*words: object) -> None:
+    """What ``python -m gamba_warp WORDS`` does."""
+    sys.argv = ["gamba", *map(str, words)]
+    runpy.run_module("gamba_warp", run_name="__main__", alter_sys=True)
+
+
+def run_child(function, *arguments, kill_after=None, file_limit=None) -> End:
+    """Calls a function in a child process.
+
+    Args:
+        function: of a module; the exit code is that of ``sys.exit`` in it, 1 of an exception.
+        arguments: its arguments.
+        kill_after: seconds until SIGKILL, or None.
+        file_limit: no file may grow beyond so many bytes, or None.
+    """
+    ours, theirs = _FORKS.Pipe(duplex=False)
+    process = _FORKS.Process(target=_become, args=(theirs, file_limit, function, arguments))
+    process.start()
+    started, parts = time.monotonic(), []
+    theirs.close()
+
+    def listen() -> None:
+        with suppress(OSError):
+            while part := os.read(ours.fileno(), 1 << 16):
+                parts.append(part)
+
+    # A file would not take what a child says whose files may not grow.
+    listener = threading.Thread(target=listen, daemon=True)
+    listener.start()
+    process.join(LONGEST if kill_after is None else kill_after)
+    killed = process.is_alive()
+    process.kill()
+    process.join()
+    seconds = time.monotonic() - started
+    with suppress(ProcessLookupError):  # helpers of the command, such as ffmpeg or workers
+        os.killpg(process.pid, signal.SIGKILL)
+    listener.join(10)
+    ours.close()
+    said = b"".join(parts).decode(errors="replace")
+    return End(process.exitcode, said, seconds, killed and process.exitcode == -signal.SIGKILL)
+
+
+def _become(pipe, file_limit, function, arguments) -> None:
+    import torch
+    from tqdm import tqdm
+
+    os.setsid()
+    tqdm.set_lock(threading.RLock())  # its own would outlive a killed child, as a semaphore
+    for target, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(pipe.fileno(), target)
+        setattr(sys, name, open(target, "w", encoding="utf-8", closefd=False))
+    pipe.close()
+    torch.set_num_threads(1)
+    if file_limit is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, file_limit))
+    function(*arguments)

@@ -1,0 +1,75 @@
+"""What is in a folder of results: whole files, and what is left over of killed commands."""
+
+import io
+import json
+import os
+from pathlib import Path
+
+from PIL import Image
+from plyfile import PlyData
+from safetensors.torch import load
+
+from gamba_warp.files import PART
+
+_KEPT = (".lock", ".gamba-library.json")  # of a run; of a library that was unpacked
+_TWO_DAYS = 2 * 24 * 3600
+_ENDS = {".png": b"IEND\xaeB`\x82", ".gif": b";", ".html": b"</html>\n"}
+_ENDS |= dict.fromkeys((".json", ".jsonl", ".md", ".csv"), b"\n")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of a folder by their path in it; what is left over is not among them."""
+    found = sorted(path for path in folder.rglob("*") if path.is_file())
+    named = ((path.relative_to(folder), path) for path in found)
+    return {
+        relative.as_posix(): path.read_bytes()
+        for relative, path in named
+        if not any(part.startswith(".") for part in relative.parts)
+    }
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """What killed commands left behind: all names with a dot, but for ``_KEPT``."""
+    found = (path for path in folder.rglob(".*") if path.name not in _KEPT)
+    return [path for path in found if not any(p.startswith(PART) for p in path.parent.parts)]
+
+
+def age(folder: Path) -> None:
+    """Makes the leftovers look two days old, so that the next command may sweep them."""
+    for top in leftovers(folder):
+        for path in (*top.rglob("*"), top):
+            when = path.lstat().st_mtime - _TWO_DAYS
+            os.utime(path, (when, when), follow_symlinks=False)
+
+
+def lost(before: dict[str, bytes], after: dict[str, bytes]) -> list[str]:
+    """Names of files that were there and are not, or are neither what they were nor whole."""
+    return [
+        name
+        for name in sorted(before.keys() | after.keys())
+        if name not in after
+        or (after[name] != before.get(name) and not is_whole(name, after[name]))
+    ]
+
+
+def is_whole(name: str, data: bytes) -> bool:
+    """Whether a new file is one that a command finished, by other readers than ours."""
+    suffix = Path(name).suffix
+    try:
+        if suffix in (".png", ".gif", ".webp"):
+            with Image.open(io.BytesIO(data)) as picture:
+                for index in range(getattr(picture, "n_frames", 1)):
+                    picture.seek(index)
+                    picture.load()
+        elif suffix in (".json", ".jsonl"):
+            for text in data.splitlines() if suffix == ".jsonl" else [data]:
+                json.loads(text)
+        elif suffix == ".safetensors":
+            load(data)
+        elif suffix == ".ply":
+            PlyData.read(io.BytesIO(data))
+        elif suffix == ".glb":
+            return data[:4] == b"glTF" and int.from_bytes(data[8:12], "little") == len(data)
+    except Exception:  # each library has its own
+        return False
+    return bool(data) and data.endswith(_ENDS.get(suffix, b""))
