@@ -46,7 +46,10 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
 
 def markdown(documents: Sequence[dict]) -> str:
     """The tables of studies as Markdown."""
-    return report.markdown(documents, more)
+    return report.markdown(documents, more).replace(
+        "Written by `gamba bench`, not by hand.",
+        "Written by `make study`, not by hand, of results of `gamba bench` and of the studies.",
+    )
 
 
 def page(documents: Sequence[dict]) -> str:

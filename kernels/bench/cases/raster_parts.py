@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -84,16 +86,18 @@ def gsplat_parts(settings: Settings) -> list[Variant]:
     for count in (None, *more):
         scene = make_scene(settings, math.sqrt(COUNT / (count or COUNT)), count)
         parts = Parts(scene)
-        runs = {"projection": (parts.project, parts.gsplat_project)}
+        runs: dict[str, tuple[Callable, Callable]] = {
+            "projection": (parts.project, parts.gsplat_project)
+        }
         if count != 1048576:  # gsplat's lists of so many take long: a loop in Python
             runs["tile lists"] = (parts.bin, parts.gsplat_bin)
         for part, (ours, theirs) in runs.items():
             end = f", {count} Gaussians" if count else ""
             exact = part == "projection"  # lists differ by design
-            both = dict(direction=part, parameters=scene.sizes)
-            made.append(Variant(f"ours{end}", ours, None, default=True, **both))
-            peer = Variant(f"gsplat{end}", theirs, parts.check if exact else None, **both)
-            peer.peer, peer.limit, peer.rounds = True, 1e-4, None if exact else 3
+            variant = partial(Variant, direction=part, parameters=scene.sizes)
+            made.append(variant(f"ours{end}", ours, None, default=True))
+            peer = variant(f"gsplat{end}", theirs, parts.check if exact else None, peer=True)
+            peer.limit, peer.rounds = 1e-4, None if exact else 3
             peer.oracle = "our float32 result" if exact else ""
             made.append(peer)
     return made

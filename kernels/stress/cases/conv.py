@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -48,7 +50,8 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
 
 def _run(o: dict, x: dict) -> dict[str, Tensor]:
     """The results by name, channels last."""
-    values, rest = (x["weight"], x["bias"]), {"activation": "silu" if o["silu"] else None}
+    values = x["weight"], x["bias"]
+    rest: dict[str, Any] = {"activation": "silu" if o["silu"] else None}
     state = x["initial_state"]
     if o["api"] == "conv":
         rest |= dict(initial_state=state, return_final_state=o["final"])
@@ -64,7 +67,7 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the operator and compares output, final state and all gradients with float64."""
     o, x = case.options, build(case, device)
-    samples = {k: samples_of(t) for k, t in x.items()}
+    samples: dict[str, Any] = {k: samples_of(t) for k, t in x.items()}
     r = Rounding(case.seed, trial)
     out, final = scan_oracle.conv(samples, o["silu"], DTYPES[o["dtype"]], r)
     leaves = {k: t for k, t in x.items() if t is not None}

@@ -180,7 +180,7 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
     """The results by name, channels last."""
     common: dict[str, Any] = dict(delta_softplus=o["softplus"])
     if o["api"] == "mamba-ssm":
-        u, delta, z = (None if x[k] is None else x[k].mT for k in ("u", "delta", "z"))
+        u, delta, z = x["u"].mT, x["delta"].mT, None if x["z"] is None else x["z"].mT
         B, C = (t if t.dim() == 2 else t.permute(0, 2, 3, 1).squeeze(1) for t in (x["B"], x["C"]))
         more = dict(return_last_state=o["last"], **common)
         result = selective_scan_fn(u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], **more)
@@ -207,7 +207,7 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
 def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     """Runs the operator and compares outputs and all gradients with float64."""
     o, r, x = case.options, Rounding(case.seed, trial), build(case, device)
-    samples = {name: samples_of(t) for name, t in x.items()}
+    samples: dict[str, Any] = {name: samples_of(t) for name, t in x.items()}
     used = dict(samples)
     if o["constant_B"]:  # every channel is a group of its own
         used["B"] = scan_oracle.over_tokens(r(samples["B"]), samples["u"], r)
@@ -216,7 +216,7 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     truths = {"out": out[:, :, o["split"] :], "last": last}
     runs = Runs(case, lambda: _run(o, x), leaves, truths, {k: samples[k] for k in leaves})
     # the tokens of a channel are taken together
-    parts = dict.fromkeys(("out", "u", "delta", "z", "B", "C"), (1,))
+    parts: dict[str, tuple[int, ...]] = dict.fromkeys(("out", "u", "delta", "z", "B", "C"), (1,))
     return runs.outcome(parts | {"B": ()} if o["constant_B"] else parts)
 
 

@@ -129,7 +129,7 @@ class Option(NamedTuple):
     """
 
     plain: Any
-    drawn: Sequence | float | Callable[[Random, dict], Any] = ()
+    drawn: Any = ()
     chance: float = 1.0
     others: Sequence = ()
     span: tuple[int, int] = (0, 10**6)

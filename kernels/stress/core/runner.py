@@ -41,8 +41,8 @@ def shrink(
     """
     outcome, tried, end = run_case(op, case, device), 0, time.monotonic() + seconds
     failure = outcome.failure()
-    improved = failure is not None
-    while improved:
+    improved = True
+    while failure is not None and improved:
         improved = False
         for name in ("kind", *op.plain):
             if name == "kind":
