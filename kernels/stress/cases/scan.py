@@ -180,7 +180,8 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
     """The results by name, channels last."""
     common: dict[str, Any] = dict(delta_softplus=o["softplus"])
     if o["api"] == "mamba-ssm":
-        u, delta, z = x["u"].mT, x["delta"].mT, None if x["z"] is None else x["z"].mT
+        u, delta = x["u"].mT, x["delta"].mT
+        z = None if x["z"] is None else x["z"].mT
         B, C = (t if t.dim() == 2 else t.permute(0, 2, 3, 1).squeeze(1) for t in (x["B"], x["C"]))
         more = dict(return_last_state=o["last"], **common)
         result = selective_scan_fn(u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], **more)
@@ -216,8 +217,8 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     truths = {"out": out[:, :, o["split"] :], "last": last}
     runs = Runs(case, lambda: _run(o, x), leaves, truths, {k: samples[k] for k in leaves})
     # the tokens of a channel are taken together
-    parts: dict[str, tuple[int, ...]] = dict.fromkeys(("out", "u", "delta", "z", "B", "C"), (1,))
-    return runs.outcome(parts | {"B": ()} if o["constant_B"] else parts)
+    parts: dict[str, tuple[int, ...]] = dict.fromkeys(("out", "u", "delta", "z", "C"), (1,))
+    return runs.outcome(parts if o["constant_B"] else parts | {"B": (1,)})
 
 
 OP = Op("scan", KINDS, OPTIONS, _fit, evaluate)

@@ -87,7 +87,7 @@ class Tally:
 def table(rows: list[Row]) -> str:
     """Returns a Markdown table with its columns aligned for a terminal."""
     error = lambda value: f"{value:.1e}" if value else "0"  # noqa: E731
-    cells: list[list[str]] = [list(_HEAD)]
+    cells: list[list[str]] = [[*_HEAD]]
     for r in rows:
         cells.append([
             r.op, r.kind, str(r.cases), error(r.forward[0]), r.forward[1], error(r.gradient[0]),

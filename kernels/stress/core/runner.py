@@ -40,9 +40,9 @@ def shrink(
         The case, its outcome, and the number of cases tried.
     """
     outcome, tried, end = run_case(op, case, device), 0, time.monotonic() + seconds
-    failure = outcome.failure()
-    improved = True
-    while failure is not None and improved:
+    failure = outcome.failure() or {}
+    improved = bool(failure)
+    while improved:
         improved = False
         for name in ("kind", *op.plain):
             if name == "kind":
