@@ -234,8 +234,9 @@ def _fresh_store(rank: int, size: int) -> Store:
     limit = time.monotonic() + _MEETING.total_seconds()
     while time.monotonic() < limit:
         group = store.multi_get(names)  # waits for who has not come at all
-        store.set(seen[rank], b",".join(group).decode())
-        if {*store.multi_get(seen)} == {b",".join(group)}:
+        together = b",".join(group)
+        store.set(seen[rank], together.decode())
+        if {*store.multi_get(seen)} == {together}:
             return PrefixStore(f"gamba/{group[0].decode()}", store)
         time.sleep(0.02)
     raise UserError(f"not all of {size} processes have come to {host}:{port}")

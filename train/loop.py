@@ -341,6 +341,7 @@ class Trainer:
         # Everything was read and checked before any of it is loaded. The processes need no disk in
         # common: the main one reads.
         state, length, moments, weights, averages = self.world.first(held)
+        old = replace(self._schedule(length), since=state.new_length)
         if self.ema is not None:
             self.ema.model.load_stored_state(averages)
             self.ema.updates = state.ema_updates
@@ -348,7 +349,6 @@ class Trainer:
         self.optimizer.load_state_dict(moments)
         self.step, self.skipped = state.step, state.skipped
         self.skipped_in_row, self.elapsed = state.skipped_in_row, state.elapsed
-        old = replace(self._schedule(length), since=state.new_length)
         self.schedule, note = self.schedule.after(old, self.step, self.elapsed)
         self._saved = self.step if checkpoint.parent.parent == self.config.run.out else -1
         torch.set_rng_state(state.rng)
