@@ -67,12 +67,6 @@ MODULES = {
 }
 
 
-def _usage() -> str:
-    lines = [f"gamba {__version__}: one image to 3D Gaussians", "", "Commands:"]
-    lines += [f"  gamba {name:<14} {text}" for name, text in COMMANDS.items()]
-    return "\n".join([*lines, "", "gamba COMMAND --help shows the options of one."])
-
-
 def _find(arguments: list[str]) -> tuple[str, list[str]]:
     """The command's name, and its own arguments."""
     for words in (2, 1):
@@ -232,7 +226,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _main(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_usage())
+        print(f"gamba {__version__}: one image to 3D Gaussians\n\nCommands:")
+        for name, text in COMMANDS.items():
+            print(f"  gamba {name:<14} {text}")
+        print("\ngamba COMMAND --help shows the options of one.")
         return 0
     if arguments[0] in ("-V", "--version"):
         print(__version__)

@@ -140,7 +140,11 @@ def load_rgba(path: str | Path, longest: int | None = None) -> np.ndarray:
     """
     with _still(path) as image:
         factor = 1 if longest is None else max(image.size) // (2 * longest)
-        return _to_rgba(_upright(_reduced(image, factor)), np.float32)
+        if factor > 1:
+            if image.mode != "F":
+                image = image.convert("I" if image.mode.startswith("I") else "RGBA")
+            image = image.reduce(factor)
+        return _to_rgba(_upright(image), np.float32)
 
 
 def load_rgba8(path: str | Path) -> np.ndarray:
@@ -213,14 +217,6 @@ def _upright(image: Image.Image) -> Image.Image:
     turned = image.transpose(_UPRIGHT[orientation])
     image.close()  # two large pictures are too much beside the floats
     return turned
-
-
-def _reduced(image: Image.Image, factor: int) -> Image.Image:
-    if factor <= 1:
-        return image
-    if image.mode != "F":
-        image = image.convert("I" if image.mode.startswith("I") else "RGBA")
-    return image.reduce(factor)
 
 
 def _to_rgba(image: Image.Image, dtype: type) -> np.ndarray:

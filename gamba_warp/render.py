@@ -47,15 +47,18 @@ def render(
     """
     if background is not None:
         background = background.expand(*cameras.viewmats.shape[:-2], 3)
-    if gaussians.harmonics is not None:
+    colors = gaussians.colors
+    if gaussians.harmonics is not None:  # all coefficients, the colours as that of degree 0
         options["sh_degree"] = gaussians.degree
+        constant = (colors - 0.5) / SH_C0
+        colors = torch.cat([constant[..., None, :], gaussians.harmonics], -2)
     with record_function("rasterizer"):
         pictures, alpha, meta = rasterization(
             means=gaussians.means,
             quats=gaussians.quats,
             scales=gaussians.scales,
             opacities=gaussians.opacities,
-            colors=gaussians.colors if gaussians.harmonics is None else _coefficients(gaussians),
+            colors=colors,
             viewmats=cameras.viewmats,
             Ks=cameras.Ks,
             width=cameras.width,
@@ -65,10 +68,3 @@ def render(
             **options,
         )
     return Rendering(pictures[..., :3], alpha, pictures[..., 3:] if depth else None, meta)
-
-
-def _coefficients(gaussians: Gaussians) -> Tensor:
-    """All coefficients ``[.., N, (degree + 1)², 3]``, the colours as that of degree 0."""
-    assert gaussians.harmonics is not None
-    constant = (gaussians.colors - 0.5) / SH_C0
-    return torch.cat([constant[..., None, :], gaussians.harmonics], -2)

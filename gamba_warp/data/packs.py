@@ -193,18 +193,15 @@ class _Shards:
         Raises:
             UserError: there is no such shard, or it is too short.
         """
-        data = self._map(name)
+        with self._lock:
+            if name not in self._maps:
+                self._maps[name] = self._opened(name)
+            data = self._maps[name]
         # The file may have been cut short since; reading behind its end would kill the process.
         if start + count > min(len(data), data.size()):
             at_most = f"{data.size():,} bytes, {start + count:,} are needed"
             raise UserError(f"{self.folder / name}: cut short ({at_most})")
         return memoryview(data)[start : start + count]
-
-    def _map(self, name: str) -> mmap.mmap:
-        with self._lock:
-            if name not in self._maps:
-                self._maps[name] = self._opened(name)
-            return self._maps[name]
 
     def _opened(self, name: str) -> mmap.mmap:
         path = inside(self.folder, plain_name(name, str(self.folder / INDEX)), str(self.folder))

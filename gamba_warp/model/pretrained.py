@@ -50,7 +50,8 @@ def save_pretrained(model: Gamba, folder: str | Path, card: str = "") -> Path:
         with atomic_path(folder / ENCODER_NAME) as temporary:
             save_file(encoder.weights(), temporary)
     save_model(folder / FILE_NAME, model)
-    write_text(folder / CONFIG_NAME, _indented(model.config))
+    values = json.loads(model.config.to_json())
+    write_text(folder / CONFIG_NAME, json.dumps(values, indent=2, sort_keys=True) + "\n")
     if not (folder / CARD_NAME).exists():
         write_text(folder / CARD_NAME, model_card(model, folder.name, card))
     return folder
@@ -158,10 +159,6 @@ def model_card(model: Gamba, name: str, card: str = "") -> str:
         "",
     ]
     return "\n".join(lines + ([card.strip(), ""] if card else []))
-
-
-def _indented(config: GambaConfig) -> str:
-    return json.dumps(json.loads(config.to_json()), indent=2, sort_keys=True) + "\n"
 
 
 def _check_config(config: Path, model: Path) -> None:

@@ -116,13 +116,10 @@ def fetch(model: Published, address: str) -> Path:
             downloader=downloader,
         )
     except Exception as error:  # of requests, of urllib3, of the disk, and a ValueError of pooch
-        raise NotFetched(_short(error, address)) from error
+        reason = first_line(error)[:200]
+        # requests puts several errors into one another
+        names = {type(error).__name__, type(error.__context__).__name__}
+        if names & {"ConnectionError", "ConnectTimeout", "ReadTimeout", "ProxyError", "SSLError"}:
+            reason = f"{urlsplit(address).hostname} cannot be reached"
+        raise NotFetched(reason) from error
     return Path(found)
-
-
-def _short(error: Exception, address: str) -> str:
-    """Why it could not be fetched; requests puts several errors into one another."""
-    names = {type(error).__name__, type(error.__context__).__name__}
-    if names & {"ConnectionError", "ConnectTimeout", "ReadTimeout", "ProxyError", "SSLError"}:
-        return f"{urlsplit(address).hostname} cannot be reached"
-    return first_line(error)[:200]

@@ -65,7 +65,9 @@ def run_each(
     try:
         while waiting or busy:
             while waiting and len(busy) < max(1, workers):
-                index, child = waiting.pop(), _take()
+                while _idle and not _idle[-1].is_alive():
+                    _idle.pop().end()
+                index, child = waiting.pop(), _idle.pop() if _idle else _Child()
                 busy[index] = child
                 child.begin(function, items[index], memory)
             for index, value in _answers(busy, seconds):
@@ -161,16 +163,6 @@ class _Child:
 
 
 _idle: list[_Child] = []
-
-
-def _take() -> _Child:
-    """A child that is kept, or a new one."""
-    while _idle:
-        child = _idle.pop()
-        if child.is_alive():
-            return child
-        child.end()
-    return _Child()
 
 
 def _of(code: int | None) -> str:

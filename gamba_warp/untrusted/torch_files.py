@@ -97,16 +97,12 @@ class _Copy:
                 raise ValueError("its tensors are larger than the file")
             return value.detach().clone(memory_format=torch.contiguous_format)
         if isinstance(value, dict):
-            return {self._key(k): self.of(v, depth + 1) for k, v in value.items()}
+            if not all(isinstance(key, (str, int)) for key in value):
+                raise ValueError("a key is neither a text nor a number")
+            return {k: self.of(v, depth + 1) for k, v in value.items()}
         if isinstance(value, (list, tuple)):
             items = [self.of(item, depth + 1) for item in value]
             return items if isinstance(value, list) else tuple(items)
         if value is None or isinstance(value, (bool, int, float, str)):
             return value
         raise ValueError(f"it holds a {type(value).__name__}")
-
-    @staticmethod
-    def _key(key: Any) -> Any:
-        if isinstance(key, (str, int)):
-            return key
-        raise ValueError(f"a key is a {type(key).__name__}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import os
-import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -16,26 +16,11 @@ from . import team
 from .recording import recorder
 from .views import unkept, view
 
-_lock = threading.Lock()
-_pool: ThreadPoolExecutor | None = None
 
-
-def _get_pool() -> ThreadPoolExecutor:
-    global _pool
-    with _lock:
-        if _pool is None:
-            _pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="gamba-warp")
-        return _pool
-
-
-def _forget_pool() -> None:
-    """A forked child has the executor's object but none of its threads."""
-    global _pool, _lock
-    _pool, _lock = None, threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pool)
+@functools.cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Threads of Python; a forked child would have the object of its parent but no threads."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="gamba-warp")
 
 
 def parallel_launch(
@@ -93,7 +78,7 @@ def parallel_launch(
                 record_tape=False,
             )
 
-    helpers = [_get_pool().submit(work) for _ in range(threads - 1)] if threads > 1 else []
+    helpers = [_pool(os.getpid()).submit(work) for _ in range(threads - 1)]
     try:
         work()
     finally:

@@ -65,7 +65,12 @@ class Pool:
 
         Its storage cannot be resized.
         """
-        block = self._find(size) or _fresh(size)
+        block = self._find(size)
+        if block is None:  # rounded up, and room to begin at a huge page
+            room = -(-size // _PAGE) * _PAGE + _PAGE
+            block = _Block(-1, room, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            with contextlib.suppress(OSError, AttributeError):  # a kernel without huge pages
+                block.madvise(mmap.MADV_HUGEPAGE)
         block.lent = False
         begin = ctypes.addressof(ctypes.c_char.from_buffer(block))
         # torch holds this object for as long as the storage lives
@@ -113,16 +118,6 @@ class Pool:
     def clear(self) -> None:
         """Gives all that lies in the pool back to the system."""
         self._free.clear()
-
-
-def _fresh(size: int) -> _Block:
-    """Memory for ``size`` bytes, rounded up, and room to begin at a huge page."""
-    block = _Block(
-        -1, -(-size // _PAGE) * _PAGE + _PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
-    )
-    with contextlib.suppress(OSError, AttributeError):  # a kernel without huge pages does no harm
-        block.madvise(mmap.MADV_HUGEPAGE)
-    return block
 
 
 def _most() -> int:

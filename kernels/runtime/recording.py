@@ -52,9 +52,8 @@ def multiprocessors_of(device: torch.device) -> int:
     recorder = _recorder.get()
     if recorder is not None:
         return recorder.multiprocessors
-    return _multiprocessors(torch.cuda.current_device() if device.index is None else device.index)
+    index = torch.cuda.current_device() if device.index is None else device.index
+    return _properties(index).multi_processor_count
 
 
-@functools.cache
-def _multiprocessors(index: int) -> int:
-    return torch.cuda.get_device_properties(index).multi_processor_count
+_properties = functools.cache(torch.cuda.get_device_properties)

@@ -104,7 +104,10 @@ def write_pack(
             settings, cannot be written, or its disk is full.
     """
     dataset = open_dataset(data, settings.split)
-    splits = _splits(data, dataset)
+    if dataset.layout == "pack":  # whose splits stand in its index
+        splits = {values["uid"]: str(values.get("split")) for values in read_index(data).objects}
+    else:
+        splits = splits_of(data, dataset.uids)
     before = _begun(out, settings)  # before the folder is made
     out = output_folder(out)
     with only_process(out, "packs"):
@@ -115,7 +118,11 @@ def write_pack(
         known = {values["uid"] for values in index.objects}
         wanted = dataset.uids[:limit]
         todo = [uid for uid in wanted if uid not in known]
-        _remove_unnamed(out, index)
+        named = {values["shard"] for values in index.objects}
+        for suffix in SUFFIXES.values():  # of a run that was killed, or all damaged
+            for path in out.glob(f"shard-*.{suffix}"):
+                if path.name not in named:
+                    path.unlink(missing_ok=True)
         failures: dict[str, str] = {}
         blocks = _blocks(dataset, todo, splits, settings, workers, failures)
         if todo or not index.finished:
@@ -129,14 +136,6 @@ def write_pack(
     shards = {values["shard"] for values in index.objects}
     there = len(wanted) - len(todo)
     return Packed(len(todo) - len(failures), there, len(shards), failures)
-
-
-def _splits(data: Path, dataset: ViewDataset) -> dict[str, str]:
-    """The split of each object; that of a pack is the one in its index."""
-    if dataset.layout == "pack":
-        index = read_index(data)
-        return {values["uid"]: str(values.get("split")) for values in index.objects}
-    return splits_of(data, dataset.uids)
 
 
 def _begun(out: Path, settings: PackSettings) -> Index | None:
@@ -168,15 +167,6 @@ def _whole(out: Path, index: Index) -> list[dict]:
             continue
         good.append(by_uid[packed.uid])
     return good
-
-
-def _remove_unnamed(out: Path, index: Index) -> None:
-    """Removes shards that the index does not name: of a run that was killed, or all damaged."""
-    named = {values["shard"] for values in index.objects}
-    for suffix in SUFFIXES.values():
-        for path in out.glob(f"shard-*.{suffix}"):
-            if path.name not in named:
-                path.unlink(missing_ok=True)
 
 
 def _blocks(
