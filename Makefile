@@ -8,8 +8,8 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test endurance bench study instructions docs lint format architecture \
-        constraints clean
+.PHONY: setup demo test hostile endurance bench study instructions docs lint format \
+        architecture constraints clean
 
 setup: $(STAMP)
 
@@ -32,6 +32,13 @@ demo: $(STAMP)
 # would, so waiting threads must let go of the core (docs/pace.md).
 test: $(STAMP)
 	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile
+
+# Hostile files for every reader, or for READERS='shape or picture', as SEED draws them.
+MINUTES ?= 10
+READERS ?=
+hostile: $(STAMP)
+	GAMBA_HOSTILE_MINUTES=$(MINUTES) GAMBA_HOSTILE_SEED=$(SEED) \
+		$(BIN)/python -m pytest -s tests/hostile -k 'test_hostile_files $(if $(READERS),and ($(READERS)))'
 
 # Every writing command killed at random moments (training five times as often), and on a full disk.
 KILLS ?= 20

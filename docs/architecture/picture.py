@@ -85,7 +85,6 @@ BOXES = {
     "train": Box(3.6, 8, "train", "train", ("batches, losses, loop;", "data/: rendering")),
     "eval": Box(4.7, 7, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
     "gpu_check": Box(1, 8, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
-    "hostile": Box(3.4, 10, "gamba_warp", "hostile", ("the fuzzer of", "every reader")),
     "ablation": Box(2.1, 9, "gamba_warp", "ablation", ("rows trained and", "evaluated alike")),
     "commands": Box(2.2, 11, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
     "cli": Box(2.8, 12, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),

@@ -96,11 +96,6 @@ ROOMS = {
         (*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
     ),
     "measure": Room("benchmark and stress cases that need the model", _MEASURES),
-    "hostile": Room(
-        "hostile files for every reader",
-        (*_RESULTS, "kernels.stress"),
-        ("measure", "ablation", *_BENCH, *_STRESS, *_TRAIN, *_EVAL),
-    ),
     "train.data": Room("furniture, rendering of meshes, starter set", _LIBRARY),
     "train.sources": Room("published datasets, packs of views", (*_LIBRARY, "train.data")),
     "train.config": Room("the options of a run", _LIBRARY),
@@ -121,7 +116,7 @@ ROOMS = {
     ),
     "commands": Room(
         "a file a command",
-        (*_MEASURES, "measure", "hostile", "ablation", "gpu_check"),
+        (*_MEASURES, "measure", "ablation", "gpu_check"),
         (*_TRAIN, *_EVAL),
     ),
     "app": Room("the local web app", _RESULTS),

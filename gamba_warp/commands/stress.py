@@ -1,9 +1,8 @@
-"""``gamba stress``: random and hostile cases, each against float64; hostile files, each read."""
+"""``gamba stress``: random and hostile cases, each against float64."""
 
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +11,6 @@ from msgspec import Meta
 
 from ..conventions import DeviceChoice
 from ..devices import pick_device
-from ..errors import UserError
 from ..files import output_folder
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 
@@ -38,40 +36,34 @@ def stress_command(
 
     Forward results and all gradients; a failing case is made small and written to a file that
     --replay runs again. Writes stress.json and stress.md. Ctrl-C keeps what was found.
-    With "files": hostile files for every reader, in child processes with limits of memory and time;
-    on Linux only.
 
     Args:
-        what: scan (with the convolution), raster, model, or all (of these); or files, after which
-            names of readers may follow.
+        what: scan (with the convolution), raster, model, or all (of these).
         seed: The same seed gives the same cases in the same order.
         minutes: Time limit; 1 if not given, or none with --cases.
         cases: Number of cases; as many as fit in --minutes if not given.
         device: Device of the kernels; auto is the GPU if there is one.
-        threads: Number of CPU threads; torch's own number if not given. Of "files": of child
-            processes; one per core if not given.
+        threads: Number of CPU threads; torch's own number if not given.
         out: Folder for the summary and the failing cases.
         shrink_seconds: Time limit for making one failing case small.
         replay: Run only these files of failing cases.
     """
     import torch
 
-    from ..hostile import run as files_run
     from ..measure import stress_run
 
     chosen = pick_device(device)
     if threads is not None:
         torch.set_num_threads(threads)
     if replay:
-        return _replay(replay, chosen)
+        code = 0
+        for passes, text in stress_run.replay(replay, chosen):
+            print(text)
+            code = code if passes else 1
+        return code
     endless = minutes is None and cases is not None
-    if "files" in what:
-        _only_on_linux()
-        names = files_run.choose_readers(what)
-        run = files_run.FilesRun(names, output_folder(out), seed, shrink_seconds, threads)
-    else:
-        ops = stress_run.choose_ops(what)
-        run = stress_run.StressRun(ops, chosen, output_folder(out), seed, shrink_seconds)
+    ops = stress_run.choose_ops(what)
+    run = stress_run.StressRun(ops, chosen, output_folder(out), seed, shrink_seconds)
     run.run(cases, math.inf if endless else 60 * (minutes or _MINUTES))
     run.write()
     print(f"{run.summary()}; wrote {out / 'stress.json'}")
@@ -79,24 +71,3 @@ def stress_command(
         print("interrupted; what was found is kept")
         return 130
     return 1 if run.failures else 0
-
-
-def _only_on_linux() -> None:
-    if sys.platform != "linux":
-        raise UserError("stress files runs on Linux only: it limits the memory of its children")
-
-
-def _replay(paths: tuple[Path, ...], device) -> int:
-    """Runs failing cases, those of files last; returns the exit code."""
-    from ..hostile import run as files_run
-    from ..measure import stress_run
-
-    files = [path for path in paths if files_run.is_hostile_case(path)]
-    if files:
-        _only_on_linux()
-    numeric = [path for path in paths if path not in files]
-    code = 0
-    for passes, text in (*stress_run.replay(numeric, device), *files_run.replay(files)):
-        print(text)
-        code = code if passes else 1
-    return code

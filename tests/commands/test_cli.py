@@ -366,3 +366,17 @@ def test_names_that_are_not_utf_8_can_be_printed(tmp_path):
     result = run("export", name, stdout=subprocess.PIPE, cwd=tmp_path)
     assert result.returncode == 2 and "Traceback" not in result.stderr
     assert result.stderr.endswith("caf\\udce9.ply: no such file\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--replay", "none.json"], "No such file"),
+        (["--minutes", "inf"], "--minutes"),
+        (["--cases", "0"], "--cases"),
+        (["files"], "unknown 'files'; there are scan, raster, model and all"),
+    ],
+)
+def test_bad_options_of_stress(arguments, reason, capsys):
+    assert exit_code(["stress", *arguments]) == 2
+    assert reason in capsys.readouterr().err

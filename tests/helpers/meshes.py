@@ -1,4 +1,7 @@
-"""A textured square as an .obj file, for tests of meshes and of their rendering."""
+"""A textured square as an .obj file, and the container of a .glb, for tests of meshes."""
+
+import json
+import struct
 
 import numpy as np
 from PIL import Image
@@ -28,3 +31,12 @@ def write_quad(folder, obj=QUAD, mtl=MTL, texture="paint.png"):
     path = folder / "quad.obj"
     path.write_text(obj)
     return path
+
+
+def glb(tree: dict | bytes, binary: bytes) -> bytes:
+    """A GLB container of a tree, which may be given as text, and a binary part."""
+    text = tree if isinstance(tree, bytes) else json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -8,12 +8,12 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 from helpers.images import disc_on_noise
+from helpers.matting import matting_network
 from PIL import Image
 
 from gamba_warp import versions
 from gamba_warp.data.preprocess import recenter
 from gamba_warp.errors import UserError
-from gamba_warp.hostile.seeds.networks import matting_network
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.photo import cutout, matte, models
 from gamba_warp.photo.cutout import Ways, cut_out, fault_of

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.images import disc_on_noise
+from helpers.matting import matting_network
 from PIL import Image
 
 from gamba_warp import cli
 from gamba_warp.errors import UserError
-from gamba_warp.hostile.seeds.networks import matting_network
 from gamba_warp.images import save_image
 from gamba_warp.photo import matte
 from gamba_warp.photo.cutout import Ways, cut_out

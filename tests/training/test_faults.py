@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-from functools import partial
 
 import pytest
 import torch
@@ -15,7 +14,6 @@ from gamba_warp import cli
 from gamba_warp.ablation.processes import stop_requests
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, only_process
-from gamba_warp.hostile.pool import Pool
 from gamba_warp.train import loop
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.log import Quiet, RunLog, say
@@ -133,8 +131,8 @@ def test_each_signal_saves_and_stops(no_nohup, number):
 
 @pytest.mark.parametrize(
     "collect",
-    [loop.stop_signals, stop_requests, partial(Pool, 0)],
-    ids=["train", "ablate", "stress"],
+    [loop.stop_signals, stop_requests],
+    ids=["train", "ablate"],
 )
 def test_nohup_holds(no_nohup, collect):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)

@@ -20,7 +20,6 @@ DOORS = {
     "pickle.load": set(),
     "pickle.loads": {"gamba_warp/untrusted/children.py"},
 }
-TESTERS = ("gamba_warp/hostile",)  # they make the files that they open
 
 
 def calls(path):
@@ -37,10 +36,9 @@ def found():
     for folder in ("gamba_warp", "train", "eval", "kernels"):
         for path in (ROOT / folder).rglob("*.py"):
             place = path.relative_to(ROOT).as_posix()
-            if not place.startswith(TESTERS):
-                for name, line in calls(path):
-                    if name in lines:
-                        lines[name].add((place, line))
+            for name, line in calls(path):
+                if name in lines:
+                    lines[name].add((place, line))
     return lines
 
 

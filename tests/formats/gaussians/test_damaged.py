@@ -11,11 +11,11 @@ import torch
 import trimesh
 from helpers.gaussians import some
 from helpers.judges.splats import check
+from helpers.meshes import glb
 
 from gamba_warp.errors import UserError
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
-from gamba_warp.hostile.seeds.shapes import glb
 
 
 def refused(path, *words):

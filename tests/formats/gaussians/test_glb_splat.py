@@ -8,12 +8,12 @@ import trimesh
 from helpers.gaussians import some
 from helpers.judges.npm import npm_package, run_node
 from helpers.judges.splats import attributes, covariances, read_glb
+from helpers.meshes import glb
 
 from gamba_warp.formats.gaussians.glb import save_glb
 from gamba_warp.formats.gaussians.splat import save_splat
 from gamba_warp.formats.materials import to_linear
 from gamba_warp.formats.ply import SH_C0
-from gamba_warp.hostile.seeds.shapes import glb
 
 KHR = "KHR_gaussian_splatting"
 

