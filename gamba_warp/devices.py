@@ -6,6 +6,7 @@ import ctypes
 import functools
 import os
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -83,13 +84,31 @@ def keep_memory() -> None:
 def quiet_warp() -> None:
     """Has Warp say its warnings alone, and not its start and each module that it loads.
 
-    That is a setting of the whole process, so only commands call it; a level that somebody chose
-    stays.
+    Where there is no GPU, its start also says that no driver was found: that line, which Warp's own
+    machine code writes, is held back. These are settings of the whole process, so only commands
+    call this; a level that somebody chose stays.
     """
+    import torch
     import warp
 
     if warp.config.log_level == warp.LOG_INFO:
         warp.config.log_level = warp.LOG_WARNING
+    if torch.cuda.is_available():
+        return
+    try:
+        saved = os.dup(2)
+    except OSError:  # stderr is closed, so nobody would see the line
+        return
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            warp.init()
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+        held.seek(0)
+        lines = held.read().decode(errors="replace").splitlines(keepends=True)
+    sys.stderr.write("".join(line for line in lines if "NVIDIA CUDA driver" not in line))
 
 
 def pick_precision(name: Precision, device: torch.device, width: int) -> torch.dtype:
