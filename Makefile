@@ -13,7 +13,7 @@ WHEEL := build/wheel-check
 
 setup: $(STAMP)
 
-$(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py $(LOCK)
+$(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py $(LOCK) | starter/data
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 		{ echo "Python >= 3.10 is needed; set PYTHON=..." >&2; exit 1; }
 	@# Some systems ship Python without ensurepip: virtualenv, from pip, then serves.
@@ -24,6 +24,10 @@ $(STAMP): setup.cfg pyproject.toml gamba_warp/versions.py $(LOCK)
 	$(BIN)/python -m pip install --quiet $(addprefix --constraint ,$(LOCK)) --editable '.[test]'
 	@rm -f $(VENV)/.ready*
 	@touch $@
+
+# The starter set's pictures are a thousand files, which the repository keeps as one.
+starter/data: starter/data.tar
+	@tar -xf $< -C starter && touch $@
 
 demo: $(STAMP)
 	$(BIN)/gamba demo

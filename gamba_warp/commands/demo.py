@@ -12,8 +12,9 @@ from ..untrusted.ranges import Minutes, ranged
 
 # An installed package has the shipped model and two pictures, but no posed views and no meshes.
 _MAKE = (
-    "make the starter set by 'gamba data furniture --out furniture' and 'python -m "
-    "gamba_warp.train.data.starter furniture --out starter', then give --starter starter"
+    "make setup unpacks it in a checkout; elsewhere make it by 'gamba data furniture --out "
+    "furniture' and 'python -m gamba_warp.train.data.starter furniture --out starter', then give "
+    "--starter starter"
 )
 
 

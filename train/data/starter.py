@@ -4,7 +4,8 @@
 ``python -m gamba_warp.train.data.starter FURNITURE --out starter``. The same call makes the same
 files again, but the set in the repository is older: its cameras are others. The split is that of
 the whole furniture set (by group, see ``gamba_warp.data.dataset``), so nothing that is held out
-here is trained on there.
+here is trained on there. The repository keeps ``data/`` as one file, which ``make setup`` unpacks:
+``cd starter; tar --sort=name --mtime=@0 --owner=0 --group=0 -cf data.tar data``.
 """
 
 from __future__ import annotations
