@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
@@ -21,6 +20,7 @@ from .parts.patches import Patches, foreground_patches
 from .parts.rays import RayDecoder, joined
 from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
+from .pretrained import Pretrained
 
 
 def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) -> nn.ModuleList:
@@ -29,7 +29,7 @@ def make_blocks(config: GambaConfig, camera_channels: int, image_channels: int) 
     return nn.ModuleList(kind(config, camera_channels, image_channels) for _ in range(config.depth))
 
 
-class Gamba(nn.Module):
+class Gamba(Pretrained, nn.Module):
     """One posed picture to Gaussians, in one pass (paper §3.2, GambaFormer and decoder).
 
     Attributes:
@@ -178,25 +178,6 @@ class Gamba(nn.Module):
         at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
         tokens = tokens.gather(1, at).unflatten(1, places.shape[1:])
         return self.decoder(tokens, pixels, patches, rgba, cameras)
-
-    @classmethod
-    def from_pretrained(cls, name: str | Path, *args: Any, **options: Any) -> Gamba:
-        """Reads a model from a folder or the Hugging Face Hub: ``pretrained.from_pretrained``."""
-        from .pretrained import from_pretrained
-
-        return from_pretrained(name, *args, **options)
-
-    def save_pretrained(self, folder: str | Path, card: str = "") -> Path:
-        """Writes the model as a folder: ``pretrained.save_pretrained``."""
-        from .pretrained import save_pretrained
-
-        return save_pretrained(self, folder, card)
-
-    def push_to_hub(self, repo_id: str, card: str = "", **options: Any) -> str:
-        """Writes the model to the Hugging Face Hub: ``pretrained.push_to_hub``."""
-        from .pretrained import push_to_hub
-
-        return push_to_hub(self, repo_id, card, **options)
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size

@@ -1,131 +1,307 @@
-"""Models as folders: ``model.safetensors``, ``config.json``, a card, a frozen encoder's weights.
+"""Models as files and folders, and the part of ``Gamba`` that reads and writes them.
 
-``Gamba.from_pretrained``, ``save_pretrained`` and ``push_to_hub`` are these functions. A folder is
-read and written without huggingface_hub and without a network.
+One safetensors file holds the weights and, in its header, the configuration. What a file says is
+compared with the model that its configuration means before that model, or any of the file's
+tensors, takes memory. A folder has that file, ``config.json``, a card, and a frozen encoder's
+weights; it is read and written without huggingface_hub and without a network.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from ..errors import UserError, first_line
 from ..files import atomic_path, output_folder, write_text
 from ..versions import __version__, advice
-from .checkpoint import ENCODER_NAME, FILE_NAME, load_model, read_config, save_model
 from .config import GambaConfig
+from .encoders import Weights, outline_encoder
 
 if TYPE_CHECKING:
-    from .encoders import Weights
+    from safetensors import safe_open
+
     from .gamba import Gamba
+
+FORMAT = "gamba_warp.model.1"
+FILE_NAME = "model.safetensors"
+ENCODER_NAME = "encoder.safetensors"  # a frozen encoder's weights, in the same folder
+MAX_HEADER = 16 << 20  # bytes; that of a model of 256 blocks takes 1 MB
+_SMALL = 10_000_000  # parameters of a model that is built at once: torch's meta device is slow
+_STORED = ("F32", "BF16", "F16")  # numbers that a file may have; all become float32
 
 CONFIG_NAME, CARD_NAME = "config.json", "README.md"
 WRITTEN = (FILE_NAME, ENCODER_NAME, CONFIG_NAME, CARD_NAME)  # what ``save_pretrained`` writes
 _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 1,500
+# These keys of the header are ours; extra_metadata may use any other key.
+_OWN_KEYS = ("format", "config", "encoder_sha256")
 
 
-def save_pretrained(model: Gamba, folder: str | Path, card: str = "") -> Path:
-    """Writes a model as a folder that ``from_pretrained`` and ``load_model`` read.
+class Pretrained:
+    """The methods of ``Gamba`` that read and write folders, and repositories of a hub."""
+
+    def save_pretrained(self: Gamba, folder: str | Path, card: str = "") -> Path:  # type: ignore[misc]
+        """Writes a model as a folder that ``from_pretrained`` and ``load_model`` read.
+
+        A frozen timm encoder is written too, as ``encoder.safetensors``.
+
+        Args:
+            folder: is made; files of the same names are replaced, each when it is whole, but a
+                README.md that is there stays as it is.
+            card: Markdown that follows what the model card says by itself.
+
+        Returns:
+            The folder.
+
+        Raises:
+            UserError: a file cannot be written.
+        """
+        from safetensors.torch import save_file
+
+        folder = output_folder(folder)
+        encoder = self.encoder
+        if encoder and encoder.frozen and self.config.encoder != "vgg16":
+            with atomic_path(folder / ENCODER_NAME) as temporary:
+                save_file(encoder.weights(), temporary)
+        save_model(folder / FILE_NAME, self)
+        values = json.loads(self.config.to_json())
+        write_text(folder / CONFIG_NAME, json.dumps(values, indent=2, sort_keys=True) + "\n")
+        if not (folder / CARD_NAME).exists():
+            write_text(folder / CARD_NAME, model_card(self, folder.name, card))
+        return folder
+
+    @classmethod
+    def from_pretrained(
+        cls: type[Gamba],  # type: ignore[misc]
+        name: str | Path,
+        device: str | torch.device = "cpu",
+        encoder_weights: Weights | None = None,
+        *,
+        revision: str | None = None,
+        cache_dir: str | Path | None = None,
+        force_download: bool = False,
+        local_files_only: bool = False,
+        token: str | bool | None = None,
+    ) -> Gamba:
+        """Reads a model from a folder, a file or a repository of the Hugging Face Hub.
+
+        A repository that is in the cache is not asked for again; ``force_download`` does that.
+
+        Args:
+            name: a folder of ``save_pretrained``, a model file, or ``owner/repository``.
+            device: as for ``load_model``, like ``encoder_weights``.
+            revision: of the repository: a branch, tag or commit.
+            cache_dir: of huggingface_hub, like the arguments that follow.
+
+        Returns:
+            The model in eval mode.
+
+        Raises:
+            UserError: it cannot be had, is no model of ours, or its config.json is of another one.
+        """
+        path = Path(name)
+        if not path.exists():
+            path = _fetched(
+                str(name),
+                force_download,
+                revision=revision,
+                cache_dir=cache_dir,
+                local_files_only=local_files_only,
+                token=token,
+            )
+        _check_config(path / CONFIG_NAME, path / FILE_NAME)
+        return read_model(cls, path, device, encoder_weights)
+
+    def push_to_hub(self: Gamba, repo_id: str, card: str = "", **options: Any) -> str:  # type: ignore[misc]
+        """Writes a model into a repository of the Hugging Face Hub, as ``save_pretrained`` does.
+
+        Args:
+            repo_id: ``owner/repository``; it is made if it is not there.
+            card: as for ``save_pretrained``.
+            options: of ``huggingface_hub.ModelHubMixin.push_to_hub``: token, private, branch,
+                commit_message and others.
+
+        Returns:
+            The address of the commit.
+
+        Raises:
+            UserError: huggingface_hub is missing, or the Hub refuses.
+        """
+        model, hub = self, _hub("Gamba.push_to_hub")
+
+        class Pushed(hub.ModelHubMixin):
+            def _save_pretrained(self, save_directory: Path) -> None:
+                model.save_pretrained(save_directory, card)
+
+        try:
+            return str(Pushed().push_to_hub(repo_id, **options))
+        except UserError:
+            raise
+        except Exception as error:  # of the library, of its network and of its checks
+            reason = first_line(error)
+            raise UserError(f"{repo_id}: cannot be written to the Hub ({reason})") from error
+
+
+def save_model(
+    path: str | Path, model: Gamba, extra_metadata: dict[str, str] | None = None
+) -> None:
+    """Writes weights and configuration to one safetensors file, atomically.
 
     Args:
-        model: with a frozen timm encoder, that is written too, as ``encoder.safetensors``.
-        folder: is made; files of the same names are replaced, each when it is whole, but a
-            README.md that is there stays as it is.
-        card: Markdown that follows what the model card says by itself.
-
-    Returns:
-        The folder.
+        path: the file; if it is named ``model.safetensors``, ``load_model`` finds it by its folder.
+        model: the model; of a frozen encoder only the SHA-256 of its weights is stored.
+        extra_metadata: further entries of the file's header; the keys "format", "config" and
+            "encoder_sha256" are taken.
 
     Raises:
-        UserError: a file cannot be written.
+        UserError: the file cannot be written.
+        ValueError: ``extra_metadata`` has a key that is taken.
     """
     from safetensors.torch import save_file
 
-    folder = output_folder(folder)
-    encoder = model.encoder
-    if encoder and encoder.frozen and model.config.encoder != "vgg16":
-        with atomic_path(folder / ENCODER_NAME) as temporary:
-            save_file(encoder.weights(), temporary)
-    save_model(folder / FILE_NAME, model)
-    values = json.loads(model.config.to_json())
-    write_text(folder / CONFIG_NAME, json.dumps(values, indent=2, sort_keys=True) + "\n")
-    if not (folder / CARD_NAME).exists():
-        write_text(folder / CARD_NAME, model_card(model, folder.name, card))
-    return folder
+    metadata = dict(extra_metadata or {})
+    taken = [key for key in _OWN_KEYS if key in metadata]
+    if taken:
+        raise ValueError(f"extra_metadata has {', '.join(taken)}, which save_model writes itself")
+    metadata |= {"format": FORMAT, "config": model.config.to_json()}
+    if model.encoder and model.encoder.frozen:
+        metadata["encoder_sha256"] = model.encoder.fingerprint
+    state = {name: value.contiguous() for name, value in model.stored_state().items()}
+    with atomic_path(path) as temporary:
+        save_file(state, temporary, metadata=metadata)
+        _sort_metadata(temporary)
 
 
-def from_pretrained(
-    name: str | Path,
-    device: str | torch.device = "cpu",
-    encoder_weights: Weights | None = None,
-    *,
-    revision: str | None = None,
-    cache_dir: str | Path | None = None,
-    force_download: bool = False,
-    local_files_only: bool = False,
-    token: str | bool | None = None,
+def _sort_metadata(path: Path) -> None:
+    """Sorts the header's entries, which the library writes in another order each time.
+
+    So equal weights are equal bytes. The header keeps its length, and the tensors their places.
+    """
+    with open(path, "r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        text = json.dumps(header, ensure_ascii=False, separators=(",", ":"))
+        file.seek(8)
+        file.write(text.encode().ljust(size))
+
+
+def read_model(
+    kind: type[Gamba],
+    path: Path,
+    device: str | torch.device,
+    encoder_weights: Weights | None,
 ) -> Gamba:
-    """Reads a model from a folder, a file or a repository of the Hugging Face Hub.
-
-    A repository that is in the cache is not asked for again; ``force_download`` does that.
-
-    Args:
-        name: a folder of ``save_pretrained``, a model file, or ``owner/repository``.
-        device: as for ``load_model``, like ``encoder_weights``.
-        revision: of the repository: a branch, tag or commit.
-        cache_dir: of huggingface_hub, like the arguments that follow.
-
-    Returns:
-        The model in eval mode.
-
-    Raises:
-        UserError: it cannot be had, is no model of ours, or its config.json is of another one.
-    """
-    path = Path(name)
+    """``load_model``: ``kind`` is ``Gamba``, which this module is a part of."""
+    if path.is_dir():
+        path = path / FILE_NAME
     if not path.exists():
-        path = _fetched(
-            str(name),
-            force_download,
-            revision=revision,
-            cache_dir=cache_dir,
-            local_files_only=local_files_only,
-            token=token,
-        )
-    _check_config(path / CONFIG_NAME, path / FILE_NAME)
-    return load_model(path, device, encoder_weights)
+        raise UserError(f"{path}: no such checkpoint")
+    config, encoder_sha256 = read_config(path)
+    if not config.encoder_frozen and config.encoder != "none":
+        encoder_weights = "random"  # the file holds the trained ones
+    beside = path.parent / ENCODER_NAME
+    if encoder_weights is None and config.encoder not in ("none", "vgg16") and beside.is_file():
+        encoder_weights = beside
+    model = None
+    if config.num_parameters <= _SMALL and (not config.prepend or config.encoder == "none"):
+        model = kind(config)
+    try:
+        state = read_weights(path, model or _outline(kind, config, path))
+    except ValueError as error:
+        raise UserError(f"{path}: does not fit its own configuration: {error}") from error
+    model = model or kind(config, encoder_weights)
+    model.load_stored_state(state)
+    if model.encoder and model.encoder.frozen:
+        if model.encoder.fingerprint != encoder_sha256:
+            raise UserError(
+                f"{path}: was trained with other weights of {config.encoder} than those given"
+            )
+    return model.to(device).eval()
 
 
-def push_to_hub(model: Gamba, repo_id: str, card: str = "", **options: Any) -> str:
-    """Writes a model into a repository of the Hugging Face Hub, as ``save_pretrained`` does.
+def _outline(kind: type[Gamba], config: GambaConfig, path: Path) -> Gamba:
+    """The model that a file's configuration means, as shapes without memory."""
+    try:
+        with torch.device("meta"):
+            return kind(config, encoder=outline_encoder(config))
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def read_config(path: Path) -> tuple[GambaConfig, str | None]:
+    """Reads what a model file says of itself, and no tensor.
 
     Args:
-        model: what is written.
-        repo_id: ``owner/repository``; it is made if it is not there.
-        card: as for ``save_pretrained``.
-        options: of ``huggingface_hub.ModelHubMixin.push_to_hub``: token, private, branch,
-            commit_message and others.
+        path: a file of ``save_model``.
 
     Returns:
-        The address of the commit.
+        The configuration, and the SHA-256 of a frozen encoder's weights or None.
 
     Raises:
-        UserError: huggingface_hub is missing, or the Hub refuses.
+        UserError: the file is missing, damaged or not of our format.
     """
-    hub = _hub("Gamba.push_to_hub")
+    with _opened(path) as file:
+        metadata = file.metadata() or {}
+    if metadata.get("format") != FORMAT or "config" not in metadata:
+        found = "".join(filter(str.isprintable, metadata.get("format", "none")[:40]))
+        raise UserError(f"{path}: not a Gamba checkpoint (format {found}, not {FORMAT})")
+    return GambaConfig.from_json(metadata["config"], str(path)), metadata.get("encoder_sha256")
 
-    class Pushed(hub.ModelHubMixin):
-        def _save_pretrained(self, save_directory: Path) -> None:
-            save_pretrained(model, save_directory, card)
+
+def read_weights(path: Path, model: Gamba) -> dict[str, Tensor]:
+    """Reads a model file's tensors, after their names, shapes and kinds are those of a model.
+
+    Args:
+        path: a file of ``save_model``.
+        model: of the file's configuration; it may be on the meta device.
+
+    Returns:
+        What ``Gamba.load_stored_state`` takes: float32, finite, on the CPU.
+
+    Raises:
+        UserError: the file is missing or damaged, or a number in it is not finite.
+        ValueError: a tensor is missing, unknown, or of another shape or kind; it names the tensor.
+    """
+    state = {}
+    with _opened(path) as file:
+        model.check_stored_state({name: file.get_slice(name).get_shape() for name in file.keys()})
+        for name in file.keys():
+            kind = file.get_slice(name).get_dtype()
+            if kind not in _STORED:
+                raise ValueError(f"tensor '{name}' is of {kind}, not {', '.join(_STORED)}")
+        for name in file.keys():
+            state[name] = file.get_tensor(name).float()
+            bad = int((~state[name].isfinite()).sum())
+            if bad:
+                count = state[name].numel()
+                raise UserError(f"{path}: {bad} of {count} numbers of '{name}' are not finite")
+    return state
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[safe_open]:
+    """An open safetensors file. Raises UserError for all that is wrong with the file itself."""
+    from safetensors import SafetensorError, safe_open
 
     try:
-        return str(Pushed().push_to_hub(repo_id, **options))
-    except UserError:
-        raise
-    except Exception as error:  # of the library, of its network and of its checks
-        raise UserError(f"{repo_id}: cannot be written to the Hub ({first_line(error)})") from error
+        if not path.is_file():
+            raise UserError(f"{path}: {'not a plain file' if path.exists() else 'no such file'}")
+        with open(path, "rb") as raw:
+            length = int.from_bytes(raw.read(8), "little")
+        # The library's own limit is 100 MB, which it would parse.
+        if length > min(MAX_HEADER, path.stat().st_size):
+            raise UserError(f"{path}: not a whole safetensors file (its header is too large)")
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except (SafetensorError, OSError) as error:
+        reason = first_line(error)[:200]
+        raise UserError(f"{path}: not a whole safetensors file ({reason})") from error
 
 
 def model_card(model: Gamba, name: str, card: str = "") -> str:

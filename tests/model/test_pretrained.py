@@ -8,7 +8,7 @@ from helpers.model import inputs, micro
 
 from gamba_warp import Gamba, load_model
 from gamba_warp.errors import UserError
-from gamba_warp.model.pretrained import WRITTEN, from_pretrained, push_to_hub, save_pretrained
+from gamba_warp.model.pretrained import WRITTEN
 
 
 def _model(**changes) -> Gamba:
@@ -46,14 +46,14 @@ def test_an_edited_card_stays(tmp_path):
 
 
 def test_config_json_of_another_model(tmp_path):
-    save_pretrained(_model(), tmp_path)
+    _model().save_pretrained(tmp_path)
     fields = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(fields | {"state_size": 5}))
     with pytest.raises(UserError, match="is not the configuration in"):
-        from_pretrained(tmp_path)
+        Gamba.from_pretrained(tmp_path)
     (tmp_path / "config.json").write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match="config.json: cannot be read"):
-        from_pretrained(tmp_path)
+        Gamba.from_pretrained(tmp_path)
 
 
 def test_needs_no_hub_for_a_folder(tmp_path, monkeypatch):
@@ -71,7 +71,7 @@ def _cached(tmp_path, model):
     commit = "a" * 40
     (repository / "refs").mkdir(parents=True)
     (repository / "refs" / "main").write_text(commit)
-    return save_pretrained(model, repository / "snapshots" / commit)
+    return model.save_pretrained(repository / "snapshots" / commit)
 
 
 def test_a_cached_repository_needs_no_network(tmp_path, monkeypatch):
@@ -129,4 +129,4 @@ def test_push(tmp_path, monkeypatch):
     assert sent["files"] == {"README.md", "config.json", "model.safetensors"}
     monkeypatch.setattr(Api, "create_repo", _no_network)
     with pytest.raises(UserError, match="owner/name: cannot be written to the Hub"):
-        push_to_hub(model, "owner/name")
+        model.push_to_hub("owner/name")

@@ -89,7 +89,7 @@ def test_killed_while_saving_leaves_the_old_one(tmp_path, model):
         "import sys, time\n"
         "from helpers import micro\n"
         "from pathlib import Path\n"
-        "from gamba_warp.model.checkpoint import Gamba\n"
+        "from gamba_warp import Gamba\n"
         "from gamba_warp.train import checkpoint\n"
         "run = Path(sys.argv[1])\n"
         "model = Gamba(micro.options(run, run).model_config())\n"
