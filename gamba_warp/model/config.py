@@ -32,7 +32,7 @@ _LATER = {
     *(f"ray_{name}" for name in ("depth", "offset")),
     *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
     *("mixer", "attention_heads", "attention_mlp", "mixed_tokens"),
-    *("triplane_size", "triplane_features", "image_tokens"),
+    *("triplane_size", "triplane_features", "image_tokens", "num_orders"),
 }
 
 # No model that anyone trains comes near these; a file that says more is not believed.
@@ -49,7 +49,7 @@ class GambaConfig:
     Attributes:
         image_size: side H = W of the input picture, pixels; a multiple of ``patch_size``.
         patch_size: side p of the patches that become 3DGS tokens, pixels; the number of Gaussians
-            is L = 4·(H/p)² (paper §3.2).
+            is L = 4·(H/p)² (paper §3.2), or as many times as there are ``num_orders``.
         width: channels D of a token.
         depth: number of Gamba blocks.
         state_size: SSM states per channel, 1 to 256.
@@ -68,6 +68,7 @@ class GambaConfig:
             are the exact zero-order hold and the paper's appendix.
         scan_orders: the four orders of the patches: rows, columns, and "backward" both of them from
             the end (paper §3.2), or "mirrored" each row from its end and each column from its end.
+        num_orders: the first so many of these four; each gives every patch a token.
         embedding_init: standard deviation of the learned embedding E at the start.
         additive_image_tokens: False makes G = E (paper Table 2, "w/o additive 3DGS tokens").
         mixed_tokens: True makes the first quarter of the tokens of patches of twice the side, and
@@ -127,6 +128,7 @@ class GambaConfig:
     norm: Norm = "layer"
     final_norm: FinalNorm = "same"
     scan_orders: Orders = "backward"
+    num_orders: Annotated[int, Meta(ge=1, le=4)] = 4
     discretization: Discretization = "mamba"
     embedding_init: Annotated[float, Meta(gt=0, le=100)] = 0.5
     additive_image_tokens: bool = True
@@ -220,7 +222,7 @@ class GambaConfig:
     @property
     def num_tokens(self) -> int:
         """L, the number of 3DGS tokens."""
-        return 4 * self.grid_size**2
+        return self.num_orders * self.grid_size**2
 
     @property
     def num_gaussians(self) -> int:
@@ -301,7 +303,9 @@ class GambaConfig:
             planes = 3 * self.triplane_features + hidden + 2 if self.decoder == "triplane" else 0
             return (self.width + 1 + planes) * hidden + (hidden + 1) * (hidden + heads)
         features, side = self.ray_features, self.patch_size // self.ray_cells + 2
-        up = (4 * self.width + 1) * (self.ray_coarse or self.ray_cells) ** 2 * features
+        up = (
+            (self.num_orders * self.width + 1) * (self.ray_coarse or self.ray_cells) ** 2 * features
+        )
         stem = (side**2 * self.pixel_channels + 1) * RAY_STEM
         stem += (9 * RAY_STEM + 1 + 9 * features + 1) * features
         each = sum(RAY_CHANNELS) + (4 if self.predict_rotation else 0)

@@ -173,7 +173,7 @@ class Gamba(Pretrained, nn.Module):
     ) -> Gaussians:
         pixels = self.tokens.pixels(rgba, cameras)
         tokens, places = self.tokens.of_patches(pixels, patches)
-        own = 4 * patches.valid.sum(1) if len(rgba) > 1 else None
+        own = self.config.num_orders * patches.valid.sum(1) if len(rgba) > 1 else None
         tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute, own))
         at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
         tokens = tokens.gather(1, at).unflatten(1, places.shape[1:])

@@ -149,9 +149,9 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
     assert patches.boxes() == [((5, 6), (4, 5)), ((0, 1), (0, 1)), ((2, 10), (0, 10))]
 
 
-@pytest.mark.parametrize("additive", [True, False])
-def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive):
-    tokens = Gamba(rays(additive_image_tokens=additive)).tokens
+@pytest.mark.parametrize("additive, orders", [(True, 4), (False, 4), (True, 2)])
+def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive, orders):
+    tokens = Gamba(rays(additive_image_tokens=additive, num_orders=orders)).tokens
     rgba, cameras = cut_outs()
     whole = tokens(rgba, cameras)
     patches = foreground_patches(rgba[..., 3], 4)
@@ -162,8 +162,8 @@ def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive):
         want = whole[index, inside[tokens.orders]]
         torch.testing.assert_close(got[index, : len(want)], want)
         for place, patch in zip(places[index], patches.index[index][patches.valid[index]]):
-            for order in range(4):
-                number = 9 * order + tokens.orders.view(4, 9)[order].tolist().index(patch)
+            for order in range(orders):
+                number = 9 * order + tokens.orders.view(orders, 9)[order].tolist().index(patch)
                 torch.testing.assert_close(got[index, place[order]], whole[index, number])
 
 

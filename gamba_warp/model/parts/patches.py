@@ -99,21 +99,25 @@ class Patches:
         A picture's own tokens come first, so what fills up the batch is never seen by them.
 
         Args:
-            scan: ``[4 · grid²]`` int64, the place of each token's patch; see ``scan_orders``.
+            scan: ``[O · grid²]`` int64, the place of each token's patch in O orders; see
+                ``scan_orders``.
 
         Returns:
-            ``[B, 4F]`` int64, the tokens' numbers among all; and ``[B, F, 4]`` int64, where in this
-            list each patch has its token of each of the four orders.
+            ``[B, OF]`` int64, the tokens' numbers among all; and ``[B, F, O]`` int64, where in this
+            list each patch has its token of each order.
         """
         batch, total = len(self.index), self.grid**2
+        orders = len(scan) // total
         inside = self.valid.new_zeros(batch, total)
         inside = inside.scatter_reduce(1, self.index, self.valid, "amax")[:, scan]
-        kept = torch.argsort(~inside, dim=1, stable=True)[:, : 4 * self.index.shape[1]]
+        kept = torch.argsort(~inside, dim=1, stable=True)[:, : orders * self.index.shape[1]]
         places = inside.cumsum(1) - 1  # in the list, of each token that is in it
-        starts = total * torch.arange(4, device=scan.device)[:, None]
-        tokens = torch.argsort(scan.view(4, total), dim=1) + starts  # of a place, in each order
+        starts = total * torch.arange(orders, device=scan.device)[:, None]
+        tokens = (
+            torch.argsort(scan.view(orders, total), dim=1) + starts
+        )  # of a place, in each order
         found = places.gather(1, tokens[:, self.index].permute(1, 2, 0).flatten(1))
-        found = found.unflatten(1, (-1, 4))
+        found = found.unflatten(1, (-1, orders))
         return kept, torch.where(self.valid[..., None], found, 0)
 
 

@@ -47,7 +47,7 @@ class RayDecoder(nn.Module):
         cells, layers, features = config.ray_cells, config.ray_layers, config.ray_features
         step = config.patch_size // cells  # pixels a side of a cell
         coarse = config.ray_coarse or cells
-        self.up = nn.Linear(4 * config.width, coarse**2 * features)
+        self.up = nn.Linear(config.num_orders * config.width, coarse**2 * features)
         self.register_buffer("between", _interpolation(coarse, cells), persistent=False)
         self.stem = nn.Sequential(
             nn.Conv2d(config.pixel_channels, RAY_STEM, step + 2, step, padding=1),
@@ -80,7 +80,7 @@ class RayDecoder(nn.Module):
         """Decodes the patches of each picture to F · ray_cells² · ray_layers Gaussians.
 
         Args:
-            tokens: ``[B, F, 4, width]``, the token of each patch in each of the four orders.
+            tokens: ``[B, F, O, width]``, the token of each patch in each of the O orders.
             pixels: ``[B, pixel_channels, H, W]``, what the network sees of the pictures.
             patches: F patches of each picture; one that is only a filling gets opacity 0.
             rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha.

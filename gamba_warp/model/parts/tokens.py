@@ -19,20 +19,20 @@ def normalize_imagenet(images: Tensor) -> Tensor:
     return torch.stack([(plane - mean) / std for plane, mean, std in planes], -1)
 
 
-def scan_orders(height: int, width: int, orders: Orders = "backward") -> Tensor:
-    """Returns the four orders in which a map is read.
+def scan_orders(height: int, width: int, orders: Orders = "backward", count: int = 4) -> Tensor:
+    """Returns the orders in which a map is read, the first ``count`` of four.
 
     These are: row by row from the top left, column by column from the top left, and each of the two
     backward (VMamba's cross-scan; paper §3.2), or "mirrored": row by row from the top right, column
     by column from the bottom left (the authors' public code).
 
     Returns:
-        ``[4, height·width]`` int64 positions in the row-major map; each row is a permutation.
+        ``[count, height·width]`` int64 positions in the row-major map; each row is a permutation.
     """
     rows = torch.arange(height * width).reshape(height, width)
     flipped = (0, 1) if orders == "backward" else (1,)
     passes = [rows, rows.T, rows.flip(flipped), rows.T.flip(flipped)]
-    return torch.stack([order.flatten() for order in passes])
+    return torch.stack([order.flatten() for order in passes[:count]])
 
 
 class CameraToken(nn.Module):
@@ -85,7 +85,9 @@ class SplatTokens(nn.Module):
         nn.init.normal_(self.embedding, std=config.embedding_init)
         vars(self.embedding)["_no_weight_decay"] = True
         self.register_buffer(
-            "orders", scan_orders(grid, grid, config.scan_orders).flatten(), persistent=False
+            "orders",
+            scan_orders(grid, grid, config.scan_orders, config.num_orders).flatten(),
+            persistent=False,
         )
 
     def forward(self, images: Tensor, cameras: Cameras) -> Tensor:
@@ -131,8 +133,8 @@ class SplatTokens(nn.Module):
             patches: F patches of each picture.
 
         Returns:
-            Tokens ``[B, 4F, width]`` in their order, and where among them each patch has its four:
-            ``[B, F, 4]`` int64; see ``Patches.orders``.
+            Tokens ``[B, OF, width]`` in their order, and where among them each patch has those of
+            its O orders: ``[B, F, O]`` int64; see ``Patches.orders``.
         """
         kept, places = patches.orders(self.orders)
         tokens = self.embedding[kept]

@@ -22,7 +22,7 @@ STORED = {
     "released": "d2aa8d5e9898f27a",
 }
 NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
-NEW += ("triplane_size", "triplane_features", "image_tokens")
+NEW += ("triplane_size", "triplane_features", "image_tokens", "num_orders")
 VARIANTS = [
     {"mixer": "attention", "attention_heads": 2},
     {"mixer": "attention", "attention_mlp": 1, "norm": "rms", "prepend": False},
@@ -35,6 +35,8 @@ VARIANTS = [
     {"image_tokens": "mixed", "decoder": "triplane", "triplane_size": 3},
     {"decoder": "triplane", "triplane_size": 2, "mixer": "attention", "predict_rotation": True},
     {"decoder": "triplane", "triplane_size": 5, "mixed_tokens": True, "image_size": 8},
+    {"num_orders": 1, "mixed_tokens": True, "image_size": 8},
+    {"num_orders": 3, "decoder": "rays", "ray_cells": 2},
 ]
 
 
