@@ -8,7 +8,7 @@ from ..runtime.views import tokens_first
 from .function import selective_scan
 
 
-def _input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
+def input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
     """Brings (D, N), (B, N, L) or (B, G, N, L) to ``[B, L, G, N]``."""
     if not isinstance(x, Tensor):
         raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
@@ -72,7 +72,7 @@ def selective_scan_fn(
     if not isinstance(u, Tensor):
         raise TypeError(f"u is {type(u).__name__}, must be a tensor")
     tokens = u.transpose(1, 2)
-    B, C = _input_matrix(B, tokens, "B"), _input_matrix(C, tokens, "C")
+    B, C = input_matrix(B, tokens, "B"), input_matrix(C, tokens, "C")
     groups = max(B.shape[2], C.shape[2])
     B, C = _grouped(B, groups), _grouped(C, groups)
     out, last = selective_scan(

@@ -122,7 +122,7 @@ def test_the_whole_is_that_of_the_kernel():
         ({"x": torch.ones(3, 5).double()}, TypeError, "x has dtype torch.float64, allowed"),
         ({"activation": "gelu"}, ValueError, "activation is 'gelu', allowed"),
         ({"conv_state": torch.ones(3, 5, 2)}, ValueError, "conv_state has shape .* S >= 3"),
-        ({"weight": torch.ones(4, 4)}, ValueError, r"weight has shape \(4, 4\), must be \(5, W\)"),
+        ({"weight": torch.ones(4, 4)}, ValueError, r"weight has shape \[4, 4\], allowed is \[5, W"),
         ({"cache_seqlens": torch.ones(3)}, TypeError, "cache_seqlens has dtype torch.float32, al"),
     ],
 )

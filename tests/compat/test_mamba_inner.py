@@ -98,7 +98,7 @@ def test_matches_torch(constant_B, constant_C, norms, taps):
         ({"A": torch.ones(10, 3, dtype=torch.complex64)}, TypeError, "A has dtype torch.complex64"),
         ({"checkpoint_lvl": 2}, ValueError, "checkpoint_lvl is 2, allowed"),
         ({"x_proj_weight": torch.ones(9, 10)}, ValueError, "x_proj_weight has 9 rows, must"),
-        ({"conv1d_weight": torch.ones(10, 4)}, ValueError, "conv1d_weight has shape .10, 4., must"),
+        ({"conv1d_weight": torch.ones(10, 4)}, ValueError, "conv1d_weight has shape .10, 4., al"),
         ({"B": torch.ones(10, 3)}, ValueError, "B_proj_bias is given; it has no use"),
     ],
 )  # fmt: skip

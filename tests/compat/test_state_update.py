@@ -121,9 +121,9 @@ def test_no_gradient_flows():
             "A has dtype torch.complex64, al",
         ),
         ("dt", torch.ones(3, 7).double(), TypeError, "dt has dtype torch.float64, allowed"),
-        ("C", None, TypeError, "C is NoneType, must be a tensor"),
-        ("B", torch.ones(3, 2, 5), ValueError, r"B has shape \(3, 2, 5\), must be \(3, 5\)"),
-        ("D", torch.ones(5), ValueError, r"D has shape \(5,\), must be \(7,\)"),
+        ("C", None, TypeError, "C is NoneType, allowed is a tensor"),
+        ("B", torch.ones(3, 2, 5), ValueError, r"B has shape \[3, 2, 5\], allowed is \[3, 5\] or"),
+        ("D", torch.ones(5), ValueError, r"D has shape \[5\], allowed is \[7\]$"),
     ],
 )
 def test_refuses(name, value, error, text):
@@ -134,5 +134,7 @@ def test_refuses(name, value, error, text):
 
 def test_refuses_groups_that_do_not_divide_the_heads():
     state, given = make(3, 5, 4, 3, torch.float32)
-    with pytest.raises(ValueError, match=r"^B has shape \(3, 3, 5\), must be \[3, G, 5\] with G a"):
+    with pytest.raises(
+        ValueError, match=r"^B has shape \[3, 3, 5\], allowed is \[3, 5\] or .* \[3, 4, 5\]$"
+    ):
         selective_state_update(state, **given)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -11,14 +11,7 @@ from torch import Tensor
 from ...kernels.causal_conv1d import causal_conv1d_fn
 from ...kernels.causal_conv1d.reference import causal_conv1d_reference
 from ...kernels.selective_scan.cpu.step import conv_step
-from ..states import (
-    check_dtype,
-    check_indices,
-    check_tensors,
-    put_rows,
-    take_rows,
-    without_gradient,
-)
+from ..checks import DTYPES, INDEX_DTYPES, check_tensor, one_of
 
 __all__ = [
     "causal_conv1d_fn",
@@ -30,7 +23,6 @@ __all__ = [
 ACTIVATIONS = (None, "silu", "swish")
 
 
-@without_gradient
 def causal_conv1d_update(
     x: Tensor,
     conv_state: Tensor,
@@ -65,25 +57,39 @@ def causal_conv1d_update(
         out = conv_step(x, weight, bias, conv_state, activation is not None)
         if out is not None:  # None, and nothing done, also where an argument is wrong
             return out
-    state = _check(x, conv_state, weight, bias, activation, cache_seqlens, conv_state_indices)
-    tokens = x[..., None] if x.dim() == 2 else x
-    if cache_seqlens is None:
-        recent = _shift(state, tokens, weight.shape[1])
-    else:
-        recent = _turn(state, tokens, weight.shape[1], cache_seqlens)
-    width = weight.shape[1]
-    window = recent[..., recent.shape[2] - (width - 1 + tokens.shape[2]) :].float()
-    if x.dim() == 2:  # the window is that of the one token
-        out = (window * weight).sum(-1)
-    else:
-        out = (window.unfold(-1, width, 1) * weight[:, None]).sum(-1)
+    check_tensor("x", x, ("B", "D"), ("B", "D", "L"), dtypes=DTYPES)
+    batch, channels = x.shape[:2]
+    check_tensor("weight", weight, (channels, "W >= 1"), dtypes=DTYPES)
     if bias is not None:
-        out += bias if x.dim() == 2 else bias[:, None]
-    if activation is not None:
-        out = F.silu(out, inplace=True)
-    if conv_state_indices is not None:
-        out = put_rows(conv_state, conv_state_indices, state, out)
-    return out.to(x.dtype)
+        check_tensor("bias", bias, (channels,), dtypes=DTYPES)
+    rows, least = batch if conv_state_indices is None else "rows", max(1, weight.shape[1] - 1)
+    check_tensor("conv_state", conv_state, (rows, channels, f"S >= {least}"), dtypes=DTYPES)
+    numbers = {"cache_seqlens": cache_seqlens, "conv_state_indices": conv_state_indices}
+    for name, value in numbers.items():
+        if value is not None:
+            check_tensor(name, value, (batch,), dtypes=INDEX_DTYPES)
+
+    def update(state: Tensor) -> Tensor:
+        return causal_conv1d_update_ref(x, state, weight.float(), bias, activation, cache_seqlens)
+
+    return of_rows(update, conv_state, conv_state_indices)
+
+
+@torch.no_grad()
+def of_rows(update: Callable[[Tensor], Tensor], state: Tensor, indices: Tensor | None) -> Tensor:
+    """Updates those rows of a state that indices choose; returns what ``update`` returns for them.
+
+    Args:
+        update: takes ``[B, ..]`` rows, updates them in place and returns the output ``[B, ..]``.
+        state: ``[rows, ..]``, updated in place.
+        indices: ``[B]``; below 0 the output is 0 and no row is touched. Or None: all rows.
+    """
+    if indices is None:
+        return update(state)
+    rows, kept = state.index_select(0, indices.clamp(min=0)), indices >= 0
+    out = update(rows)
+    state.index_copy_(0, indices[kept].long(), rows[kept])
+    return out.masked_fill(~kept.view(-1, *[1] * (out.dim() - 1)), 0)
 
 
 def causal_conv1d_ref(
@@ -116,8 +122,7 @@ def causal_conv1d_ref(
     """
     if seq_idx is not None:
         raise ValueError("seq_idx is given; packed sequences are not supported")
-    if activation not in ACTIVATIONS:
-        raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")
+    one_of("activation", activation, *ACTIVATIONS)
     first = None if initial_states is None else initial_states.mT.to(weight.dtype)
     out, final = causal_conv1d_reference(x.mT.to(weight.dtype), weight, bias, first, activation)
     out, final = out.mT.to(x.dtype), final.mT.to(x.dtype)
@@ -151,71 +156,22 @@ def causal_conv1d_update_ref(
     Raises:
         ValueError: another ``activation``.
     """
+    one_of("activation", activation, *ACTIVATIONS)  # before the state changes
     tokens = x[..., None] if x.dim() == 2 else x
-    size, before = conv_state.shape[2], weight.shape[1] - 1
+    size, before, length = conv_state.shape[2], weight.shape[1] - 1, tokens.shape[2]
     if cache_seqlens is None:
-        every = torch.cat([conv_state, tokens.to(conv_state.dtype)], -1)
-        seen = conv_state[..., size - before :].clone()
-        conv_state.copy_(every[..., every.shape[2] - size :])
+        every = torch.cat([conv_state, tokens], -1)
+        window = every[..., size - before :]
+        conv_state.copy_(every[..., length:])
     else:
-        places = cache_seqlens.long()[:, None] + torch.arange(-before, 0, device=x.device)
-        columns = places.remainder(size)[:, None].expand(-1, conv_state.shape[1], -1)
-        seen = conv_state.gather(2, columns)
-        for t in range(tokens.shape[2]):
-            at = (cache_seqlens.long() + t).remainder(size)[:, None, None]
-            token = tokens[..., t : t + 1].to(conv_state.dtype)
-            conv_state.scatter_(2, at.expand_as(token), token)
-    out = cast(Tensor, causal_conv1d_ref(tokens, weight, bias, seen, activation=activation))
-    return out[..., 0] if x.dim() == 2 else out
-
-
-def _check(x, conv_state, weight, bias, activation, cache_seqlens, indices) -> Tensor:
-    """Checks the arguments; returns the states of the batch, copied if there are indices."""
-    for name, value in {"x": x, "conv_state": conv_state, "weight": weight}.items():
-        check_dtype(name, value)
-    if x.dim() not in (2, 3):
-        raise ValueError(f"x has shape {tuple(x.shape)}, must be [B, D] or [B, D, L]")
-    if weight.dim() != 2 or weight.shape[0] != x.shape[1] or weight.shape[1] == 0:
-        raise ValueError(f"weight has shape {tuple(weight.shape)}, must be ({x.shape[1]}, W)")
-    (batch, channels), width = x.shape[:2], weight.shape[1]
+        places = cache_seqlens.long()[:, None] + torch.arange(-before, length, device=x.device)
+        columns = places.remainder(size)[:, None].expand(-1, tokens.shape[1], -1)
+        window = torch.cat([conv_state.gather(2, columns[..., :before]), tokens], -1)
+        new = max(0, length - size)  # of more tokens than columns, two would meet in a column
+        conv_state.scatter_(2, columns[..., before + new :], tokens[..., new:].to(conv_state.dtype))
+    out = (window.to(weight.dtype).unfold(-1, before + 1, 1) * weight[:, None]).sum(-1)
     if bias is not None:
-        check_tensors({"bias": (bias, (channels,))})
-    rows = batch if indices is None else conv_state.shape[0]
-    shape = tuple(conv_state.shape)
-    if len(shape) != 3 or shape[:2] != (rows, channels) or shape[2] < max(1, width - 1):
-        raise ValueError(
-            f"conv_state has shape {shape}, must be [{'rows' if indices is not None else batch}, "
-            f"{channels}, S] with S >= {max(1, width - 1)}"
-        )
-    if activation not in ACTIVATIONS:
-        raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")
-    if cache_seqlens is not None:
-        check_indices("cache_seqlens", cache_seqlens, batch)
-    if indices is None:
-        return conv_state
-    check_indices("conv_state_indices", indices, batch)
-    return take_rows(conv_state, indices)
-
-
-def _shift(state: Tensor, tokens: Tensor, width: int) -> Tensor:
-    """Moves the tokens into the state from behind; returns at least the last W - 1 + L of both."""
-    size, length = state.shape[2], tokens.shape[2]
-    # What neither the state nor the taps need any more is not copied.
-    recent = torch.cat((state[..., min(length, size - width + 1) :], tokens), -1)
-    state.copy_(recent[..., recent.shape[2] - size :])
-    return recent
-
-
-def _turn(state: Tensor, tokens: Tensor, width: int, seen: Tensor) -> Tensor:
-    """Writes the tokens into the ring; returns the last W - 1 + L."""
-    size, (_, channels, length) = state.shape[2], tokens.shape
-
-    def columns(first: int, last: int) -> Tensor:
-        steps = torch.arange(first, last, device=state.device)
-        at = torch.remainder(seen.long()[:, None] + steps, size)
-        return at[:, None].expand(-1, channels, -1)
-
-    recent = torch.cat((state.gather(2, columns(1 - width, 0)), tokens), -1)
-    kept = min(length, size)  # of more tokens than columns, two would meet in a column
-    state.scatter_(2, columns(length - kept, length), tokens[..., length - kept :].to(state.dtype))
-    return recent
+        out = out + bias[:, None]
+    if activation is not None:
+        out = F.silu(out)
+    return out.to(x.dtype).view(x.shape)

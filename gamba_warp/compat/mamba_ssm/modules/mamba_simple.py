@@ -12,22 +12,9 @@ from ....kernels.causal_conv1d import causal_conv1d
 from ....kernels.selective_scan import selective_scan
 from ....kernels.selective_scan.cpu.step import scan_step
 from ...causal_conv1d import causal_conv1d_update
-from ...states import check_dtype, without_gradient
+from ...checks import DTYPES, check_tensor, one_of
 from ..ops.triton.selective_state_update import selective_state_update
 from ..utils.generation import InferenceParams
-
-CONV_SIZES = (2, 3, 4)  # what the convolution's kernel has
-
-
-def _check_sizes(d_state: int, d_conv: int, dt_rank: int | str, dt_init: str) -> None:
-    if not 1 <= d_state <= 256:
-        raise ValueError(f"d_state is {d_state}, must be from 1 to 256")
-    if d_conv not in CONV_SIZES:
-        raise ValueError(f"d_conv is {d_conv}, allowed: {CONV_SIZES}")
-    if isinstance(dt_rank, str) and dt_rank != "auto":
-        raise ValueError(f"dt_rank is {dt_rank!r}, must be a number or 'auto'")
-    if dt_init not in ("random", "constant"):
-        raise ValueError(f"dt_init is {dt_init!r}, allowed: ('random', 'constant')")
 
 
 class Mamba(nn.Module):
@@ -81,7 +68,12 @@ class Mamba(nn.Module):
             ValueError: ``d_state``, ``d_conv``, ``dt_rank`` or ``dt_init`` is not one of the above.
         """
         super().__init__()
-        _check_sizes(d_state, d_conv, dt_rank, dt_init)
+        if not 1 <= d_state <= 256:
+            raise ValueError(f"d_state is {d_state}, allowed is 1 to 256")
+        one_of("d_conv", d_conv, 2, 3, 4)  # what the convolution's kernel has
+        one_of("dt_init", dt_init, "random", "constant")
+        if isinstance(dt_rank, str):
+            one_of("dt_rank", dt_rank, "auto")
         self.d_model, self.d_state, self.d_conv, self.expand = d_model, d_state, d_conv, expand
         self.d_inner = inner = int(expand * d_model)
         self.dt_rank = math.ceil(d_model / 16) if isinstance(dt_rank, str) else dt_rank
@@ -131,7 +123,7 @@ class Mamba(nn.Module):
             ValueError: the shape is another; ``layer_idx`` is None, or the states in
                 ``inference_params`` are of another batch.
         """
-        self._check(hidden_states)
+        check_tensor("hidden_states", hidden_states, ("B", "L", self.d_model), dtypes=DTYPES)
         if inference_params is None:
             return self._run(hidden_states)[0]
         states = self._get_states_from_cache(inference_params, hidden_states.shape[0])
@@ -178,7 +170,7 @@ class Mamba(nn.Module):
         )
         return self.out_proj(y), recent.transpose(1, 2), scan_state
 
-    @without_gradient
+    @torch.no_grad()
     def step(
         self, hidden_states: Tensor, conv_state: Tensor, ssm_state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -196,10 +188,7 @@ class Mamba(nn.Module):
             TypeError: as ``forward``.
             ValueError: a shape is not one of the above.
         """
-        self._check(hidden_states)
-        if hidden_states.shape[1] != 1:
-            shape = tuple(hidden_states.shape)
-            raise ValueError(f"hidden_states has shape {shape}, must be [B, 1, {self.d_model}]")
+        check_tensor("hidden_states", hidden_states, ("B", 1, self.d_model), dtypes=DTYPES)
         x, z = self.in_proj(hidden_states[:, 0]).chunk(2, dim=-1)
         x = causal_conv1d_update(
             x, conv_state, self.conv1d.weight[:, 0], self.conv1d.bias, self.activation
@@ -254,9 +243,3 @@ class Mamba(nn.Module):
             conv_state.zero_()
             ssm_state.zero_()
         return conv_state, ssm_state
-
-    def _check(self, hidden_states: Tensor) -> None:
-        check_dtype("hidden_states", hidden_states)
-        if hidden_states.dim() != 3 or hidden_states.shape[2] != self.d_model:
-            shape = tuple(hidden_states.shape)
-            raise ValueError(f"hidden_states has shape {shape}, must be [B, L, {self.d_model}]")

@@ -1,0 +1,61 @@
+"""What the interfaces refuse, each in one line that names the argument."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+DTYPES = (torch.float32, torch.bfloat16, torch.float16)
+INDEX_DTYPES = (torch.int32, torch.int64)
+
+Shape = tuple["int | str", ...]
+
+
+def check_tensor(
+    name: str, value: Any, *shapes: Shape, dtypes: tuple[torch.dtype, ...] = ()
+) -> None:
+    """Refuses what is no tensor, or one of another shape or dtype.
+
+    Args:
+        name: of the argument.
+        value: what it got.
+        shapes: those that it may have, all if there are none. A word is any number, "S >= 3" one
+            from 3 on, and ".." in the first place any number of dimensions.
+        dtypes: those that it may have, all if there are none.
+
+    Raises:
+        TypeError: it is no tensor, or has another dtype.
+        ValueError: it has another shape.
+    """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} is {type(value).__name__}, allowed is a tensor")
+    if dtypes and value.dtype not in dtypes:
+        raise TypeError(f"{name} has dtype {value.dtype}, allowed: {', '.join(map(str, dtypes))}")
+    size = tuple(value.shape)
+    if shapes and size not in shapes and not any(_fits(size, shape) for shape in shapes):
+        allowed = " or ".join(f"[{', '.join(map(str, shape))}]" for shape in shapes)
+        raise ValueError(f"{name} has shape {list(size)}, allowed is {allowed}")
+
+
+def _fits(size: tuple[int, ...], shape: Shape) -> bool:
+    if shape[:1] == ("..",):
+        shape = shape[1:]
+        size = size[max(0, len(size) - len(shape)) :]
+    return len(size) == len(shape) and all(
+        n >= int(want.partition(" >= ")[2] or 0) if isinstance(want, str) else n == want
+        for n, want in zip(size, shape)
+    )
+
+
+def one_of(name: str, value: Any, *allowed: Any) -> None:
+    """Refuses an option at other values than the allowed ones.
+
+    Raises:
+        ValueError: it has another value.
+    """
+    if isinstance(value, Tensor) or value not in allowed:
+        got = "a tensor" if isinstance(value, Tensor) else repr(value)
+        verdict = "which is not supported: allowed is" if len(allowed) == 1 else "allowed are"
+        raise ValueError(f"{name} is {got}, {verdict} {', '.join(map(repr, allowed))}")
