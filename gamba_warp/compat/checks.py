@@ -9,6 +9,7 @@ from torch import Tensor
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 INDEX_DTYPES = (torch.int32, torch.int64)
+MAX_SIDE = 2**15  # pixels of a picture
 
 Shape = tuple["int | str", ...]
 
@@ -59,3 +60,37 @@ def one_of(name: str, value: Any, *allowed: Any) -> None:
         got = "a tensor" if isinstance(value, Tensor) else repr(value)
         verdict = "which is not supported: allowed is" if len(allowed) == 1 else "allowed are"
         raise ValueError(f"{name} is {got}, {verdict} {', '.join(map(repr, allowed))}")
+
+
+def positive(**numbers: float) -> None:
+    """Refuses numbers that are not above 0, by their names.
+
+    Raises:
+        ValueError: one is not.
+    """
+    for name, value in numbers.items():
+        if not value > 0:
+            raise ValueError(f"{name} is {value}, allowed is > 0")
+
+
+def side(**pixels: int) -> None:
+    """Refuses sizes of a picture that are no integers from 1 to 32,768, by their names.
+
+    Raises:
+        ValueError: one is not.
+    """
+    for name, value in pixels.items():
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE:
+            raise ValueError(f"{name} is {value!r}, allowed are integers from 1 to {MAX_SIDE}")
+
+
+def one_device(tensors: dict[str, Any]) -> None:
+    """Refuses tensors of several devices, or of one that has no kernels.
+
+    Raises:
+        ValueError: they are on more than one, or on one that is neither a CPU nor CUDA.
+    """
+    devices = {x.device for x in tensors.values() if isinstance(x, Tensor)}
+    if len(devices) > 1 or not {device.type for device in devices} <= {"cpu", "cuda"}:
+        names = ", ".join(sorted(map(str, devices)))
+        raise ValueError(f"{', '.join(tensors)} are on {names}: allowed is one, cpu or cuda")

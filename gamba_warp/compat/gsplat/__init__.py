@@ -8,17 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 from ..absent import complete
-from .checks import RollingShutterType
-from .pixels import rasterize_to_pixels
-from .projection import fully_fused_projection
-from .rendering import rasterization
-from .shapes import (
-    proj,
-    quat_scale_to_covar_preci,
-    spherical_harmonics,
-    world_to_cam,
-)
-from .tiles import isect_offset_encode, isect_tiles
+from .pixels import isect_offset_encode, isect_tiles, rasterize_to_pixels
+from .projection import fully_fused_projection, proj, spherical_harmonics, world_to_cam
+from .relocation import quat_scale_to_covar_preci
+from .rendering import RollingShutterType, rasterization
 
 __all__ = [
     "RollingShutterType",

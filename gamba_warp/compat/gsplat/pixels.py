@@ -1,4 +1,4 @@
-"""gsplat's ``rasterize_to_pixels``: given lists of tiles, blended by our compositor."""
+"""gsplat's lists of tiles, and the pictures that our compositor makes of lists."""
 
 from __future__ import annotations
 
@@ -12,15 +12,136 @@ from torch.nn import functional as F
 
 from gamba_warp.kernels.rasterize import Skip
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, T_MIN
-from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, tuning_for
+from gamba_warp.kernels.rasterize.cpu.tuning import tuning_for
 from gamba_warp.kernels.rasterize.ops import composite
 from gamba_warp.kernels.rasterize.tiles import Bins, Limits, Size, Tiling
 
-from .absolute import Drawn, absolute_gradients, listen
-from .checks import one_device, positive, shape, side
+from ..checks import check_tensor, one_device, positive, side
 
 LIMITS = Limits(ALPHA_MIN, 0.999, T_MIN)  # gsplat 1.5.3 clamps alpha at 0.999
 SKIP = Skip().bits()
+_ROOM = 2**19  # numbers of (tile, pair, pixel) that are worked on at once: they fit a cache
+
+
+def tile_bits(tiles: int) -> int:
+    """Bits that gsplat keeps for the number of a tile."""
+    return tiles.bit_length()
+
+
+def pair_ids(images: Tensor, tiles: Tensor, depths: Tensor, count: int) -> Tensor:
+    """Makes gsplat's numbers of pairs, image | tile | depth, whose order is that of the lists.
+
+    Args:
+        images: ``[P]`` int64.
+        tiles: ``[P]`` int64, tile of the picture.
+        depths: ``[P]`` float32.
+        count: tiles of a picture.
+
+    Returns:
+        ``[P]`` int64; the lower half holds the bits of the depth.
+    """
+    depth = depths.float().contiguous().view(torch.int32).long() & 0xFFFFFFFF
+    return (images << (tile_bits(count) + 32)) | (tiles << 32) | depth
+
+
+@torch.no_grad()
+def isect_tiles(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    sort: bool = True,
+    segmented: bool = False,
+    packed: bool = False,
+    n_images: int | None = None,
+    image_ids: Tensor | None = None,
+    gaussian_ids: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pairs of tiles and Gaussians whose boxes meet.
+
+    Args:
+        means2d: ``[.., N, 2]`` pixels, or packed ``[nnz, 2]``.
+        radii: the same shape, half sides of the boxes; no pair where one is 0.
+        depths: ``[.., N]`` or ``[nnz]``.
+        tile_size: side of a tile, pixels.
+        tile_width: tiles in a row.
+        tile_height: rows of tiles.
+        sort: by image, tile and depth; else by image and Gaussian.
+        segmented: a way of sorting, without effect here.
+        packed: whether the tensors are packed.
+        n_images: of packed tensors.
+        image_ids: ``[nnz]`` of packed tensors.
+        gaussian_ids: of packed tensors; not used.
+
+    Returns:
+        ``tiles_per_gauss`` int32 ``[.., N]`` or ``[nnz]``; ``isect_ids`` int64 and ``flatten_ids``
+        int32 ``[n_isects]``, the index in the flattened Gaussians.
+
+    Raises:
+        TypeError: no tensor.
+        ValueError: a shape or number is not as above, or the numbers of pairs do not fit 63 bits.
+    """
+    check_tensor("means2d", means2d, ("..", 2))
+    lead = means2d.shape[:-1]
+    check_tensor("radii", radii, (*lead, 2))
+    check_tensor("depths", depths, (*lead,))
+    positive(tile_size=tile_size, tile_width=tile_width, tile_height=tile_height)
+    if packed:
+        if n_images is None or image_ids is None:
+            raise ValueError("n_images and image_ids are None: packed tensors need them")
+        check_tensor("image_ids", image_ids, (*lead,))
+        count, images = n_images, image_ids.long()
+    else:
+        count, num = math.prod(lead[:-1]), lead[-1]
+        images = torch.arange(count, device=means2d.device).repeat_interleave(num)
+    tiles = tile_width * tile_height
+    if count.bit_length() + tile_bits(tiles) + 32 > 63:
+        raise ValueError(f"{count} images of {tiles} tiles: their numbers do not fit 63 bits")
+    size = means2d.new_tensor([tile_width, tile_height])
+    center, reach = (x.reshape(-1, 2) / tile_size for x in (means2d, radii))
+    first = (center - reach).floor().clamp_min(0).minimum(size).long()
+    last = (center + reach).ceil().clamp_min(0).minimum(size).long()
+    counts = (last - first).prod(-1) * (radii.reshape(-1, 2) > 0).all(-1)
+    gaussian = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+    place = (
+        torch.arange(len(gaussian), device=counts.device) - (counts.cumsum(0) - counts)[gaussian]
+    )
+    columns = (last - first)[gaussian, 0]
+    x, y = first[gaussian, 0] + place % columns, first[gaussian, 1] + place // columns
+    ids = pair_ids(images[gaussian], y * tile_width + x, depths.flatten()[gaussian], tiles)
+    if sort:
+        ids, order = ids.sort(stable=True)
+        gaussian = gaussian[order]
+    return counts.int().view(lead), ids, gaussian.int()
+
+
+@torch.no_grad()
+def isect_offset_encode(
+    isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int
+) -> Tensor:
+    """Where the list of each tile begins.
+
+    Args:
+        isect_ids: ``[n_isects]`` int64, sorted, from ``isect_tiles``.
+        n_images: pictures.
+        tile_width: tiles in a row.
+        tile_height: rows of tiles.
+
+    Returns:
+        ``[n_images, tile_height, tile_width]`` int32.
+
+    Raises:
+        TypeError: no tensor.
+        ValueError: ``isect_ids`` has not one dimension.
+    """
+    check_tensor("isect_ids", isect_ids, ("P",))
+    tiles = tile_width * tile_height
+    image, tile = torch.arange(n_images), torch.arange(tiles)
+    keys = ((image[:, None] << tile_bits(tiles)) | tile).to(isect_ids.device)
+    begins = torch.searchsorted(isect_ids >> 32, keys.flatten())
+    return begins.int().view(n_images, tile_height, tile_width)
 
 
 class Layers(NamedTuple):
@@ -43,100 +164,83 @@ def blend(
     layers: Layers,
     bins: Bins,
     tiling: Tiling,
-    tuning: Tuning,
-    views: int,
-    keep: Callable[[Tensor], None] | None,
+    views: int = 1,
+    keep: Callable[[Tensor], None] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blends I pictures: ``[I, H, W, C]`` and alphas ``[I, H, W, 1]``, with gradients.
 
     Args:
         layers: what is blended.
         bins: the lists of tiles.
-        tiling: the cut into tiles.
-        tuning: its tile is the tiling's.
+        tiling: the cut into tiles, of the side that ``tuning_for`` says.
         views: pictures of an object, which share the colours; 1 if none do.
         keep: given, in backward, the absolute gradients ``[I * R, 2]`` of the centres; or None.
     """
     size = Size(tiling.width, tiling.height, views, int(views == 1), SKIP)
-    renders, alphas, *_ = composite(
-        *layers, list(bins), list(size), list(LIMITS), tuning.numbers(), None
-    )
-    if keep is None:
+    tuning = tuning_for(layers.means2d.device.type).numbers()
+    renders, alphas, *_ = composite(*layers, list(bins), list(size), list(LIMITS), tuning, None)
+    if keep is None or not renders.requires_grad:
         return renders, alphas
-    means2d, conics, opacities, colors = (x.detach() for x in layers)
+    both = torch.cat([renders, alphas], -1)
+    drawn = Layers(*(x.detach() for x in layers))
+    both.register_hook(lambda v: keep(_absolute_gradients(drawn, bins, tiling, views, v)))
+    renders, alphas = both.split([renders.shape[-1], 1], -1)
+    return renders, alphas
+
+
+@torch.no_grad()
+def _absolute_gradients(
+    layers: Layers, bins: Bins, tiling: Tiling, views: int, upstream: Tensor
+) -> Tensor:
+    """``Σ_pixels |∂L/∂means2d|`` of each row, ``[I * R, 2]`` (Ye et al. 2024, "AbsGS").
+
+    The rasterizer's own gradient sums over pixels with their signs, and the absolute values cannot
+    be had from those sums. So the lists are walked once more here, in torch, by README §5 of the
+    rasterizer. ``upstream`` is the gradient of the pictures and of alpha, ``[I, H, W, C + 1]``.
+    """
+    means2d, conics, opacities, colors = layers
     if views > 1:
-        shared = colors.view(len(means2d) // views, 1, -1, colors.shape[-1])
-        colors = shared.expand(-1, views, -1, -1).flatten(0, 2)
-    rows = means2d.flatten(0, 1), conics.flatten(0, 1), opacities.flatten(), colors
-    drawn = Drawn((*rows, bins.pairs, bins.starts))
-
-    def look(v_renders: Tensor, v_alphas: Tensor) -> None:
-        keep(absolute_gradients(drawn, tiling, LIMITS, v_renders, v_alphas))
-
-    return listen(look, renders, alphas)
-
-
-class Lists(NamedTuple):
-    """gsplat's lists: those of ``counts[t]`` ids from ``begins[t]`` on belong to tile t.
-
-    Attributes:
-        ids: ``[P]`` rows.
-        begins: ``[I * tiles]``.
-        counts: ``[I * tiles]``.
-    """
-
-    ids: Tensor
-    begins: Tensor
-    counts: Tensor
-
-    def taken(self, tiles: Tensor) -> tuple[Tensor, Tensor]:
-        """The lists of some tiles one after another: places in ``ids``, and their counts."""
-        counts, begins = self.counts[tiles], self.begins[tiles]
-        ends = counts.cumsum(0)
-        places = torch.arange(int(counts.sum()), device=counts.device)
-        return places + (begins - (ends - counts)).repeat_interleave(counts), counts
-
-
-def _lists(offsets: Tensor, ids: Tensor, masks: Tensor | None, rows: int) -> Lists:
-    begins = offsets.flatten().long()
-    counts = torch.cat([begins, begins.new_tensor([len(ids)])]).diff()
-    if len(begins) and (int(begins[0]) < 0 or int(counts.min()) < 0):
-        raise ValueError(f"isect_offsets do not rise from 0 to {len(ids)}, the length of ids")
-    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < rows:
-        raise ValueError(f"flatten_ids has {int(ids.min())} to {int(ids.max())} of {rows} rows")
-    if masks is not None:
-        counts = torch.where(masks.flatten(), counts, 0)
-    return Lists(ids.long(), begins, counts)
-
-
-def _bins(pairs: Tensor, counts: Tensor, rows: int) -> Bins:
-    """Lists in tile order as the compositor has them; pairs of a row are numbered together."""
-    order = pairs.argsort(stable=True)
-    number = torch.empty_like(order)
-    number[order] = torch.arange(len(order), device=order.device)
-    ends = torch.bincount(pairs, minlength=rows).cumsum(0)
-    return Bins(
-        order=torch.arange(rows, device=pairs.device, dtype=torch.int32),
-        offsets=F.pad(ends, (1, 0)).int(),
-        pairs=pairs.int(),
-        rows=number.int(),
-        starts=F.pad(counts.cumsum(0), (1, 0)).int(),
-        box_pairs=counts.sum(),
-        count=counts.sum(),
-    )
-
-
-def _sheared(conics: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """From gsplat's xx, xy, yy to (a, k, e); what is no ellipse gets opacity 0.
-
-    In float64, because ``e = yy - xy²/xx`` cancels for needles.
-    """
-    xx, xy, yy = conics.double().unbind(-1)
-    fits = (xx > 0) & (xx * yy - xy * xy > 0)
-    xx = torch.where(fits, xx, 1.0)
-    k = torch.where(fits, xy, 0.0) / xx
-    e = torch.where(fits, yy, 1.0) - xx * k * k
-    return torch.stack([xx, k, e], -1).float(), torch.where(fits, opacities, 0.0)
+        colors = colors.view(len(means2d) // views, 1, -1, colors.shape[-1])
+        colors = colors.expand(-1, views, -1, -1).flatten(0, 2)
+    means2d, conics, opacities = means2d.flatten(0, 1), conics.flatten(0, 1), opacities.flatten()
+    # a channel of ones stands for alpha, which is the sum of the weights
+    colors = torch.cat([colors, torch.ones_like(opacities)[:, None]], -1)
+    right, below = (-size % tiling.tile for size in (tiling.width, tiling.height))
+    cut = F.pad(upstream, (0, 0, 0, right, 0, below))  # 0 beyond the picture
+    cut = cut.unflatten(2, (tiling.tiles_x, tiling.tile)).unflatten(1, (-1, tiling.tile))
+    by_tile = cut.transpose(2, 3).flatten(3, 4).flatten(0, 2)
+    inside = torch.arange(tiling.tile**2, device=means2d.device)
+    offsets = torch.stack([inside % tiling.tile, inside // tiling.tile], -1) + 0.5
+    total, counts = torch.zeros_like(means2d), bins.starts.diff()
+    order = counts.argsort(descending=True)[: int((counts > 0).sum())]
+    while len(order):  # those of like lengths together
+        longest = int(counts[order[0]])
+        some = max(1, _ROOM // (longest * len(inside)))
+        tiles, order = order[:some], order[some:]
+        place = torch.arange(longest, device=tiles.device)
+        real = place < counts[tiles, None]
+        rows = bins.pairs[(bins.starts[tiles, None] + place).clamp_max(len(bins.pairs) - 1)]
+        column, line = tiles % tiling.tiles_x, tiles // tiling.tiles_x % tiling.tiles_y
+        corners = torch.stack([column, line], -1) * tiling.tile
+        d = corners[:, None, None] + offsets - means2d[rows][:, :, None]
+        a, k, e = conics[rows][:, :, None].unbind(-1)
+        dy = d[..., 1]
+        u = d[..., 0] + k * dy
+        alpha = opacities[rows][..., None] * torch.exp(-0.5 * (a * u * u + e * dy * dy))
+        alpha = torch.where(real[..., None] & (alpha >= LIMITS.alpha_min), alpha, 0.0)
+        clamped = alpha >= LIMITS.alpha_max
+        alpha = alpha.clamp_max(LIMITS.alpha_max)
+        after = (1 - alpha).cumprod(1)
+        live = (after > LIMITS.t_min) & ~clamped
+        before = after / (1 - alpha)
+        worth = torch.einsum("tlc,tpc->tlp", colors[rows], by_tile[tiles])
+        part = torch.where(after > LIMITS.t_min, before * alpha * worth, 0.0)
+        behind = part.flip(1).cumsum(1).flip(1) - part
+        h = torch.where(live, alpha * (before * worth - behind / (1 - alpha)), 0.0)
+        x, y = a * h * u, a * k * h * u + e * h * dy
+        sums = torch.stack([x.abs().sum(-1), y.abs().sum(-1)], -1)
+        total.index_add_(0, rows.flatten(), sums.flatten(0, 1))
+    return total
 
 
 def rasterize_to_pixels(
@@ -164,8 +268,8 @@ def rasterize_to_pixels(
         opacities: ``[.., N]`` or ``[nnz]``.
         image_width: pixels.
         image_height: pixels.
-        tile_size: side of a tile, pixels. With another one than 16 each tile is drawn as a
-            picture of its own, with copies of its Gaussians: slower, and the same picture.
+        tile_size: side of a tile, pixels. Where 16 does not divide it, each tile has copies of its
+            Gaussians: slower, and the same picture.
         isect_offsets: ``[.., tile_height, tile_width]`` int32.
         flatten_ids: ``[n_isects]`` int32.
         backgrounds: ``[.., D]``, or None: black.
@@ -180,115 +284,95 @@ def rasterize_to_pixels(
         TypeError: no tensor.
         ValueError: a shape or device is not as above; the lists name rows that are not there.
     """
-    lead = tuple(isect_offsets.shape[:-2])
-    rows = (len(means2d),) if packed else (*lead, means2d.shape[-2])
-    shape("means2d", means2d, (*rows, 2))
-    shape("conics", conics, (*rows, 3))
-    shape("opacities", opacities, rows)
-    shape("colors", colors, (*rows, max(1, colors.shape[-1])))
-    shape("flatten_ids", flatten_ids, (flatten_ids.numel(),))
+    check_tensor("isect_offsets", isect_offsets, ("..", "tile_height", "tile_width"))
+    *lead, grid_y, grid_x = isect_offsets.shape
+    check_tensor("means2d", means2d, ("nnz", 2) if packed else (*lead, "N", 2))
+    rows = means2d.shape[:-1]
+    check_tensor("conics", conics, (*rows, 3))
+    check_tensor("opacities", opacities, (*rows,))
+    check_tensor("colors", colors, (*rows, "D >= 1"))
+    check_tensor("flatten_ids", flatten_ids, ("P",))
     if backgrounds is not None:
-        shape("backgrounds", backgrounds, (*lead, colors.shape[-1]))
+        check_tensor("backgrounds", backgrounds, (*lead, colors.shape[-1]))
     if masks is not None:
-        shape("masks", masks, tuple(isect_offsets.shape))
+        check_tensor("masks", masks, (*lead, grid_y, grid_x))
     one_device(dict(means2d=means2d, conics=conics, colors=colors, opacities=opacities))
     side(image_width=image_width, image_height=image_height)
     positive(tile_size=tile_size)
-    grid = tuple(isect_offsets.shape[-2:])
-    if grid[0] * tile_size < image_height or grid[1] * tile_size < image_width:
+    if grid_y * tile_size < image_height or grid_x * tile_size < image_width:
         need = f"{image_height} x {image_width} pixels"
-        raise ValueError(f"isect_offsets has {grid} tiles of {tile_size}: too few for {need}")
-    total, images = math.prod(rows), math.prod(lead)
-    sheared, visible = _sheared(conics.reshape(total, 3), opacities.reshape(total))
-    flat = [means2d.reshape(total, 2), sheared, visible, colors.reshape(total, colors.shape[-1])]
-    lists = _lists(isect_offsets, flatten_ids, masks, total)
+        raise ValueError(
+            f"isect_offsets has {grid_y, grid_x} tiles of {tile_size}: too few for {need}"
+        )
+    total, ids, begins = math.prod(rows), flatten_ids.long(), isect_offsets.flatten().long()
+    counts = F.pad(begins, (0, 1), value=len(ids)).diff()
+    if len(begins) and (int(begins[0]) != 0 or int(counts.min()) < 0):
+        raise ValueError(f"isect_offsets do not rise from 0 to {len(ids)}, the length of ids")
+    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < total:
+        raise ValueError(f"flatten_ids has {int(ids.min())} to {int(ids.max())} of {total} rows")
+
+    # From gsplat's xx, xy, yy to (a, k, e) in float64, because e = yy - xy²/xx cancels for needles.
+    xx, xy, yy = conics.reshape(total, 3).double().unbind(-1)
+    fits = (xx > 0) & (xx * yy - xy * xy > 0)  # else it is no ellipse, and not drawn
+    a = torch.where(fits, xx, 1.0)
+    k = torch.where(fits, xy, 0.0) / a
+    sheared = torch.stack([a, k, torch.where(fits, yy, 1.0) - a * k * k], -1)
+    layers = [
+        means2d.reshape(total, 2),
+        sheared,
+        torch.where(fits, opacities.reshape(total), 0.0),
+        colors.reshape(total, colors.shape[-1]),
+    ]
 
     def keep(values: Tensor) -> None:
-        means2d.absgrad = values.view(means2d.shape)  # type: ignore[attr-defined]
+        if moved:
+            values = values.new_zeros(total, 2).index_add_(0, ids, values[: len(ids)])
+        means2d.absgrad = values[:total].view(means2d.shape)  # type: ignore[attr-defined]
 
-    cut = _Cut(images, grid[0], grid[1], tile_size, image_width, image_height)
-    renders, alphas = _draw(flat, lists, cut, keep if absgrad else None)
-    renders, alphas = (x.reshape(*lead, *x.shape[1:]) for x in (renders, alphas))
+    # Each of gsplat's tiles begins at one of ours: where it needs a part of a tile, the next one is
+    # moved, and so are its Gaussians.
+    tile, device = tuning_for(means2d.device.type).tile, means2d.device
+    parts = -(-tile_size // tile)
+    moved = tile_size % tile != 0
+    if moved:
+        owner = torch.arange(len(counts), device=device).repeat_interleave(counts)
+        corner = torch.stack([owner % grid_x, owner // grid_x % grid_y], -1)
+        layers = [x[ids] for x in layers]
+        layers[0] = layers[0] + corner * (parts * tile - tile_size)
+    images = math.prod(lead)
+    around = torch.arange(len(counts), device=device).view(images, grid_y, 1, grid_x, 1)
+    around = around.expand(-1, -1, parts, -1, parts).flatten()
+    counts = (counts if masks is None else torch.where(masks.flatten(), counts, 0))[around]
+    starts = F.pad(counts.cumsum(0), (1, 0))
+    pairs = torch.arange(int(starts[-1]), device=device)
+    pairs = pairs + (begins[around] - starts[:-1]).repeat_interleave(counts)
+    pairs = pairs if moved else ids[pairs]
+
+    # Rows belong to all pictures: they are dealt out to them, with a few to spare.
+    each = -(-len(layers[0]) // max(images, 1))
+    spare = each * images - len(layers[0])
+    layers = [F.pad(x.float(), (0, 0) * (x.dim() - 1) + (0, spare)) for x in layers]
+    blended = Layers(*(x.view(images, each, *x.shape[1:]) for x in layers[:3]), layers[3])
+    order = pairs.argsort(stable=True)  # pairs of a row are numbered together
+    number = torch.empty_like(order)
+    number[order] = torch.arange(len(order), device=device)
+    bins = Bins(
+        order=torch.arange(images * each, device=device, dtype=torch.int32),
+        offsets=F.pad(torch.bincount(pairs, minlength=images * each).cumsum(0), (1, 0)).int(),
+        pairs=pairs.int(),
+        rows=number.int(),
+        starts=starts.int(),
+        box_pairs=starts[-1],
+        count=starts[-1],
+    )
+    tiling = Tiling(grid_x * parts * tile, grid_y * parts * tile, tile)
+    found = []
+    for picture in blend(blended, bins, tiling, keep=keep if absgrad else None):
+        apart = picture.unflatten(2, (grid_x, -1)).unflatten(1, (grid_y, -1))
+        whole = apart[:, :, :tile_size, :, :tile_size].flatten(3, 4).flatten(1, 2)
+        whole = whole[:, :image_height, :image_width]
+        found.append(whole.reshape(*lead, *whole.shape[1:]))
+    renders, alphas = found
     if backgrounds is not None:
         renders = renders + (1 - alphas) * backgrounds[..., None, None, :]
     return renders, alphas
-
-
-class _Cut(NamedTuple):
-    """How I pictures are cut into gsplat's tiles."""
-
-    images: int
-    rows: int
-    columns: int
-    tile: int
-    width: int
-    height: int
-
-
-def _draw(flat: list[Tensor], lists: Lists, cut: _Cut, keep: Callable | None):
-    tuning = tuning_for(flat[0].device.type)
-    tiling = Tiling(cut.width, cut.height, tuning.tile)
-    grid = (tiling.tiles_y, tiling.tiles_x)
-    if cut.tile == tuning.tile and grid == (cut.rows, cut.columns):
-        tiles = torch.arange(len(lists.counts), device=lists.counts.device)
-        places, counts = lists.taken(tiles)
-        pairs = lists.ids[places]
-        return _blend_rows(flat, pairs, counts, cut.images, tiling, tuning, keep)
-    return _draw_apart(flat, lists, cut, tuning, keep)
-
-
-def _draw_apart(flat: list[Tensor], lists: Lists, cut: _Cut, tuning: Tuning, keep: Callable | None):
-    """Tiles of any size: each is a picture of its own, with copies of its rows."""
-    parts = -(-cut.tile // tuning.tile)
-    side = parts * tuning.tile
-    tiles = torch.arange(len(lists.counts), device=lists.counts.device)
-    places, counts = lists.taken(tiles)
-    ids = lists.ids[places]
-    owner = tiles.repeat_interleave(counts)
-    corner = torch.stack([owner % cut.columns, owner // cut.columns % cut.rows], -1)
-    copies = [x[ids] for x in flat]
-    copies[0] = copies[0] - corner * cut.tile
-    mine = Lists(ids, counts.cumsum(0) - counts, counts)
-    pairs, fine_counts = mine.taken(tiles.repeat_interleave(parts * parts))
-
-    def gather(values: Tensor) -> None:
-        if keep is not None:
-            keep(values.new_zeros(len(flat[0]), 2).index_add_(0, ids, values))
-
-    tiling = Tiling(side, side, tuning.tile)
-    drawn = _blend_rows(copies, pairs, fine_counts, len(tiles), tiling, tuning, keep and gather)
-    return tuple(_together(x, cut) for x in drawn)
-
-
-def _together(pictures: Tensor, cut: _Cut) -> Tensor:
-    apart = pictures[:, : cut.tile, : cut.tile].unflatten(0, (cut.images, cut.rows, cut.columns))
-    whole = apart.transpose(2, 3).flatten(3, 4).flatten(1, 2)
-    return whole[:, : cut.height, : cut.width]
-
-
-def _blend_rows(
-    flat: list[Tensor],
-    pairs: Tensor,
-    counts: Tensor,
-    images: int,
-    tiling: Tiling,
-    tuning: Tuning,
-    keep: Callable | None,
-) -> tuple[Tensor, Tensor]:
-    """Blends rows that belong to all pictures: they are dealt out to them, with a few to spare."""
-    total = len(flat[0])
-    each = -(-total // max(images, 1))
-    spare = each * images - total
-    means2d, conics, opacities, colors = (
-        F.pad(x.float(), (0, 0, 0, spare) if x.dim() == 2 else (0, spare)).contiguous()
-        for x in flat
-    )
-    layers = Layers(
-        means2d.view(images, each, 2),
-        conics.view(images, each, 3),
-        opacities.view(images, each),
-        colors,
-    )
-    bins = _bins(pairs, counts, images * each)
-    cropped = None if keep is None else lambda values: keep(values[:total])
-    return blend(layers, bins, tiling, tuning, 1, cropped)

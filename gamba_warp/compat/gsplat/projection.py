@@ -1,48 +1,67 @@
-"""3D Gaussians to 2D in gsplat's layouts, by the rasterizer's projection."""
+"""About single Gaussians in gsplat's layouts: harmonics, and the projection to the picture."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, EPS2D
+from gamba_warp.kernels.rasterize.constants import (
+    ALPHA_MIN,
+    COMPENSATION_MIN,
+    EPS2D,
+    FRUSTUM_MARGIN,
+)
+from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 from gamba_warp.kernels.rasterize.ops import project
 from gamba_warp.kernels.rasterize.project import LensOptions
 
-from .checks import cameras, means_of, only, positive, shape
-from .faint import compensation_of, exact_where_faint
-from .shapes import proj, symmetric, world_to_cam
+from ..checks import check_tensor, one_device, one_of, positive, side
+from .relocation import quat_scale_to_covar_preci
 
+MAX_SH_DEGREE = 4
 # Without opacities gsplat draws a box of 3.33 standard deviations: that of this opacity, about 1.
 _OPAQUE = ALPHA_MIN * math.exp(0.5 * 3.33**2)
 _LARGE = 1e15  # an opacity that stays over alpha_min with every factor of antialiasing from 4e-18
+_NEARLY = 1 + 1e-5  # float32's product of an opacity and the smallest factor, a few roundings off
 
 
-class Lens(NamedTuple):
-    """What a projection is told beside the tensors; as ``fully_fused_projection`` has them."""
+class Scene(NamedTuple):
+    """N Gaussians of each of B objects and its C cameras; float32, contiguous.
 
-    width: int
-    height: int
-    eps2d: float
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    antialiased: bool
+    Attributes:
+        means: ``[B, N, 3]``.
+        viewmats: ``[B, C, 4, 4]``.
+        Ks: ``[B, C, 3, 3]``.
+        opacities: ``[B, N]``.
+        colors: ``[B, N, D]`` or ``[B, C, N, D]``, only to cull what is not finite.
+        quats: ``[B, N, 4]``, or None with ``covars``.
+        scales: ``[B, N, 3]``, or None with ``covars``.
+        covars: ``[B, N, 3, 3]``, or None.
+    """
+
+    means: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    opacities: Tensor
+    colors: Tensor
+    quats: Any = None
+    scales: Any = None
+    covars: Tensor | None = None
 
 
 class Splats(NamedTuple):
-    """N Gaussians of each of B objects in C views; what is culled has radii and extents 0.
+    """N Gaussians of each of B objects in C views; what is culled has extents 0.
 
     Attributes:
         means2d: ``[B, C, N, 2]`` pixels.
         conics: ``[B, C, N, 3]``: a, k, e of ``a (dx + k dy)² + e dy²``.
         depths: ``[B, C, N]``.
         opacities: ``[B, C, N]``, with the factor of antialiasing.
-        extents: ``[B, C, N, 2]`` half sides of the box that is drawn, pixels.
-        radii: ``[B, C, N, 2]`` int32, the same rounded up.
+        extents: ``[B, C, N, 2]`` half sides of the box that is drawn, pixels; gsplat's radii are
+            the same rounded up.
     """
 
     means2d: Tensor
@@ -50,7 +69,31 @@ class Splats(NamedTuple):
     depths: Tensor
     opacities: Tensor
     extents: Tensor
-    radii: Tensor
+
+
+def check_scene(tensors: dict[str, Any], covariance: tuple[int, ...]) -> tuple[int, ...]:
+    """Checks what a projection is given; returns the batch dimensions.
+
+    Args:
+        tensors: by name ``means``, ``viewmats``, ``Ks`` and others of a ``Scene`` but ``colors``.
+        covariance: the last dimensions of ``covars``.
+
+    Raises:
+        TypeError: one is no tensor.
+        ValueError: one has another shape or device.
+    """
+    check_tensor("means", tensors["means"], ("..", "N", 3))
+    *lead, num, _ = tensors["means"].shape
+    check_tensor("viewmats", tensors["viewmats"], (*lead, "C", 4, 4))
+    shapes = {
+        "Ks": (tensors["viewmats"].shape[-3], 3, 3), "quats": (num, 4), "scales": (num, 3),
+        "covars": (num, *covariance), "opacities": (num,),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if name in tensors:
+            check_tensor(name, tensors[name], (*lead, *shape))
+    one_device(tensors)
+    return tuple(lead)
 
 
 def flat(x: Tensor, lead: tuple[int, ...]) -> Tensor:
@@ -64,79 +107,155 @@ def plain_conics(conics: Tensor) -> Tensor:
     return torch.stack([a, a * k, a * k * k + e], -1)
 
 
-def project_views(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    lens: Lens,
-) -> Splats:
-    """Projects B objects into C views each; float32, contiguous tensors.
+def spherical_harmonics(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
+) -> Tensor:
+    """Values of real spherical harmonics, ``Σ_k Y_k(dirs) coeffs_k``; nothing is added or clamped.
 
     Args:
-        means: ``[B, N, 3]``.
-        quats: ``[B, N, 4]``, or None with ``covars``.
-        scales: ``[B, N, 3]``, or None with ``covars``.
-        covars: ``[B, N, 3, 3]``, or None.
-        opacities: ``[B, N]``.
-        colors: ``[B, N, D]`` or ``[B, C, N, D]``, only to cull what is not finite.
-        viewmats: ``[B, C, 4, 4]``.
-        Ks: ``[B, C, 3, 3]``.
-        lens: options.
+        degrees_to_use: 0 to 4; coefficients beyond it are not used.
+        dirs: ``[.., 3]``, of any length.
+        coeffs: ``[.., K, D]``, K >= (degrees_to_use + 1)²; gsplat's D is 3.
+        masks: ``[..]`` bool, or None; the result is 0 where it is False.
+
+    Returns:
+        ``[.., D]``; NaN in all D without a gradient where a direction or a used coefficient is not
+        finite.
+
+    Raises:
+        TypeError: no tensor.
+        ValueError: the degree or a shape is not as above.
     """
+    one_of("degrees_to_use", degrees_to_use, *range(MAX_SH_DEGREE + 1))
+    check_tensor("dirs", dirs, ("..", 3))
+    lead = dirs.shape[:-1]
+    check_tensor("coeffs", coeffs, (*lead, f"K >= {(degrees_to_use + 1) ** 2}", "D"))
+    if masks is not None:
+        check_tensor("masks", masks, (*lead,))
+    rows = coeffs.reshape(1, -1, *coeffs.shape[-2:])
+    values = sums_seen_from(degrees_to_use, rows, dirs.reshape(1, -1, 3), dirs.new_zeros(1, 1, 3))
+    values = values.reshape(*lead, coeffs.shape[-1])
+    return values if masks is None else torch.where(masks[..., None], values, 0.0)
+
+
+def world_to_cam(means: Tensor, covars: Tensor, viewmats: Tensor) -> tuple[Tensor, Tensor]:
+    """Means and covariances in the frames of cameras.
+
+    Args:
+        means: ``[.., N, 3]``.
+        covars: ``[.., N, 3, 3]``.
+        viewmats: ``[.., C, 4, 4]``.
+
+    Returns:
+        ``[.., C, N, 3]`` and ``[.., C, N, 3, 3]``.
+    """
+    rotation, translation = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    turned = means[..., None, :, :] @ rotation.mT + translation[..., None, :]
+    rotation = rotation[..., None, :, :]
+    return turned, rotation @ covars[..., None, :, :, :] @ rotation.mT
+
+
+def proj(
+    means: Tensor,
+    covars: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    camera_model: str = "pinhole",
+) -> tuple[Tensor, Tensor]:
+    """Means and covariances in the picture, of those in cameras' frames (EWA, a pinhole's).
+
+    Args:
+        means: ``[.., C, N, 3]``.
+        covars: ``[.., C, N, 3, 3]``.
+        Ks: ``[.., C, 3, 3]`` in pixels; skew is ignored.
+        width: pixels.
+        height: pixels.
+        camera_model: "pinhole".
+
+    Returns:
+        ``[.., C, N, 2]`` pixels and ``[.., C, N, 2, 2]`` square pixels.
+
+    Raises:
+        ValueError: another camera, or a size that is not allowed.
+    """
+    one_of("camera_model", camera_model, "pinhole")
+    side(width=width, height=height)
+    focal = torch.stack([Ks[..., 0, 0], Ks[..., 1, 1]], -1)[..., None, :]
+    center = Ks[..., None, :2, 2]
+    size = Ks.new_tensor([width, height])
+    z = means[..., 2:]
+    slopes = means[..., :2] / z
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    clamped = slopes.clamp(-(center / focal + margin), (size - center) / focal + margin)
+    scale = (focal / z).expand(slopes.shape)
+    jacobian = torch.cat([torch.diag_embed(scale), (-scale * clamped)[..., None]], -1)
+    return focal * slopes + center, jacobian @ covars @ jacobian.mT
+
+
+def project_views(scene: Scene, lens: LensOptions) -> Splats:
+    """Projects each object into each of its views.
+
+    The rasterizer's projection does the work, but its factor of antialiasing ends at 0.005 where
+    gsplat's goes down to 0. The few Gaussians there are done again by their covariances, in
+    float64, and culled by their own factor.
+    """
+    means, viewmats, Ks, opacities, colors, quats, scales, covars = scene
     if covars is not None:
-        found = _project_covariances(means, covars, opacities, colors, viewmats, Ks, lens)
-    else:
-        options = LensOptions(
-            width=lens.width, height=lens.height, near_plane=lens.near_plane,
-            far_plane=lens.far_plane, radius_clip=lens.radius_clip, eps2d=lens.eps2d,
-            alpha_min=ALPHA_MIN, antialiased=lens.antialiased, skip_unused=True, rounded=True,
-        ).numbers()  # fmt: skip
-        given = means, quats, scales, opacities, colors.detach(), viewmats, Ks
-        found = project(*given, options)[:5]
-        if lens.antialiased:
-            assert quats is not None and scales is not None
-            found = exact_where_faint(found, means, quats, scales, opacities, viewmats, Ks, lens)
-    means2d, conics, depths, view_opacities, extents = found
-    extents = extents.detach()
-    return Splats(means2d, conics, depths, view_opacities, extents, extents.ceil().int())
+        finite = colors.isfinite().all(-1).view(len(colors), -1, means.shape[1])
+        finite = finite & opacities.isfinite()[:, None]
+        shown = torch.where(finite, opacities[:, None], 0.0)
+        return _project_covariances(means, covars, shown, viewmats, Ks, lens)
+    given = means, quats, scales, opacities, colors.detach(), viewmats, Ks
+    splats = Splats(*project(*given, lens.numbers())[:5])
+    splats = splats._replace(extents=splats.extents.detach())
+    if not lens.antialiased:
+        return splats
+    with torch.no_grad():
+        faint = splats.opacities <= opacities[:, None] * (COMPENSATION_MIN * _NEARLY)
+        at = (faint & (splats.extents > 0).all(-1)).nonzero(as_tuple=True)
+    b, c, g = at
+    if len(b) == 0:
+        return splats
+    covars, _ = quat_scale_to_covar_preci(quats[b, g].double(), scales[b, g].double(), True, False)
+    given = means[b, g], covars, opacities[b, g, None], viewmats[b, c], Ks[b, c]
+    exact = _project_covariances(*(x[:, None] for x in given), lens)
+    return Splats(*(x.index_put(at, one[:, 0, 0]) for x, one in zip(splats, exact)))
 
 
 def _project_covariances(
     means: Tensor,
     covars: Tensor,
     opacities: Tensor,
-    colors: Tensor,
     viewmats: Tensor,
     Ks: Tensor,
-    lens: Lens,
-) -> tuple[Tensor, ...]:
-    """The operator's results for covariances, in torch and float64: it takes scales alone."""
+    lens: LensOptions,
+) -> Splats:
+    """What the operator gives, for covariances, in torch and float64; opacities ``[B, (C), N]``."""
     finite = means.isfinite().all(-1) & covars.isfinite().flatten(-2).all(-1)
     # what is culled is replaced before any product, so that its gradient is 0 and not NaN
     means = torch.where(finite[..., None], means, 0.0)
     covars = torch.where(finite[..., None, None], covars, 0.0)
-    finite = finite[:, None] & opacities.isfinite()[:, None]
-    finite = finite & (colors if colors.dim() == 4 else colors[:, None]).isfinite().all(-1)
     turned, covars = world_to_cam(means.double(), covars.double(), viewmats.double())
     depths = turned[..., 2]
-    seen = finite & (depths >= lens.near_plane) & (depths <= lens.far_plane)
+    seen = finite[:, None] & (depths >= lens.near_plane) & (depths <= lens.far_plane)
     # and here before the division by z
     turned = torch.where(seen[..., None], turned, turned.new_tensor([0.0, 0.0, 1.0]))
     covars = torch.where(seen[..., None, None], covars, torch.eye(3).to(covars))
-    centers, plane = proj(turned, covars, Ks.double(), lens.width, lens.height)
+    centers, plane = proj(turned, covars, Ks.double(), int(lens.width), int(lens.height))
     xx, xy, yy = plane[..., 0, 0], plane[..., 0, 1], plane[..., 1, 1]
-    factor = compensation_of(xx, xy, yy, lens.eps2d) if lens.antialiased else 1.0
+    before = xx * yy - xy * xy
     xx, yy = xx + lens.eps2d, yy + lens.eps2d
     det = xx * yy - xy * xy
-    view_opacities = opacities[:, None].double().expand_as(depths) * factor
-    seen = seen & (det > 0) & (view_opacities >= ALPHA_MIN)
+    shown = opacities.double().expand_as(depths)
+    if lens.antialiased:
+        some = before > 0
+        # replaced before the root, whose slope at 0 would make NaN of a gradient of 0
+        factor = torch.where(some, before / det, 1.0).sqrt()
+        shown = shown * torch.where(some, factor, 0.0)
+    seen = seen & (det > 0) & (shown >= ALPHA_MIN)
     with torch.no_grad():
-        cut = (2 * (view_opacities / ALPHA_MIN).clamp_min(1).log()).sqrt()
+        cut = (2 * (shown / ALPHA_MIN).clamp_min(1).log()).sqrt()
         extents = cut[..., None] * torch.stack([xx, yy], -1).clamp_min(0).sqrt()
         reach = extents.ceil()
         inside = (centers + reach >= 0) & (centers - reach <= plane.new_tensor(lens[:2]))
@@ -147,27 +266,10 @@ def _project_covariances(
         centers.masked_fill(culled[..., None], 0.0),
         torch.where(seen[..., None], conics, conics.new_tensor([1.0, 0.0, 1.0])),
         turned[..., 2].masked_fill(culled, 0.0),
-        view_opacities.masked_fill(culled, 0.0),
+        shown.masked_fill(culled, 0.0),
         extents.masked_fill(culled[..., None], 0.0),
     )
-    return tuple(x.float().contiguous() for x in kept)
-
-
-class Packing(NamedTuple):
-    """Which (object, view, Gaussian) are seen: P of them, in their order, each int64 ``[P]``."""
-
-    batch: Tensor
-    camera: Tensor
-    gaussian: Tensor
-    flat: Tensor  # the index among all B * C * N
-
-    @classmethod
-    def of(cls, radii: Tensor) -> Packing:
-        """Those with a box, from radii ``[B, C, N, 2]``."""
-        seen = (radii > 0).all(-1)
-        _, views, num = seen.shape
-        index = seen.flatten().nonzero()[:, 0]
-        return cls(index // (views * num), index // num % views, index % num, index)
+    return Splats(*(x.float().contiguous() for x in kept))
 
 
 def fully_fused_projection(
@@ -219,42 +321,40 @@ def fully_fused_projection(
         TypeError: no tensor.
         ValueError: a shape, device or option is not as above.
     """
-    only("sparse_grad", sparse_grad, False)
-    only("camera_model", camera_model, "pinhole")
+    one_of("sparse_grad", sparse_grad, False)
+    one_of("camera_model", camera_model, "pinhole")
     positive(eps2d=eps2d, near_plane=near_plane)
-    lead, num = means_of(means)
-    if covars is not None:
-        shape("covars", covars, (*lead, num, 6))
-        quats = scales = None
-    elif quats is None or scales is None:
-        raise ValueError("covars is None and so are quats or scales: allowed is either or")
-    tensors = dict(quats=quats, scales=scales, opacities=opacities, viewmats=viewmats, Ks=Ks)
-    cameras(lead, num, {"means": means, **tensors}, width, height)
-    quats, scales = (None if x is None else flat(x, lead) for x in (quats, scales))
-    covars = None if covars is None else symmetric(flat(covars, lead))
-    given = flat(means, lead), quats, scales, covars
-    cams = flat(viewmats, lead), flat(Ks, lead)
+    side(width=width, height=height)
+    tensors = dict(means=means, viewmats=viewmats, Ks=Ks)
+    tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
+    lead = check_scene({**tensors, **({} if opacities is None else {"opacities": opacities})}, (6,))
+    given = {name: flat(x, lead) for name, x in tensors.items()}
+    if covars is not None:  # to the whole matrix
+        given["covars"] = given["covars"][..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
+    opacity = flat(means.detach()[..., 0] if opacities is None else opacities.detach(), lead)
 
     def projected(opacity: Tensor, antialiased: bool) -> Splats:
-        lens = Lens(width, height, eps2d, near_plane, far_plane, radius_clip, antialiased)
-        return project_views(*given, opacity, opacity[..., None], *cams, lens)
+        scene = Scene(**given, opacities=opacity, colors=opacity[..., None])
+        lens = LensOptions(
+            width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN, antialiased,
+            skip_unused=True, rounded=True,
+        )  # fmt: skip
+        return project_views(scene, lens)
 
     compensations = None
     if opacities is not None:
-        opacity = flat(opacities.detach(), lead)
         found = projected(opacity, calc_compensations)
         if calc_compensations:
             # an opacity of 0 is culled, and its factor is 0
             compensations = found.opacities / opacity[:, None].clamp_min(ALPHA_MIN)
     else:
-        opacity = flat(means.detach()[..., 0], lead)
         found = projected(torch.full_like(opacity, _OPAQUE), False)
         if calc_compensations:  # without opacities the factor does not shrink gsplat's boxes
-            compensations = projected(torch.full_like(opacity, _LARGE), True).opacities / _LARGE
-            compensations = torch.where((found.radii > 0).all(-1), compensations, 0.0)
-    results = found.radii, found.means2d, found.depths, plain_conics(found.conics), compensations
+            factors = projected(torch.full_like(opacity, _LARGE), True).opacities / _LARGE
+            compensations = torch.where((found.extents > 0).all(-1), factors, 0.0)
+    radii = found.extents.ceil().int()
+    results = radii, found.means2d, found.depths, plain_conics(found.conics), compensations
     if not packed:
         return tuple(None if x is None else x.view(*lead, *x.shape[1:]) for x in results)
-    at = Packing.of(found.radii)
-    seen = (None if x is None else x.flatten(0, 2)[at.flat] for x in results)
-    return at.batch, at.camera, at.gaussian, *seen
+    at = (radii > 0).all(-1).nonzero(as_tuple=True)
+    return *at, *(None if x is None else x[at] for x in results)

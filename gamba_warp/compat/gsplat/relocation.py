@@ -1,4 +1,4 @@
-"""Relocation of Gaussians (Kheradmand et al. 2024) in torch, and gsplat's strategies with it."""
+"""What gsplat's strategies take from its CUDA extension, in torch: covariances and relocation."""
 
 from __future__ import annotations
 
@@ -7,9 +7,51 @@ from contextlib import contextmanager
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from .checks import shape
-from .shapes import quat_scale_to_covar_preci
+from ..checks import check_tensor
+
+
+def quat_scale_to_covar_preci(
+    quats: Tensor,
+    scales: Tensor,
+    compute_covar: bool = True,
+    compute_preci: bool = True,
+    triu: bool = False,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Rotations and standard deviations to covariances and their inverses.
+
+    Args:
+        quats: ``[.., 4]`` wxyz, any length.
+        scales: ``[.., 3]``.
+        compute_covar: if False, the first result is None.
+        compute_preci: if False, the second result is None.
+        triu: the six entries xx, xy, xz, yy, yz, zz in place of the matrix.
+
+    Returns:
+        Covariances R diag(s²) Rᵀ and their inverses, ``[.., 3, 3]``, or ``[.., 6]``.
+
+    Raises:
+        TypeError: no tensor.
+        ValueError: the shapes do not fit.
+    """
+    check_tensor("scales", scales, ("..", 3))
+    check_tensor("quats", quats, (*scales.shape[:-1], 4))
+    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    rotation = torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+    def product(lengths: Tensor) -> Tensor:
+        root = rotation * lengths[..., None, :]
+        square = root @ root.mT
+        return square[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] if triu else square
+
+    covars = product(scales) if compute_covar else None
+    return covars, product(1 / scales) if compute_preci else None
 
 
 def compute_relocation(
@@ -34,12 +76,11 @@ def compute_relocation(
         TypeError: no tensor.
         ValueError: a shape is not as above.
     """
-    num = len(scales) if isinstance(scales, Tensor) and scales.dim() else 0
-    shape("scales", scales, (num, 3))
-    shape("opacities", opacities, (num,), (num, 1))
-    shape("ratios", ratios, (num,))
-    shape("binoms", binoms, (len(binoms), len(binoms)))
-    most = len(binoms)
+    check_tensor("scales", scales, ("N", 3))
+    num, most = len(scales), len(binoms)
+    check_tensor("opacities", opacities, (num,), (num, 1))
+    check_tensor("ratios", ratios, (num,))
+    check_tensor("binoms", binoms, (most, most))
     ratios.clamp_(min=1, max=most)
     count = ratios.long()
     old = opacities.flatten().double()

@@ -2,24 +2,43 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from types import SimpleNamespace
+import inspect
+from enum import Enum
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
-from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, tuning_for
+from gamba_warp.kernels.rasterize.cpu.tuning import tuning_for
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.ops import bin_op
+from gamba_warp.kernels.rasterize.project import LensOptions
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 
-from .checks import RollingShutterType, rasterization_arguments
-from .pixels import SKIP, Layers, blend
-from .projection import Lens, Packing, Splats, flat, plain_conics, project_views
-from .tiles import pair_ids
+from ..checks import check_tensor, one_device, one_of, positive, side
+from .pixels import SKIP, Layers, blend, pair_ids
+from .projection import MAX_SH_DEGREE, Scene, check_scene, flat, plain_conics, project_views
+
+# Arguments that ask for what is not here: each must have its default. ``tile_size``,
+# ``channel_chunk`` and ``segmented`` have no effect, and ``rolling_shutter`` may be gsplat's own
+# ``GLOBAL``; all others are used.
+MUST_BE_DEFAULT = (
+    "sparse_grad", "distributed", "camera_model", "with_ut", "with_eval3d", "radial_coeffs",
+    "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "viewmats_rs", "macro_tile",
+    "return_normals", "global_z_order", "rays", "lidar_coeffs", "external_distortion_coeffs",
+    "ut_params", "extra_signals", "extra_signals_sh_degree", "renderer_config",
+)  # fmt: skip
+
+
+class RollingShutterType(Enum):
+    """The shutters of gsplat's cameras; every pixel at once, ``GLOBAL``, is the one we have."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    ROLLING_LEFT_TO_RIGHT = 1
+    ROLLING_BOTTOM_TO_TOP = 2
+    ROLLING_RIGHT_TO_LEFT = 3
+    GLOBAL = 4
 
 
 def rasterization(
@@ -107,157 +126,103 @@ def rasterization(
         TypeError: no tensor where one is asked for.
         ValueError: a shape, device or option is not allowed; the message names it.
     """
-    arguments = dict(locals())
-    return _rasterize(SimpleNamespace(**arguments), rasterization_arguments(arguments))
+    given = locals()
+    for name in MUST_BE_DEFAULT:
+        one_of(name, given[name], _PARAMETERS[name].default)
+    one_of("rolling_shutter", getattr(rolling_shutter, "name", rolling_shutter), "GLOBAL")
+    one_of("render_mode", render_mode, "RGB", "D", "ED", "RGB+D", "RGB+ED")
+    one_of("rasterize_mode", rasterize_mode, "classic", "antialiased")
+    one_of("sh_degree", sh_degree, None, *range(MAX_SH_DEGREE + 1))
+    positive(near_plane=near_plane, eps2d=eps2d)
+    side(width=width, height=height)
+    tensors = dict(means=means, viewmats=viewmats, Ks=Ks, opacities=opacities)
+    tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
+    lead = check_scene(tensors, (3, 3))
+    num, views, colored = means.shape[-2], viewmats.shape[-3], "RGB" in render_mode
+    if colored or colors is not None:
+        least = () if sh_degree is None else (f"K >= {(sh_degree + 1) ** 2}",)
+        shapes = ((*lead, *rows, *least, "D >= 1") for rows in ((num,), (views, num)))
+        check_tensor("colors", colors, *shapes)
+    if colored and backgrounds is not None:
+        check_tensor("backgrounds", backgrounds, (*lead, views, colors.shape[-1]))
+    one_device({"means": means, "colors": colors, "backgrounds": backgrounds})
 
+    given = {name: flat(x, lead) for name, x in tensors.items()}
+    if colors is None or not colored:
+        blended = torch.ones_like(given["opacities"])[..., None]
+    elif sh_degree is None:
+        blended = flat(colors, lead)
+    else:
+        centers = torch.linalg.inv(given["viewmats"])[..., :3, 3]
+        colors = flat(colors, lead)
+        blended = colors_seen_from(sh_degree, colors, given["means"], centers).contiguous()
+    lens = LensOptions(
+        width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN,
+        rasterize_mode == "antialiased", skip_unused=True, rounded=True,
+    )  # fmt: skip
+    splats = project_views(Scene(**given, colors=blended), lens)
+    radii = splats.extents.ceil().int()
+    seen = (radii > 0).all(-1)
+    at = seen.nonzero(as_tuple=True) if packed else None
 
-def _rasterize(a: SimpleNamespace, lead: tuple[int, ...]) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    a.views, a.num = a.viewmats.shape[-3], a.means.shape[-2]
-    a.batch, a.lead = math.prod(lead), lead
-    names = ("means", "quats", "scales", "covars", "opacities", "colors", "viewmats", "Ks")
-    given = {k: getattr(a, k) for k in names}
-    if a.covars is not None:
-        given.update(quats=None, scales=None)
-    if "RGB" not in a.render_mode:
-        given["colors"] = a.means.new_ones(*lead, a.num, 1)
-    scene = SimpleNamespace(**{k: None if x is None else flat(x, lead) for k, x in given.items()})
-    if a.sh_degree is not None and "RGB" in a.render_mode:
-        centers = torch.linalg.inv(scene.viewmats)[..., :3, 3]
-        colors = colors_seen_from(a.sh_degree, scene.colors, scene.means, centers)
-        scene.colors = colors.contiguous()
-    lens = Lens(
-        a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip,
-        a.rasterize_mode == "antialiased",
+    def shown(x: Tensor) -> Tensor:
+        """What ``meta`` has of ``[B, C, N, ..]``."""
+        return x.view(*lead, *x.shape[1:]) if at is None else x[at]
+
+    # What meta shows of these is on the gradient's way.
+    way = {name: shown(getattr(splats, name)) for name in ("means2d", "depths", "opacities")}
+    for name, value in way.items():
+        x = getattr(splats, name)
+        x = value.view(x.shape) if at is None else x.detach().index_put(at, value)
+        splats = splats._replace(**{name: x})
+    ids = dict(zip(("batch_ids", "camera_ids", "gaussian_ids"), at or (None, None, None)))
+    conics = shown(plain_conics(splats.conics))
+    meta: dict[str, Any] = dict(**ids, **way, radii=shown(radii), conics=conics)
+
+    if render_mode != "RGB":  # depth comes last
+        parts = [splats.depths[..., None]]
+        if colored:
+            each = blended if blended.dim() == 4 else blended[:, None]
+            parts.insert(0, each.expand(-1, views, -1, -1))
+        blended = torch.cat(parts, -1)
+    tuning = tuning_for(means.device.type)
+    tiling = Tiling(width, height, tuning.tile)
+    per_view = [x.flatten(0, 1).contiguous() for x in splats]
+    # of exact length, because meta shows them
+    numbers = width, height, ALPHA_MIN, SKIP, tuning.numbers(), True
+    bins = Bins(*bin_op(*(x.detach() for x in per_view), *numbers))
+    layers = Layers(per_view[0], per_view[1], per_view[3], blended.flatten(0, -2).contiguous())
+
+    def keep(values: Tensor) -> None:
+        meta["means2d"].absgrad = shown(values.view(splats.means2d.shape))
+
+    shared = views if blended.dim() == 3 else 1
+    renders, alphas = blend(layers, bins, tiling, shared, keep if absgrad else None)
+    if render_mode != "RGB":
+        renders, depth = renders.split([renders.shape[-1] - 1, 1], -1)
+        depth = depth / alphas.clamp_min(1e-10) if render_mode.endswith("ED") else depth
+    if colored and backgrounds is not None:
+        renders = renders + (1 - alphas) * flat(backgrounds, lead).flatten(0, 1)[:, None, None]
+    if render_mode != "RGB":
+        renders = torch.cat([renders, depth], -1)
+
+    # gsplat's names of the lists; ours hold the tiles that the ellipse meets, not its box.
+    counts = torch.empty_like(bins.order)
+    counts[bins.order.long()] = bins.offsets.diff()
+    tile = torch.arange(len(bins.starts) - 1, device=counts.device)
+    tile = tile.repeat_interleave(bins.starts.diff().long())
+    pairs = bins.pairs.long()
+    depths = splats.depths.detach().flatten()[pairs]
+    row = pairs if at is None else (seen.flatten().cumsum(0) - 1)[pairs]
+    grid = tiling.tiles_y, tiling.tiles_x
+    meta.update(
+        tile_width=grid[1], tile_height=grid[0], tiles_per_gauss=shown(counts.view(seen.shape)),
+        isect_ids=pair_ids(tile // tiling.count, tile % tiling.count, depths, tiling.count),
+        flatten_ids=row.int(), isect_offsets=bins.starts[:-1].view(*lead, views, *grid),
+        width=width, height=height, tile_size=tiling.tile, n_batches=len(radii), n_cameras=views,
     )  # fmt: skip
-    splats = project_views(
-        scene.means, scene.quats, scene.scales, scene.covars, scene.opacities,
-        scene.colors.detach(), scene.viewmats, scene.Ks, lens,
-    )  # fmt: skip
-    meta, splats = _described(splats, a)
-    channels = _channels(a.render_mode, scene.colors, splats.depths)
-    tuning = tuning_for(a.means.device.type)
-    tiling = Tiling(a.width, a.height, tuning.tile)
-    per_view = [x.detach().flatten(0, 1).contiguous() for x in splats[:5]]
-    picture = a.width, a.height, ALPHA_MIN, SKIP
-    bins = Bins(*bin_op(*per_view, *picture, tuning.numbers(), True))  # its meta shows them
-    keep = _keeper(meta["means2d"], meta.pop("_packing")) if a.absgrad else None
-    meta.pop("_packing", None)
-    renders, alphas = _blended(splats, channels, bins, tiling, tuning, keep)
-    renders = _finished(a, renders, alphas)
-    _list(meta, splats, bins, tiling, a)
-    renders, alphas = (x.view(*lead, a.views, *x.shape[1:]) for x in (renders, alphas))
+    renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
     return renders, alphas, meta
 
 
-def _described(splats: Splats, a: SimpleNamespace) -> tuple[dict[str, Any], Splats]:
-    """Makes gsplat's ``meta``, and the splats that are drawn: what it shows of means2d, depths and
-    opacities is on the gradient's way.
-    """
-    meta: dict[str, Any] = dict(batch_ids=None, camera_ids=None, gaussian_ids=None)
-    if not a.packed:
-        shown = splats._replace(conics=plain_conics(splats.conics))
-        shown = Splats(*(x.view(*a.lead, *x.shape[1:]) for x in shown))
-        size = splats.depths.shape
-        splats = splats._replace(
-            means2d=shown.means2d.view(*size, 2),
-            depths=shown.depths.view(size),
-            opacities=shown.opacities.view(size),
-        )
-        at = None
-    else:
-        at = Packing.of(splats.radii)
-        shown = Splats(*(x.flatten(0, 2)[at.flat] for x in splats))
-        back = {
-            name: getattr(splats, name).detach().flatten(0, 2).index_copy(0, at.flat, value)
-            for name, value in zip(("means2d", "depths", "opacities"), (shown[0], *shown[2:4]))
-        }
-        splats = splats._replace(**{k: x.view_as(getattr(splats, k)) for k, x in back.items()})
-        shown = shown._replace(conics=plain_conics(shown.conics))
-        meta.update(batch_ids=at.batch, camera_ids=at.camera, gaussian_ids=at.gaussian)
-    meta.update(
-        radii=shown.radii, means2d=shown.means2d, depths=shown.depths, conics=shown.conics,
-        opacities=shown.opacities, _packing=at,
-    )  # fmt: skip
-    return meta, splats
-
-
-def _keeper(means2d: Tensor, at: Packing | None) -> Callable[[Tensor], None]:
-    def keep(values: Tensor) -> None:
-        values = values if at is None else values[at.flat]
-        means2d.absgrad = values.view(means2d.shape)  # type: ignore[attr-defined]
-
-    return keep
-
-
-def _channels(mode: str, colors: Tensor, depths: Tensor) -> Tensor:
-    """What is blended: ``[B, N, D]`` shared by the views, or ``[B, C, N, D]``."""
-    if mode == "RGB":
-        return colors
-    depths = depths[..., None]
-    if "RGB" not in mode:
-        return depths
-    if colors.dim() == 3:
-        colors = colors[:, None].expand(-1, depths.shape[1], -1, -1)
-    return torch.cat([colors, depths], -1)
-
-
-def _blended(
-    splats: Splats,
-    channels: Tensor,
-    bins: Bins,
-    tiling: Tiling,
-    tuning: Tuning,
-    keep: Callable[[Tensor], None] | None,
-) -> tuple[Tensor, Tensor]:
-    views = 1 if channels.dim() == 4 else splats.depths.shape[1]
-    layers = Layers(
-        splats.means2d.flatten(0, 1).contiguous(),
-        splats.conics.flatten(0, 1).contiguous(),
-        splats.opacities.flatten(0, 1).contiguous(),
-        channels.reshape(-1, channels.shape[-1]).contiguous(),
-    )
-    return blend(layers, bins, tiling, tuning, views, keep)
-
-
-def _finished(a: SimpleNamespace, renders: Tensor, alphas: Tensor) -> Tensor:
-    """Background behind the colours, and expected depth."""
-    depth = None
-    if a.render_mode != "RGB":
-        renders, depth = renders.split([renders.shape[-1] - 1, 1], -1)
-        if a.render_mode.endswith("ED"):
-            depth = depth / alphas.clamp_min(1e-10)
-    if a.backgrounds is not None and renders.shape[-1]:
-        behind = flat(a.backgrounds, a.lead).flatten(0, 1)[:, None, None]
-        renders = renders + (1 - alphas) * behind
-    return renders if depth is None else torch.cat([renders, depth], -1)
-
-
-def _list(
-    meta: dict[str, Any], splats: Splats, bins: Bins, tiling: Tiling, a: SimpleNamespace
-) -> None:
-    """Adds gsplat's names of the lists; ours hold the tiles that the ellipse meets, not its box."""
-    images = a.batch * a.views
-    counts = torch.empty_like(bins.order)
-    counts[bins.order.long()] = bins.offsets.diff()
-    tile = torch.arange(images * tiling.count, device=counts.device)
-    tile = tile.repeat_interleave(bins.starts.diff().long())
-    pairs = bins.pairs.long()
-    ids = pair_ids(
-        tile // tiling.count, tile % tiling.count, splats.depths.detach().flatten()[pairs],
-        tiling.count,
-    )  # fmt: skip
-    if a.packed:
-        seen = (splats.radii > 0).all(-1).flatten()
-        number = seen.cumsum(0) - 1
-        pairs, counts = number[pairs], counts[seen]
-    else:
-        counts = counts.view(*a.lead, a.views, a.num)
-    meta.update(
-        tile_width=tiling.tiles_x, tile_height=tiling.tiles_y, tiles_per_gauss=counts,
-        isect_ids=ids, flatten_ids=pairs.int(),
-        isect_offsets=bins.starts[:-1].view(
-            *a.lead, a.views, tiling.tiles_y, tiling.tiles_x
-        ),
-        width=a.width, height=a.height, tile_size=tiling.tile, n_batches=a.batch,
-        n_cameras=a.views,
-    )  # fmt: skip
+_PARAMETERS = inspect.signature(rasterization).parameters
