@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -11,7 +9,7 @@ from torch import Tensor
 from ...kernels.causal_conv1d import causal_conv1d_fn
 from ...kernels.causal_conv1d.reference import causal_conv1d_reference
 from ...kernels.selective_scan.cpu.step import conv_step
-from ..checks import DTYPES, INDEX_DTYPES, check_tensor, one_of
+from ..shared import DTYPES, INDEX_DTYPES, check_tensor, of_rows, one_of
 
 __all__ = [
     "causal_conv1d_fn",
@@ -60,36 +58,17 @@ def causal_conv1d_update(
     check_tensor("x", x, ("B", "D"), ("B", "D", "L"), dtypes=DTYPES)
     batch, channels = x.shape[:2]
     check_tensor("weight", weight, (channels, "W >= 1"), dtypes=DTYPES)
-    if bias is not None:
-        check_tensor("bias", bias, (channels,), dtypes=DTYPES)
+    check_tensor("bias", bias, (channels,), dtypes=DTYPES, optional=True)
     rows, least = batch if conv_state_indices is None else "rows", max(1, weight.shape[1] - 1)
     check_tensor("conv_state", conv_state, (rows, channels, f"S >= {least}"), dtypes=DTYPES)
     numbers = {"cache_seqlens": cache_seqlens, "conv_state_indices": conv_state_indices}
     for name, value in numbers.items():
-        if value is not None:
-            check_tensor(name, value, (batch,), dtypes=INDEX_DTYPES)
+        check_tensor(name, value, (batch,), dtypes=INDEX_DTYPES, optional=True)
 
     def update(state: Tensor) -> Tensor:
         return causal_conv1d_update_ref(x, state, weight.float(), bias, activation, cache_seqlens)
 
     return of_rows(update, conv_state, conv_state_indices)
-
-
-@torch.no_grad()
-def of_rows(update: Callable[[Tensor], Tensor], state: Tensor, indices: Tensor | None) -> Tensor:
-    """Updates those rows of a state that indices choose; returns what ``update`` returns for them.
-
-    Args:
-        update: takes ``[B, ..]`` rows, updates them in place and returns the output ``[B, ..]``.
-        state: ``[rows, ..]``, updated in place.
-        indices: ``[B]``; below 0 the output is 0 and no row is touched. Or None: all rows.
-    """
-    if indices is None:
-        return update(state)
-    rows, kept = state.index_select(0, indices.clamp(min=0)), indices >= 0
-    out = update(rows)
-    state.index_copy_(0, indices[kept].long(), rows[kept])
-    return out.masked_fill(~kept.view(-1, *[1] * (out.dim() - 1)), 0)
 
 
 def causal_conv1d_ref(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -16,16 +15,11 @@ from gamba_warp.kernels.rasterize.cpu.tuning import tuning_for
 from gamba_warp.kernels.rasterize.ops import composite
 from gamba_warp.kernels.rasterize.tiles import Bins, Limits, Size, Tiling
 
-from ..checks import check_tensor, one_device, positive, side
+from ..shared import check_tensor, one_device, positive, side
 
 LIMITS = Limits(ALPHA_MIN, 0.999, T_MIN)  # gsplat 1.5.3 clamps alpha at 0.999
 SKIP = Skip().bits()
 _ROOM = 2**19  # numbers of (tile, pair, pixel) that are worked on at once: they fit a cache
-
-
-def tile_bits(tiles: int) -> int:
-    """Bits that gsplat keeps for the number of a tile."""
-    return tiles.bit_length()
 
 
 def pair_ids(images: Tensor, tiles: Tensor, depths: Tensor, count: int) -> Tensor:
@@ -41,7 +35,7 @@ def pair_ids(images: Tensor, tiles: Tensor, depths: Tensor, count: int) -> Tenso
         ``[P]`` int64; the lower half holds the bits of the depth.
     """
     depth = depths.float().contiguous().view(torch.int32).long() & 0xFFFFFFFF
-    return (images << (tile_bits(count) + 32)) | (tiles << 32) | depth
+    return (images << (count.bit_length() + 32)) | (tiles << 32) | depth
 
 
 @torch.no_grad()
@@ -97,7 +91,7 @@ def isect_tiles(
         count, num = math.prod(lead[:-1]), lead[-1]
         images = torch.arange(count, device=means2d.device).repeat_interleave(num)
     tiles = tile_width * tile_height
-    if count.bit_length() + tile_bits(tiles) + 32 > 63:
+    if count.bit_length() + tiles.bit_length() + 32 > 63:
         raise ValueError(f"{count} images of {tiles} tiles: their numbers do not fit 63 bits")
     size = means2d.new_tensor([tile_width, tile_height])
     center, reach = (x.reshape(-1, 2) / tile_size for x in (means2d, radii))
@@ -105,9 +99,8 @@ def isect_tiles(
     last = (center + reach).ceil().clamp_min(0).minimum(size).long()
     counts = (last - first).prod(-1) * (radii.reshape(-1, 2) > 0).all(-1)
     gaussian = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-    place = (
-        torch.arange(len(gaussian), device=counts.device) - (counts.cumsum(0) - counts)[gaussian]
-    )
+    begins = counts.cumsum(0) - counts
+    place = torch.arange(len(gaussian), device=counts.device) - begins[gaussian]
     columns = (last - first)[gaussian, 0]
     x, y = first[gaussian, 0] + place % columns, first[gaussian, 1] + place // columns
     ids = pair_ids(images[gaussian], y * tile_width + x, depths.flatten()[gaussian], tiles)
@@ -139,29 +132,13 @@ def isect_offset_encode(
     check_tensor("isect_ids", isect_ids, ("P",))
     tiles = tile_width * tile_height
     image, tile = torch.arange(n_images), torch.arange(tiles)
-    keys = ((image[:, None] << tile_bits(tiles)) | tile).to(isect_ids.device)
+    keys = ((image[:, None] << tiles.bit_length()) | tile).to(isect_ids.device)
     begins = torch.searchsorted(isect_ids >> 32, keys.flatten())
     return begins.int().view(n_images, tile_height, tile_width)
 
 
-class Layers(NamedTuple):
-    """What is blended in I pictures: R rows of each; the lists of tiles name rows of all.
-
-    Attributes:
-        means2d: ``[I, R, 2]`` pixels.
-        conics: ``[I, R, 3]``: a, k, e of ``a (dx + k dy)² + e dy²``.
-        opacities: ``[I, R]``.
-        colors: ``[I * R, C]``, or ``[I / views * R, C]`` if an object's views share them.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    opacities: Tensor
-    colors: Tensor
-
-
 def blend(
-    layers: Layers,
+    layers: Sequence[Tensor],
     bins: Bins,
     tiling: Tiling,
     views: int = 1,
@@ -170,19 +147,21 @@ def blend(
     """Blends I pictures: ``[I, H, W, C]`` and alphas ``[I, H, W, 1]``, with gradients.
 
     Args:
-        layers: what is blended.
+        layers: R rows of each picture: means2d ``[I, R, 2]`` pixels, conics ``[I, R, 3]`` (a, k, e
+            of ``a (dx + k dy)² + e dy²``), opacities ``[I, R]``, and colors ``[I * R, C]``, or
+            ``[I / views * R, C]`` if an object's views share them. The lists name rows of all.
         bins: the lists of tiles.
         tiling: the cut into tiles, of the side that ``tuning_for`` says.
         views: pictures of an object, which share the colours; 1 if none do.
         keep: given, in backward, the absolute gradients ``[I * R, 2]`` of the centres; or None.
     """
     size = Size(tiling.width, tiling.height, views, int(views == 1), SKIP)
-    tuning = tuning_for(layers.means2d.device.type).numbers()
+    tuning = tuning_for(layers[0].device.type).numbers()
     renders, alphas, *_ = composite(*layers, list(bins), list(size), list(LIMITS), tuning, None)
     if keep is None or not renders.requires_grad:
         return renders, alphas
     both = torch.cat([renders, alphas], -1)
-    drawn = Layers(*(x.detach() for x in layers))
+    drawn = [x.detach() for x in layers]
     both.register_hook(lambda v: keep(_absolute_gradients(drawn, bins, tiling, views, v)))
     renders, alphas = both.split([renders.shape[-1], 1], -1)
     return renders, alphas
@@ -190,7 +169,7 @@ def blend(
 
 @torch.no_grad()
 def _absolute_gradients(
-    layers: Layers, bins: Bins, tiling: Tiling, views: int, upstream: Tensor
+    layers: Sequence[Tensor], bins: Bins, tiling: Tiling, views: int, upstream: Tensor
 ) -> Tensor:
     """``Σ_pixels |∂L/∂means2d|`` of each row, ``[I * R, 2]`` (Ye et al. 2024, "AbsGS").
 
@@ -292,10 +271,8 @@ def rasterize_to_pixels(
     check_tensor("opacities", opacities, (*rows,))
     check_tensor("colors", colors, (*rows, "D >= 1"))
     check_tensor("flatten_ids", flatten_ids, ("P",))
-    if backgrounds is not None:
-        check_tensor("backgrounds", backgrounds, (*lead, colors.shape[-1]))
-    if masks is not None:
-        check_tensor("masks", masks, (*lead, grid_y, grid_x))
+    check_tensor("backgrounds", backgrounds, (*lead, colors.shape[-1]), optional=True)
+    check_tensor("masks", masks, (*lead, grid_y, grid_x), optional=True)
     one_device(dict(means2d=means2d, conics=conics, colors=colors, opacities=opacities))
     side(image_width=image_width, image_height=image_height)
     positive(tile_size=tile_size)
@@ -317,12 +294,8 @@ def rasterize_to_pixels(
     a = torch.where(fits, xx, 1.0)
     k = torch.where(fits, xy, 0.0) / a
     sheared = torch.stack([a, k, torch.where(fits, yy, 1.0) - a * k * k], -1)
-    layers = [
-        means2d.reshape(total, 2),
-        sheared,
-        torch.where(fits, opacities.reshape(total), 0.0),
-        colors.reshape(total, colors.shape[-1]),
-    ]
+    visible = torch.where(fits, opacities.reshape(total), 0.0)
+    layers = [means2d.reshape(total, 2), sheared, visible, colors.reshape(total, colors.shape[-1])]
 
     def keep(values: Tensor) -> None:
         if moved:
@@ -352,7 +325,7 @@ def rasterize_to_pixels(
     each = -(-len(layers[0]) // max(images, 1))
     spare = each * images - len(layers[0])
     layers = [F.pad(x.float(), (0, 0) * (x.dim() - 1) + (0, spare)) for x in layers]
-    blended = Layers(*(x.view(images, each, *x.shape[1:]) for x in layers[:3]), layers[3])
+    layers[:3] = (x.view(images, each, *x.shape[1:]) for x in layers[:3])
     order = pairs.argsort(stable=True)  # pairs of a row are numbered together
     number = torch.empty_like(order)
     number[order] = torch.arange(len(order), device=device)
@@ -367,7 +340,7 @@ def rasterize_to_pixels(
     )
     tiling = Tiling(grid_x * parts * tile, grid_y * parts * tile, tile)
     found = []
-    for picture in blend(blended, bins, tiling, keep=keep if absgrad else None):
+    for picture in blend(layers, bins, tiling, keep=keep if absgrad else None):
         apart = picture.unflatten(2, (grid_x, -1)).unflatten(1, (grid_y, -1))
         whole = apart[:, :, :tile_size, :, :tile_size].flatten(3, 4).flatten(1, 2)
         whole = whole[:, :image_height, :image_width]

@@ -18,7 +18,7 @@ from gamba_warp.kernels.rasterize.harmonics import sums_seen_from
 from gamba_warp.kernels.rasterize.ops import project
 from gamba_warp.kernels.rasterize.project import LensOptions
 
-from ..checks import check_tensor, one_device, one_of, positive, side
+from ..shared import check_tensor, one_device, one_of, positive, side
 from .relocation import quat_scale_to_covar_preci
 
 MAX_SH_DEGREE = 4
@@ -26,30 +26,6 @@ MAX_SH_DEGREE = 4
 _OPAQUE = ALPHA_MIN * math.exp(0.5 * 3.33**2)
 _LARGE = 1e15  # an opacity that stays over alpha_min with every factor of antialiasing from 4e-18
 _NEARLY = 1 + 1e-5  # float32's product of an opacity and the smallest factor, a few roundings off
-
-
-class Scene(NamedTuple):
-    """N Gaussians of each of B objects and its C cameras; float32, contiguous.
-
-    Attributes:
-        means: ``[B, N, 3]``.
-        viewmats: ``[B, C, 4, 4]``.
-        Ks: ``[B, C, 3, 3]``.
-        opacities: ``[B, N]``.
-        colors: ``[B, N, D]`` or ``[B, C, N, D]``, only to cull what is not finite.
-        quats: ``[B, N, 4]``, or None with ``covars``.
-        scales: ``[B, N, 3]``, or None with ``covars``.
-        covars: ``[B, N, 3, 3]``, or None.
-    """
-
-    means: Tensor
-    viewmats: Tensor
-    Ks: Tensor
-    opacities: Tensor
-    colors: Tensor
-    quats: Any = None
-    scales: Any = None
-    covars: Tensor | None = None
 
 
 class Splats(NamedTuple):
@@ -75,7 +51,8 @@ def check_scene(tensors: dict[str, Any], covariance: tuple[int, ...]) -> tuple[i
     """Checks what a projection is given; returns the batch dimensions.
 
     Args:
-        tensors: by name ``means``, ``viewmats``, ``Ks`` and others of a ``Scene`` but ``colors``.
+        tensors: by name ``means``, ``viewmats``, ``Ks``, and ``opacities``, ``quats`` and
+            ``scales``, or ``covars``.
         covariance: the last dimensions of ``covars``.
 
     Raises:
@@ -130,8 +107,7 @@ def spherical_harmonics(
     check_tensor("dirs", dirs, ("..", 3))
     lead = dirs.shape[:-1]
     check_tensor("coeffs", coeffs, (*lead, f"K >= {(degrees_to_use + 1) ** 2}", "D"))
-    if masks is not None:
-        check_tensor("masks", masks, (*lead,))
+    check_tensor("masks", masks, (*lead,), optional=True)
     rows = coeffs.reshape(1, -1, *coeffs.shape[-2:])
     values = sums_seen_from(degrees_to_use, rows, dirs.reshape(1, -1, 3), dirs.new_zeros(1, 1, 3))
     values = values.reshape(*lead, coeffs.shape[-1])
@@ -193,19 +169,27 @@ def proj(
     return focal * slopes + center, jacobian @ covars @ jacobian.mT
 
 
-def project_views(scene: Scene, lens: LensOptions) -> Splats:
-    """Projects each object into each of its views.
+def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -> Splats:
+    """Projects each object into each of its views; all float32, contiguous.
 
     The rasterizer's projection does the work, but its factor of antialiasing ends at 0.005 where
     gsplat's goes down to 0. The few Gaussians there are done again by their covariances, in
     float64, and culled by their own factor.
+
+    Args:
+        scene: by name ``means [B, N, 3]``, ``opacities [B, N]``, ``viewmats [B, C, 4, 4]``,
+            ``Ks [B, C, 3, 3]``, and ``quats [B, N, 4]`` and ``scales [B, N, 3]``, or
+            ``covars [B, N, 3, 3]``.
+        colors: ``[B, N, D]`` or ``[B, C, N, D]``, only to cull what is not finite.
+        lens: options.
     """
-    means, viewmats, Ks, opacities, colors, quats, scales, covars = scene
-    if covars is not None:
+    means, opacities, viewmats, Ks = (scene[k] for k in ("means", "opacities", "viewmats", "Ks"))
+    if "covars" in scene:
         finite = colors.isfinite().all(-1).view(len(colors), -1, means.shape[1])
         finite = finite & opacities.isfinite()[:, None]
         shown = torch.where(finite, opacities[:, None], 0.0)
-        return _project_covariances(means, covars, shown, viewmats, Ks, lens)
+        return _project_covariances(means, scene["covars"], shown, viewmats, Ks, lens)
+    quats, scales = scene["quats"], scene["scales"]
     given = means, quats, scales, opacities, colors.detach(), viewmats, Ks
     splats = Splats(*project(*given, lens.numbers())[:5])
     splats = splats._replace(extents=splats.extents.detach())
@@ -261,13 +245,13 @@ def _project_covariances(
         inside = (centers + reach >= 0) & (centers - reach <= plane.new_tensor(lens[:2]))
         seen = seen & inside.all(-1) & (reach > lens.radius_clip).any(-1)
     conics = torch.stack([yy / det, -xy / yy, 1 / yy], -1)
-    culled = ~seen
+    box, blank = seen[..., None], conics.new_tensor([1.0, 0.0, 1.0])
     kept = (
-        centers.masked_fill(culled[..., None], 0.0),
-        torch.where(seen[..., None], conics, conics.new_tensor([1.0, 0.0, 1.0])),
-        turned[..., 2].masked_fill(culled, 0.0),
-        shown.masked_fill(culled, 0.0),
-        extents.masked_fill(culled[..., None], 0.0),
+        torch.where(box, centers, 0.0),
+        torch.where(box, conics, blank),
+        torch.where(seen, turned[..., 2], 0.0),
+        torch.where(seen, shown, 0.0),
+        torch.where(box, extents, 0.0),
     )
     return Splats(*(x.float().contiguous() for x in kept))
 
@@ -334,12 +318,12 @@ def fully_fused_projection(
     opacity = flat(means.detach()[..., 0] if opacities is None else opacities.detach(), lead)
 
     def projected(opacity: Tensor, antialiased: bool) -> Splats:
-        scene = Scene(**given, opacities=opacity, colors=opacity[..., None])
+        scene = {**given, "opacities": opacity}
         lens = LensOptions(
             width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN, antialiased,
             skip_unused=True, rounded=True,
         )  # fmt: skip
-        return project_views(scene, lens)
+        return project_views(scene, opacity[..., None], lens)
 
     compensations = None
     if opacities is not None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ..checks import check_tensor
+from ..shared import check_tensor
 
 
 def quat_scale_to_covar_preci(

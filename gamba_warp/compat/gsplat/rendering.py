@@ -16,9 +16,9 @@ from gamba_warp.kernels.rasterize.ops import bin_op
 from gamba_warp.kernels.rasterize.project import LensOptions
 from gamba_warp.kernels.rasterize.tiles import Bins, Tiling
 
-from ..checks import check_tensor, one_device, one_of, positive, side
-from .pixels import SKIP, Layers, blend, pair_ids
-from .projection import MAX_SH_DEGREE, Scene, check_scene, flat, plain_conics, project_views
+from ..shared import check_tensor, one_device, one_of, positive, side
+from .pixels import SKIP, blend, pair_ids
+from .projection import MAX_SH_DEGREE, check_scene, flat, plain_conics, project_views
 
 # Arguments that ask for what is not here: each must have its default. ``tile_size``,
 # ``channel_chunk`` and ``segmented`` have no effect, and ``rolling_shutter`` may be gsplat's own
@@ -143,8 +143,8 @@ def rasterization(
         least = () if sh_degree is None else (f"K >= {(sh_degree + 1) ** 2}",)
         shapes = ((*lead, *rows, *least, "D >= 1") for rows in ((num,), (views, num)))
         check_tensor("colors", colors, *shapes)
-    if colored and backgrounds is not None:
-        check_tensor("backgrounds", backgrounds, (*lead, views, colors.shape[-1]))
+    if colored:
+        check_tensor("backgrounds", backgrounds, (*lead, views, colors.shape[-1]), optional=True)
     one_device({"means": means, "colors": colors, "backgrounds": backgrounds})
 
     given = {name: flat(x, lead) for name, x in tensors.items()}
@@ -160,7 +160,7 @@ def rasterization(
         width, height, near_plane, far_plane, radius_clip, eps2d, ALPHA_MIN,
         rasterize_mode == "antialiased", skip_unused=True, rounded=True,
     )  # fmt: skip
-    splats = project_views(Scene(**given, colors=blended), lens)
+    splats = project_views(given, blended, lens)
     radii = splats.extents.ceil().int()
     seen = (radii > 0).all(-1)
     at = seen.nonzero(as_tuple=True) if packed else None
@@ -191,7 +191,7 @@ def rasterization(
     # of exact length, because meta shows them
     numbers = width, height, ALPHA_MIN, SKIP, tuning.numbers(), True
     bins = Bins(*bin_op(*(x.detach() for x in per_view), *numbers))
-    layers = Layers(per_view[0], per_view[1], per_view[3], blended.flatten(0, -2).contiguous())
+    layers = *per_view[:2], per_view[3], blended.flatten(0, -2).contiguous()
 
     def keep(values: Tensor) -> None:
         meta["means2d"].absgrad = shown(values.view(splats.means2d.shape))

@@ -12,7 +12,7 @@ from ....kernels.causal_conv1d import causal_conv1d
 from ....kernels.selective_scan import selective_scan
 from ....kernels.selective_scan.cpu.step import scan_step
 from ...causal_conv1d import causal_conv1d_update
-from ...checks import DTYPES, check_tensor, one_of
+from ...shared import DTYPES, check_tensor, one_of
 from ..ops.triton.selective_state_update import selective_state_update
 from ..utils.generation import InferenceParams
 
@@ -139,20 +139,14 @@ class Mamba(nn.Module):
     def _run(self, tokens: Tensor, states: tuple[Tensor, Tensor] | None = None):
         """The output, and both states after the last token, in the layout of the cache."""
         x, z = self.in_proj(tokens).chunk(2, dim=-1)
-        if states is None:
-            seen, scan_state = x.new_zeros(x.shape[0], self.d_conv, self.d_inner), None
-            conv_state = None
-        else:  # copies: the cache is overwritten, and a gradient may need what it was
+        conv_state = scan_state = None
+        seen = x.new_zeros(x.shape[0], self.d_conv, self.d_inner)
+        if states is not None:  # copies: the cache is overwritten, and a gradient may need it
             seen, scan_state = states[0].transpose(1, 2).to(x.dtype), states[1].float().clone()
             conv_state = seen[:, 1:].clone()
         recent = torch.cat([seen, x[:, -self.d_conv :]], 1)[:, -self.d_conv :]
-        x = causal_conv1d(
-            x,
-            self.conv1d.weight[:, 0],
-            self.conv1d.bias,
-            activation=self.activation,
-            initial_state=conv_state,
-        )
+        taps, bias = self.conv1d.weight[:, 0], self.conv1d.bias
+        x = causal_conv1d(x, taps, bias, activation=self.activation, initial_state=conv_state)
         low_rank, B, C = self.x_proj(x).split([self.dt_rank, self.d_state, self.d_state], dim=-1)
         y, scan_state = selective_scan(
             x,
@@ -218,28 +212,24 @@ class Mamba(nn.Module):
         Returns:
             ``[B, d_inner, d_conv]`` and ``[B, d_inner, d_state]``, zeros.
         """
-        device = self.out_proj.weight.device
-        conv_dtype, scan_dtype = dtype or self.conv1d.weight.dtype, dtype or torch.float32
-        conv = torch.zeros(batch_size, self.d_inner, self.d_conv, device=device, dtype=conv_dtype)
-        scan = torch.zeros(batch_size, self.d_inner, self.d_state, device=device, dtype=scan_dtype)
+        zeros = self.conv1d.weight.new_zeros
+        conv = zeros(batch_size, self.d_inner, self.d_conv, dtype=dtype)
+        scan = zeros(batch_size, self.d_inner, self.d_state, dtype=dtype or torch.float32)
         return conv, scan
 
     def _get_states_from_cache(
-        self, inference_params: InferenceParams, batch_size: int, initialize_states: bool = False
+        self, inference_params: InferenceParams, batch_size: int
     ) -> tuple[Tensor, Tensor]:
-        """This layer's states in ``inference_params``, made if there are none, or set to zero."""
+        """This layer's states in ``inference_params``, made if there are none."""
         if self.layer_idx is None:
             raise ValueError("layer_idx is None, must be this layer's number to use a cache")
         cache = inference_params.key_value_memory_dict
         if self.layer_idx not in cache:
             cache[self.layer_idx] = self.allocate_inference_cache(batch_size, 0)
-        conv_state, ssm_state = cache[self.layer_idx]
-        if conv_state.shape[0] != batch_size:
+        states = cache[self.layer_idx]
+        if len(states[0]) != batch_size:
             raise ValueError(
                 f"hidden_states has a batch of {batch_size}, "
-                f"the cache of layer {self.layer_idx} one of {conv_state.shape[0]}"
+                f"the cache of layer {self.layer_idx} one of {len(states[0])}"
             )
-        if initialize_states:
-            conv_state.zero_()
-            ssm_state.zero_()
-        return conv_state, ssm_state
+        return states

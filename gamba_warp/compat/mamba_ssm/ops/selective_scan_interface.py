@@ -11,7 +11,7 @@ from ....kernels.causal_conv1d import causal_conv1d_fn
 from ....kernels.selective_scan import selective_scan_fn
 from ....kernels.selective_scan.dropin import input_matrix
 from ....kernels.selective_scan.reference import selective_scan_reference
-from ...checks import check_tensor, one_of
+from ...shared import check_tensor, one_of
 
 __all__ = ["mamba_inner_fn", "mamba_inner_ref", "selective_scan_fn", "selective_scan_ref"]
 
@@ -48,7 +48,8 @@ def selective_scan_ref(
     Raises:
         TypeError: A, B or C is complex.
     """
-    _check_real(A)
+    if A.is_complex():
+        raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
     tokens = [None if x is None else x.mT.float() for x in (u, delta, z)]
     B, C = (input_matrix(x, u, name).float() for x, name in ((B, "B"), (C, "C")))
     D, delta_bias = (None if x is None else x.float() for x in (D, delta_bias))
@@ -57,11 +58,6 @@ def selective_scan_ref(
     )
     out = out.mT.to(u.dtype)
     return (out, last) if return_last_state else out
-
-
-def _check_real(A: Tensor) -> None:
-    if A.is_complex():
-        raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
 
 
 def mamba_inner_fn(
@@ -118,7 +114,6 @@ def mamba_inner_fn(
         ValueError: as ``selective_scan_fn``; also for rows of x_proj_weight that fit no B and C,
             and for a bias or norm of a B or C that is given.
     """
-    _check_real(A)
     one_of("checkpoint_lvl", checkpoint_lvl, 0, 1)
     rank, states = delta_proj_weight.shape[1], A.shape[1]
     check_tensor("conv1d_weight", conv1d_weight, ("D", 1, "W"))

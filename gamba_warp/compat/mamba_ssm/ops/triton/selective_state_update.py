@@ -7,8 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .....kernels.selective_scan.cpu.step import scan_step
-from ....causal_conv1d.causal_conv1d_interface import of_rows
-from ....checks import DTYPES, INDEX_DTYPES, check_tensor
+from ....shared import DTYPES, INDEX_DTYPES, check_tensor, of_rows
 
 
 def selective_state_update(
@@ -63,17 +62,14 @@ def selective_state_update(
     token = (batch, *parameter)
     groups = [g for g in range(1, heads[0] + 1) if heads[0] % g == 0] if heads else [1]
     matrix = ((batch, states), *((batch, g, states) for g in groups))
-    needed = {"dt": dt, "A": A, "B": B, "C": C}
-    allowed = {
-        "dt": [token], "A": [(*parameter, states)], "B": matrix, "C": matrix, "D": [parameter],
-        "z": [token], "dt_bias": [parameter],
+    needed = {
+        "dt": (dt, token), "A": (A, (*parameter, states)), "B": (B, *matrix), "C": (C, *matrix)
     }  # fmt: skip
-    for name, value in {**needed, "D": D, "z": z, "dt_bias": dt_bias}.items():
-        if value is not None or name in needed:
-            check_tensor(name, value, *allowed[name], dtypes=DTYPES)
+    optional = {"D": (D, parameter), "z": (z, token), "dt_bias": (dt_bias, parameter)}
+    for name, (value, *shapes) in (needed | optional).items():
+        check_tensor(name, value, *shapes, dtypes=DTYPES, optional=name in optional)
     indices = state_batch_indices
-    if indices is not None:
-        check_tensor("state_batch_indices", indices, (batch,), dtypes=INDEX_DTYPES)
+    check_tensor("state_batch_indices", indices, (batch,), dtypes=INDEX_DTYPES, optional=True)
 
     def update(state: Tensor) -> Tensor:
         return selective_state_update_ref(state, x, dt, A, B, C, D, z, dt_bias, dt_softplus)

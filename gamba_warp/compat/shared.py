@@ -1,7 +1,8 @@
-"""What the interfaces refuse, each in one line that names the argument."""
+"""What the interfaces share: checks, which name the argument in one line, and rows of states."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,7 +16,11 @@ Shape = tuple["int | str", ...]
 
 
 def check_tensor(
-    name: str, value: Any, *shapes: Shape, dtypes: tuple[torch.dtype, ...] = ()
+    name: str,
+    value: Any,
+    *shapes: Shape,
+    dtypes: tuple[torch.dtype, ...] = (),
+    optional: bool = False,
 ) -> None:
     """Refuses what is no tensor, or one of another shape or dtype.
 
@@ -25,11 +30,14 @@ def check_tensor(
         shapes: those that it may have, all if there are none. A word is any number, "S >= 3" one
             from 3 on, and ".." in the first place any number of dimensions.
         dtypes: those that it may have, all if there are none.
+        optional: whether it may be None.
 
     Raises:
         TypeError: it is no tensor, or has another dtype.
         ValueError: it has another shape.
     """
+    if optional and value is None:
+        return
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} is {type(value).__name__}, allowed is a tensor")
     if dtypes and value.dtype not in dtypes:
@@ -94,3 +102,20 @@ def one_device(tensors: dict[str, Any]) -> None:
     if len(devices) > 1 or not {device.type for device in devices} <= {"cpu", "cuda"}:
         names = ", ".join(sorted(map(str, devices)))
         raise ValueError(f"{', '.join(tensors)} are on {names}: allowed is one, cpu or cuda")
+
+
+@torch.no_grad()
+def of_rows(update: Callable[[Tensor], Tensor], state: Tensor, indices: Tensor | None) -> Tensor:
+    """Updates those rows of a state that indices choose; returns what ``update`` returns for them.
+
+    Args:
+        update: takes ``[B, ..]`` rows, updates them in place and returns the output ``[B, ..]``.
+        state: ``[rows, ..]``, updated in place.
+        indices: ``[B]``; below 0 the output is 0 and no row is touched. Or None: all rows.
+    """
+    if indices is None:
+        return update(state)
+    rows, kept = state.index_select(0, indices.clamp(min=0)), indices >= 0
+    out = update(rows)
+    state.index_copy_(0, indices[kept].long(), rows[kept])
+    return out.masked_fill(~kept.view(-1, *[1] * (out.dim() - 1)), 0)
