@@ -6,7 +6,6 @@ import torch.nn.functional as F
 from helpers import assert_rel_rms
 
 from gamba_warp.compat.causal_conv1d import (
-    causal_conv1d_fn,
     causal_conv1d_ref,
     causal_conv1d_update,
     causal_conv1d_update_ref,
@@ -108,12 +107,6 @@ def test_rows_by_indices_and_padding(ring):
     out = causal_conv1d_update(x, state, weight, bias, "silu", at, indices)
     assert torch.equal(out[[0, 2]], want) and (out[1] == 0).all()
     assert torch.equal(state, expected)
-
-
-def test_the_whole_is_that_of_the_kernel():
-    x, weight, bias = torch.randn(2, 5, 12), torch.randn(5, 3), torch.randn(5)
-    out = causal_conv1d_fn(x, weight, bias, activation="silu")
-    assert_rel_rms(out, whole(x, weight, bias, "silu"), 5e-7, "out")
 
 
 @pytest.mark.parametrize(

@@ -9,23 +9,29 @@ from helpers import assert_rel_rms
 from helpers.raster import leaves, make, nerfacc, visible_pairs
 
 from gamba_warp.compat import gsplat as compat
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, COMPENSATION_MIN
 
 if importlib.util.find_spec("gsplat") is None:
     pytest.skip("needs the package gsplat (pip install gsplat==1.5.3)", allow_module_level=True)
 from gsplat.cuda import _torch_impl as gsplat
 
-EXACT = 1e-5  # float32 against float64: a few hundred roundings
+pytestmark = pytest.mark.usefixtures("one_thread")
+# float32 against float64: a few hundred roundings. The kernel's factor of antialiasing multiplies
+# rows of up to 30 pixels that may be nearly parallel, 30 / sqrt(eps2d) roundings.
+EXACT = 1e-5
 GRADIENT = 1e-4  # as above, with factors up to 1 / (1 - alpha)
 WIDTH, HEIGHT = 39, 27
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small operations: on a busy machine threads would only wait."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+GEOMETRY = ("means", "quats", "scales", "viewmats")
+NUM = 63
+KINDS = {
+    "tiny": (1e-4, 2e-4, 5e-5),
+    "speck": (1e-12, 1e-12, 1e-12),
+    "needle": (0.2, 1e-5, 1e-5),
+    "thread": (0.2, 1e-9, 1e-9),
+    "flat": (0.1, 0.1, 1e-6),
+    "line": (0.1, 0.0, 0.0),
+    "point": (0.0, 0.0, 0.0),
+}
 
 
 def scene_of(num=61, **changes):
@@ -33,6 +39,43 @@ def scene_of(num=61, **changes):
     scene["opacities"] = 0.02 + 0.5 * torch.rand(1, num)  # gsplat's accumulate never stops
     del scene["backgrounds"]
     return scene
+
+
+def tiny_of(kind):
+    """A scene of Gaussians whose factor of antialiasing goes down to 0."""
+    scene = make(1, 2, NUM, width=WIDTH, height=HEIGHT, size=0.05)
+    spread = torch.logspace(-1, 1, NUM)[:, None]  # from a tenth of the sizes to ten times
+    scene["scales"] = (torch.tensor(KINDS[kind]) * spread)[None]
+    if kind == "flat":  # nearly or exactly from the edge
+        scene["viewmats"][..., :3, :3] = torch.eye(3)
+        scene["viewmats"][..., :3, 3] = torch.tensor([0.0, 0.0, 1.6])
+        scene["means"][..., 0] *= 0.1 * (torch.arange(NUM) % 3)
+        scene["quats"] = torch.tensor([0.5**0.5, 0.0, 0.5**0.5, 0.0]).expand(1, NUM, 4).clone()
+    return scene
+
+
+def twice(made):
+    """Leaves in float32 for ours, and in float64 for theirs."""
+    return (leaves({"Ks": torch.zeros(1), **made}, t) for t in (torch.float32, torch.float64))
+
+
+def project(scene, by="quats", **options):
+    """Our projection of a scene, from quats and scales or from their covariances."""
+    shape = None, scene["quats"], scene["scales"]
+    if by == "covars":
+        wide = scene["quats"].double(), scene["scales"].double()
+        shape = compat.quat_scale_to_covar_preci(*wide, triu=True)[0].float(), None, None
+    cameras = scene["viewmats"], scene["Ks"], WIDTH, HEIGHT
+    return compat.fully_fused_projection(scene["means"], *shape, *cameras, **options)
+
+
+def project_there(scene, covars=None, **options):
+    """gsplat's projection of a scene in float64."""
+    if covars is None:
+        shape = scene["quats"], scene["scales"]
+        covars = gsplat._quat_scale_to_covar_preci(*shape, True, False)[0]
+    cameras = scene["viewmats"], scene["Ks"], WIDTH, HEIGHT
+    return gsplat._fully_fused_projection(scene["means"], covars, *cameras, **options)
 
 
 def compare(ours, theirs, got, want, names, limit=GRADIENT):
@@ -48,8 +91,7 @@ def compare(ours, theirs, got, want, names, limit=GRADIENT):
 @pytest.mark.parametrize("triu", [False, True])
 def test_covariances_and_precisions(triu):
     made = dict(quats=torch.randn(3, 7, 4), scales=torch.rand(3, 7, 3) + 0.1)
-    got, want = leaves({**made, "Ks": torch.zeros(1)}, torch.float32), None
-    want = leaves({**made, "Ks": torch.zeros(1)}, torch.float64)
+    got, want = twice(made)
     ours = compat.quat_scale_to_covar_preci(got["quats"], got["scales"], triu=triu)
     theirs = gsplat._quat_scale_to_covar_preci(want["quats"], want["scales"], triu=triu)
     for a, b in zip(ours, theirs):
@@ -63,8 +105,7 @@ def test_covariances_and_precisions(triu):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_harmonics(degree):
     made = dict(dirs=torch.randn(5, 7, 3), coeffs=torch.randn(5, 7, 25, 3))
-    got = leaves({**made, "Ks": torch.zeros(1)}, torch.float32)
-    want = leaves({**made, "Ks": torch.zeros(1)}, torch.float64)
+    got, want = twice(made)
     ours = compat.spherical_harmonics(degree, got["dirs"], got["coeffs"])
     theirs = gsplat._spherical_harmonics(degree, want["dirs"], want["coeffs"])
     assert (ours - theirs).abs().max() < EXACT * 10  # up to 25 terms of size 3
@@ -79,18 +120,9 @@ def test_harmonics(degree):
 def test_projection(by, compensated):
     scene = scene_of()
     scene["means"][..., :9, :] *= 9  # beside the picture and behind the camera
-    got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
-    covars = compat.quat_scale_to_covar_preci(got["quats"], got["scales"], triu=True)[0]
-    shape = (covars, None, None) if by == "covars" else (None, got["quats"], got["scales"])
-    views = got["viewmats"], got["Ks"], WIDTH, HEIGHT
-    found = compat.fully_fused_projection(
-        got["means"], *shape, *views, calc_compensations=compensated
-    )
-    covars = gsplat._quat_scale_to_covar_preci(want["quats"], want["scales"], True, False)[0]
-    views = want["viewmats"], want["Ks"], WIDTH, HEIGHT
-    expected = gsplat._fully_fused_projection(
-        want["means"], covars, *views, calc_compensations=compensated
-    )
+    got, want = twice(scene)
+    found = project(got, by, calc_compensations=compensated)
+    expected = project_there(want, calc_compensations=compensated)
     seen, theirs = ((x[0] > 0).all(-1) for x in (found, expected))
     assert 0.5 < seen.float().mean() < 1
     assert not (seen & ~theirs).any()
@@ -100,17 +132,14 @@ def test_projection(by, compensated):
     assert len(ours) == 3 + compensated
     for name, a, b in zip(("means2d", "depths", "conics", "compensations"), ours, theirs):
         assert (a - b).abs().max() <= EXACT * b.abs().max(), name
-    compare(ours, theirs, got, want, ("means", "quats", "scales", "viewmats"))
+    compare(ours, theirs, got, want, GEOMETRY)
 
 
 def test_packed_projection():
     scene = scene_of()
     scene["means"][..., :9, :] *= 9
-    given = [scene[k] for k in ("means", "quats", "scales", "viewmats", "Ks")]
-    given[1:1] = [None]
     options = dict(radius_clip=4.0, opacities=scene["opacities"])
-    dense = compat.fully_fused_projection(*given, WIDTH, HEIGHT, **options)
-    packed = compat.fully_fused_projection(*given, WIDTH, HEIGHT, packed=True, **options)
+    dense, packed = (project(scene, packed=packed, **options) for packed in (False, True))
     at, rest = packed[:3], packed[3:]
     seen = (dense[0] > 0).all(-1)
     assert 20 < seen.sum() < 110 and (dense[0][seen] > 4).any(-1).all()
@@ -154,9 +183,7 @@ def lists_of(projected, tile):
 def blended(monkeypatch, scene, channels):
     """Float64 leaves of the picture's parts and what gsplat's accumulate makes of them."""
     monkeypatch.setitem(sys.modules, "nerfacc", nerfacc())
-    given = [scene[k] for k in ("means", "quats", "scales", "viewmats", "Ks")]
-    given[1:1] = [None]
-    projected = compat.fully_fused_projection(*given, WIDTH, HEIGHT)
+    projected = project(scene)
     num = scene["means"].shape[-2]
     parts = dict(
         means2d=projected[1],
@@ -165,7 +192,7 @@ def blended(monkeypatch, scene, channels):
         colors=torch.randn(1, 2, num, channels),
         backgrounds=torch.rand(1, 2, channels),
     )
-    got, want = (leaves({**parts, "Ks": torch.zeros(1)}, t) for t in (torch.float32, torch.float64))
+    got, want = twice(parts)
     with torch.no_grad():
         wide = tuple(x.double() for x in projected[:4])
         pairs = visible_pairs((*wide, None), want["opacities"], WIDTH, HEIGHT)
@@ -202,8 +229,7 @@ def test_pixels(monkeypatch, tile, channels, packed):
 @pytest.mark.parametrize("tile", [16, 5])
 def test_masked_tiles(tile):
     scene = scene_of()
-    given = [scene[k] for k in ("means", "quats", "scales", "viewmats", "Ks")]
-    projected = compat.fully_fused_projection(given[0], None, *given[1:], WIDTH, HEIGHT)
+    projected = project(scene)
     offsets, rows = lists_of(projected, tile)
     masks = torch.rand(offsets.shape) < 0.5
     colors, opacities = torch.rand(1, 2, 61, 3), scene["opacities"][:, None].repeat(1, 2, 1)
@@ -263,3 +289,87 @@ def test_refusals():
     lists = torch.zeros(1, 1, 1, dtype=torch.int32), torch.tensor([3], dtype=torch.int32)
     with pytest.raises(ValueError, match="flatten_ids has 3 to 3 of 3 rows"):
         compat.rasterize_to_pixels(*parts, 4, 4, 16, *lists)
+
+
+def faint(kind, by="quats"):
+    """Leaves of ours and theirs, what the projections return, and which Gaussians are seen."""
+    got, want = twice(tiny_of(kind))
+    covars = None
+    if by == "covars":  # the same rounded covariances
+        wide = want["quats"], want["scales"]
+        covars = compat.quat_scale_to_covar_preci(*wide, True, False)[0].float().double()
+    found = project(got, by, calc_compensations=True)
+    expected = project_there(want, covars, calc_compensations=True)
+    seen = (found[0] > 0).all(-1)
+    assert seen.float().mean() > 0.5 and not (seen & ~(expected[0] > 0).all(-1)).any()
+    return got, want, found, expected, seen
+
+
+@pytest.mark.parametrize("by", ["quats", "covars"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_factor_is_that_of_gsplat(kind, by):
+    got, _, found, expected, seen = faint(kind, by)
+    ours, theirs = found[4][seen], expected[4].detach()[seen]
+    # theirs is the root of a difference, of which float64 leaves sqrt(1e-16) times the pixels
+    limit = EXACT if by == "quats" else 1e-6
+    assert (ours - theirs).abs().max() <= limit
+    assert (theirs < COMPENSATION_MIN).sum() > 10 and (ours >= 0).all()
+    ours.sum().backward()
+    for name in GEOMETRY:
+        assert got[name].grad.isfinite().all(), name
+
+
+@pytest.mark.parametrize("kind", ["tiny", "needle", "flat"])
+def test_gradients_of_small_factors_are_those_of_gsplat(kind):
+    got, want, found, expected, seen = faint(kind)
+    small = seen & (found[4] < COMPENSATION_MIN) & (found[4] > 1e-6)
+    assert small.sum() > 10
+    v = torch.randn(int(small.sum()))
+    found[4][small].backward(v)
+    expected[4][small].backward(v.double())
+    for name in GEOMETRY:
+        assert want[name].grad.abs().max() > 0, name
+        assert_rel_rms(got[name].grad, want[name].grad, GRADIENT, name)
+
+
+@pytest.mark.parametrize("by", ["quats", "covars"])
+def test_pictures_cull_by_the_true_factor(by):
+    """Of opaque needles, those whose factor is below 1 / 255 are not drawn."""
+    scene = tiny_of("needle")
+    scene["opacities"][:] = 0.99
+    got = leaves(scene, torch.float32)
+    shape = dict(quats=got["quats"], scales=got["scales"])
+    if by == "covars":
+        covars = compat.quat_scale_to_covar_preci(got["quats"], got["scales"])[0]
+        shape = dict(quats=None, scales=None, covars=covars)
+    picture, alphas, meta = compat.rasterization(
+        means=got["means"], opacities=got["opacities"], colors=got["colors"], width=WIDTH,
+        viewmats=got["viewmats"], Ks=got["Ks"], height=HEIGHT, packed=False,
+        rasterize_mode="antialiased", **shape,
+    )  # fmt: skip
+    wide = {k: scene[k].double() for k in (*GEOMETRY, "Ks")}
+    # the same rounded covariances
+    covars = covars.detach().double() if by == "covars" else None
+    radii, _, _, _, factor = project_there(wide, covars, calc_compensations=True)
+    shown = 0.99 * factor
+    drawn = (meta["radii"] > 0).all(-1)
+    inside = (radii > 0).all(-1)
+    lost = shown < ALPHA_MIN * (1 - 1e-4)
+    band = inside & ~lost & (factor < COMPENSATION_MIN)
+    assert not drawn[lost].any() and (inside & lost).sum() > 10
+    assert (drawn & band).sum() >= 3, "some lie between the two ends"
+    assert ((meta["opacities"] - shown).abs()[drawn] < 1e-5).all()
+    cut = (2 * (shown / ALPHA_MIN).log()).sqrt()  # of the box around alpha >= 1 / 255, rounded up
+    limit = torch.minimum(radii, (radii / 3.33 * cut[..., None]).ceil() + 1)
+    assert (meta["radii"] <= limit)[drawn & (factor < 0.02)].all()
+    torch.autograd.backward([picture, alphas], [torch.randn_like(x) for x in (picture, alphas)])
+    for name in (*GEOMETRY, "opacities"):
+        assert got[name].grad.isfinite().all() and got[name].grad.abs().max() > 0, name
+
+
+def test_factor_of_what_is_transparent():
+    """An opacity of 0 is culled, and has the factor 0 and not 0 / 0."""
+    scene = tiny_of("needle")
+    opacities = torch.where(torch.arange(NUM) % 2 == 0, 0.0, 0.99)[None]
+    found = project(scene, calc_compensations=True, opacities=opacities)
+    assert (found[4][..., ::2] == 0).all() and (found[4] > ALPHA_MIN).any()

@@ -12,30 +12,19 @@ from gamba_warp.compat.gsplat import rasterization
 from gamba_warp.compat.gsplat.relocation import compute_relocation, torch_strategies
 
 ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.usefixtures("one_thread")
 NEEDS_GSPLAT = pytest.mark.skipif(
     importlib.util.find_spec("gsplat") is None,
     reason="needs the package gsplat (pip install gsplat==1.5.3)",
 )
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small operations: on a busy machine threads would only wait."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-def binomials(most=51):
-    return torch.tensor([[math.comb(n, k) for k in range(most)] for n in range(most)]).float()
-
-
 def test_relocation():
     """Equation 9 in whole numbers' arithmetic, and one Gaussian that stays as it is."""
     opacities = torch.tensor([0.3, 0.9, 0.99, 0.005, 0.6])
     scales, ratios = torch.rand(5, 3) + 0.1, torch.tensor([1, 2, 51, 7, 99])
-    new, sizes = compute_relocation(opacities, scales, ratios, binomials())
+    binoms = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)]).float()
+    new, sizes = compute_relocation(opacities, scales, ratios, binoms)
     assert ratios.tolist() == [1, 2, 51, 7, 51]
     assert new[0] == pytest.approx(0.3) and torch.allclose(sizes[0], scales[0])
     for i, n in enumerate(ratios.tolist()):
@@ -51,17 +40,6 @@ def test_relocation():
         assert torch.allclose(sizes[i], scales[i] * old / total, rtol=1e-6)
 
 
-def params_of(count):
-    values = dict(
-        means=torch.rand(count, 3) * 2 - 1,
-        scales=torch.full((count, 3), -2.5),
-        quats=torch.randn(count, 4),
-        opacities=torch.randn(count),
-        colors=torch.randn(count, 3),
-    )
-    return {name: torch.nn.Parameter(value) for name, value in values.items()}
-
-
 def fitted(strategy, state, rendering, steps=31, size=(29, 23), **more):
     """Fits a smooth picture; returns the numbers of Gaussians and the losses, step by step."""
     torch.manual_seed(2)
@@ -71,25 +49,21 @@ def fitted(strategy, state, rendering, steps=31, size=(29, 23), **more):
     viewmat = torch.eye(4)
     viewmat[2, 3] = 3.0
     K = torch.tensor([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
-    params = params_of(250)
+    values = dict(
+        means=torch.rand(250, 3) * 2 - 1, scales=torch.full((250, 3), -2.5),
+        quats=torch.randn(250, 4), opacities=torch.randn(250), colors=torch.randn(250, 3),
+    )  # fmt: skip
+    params = {name: torch.nn.Parameter(value) for name, value in values.items()}
     with torch.no_grad():
         params["opacities"][:20] = -8  # dead ones
     optimizers = {k: torch.optim.Adam([v], lr=0.02) for k, v in params.items()}
     strategy.check_sanity(params, optimizers)
     counts, losses = [], []
     for step in range(steps):
-        renders, _, info = rasterization(
-            params["means"],
-            params["quats"],
-            params["scales"].exp(),
-            params["opacities"].sigmoid(),
-            params["colors"].sigmoid(),
-            viewmat[None],
-            K[None],
-            width,
-            height,
-            **rendering,
-        )
+        shown = [params[name].sigmoid() for name in ("opacities", "colors")]
+        gaussians = params["means"], params["quats"], params["scales"].exp(), *shown
+        picture = viewmat[None], K[None], width, height
+        renders, _, info = rasterization(*gaussians, *picture, **rendering)
         strategy.step_pre_backward(params, optimizers, state, step, info)
         loss = (renders[0] - target).square().mean()
         loss.backward()

@@ -1,14 +1,31 @@
-"""The Mamba layer under mamba-ssm's name: its weights, and tokens at once or one by one."""
+"""mamba-ssm's names: the scan, the block and the layer, each against float64; its example."""
 
 import importlib
+from itertools import product
 
 import pytest
 import torch
 import torch.nn.functional as F
+from examples import char_mamba
 from helpers import assert_rel_rms
 
 from gamba_warp.compat import mamba_ssm
-from gamba_warp.compat.mamba_ssm import InferenceParams, Mamba
+from gamba_warp.compat.mamba_ssm import (
+    InferenceParams,
+    Mamba,
+    mamba_inner_fn,
+    mamba_inner_ref,
+    selective_scan_fn,
+    selective_scan_ref,
+)
+
+BATCH, CHANNELS, STATES, LENGTH, RANK, WIDTH = 2, 10, 3, 21, 4, 7
+# How B and C vary: with the token or not, and in how many groups.
+CONSTANT, VARYING = (CHANNELS, STATES), (BATCH, STATES, LENGTH)
+MATRICES = [*product([CONSTANT, VARYING], repeat=2), 2 * ((BATCH, 2, STATES, LENGTH),)]
+# Half an ulp of the output is 2^-12 of float16 and 2^-9 of bfloat16; the interior is float32.
+SCAN_LIMITS = {torch.float32: 2e-6, torch.float16: 5e-4, torch.bfloat16: 4e-3}
+
 
 # Relative to the output's largest value. Float32: rounding of sums in another order. The halves:
 # a few roundings of 2^-9 and 2^-12 at other places than in the forward pass.
@@ -17,6 +34,172 @@ SHAPES = [
     {},
     {"d_state": 5, "d_conv": 3, "expand": 3, "bias": True, "conv_bias": False, "dt_rank": 2},
 ]
+
+
+def inputs(B, C, dtype=torch.float32, without=()):
+    """All tensors by name, B and C of these shapes; one that does not vary is float32."""
+    shape = (BATCH, CHANNELS, LENGTH)
+    made = {
+        "u": torch.randn(shape).to(dtype),
+        "delta": (0.5 * torch.rand(shape)).to(dtype),
+        "A": -0.5 * torch.rand(CHANNELS, STATES),
+        "B": torch.randn(B).to(torch.float32 if B == CONSTANT else dtype),
+        "C": torch.randn(C).to(torch.float32 if C == CONSTANT else dtype),
+        "D": torch.randn(CHANNELS),
+        "z": torch.randn(shape).to(dtype),
+        "delta_bias": 0.5 * torch.rand(CHANNELS),
+    }
+    return {name: x for name, x in made.items() if name not in without}
+
+
+def scan_in_float64(u, delta, A, B, C, D=None, z=None, delta_bias=None, softplus=False):
+    """The scan written out, channel by channel, for any shapes of B and C."""
+
+    def at(matrix, t):  # [B or 1, D, N]
+        if matrix.dim() == 2:
+            return matrix[None]
+        if matrix.dim() == 3:
+            return matrix[:, None, :, t]
+        return matrix[..., t].repeat_interleave(u.shape[1] // matrix.shape[1], dim=1)
+
+    if delta_bias is not None:
+        delta = delta + delta_bias[:, None]
+    if softplus:
+        delta = torch.log1p(delta.exp())
+    h, rows = u.new_zeros(*u.shape[:2], A.shape[1]), []
+    for t in range(u.shape[2]):
+        step = delta[:, :, t, None]
+        h = (step * A).exp() * h + step * at(B, t) * u[:, :, t, None]
+        rows.append((h * at(C, t)).sum(-1))
+    y = torch.stack(rows, -1)
+    if D is not None:
+        y = y + D[:, None] * u
+    return (y if z is None else y * z * torch.sigmoid(z)), h
+
+
+def run(function, tensors, dtype=None, **options):
+    """Outputs, and gradients by name for one cotangent of the output."""
+    leaves = {k: x.detach().to(dtype or x.dtype).requires_grad_() for k, x in tensors.items()}
+    out = function(**leaves, **options)
+    out, last = out if isinstance(out, tuple) else (out, torch.zeros(()))
+    generator = torch.Generator().manual_seed(1)
+    out.backward(torch.randn(out.shape, generator=generator).to(out.dtype))
+    return {"out": out, "last": last} | {name: x.grad for name, x in leaves.items()}
+
+
+@pytest.mark.parametrize("dtype", SCAN_LIMITS, ids=str)
+@pytest.mark.parametrize("matrices", MATRICES, ids=str)
+def test_the_grid(matrices, dtype):
+    for *kept, softplus in product([False, True], repeat=4):
+        without = [k for k, keep in zip(("D", "z", "delta_bias"), kept) if not keep]
+        tensors, given = inputs(*matrices, dtype, without), f"no {without}, softplus {softplus}"
+        got = run(selective_scan_fn, tensors, delta_softplus=softplus, return_last_state=True)
+        alone = selective_scan_fn(**tensors, delta_softplus=softplus)
+        assert isinstance(alone, torch.Tensor) and torch.equal(alone, got["out"]), given
+        want = run(scan_in_float64, tensors, torch.float64, softplus=softplus)
+        assert got["out"].dtype == dtype and got["last"].dtype == torch.float32
+        for name, value in want.items():
+            # A cotangent in the output's dtype, and a sum of rounded products, in each gradient.
+            assert_rel_rms(got[name], value, 2 * SCAN_LIMITS[dtype], f"{name} ({given})")
+
+
+@pytest.mark.parametrize("matrices", MATRICES, ids=str)
+def test_the_reference_of_the_scan(matrices):
+    tensors = inputs(*matrices)
+    got = run(selective_scan_ref, tensors, delta_softplus=True, return_last_state=True)
+    for name, value in run(scan_in_float64, tensors, torch.float64, softplus=True).items():
+        assert_rel_rms(got[name], value, 2e-6, name)  # float32, sums of some hundred terms
+    assert isinstance(selective_scan_ref(**tensors), torch.Tensor)
+
+
+@pytest.mark.parametrize("scan", [selective_scan_fn, selective_scan_ref])
+@pytest.mark.parametrize("name", ["A", "B", "C"])
+def test_complex_states_are_refused(scan, name):
+    tensors = inputs(CONSTANT, CONSTANT)
+    tensors[name] = tensors[name].to(torch.complex64)
+    with pytest.raises(TypeError, match=f"^{name} has dtype torch.complex64; complex states are"):
+        scan(**tensors)
+
+
+def test_float64_is_refused():
+    tensors = inputs(VARYING, VARYING)
+    tensors["u"] = tensors["u"].double()
+    with pytest.raises(TypeError, match="^u has dtype torch.float64, allowed: torch.float32"):
+        selective_scan_fn(**tensors)
+
+
+def block(constant_B, constant_C, taps=4):
+    """The arguments by mamba-ssm's names, in its order."""
+    rows = RANK + STATES * ((not constant_B) + (not constant_C))
+    return {
+        "xz": torch.randn(BATCH, 2 * CHANNELS, LENGTH),
+        "conv1d_weight": torch.randn(CHANNELS, 1, taps),
+        "conv1d_bias": torch.randn(CHANNELS),
+        "x_proj_weight": torch.randn(rows, CHANNELS) / CHANNELS**0.5,
+        "delta_proj_weight": torch.randn(CHANNELS, RANK) / RANK**0.5,
+        "out_proj_weight": torch.randn(WIDTH, CHANNELS),
+        "out_proj_bias": torch.randn(WIDTH),
+        "A": -torch.rand(CHANNELS, STATES),
+        "B": torch.randn(CHANNELS, STATES) if constant_B else None,
+        "C": torch.randn(CHANNELS, STATES) if constant_C else None,
+        "D": torch.randn(CHANNELS),
+        "delta_bias": torch.randn(CHANNELS),
+        "B_proj_bias": None if constant_B else torch.randn(STATES),
+        "C_proj_bias": None if constant_C else torch.randn(STATES),
+    }
+
+
+def norm(x, weight, eps=1e-6):
+    """RMS norm, or x itself without a weight."""
+    return x if weight is None else x * weight / (x.square().mean(-1, keepdim=True) + eps).sqrt()
+
+
+def block_in_float64(**g):
+    """What mamba_inner_fn does, from its arguments by name."""
+    x, z = g["xz"].chunk(2, 1)
+    padded = F.pad(x, (g["conv1d_weight"].shape[2] - 1, 0))
+    x = F.silu(F.conv1d(padded, g["conv1d_weight"], g["conv1d_bias"], groups=x.shape[1]))
+    low, rank = x.mT @ g["x_proj_weight"].T, g["delta_proj_weight"].shape[1]
+    delta = norm(low[..., :rank] @ g["delta_proj_weight"].T, g.get("dt_rms_weight")).mT
+    states, matrices = g["A"].shape[1], []
+    for name, part in (("B", low[..., rank : rank + states]), ("C", low[..., -states:])):
+        part = norm(part + g.get(f"{name}_proj_bias", 0), g.get(f"{name.lower()}_rms_weight")).mT
+        matrices.append(g.get(name, part))
+    y, _ = scan_in_float64(x, delta, g["A"], *matrices, g["D"], z, g["delta_bias"], True)
+    return y.mT @ g["out_proj_weight"].T + g["out_proj_bias"]
+
+
+@pytest.mark.parametrize("taps", [3, 4])
+@pytest.mark.parametrize("constant_B", [False, True])
+@pytest.mark.parametrize("constant_C", [False, True])
+@pytest.mark.parametrize("norms", [False, True])
+def test_the_block_is_that_of_float64(constant_B, constant_C, norms, taps):
+    given = block(constant_B, constant_C, taps)
+    if not norms:
+        alike = (f(*given.values()) for f in (mamba_inner_ref, mamba_inner_fn))
+        assert torch.equal(*alike), "by their places too"
+    sizes = {"dt": CHANNELS, "b": 0 if constant_B else STATES, "c": 0 if constant_C else STATES}
+    given |= {f"{k}_rms_weight": torch.rand(n) for k, n in sizes.items() if norms and n}
+    tensors = {name: x for name, x in given.items() if x is not None}
+    got = run(mamba_inner_fn, tensors, checkpoint_lvl=0)
+    for name, value in run(block_in_float64, tensors, torch.float64).items():
+        # Float32 through four products: the largest gradients add some hundred terms.
+        assert_rel_rms(got[name], value, 2e-6 if name == "out" else 5e-6, name)
+
+
+@pytest.mark.parametrize(
+    "change, error, text",
+    [
+        ({"A": torch.ones(10, 3).cfloat()}, TypeError, "A has dtype torch.complex64"),
+        ({"checkpoint_lvl": 2}, ValueError, "checkpoint_lvl is 2, allowed"),
+        ({"x_proj_weight": torch.ones(9, 10)}, ValueError, "x_proj_weight has 9 rows, must"),
+        ({"conv1d_weight": torch.ones(10, 4)}, ValueError, "conv1d_weight has shape .10, 4., al"),
+        ({"B": torch.ones(10, 3)}, ValueError, "B_proj_bias is given; it has no use"),
+    ],
+)  # fmt: skip
+def test_the_block_refuses(change, error, text):
+    with pytest.raises(error, match=f"^{text}"):
+        mamba_inner_fn(**block(False, False) | change)
 
 
 def relative(got, want):
@@ -93,8 +276,11 @@ def test_gradients_are_those_of_plain_torch(cached):
         layer.A_log += 0.1 * torch.randn_like(layer.A_log)
     tokens = torch.randn(2, 9, 6, requires_grad=True)
     out = layer(tokens, InferenceParams(9, 2) if cached else None)
-    weights = {name: p.double() for name, p in layer.named_parameters()}
-    want = plain(weights, tokens.double(), layer.dt_rank)
+    w = {name.replace(".", "_"): p.double() for name, p in layer.named_parameters()}
+    given = {k: w.get(k) for k in ("conv1d_weight", "conv1d_bias", "x_proj_weight", "D")}
+    given |= {"xz": (tokens.double() @ w["in_proj_weight"].T).mT, "A": -w["A_log"].exp()}
+    given |= {"delta_proj_weight": w["dt_proj_weight"], "delta_bias": w["dt_proj_bias"]}
+    want = block_in_float64(**given, out_proj_weight=w["out_proj_weight"], out_proj_bias=0)
     assert_rel_rms(out, want, 1e-6, "out")
     leaves = {"tokens": tokens, **dict(layer.named_parameters())}
     cotangent = torch.randn_like(out)
@@ -102,23 +288,6 @@ def test_gradients_are_those_of_plain_torch(cached):
     want = torch.autograd.grad(want, leaves.values(), cotangent.double())
     for name, a, b in zip(leaves, got, want):
         assert_rel_rms(a, b, 5e-6, name)  # float32, sums over 18 tokens
-
-
-def plain(w, tokens, rank):
-    """The layer written out in torch, from a state dict."""
-    x, z = (tokens @ w["in_proj.weight"].T).chunk(2, -1)
-    width = w["conv1d.weight"].shape[2]
-    padded = F.pad(x.mT, (width - 1, 0))
-    x = F.silu(F.conv1d(padded, w["conv1d.weight"], w["conv1d.bias"], groups=x.shape[2])).mT
-    states = w["A_log"].shape[1]
-    low, B, C = (x @ w["x_proj.weight"].T).split([rank, states, states], -1)
-    delta = F.softplus(low @ w["dt_proj.weight"].T + w["dt_proj.bias"])
-    h, rows = 0, []
-    for t in range(x.shape[1]):
-        step = delta[:, t, :, None]
-        h = torch.exp(-step * w["A_log"].exp()) * h + step * B[:, t, None] * x[:, t, :, None]
-        rows.append((h * C[:, t, None]).sum(-1))
-    return ((torch.stack(rows, 1) + w["D"] * x) * F.silu(z)) @ w["out_proj.weight"].T
 
 
 def test_the_state_dict_is_that_of_mamba_ssm():
@@ -215,3 +384,33 @@ def test_paths_of_the_original(path, names):
     for name in names.split():
         assert getattr(module, name) is getattr(mamba_ssm, name)
     assert list(mamba_ssm.__all__) == sorted(mamba_ssm.__all__)
+
+
+def test_the_example_learns_and_writes(capsys):
+    loss = char_mamba.main(["--steps", "25", "--letters", "9", "--length", "32"])
+    out = capsys.readouterr().out
+    first = float(out.split("loss ")[1].split()[0])
+    assert loss < first - 0.3, "the average of the loss falls"
+    assert out.rpartition("letters/s:\n")[2].startswith("The statement ")
+
+
+def test_the_example_writes_the_letters_that_the_whole_text_gives():
+    model, prompt = char_mamba.CharModel(11, width=16), torch.tensor([3, 1, 4, 1, 5])
+    with torch.no_grad():
+        model.head.weight *= 1e4  # so that each letter is certain
+        model.head.bias *= 0
+        written = char_mamba.write(model, prompt, 12)
+        logits = model(written[None])[0]
+    assert torch.equal(written[:5], prompt)
+    assert torch.equal(logits[4:-1].argmax(-1), written[5:])
+
+
+def test_layers_of_one_kind_have_one_result(capsys):
+    """docs/examples/layer_speed.py, small: mambapy's layer and the formula against ours."""
+    pytest.importorskip("mambapy")
+    from examples import layer_speed
+
+    layer_speed.compare(width=16, length=9, turns=1)
+    for line in capsys.readouterr().out.splitlines()[1:]:
+        errors = [float(word) for word in line.partition("to the loop ")[2].split(" and ")]
+        assert len(errors) == 2 and max(errors) < 2e-6, line
