@@ -1,6 +1,8 @@
 """``rasterization`` with gsplat's signature: pictures, ``meta``, options, refusals."""
 
 import inspect
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +15,7 @@ from gamba_warp.compat.gsplat import (
     rasterization,
     rasterize_to_pixels,
 )
+from gamba_warp.compat.gsplat.rendering import MUST_BE_DEFAULT
 from gamba_warp.kernels import rasterization as ours
 
 GRADIENT = 1e-5  # the same kernels; sums by views may come in another order
@@ -114,8 +117,7 @@ def test_meta(lead, packed):
         assert seen.all() and 0 < len(seen) < batch * 3 * num
         for name in ("batch_ids", "camera_ids", "gaussian_ids"):
             assert meta[name].dtype == torch.int64 and meta[name].shape == rows
-        at = meta["batch_ids"] * 3 + meta["camera_ids"]
-        at = at * num + meta["gaussian_ids"]
+        at = (meta["batch_ids"] * 3 + meta["camera_ids"]) * num + meta["gaussian_ids"]
         assert (at.diff() > 0).all()
         colors = scene["colors"].reshape(batch * num, 3)
         colors = colors[meta["batch_ids"] * num + meta["gaussian_ids"]]
@@ -129,11 +131,9 @@ def test_meta(lead, packed):
     assert meta["tiles_per_gauss"].shape == rows
     assert meta["tiles_per_gauss"].sum() == len(meta["flatten_ids"]) == len(meta["isect_ids"])
     assert (meta["isect_ids"].diff() >= 0).all()
-    names = ("isect_offsets", "flatten_ids")
     parts = meta["means2d"], meta["conics"], colors, meta["opacities"], 37, 23, 16
-    again, _ = rasterize_to_pixels(
-        *parts, *(meta[k] for k in names), scene["backgrounds"], packed=packed
-    )
+    lists = meta["isect_offsets"], meta["flatten_ids"]
+    again, _ = rasterize_to_pixels(*parts, *lists, scene["backgrounds"], packed=packed)
     assert (again - renders).abs().max() < 1e-5
     meta["means2d"].retain_grad()
     renders.backward(torch.randn_like(renders))
@@ -179,29 +179,13 @@ def test_no_gaussians():
         assert meta["flatten_ids"].numel() == 0
 
 
-OPTIONS = dict(
-    sparse_grad=True,
-    distributed=True,
-    camera_model="fisheye",
-    with_ut=True,
-    with_eval3d=True,
-    radial_coeffs=torch.zeros(2, 3, 6),
-    viewmats_rs=torch.zeros(2, 3, 4, 4),
-    rolling_shutter=RollingShutterType.ROLLING_TOP_TO_BOTTOM,
-    macro_tile=True,
-    return_normals=True,
-    global_z_order=False,
-    rays=torch.zeros(1),
-    extra_signals=torch.zeros(1),
-    render_mode="d",
-    rasterize_mode="fast",
-    sh_degree=5,
-    near_plane=0.0,
-    width=0,
-    opacities=torch.zeros(2, 36),
-    backgrounds=torch.zeros(2, 3, 4),
-    Ks=torch.zeros(2, 2, 3, 3),
-)
+DEFAULTS = {k: p.default for k, p in inspect.signature(rasterization).parameters.items()}
+OTHER = {None: torch.zeros(2, 3, 6), False: True, True: False, "pinhole": "fisheye"}
+OPTIONS = {name: OTHER[DEFAULTS[name]] for name in MUST_BE_DEFAULT} | dict(
+    rolling_shutter=RollingShutterType.ROLLING_TOP_TO_BOTTOM, render_mode="d",
+    rasterize_mode="fast", sh_degree=5, near_plane=0.0, width=0, opacities=torch.zeros(2, 36),
+    backgrounds=torch.zeros(2, 3, 4), Ks=torch.zeros(2, 2, 3, 3),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -212,16 +196,21 @@ def test_refusals(name):
     assert len(str(error.value).splitlines()) == 1
 
 
+def test_the_page_says_what_is_refused():
+    text = (Path(__file__).parents[2] / "docs/drop-in-gsplat.md").read_text(encoding="utf-8")
+    rows = [row.split(" | ") for row in text.splitlines() if row.startswith("| ")]
+    refused = [row[0] for row in rows if len(row) > 1 and row[1].startswith("refused")]
+    names = {name for cell in refused[:8] for name in re.findall(r"`(\w+)`", cell)}
+    assert names == {*MUST_BE_DEFAULT, "rolling_shutter"}
+
+
 def test_signature():
     """Order, names and defaults are those of the installed gsplat."""
     theirs = pytest.importorskip("gsplat").rasterization
     theirs = inspect.signature(theirs).parameters
     mine = inspect.signature(rasterization).parameters
     assert [*mine][: len(theirs)] == [*theirs]
-    for name, parameter in theirs.items():
-        default = mine[name].default
-        assert getattr(default, "name", default) == getattr(
-            parameter.default, "name", parameter.default
-        ), name
-    later = [*mine.values()][len(theirs) :]
-    assert all(p.kind == p.KEYWORD_ONLY for p in later)
+    for name, parameter in theirs.items():  # gsplat's enum is not ours
+        plain = (getattr(x, "name", x) for x in (DEFAULTS[name], parameter.default))
+        assert len({*plain}) == 1, name
+    assert all(p.kind == p.KEYWORD_ONLY for p in [*mine.values()][len(theirs) :])
