@@ -11,44 +11,6 @@ _RASTERIZE_MODES = ("classic", "antialiased")
 _MAX_SIDE = 2**15  # pixels
 _MAX_SH_DEGREE = 3
 
-# Options of gsplat's function that make it fast, and mean nothing here.
-_ITS_MEANS = ("packed", "tile_size", "channel_chunk", "segmented")
-# Options of gsplat's function that this rasterizer does not have: only these values are accepted.
-NOT_HERE = {
-    "sparse_grad": False,
-    "absgrad": False,
-    "distributed": False,
-    "camera_model": "pinhole",
-    "covars": None,
-    "with_ut": False,
-    "with_eval3d": False,
-    "radial_coeffs": None,
-    "tangential_coeffs": None,
-    "thin_prism_coeffs": None,
-    "ftheta_coeffs": None,
-    "viewmats_rs": None,
-}
-
-
-def _check_gsplat_options(options: dict) -> None:
-    """Refuses options of gsplat that would change the result, and names that nobody knows.
-
-    Raises:
-        TypeError: gsplat does not have the option either.
-        ValueError: it asks for what this rasterizer does not do.
-    """
-    for name, value in options.items():
-        if name == "rolling_shutter":
-            value, allowed = getattr(value, "name", value), "GLOBAL"
-        elif name in NOT_HERE:
-            allowed = NOT_HERE[name]
-        elif name in _ITS_MEANS:
-            continue
-        else:
-            raise TypeError(f"rasterization() got an unexpected keyword argument '{name}'")
-        if isinstance(value, Tensor) or value != allowed:
-            raise ValueError(f"{name} is not supported, allowed is {allowed!r}")
-
 
 def _want(name: str, value: Tensor, *allowed: tuple) -> None:
     if tuple(value.shape) not in allowed:
@@ -77,17 +39,16 @@ def _check_options(options: dict) -> None:
         raise ValueError(f"sh_degree is {degree!r}, allowed are None and 0 to {_MAX_SH_DEGREE}")
 
 
-def check_inputs(tensors: dict[str, Any], options: dict, gsplat_options: dict) -> tuple[int, ...]:
+def check_inputs(tensors: dict[str, Any], options: dict) -> tuple[int, ...]:
     """Checks the arguments of ``rasterization`` by name.
 
     Returns:
         The leading batch dimensions.
 
     Raises:
-        TypeError: no tensor, or another dtype; an option that gsplat does not have either.
+        TypeError: no tensor, or another dtype.
         ValueError: a shape, device or option that is not allowed.
     """
-    _check_gsplat_options(gsplat_options)
     _check_options(options)
     device = getattr(tensors["means"], "device", None)
     for name, value in tensors.items():

@@ -45,7 +45,6 @@ def rasterization(
     alpha_max: float = ALPHA_MAX,
     t_min: float = T_MIN,
     skip: Skip = EVERYTHING,
-    **gsplat_options,
 ) -> tuple[Tensor, Tensor, Meta]:
     """Renders N Gaussians of each object in each of its V views, all in single launches.
 
@@ -80,9 +79,6 @@ def rasterization(
         alpha_max: alpha is clamped here, and has zero gradient then; < 1.
         t_min: a pixel stops before its transmittance would fall to this; 1e-30 to < 1.
         skip: what work to leave out; changes neither picture nor gradients.
-        gsplat_options: what else gsplat's function takes, so that its callers need no change:
-            ``packed, tile_size, channel_chunk, segmented`` have no effect, others are accepted at
-            the values that ask for nothing.
 
     Returns:
         ``renders [.., V, H, W, C]``, ``alphas [.., V, H, W, 1]`` and ``meta``, a dict with
@@ -90,7 +86,7 @@ def rasterization(
         (see ``Meta``).
 
     Raises:
-        TypeError: a tensor has another dtype, or is no tensor; an unknown option.
+        TypeError: a tensor has another dtype, or is no tensor.
         ValueError: a shape, device or option is not as above; the message names it. Or there are
             over 2^31 pairs of tiles and Gaussians, and this is not CUDA, or the first such call.
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered before.
@@ -104,7 +100,7 @@ def rasterization(
         alpha_max=alpha_max, t_min=t_min, sh_degree=sh_degree, render_mode=render_mode,
         rasterize_mode=rasterize_mode,
     )  # fmt: skip
-    lead = check_inputs(tensors, options, gsplat_options)
+    lead = check_inputs(tensors, options)
     tuning = tuning_for(means.device.type)
     views, batch = viewmats.shape[-3], math.prod(lead)
     flat: dict[str, Any] = {k: _flat(x, batch, len(lead)) for k, x in tensors.items()}

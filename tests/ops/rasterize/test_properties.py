@@ -321,16 +321,3 @@ def test_too_many_pairs(monkeypatch):
     monkeypatch.setattr(ops, "MAX_PAIRS", 5000)
     with pytest.raises(ValueError, match="pairs of tiles and Gaussians"):
         rasterization(**make(num=400, size=1.0))
-
-
-def test_options_of_gsplat():
-    scene = make()
-    want, _, _ = rasterization(**scene)
-    same = dict(packed=False, tile_size=8, absgrad=False, camera_model="pinhole", covars=None)
-    got, _, _ = rasterization(**scene, **same, channel_chunk=4, rolling_shutter="GLOBAL")
-    assert torch.equal(got, want)
-    for name, value in dict(absgrad=True, camera_model="ortho", covars=torch.eye(3)).items():
-        with pytest.raises(ValueError, match=name):
-            rasterization(**scene, **{name: value})
-    with pytest.raises(TypeError, match="unexpected keyword argument 'tilesize'"):
-        rasterization(**scene, tilesize=8)
