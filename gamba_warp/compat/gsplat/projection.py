@@ -201,9 +201,10 @@ def project_views(scene: dict[str, Tensor], colors: Tensor, lens: LensOptions) -
     b, c, g = at
     if len(b) == 0:
         return splats
-    covars, _ = quat_scale_to_covar_preci(quats[b, g].double(), scales[b, g].double(), True, False)
+    wide = quats[b, g].double(), scales[b, g].double()
+    covars: Any = quat_scale_to_covar_preci(*wide, True, False)[0]
     given = means[b, g], covars, opacities[b, g, None], viewmats[b, c], Ks[b, c]
-    exact = _project_covariances(*(x[:, None] for x in given), lens)
+    exact = _project_covariances(*(x[:, None] for x in given), lens=lens)
     return Splats(*(x.index_put(at, one[:, 0, 0]) for x, one in zip(splats, exact)))
 
 
@@ -309,7 +310,7 @@ def fully_fused_projection(
     one_of("camera_model", camera_model, "pinhole")
     positive(eps2d=eps2d, near_plane=near_plane)
     side(width=width, height=height)
-    tensors = dict(means=means, viewmats=viewmats, Ks=Ks)
+    tensors: dict[str, Any] = dict(means=means, viewmats=viewmats, Ks=Ks)
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
     lead = check_scene({**tensors, **({} if opacities is None else {"opacities": opacities})}, (6,))
     given = {name: flat(x, lead) for name, x in tensors.items()}

@@ -135,7 +135,7 @@ def rasterization(
     one_of("sh_degree", sh_degree, None, *range(MAX_SH_DEGREE + 1))
     positive(near_plane=near_plane, eps2d=eps2d)
     side(width=width, height=height)
-    tensors = dict(means=means, viewmats=viewmats, Ks=Ks, opacities=opacities)
+    tensors: dict[str, Any] = dict(means=means, viewmats=viewmats, Ks=Ks, opacities=opacities)
     tensors |= dict(quats=quats, scales=scales) if covars is None else dict(covars=covars)
     lead = check_scene(tensors, (3, 3))
     num, views, colored = means.shape[-2], viewmats.shape[-3], "RGB" in render_mode
@@ -143,7 +143,7 @@ def rasterization(
         least = () if sh_degree is None else (f"K >= {(sh_degree + 1) ** 2}",)
         shapes = ((*lead, *rows, *least, "D >= 1") for rows in ((num,), (views, num)))
         check_tensor("colors", colors, *shapes)
-    if colored:
+    if colored and colors is not None:
         check_tensor("backgrounds", backgrounds, (*lead, views, colors.shape[-1]), optional=True)
     one_device({"means": means, "colors": colors, "backgrounds": backgrounds})
 
