@@ -50,10 +50,10 @@ def selective_scan_ref(
     """
     if A.is_complex():
         raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
-    matrices = (input_matrix(x, u, name).float() for x, name in ((B, "B"), (C, "C")))
+    B, C = (input_matrix(x, u, name).float() for x, name in ((B, "B"), (C, "C")))
     D, delta_bias = (None if x is None else x.float() for x in (D, delta_bias))
     z = None if z is None else z.mT.float()
-    given = u.mT.float(), delta.mT.float(), A.float(), *matrices, D, z, delta_bias
+    given = u.mT.float(), delta.mT.float(), A.float(), B, C, D, z, delta_bias
     out, last = selective_scan_reference(*given, delta_softplus=delta_softplus)
     out = out.mT.to(u.dtype)
     return (out, last) if return_last_state else out
