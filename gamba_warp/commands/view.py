@@ -52,7 +52,7 @@ def view_command(
     from ..pages.run import write_run_page
     from ..pages.serve import page_server
     from ..trajectories.paths import Viewpoint
-    from ..viewer.mesh_file import read_viewed_mesh
+    from ..viewer.pack import read_viewed_mesh
     from ..viewer.page import write_viewer
 
     check_not_read([] if out is None else [out], [file] if mesh is None else [file, mesh])

@@ -186,27 +186,21 @@ def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.nd
         if rgba is not None:
             return "plain", rgba, ""
     reasons = []
-    segmenter = ways.segmenter()
-    if segmenter is not None:
-        alpha = segmenter(rgb)
+    networks = ("sam", "Segment Anything", ways.segmenter), ("matte", "matting model", ways.matte)
+    for method, name, opened in (*networks, ("grabcut", "GrabCut", lambda: grabcut)):
+        try:
+            cut = opened()
+            alpha = None if cut is None else cut(rgb)
+        except NoMatte as error:
+            reasons.append(str(error))
+            continue
+        if alpha is None:
+            reasons += ["no matting model"] if method == "matte" else []
+            continue
         fault = fault_of(alpha)
         if fault is None:
-            return "sam", _blended(rgb, alpha), ""
-        reasons.append(f"Segment Anything: {fault}")
-    try:
-        matte = ways.matte()
-        alpha = None if matte is None else matte(rgb)
-        fault = "no matting model" if alpha is None else fault_of(alpha)
-    except NoMatte as error:
-        alpha, fault = None, str(error)
-    if alpha is not None and fault is None:
-        return "matte", _blended(rgb, alpha), ""
-    reasons.append(f"matting model: {fault}" if alpha is not None else str(fault))
-    alpha = grabcut(rgb)
-    fault = fault_of(alpha)
-    if fault is None:
-        return "grabcut", _blended(rgb, alpha), f" ({'; '.join(reasons)})"
-    reasons.append(f"GrabCut: {fault}")
+            return method, _blended(rgb, alpha), f" ({'; '.join(reasons)})"
+        reasons.append(f"{name}: {fault}")
     raise UserError(
         f"{path}: cannot tell object from background ({'; '.join(reasons)}); give a picture with a "
         "transparent or plain background, --mask FILE, --matte-model FILE or --sam FILE"

@@ -47,8 +47,8 @@ def grabcut(rgb: np.ndarray) -> np.ndarray:
     small = (max(4, round(height * factor)), max(4, round(width * factor)))
     picture = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
     colors = _resized(picture, small)[0].permute(1, 2, 0).contiguous().numpy()
-    inside = torch.from_numpy(_connected(_cut(colors)))
-    alpha = _resized(inside[None, None].float(), (height, width))
+    inside = _connected(torch.from_numpy(_cut(colors))[None, None].float())
+    alpha = _resized(inside, (height, width))
     return _fitted(alpha, picture, max(1, round(1 / factor)))[0, 0].clamp(0, 1).numpy()
 
 
@@ -171,22 +171,16 @@ def _ends(plane: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndarray, np.nd
     return plane[: height - down, here], plane[down:, there][:, : width - abs(right)]
 
 
-def _connected(inside: np.ndarray) -> np.ndarray:
-    """What hangs together with the middle half of the picture."""
-    height, width = inside.shape
-    found = np.zeros_like(inside)
-    middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+def _connected(inside: Tensor) -> Tensor:
+    """What hangs together with the middle half of the picture, ``[1, 1, h, w]`` of 0 and 1."""
+    height, width = inside.shape[-2:]
+    found, before = torch.zeros_like(inside), None
+    middle = np.s_[..., height // 4 : height - height // 4, width // 4 : width - width // 4]
     found[middle] = inside[middle]
-    count = -1
-    while (now := int(found.sum())) != count:
-        count = now
+    while before is None or not torch.equal(found, before):
+        before = found
         for _ in range(8):
-            grown = found.copy()
-            for offset in _OFFSETS:
-                (a, b), (was_a, was_b) = _ends(grown, offset), _ends(found, offset)
-                a |= was_b
-                b |= was_a
-            found = grown & inside
+            found = functional.max_pool2d(found, 3, 1, 1) * inside
     return found
 
 

@@ -9,26 +9,30 @@ moves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from ..conventions import Axes
 from ..errors import UserError
+from ..formats.materials import to_linear
+from ..formats.meshes import TexturedMesh, load_mesh, to_display
 from ..gaussians import Gaussians
 from ..images import to_uint8
 
 _COUNTS = 0.05  # opacity from which a Gaussian counts for the object's extent
 _MOST = 6e4  # float16 ends at 65504
 
+_LINEAR = (".glb", ".gltf")  # the format's colours of vertices are linear light
+
 RECORD = np.dtype(
     [("means", "<f4", 3), ("look", "<f2", 4), ("scales", "<f2", 3), ("turns", "<i2", 3)]
 )
 
 
-@dataclass
-class Frame:
+class Frame(NamedTuple):
     """Where the viewer's own frame lies: it is the object's, moved and scaled.
 
     Attributes:
@@ -125,6 +129,59 @@ def _rodrigues(gaussians: Gaussians) -> np.ndarray:
     quats = np.where(norms > 0, quats / norms.clip(1e-300), [1.0, 0, 0, 0])
     quats = np.where(quats[:, :1] < 0, -quats, quats)  # the same rotation
     return quats[:, 1:] / (1 + quats[:, :1])
+
+
+class ViewedMesh(NamedTuple):
+    """Triangles with coloured corners.
+
+    Attributes:
+        vertices: ``[V, 3]`` float64.
+        faces: ``[F, 3]`` int64.
+        colors: ``[V, 3]`` float32, display values in [0, 1].
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+
+
+def read_viewed_mesh(path: str | Path, axes: Axes = "opengl") -> ViewedMesh:
+    """Reads a mesh file for the viewer, which shows OpenCV's axes (y down).
+
+    A texture is seen as its colours at the corners.
+
+    Args:
+        path: the file.
+        axes: those of the file; OpenGL's (y up) are what ``save_mesh`` writes.
+
+    Raises:
+        UserError: as ``load_mesh``.
+    """
+    mesh = load_mesh(path)
+    linear = Path(path).suffix.lower() in _LINEAR
+    vertices = mesh.vertices * ([1.0, -1.0, -1.0] if axes == "opengl" else 1.0)
+    paint = (255 * _corner_colors(mesh, linear) + 0.5).astype(np.int64)
+    # A vertex that has several colours becomes several.
+    keys = mesh.faces << 24 | paint[..., 0] << 16 | paint[..., 1] << 8 | paint[..., 2]
+    found, corners = np.unique(keys, return_inverse=True)
+    colors = np.stack([found >> 16 & 255, found >> 8 & 255, found & 255], 1) / np.float32(255)
+    return ViewedMesh(vertices[found >> 24], corners.reshape(mesh.faces.shape), colors)
+
+
+def _corner_colors(mesh: TexturedMesh, linear: bool) -> np.ndarray:
+    """``[F, 3, 3]`` display values: the product of material, texture and vertices' colours."""
+    light = mesh.colors[..., :3].astype(np.float32) / 255
+    light = light if linear else to_linear(light)
+    for i, material in enumerate(mesh.materials):
+        mine = mesh.material_ids == i
+        light[mine] *= material.color[:3]
+        if material.texture is not None:
+            height, width = material.texture.shape[:2]
+            u, v = np.moveaxis(mesh.uvs[mine] % 1, -1, 0)
+            rows = ((1 - v) * height).astype(int).clip(0, height - 1)
+            columns = (u * width).astype(int).clip(0, width - 1)
+            light[mine] *= to_linear(material.texture[rows, columns, :3] / np.float32(255))
+    return to_display(light.clip(0, 1))
 
 
 def pack_mesh(mesh: Any, frame: Frame, name: str) -> tuple[bytes, int, int]:

@@ -8,9 +8,8 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,16 +18,8 @@ from ..files import write_text
 from ..gaussians import Gaussians
 from .pack import Frame, own_frame, pack_gaussians, pack_mesh, visible
 
-_PROGRAM = Path(__file__).parent / "program"
-_SCRIPTS = (
-    "shaders",
-    "gl",
-    "sorter",
-    "camera",
-    "controls",
-    "ui",
-    "main",
-)  # as they need each other
+# As they need each other.
+_SCRIPTS = ("shaders", "gl", "sorter", "camera", "controls", "ui", "main")
 # The page may load only what is inlined in it. The worker that sorts is made of a text of the page.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
@@ -36,8 +27,7 @@ POLICY = (
 )
 
 
-@dataclass
-class ViewerParts:
+class ViewerParts(NamedTuple):
     """What differs between two viewers, as texts that stand in HTML as they are.
 
     Attributes:
@@ -81,8 +71,7 @@ def viewer_page(
         ValueError: there is a batch dimension.
     """
     parts = viewer_parts(title, gaussians, mesh=mesh, camera=camera, view=view, note=note)
-    texts = {field.name: getattr(parts, field.name) for field in fields(parts)}
-    return _filled(program_page(title), texts)
+    return _filled(program_page(title), parts._asdict())
 
 
 def write_viewer(path: str | Path, title: str, gaussians: Gaussians, **options: Any) -> None:
@@ -99,12 +88,14 @@ def program_page(title: str = "") -> str:
     texts = {
         "policy": POLICY,
         "title": html.escape(title),
-        "style": (_PROGRAM / "viewer.css").read_text(encoding="utf-8"),
-        "script": "".join(
-            (_PROGRAM / f"{name}.js").read_text(encoding="utf-8") for name in _SCRIPTS
-        ),
+        "style": _program("viewer.css"),
+        "script": "".join(_program(f"{name}.js") for name in _SCRIPTS),
     }
-    return _filled((_PROGRAM / "viewer.html").read_text(encoding="utf-8"), texts)
+    return _filled(_program("viewer.html"), texts)
+
+
+def _program(name: str) -> str:
+    return (Path(__file__).parent / "program" / name).read_text(encoding="utf-8")
 
 
 def viewer_parts(
@@ -120,14 +111,9 @@ def viewer_parts(
     seen = visible(gaussians, title)
     frame = own_frame(seen, title) if camera is None else Frame(np.zeros(3), 1.0)
     distance, fov, elevation = camera or view or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
-    home = {
-        "azimuth": 0.0,
-        "elevation": math.radians(elevation),
-        "distance": distance,
-        "target": [0.0, 0.0, 0.0],
-        "fov": fov,
-    }
-    records, harmonics = pack_gaussians(seen, frame)
+    home = {"azimuth": 0.0, "elevation": math.radians(elevation), "distance": distance}
+    home |= {"target": [0.0, 0.0, 0.0], "fov": fov}
+    packed = [base64.b64encode(x).decode() for x in pack_gaussians(seen, frame)]
     surface, vertices, faces = (b"", 0, 0) if mesh is None else pack_mesh(mesh, frame, title)
     about = {
         "title": title,
@@ -141,7 +127,7 @@ def viewer_parts(
         "input": None if camera is None else home,
         "frame": {"center": frame.center.tolist(), "size": frame.size},
     }
-    return ViewerParts(json_text(about), *map(_base64, (records, harmonics, surface)))
+    return ViewerParts(json_text(about), *packed, base64.b64encode(surface).decode())
 
 
 def frame_element(
@@ -167,9 +153,8 @@ def frame_element(
     parts = viewer_parts(title, gaussians, **options)
     kinds = {"object": "application/json"}
     scripts = "".join(
-        f'<script type="{kinds.get(field.name, "text/plain")}" id="{name}-{field.name}">'
-        f"{getattr(parts, field.name)}</script>"
-        for field in fields(parts)
+        f'<script type="{kinds.get(part, "text/plain")}" id="{name}-{part}">{text}</script>'
+        for part, text in parts._asdict().items()
     )
     start = " data-auto" if auto else ""
     return (
@@ -180,8 +165,7 @@ def frame_element(
 
 def frames_script() -> str:
     """What starts the viewers of a page: the program, once, and a script."""
-    script = (_PROGRAM / "frames.js").read_text(encoding="utf-8")
-    program = json_text(program_page())
+    script, program = _program("frames.js"), json_text(program_page())
     return (
         f'<script type="application/json" id="viewer-program">{program}</script>\n'
         f"<script>\n{script}</script>\n"
@@ -194,10 +178,6 @@ def json_text(value: Any) -> str:
     for letter in "<>&'":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
     return text
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode()
 
 
 def _filled(template: str, texts: Mapping[str, str]) -> str:

@@ -11,8 +11,15 @@ from helpers.gaussians import some
 from gamba_warp.errors import UserError
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
-from gamba_warp.viewer.mesh_file import read_viewed_mesh
-from gamba_warp.viewer.pack import RECORD, Frame, own_frame, pack_gaussians, pack_mesh, visible
+from gamba_warp.viewer.pack import (
+    RECORD,
+    Frame,
+    own_frame,
+    pack_gaussians,
+    pack_mesh,
+    read_viewed_mesh,
+    visible,
+)
 from gamba_warp.viewer.page import viewer_page, write_viewer
 
 UNMOVED = Frame(np.zeros(3), 1.0)
