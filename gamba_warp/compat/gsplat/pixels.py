@@ -185,9 +185,9 @@ def _absolute_gradients(
     # a channel of ones stands for alpha, which is the sum of the weights
     colors = torch.cat([colors, torch.ones_like(opacities)[:, None]], -1)
     right, below = (-size % tiling.tile for size in (tiling.width, tiling.height))
-    cut = F.pad(upstream, (0, 0, 0, right, 0, below))  # 0 beyond the picture
-    cut = cut.unflatten(2, (tiling.tiles_x, tiling.tile)).unflatten(1, (-1, tiling.tile))
-    by_tile = cut.transpose(2, 3).flatten(3, 4).flatten(0, 2)
+    padded = F.pad(upstream.permute(0, 3, 1, 2), (0, right, 0, below))  # 0 beyond the picture
+    by_tile = F.pixel_unshuffle(padded, tiling.tile).unflatten(1, (-1, tiling.tile**2))
+    by_tile = by_tile.permute(0, 3, 4, 2, 1).flatten(0, 2)  # [tiles, pixels, C + 1]
     inside = torch.arange(tiling.tile**2, device=means2d.device)
     offsets = torch.stack([inside % tiling.tile, inside // tiling.tile], -1) + 0.5
     total, counts = torch.zeros_like(means2d), bins.starts.diff()
