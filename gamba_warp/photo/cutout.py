@@ -186,8 +186,12 @@ def _found(path: str | Path, rgb: np.ndarray, ways: Ways) -> tuple[Method, np.nd
         if rgba is not None:
             return "plain", rgba, ""
     reasons = []
-    networks = ("sam", "Segment Anything", ways.segmenter), ("matte", "matting model", ways.matte)
-    for method, name, opened in (*networks, ("grabcut", "GrabCut", lambda: grabcut)):
+    those: list[tuple[Method, str, Callable[[], Callable | None]]] = [
+        ("sam", "Segment Anything", ways.segmenter),
+        ("matte", "matting model", ways.matte),
+        ("grabcut", "GrabCut", lambda: grabcut),
+    ]
+    for method, name, opened in those:
         try:
             cut = opened()
             alpha = None if cut is None else cut(rgb)

@@ -113,7 +113,7 @@ def viewer_parts(
     distance, fov, elevation = camera or view or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
     home = {"azimuth": 0.0, "elevation": math.radians(elevation), "distance": distance}
     home |= {"target": [0.0, 0.0, 0.0], "fov": fov}
-    packed = [base64.b64encode(x).decode() for x in pack_gaussians(seen, frame)]
+    records, harmonics = pack_gaussians(seen, frame)
     surface, vertices, faces = (b"", 0, 0) if mesh is None else pack_mesh(mesh, frame, title)
     about = {
         "title": title,
@@ -127,7 +127,8 @@ def viewer_parts(
         "input": None if camera is None else home,
         "frame": {"center": frame.center.tolist(), "size": frame.size},
     }
-    return ViewerParts(json_text(about), *packed, base64.b64encode(surface).decode())
+    packed = (base64.b64encode(part).decode() for part in (records, harmonics, surface))
+    return ViewerParts(json_text(about), *packed)
 
 
 def frame_element(
