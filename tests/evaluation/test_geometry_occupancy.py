@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from lab.studies.drift import doubled, drift, known_shapes, with_flips, with_hole
 
 from gamba_warp.eval.shapes import occupancy
 from gamba_warp.eval.shapes.compare import compare, shape_iou
-from gamba_warp.eval.shapes.drift import doubled, drift, known_shapes, with_flips, with_hole
 from gamba_warp.eval.shapes.flags import tidied
 from gamba_warp.eval.shapes.metrics import volume_iou
 from gamba_warp.eval.shapes.occupancy import RULES, connected_parts, grid_around, solid

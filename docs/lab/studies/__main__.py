@@ -16,7 +16,7 @@ from gamba_warp.files import output_folder
 from gamba_warp.measure import suites
 from gamba_warp.untrusted.ranges import Threads, ranged
 
-from . import show
+from . import drift, show
 
 # What is studied -> the module with ``cases(settings)`` and ``targets(settings)``.
 STUDIES = {
@@ -61,7 +61,7 @@ def study(
             precisions, without background), lengths (a Mamba block against a transformer block
             over the number of tokens), step (of training, by parts), growth (time, memory and
             errors over every size, with slopes; growth-scan, growth-raster and growth-errors are
-            its parts), loader.
+            its parts), loader; drift, alone, prints how rules of occupancy drift on damaged shapes.
         device: Device to measure; auto is the GPU if there is one.
         quick: Small sizes and a few rounds, which take seconds.
         full: All sizes and many rounds.
@@ -91,6 +91,8 @@ def study(
 
 if __name__ == "__main__":
     try:
+        if sys.argv[1:2] == ["drift"]:  # prints its table, and takes options of its own
+            sys.exit(tyro.cli(drift.main, prog="make study WHAT=drift", args=sys.argv[2:]))
         sys.exit(tyro.cli(study, prog="make study"))
     except UserError as error:
         sys.exit(f"study: {error}")

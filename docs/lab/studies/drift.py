@@ -1,6 +1,6 @@
 """How far the rules of occupancy drift on known shapes that are damaged.
 
-``python -m gamba_warp.eval.shapes.drift`` prints the table that stands in ``eval/README.md``.
+``make study WHAT=drift`` prints the table that stands in ``eval/README.md``.
 """
 
 from __future__ import annotations
@@ -9,14 +9,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-import tyro
 
 from gamba_warp.batch import progress_bar
-
-from .flags import tidied
-from .metrics import volume_iou
-from .occupancy import RULES, enclosed, grid_around
-from .shape import Mesh
+from gamba_warp.eval.shapes.flags import tidied
+from gamba_warp.eval.shapes.metrics import volume_iou
+from gamba_warp.eval.shapes.occupancy import RULES, enclosed, grid_around
+from gamba_warp.eval.shapes.shape import Mesh
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -114,16 +112,11 @@ def main(voxels: int = 32, seeds: int = 3) -> None:
         seeds: Number of places of the hole for each row.
     """
     print(f"| shape | damage | {' | '.join(RULES)} |\n| --- | --- |{' --- |' * len(RULES)}")
-    damages = {f"hole {100 * share:g} %": _hole(share) for share in HOLES}
+    damages = {
+        f"hole {100 * share:g} %": lambda mesh, seed, share=share: with_hole(mesh, share, seed)
+        for share in HOLES
+    }
     for name, mesh in known_shapes().items():
         for damage, function in progress_bar({**damages, **DAMAGES}.items(), desc=name):
             values = drift(mesh, function, voxels, seeds)
             print(f"| {name} | {damage} | {' | '.join(f'{v:.3f}' for v in values.values())} |")
-
-
-def _hole(share: float) -> Callable[[Mesh, int], Mesh]:
-    return lambda mesh, seed: with_hole(mesh, share, seed)
-
-
-if __name__ == "__main__":
-    tyro.cli(main)
