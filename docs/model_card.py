@@ -22,7 +22,15 @@ from page_parts import table, with_parts
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
-from gamba_warp.pages.card import METRICS, OF_GROUNDS, ModelCard, Row, card_path, read_card
+from gamba_warp.pages.card import (
+    METRICS,
+    OF_GROUNDS,
+    OF_PICTURES,
+    ModelCard,
+    Row,
+    card_path,
+    read_card,
+)
 from gamba_warp.untrusted.documents import read_document
 
 PAGE = Path(__file__).with_name("model-card.md")
@@ -96,7 +104,7 @@ def readme_of(text: str, card: ModelCard) -> str:
     """
     novel = [row for row in card.figures if row.views == "novel"]
     shapes = {row.name: row for row in card.figures if row.views == "shape"}
-    of_views, of_shapes = ("psnr", "ssim", "lpips", "mask_iou"), ("chamfer", "iou")
+    of_views, of_shapes = tuple(OF_PICTURES), ("chamfer", "iou")
     heads = [METRICS[key][0] for key in (*of_views, *of_shapes)]
     rows = []
     for row in novel:

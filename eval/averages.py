@@ -9,6 +9,7 @@ import numpy as np
 
 LEVEL = 0.95  # share of the resampled means within an interval
 RESAMPLES = 10_000
+BOOTSTRAP = {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"}
 _AT_ONCE = 1_000_000  # numbers drawn at once, which bounds the memory
 
 Statistic = Callable[[np.ndarray], np.ndarray]  # of ``[.., n]`` objects, ``[..]``

@@ -44,10 +44,7 @@ def compare_command(
         raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
     from gamba_warp.files import output_folder, write_json, write_text
 
-    from .joined import join
-    from .joined_page import html_page, markdown_page
-    from .methods import read_methods
-    from .paper import CAVEAT, TABLE_1
+    from .compare import CAVEAT, TABLE_1, html_page, join, markdown_page, read_methods
     from .report import json_of
 
     methods, notes = read_methods(reports, seconds)

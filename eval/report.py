@@ -17,7 +17,7 @@ from typing import Any
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import write_json, write_text
 
-from .averages import LEVEL, RESAMPLES, intervals_of, mean_of, median_of
+from .averages import BOOTSTRAP, intervals_of, mean_of, median_of
 
 OK, FAILED = "ok", "failed"
 
@@ -97,7 +97,7 @@ def make_report(
         "protocol": protocol,
         "versions": used,
         **over_objects(objects, left_out),
-        "bootstrap": {"level": LEVEL, "resamples": RESAMPLES, "seed": 0, "method": "percentile"},
+        "bootstrap": BOOTSTRAP,
         **more,
     }
     return finite_or_none(report)

@@ -11,10 +11,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 # Grey values of the backgrounds that pictures are compared on: white, and beside it black and grey,
 # because what is right on white may be a white haze on another. Figures on white have a metric's
-# plain name, the others the keys of ON_GROUNDS, which say of which metric and ground they are.
+# plain name, those on the others end in its name.
 WHITE = 1.0
 GROUNDS = {"black": 0.0, "grey": 0.5}
-ON_GROUNDS = {f"{m}_{ground}": (m, ground) for ground in GROUNDS for m in ("psnr", "lpips")}
 
 # Axes of a file: x right, y down, z forward; or x right, y up, z backward.
 Axes = Literal["opencv", "opengl"]

@@ -1,9 +1,18 @@
-"""Measures of how far two pictures are apart: PSNR, SSIM, and the IoU of masks."""
+"""Measures of how far two pictures are apart, and the registry of those that are reported.
+
+A measure that ``METRICS`` holds is taken by ``gamba eval-views``, by the validation of a training
+and in ablations, and stands in their reports, tables and pages. Importing this loads no torch.
+"""
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from collections.abc import Callable, Container
+from typing import TYPE_CHECKING, NamedTuple
+
+from .conventions import GROUNDS, WHITE
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MAX_PSNR = 100.0  # dB; given for equal pictures, whose PSNR has no bound
 SSIM_WINDOW = 11  # pixels
@@ -22,7 +31,7 @@ def psnr(a: Tensor, b: Tensor) -> Tensor:
     """
     _same_shape(a, b)
     error = (a.double() - b.double()).square().mean((-3, -2, -1))
-    return -10 * torch.log10(error.clamp(min=10 ** (-MAX_PSNR / 10)))
+    return -10 * error.clamp(min=10 ** (-MAX_PSNR / 10)).log10()
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
@@ -64,9 +73,99 @@ def mask_iou(a: Tensor, b: Tensor) -> Tensor:
     """
     _same_shape(a, b)
     both, either = (a & b).sum((-2, -1)), (a | b).sum((-2, -1))
-    return torch.where(either > 0, both.double() / either.clamp(min=1), 1.0)
+    return (both.double() / either.clamp(min=1)).where(either > 0, 1.0)
 
 
 def _same_shape(a: Tensor, b: Tensor) -> None:
     if a.shape != b.shape:
         raise ValueError(f"shapes differ: {tuple(a.shape)} and {tuple(b.shape)}")
+
+
+class Metric(NamedTuple):
+    """A measure of pictures, as records, tables and pages have it.
+
+    Attributes:
+        title: heads its column.
+        compare: of pictures ``[V, H, W, 3]`` in [0, 1] or of masks ``[V, H, W]`` bool, and the
+            true ones, ``[V]``; None: it is that of LPIPS's network, which may not be there.
+        unit: or "".
+        digits: that are shown after the point.
+        more_is_better: else less is.
+        of_masks: it compares what the object covers, by alpha, and no colours.
+        on_grounds: it depends on the background, and is also taken on each of ``GROUNDS``.
+        ground: the key of ``GROUNDS`` that it is taken on; None: white.
+        least_side: pictures with a shorter side have no such figure.
+        in_compare: the table of ``gamba compare`` has it; its JSON has all.
+    """
+
+    title: str
+    compare: Callable[[Tensor, Tensor], Tensor] | None
+    unit: str = ""
+    digits: int = 3
+    more_is_better: bool = True
+    of_masks: bool = False
+    on_grounds: bool = False
+    ground: str | None = None
+    least_side: int = 1
+    in_compare: bool = True
+
+    @property
+    def head(self) -> str:
+        """The title with the unit."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    @property
+    def grey(self) -> float:
+        """The value of its ground."""
+        return WHITE if self.ground is None else GROUNDS[self.ground]
+
+
+METRICS = {
+    "psnr": Metric("PSNR", psnr, "dB", digits=2, on_grounds=True),
+    "ssim": Metric("SSIM", ssim, least_side=SSIM_WINDOW),
+    "lpips": Metric("LPIPS", None, more_is_better=False, on_grounds=True),
+    "mask_iou": Metric("mask IoU", mask_iou, of_masks=True, in_compare=False),
+}
+
+
+def on_grounds() -> dict[str, Metric]:
+    """Those of ``METRICS`` that depend on the background, on each of ``GROUNDS``, by their keys."""
+    return {
+        f"{name}_{key}": metric._replace(title=f"{metric.title} on {key}", unit="", ground=key)
+        for key in GROUNDS
+        for name, metric in METRICS.items()
+        if metric.on_grounds
+    }
+
+
+def all_figures() -> dict[str, Metric]:
+    """Every figure of a picture by its key in records: on white, then on the other grounds."""
+    return METRICS | on_grounds()
+
+
+def measure(
+    pictures: Callable[[float], tuple[Tensor, Tensor]],
+    masks: tuple[Tensor, Tensor] | None,
+    keys: Container[str] | None = None,
+) -> dict[str, Tensor]:
+    """Takes every figure that needs no network.
+
+    Args:
+        pictures: of a grey value: those to judge, and the true ones, on that ground.
+        masks: of the same views, see ``Metric.compare``; None where there are none.
+        keys: of the figures, or None for all.
+
+    Returns:
+        Figures ``[V]`` float64 by their keys, in the order of ``all_figures``.
+
+    Raises:
+        ValueError: as the measures do.
+    """
+    found = {}
+    for key, metric in all_figures().items():
+        if metric.compare is None or (keys is not None and key not in keys):
+            continue
+        pair = masks if metric.of_masks else pictures(metric.grey)
+        if pair is not None:
+            found[key] = metric.compare(*pair)
+    return found

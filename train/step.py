@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from gamba_warp.conventions import GROUNDS, WHITE, over_another, over_background
+from gamba_warp.conventions import WHITE, over_another, over_background
 from gamba_warp.devices import network_products
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import SSIM_WINDOW, mask_iou, psnr, ssim
+from gamba_warp.image_metrics import all_figures, measure
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.render import Rendering, render
 from gamba_warp.vision.lpips import LPIPS
@@ -235,10 +235,10 @@ def validate(
         batch = batch.to(device)
         result = forward(model, batch, weights, lpips)
         figures = {"loss": result.loss.item()}
-        for measure, values in _quality(result, batch, lpips).items():
-            figures[f"{measure}_input"] = values[0].item()
+        for key, values in _quality(result, batch, lpips).items():
+            figures[f"{key}_input"] = values[0].item()
             if len(values) > 1:
-                figures[f"{measure}_novel"] = values[1:].mean().item()
+                figures[f"{key}_novel"] = values[1:].mean().item()
         for name, value in figures.items():
             sums.setdefault(name, []).append(value)
         if len(rows) < 2 * STRIP_OBJECTS:
@@ -253,13 +253,16 @@ def _quality(
     """The measures of a validation's object, each ``[V+1]``."""
     rgb, alpha, true = result.rendering.rgb[0], result.rendering.alpha[0], batch.targets[0]
     got, want = rgb.clamp(0, 1), result.target[0]
+
+    def pictures(grey: float) -> tuple[Tensor, Tensor]:
+        if grey == WHITE:
+            return got, want
+        return over_another(rgb, alpha, WHITE, grey).clamp(0, 1), over_background(true, grey)
+
     masks = alpha[..., 0] > 0.5, true[..., 3] > 0.5
-    measures = {"psnr": psnr(got, want), "mask_iou": mask_iou(*masks)}
-    for ground, grey in GROUNDS.items():
-        shown = over_another(rgb, alpha, WHITE, grey).clamp(0, 1)
-        measures[f"psnr_{ground}"] = psnr(shown, over_background(true, grey))
-    if min(want.shape[-3:-1]) >= SSIM_WINDOW:
-        measures["ssim"] = ssim(got, want)
+    side = min(want.shape[-3:-1])
+    keys = [key for key, metric in all_figures().items() if side >= metric.least_side]
+    measures = measure(pictures, masks, keys)
     if lpips is not None:
         terms = result.terms
         measures["lpips"] = terms["lpips"][0] if "lpips" in terms else lpips(got, want)

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.conventions import GROUNDS, ON_GROUNDS, WHITE, over_another, over_background
-from gamba_warp.data.dataset import SPLIT_VERSION, ViewDataset
+from gamba_warp.conventions import GROUNDS, WHITE, over_another, over_background
+from gamba_warp.data.dataset import SPLIT_VERSION, ViewDataset, evenly
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, mask_iou, psnr, ssim
+from gamba_warp.image_metrics import MAX_PSNR, SSIM_SIGMA, SSIM_WINDOW, all_figures, measure
 from gamba_warp.model.posing import relative_cameras
 from gamba_warp.render import render
 from gamba_warp.vision.lpips import LPIPS
@@ -23,7 +23,6 @@ from gamba_warp.vision.lpips import LPIPS
 from ..averages import mean_of
 
 BATCH = 4  # views compared at once, which bounds the memory of LPIPS features
-METRICS = ("psnr", "ssim", "lpips", "mask_iou", *ON_GROUNDS)
 NEARLY_EMPTY = 0.01  # share of the picture; see ViewsProtocol
 
 Values = dict[str, float | None]  # one view's metrics
@@ -150,10 +149,7 @@ def choose_views(count: int, reference: int, wanted: int | None) -> list[int]:
     if not 0 <= reference < count:
         raise UserError(f"no view {reference} for the input among its {count}")
     others = [view for view in range(count) if view != reference]
-    if wanted is not None and wanted - 1 < len(others):
-        step = len(others) / max(1, wanted - 1)
-        others = [others[int(k * step)] for k in range(wanted - 1)]
-    return [reference, *others]
+    return [reference, *evenly(others, len(others) if wanted is None else wanted - 1)]
 
 
 def load_truth(dataset: ViewDataset, uid: str, protocol: ViewsProtocol, device: str) -> Truth:
@@ -182,27 +178,22 @@ def render_views(gaussians: Gaussians, cameras: Cameras) -> Shown:
 
 
 def compare(candidates: Mapping[str, Shown], truth: Truth) -> dict[str, list[Values]]:
-    """Computes ``METRICS`` of each view for each candidate; LPIPS is None yet.
+    """Computes all figures of each view for each candidate; LPIPS is None yet.
 
-    Besides, ``mse``: the mean squared error that the PSNR on white states. Mask IoU and figures on
-    other backgrounds are None where a candidate has no alpha.
+    Besides, ``mse``: the mean squared error that the PSNR on white states. Masks and figures on
+    other backgrounds go by alpha, and are None where a candidate has none.
     """
     result: dict[str, list[Values]] = {}
     for name, pictures in candidates.items():
-        rgb, mask = pictures.on(), pictures.mask()
-        decibels, nothing = psnr(rgb, truth.rgb), [None] * len(rgb)
-        values = {
-            "psnr": decibels.tolist(),
-            "ssim": ssim(rgb, truth.rgb).tolist(),
-            "lpips": nothing,
-            "mask_iou": nothing if mask is None else mask_iou(mask, truth.mask).tolist(),
-            **dict.fromkeys(ON_GROUNDS, nothing),
-            "mse": (10 ** (-decibels / 10)).tolist(),
-        }
-        if pictures.alpha is not None:
-            for ground, grey in GROUNDS.items():
-                found = psnr(pictures.on(grey), truth.shown.on(grey))
-                values[f"psnr_{ground}"] = found.tolist()
+        alpha, mask = pictures.alpha, pictures.mask()
+        found = measure(
+            lambda grey, shown=pictures: (shown.on(grey), truth.shown.on(grey)),
+            None if mask is None else (mask, truth.mask),
+            [k for k, m in all_figures().items() if alpha is not None or m.ground is None],
+        )
+        values = dict.fromkeys(all_figures(), [None] * len(pictures.rgb))
+        values |= {key: figures.tolist() for key, figures in found.items()}
+        values["mse"] = (10 ** (-found["psnr"] / 10)).tolist()
         result[name] = [dict(zip(values, row)) for row in zip(*values.values())]
     return result
 
@@ -219,10 +210,10 @@ def add_lpips(
     Nearly all the time goes into the features. They are computed once for the truth, and once for
     a candidate that shows the same picture (an expanded tensor) in every view.
     """
-    for key, grey in {
-        "lpips": WHITE,
-        **{f"lpips_{g}": grey for g, grey in GROUNDS.items()},
-    }.items():
+    for key, metric in all_figures().items():
+        if metric.compare is not None:
+            continue
+        grey = metric.grey
         known = {n: c for n, c in candidates.items() if c.alpha is not None or grey == WHITE}
         shown = {name: pictures.on(grey) for name, pictures in known.items()}
         fixed = {n: lpips.features(shown[n][0]) for n, c in known.items() if not c.rgb.stride(0)}

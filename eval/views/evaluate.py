@@ -16,6 +16,7 @@ from gamba_warp.batch import progress_bar
 from gamba_warp.files import output_folder, write_text
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.image_metrics import METRICS
 from gamba_warp.images import save_image
 from gamba_warp.versions import __version__, installed
 
@@ -241,10 +242,13 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         lines = [record["name"], f"{group}: {rank + 1} of {len(done)}"]
         for kind, values in (("novel", record), ("input", record["input"])):
             if values["psnr"] is not None:
-                lines.append(f"{kind}: {values['psnr']:.2f} dB, SSIM {values['ssim']:.3f}")
-                rest = (("LPIPS", values["lpips"]), ("IoU", values["mask_iou"]))
-                known = [f"{label} {value:.3f}" for label, value in rest if value is not None]
-                lines.append(f"    {', '.join(known)}")
+                known = [
+                    f"{metric.title} {values[key]:.{metric.digits}f} {metric.unit}".strip()
+                    for key, metric in METRICS.items()
+                    if values[key] is not None
+                ]
+                lines.append(f"{kind}: {', '.join(known[:2])}")
+                lines.append(f"    {', '.join(known[2:])}")
         rows.append(Row(lines, truth.rgb[0], truth.rgb[views], rgb[views]))
     return rows
 

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from gamba_warp.conventions import ON_GROUNDS
+from gamba_warp.image_metrics import METRICS, Metric, all_figures, on_grounds
 
 from ..averages import LEVEL, bootstrap, minus, summary_of
-from ..tables import cell, markdown
-from .compare import METRICS, NEARLY_EMPTY
+from ..tables import Column, Row, figures, markdown
+from .compare import NEARLY_EMPTY
 
 Record = dict[str, Any]
 Records = dict[str, Record]  # uid -> what summary() returns
-KINDS = ("novel", "input")
+Rows = list[dict[str, Any]]
 MEAN_ERROR = "psnr_of_mean_error"
-_LABELS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "mask IoU"}
-_GROUNDS = {key: f"{metric.upper()} on {ground}" for key, (metric, ground) in ON_GROUNDS.items()}
-_DIGITS = {key: 2 if key.startswith("psnr") else 3 for key in (*METRICS, MEAN_ERROR)}
 
 
 def _decibels(errors: np.ndarray) -> np.ndarray:
@@ -26,70 +24,53 @@ def _decibels(errors: np.ndarray) -> np.ndarray:
     return -10 * np.log10(errors.mean(-1))
 
 
-def _row(kind: str, name: str, records: list[Record]) -> dict[str, Any] | None:
-    """Means, medians and intervals of one candidate; None where no object has such views."""
-    values = [record["input"] if kind == "input" else record for record in records]
-    values = [value for value in values if value["psnr"] is not None]
-    if not values:
-        return None
-    errors = np.array([value["mse"] for value in values])
-    return {
-        "views": kind,
-        "name": name,
-        "objects": len(values),
-        **{key: summary_of([value[key] for value in values]) for key in METRICS},
-        MEAN_ERROR: {"value": float(_decibels(errors)), "interval": bootstrap(errors, _decibels)},
-    }
+def _rows(
+    named: dict[str, list[tuple[Record, ...]]], statistic: Callable[[np.ndarray], np.ndarray]
+) -> Rows:
+    """A row for each kind of views and each name that has objects with such views.
+
+    Args:
+        named: by name, of each object its record, or two, whose difference counts.
+        statistic: makes a PSNR of their mean squared errors ``[1 or 2, .., n]``.
+    """
+    rows = []
+    for kind in ("novel", "input"):
+        for name, tuples in named.items():
+            parts = [[r["input"] if kind == "input" else r for r in some] for some in tuples]
+            parts = [some for some in parts if all(values["psnr"] is not None for values in some)]
+            if not parts:
+                continue
+            values = [some[0] if len(some) == 1 else minus(*some) for some in parts]
+            errors = np.array([[record["mse"] for record in some] for some in parts]).T
+            error = {"value": float(statistic(errors)), "interval": bootstrap(errors, statistic)}
+            rows.append(
+                {
+                    **{"views": kind, "name": name, "objects": len(parts)},
+                    **{key: summary_of([v[key] for v in values]) for key in all_figures()},
+                    MEAN_ERROR: error,
+                }
+            )
+    return rows
 
 
-def _difference(kind: str, name: str, pairs: list[tuple[Record, Record]]) -> dict[str, Any] | None:
-    """As ``_row``, of the first of each pair minus the second."""
-    if kind == "input":
-        pairs = [(a["input"], b["input"]) for a, b in pairs]
-    pairs = [(a, b) for a, b in pairs if a["psnr"] is not None and b["psnr"] is not None]
-    if not pairs:
-        return None
-    errors = np.array([[a["mse"] for a, _ in pairs], [b["mse"] for _, b in pairs]])
-
-    gains = [minus(a, b) for a, b in pairs]
-
-    def gain(drawn: np.ndarray) -> np.ndarray:
-        return _decibels(drawn[0]) - _decibels(drawn[1])
-
-    return {
-        "views": kind,
-        "name": name,
-        "objects": len(pairs),
-        **{key: summary_of([g[key] for g in gains]) for key in METRICS},
-        MEAN_ERROR: {"value": float(gain(errors)), "interval": bootstrap(errors, gain)},
-    }
-
-
-def table_of(candidates: dict[str, Records]) -> list[dict[str, Any]]:
+def table_of(candidates: dict[str, Records]) -> Rows:
     """Rows of all candidates, novel views before the input.
 
     Returns:
-        ``{views, name, objects}``, for each metric ``{mean, interval, median, median_interval}``,
+        ``{views, name, objects}``, for each figure ``{mean, interval, median, median_interval}``,
         and ``psnr_of_mean_error`` ``{value, interval}``.
     """
-    rows = [
-        _row(kind, name, list(records.values()))
-        for kind in KINDS
-        for name, records in candidates.items()
-    ]
-    return [row for row in rows if row is not None]
+    named = {name: [(r,) for r in records.values()] for name, records in candidates.items()}
+    return _rows(named, lambda drawn: _decibels(drawn[0]))
 
 
-def differences_of(model: Records, baselines: dict[str, Records]) -> list[dict[str, Any]]:
+def differences_of(model: Records, baselines: dict[str, Records]) -> Rows:
     """Rows like ``table_of``'s: the model's value minus the baseline's, over objects with both."""
-    rows = [
-        _difference(
-            kind, f"model - {name}", [(model[uid], r) for uid, r in records.items() if uid in model]
-        )
-        for kind in KINDS
+    named = {
+        f"model - {name}": [(model[uid], r) for uid, r in records.items() if uid in model]
         for name, records in baselines.items()
-    ]
-    return [row for row in rows if row is not None]
+    }
+    return _rows(named, lambda drawn: _decibels(drawn[0]) - _decibels(drawn[1]))
 
 
 def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
@@ -100,45 +81,38 @@ def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
     }
 
 
-def means(
-    rows: list[dict[str, Any]], signed: bool = False, labels: dict[str, str] = _LABELS
-) -> str:
+def means(rows: Rows, signed: bool = False, shown: dict[str, Metric] = METRICS) -> str:
     """A Markdown table of the rows' means, with their intervals.
 
     Args:
         rows: those of ``table_of`` or ``differences_of``.
         signed: whether positive means get a plus sign.
-        labels: of the metrics shown; those on white unless told.
+        shown: the figures; those on white unless told.
     """
-    lines = [["views", "", "objects", *labels.values()]]
-    for row in rows:
-        cells = [cell(row[k]["mean"], row[k]["interval"], _DIGITS[k], signed) for k in labels]
-        lines.append([row["views"], row["name"], str(row["objects"]), *cells])
-    return markdown(lines)
+    return _markdown(rows, {key: Column(m.head, m.digits) for key, m in shown.items()}, signed)
 
 
-def medians(rows: list[dict[str, Any]], signed: bool = False) -> str:
-    """As ``means``: the PSNR of the mean error, and the medians over objects."""
-    medians_of = [f"median {label}" for label in _LABELS.values()]
-    lines = [["views", "", "objects", "PSNR of mean error [dB]", *medians_of]]
-    for row in rows:
-        error = row[MEAN_ERROR]
-        cells = [cell(error["value"], error["interval"], _DIGITS[MEAN_ERROR], signed)]
-        for key in _LABELS:
-            value, ends = row[key]["median"], row[key]["median_interval"]
-            cells.append(cell(value, ends, _DIGITS[key], signed))
-        lines.append([row["views"], row["name"], str(row["objects"]), *cells])
-    return markdown(lines)
-
-
-def on_grounds(rows: list[dict[str, Any]], signed: bool = False) -> str:
+def _on_grounds(rows: Rows, signed: bool = False) -> str:
     """As ``means``: of the figures on black and on grey."""
-    return means(rows, signed, _GROUNDS)
+    return means(rows, signed, on_grounds())
 
 
-def _first_kind(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows of novel views; those of the input where there are no novel ones."""
-    return [row for row in rows if row["views"] == rows[0]["views"]]
+def _medians(rows: Rows, signed: bool = False) -> str:
+    """As ``means``: the PSNR of the mean error, and the medians over objects."""
+    columns = {MEAN_ERROR: Column("PSNR of mean error [dB]", METRICS["psnr"].digits)}
+    columns |= {key: Column(f"median {m.head}", m.digits) for key, m in METRICS.items()}
+    errors = [row[MEAN_ERROR] for row in rows]
+    rows = [
+        row | {MEAN_ERROR: {"median": error["value"], "median_interval": error["interval"]}}
+        for row, error in zip(rows, errors)
+    ]
+    return _markdown(rows, columns, signed, "median")
+
+
+def _markdown(rows: Rows, columns: dict[str, Column], signed: bool, of: str = "mean") -> str:
+    names = [[row["views"], row["name"], str(row["objects"])] for row in rows]
+    shown = [Row(name, row, signed) for name, row in zip(names, rows)]
+    return markdown(figures(["views", "", "objects"], columns, shown, of))
 
 
 def nearly_empty_line(counts: dict[str, Any]) -> str:
@@ -154,30 +128,32 @@ def nearly_empty_line(counts: dict[str, Any]) -> str:
 
 def page(report: dict[str, Any]) -> str:
     """The text of ``table.md``, from a report of ``eval-views``."""
-    counts, share = report["nearly_empty"], f"{100 * LEVEL:g} %"
-    lpips = report["protocol"]["lpips_reason"]
+    counts, lpips = report["nearly_empty"], report["protocol"]["lpips_reason"]
     parts = [means(report["table"])]
     if report["differences"]:
         parts += ["Differences, object by object:", means(report["differences"], signed=True)]
     parts += [
-        f"Means over objects of means over views, with {share} bootstrap intervals over objects. "
-        "LPIPS: less is better." + (f" LPIPS left out: {lpips}." if lpips else "")
+        f"Means over objects of means over views, with {100 * LEVEL:g} % bootstrap intervals over "
+        "objects. LPIPS: less is better."
+        + (f" LPIPS left out: {lpips}." if lpips else "")
+        + f" {nearly_empty_line(counts)}"
+        + (" They count in these tables." if counts["views"] else "")
     ]
-    tables = [(show, report["table"], report["differences"]) for show in (on_grounds, medians)]
-    titles = [
-        "The same on black and on grey, both sides composited by their alpha; means:",
-        "PSNR of the mean squared error over all views and objects; medians over objects:",
-    ]
+    more = {
+        "The same on black and on grey, both sides composited by their alpha; means:": _on_grounds,
+        "PSNR of the mean squared error over all views and objects; "
+        "medians over objects:": _medians,
+    }
+    tables = [(title, show, report) for title, show in more.items()]
     if counts["views"]:
-        parts[-1] += f" {nearly_empty_line(counts)} They count in these tables."
-        rest = report["without_nearly_empty"]
-        tables.append((means, rest["table"], rest["differences"]))
-        titles.append("Means as above, without the views that are nearly empty:")
-    else:
-        parts[-1] += f" {nearly_empty_line(counts)}"
-    for title, (show, rows, differences) in zip(titles, tables):
-        if rows:
-            parts += [title, show(_first_kind(rows))]
-        if differences:
-            parts.append(show(_first_kind(differences), signed=True))
+        title = "Means as above, without the views that are nearly empty:"
+        tables.append((title, means, report["without_nearly_empty"]))
+    for title, show, part in tables:
+        # the rows of novel views; those of the input where there are no novel ones
+        rows, gains = (
+            [row for row in part[key] if row["views"] == part[key][0]["views"]]
+            for key in ("table", "differences")
+        )
+        parts += [title, show(rows)] if rows else []
+        parts += [show(gains, signed=True)] if gains else []
     return "\n\n".join(parts) + "\n"

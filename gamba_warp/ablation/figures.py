@@ -9,15 +9,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..conventions import GROUNDS, ON_GROUNDS, WHITE, over_background
+from ..conventions import GROUNDS, WHITE, over_background
 from ..errors import UserError
+from ..image_metrics import all_figures
 from ..pages.run_log import read_lines
 from ..untrusted.documents import read_document
 from .jobs import Settings, gaussians_of, stages
 from .plan import Plan, Row
 from .record import Record, changed, new_record, read_record, row_folder
 
-VIEW_METRICS = ("psnr", "ssim", "lpips", "mask_iou", *ON_GROUNDS)
+VIEW_METRICS = tuple(all_figures())
 SHAPE_METRICS = ("chamfer", "iou")
 Objects = dict[str, dict[str, float]]  # metrics by object
 

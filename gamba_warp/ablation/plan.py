@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from .. import image_metrics
 from ..errors import UserError
 from ..files import write_json
 from ..fitting.config import Count, FitConfig, RasterizeMode, Steps, Strategy
@@ -20,7 +21,7 @@ from ..untrusted.ranges import Seed
 
 PLANS = Path(__file__).parent / "plans"
 MAX_PLAN = 1 << 20  # bytes; ours have 5,000
-METRICS = ("psnr", "ssim", "lpips", "mask_iou", "chamfer", "iou")
+METRICS = (*image_metrics.METRICS, "chamfer", "iou")
 
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,59}\Z")]
 Text = Annotated[str, Meta(max_length=1000)]

@@ -6,23 +6,18 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
-from ..conventions import ON_GROUNDS
+from .. import image_metrics
 from .figures import SHAPE_METRICS, VIEW_METRICS, RowResult
 from .jobs import Settings
 from .plan import Plan
 from .series import DEFINITION, SHARES, series_of
 
 METRICS = (*VIEW_METRICS, *SHAPE_METRICS)  # of which LABELS are in the table itself
-LABELS = {
-    "psnr": "PSNR [dB]",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
-    "mask_iou": "mask IoU",
-    "chamfer": "Chamfer",
-    "iou": "Volume IoU",
-}
-_GROUNDS = {key: f"{metric.upper()} on {ground}" for key, (metric, ground) in ON_GROUNDS.items()}
-_DIGITS = {**{key: 2 for key in METRICS if key.startswith("psnr")}, "chamfer": 4}
+LABELS = {key: metric.head for key, metric in image_metrics.METRICS.items()}
+LABELS |= {"chamfer": "Chamfer", "iou": "Volume IoU"}
+_GROUNDS = {key: metric.head for key, metric in image_metrics.on_grounds().items()}
+_DIGITS = {key: metric.digits for key, metric in image_metrics.all_figures().items()}
+_DIGITS |= {"chamfer": 4, "iou": 3}
 Empty = Mapping[str, Mapping[str, float]]  # by row, PSNR of an empty picture by object
 
 
@@ -238,7 +233,7 @@ def _mean_cell(figure: dict[str, Any] | None, metric: str, signed: bool = False)
 
     if figure is None:
         return "-"
-    return cell(figure["mean"], figure["interval"], _DIGITS.get(metric, 3), signed)
+    return cell(figure["mean"], figure["interval"], _DIGITS[metric], signed)
 
 
 def _cost_cells(row: dict[str, Any]) -> list[str]:
@@ -280,7 +275,7 @@ def extra_tables(table: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
             for metric in LABELS:
                 figure = row["figures"].get(metric)
                 spread = None if figure is None else figure["spread"]
-                cells.append("-" if spread is None else f"{spread:.{_DIGITS.get(metric, 3) + 1}f}")
+                cells.append("-" if spread is None else f"{spread:.{_DIGITS[metric] + 1}f}")
             lines.append([row["title"], *cells])
         found.append(("Spread between seeds (standard deviation of their means)", lines))
     for name, series in table["series"].items():

@@ -8,24 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from ..conventions import ON_GROUNDS
 from ..errors import UserError
+from ..image_metrics import METRICS as OF_VIEWS
+from ..image_metrics import all_figures, on_grounds
 from ..untrusted.documents import read_document
 
 _LIMIT = 1 << 20  # bytes; ours take a few kB
 _Text = Annotated[str, Meta(max_length=2000)]
 _Count = Annotated[int, Meta(ge=0, le=10**12)]
 _Name = Annotated[str, Meta(max_length=80)]
-OF_PICTURES = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS", "mask_iou": "mask IoU"}
-OF_GROUNDS = {key: f"{metric.upper()} on {ground}" for key, (metric, ground) in ON_GROUNDS.items()}
+OF_PICTURES = {key: metric.head for key, metric in OF_VIEWS.items()}
+OF_GROUNDS = {key: metric.head for key, metric in on_grounds().items()}
 # How each metric is called, and with how many digits it is shown.
 METRICS = {
-    **{k: (n, 2 if k.startswith("psnr") else 3) for k, n in (OF_PICTURES | OF_GROUNDS).items()},
+    **{key: (metric.head, metric.digits) for key, metric in all_figures().items()},
     "chamfer": ("Chamfer", 4),
     "normal_consistency": ("normal consistency", 3),
     "iou": ("Volume IoU", 3),
@@ -50,8 +51,8 @@ class Figure(msgspec.Struct, frozen=True, omit_defaults=True):
         return f"{self.mean:.{digits}f}" + (f" [{between}]" if between else "")
 
 
-class Row(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Figures of a model or of a baseline; a metric that was not measured is None.
+class _Row(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Figures of a model or of a baseline: a field for each of ``METRICS``, None if not measured.
 
     Attributes:
         views: views that were compared, or ``shape`` for the geometry.
@@ -62,17 +63,13 @@ class Row(msgspec.Struct, frozen=True, omit_defaults=True):
     views: Literal["novel", "input", "shape"]
     name: _Name
     objects: _Count
-    psnr: Figure | None = None
-    ssim: Figure | None = None
-    lpips: Figure | None = None
-    mask_iou: Figure | None = None
-    psnr_black: Figure | None = None
-    lpips_black: Figure | None = None
-    psnr_grey: Figure | None = None
-    lpips_grey: Figure | None = None
-    chamfer: Figure | None = None
-    normal_consistency: Figure | None = None
-    iou: Figure | None = None
+
+
+if TYPE_CHECKING:
+    Row = _Row
+else:
+    _figures = [(key, Figure | None, None) for key in METRICS]
+    Row = msgspec.defstruct("Row", _figures, bases=(_Row,), frozen=True, omit_defaults=True)
 
 
 class ModelCard(msgspec.Struct, frozen=True):
@@ -157,7 +154,8 @@ def _in_short(card: ModelCard) -> Iterator[tuple[str, str]]:
             value = getattr(own, key)
             if value is None:
                 continue
-            pick = min if key.startswith(("lpips", "chamfer")) else max
+            metric = all_figures().get(key)
+            pick = max if (metric.more_is_better if metric else key != "chamfer") else min
             known = [(figure.mean, row.name) for row in others if (figure := getattr(row, key))]
             best = pick(known, default=None)
             name, bracket, unit = name.partition(" [")

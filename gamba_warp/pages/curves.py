@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..conventions import GROUNDS
+from ..image_metrics import METRICS
 from .page import ticks
 from .run_log import RunRecord, Series
 
@@ -63,9 +64,15 @@ _CHARTS = (
         "PSNR of novel views on other grounds, dB, held out",
         {f"on {ground}": f"val.psnr_{ground}_novel" for ground in GROUNDS},
     ),
-    Chart("SSIM, held out", _held_out("ssim")),
-    Chart("LPIPS, held out (lower is better)", _held_out("lpips")),
-    Chart("Mask IoU, held out", _held_out("mask_iou")),
+    *(
+        Chart(
+            f"{metric.title[0].upper()}{metric.title[1:]}, held out"
+            + ("" if metric.more_is_better else " (lower is better)"),
+            _held_out(key),
+        )
+        for key, metric in METRICS.items()
+        if key != "psnr"
+    ),
     Chart("Learning rate", {"": "train.lr"}, exact=True),
     Chart("Norm of the gradient", {"": "train.grad_norm"}, True),
     Chart("Speed, views a second", {"": "train.views_per_second"}),

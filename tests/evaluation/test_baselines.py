@@ -6,7 +6,6 @@ from helpers.micro import to_opengl
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
 from gamba_warp.cli import run
-from gamba_warp.conventions import ON_GROUNDS
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.eval.views import baselines
@@ -18,6 +17,7 @@ from gamba_warp.eval.views.table import differences_of, means, table_of
 from gamba_warp.fitting.config import FitConfig
 from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.image_metrics import on_grounds
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.render import render
 
@@ -344,7 +344,7 @@ def test_ceiling_of_nothing(data, wanted, tmp_path):
 
 def record(psnr, novel=True, lpips=None):
     values = {"psnr": psnr, "ssim": 0.5, "lpips": lpips, "mask_iou": 0.25}
-    values |= dict.fromkeys(ON_GROUNDS) | {"mse": 10 ** (-psnr / 10)}
+    values |= dict.fromkeys(on_grounds()) | {"mse": 10 ** (-psnr / 10)}
     none = dict.fromkeys(values)
     return {**(values if novel else none), "input": {**values, "psnr": psnr + 1}}
 

@@ -10,7 +10,7 @@ import pytest
 
 from gamba_warp.cli import run
 from gamba_warp.eval.averages import bootstrap
-from gamba_warp.eval.paper import TABLE_1
+from gamba_warp.eval.compare import TABLE_1
 
 ROOT = Path(__file__).parents[2]
 UIDS = ("a", "b", "c", "d")

@@ -9,7 +9,7 @@ from helpers.micro import to_opengl
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
-from gamba_warp.conventions import ON_GROUNDS, over_another, over_background
+from gamba_warp.conventions import over_another, over_background
 from gamba_warp.errors import UserError
 from gamba_warp.eval.report import (
     check_finite,
@@ -25,7 +25,7 @@ from gamba_warp.eval.shapes.shape import Points
 from gamba_warp.eval.views.compare import Shown, Truth, compare, render_views
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import mask_iou, psnr, ssim
+from gamba_warp.image_metrics import METRICS, Metric, mask_iou, on_grounds, psnr, ssim
 from gamba_warp.images import save_image
 from gamba_warp.render import render
 from gamba_warp.versions import import_open3d
@@ -288,10 +288,12 @@ def test_known_values_on_each_ground():
         assert view["psnr_black"] == pytest.approx(-20 * math.log10(0.25), abs=1e-5)
         assert view["psnr_grey"] == pytest.approx(-20 * math.log10(0.125), abs=1e-5)
     assert values["opaque"][0]["psnr"] == 100
-    assert {values["opaque"][0][key] for key in ON_GROUNDS} == {None}
+    assert {values["opaque"][0][key] for key in on_grounds()} == {None}
 
 
-def test_a_report_tells_of_haze_that_white_hides(tmp_path, capsys):
+@pytest.fixture
+def red_ball(tmp_path):
+    """A dataset of one ball in data/, and itself in pred/."""
     frames, views = [], rgba(balls(RED))
     (tmp_path / "data" / "a").mkdir(parents=True)
     for v, pose in enumerate(to_opengl(cameras().viewmats)):
@@ -301,7 +303,42 @@ def test_a_report_tells_of_haze_that_white_hides(tmp_path, capsys):
     top = {"w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "frames": frames}
     (tmp_path / "data" / "a" / "transforms.json").write_text(json.dumps(top))
     (tmp_path / "pred").mkdir()
-    found = {}
+    save_ply(tmp_path / "pred" / "a.ply", balls(RED))
+    return tmp_path
+
+
+def test_a_metric_of_the_registry_is_everywhere(red_ball, monkeypatch, capsys):
+    """In records, means, baselines, differences, CSV, tables, and the comparison of methods."""
+
+    def mean_error(a, b):
+        return (a.double() - b.double()).abs().mean((-3, -2, -1))
+
+    metric = Metric("mean error", mean_error, digits=4, more_is_better=False, on_grounds=True)
+    monkeypatch.setitem(METRICS, "mae", metric)
+    places = ["--checkpoint", str(red_ball / "pred"), "--data", str(red_ball / "data")]
+    words = [*places, "--split", "all", "--no-lpips", "--device", "cpu", "--out", str(red_ball)]
+    assert run("eval-views", words) == 0
+    report = json.loads((red_ball / "report.json").read_text())
+    for key in ("mae", "mae_black", "mae_grey"):
+        assert report["objects"][0][key] == report["mean"][key] < 0.01
+        assert report["baselines"]["background"][key] > report["mean"][key]
+        assert report["table"][0][key]["mean"] == report["mean"][key]
+        assert report["differences"][0][key]["mean"] < 0
+    header = (red_ball / "objects.csv").read_text().partition("\n")[0].split(",")
+    assert {"mae", "input.mae_grey", "baselines.billboard.mae"} <= set(header)
+    said = capsys.readouterr().out
+    assert "| mean error " in said and "| median mean error " in said
+    assert "| mean error on black " in said
+    assert run("compare", [f"x={red_ball}", f"y={red_ball}", "--out", str(red_ball)]) == 0
+    joined = json.loads((red_ball / "compare.json").read_text())
+    assert joined["rows"][0]["mae"]["mean"] == report["mean"]["mae"]
+    assert joined["differences"][0]["mae_grey"]["mean"] == 0
+    said = capsys.readouterr().out
+    assert "| mean error ↓ |" in said and "| mean error on grey ↓ |" in said
+
+
+def test_a_report_tells_of_haze_that_white_hides(red_ball, capsys):
+    tmp_path, found = red_ball, {}
     for name, scene in {"clear": balls(RED), "hazy": balls(RED, WHITE)}.items():
         save_ply(tmp_path / "pred" / "a.ply", scene)
         places = ["--checkpoint", str(tmp_path / "pred"), "--data", str(tmp_path / "data")]

@@ -9,13 +9,13 @@ from helpers.micro import to_opengl
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
-from gamba_warp.conventions import ON_GROUNDS
 from gamba_warp.eval.averages import bootstrap, median_of, minus, summary_of
 from gamba_warp.eval.views.compare import NEARLY_EMPTY, Truth, summary
 from gamba_warp.eval.views.evaluate import count_nearly_empty
 from gamba_warp.eval.views.table import differences_of, page, table_of, without_nearly_empty
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
+from gamba_warp.image_metrics import on_grounds
 from gamba_warp.images import save_image
 
 SIZE = 40  # 16 of its pixels are exactly 1 %
@@ -23,7 +23,7 @@ SIZE = 40  # 16 of its pixels are exactly 1 %
 
 def values(psnr, ssim=0.5):
     measured = {"psnr": psnr, "ssim": ssim, "mask_iou": 0.5, "mse": 10 ** (-psnr / 10)}
-    return {"lpips": None, **dict.fromkeys(ON_GROUNDS), **measured}
+    return {"lpips": None, **dict.fromkeys(on_grounds()), **measured}
 
 
 def test_means_with_and_without():

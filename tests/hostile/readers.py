@@ -285,9 +285,7 @@ def _plan(path: Path, out: Path) -> Any:
 
 def _compare(path: Path, out: Path) -> Any:
     """The table of a report beside itself, as ``gamba compare`` writes it."""
-    from gamba_warp.eval.joined import join
-    from gamba_warp.eval.joined_page import html_page, markdown_page
-    from gamba_warp.eval.methods import read_methods
+    from gamba_warp.eval.compare import html_page, join, markdown_page, read_methods
 
     methods, notes = read_methods((f"a={path}", f"b={path}"), ())
     joined = join(methods, None, notes)

@@ -1,0 +1,491 @@
+"""Reports of several methods, held to one protocol and one truth, in one table as the paper's.
+
+A method has a report of ``eval-views``, one of ``eval-geometry``, or both. The table runs over the
+objects that all methods have; it is Markdown, JSON, and a page that loads nothing else.
+"""
+
+from __future__ import annotations
+
+import html
+import statistics
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from gamba_warp.errors import UserError, one_line
+from gamba_warp.image_metrics import METRICS, all_figures, on_grounds
+from gamba_warp.untrusted.documents import parse_document, read_bytes
+from gamba_warp.versions import __version__
+
+from .averages import BOOTSTRAP, LEVEL, summary_of
+from .report import OK, flat
+from .tables import Column, Lines, Row, figures, markdown
+
+FORMAT = "gamba_warp.compare.1"
+MOST = 50  # reports
+VIEWS, SHAPES = "eval-views", "eval-geometry"
+_LETTERS = 60  # of a method's name
+_NAMED = 5  # objects of a method that a line names
+
+# Of shapes, what is compared, and of the table what the paper has besides pictures.
+OF_SHAPES = {"chamfer": Column("Chamfer ↓", 4), "iou": Column("Volume IoU ↑", 4)}
+# A field of the protocol that tells the kind of a report.
+_TELLS = {"max_psnr": VIEWS, "occupancy": SHAPES}
+# What of a protocol decides no number of one object: names, what is under test, and how a method's
+# own files lie in space.
+_FREE = {
+    VIEWS: (
+        *("source", "data", "split", "split_version", "uids", "uids_sha256"),
+        *("baselines", "contact_sheet", "distance", "rendering", "pictures", "resize_pictures"),
+        *("lpips", "lpips_reason", "grounds"),
+    ),
+    SHAPES: ("name", "definitions", "frame", "pred_axes", "reference", "distance"),
+}
+# Of those, what is worth a line where methods differ in it.
+_NOTED = {VIEWS: ("split", "resize_pictures", "rendering", "lpips"), SHAPES: ("frame", "pred_axes")}
+
+# Gamba (Shen et al. 2024), Table 1: PSNR, SSIM, LPIPS, Chamfer distance, Volume IoU, seconds.
+TABLE_1: dict[str, tuple[float | None, ...]] = {
+    "One-2-3-45": (14.93, 0.72, 0.28, 0.0683, 0.3485, 40),
+    "Point-E": (None, None, None, 0.0515, 0.2643, 78),
+    "Shap-E": (None, None, None, 0.0579, 0.3228, 27),
+    "Zero-1-to-3": (18.28, 0.76, 0.19, 0.0385, 0.3786, 1800),
+    "DreamGaussian": (21.65, 0.82, 0.14, 0.0341, 0.3615, 70),
+    "LRM": (21.35, 0.82, 0.15, 0.0325, 0.3872, 0.5),
+    "TGS": (22.68, 0.85, 0.12, 0.0257, 0.4121, 0.2),
+    "Gamba": (24.74, 0.91, 0.08, 0.0232, 0.4289, 0.05),
+}
+_OF_TABLE_1 = ("psnr", "ssim", "lpips", *OF_SHAPES)
+CAVEAT = (
+    "The paper's own figures, of other objects and by a protocol that it does not write "
+    "down, on an A100. They cannot be compared with the rows above."
+)
+
+Number = Annotated[float, msgspec.Meta(ge=-1e30, le=1e30)]
+Figures = dict[str, Number | None]
+
+
+def _keys() -> dict[str, list[str]]:
+    """The figures that are compared, by kind of report."""
+    return {VIEWS: list(all_figures()), SHAPES: list(OF_SHAPES)}
+
+
+class _ViewsRecord(msgspec.Struct):
+    """What is used of the record of an object that ``eval-views`` evaluated, beside its figures."""
+
+    name: str
+    truth_sha256: str
+    views: list[int]
+    seconds: dict[str, Number] = {}
+
+    @property
+    def truth(self) -> str:
+        """Says which views were compared."""
+        return f"{self.truth_sha256}, views {self.views}"
+
+
+class _ShapesRecord(msgspec.Struct):
+    """Likewise, of an object that ``eval-geometry`` evaluated."""
+
+    name: str
+    gt_sha256: str
+    kind: str
+
+    @property
+    def truth(self) -> str:
+        """Says which shape was compared with."""
+        return self.gt_sha256
+
+
+_RECORDS = {VIEWS: _ViewsRecord, SHAPES: _ShapesRecord}
+
+
+class _Document(msgspec.Struct):
+    protocol: dict[str, Any]
+    objects: list[dict[str, Any]]
+    versions: dict[str, Any] = {}
+
+
+@dataclass
+class Report:
+    """A report of one method.
+
+    Attributes:
+        path: its file.
+        kind: ``VIEWS`` or ``SHAPES``.
+        protocol: as the file states it.
+        records: of the objects that were evaluated, by name.
+        figures: likewise.
+        failed: reasons by name, of those that could not be evaluated.
+    """
+
+    path: Path
+    kind: str
+    protocol: dict[str, Any]
+    records: dict[str, Any] = field(default_factory=dict)
+    figures: dict[str, Figures] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Method:
+    """A method and its reports.
+
+    Attributes:
+        name: as the user gave it.
+        reports: by kind.
+        seconds: of an object, as the user stated them; or None.
+    """
+
+    name: str
+    reports: dict[str, Report] = field(default_factory=dict)
+    seconds: float | None = None
+
+
+def read_methods(
+    arguments: tuple[str, ...], seconds: tuple[str, ...]
+) -> tuple[list[Method], list[str]]:
+    """Reads reports, and checks that they are of one protocol and one truth.
+
+    Args:
+        arguments: ``NAME=FILE`` each, or a folder with a report.json.
+        seconds: ``NAME=SECONDS`` each.
+
+    Returns:
+        The methods in the order of their first report; and remarks on what differs between them
+        without changing what a number means.
+
+    Raises:
+        UserError: an argument is not of this form, a file is no report, a method has two of one
+            kind, or two reports have different protocols or truths; the message says in what.
+    """
+    if len(arguments) > MOST:
+        raise UserError(f"{len(arguments)} reports, at most {MOST} are compared")
+    methods: dict[str, Method] = {}
+    for argument in arguments:
+        name, text = _split(argument, "a report.json or its folder")
+        report = read_report(Path(text))
+        reports = methods.setdefault(name, Method(name)).reports
+        if report.kind in reports:
+            raise UserError(f"{argument}: {name} has a report of {report.kind} already")
+        reports[report.kind] = report
+    for argument in seconds:
+        name, text = _split(argument, "seconds", "--seconds ")
+        if name not in methods:
+            raise UserError(f"--seconds {argument}: there is no report of {name}")
+        try:
+            methods[name].seconds = value = float(text)
+        except ValueError:
+            value = 0.0
+        if not 0 < value < 1e9:
+            raise UserError(f"--seconds {argument}: not a number of seconds above 0")
+    found = list(methods.values())
+    return found, [note for kind in (VIEWS, SHAPES) for note in _check_same(found, kind)]
+
+
+def _split(argument: str, what: str, option: str = "") -> tuple[str, str]:
+    name, equals, text = argument.partition("=")
+    if not (name and equals and text):
+        raise UserError(f"{option}{argument}: give NAME={what}")
+    if len(name) > _LETTERS or not name.isprintable() or "|" in name:
+        raise UserError(f"{option}{argument}: a name has at most {_LETTERS} letters and no '|'")
+    return name, text
+
+
+def read_report(path: Path) -> Report:
+    """Reads a report of ``eval-views`` or ``eval-geometry``.
+
+    Args:
+        path: the file, or the folder with its ``report.json``.
+
+    Raises:
+        UserError: there is none, or it is no such report; the message says why.
+    """
+    path = path / "report.json" if path.is_dir() else path
+    content = parse_document(read_bytes(path), _Document, str(path))
+    kind = next((kind for told, kind in _TELLS.items() if told in content.protocol), None)
+    if kind is None:
+        raise UserError(f"{path}: no report of gamba eval-views or gamba eval-geometry")
+    report = Report(path, kind, content.protocol)
+    for number, item in enumerate(content.objects):
+        name = item.get("name")
+        if not isinstance(name, str) or name in report.records or name in report.failed:
+            raise UserError(f"{path}: objects[{number}] has no name, or that of another one")
+        if item.get("status") != OK:
+            report.failed[name] = str(item.get("reason", "failed"))
+            continue
+        try:
+            report.records[name] = msgspec.convert(item, _RECORDS[kind])
+            values = {key: item.get(key) for key in _keys()[kind]}
+            report.figures[name] = msgspec.convert(values, Figures)
+        except msgspec.ValidationError as error:
+            raise UserError(f"{path}: {name}: {error}") from error
+    return report
+
+
+def having(methods: list[Method], kind: str) -> dict[str, Report]:
+    """The reports of one kind by the method's name."""
+    return {m.name: m.reports[kind] for m in methods if kind in m.reports}
+
+
+def _check_same(methods: list[Method], kind: str) -> list[str]:
+    """Holds the reports of a kind against one another; returns remarks."""
+    reports = having(methods, kind)
+    for one, other in combinations(reports.values(), 2):
+        _check_pair(one, other)
+    notes = []
+    for key in _NOTED[kind]:
+        names: dict[str, list[str]] = {}
+        for name, report in reports.items():
+            names.setdefault(_shown(report.protocol.get(key)), []).append(name)
+        if len(names) > 1:
+            parts = (f"{value} ({', '.join(who)})" for value, who in names.items())
+            notes.append(f"{kind}: {key} is {'; '.join(parts)}")
+    return notes
+
+
+def _check_pair(first: Report, report: Report) -> None:
+    """Raises UserError where two reports of one kind cannot stand in one table."""
+    pair = (report, first)
+    mine, other = (flat(r.protocol, lists=True) for r in pair)
+    for key in dict.fromkeys((*mine, *other)):
+        a, b = mine.get(key), other.get(key)
+        if a == b:
+            continue
+        top = key.split(".")[0]
+        free = top in _FREE[report.kind] and (top != "lpips" or None in (a, b))
+        if top == "surface" and report.kind == SHAPES:  # of Gaussians, which a method may not have
+            free = not all(any(v.kind == "gaussians" for v in r.records.values()) for r in pair)
+        if not free:
+            raise UserError(
+                f"{report.path}: not of the protocol of {first.path}: "
+                f"{key} is {_shown(a)}, not {_shown(b)}"
+            )
+    for uid in sorted(report.records.keys() & first.records.keys()):
+        if report.records[uid].truth != first.records[uid].truth:
+            raise UserError(
+                f"{report.path}: {uid} was compared with another truth than in {first.path}"
+            )
+
+
+def _shown(value: Any) -> str:
+    return "absent" if value is None else one_line(str(value), 60)
+
+
+def join(methods: list[Method], against: str | None, notes: list[str]) -> dict[str, Any]:
+    """Makes the table of methods.
+
+    A figure is averaged over the objects for which every method that has this figure at all has a
+    value, so that no method is spared the objects that it failed at without the others being spared
+    them too.
+
+    Args:
+        methods: as ``read_methods`` returns them.
+        against: the method that the others are compared with, object by object; the first one if
+            None.
+        notes: remarks for the readers.
+
+    Returns:
+        ``format, version, against, bootstrap, notes``; ``common``: the names of the objects by
+        figure; ``rows``: for each method ``name``, ``seconds`` with where they come from, and by
+        figure ``{mean, interval, median, median_interval}``, None where it has no such figure;
+        ``differences``: likewise, each method minus ``against``; ``missing``: by kind of report and
+        method, the reasons by object; ``reports``: the files and their protocols.
+
+    Raises:
+        UserError: there is no such method, or no object is common to all.
+    """
+    names = [method.name for method in methods]
+    base = names[0] if against is None else against
+    if base not in names:
+        raise UserError(f"--against {base}: the methods are {', '.join(names)}")
+    # by figure, method and object; a method without any value of a figure does not have it
+    values: dict[str, dict[str, dict[str, float]]] = {}
+    for kind, keys in _keys().items():
+        for key in keys:
+            found = {
+                name: {uid: value for uid, v in r.figures.items() if (value := v[key]) is not None}
+                for name, r in having(methods, kind).items()
+            }
+            values[key] = {name: by_uid for name, by_uid in found.items() if by_uid}
+    common = {
+        key: sorted(set.intersection(*map(set, found.values()))) if found else []
+        for key, found in values.items()
+    }
+    for kind, (first, *_) in _keys().items():
+        reports = having(methods, kind)
+        if reports and not (common[first] and all(r.records for r in reports.values())):
+            counts = ", ".join(f"{name} {len(r.records)}" for name, r in reports.items())
+            fewest = min(reports.values(), key=lambda report: len(report.records))
+            raise UserError(
+                f"{fewest.path}: no object was evaluated for all methods by {kind}: {counts}"
+            )
+
+    def summaries(name: str, less: str | None = None) -> dict[str, Any]:
+        """The figures of a method, or its values less another one's, object by object."""
+        found: dict[str, Any] = dict.fromkeys(values)
+        for key, of in values.items():
+            if common[key] and name in of and (less is None or less in of):
+                minus = of[less] if less else dict.fromkeys(common[key], 0.0)
+                found[key] = summary_of([of[name][uid] - minus[uid] for uid in common[key]])
+        return found
+
+    return {
+        "format": FORMAT,
+        "version": __version__,
+        "against": base,
+        "bootstrap": BOOTSTRAP,
+        "notes": notes,
+        "common": common,
+        "rows": [
+            {"name": m.name, **_seconds(m, common["psnr"]), **summaries(m.name)} for m in methods
+        ],
+        "differences": [
+            {"name": f"{name} - {base}", **summaries(name, base)} for name in names if name != base
+        ],
+        "missing": {kind: _missing(having(methods, kind)) for kind in (VIEWS, SHAPES)},
+        "reports": {
+            method.name: {
+                kind: {"file": report.path.name, "protocol": report.protocol}
+                for kind, report in method.reports.items()
+            }
+            for method in methods
+        },
+    }
+
+
+def _seconds(method: Method, uids: list[str]) -> dict[str, Any]:
+    """The time of one object, and where it comes from."""
+    if method.seconds is not None:
+        return {"seconds": method.seconds, "seconds_from": "stated"}
+    report = method.reports.get(VIEWS)
+    source = report.protocol.get("source") if report else None
+    if report and isinstance(source, dict) and source.get("kind") == "checkpoint":
+        records = [report.records[uid] for uid in uids if uid in report.records]
+        known = [r.seconds["predict"] for r in records if "predict" in r.seconds]
+        if known:  # the median: the first object's time holds the compilation of the kernels
+            return {"seconds": statistics.median(known), "seconds_from": "measured"}
+    return {"seconds": None, "seconds_from": None}
+
+
+def _missing(reports: dict[str, Report]) -> dict[str, dict[str, str]]:
+    """By method, why it lacks objects that another one has or tried."""
+    known = {uid for report in reports.values() for uid in (*report.records, *report.failed)}
+    return {
+        name: {
+            uid: report.failed.get(uid, "not in its report")
+            for uid in sorted(known - report.records.keys())
+        }
+        for name, report in reports.items()
+    }
+
+
+def _columns() -> tuple[dict[str, Column], dict[str, Column]]:
+    """Those of the table, and of the one on other grounds."""
+    of_views, grounds = (
+        {
+            key: Column(f"{metric.title} {'↑' if metric.more_is_better else '↓'}", metric.digits)
+            for key, metric in chosen.items()
+            if metric.in_compare
+        }
+        for chosen in (METRICS, on_grounds())
+    )
+    return of_views | OF_SHAPES, grounds
+
+
+def _parts(joined: dict[str, Any], paper: bool) -> Iterator[str | Lines]:
+    """Texts and tables in their order."""
+    columns, grounds = _columns()
+    lines = figures([""], columns, [Row([row["name"]], row) for row in joined["rows"]])
+    lines[0].append("time [s] ↓")
+    for line, row in zip(lines[1:], joined["rows"]):
+        known = row["seconds"] is not None
+        line.append(f"{row['seconds']:.3g} ({row['seconds_from']})" if known else "-")
+    yield lines
+    counts: dict[int, list[str]] = {}
+    for key, column in columns.items():
+        counts.setdefault(len(joined["common"][key]), []).append(column.title[:-2])
+    of = "; ".join(f"{', '.join(labels)}: {_count(n)}" for n, labels in counts.items())
+    yield (
+        f"Means over the objects that every method with the metric has ({of}), with "
+        f"{100 * LEVEL:g} % bootstrap intervals over objects. Views: novel views, on white here. "
+        "Lengths: the longest side of the true shape is 1. Time: measured by the evaluation on its "
+        "machine (median), or stated by whoever made this table."
+    )
+    for kind, methods in joined["missing"].items():
+        for name, missing in methods.items():
+            if missing:
+                some = "; ".join(one_line(f"{u}: {r}") for u, r in list(missing.items())[:_NAMED])
+                more = "; ..." if len(missing) > _NAMED else ""
+                yield f"{kind}: {name} lacks {_count(len(missing))} ({some}{more})."
+    yield from (f"{note}." for note in joined["notes"])
+    if joined["differences"]:
+        yield "Differences, object by object:"
+        yield figures([""], columns, [Row([r["name"]], r, True) for r in joined["differences"]])
+    if any(joined["common"][key] for key in grounds):
+        count = _count(len(joined["common"][next(iter(grounds))]))
+        yield f"The same novel views on black and on grey, of methods with alpha ({count}):"
+        yield figures([""], grounds, [Row([row["name"]], row) for row in joined["rows"]])
+    if paper:
+        yield CAVEAT
+        head = ["", *(columns[key].title for key in _OF_TABLE_1), "time [s] ↓"]
+        texts = [["-" if v is None else f"{v:g}" for v in row] for row in TABLE_1.values()]
+        yield [head, *([name, *row] for name, row in zip(TABLE_1, texts))]
+
+
+def _count(number: int) -> str:
+    return f"{number or 'no'} object{'' if number == 1 else 's'}"
+
+
+def markdown_page(joined: dict[str, Any], paper: bool) -> str:
+    """The text of ``compare.md``.
+
+    Args:
+        joined: what ``join`` returns.
+        paper: whether the paper's own figures are printed too.
+    """
+    parts = [p if isinstance(p, str) else markdown(p) for p in _parts(joined, paper)]
+    return "\n\n".join(parts) + "\n"
+
+
+_STYLE = """
+:root { color-scheme: light dark; }
+body { margin: 0 auto; padding: 2rem 1.25rem; max-width: 70rem;
+  font: 15px/1.5 system-ui, sans-serif; }
+.scroll { overflow-x: auto; margin: 1rem 0; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .3rem 1.2rem .3rem 0; text-align: left; border-bottom: 1px solid #8884; }
+th { font-weight: 600; } td span { opacity: .65; font-size: .85em; white-space: nowrap; }
+p { max-width: 52rem; }
+"""
+
+
+def html_page(joined: dict[str, Any], paper: bool) -> str:
+    """The text of ``compare.html``; arguments as for ``markdown_page``."""
+    body = "".join(
+        f"<p>{html.escape(part)}</p>" if isinstance(part, str) else _html_table(part)
+        for part in _parts(joined, paper)
+    )
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>Methods compared</title><style>{_STYLE}</style></head>\n"
+        f"<body><h1>Methods compared</h1>{body}</body></html>\n"
+    )
+
+
+def _html_table(lines: Lines) -> str:
+    def figure(text: str) -> str:
+        value, bracket, ends = html.escape(text).partition(" [")
+        return f"{value}<br><span>[{ends}</span>" if bracket else value
+
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in lines[0])
+    rows = "".join(
+        f"<tr><td>{html.escape(name)}</td>{''.join(f'<td>{figure(c)}</td>' for c in cells)}</tr>"
+        for name, *cells in lines[1:]
+    )
+    return f'<div class="scroll"><table><tr>{head}</tr>{rows}</table></div>'
