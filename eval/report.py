@@ -9,6 +9,7 @@ import math
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,25 @@ from gamba_warp.files import write_json, write_text
 from .averages import BOOTSTRAP, intervals_of, mean_of, median_of
 
 OK, FAILED = "ok", "failed"
+
+
+class Stopwatch:
+    """Times the stages of an evaluation: ``with stopwatch("load"): …``.
+
+    Attributes:
+        seconds: by stage, rounded.
+    """
+
+    def __init__(self, digits: int) -> None:
+        self.seconds: dict[str, float] = {}
+        self._digits = digits
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Times one stage."""
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = round(time.perf_counter() - start, self._digits)
 
 
 def flat(record: dict[str, Any], prefix: str = "", lists: bool = False) -> dict[str, Any]:
@@ -186,12 +206,6 @@ def count_line(report: dict[str, Any], folder: Path | None) -> str:
     """How many objects were evaluated and how many failed, and where the report is."""
     file = f"; {folder / 'report.json'}" if folder else ""
     return f"{report['num_ok']} evaluated, {report['num_failed']} failed{file}"
-
-
-def print_summary(report: dict[str, Any], folder: Path | None = None) -> int:
-    """Prints ``summary_lines`` and ``count_line``; returns the exit code: 1 for any failure."""
-    print("\n".join([*summary_lines(report), count_line(report, folder)]))
-    return 1 if report["failures"] else 0
 
 
 @contextmanager

@@ -6,18 +6,84 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Literal
 
 import tyro
+from msgspec import Meta
 
 from gamba_warp.errors import UserError
-from gamba_warp.untrusted.ranges import ranged
+from gamba_warp.surfaces.options import Method, Pixels, Views, Voxels
+from gamba_warp.untrusted.ranges import Seed, ranged
 
-from .options import ShapesOptions
+Align = Literal["none", "scale", "icp"]
+Frame = Literal["gt", "unit", "reference"]
+Up = Literal["auto", "y", "z"]
+PredAxes = Literal["auto", "opencv", "opengl", "z-up", "frame"]
+PointRule = Literal["area", "views"]
+GridRule = Literal["around", "lattice"]
+OccupancyRule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
 
-if TYPE_CHECKING:
-    from .protocol import GeometryProtocol
+Reference = Annotated[int, Meta(ge=0, le=100_000)]
+Distance = Annotated[float, Meta(ge=0.01, le=1000)]
+
+
+@dataclass(frozen=True)
+class ShapesOptions:
+    """What to evaluate, and what differs from the protocol; None leaves the protocol's value.
+
+    Attributes:
+        pred: Gaussians (.ply), a mesh or a point cloud; or a folder of them.
+        gt: A mesh or a point cloud; or a folder, paired with PRED by name.
+        out: Folder for report.json, objects.csv and, with --baseline, table.md.
+        baseline: Folders of other predictions of the same objects: PRED is compared with each,
+            object by object. A folder's name names its row.
+        protocol: default, syncdreamer (points that 16 cameras see, parity on a 64^3 lattice),
+            gso (the objects of "gamba data gso", in the input camera's frame), or a JSON file: a
+            protocol, or the report.json of an evaluation to repeat.
+        surface: How Gaussians become a surface; centers is a diagnostic.
+        align: How predictions are aligned with the truth before comparing; scale also moves, icp
+            also turns.
+        frame: Frame of the predictions: that of the GT file, its unit frame (z-up, longest side 1,
+            centred), or the reference camera's (needs --data).
+        up: Upward axis of GT files; auto goes by the format: y of .obj, .glb and .gltf; of others
+            it is not known, and taken for z.
+        pred_axes: Axes of PRED files: opencv (y down), opengl (y up), z-up, or frame:
+            those of --frame already. auto goes by the format: opencv of Gaussians, opengl of
+            .obj, .glb and .gltf; where those of PRED or GT are not known, coordinates are used as
+            they are, and the report says so.
+        data: Dataset whose objects have the same names, for --frame reference.
+        reference: Index of the input view, for --frame reference.
+        distance: Distance of the input camera in the model's world, for --frame reference.
+        points: Number of points on each surface.
+        voxels: Number of voxels in a unit of length, for surfaces of Gaussians.
+        views: Number of views of the TSDF.
+        pixels: Side of the TSDF's depth maps.
+        seed: Seed of the random points.
+        strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
+            are failures; else they are evaluated and flagged.
+    """
+
+    pred: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PRED")]
+    gt: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GT")]
+    out: Path | None = None
+    baseline: tuple[Path, ...] = ()
+    protocol: str = "default"
+    surface: Method | None = None
+    align: Align | None = None
+    frame: Frame | None = None
+    up: Up | None = None
+    pred_axes: PredAxes | None = None
+    data: Path | None = None
+    reference: Reference | None = None
+    distance: Distance | None = None
+    points: Annotated[int, Meta(ge=8, le=10_000_000)] | None = None
+    voxels: Voxels | None = None
+    views: Views | None = None
+    pixels: Pixels | None = None
+    seed: Seed | None = None
+    strict: bool = False
 
 
 @ranged
@@ -38,27 +104,21 @@ def eval_geometry_command(
     """
     if json and csv:
         raise UserError("--json and --csv: give one of them")
-    from ..report import csv_of, json_of
+    from ..report import count_line, csv_of, json_of, summary_lines
     from .pairs import evaluate_shapes
     from .protocol import chosen_protocol
+    from .table import page
 
     protocol = chosen_protocol(options)
     report = evaluate_shapes(options, protocol)
-    parts = [report, *report["baselines"].values()]
-    for name, part in zip(("", *report["baselines"]), parts):
+    parts = {"": report} | report["baselines"]
+    for name, part in parts.items():
         for text in part["warnings"]:
             print(f"warning: {name}{': ' if name else ''}{text}", file=sys.stderr)
+    code = 1 if any(part["failures"] for part in parts.values()) else 0
     if json or csv:
         print(json_of(report) if json else csv_of(report), end="")
-        return 1 if any(part["failures"] for part in parts) else 0
-    return _print_summary(report, protocol, options.out)
-
-
-def _print_summary(report: dict[str, Any], protocol: GeometryProtocol, out: Path | None) -> int:
-    """Prints the protocol, the flags, the means and the failures; returns the exit code."""
-    from ..paired import page
-    from ..report import print_summary
-
+        return code
     changes = f", changed: {', '.join(protocol.changes())}" if protocol.changes() else ""
     print(f"protocol {protocol.name}{changes}")
     for key in ("axes", "flags"):
@@ -68,11 +128,10 @@ def _print_summary(report: dict[str, Any], protocol: GeometryProtocol, out: Path
                 print(f"{side + ' ' + key:<24} {text} of {report['num_ok']}")
     if any("unknown" in counts for counts in report["axes"].values()):
         print(f"{'':<24} unknown axes: coordinates are used as they are (--pred-axes, --up)")
-    code = print_summary(report, out)
+    print("\n".join([*summary_lines(report), count_line(report, options.out)]))
     if report["baselines"]:
         print("\n" + page(report), end="")
         for name, part in report["baselines"].items():
             for item in part["failures"]:
                 print(f"failed: {item['name']} ({name}): {item['reason']}")
-                code = 1
     return code

@@ -44,9 +44,9 @@ def tidied(mesh: Mesh) -> Tidied:
     faces = index[mesh.faces]
     flat = ~(np.abs(Mesh(vertices, faces).normals()).max(1) > 0)
     order = np.sort(faces, axis=1)
-    _, first = np.unique(_keys(order, len(vertices)), return_index=True)
-    repeated = np.ones(len(faces), bool)
-    repeated[first] = False
+    rank = np.lexsort(order.T)  # equal rows in a row, in the order of the file
+    repeated = np.zeros(len(faces), bool)
+    repeated[rank[1:]] = (order[rank[1:]] == order[rank[:-1]]).all(1)
     kept = Mesh(vertices, faces[~flat & ~repeated])
     found = _edge_flags(kept)
     if flat.any():
@@ -58,13 +58,6 @@ def tidied(mesh: Mesh) -> Tidied:
     return Tidied(kept, [flag for flag in FLAGS if flag in found])
 
 
-def _keys(order: np.ndarray, count: int) -> np.ndarray:
-    """One number for each row of vertex indices, or the row itself where that would overflow."""
-    if count < 2**21:
-        return (order[:, 0] * count + order[:, 1]) * count + order[:, 2]
-    return np.ascontiguousarray(order).view([("", order.dtype)] * 3)[:, 0]
-
-
 def _edge_flags(mesh: Mesh) -> set[str]:
     edges = directed_edges(mesh.faces)
     forward = edges[:, 0] < edges[:, 1]
@@ -73,21 +66,17 @@ def _edge_flags(mesh: Mesh) -> set[str]:
         order[:, 0] * len(mesh.vertices) + order[:, 1], return_inverse=True, return_counts=True
     )
     balance = np.bincount(index.reshape(-1), np.where(forward, 1.0, -1.0), len(counts))
-    found = set()
-    if (counts % 2 == 1).any():
-        found.add("open")
-    if (counts > 2).any():
-        found.add("nonmanifold")
-    if (balance[counts == 2] != 0).any():
-        found.add("inconsistent")
-    if not found & {"open", "inconsistent"} and _signed_volume(mesh) < 0:
-        found.add("inverted")
+    there = {
+        "open": (counts % 2 == 1).any(),
+        "nonmanifold": (counts > 2).any(),
+        "inconsistent": (balance[counts == 2] != 0).any(),
+    }
+    found = {flag for flag, yes in there.items() if yes}
+    if not found & {"open", "inconsistent"}:
+        corners = (mesh.vertices - mesh.vertices.mean(0))[mesh.faces]
+        if (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() < 0:  # 6 volumes, signed
+            found.add("inverted")
     return found
-
-
-def _signed_volume(mesh: Mesh) -> float:
-    corners = (mesh.vertices - mesh.vertices.mean(0))[mesh.faces]
-    return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum()) / 6
 
 
 def _cuts_itself(mesh: Mesh) -> bool:

@@ -15,7 +15,6 @@ from gamba_warp.errors import UserError
 from gamba_warp.formats.clouds import read_cloud
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind
 from gamba_warp.formats.headers import open_shape
-from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
 from gamba_warp.formats.meshes import Y_TO_Z_UP, default_up, load_mesh
 from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.formats.ply_header import read_ply_header
@@ -25,10 +24,8 @@ from gamba_warp.surfaces.options import SurfaceOptions
 
 from .flags import STRICT, tidied
 from .protocol import GeometryProtocol
-from .shape import Mesh, Points, Shape, Similarity
+from .shape import CLOUD_SUFFIXES, SUFFIXES, Mesh, Points, Shape, Similarity
 
-CLOUD_SUFFIXES = (".xyz", ".pcd", ".pts")
-SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)))
 HUGE = 1e18  # the squares of larger coordinates overflow float32
 ROUNDED = 1e-3  # how far the rotations of a catalogue, texts of few digits, may be from one
 FAR = 1e6  # units of the truth's longest side; farther out float32 holds nothing of a shape
@@ -218,7 +215,7 @@ def load_shape(path: Path) -> Shape:
     shape: Shape
     if suffix in SPLAT_SUFFIXES and splat_kind(path) is not None:
         shape = read_gaussians(path)
-    elif suffix in CLOUD_SUFFIXES or (suffix == ".ply" and not _has_faces(path)):
+    elif suffix in CLOUD_SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
         shape = _load_points(path)
     else:
         mesh = load_mesh(path)

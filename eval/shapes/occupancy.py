@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .options import OccupancyRule
+from .command import OccupancyRule
 from .shape import Mesh, directed_edges, merged
 
 VOTERS = 26  # rays from a point

@@ -7,7 +7,6 @@ imported by the functions that run there.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,15 +20,12 @@ from gamba_warp.devices import quiet_warp
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, sha256, visible, write_text
 from gamba_warp.formats.catalogue import CATALOGUE, find_meshes
-from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
-from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
-from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.versions import __version__, installed
 
-from ..paired import PREDICTED, differences_of, page, summaries
 from ..report import (
     OK,
+    Stopwatch,
     check_finite,
     failure,
     finite_or_none,
@@ -38,21 +34,19 @@ from ..report import (
     save_report,
     stdout_to_stderr,
 )
-from .options import ShapesOptions
+from .command import ShapesOptions
 from .protocol import GeometryProtocol
+from .shape import SUFFIXES, Similarity
+from .table import PREDICTED, differences_of, page, summaries
 
 if TYPE_CHECKING:
     from gamba_warp.data.dataset import ViewDataset
 
-    from .shape import Similarity
-
-SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)))
 PAIR_SECONDS = 3600.0  # a pair takes seconds, the slowest protocol on a huge shape minutes
 PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "numpy", "torch")
 # entries of the records that have no meaningful mean
 _NO_MEAN = (
-    *("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed"),
-    "chamfer_turned",
+    *("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed", "chamfer_turned"),
 )
 
 
@@ -80,7 +74,10 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         protocol: how to compare; see ``chosen_protocol``.
 
     Returns:
-        The report; see ``report_of``.
+        The report: what ``make_report`` returns, ``inputs``, ``flags``, ``axes`` and ``warnings``;
+        ``baselines``: for each what the report says of the predictions themselves; and
+        ``differences``: for each the prediction's value minus the baseline's over the ``objects``
+        that both have: ``mean, interval, median, median_interval``.
 
     Raises:
         UserError: something cannot be opened or written.
@@ -101,8 +98,21 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
             for name, (pairs, failures) in found.items()
         }
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
-    inputs = {side: path.name if path else None for side, path in named.items()}
-    report = report_of(protocol, objects.pop(PREDICTED), inputs, objects)
+    predicted = objects.pop(PREDICTED)
+    report = make_report(
+        protocol.to_json(),
+        predicted,
+        {"gamba_warp": __version__} | installed(*PACKAGES),
+        left_out=_NO_MEAN,
+        inputs={side: path.name if path else None for side, path in named.items()},
+        **summaries(predicted),
+        baselines={},
+        differences={},
+    )
+    for name, records in objects.items():
+        other = over_objects(records, _NO_MEAN) | summaries(records)
+        report["baselines"][name] = finite_or_none(other)
+        report["differences"][name] = differences_of(report["objects"], other["objects"])
     if listed:
         done = [record["name"] for record in report["objects"] if record["status"] == OK]
         report["evaluation"] = gso.protocol_of(done)
@@ -181,17 +191,14 @@ def find_pairs(
         true = _shapes_in(gt)
     pairs, failures = [], []
     for name in sorted({*predicted, *true, *expected}):
-        sides = {"prediction": predicted.get(name, []), "ground truth": true.get(name, [])}
-        if all(len(files) == 1 for files in sides.values()):
-            pairs.append(Pair(name, predicted[name][0], true[name][0], rotations.get(name)))
-            continue
-        missing = [side for side, files in sides.items() if not files]
-        several = [files for files in sides.values() if len(files) > 1]
-        if missing:
-            reason = f"no {missing[0]}"
+        ours, theirs = predicted.get(name, []), true.get(name, [])
+        if len(ours) == len(theirs) == 1:
+            pairs.append(Pair(name, ours[0], theirs[0], rotations.get(name)))
+        elif not (ours and theirs):
+            failures.append(failure(name, "no ground truth" if ours else "no prediction"))
         else:
-            reason = f"more than one file: {', '.join(path.name for path in several[0])}"
-        failures.append(failure(name, reason))
+            files = ", ".join(path.name for path in (ours if len(ours) > 1 else theirs))
+            failures.append(failure(name, f"more than one file: {files}"))
     return pairs, failures
 
 
@@ -221,8 +228,6 @@ def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: f
     """
     from gamba_warp.cameras import relative_to_reference
 
-    from .shape import Similarity
-
     viewmat = dataset.load(uid, views=[reference]).cameras.viewmats[0].double()
     _, scale = relative_to_reference(viewmat[None], viewmat, distance)
     return Similarity(viewmat[:3, :3].T.numpy(), np.zeros(3), float(1 / scale))
@@ -244,17 +249,17 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
-    from .alignment import chamfer_by_turn
-    from .compare import compare
+    from .compare import chamfer_by_turn, compare
     from .load import FRAME_AXES, load_prediction, load_truth
 
-    start = time.perf_counter()
-    truth = load_truth(pair.gt, protocol, pair.rotation)
-    into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
-    predicted = load_prediction(pair.pred, into, frame_axes, protocol)
-    loaded = time.perf_counter()
-    metrics = check_finite(compare(predicted.shape, truth.shape, protocol))
-    turned = check_finite(chamfer_by_turn(predicted, truth, protocol))
+    stages = Stopwatch(3)
+    with stages("load"):
+        truth = load_truth(pair.gt, protocol, pair.rotation)
+        into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
+        predicted = load_prediction(pair.pred, into, frame_axes, protocol)
+    with stages("compare"):
+        metrics = check_finite(compare(predicted.shape, truth.shape, protocol))
+        turned = check_finite(chamfer_by_turn(predicted, truth, protocol))
     return {
         "name": pair.name,
         "status": OK,
@@ -270,10 +275,7 @@ def evaluate_pair(
         "pred_sha256": sha256(pair.pred),
         "gt_sha256": sha256(pair.gt),
         "gt_normalization": truth.motion.record(),
-        "seconds": {
-            "load": round(loaded - start, 3),
-            "compare": round(time.perf_counter() - loaded, 3),
-        },
+        "seconds": stages.seconds,
     }
 
 
@@ -324,58 +326,13 @@ def _attempt(
         torch.set_num_threads(threads)
     quiet_warp()  # the process is ours alone
     try:
-        return evaluate(pair, protocol, _into_unit_frame(pair.name, protocol, dataset))
+        motion = None
+        if protocol.frame == "unit":
+            motion = Similarity(np.eye(3), np.zeros(3))
+        elif dataset is not None:
+            motion = out_of_reference(dataset, pair.name, protocol.reference, protocol.distance)
+        return evaluate(pair, protocol, motion)
     except UserError as error:
         return failure(pair.name, error)
     except Exception as error:  # whatever a library runs into, the others are still evaluated
         return failure(pair.name, f"{type(error).__name__}: {error}")
-
-
-def _into_unit_frame(
-    name: str, protocol: GeometryProtocol, dataset: ViewDataset | None
-) -> Similarity | None:
-    """The prediction's motion by the protocol's frame; None: the same as the truth's."""
-    if protocol.frame == "unit":
-        from .shape import Similarity
-
-        return Similarity(np.eye(3), np.zeros(3))
-    if dataset is not None:
-        return out_of_reference(dataset, name, protocol.reference, protocol.distance)
-    return None
-
-
-def report_of(
-    protocol: GeometryProtocol,
-    objects: list[dict[str, Any]],
-    inputs: dict[str, str | None],
-    baselines: dict[str, list[dict[str, Any]]],
-) -> dict[str, Any]:
-    """The report: what ``make_report`` returns, ``inputs``, ``flags``, ``axes`` and ``warnings``.
-
-    Args:
-        protocol: what was done.
-        objects: the records.
-        inputs: names of what was compared.
-        baselines: the records of other predictions, by name.
-
-    Returns:
-        Besides, ``baselines``: for each what the report says of the predictions themselves; and
-        ``differences``: for each the prediction's value minus the baseline's over the ``objects``
-        that both have: ``mean, interval, median, median_interval``.
-    """
-    used = {"gamba_warp": __version__} | installed(*PACKAGES)
-    report = make_report(
-        protocol.to_json(),
-        objects,
-        used,
-        left_out=_NO_MEAN,
-        inputs=inputs,
-        **summaries(objects),
-        baselines={},
-        differences={},
-    )
-    for name, records in baselines.items():
-        other = over_objects(records, _NO_MEAN) | summaries(records)
-        report["baselines"][name] = finite_or_none(other)
-        report["differences"][name] = differences_of(report["objects"], other["objects"])
-    return report

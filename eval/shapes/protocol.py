@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import types
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_origin, get_type_hints
 
 from msgspec import Meta
 
@@ -13,10 +12,9 @@ from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.errors import UserError
 from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.untrusted.documents import read_document
-from gamba_warp.untrusted.ranges import Seed, check_values
+from gamba_warp.untrusted.ranges import Seed, check_kind, check_options, check_values
 
-from .occupancy import RULES
-from .options import (
+from .command import (
     Align,
     Distance,
     Frame,
@@ -28,6 +26,7 @@ from .options import (
     ShapesOptions,
     Up,
 )
+from .occupancy import RULES
 
 VERSION = 3  # goes up whenever the same protocol would give other numbers
 
@@ -162,30 +161,14 @@ def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
         UserError: there is no such protocol, or a number is out of its range.
     """
     base = read_protocol(options.protocol)
-    options.check()
-    given = {
-        "num_points": options.points,
-        "seed": options.seed,
-        "align": options.align,
-        "frame": options.frame,
-        "up": options.up,
-        "pred_axes": options.pred_axes,
-        "reference": options.reference,
-        "distance": options.distance,
-        "strict": options.strict or None,
-    }
-    surface = {
-        "method": options.surface,
-        "voxels": options.voxels,
-        "views": options.views,
-        "pixels": options.pixels,
-    }
-    changed = replace(base, surface=replace(base.surface, **_not_none(surface)), **_not_none(given))
-    return checked(changed, "options")
-
-
-def _not_none(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}
+    check_options(options)
+    names = ("seed", "align", "frame", "up", "pred_axes", "reference", "distance")
+    given = {name: getattr(options, name) for name in names}
+    given |= {"num_points": options.points, "strict": options.strict or None}
+    surface = {name: getattr(options, name) for name in ("voxels", "views", "pixels")}
+    surface["method"] = options.surface
+    given, surface = ({k: v for k, v in part.items() if v is not None} for part in (given, surface))
+    return checked(replace(base, surface=replace(base.surface, **surface), **given), "options")
 
 
 def read_protocol(choice: str) -> GeometryProtocol:
@@ -212,9 +195,8 @@ def read_protocol(choice: str) -> GeometryProtocol:
     if version != VERSION:
         shown = str(version)[:40]
         raise UserError(f"{path}: protocol version {shown}, this program has version {VERSION}")
-    base = PRESETS["default"]
-    if isinstance(value.get("name"), str):
-        base = PRESETS.get(value["name"], base)
+    name = value.get("name")
+    base = PRESETS.get(name if isinstance(name, str) else "", PRESETS["default"])
     protocol = checked(_filled(base, value, f"{path}: "), str(path))
     if words is not None and words != protocol.definitions():
         raise UserError(f"{path}: its definitions are not those of this program's version")
@@ -222,37 +204,25 @@ def read_protocol(choice: str) -> GeometryProtocol:
 
 
 def _filled(base: Any, values: dict[str, Any], where: str) -> Any:
-    """The dataclass ``base`` with the fields of ``values`` in place of its own."""
-    kinds = get_type_hints(type(base))
-    known = {item.name for item in fields(base)}
-    result = {}
+    """The dataclass ``base`` with the fields of ``values``, if of the right types, for its own."""
+    kinds, result = get_type_hints(type(base)), {}
     for name, value in values.items():
-        if name not in known:
-            raise UserError(f"{where}{name} is unknown; known: {', '.join(sorted(known))}")
-        if isinstance(getattr(base, name), SurfaceOptions) and isinstance(value, dict):
-            result[name] = _filled(getattr(base, name), value, f"{where}{name}.")
+        if name not in kinds:
+            raise UserError(f"{where}{name} is unknown; known: {', '.join(sorted(kinds))}")
+        label, kind = f"{where}{name} is", kinds[name]
+        if kind is SurfaceOptions and isinstance(value, dict):
+            value = _filled(base.surface, value, f"{where}{name}.")
+        elif get_origin(kind) is tuple:  # of floats
+            value = tuple(_typed(label, item, float) for item in _typed(label, value, list))
         else:
-            result[name] = _typed(kinds[name], value, where + name)
+            value = _typed(label, value, kind)
+        result[name] = value
     return replace(base, **result)
 
 
-def _typed(kind: Any, value: Any, where: str) -> Any:
-    """The value where it is of the kind (tuples come as lists). Raises UserError."""
-    choices = get_args(kind)
-    if get_origin(kind) is Literal:
-        if isinstance(value, str) and value in choices:
-            return value
-        raise UserError(f"{where} is {value!r}, must be one of {', '.join(map(str, choices))}")
-    if get_origin(kind) is tuple and isinstance(value, list):
-        return tuple(_typed(choices[0], item, where) for item in value)
-    if get_origin(kind) in (Union, types.UnionType):
-        if value is None and type(None) in choices:
-            return None
-        return _typed(next(c for c in choices if c is not type(None)), value, where)
-    allowed = (int, float) if kind is float else (kind,) if isinstance(kind, type) else ()
-    if isinstance(value, allowed) and (kind is bool or not isinstance(value, bool)):
-        if kind is float and abs(value) > 1e300:  # an integer of JSON may have any length
-            raise UserError(f"{where} is too large")
-        return float(value) if kind is float else value
-    name = "a list" if get_origin(kind) is tuple else getattr(kind, "__name__", "an object")
-    raise UserError(f"{where} is {value!r}, must be of type {name}")
+def _typed(label: str, value: Any, kind: Any) -> Any:
+    """The value where it is of the kind. Raises UserError."""
+    check_kind(label, value, kind)
+    if kind is float and abs(value) > 1e300:  # an integer of JSON may have any length
+        raise UserError(f"{label} too large")
+    return float(value) if kind is float else value

@@ -1,4 +1,4 @@
-"""What is evaluated, meshes and points, and the motions that bring it into one frame.
+"""What is evaluated, meshes and points, their motions, and the points drawn on them.
 
 The process that only hands pairs to a child reads this module, so torch is imported by functions.
 """
@@ -10,10 +10,17 @@ from typing import TYPE_CHECKING, TypeAlias, overload
 
 import numpy as np
 
+from gamba_warp.errors import UserError
+from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
+from gamba_warp.formats.meshes import SUFFIXES as MESH_SUFFIXES
+from gamba_warp.formats.names import SPLAT_SUFFIXES
 from gamba_warp.versions import import_open3d
 
 if TYPE_CHECKING:
     from gamba_warp.gaussians import Gaussians
+
+
+SUFFIXES = tuple(dict.fromkeys((*MESH_SUFFIXES, *CLOUD_SUFFIXES, *SPLAT_SUFFIXES)))
 
 
 @dataclass
@@ -79,11 +86,9 @@ def directed_edges(faces: np.ndarray) -> np.ndarray:
 
 def merged(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct rows of ``[V, 3]`` and ``[V]`` the index of each row among them."""
-    rows = np.ascontiguousarray(vertices, np.float64) + 0.0  # -0.0 becomes 0.0
-    _, first, index = np.unique(
-        rows.view([("", rows.dtype)] * 3)[:, 0], return_index=True, return_inverse=True
-    )
-    return rows[first], index.reshape(-1)
+    rows = np.asarray(vertices, np.float64) + 0.0  # -0.0 becomes 0.0
+    found, index = np.unique(rows, axis=0, return_inverse=True)
+    return found, index.reshape(-1)
 
 
 @dataclass
@@ -135,3 +140,82 @@ class Similarity:
             "rotation": self.rotation.tolist(),
             "translation": self.translation.tolist(),
         }
+
+
+def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
+    """Draws points on a shape: uniformly by area on a mesh, at most ``count`` from a cloud.
+
+    Args:
+        shape: a mesh or a cloud; a cloud of no more than ``count`` points comes back as it is.
+        count: number of points.
+        seed: of the draw.
+
+    Raises:
+        UserError: the mesh has no area.
+    """
+    if isinstance(shape, Points):
+        if len(shape.positions) <= count:
+            return shape
+        keep = np.random.default_rng(seed).choice(len(shape.positions), count, replace=False)
+        normals = None if shape.normals is None else shape.normals[keep]
+        return Points(shape.positions[keep], normals)
+    o3d = import_open3d()
+    has_area = np.linalg.norm(shape.normals(), axis=1) > 0
+    if not has_area.any():
+        raise UserError("the mesh has no area")
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(shape.vertices),
+        o3d.utility.Vector3iVector(shape.faces[has_area].astype(np.int32)),
+    )
+    o3d.utility.random.seed(seed)
+    cloud = mesh.sample_points_uniformly(count, use_triangle_normal=True)
+    return Points(np.asarray(cloud.points), np.asarray(cloud.normals))
+
+
+def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:
+    """Draws two parts of a cloud that share no point, each of at most ``count`` points.
+
+    Args:
+        points: at least two points.
+        count: at least one.
+        seed: of the draw.
+
+    Returns:
+        Two clouds of one size, without normals.
+    """
+    order = np.random.default_rng(seed).permutation(len(points.positions))
+    size = min(count, len(order) // 2)
+    return Points(points.positions[order[:size]]), Points(points.positions[order[-size:]])
+
+
+def visible_points(
+    mesh: Mesh, viewmats: np.ndarray, K: np.ndarray, size: int, voxel: float
+) -> Points:
+    """Back-projects depth maps of a mesh and thins the points to one mean point in each voxel.
+
+    Args:
+        mesh: what the cameras see.
+        viewmats: ``[V, 4, 4]`` world to camera, OpenCV.
+        K: ``[3, 3]`` intrinsics in pixels, of every camera.
+        size: side of the square depth maps, pixels.
+        voxel: side of a voxel, object units.
+
+    Returns:
+        Points without normals.
+
+    Raises:
+        UserError: no camera sees the mesh.
+    """
+    o3d = import_open3d()
+    scene = mesh.scene()
+    seen = []
+    for viewmat in viewmats.astype(np.float64):
+        rays = scene.create_rays_pinhole(K.astype(np.float64), viewmat, size, size)
+        depth = scene.cast_rays(rays)["t_hit"].numpy()
+        rays, hit = rays.numpy(), np.isfinite(depth)
+        seen.append(rays[hit][:, :3] + depth[hit][:, None] * rays[hit][:, 3:])
+    points = np.concatenate(seen)
+    if len(points) == 0:
+        raise UserError("no camera sees the mesh")
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    return Points(np.asarray(cloud.voxel_down_sample(voxel).points))

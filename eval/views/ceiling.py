@@ -12,7 +12,7 @@ import torch
 from gamba_warp.batch import progress_bar
 from gamba_warp.cameras import relative_to_reference
 from gamba_warp.conventions import DEFAULT_DISTANCE
-from gamba_warp.data.dataset import ObjectViews, ViewDataset
+from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
 from gamba_warp.fitting.config import FitConfig
@@ -51,7 +51,7 @@ class Ceiling:
                 nothing is fitted, and only the files that are there count.
             config: of the fit.
         """
-        self.dataset, self.protocol, self.device = dataset, protocol, device
+        self.dataset, self.protocol, self.device = dataset, protocol, torch.device(device)
         self.folder, self.uids, self.config = folder, uids, config
 
     def __call__(self, truth: Truth) -> Shown | None:
@@ -63,65 +63,58 @@ class Ceiling:
             FloatingPointError: see ``fit``.
         """
         uid = truth.uid
-        if self.uids is None:
-            path = self.folder / f"{uid}.ply" if self.folder else None
-            found = load_ply(path).to(self.device) if path and path.exists() else None
+        path = self.folder / f"{uid}.ply" if self.folder else None
+        if self.uids is not None:
+            fitted = self._fitted(uid, path) if uid in self.uids else None
         else:
-            found = self._fitted(uid) if uid in self.uids else None
-        return None if found is None else render_views(self._moved(found, uid), truth.cameras)
-
-    def _moved(self, gaussians: Gaussians, uid: str) -> Gaussians:
-        """From the world of view 0, its camera at ``DEFAULT_DISTANCE``, to that of the truth."""
+            fitted = load_ply(path).to(self.device) if path and path.exists() else None
+        if fitted is None:
+            return None
+        # from the world of view 0, its camera at DEFAULT_DISTANCE, to that of the truth
         views = self.dataset.load(uid, views=[0, self.protocol.reference])
         first, reference = views.cameras.viewmats
         scale = self.protocol.distance / reference[:3, 3].norm()
         scale = scale / (DEFAULT_DISTANCE / first[:3, 3].norm())
         turn = (reference[:3, :3] @ first[:3, :3].T).to(self.device)
-        return gaussians.transformed(turn, turn.new_zeros(3), scale.item())
+        moved = fitted.transformed(turn, turn.new_zeros(3), scale.item())
+        return render_views(moved, truth.cameras)
 
-    def _fitted(self, uid: str) -> Gaussians:
+    def _fitted(self, uid: str, path: Path | None) -> Gaussians:
         """Fits, or reads what the same settings gave for the same views before."""
-        size, device = self.protocol.size, torch.device(self.device)
         job = FitJob(
             dataset=self.dataset,
             folder=self.folder or Path(),
             config=self.config,
             held_out=0,
-            size=size,
-            device=device,
+            size=self.protocol.size,
+            device=self.device,
         )
         views = load_views(job, uid, list(range(self.dataset.num_views(uid))))
-        key = _key(views, self.config)
-        path = self.folder / f"{uid}.ply" if self.folder else None
-        if path and path.exists() and _stated(path.with_suffix(".json")) == key:
-            return load_ply(path).to(device)
+        digest = hashlib.sha256(json.dumps(asdict(self.config)).encode())
+        for tensor in (views.images, views.cameras.viewmats, views.cameras.Ks):
+            digest.update(tensor.numpy().tobytes())
+        key, told = digest.hexdigest(), path.with_suffix(".json") if path else None
+        if path and told and path.exists() and _key_in(told) == key:
+            return load_ply(path).to(self.device)
+        images, cameras = views.images.to(self.device), views.cameras.to(self.device)
         with progress_bar(total=100, desc=f"ceiling {uid}", unit="%", leave=False) as bar:
 
             def show(done: float, _: float) -> None:
                 bar.update(int(100 * done) - bar.n)
 
-            images, cameras = views.images.to(device), views.cameras.to(device)
             result = fit(images, cameras, self.config, show)
         first = cameras.viewmats[0]
         _, scale = relative_to_reference(first[None], first)
         moved = result.gaussians.transformed(first[:3, :3], first.new_zeros(3), scale.item())
-        if path:
+        if path and told:
             output_folder(path.parent)
-            path.with_suffix(".json").unlink(missing_ok=True)  # it vouches for the .ply
+            told.unlink(missing_ok=True)  # it vouches for the .ply
             save_ply(path, moved, comments=[f"fitted to all views of {uid}"])
-            write_json(path.with_suffix(".json"), {"key": key, "fit": asdict(self.config)})
+            write_json(told, {"key": key, "fit": asdict(self.config)})
         return moved
 
 
-def _key(views: ObjectViews, config: FitConfig) -> str:
-    """Names the settings and the views that a fit comes from."""
-    digest = hashlib.sha256(json.dumps(asdict(config)).encode())
-    for tensor in (views.images, views.cameras.viewmats, views.cameras.Ks):
-        digest.update(tensor.numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _stated(path: Path) -> str | None:
+def _key_in(path: Path) -> str | None:
     try:
         return json.loads(path.read_bytes())["key"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-import time
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,11 @@ from gamba_warp.images import save_image
 from gamba_warp.versions import __version__, installed
 
 from ..averages import mean_of
-from ..report import OK, check_finite, failure, make_report, save_report
+from ..report import OK, Stopwatch, check_finite, failure, make_report, save_report
 from .baselines import MEANING
+from .command import ViewsOptions
 from .compare import (
     NEARLY_EMPTY,
-    Shown,
     Truth,
     add_lpips,
     choose_views,
@@ -36,9 +36,8 @@ from .compare import (
 )
 from .contact_sheet import RULE, Row, choose_ranks, contact_sheet
 from .job import ERRORS, Job, open_job
-from .options import ViewsOptions
 from .pictures import Pictures, save_pictures
-from .table import differences_of, page, table_of, without_nearly_empty
+from .table import page, tables_of, without_nearly_empty
 
 SHEET_VIEWS = 4  # novel views of an object in the contact sheet
 
@@ -81,30 +80,14 @@ def pictures_of(predicted: Gaussians | Pictures, truth: Truth) -> Pictures:
     return Pictures(render_views(predicted, truth.cameras))
 
 
-@dataclass(frozen=True)
-class Files:
-    """Folders for what is written of an object, each None where it is not asked for.
-
-    Attributes:
-        strips: its comparison picture.
-        gaussians: its Gaussians.
-        retrieved: the retrieval's mesh.
-        pictures: what was compared, a folder for the model and for each baseline.
-    """
-
-    strips: Path | None = None
-    gaussians: Path | None = None
-    retrieved: Path | None = None
-    pictures: Path | None = None
-
-
-def evaluate_object(job: Job, uid: str, files: Files = Files()) -> dict[str, Any]:
+def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dict[str, Any]:
     """Evaluates one object and its baselines.
 
     Args:
         job: what to do.
         uid: the object.
-        files: where what is written of it goes.
+        folders: of what is written of it: ``strips``, ``gaussians``, ``retrieval`` (its mesh) and
+            ``pictures`` (what was compared, a folder for the model and for each baseline).
 
     Returns:
         The object's record, with those of its baselines in it.
@@ -113,71 +96,58 @@ def evaluate_object(job: Job, uid: str, files: Files = Files()) -> dict[str, Any
         UserError: a file cannot be read or written, or a number is not finite.
         ValueError: pictures are too small for a metric.
     """
-    marks = [time.perf_counter()]
-
-    def mark(value: Any) -> Any:
-        marks.append(time.perf_counter())
-        return value
-
-    truth = mark(load_truth(job.dataset, uid, job.protocol, job.device))
-    predicted = mark(job.predict(truth))
-    pictures = mark(pictures_of(predicted, truth))
-    baselines = mark(job.shown(truth))
+    stages = Stopwatch(4)
+    with stages("load"):
+        truth = load_truth(job.dataset, uid, job.protocol, job.device)
+    with stages("predict"):
+        predicted = job.predict(truth)
+    with stages("render"):
+        pictures = pictures_of(predicted, truth)
+    with stages("baselines"):
+        baselines = job.shown(truth)
     candidates = {"": pictures.shown} | baselines
-    by_view = mark(compare(candidates, truth))
-    if job.network:
-        add_lpips(by_view, candidates, truth, job.network)
+    with stages("compare"):
+        by_view = compare(candidates, truth)
+    with stages("lpips"):
+        if job.network:
+            add_lpips(by_view, candidates, truth, job.network)
     if not pictures.has_input:
         by_view[""][0] = dict.fromkeys(by_view[""][0])
-    mark(None)
-    _write(job, truth, predicted, pictures, baselines, files)
     found = job.retrieval.found.get(uid) if job.retrieval else None
-    stages = ("load", "predict", "render", "baselines", "compare", "lpips")
+    gaussians = predicted if isinstance(predicted, Gaussians) else None
+
+    if "strips" in folders:
+        save_strips(folders["strips"] / f"{uid}.png", pictures.shown.on(), truth)
+    if "gaussians" in folders and gaussians is not None:
+        path = folders["gaussians"] / f"{uid}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_ply(path, gaussians)
+    if "pictures" in folders:
+        model = {} if pictures.shown.alpha is None else {"model": pictures.shown}
+        for name, candidate in (model | baselines).items():
+            where = folders["pictures"] / name / uid
+            save_pictures(where, job.dataset.files(uid), truth.views, candidate)
+    if "retrieval" in folders and found and job.meshes:
+        try:
+            job.meshes.save(folders["retrieval"] / f"{uid}.ply", found, job.protocol.distance)
+        except ERRORS as error:
+            job.fail(f"{uid} (retrieval's mesh)", error)
+
+    summaries = {n: check_finite(summary(v, truth.coverage)) for n, v in by_view.items()}
     return {
         "name": uid,
         "status": OK,
-        **check_finite(summary(by_view.pop(""), truth.coverage)),
-        "baselines": {
-            name: check_finite(summary(views, truth.coverage)) for name, views in by_view.items()
-        },
+        **summaries.pop(""),
+        "baselines": summaries,
         **({"retrieval": found._asdict()} if found else {}),
         "views": truth.views,
         "coverage": truth.coverage,
         "num_nearly_empty": sum(share < NEARLY_EMPTY for share in truth.coverage),
         **({"pictures": pictures.record} if pictures.record else {}),
-        **({"gaussians": predicted.num} if isinstance(predicted, Gaussians) else {}),
+        **({} if gaussians is None else {"gaussians": gaussians.num}),
         "truth_sha256": truth.digest,
-        "seconds": {s: round(b - a, 4) for s, a, b in zip(stages, marks, marks[1:])},
+        "seconds": stages.seconds,
     }
-
-
-def _write(
-    job: Job,
-    truth: Truth,
-    predicted: Gaussians | Pictures,
-    pictures: Pictures,
-    baselines: dict[str, Shown],
-    files: Files,
-) -> None:
-    """Writes what is asked for of one object."""
-    uid = truth.uid
-    if files.strips is not None:
-        save_strips(files.strips / f"{uid}.png", pictures.shown.on(), truth)
-    if files.gaussians is not None and isinstance(predicted, Gaussians):
-        path = files.gaussians / f"{uid}.ply"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_ply(path, predicted)
-    if files.pictures is not None:
-        model = {} if pictures.shown.alpha is None else {"model": pictures.shown}
-        for name, candidate in (model | baselines).items():
-            where = files.pictures / name / uid
-            save_pictures(where, job.dataset.files(uid), truth.views, candidate)
-    found = job.retrieval.found.get(uid) if job.retrieval else None
-    if files.retrieved is not None and found and job.meshes:
-        try:
-            job.meshes.save(files.retrieved / f"{uid}.ply", found, job.protocol.distance)
-        except ERRORS as error:
-            job.fail(f"{uid} (retrieval's mesh)", error)
 
 
 def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], bool]:
@@ -194,20 +164,18 @@ def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], boo
         KeyboardInterrupt: there is no record yet.
     """
     objects: list[dict[str, Any]] = []
-    folder = options.out
-    made = {
-        name: output_folder(folder / place) if folder and wanted else None
-        for name, place, wanted in (
-            ("gaussians", "gaussians", options.save_gaussians),
-            ("retrieved", "retrieval", options.save_retrieval),
-            ("pictures", "pictures", options.save_pictures),
-        )
-    }
+    folders: dict[str, Path] = {}
+    if options.out:
+        for name in ("gaussians", "retrieval", "pictures"):
+            if getattr(options, f"save_{name}"):
+                folders[name] = output_folder(options.out / name)
     try:
         for number, uid in enumerate(progress_bar(job.uids, unit="object")):
-            strips = folder / "strips" if folder and number < options.strips else None
+            more = {}
+            if options.out and number < options.strips:
+                more["strips"] = options.out / "strips"
             try:
-                objects.append(evaluate_object(job, uid, Files(strips=strips, **made)))
+                objects.append(evaluate_object(job, uid, folders | more))
             except ERRORS as error:
                 objects.append(failure(uid, error))
     except KeyboardInterrupt:
@@ -247,8 +215,7 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
                     for key, metric in METRICS.items()
                     if values[key] is not None
                 ]
-                lines.append(f"{kind}: {', '.join(known[:2])}")
-                lines.append(f"    {', '.join(known[2:])}")
+                lines += [f"{kind}: {', '.join(known[:2])}", f"    {', '.join(known[2:])}"]
         rows.append(Row(lines, truth.rgb[0], truth.rgb[views], rgb[views]))
     return rows
 
@@ -267,14 +234,12 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         are, of how many), and ``without_nearly_empty``: both sets of rows without these views.
     """
     done = [record for record in objects if record["status"] == OK]
-    model = {record["name"]: record for record in done}
     others = {
         name: {r["name"]: r["baselines"][name] for r in done if name in r["baselines"]}
         for name in job.baselines
     }
-    rest = without_nearly_empty({"model": model} | others)
+    candidates = {"model": {record["name"]: record for record in done}} | others
     empty = [name for name, records in others.items() if not records]
-    left_out = job.left_out | dict.fromkeys(empty, "none of the objects has it")
     protocol = asdict(job.protocol) | {
         "source": job.predictions.source,
         "data": data.name,
@@ -289,14 +254,10 @@ def report_of(job: Job, data: Path, objects: list[dict[str, Any]]) -> dict[str, 
         {"gamba_warp": __version__} | installed("torch", "kornia"),
         left_out=("baselines", "num_nearly_empty", "retrieval", "pictures"),
         baselines={n: mean_of(list(records.values())) for n, records in others.items() if records},
-        left_out_baselines=left_out,
-        table=table_of({"model": model} | others),
-        differences=differences_of(model, others),
+        left_out_baselines=job.left_out | dict.fromkeys(empty, "none of the objects has it"),
+        **tables_of(candidates),
         nearly_empty=count_nearly_empty(done),
-        without_nearly_empty={
-            "table": table_of(rest),
-            "differences": differences_of(rest["model"], {name: rest[name] for name in others}),
-        },
+        without_nearly_empty=tables_of(without_nearly_empty(candidates)),
     )
     report["failures"] += job.failures
     return report

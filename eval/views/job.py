@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from gamba_warp.batch import check_not_read
@@ -19,13 +18,19 @@ from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import FETCH, lpips_available
 
 from ..report import failure
-from .baselines import Baseline, Retrieval, background, billboard, input_copy
+from .baselines import (
+    Baseline,
+    Retrieval,
+    TrainingMeshes,
+    background,
+    billboard,
+    input_copy,
+)
 from .ceiling import open_ceiling
+from .command import ViewsOptions
 from .compare import Shown, Truth, ViewsProtocol
-from .options import ViewsOptions
 from .pictures import MEANING as PICTURES
 from .pictures import PicturePredictions, Pictures
-from .placing import TrainingMeshes
 from .predictions import Predictions, open_predictions
 
 # errors that are the failure of one object and stop no other
@@ -50,7 +55,7 @@ class Job:
         meshes: of the training objects, to be placed as the retrieval's shapes; or None.
     """
 
-    predictions: Predictions | PicturePredictions
+    predictions: Predictions
     dataset: ViewDataset
     uids: list[str]
     protocol: ViewsProtocol
@@ -68,9 +73,9 @@ class Job:
             return self.predictions.pictures(self.dataset, truth)
         return self.predictions.gaussians(self.dataset, truth.uid, self.protocol.reference)
 
-    def fail(self, name: str, error: Exception) -> None:
+    def fail(self, name: str, error: Exception | str) -> None:
         """Notes a failure beside those of objects."""
-        self.failures.append({k: v for k, v in failure(name, error).items() if k != "status"})
+        self.failures.append({"name": name, "reason": failure(name, error)["reason"]})
 
     def shown(self, truth: Truth) -> dict[str, Shown]:
         """Returns what each baseline shows; one that fails is noted and stops no other."""
@@ -84,19 +89,6 @@ class Job:
             if pictures is not None:
                 result[name] = pictures
         return result
-
-
-def _opened(options: ViewsOptions, device: str) -> Predictions | PicturePredictions:
-    """What is under test."""
-    return open_predictions(
-        options.checkpoint,
-        options.distance,
-        device,
-        options.encoder_weights,
-        resize=options.resize_pictures,
-        margin=options.background_margin,
-        precision=options.precision,
-    )
 
 
 def open_job(options: ViewsOptions) -> Job:
@@ -114,7 +106,15 @@ def open_job(options: ViewsOptions) -> Job:
         if not uids:
             raise UserError(f"{options.data}: holds none of the objects of --protocol gso")
     _check_outputs(options, uids)
-    predictions = _opened(options, device)
+    predictions = open_predictions(
+        options.checkpoint,
+        options.distance,
+        device,
+        options.encoder_weights,
+        resize=options.resize_pictures,
+        margin=options.background_margin,
+        precision=options.precision,
+    )
     rendered: dict[str, Any] = {}
     if isinstance(predictions, PicturePredictions):
         if options.save_gaussians:
@@ -123,7 +123,10 @@ def open_job(options: ViewsOptions) -> Job:
         rendered = {"rendering": "pictures of 8 bits", "pictures": PICTURES}
     elif options.resize_pictures:
         raise UserError(f"--resize-pictures: {options.checkpoint} holds no pictures")
-    network, reason = _lpips_or_reason(options.lpips, device)
+    network, reason = None, "not asked for"
+    if options.lpips:
+        reason = None if lpips_available() else f"no weights; fetch them with: {FETCH}"
+        network = None if reason else load_lpips().to(device)
     protocol = ViewsProtocol(
         split=options.split,
         split_version=dataset.split_version,
@@ -139,23 +142,15 @@ def open_job(options: ViewsOptions) -> Job:
     )
     job = Job(predictions, dataset, uids, protocol, network, device)
     for name in evaluation["missing"] if evaluation else ():
-        job.fail(name, UserError(f"an object of --protocol gso that is not in {options.data}"))
+        job.fail(name, f"an object of --protocol gso that is not in {options.data}")
     folder = None if options.out is None else output_folder(options.out)
-    ceiling = None
+    ceiling = {}
     if options.ceiling is not None:
-        ceiling = open_ceiling(
-            options.ceiling,
-            dataset,
-            uids,
-            protocol,
-            device=device,
-            out=folder,
-            steps=options.ceiling_steps,
-        )
+        places = {"device": device, "out": folder, "steps": options.ceiling_steps}
+        ceiling["ceiling"] = open_ceiling(options.ceiling, dataset, uids, protocol, **places)
     if options.baselines:
-        _add_baselines(job, options.data, options.save_retrieval)
-    if ceiling is not None:
-        job.baselines["ceiling"] = ceiling
+        _add_baselines(job, options)
+    job.baselines |= ceiling
     return job
 
 
@@ -168,40 +163,31 @@ def _check_outputs(options: ViewsOptions, uids: list[str]) -> None:
         if made in (options.checkpoint.resolve(), *options.checkpoint.resolve().parents):
             raise UserError(f"{options.checkpoint}: would be overwritten; give another --out")
     targets = [options.out / "strips" / f"{uid}.png" for uid in uids[: options.strips]]
-    if options.save_gaussians:
-        targets += [options.out / "gaussians" / f"{uid}.ply" for uid in uids]
+    for name in ("gaussians", "retrieval"):
+        if getattr(options, f"save_{name}"):
+            targets += [options.out / name / f"{uid}.ply" for uid in uids]
     read = [options.checkpoint / f"{uid}.ply" for uid in uids]
     if options.save_retrieval:
-        targets += [options.out / "retrieval" / f"{uid}.ply" for uid in uids]
         read += [mesh.path for mesh in find_meshes(options.save_retrieval)]
     check_not_read(targets, [*read, *(options.data / uid for uid in uids)])
 
 
-def _lpips_or_reason(wanted: bool, device: str) -> tuple[LPIPS | None, str | None]:
-    """LPIPS on a device, or None and why there is none."""
-    if not wanted:
-        return None, "not asked for"
-    if lpips_available():
-        return load_lpips().to(device), None
-    return None, f"no weights; fetch them with: {FETCH}"
-
-
-def _add_baselines(job: Job, data: Path, meshes: Path | None) -> None:
+def _add_baselines(job: Job, options: ViewsOptions) -> None:
     """Adds the four that need no fit; the retrieval only where there is a training split.
 
     Raises:
-        UserError: ``meshes`` are asked for, and cannot be had.
+        UserError: meshes of the training objects are asked for, and cannot be had.
     """
     job.baselines |= {"background": background, "input_copy": input_copy, "billboard": billboard}
     try:
-        training = open_dataset(data, "train")
-        if meshes is not None:
-            job.meshes = TrainingMeshes(meshes, training)
-        job.baselines["retrieval"] = job.retrieval = retrieval = Retrieval(training)
+        training = open_dataset(options.data, "train")
+        if options.save_retrieval:
+            job.meshes = TrainingMeshes(options.save_retrieval, training)
+        job.baselines["retrieval"] = job.retrieval = Retrieval(training)
     except UserError as error:
-        if meshes is not None:
+        if options.save_retrieval:
             raise UserError(f"--save-retrieval: {error}") from error
         job.left_out["retrieval"] = str(error)
         return
-    for uid, reason in retrieval.failures.items():
-        job.fail(f"{uid} (retrieval)", UserError(reason))
+    for uid, reason in job.retrieval.failures.items():
+        job.fail(f"{uid} (retrieval)", reason)

@@ -77,7 +77,8 @@ class PicturePredictions:
             resize: whether pictures of another size than those compared are resized to it.
         """
         self.folder, self.distance, self.device, self.resize = folder, distance, device, resize
-        content = sha256_of_all(filter(_is_ours, visible(folder, "*")), folder)
+        files = (p for p in visible(folder, "*") if _is_picture(p) or p.name == TRANSFORMS)
+        content = sha256_of_all(files, folder)
         self.source = {"kind": "pictures", "path": folder.name, "sha256": content}
 
     def check(self, uids: Sequence[str]) -> None:
@@ -102,71 +103,68 @@ class PicturePredictions:
         folder = self.folder / truth.uid
         if not folder.is_dir():
             raise UserError(f"{folder}: no such folder")
-        files = dataset.files(truth.uid)
+        files, views = dataset.files(truth.uid), truth.views
         if (folder / TRANSFORMS).is_file():
-            by, found, given = "camera", *_by_camera(folder, files, truth.views)
+            by, found, given = "camera", *_by_camera(folder, files, views)
         else:
-            by, found, given = _by_name(folder, files, truth.views)
-        lacking = [view for view in truth.views[1:] if view not in found]
+            by, found, given = _by_name(folder, files, views)
+        lacking = [view for view in views[1:] if view not in found]
         if lacking or not found:
-            raise UserError(_lacks(folder, lacking or truth.views, truth.views, by))
-        height, width = truth.rgb.shape[1:3]
-        rgba = torch.zeros(len(truth.views), height, width, 4)
+            raise UserError(_lacks(folder, lacking or views, views, by))
+        rgba = torch.zeros(len(views), *truth.rgb.shape[1:3], 4)
+        there = [view in found for view in views]
         alphas, resized = {}, 0
-        for row, view in enumerate(truth.views):
+        for row, view in enumerate(views):
             if view in found:
-                picture, alphas[view] = _read(found[view])
-                fitted = self._fitted(found[view], picture, (width, height), files, view)
+                with open_picture(found[view]) as image:
+                    alphas[view] = image.has_transparency_data
+                picture = load_rgba8(found[view])
+                fitted = self._fitted(found[view], picture, truth, files, view)
                 resized += fitted is not picture
                 rgba[row] = torch.from_numpy(fitted.astype(np.float32) / 255)
         if len(set(alphas.values())) > 1:
             odd = next(view for view, alpha in alphas.items() if not alpha)
             raise UserError(f"{found[odd]}: has no alpha, and others of the object have")
-        opaque = bool((rgba[[view in found for view in truth.views], ..., 3] == 1).all())
+        opaque = bool((rgba[there, ..., 3] == 1).all())
         if opaque:
-            _check_white(folder, rgba[..., :3], truth, [view in found for view in truth.views])
-        record = {
-            "matched_by": by,
-            "unused": given - len(found),
-            "resized": resized,
-            "alpha": not opaque,
-        }
+            _check_white(folder, rgba[..., :3], truth, there)
+        unused = given - len(found)
+        record = {"matched_by": by, "unused": unused, "resized": resized, "alpha": not opaque}
         pictures = shown(rgba.to(self.device))
         if opaque:
             pictures = Shown(pictures.rgb, None)
-        return Pictures(pictures, truth.views[0] in found, record)
+        return Pictures(pictures, there[0], record)
 
     def _fitted(
-        self,
-        path: Path,
-        picture: np.ndarray,
-        size: tuple[int, int],
-        files: ObjectFiles,
-        view: int,
+        self, path: Path, picture: np.ndarray, truth: Truth, files: ObjectFiles, view: int
     ) -> np.ndarray:
         """The picture at the size compared: as it is, or resized as the true picture is."""
-        height, width = picture.shape[:2]
-        if (width, height) == size:
+        (height, width), (tall, wide) = picture.shape[:2], truth.rgb.shape[1:3]
+        if (width, height) == (wide, tall):
             return picture
-        if not self.resize and (width, height) != _size(files, view):
+        true, size = files.images[view], files.sizes[view]  # a pack may not say the size
+        if size is None and isinstance(true, Path):
+            with open_picture(true) as image:
+                size = image.size
+        if not self.resize and (width, height) != size:
             raise UserError(
-                f"{path}: is {width}x{height}, the pictures compared are {size[0]}x{size[1]}; "
+                f"{path}: is {width}x{height}, the pictures compared are {wide}x{tall}; "
                 "render it at this size, or give --resize-pictures"
             )
-        if abs(width * size[1] - height * size[0]) > max(width, height) / 2:
-            raise UserError(f"{path}: {width}x{height} has not the shape of {size[0]}x{size[1]}")
+        if abs(width * tall - height * wide) > max(width, height) / 2:
+            raise UserError(f"{path}: {width}x{height} has not the shape of {wide}x{tall}")
         # As the dataset resizes: PIL premultiplies RGBA, and its box filter is the area average.
-        kind = Image.Resampling.BOX if size[1] < height else Image.Resampling.BILINEAR
-        return np.asarray(Image.fromarray(picture).resize(size, kind))
+        kind = Image.Resampling.BOX if tall < height else Image.Resampling.BILINEAR
+        return np.asarray(Image.fromarray(picture).resize((wide, tall), kind))
 
 
-def _is_ours(path: Path) -> bool:
-    return path.suffix.lower() in PICTURES or path.name == TRANSFORMS
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in PICTURES
 
 
 def holds_pictures(folder: Path) -> bool:
     """Whether there is any picture in the folders of a folder."""
-    return any(p.suffix.lower() in PICTURES and p.parent != folder for p in visible(folder, "*"))
+    return any(_is_picture(p) and p.parent != folder for p in visible(folder, "*"))
 
 
 def _by_camera(
@@ -182,7 +180,13 @@ def _by_camera(
     lenses = np.stack([_lens(given, i) for i in range(len(given.images))])
     found, far = {}, {}
     for view in views:
-        off = _apart(given, lenses, files, view)
+        # The Frobenius norm of R - R' is sqrt(8) sin(angle / 2): exact for small angles too.
+        poses, pose = given.camera_to_world, files.camera_to_world[view]
+        chord = np.linalg.norm(poses[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(8)
+        angle = 2 * np.arcsin(np.clip(chord, 0, 1))
+        way = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.linalg.norm(pose[:3, 3])
+        # radians; distances of the true camera from the origin; sides of the picture
+        off = np.stack([angle, way, np.abs(lenses - _lens(files, view)).max(1)], 1)
         near = np.flatnonzero((off <= CAMERA).all(1))
         if len(near) > 1:
             names = " and ".join(given.images[i].name for i in near[:2])
@@ -202,20 +206,6 @@ def _by_camera(
     return found, len(given.images)
 
 
-def _apart(given: ObjectFiles, lenses: np.ndarray, files: ObjectFiles, view: int) -> np.ndarray:
-    """How far each camera is from a true one, ``[V, 3]``: angle, way, lens.
-
-    The angle is in radians, the way in distances of the true camera from the origin; the lens is
-    the largest difference of a focal length or of the centre, in sides of the picture.
-    """
-    pose, poses = files.camera_to_world[view], given.camera_to_world
-    # The Frobenius norm of R - R' is sqrt(8) sin(angle / 2): exact for small angles too.
-    chord = np.linalg.norm(poses[:, :3, :3] - pose[:3, :3], axis=(1, 2)) / np.sqrt(8)
-    angle = 2 * np.arcsin(np.clip(chord, 0, 1))
-    way = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1) / np.linalg.norm(pose[:3, 3])
-    return np.stack([angle, way, np.abs(lenses - _lens(files, view)).max(1)], 1)
-
-
 def _lens(files: ObjectFiles, view: int) -> np.ndarray:
     """Focal lengths and centre in sides of the picture, ``[4]``."""
     size = np.array(files.sizes[view] or (1, 1), np.float64)
@@ -232,7 +222,7 @@ def _by_name(
         UserError: two pictures are of one view.
     """
     given: dict[str, Path] = {}
-    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES):
+    for path in sorted(filter(_is_picture, folder.iterdir())):
         if not path.name.startswith(".") and given.setdefault(path.stem, path) is not path:
             raise UserError(f"{path}: {given[path.stem].name} has the same name; keep one")
     stems = [path.stem for path in files.images]
@@ -254,22 +244,6 @@ def _lacks(folder: Path, lacking: Sequence[int], views: Sequence[int], by: str) 
         f"{folder}: no picture {word} of view{plural} {some} "
         f"({len(lacking)} of the {len(views)} compared)"
     )
-
-
-def _read(path: Path) -> tuple[np.ndarray, bool]:
-    """RGBA ``[H, W, 4]`` uint8, and whether the file itself has alpha."""
-    with open_picture(path) as image:
-        alpha = image.has_transparency_data
-    return load_rgba8(path), alpha
-
-
-def _size(files: ObjectFiles, view: int) -> tuple[int, int] | None:
-    """Width and height of a true picture; None of one in a pack that does not say it."""
-    picture = files.images[view]
-    if files.sizes[view] is not None or not isinstance(picture, Path):
-        return files.sizes[view]
-    with open_picture(picture) as image:
-        return image.size
 
 
 def _check_white(folder: Path, rgb: Tensor, truth: Truth, found: list[bool]) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
 
@@ -20,19 +20,20 @@ from gamba_warp.model.posing import posed_input
 from .pictures import PicturePredictions, holds_pictures
 
 
-class Predictions(ABC):
-    """Gaussians by object, in the world of the reference camera.
+class PlyPredictions:
+    """``<folder>/<uid>.ply``, 3DGS layout, in the reference camera's world.
 
     Attributes:
         distance: of the reference camera from the origin of that world, object units.
-        source: what is under test, for the report: its kind, its name, and the SHA-256 of the file,
-            or of the names and SHA-256s of a folder's files.
+        source: what is under test, for the report: its kind, its name, and the SHA-256 of the names
+            and SHA-256s of the files.
     """
 
-    distance: float
-    source: dict[str, str]
+    def __init__(self, folder: Path, distance: float, device: str) -> None:
+        self.folder, self.distance, self.device = folder, distance, device
+        content = sha256_of_all(visible(folder, "*.ply"), folder)
+        self.source = {"kind": "ply", "path": folder.name, "sha256": content}
 
-    @abstractmethod
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
         """Returns one object's Gaussians (no batch dimension).
 
@@ -42,25 +43,13 @@ class Predictions(ABC):
             reference: index of the input view.
 
         Raises:
-            UserError: there are none, or a file cannot be read.
+            UserError: there are none, or the file cannot be read.
         """
-
-
-class PlyPredictions(Predictions):
-    """``<folder>/<uid>.ply``, 3DGS layout, in the reference camera's world."""
-
-    def __init__(self, folder: Path, distance: float, device: str) -> None:
-        self.folder, self.distance, self.device = folder, distance, device
-        content = sha256_of_all(visible(folder, "*.ply"), folder)
-        self.source = {"kind": "ply", "path": folder.name, "sha256": content}
-
-    def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
-        """Reads the file."""
         return load_ply(self.folder / f"{uid}.ply").to(self.device)
 
 
-class ModelPredictions(Predictions):
-    """A checkpoint, shown the reference view alone."""
+class ModelPredictions:
+    """A checkpoint, shown the reference view alone; attributes as those of ``PlyPredictions``."""
 
     def __init__(
         self,
@@ -84,13 +73,19 @@ class ModelPredictions(Predictions):
 
     @torch.no_grad()
     def gaussians(self, dataset: ViewDataset, uid: str, reference: int) -> Gaussians:
-        """Runs the model on the reference view, on the model's own background."""
+        """Runs the model on the reference view, on the model's own background.
+
+        Arguments and result are those of ``PlyPredictions.gaussians``.
+        """
         config = self.model.config
         views = dataset.load(uid, views=[reference], size=config.image_size)
         images, cameras = posed_input(views, config)
         images, cameras = images.to(self.device), cameras.to(self.device)
         with network_products(images.device, self.precision):
             return self.model(images, cameras, background_margin=self.margin)[0]
+
+
+Predictions: TypeAlias = PlyPredictions | ModelPredictions | PicturePredictions
 
 
 def open_predictions(
@@ -101,7 +96,7 @@ def open_predictions(
     resize: bool = False,
     margin: int | None = None,
     precision: Precision = "float32",
-) -> Predictions | PicturePredictions:
+) -> Predictions:
     """Opens a folder with ``.ply`` files or with pictures, else a checkpoint.
 
     Args:

@@ -73,6 +73,13 @@ def differences_of(model: Records, baselines: dict[str, Records]) -> Rows:
     return _rows(named, lambda drawn: _decibels(drawn[0]) - _decibels(drawn[1]))
 
 
+def tables_of(candidates: dict[str, Records]) -> dict[str, Rows]:
+    """``table``, of all candidates, and ``differences``, of "model" to each other one."""
+    others = {name: records for name, records in candidates.items() if name != "model"}
+    gains = differences_of(candidates["model"], others)
+    return {"table": table_of(candidates), "differences": gains}
+
+
 def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
     """The same records without the views that are nearly empty."""
     return {

@@ -2,7 +2,7 @@ import json
 
 import pytest
 import torch
-from helpers.micro import to_opengl
+from helpers.views import around, cloud_of, eval_views, straight, write_split, write_views
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
 from gamba_warp.cli import run
@@ -16,10 +16,8 @@ from gamba_warp.eval.views.contact_sheet import Row, choose_ranks, contact_sheet
 from gamba_warp.eval.views.table import differences_of, means, table_of
 from gamba_warp.fitting.config import FitConfig
 from gamba_warp.formats.ply import load_ply, save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import on_grounds
-from gamba_warp.images import load_rgba, save_image
-from gamba_warp.render import render
+from gamba_warp.images import load_rgba
 
 WIDTH, HEIGHT = 45, 33
 
@@ -101,31 +99,13 @@ SIZE = 32
 def blob(seed, squash=1.0):
     generator = torch.Generator().manual_seed(seed)
     means = 0.25 * (2 * torch.rand(40, 3, generator=generator) - 1)
-    return Gaussians(
-        means=means * torch.tensor([1.0, squash, 1.0]),
-        quats=None,
-        scales=torch.full((40, 3), 0.05),
-        opacities=torch.full((40,), 0.95),
-        colors=torch.rand(3, generator=generator).expand(40, 3).clone(),
-    )
+    hue = torch.rand(3, generator=generator)
+    return cloud_of(means * torch.tensor([1.0, squash, 1.0]), 0.05, 0.95, hue)
 
 
-def write_object(folder, gaussians, turn=0.0, count=6):
-    azimuths = torch.arange(count) * 60.0 + turn
-    cameras = Cameras(
-        orbit(azimuths, 15.0, 1.8), intrinsics(SIZE, SIZE, 45.0).expand(count, 3, 3), SIZE, SIZE
-    )
-    with torch.no_grad():
-        out = render(gaussians, cameras)
-    rgba = torch.cat([out.rgb / out.alpha.clamp(min=1e-6), out.alpha], -1)
-    folder.mkdir(parents=True)
-    frames = []
-    for v, pose in enumerate(to_opengl(cameras.viewmats)):
-        save_image(folder / f"{v}.png", rgba[v].numpy())
-        frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
-    focal = float(cameras.Ks[0, 0, 0])
-    top = {"w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(top))
+def write_object(folder, gaussians, turn=0.0):
+    cameras = around(torch.arange(6) * 60.0 + turn, 15.0, 1.8, SIZE, 45.0)
+    write_views(folder, straight(gaussians, cameras), cameras)
     _, scale = relative_to_reference(cameras.viewmats, cameras.viewmats[0])
     moved = gaussians.transformed(cameras.viewmats[0, :3, :3], torch.zeros(3), scale.item())
     moved.colors = 0.8 * moved.colors  # so that the prediction is good, not perfect
@@ -145,8 +125,7 @@ def data(tmp_path):
     write_object(root / "twin", blob(0))
     write_object(root / "flat", blob(1, 0.3))
     write_object(root / "other", blob(2))
-    split = {"version": 1, "train": ["flat", "other", "seen"], "val": [], "test": ["twin"]}
-    (root / "split.json").write_text(json.dumps(split))
+    write_split(root, train=["flat", "other", "seen"], test=["twin"])
     return root
 
 
@@ -185,8 +164,7 @@ def test_retrieval_is_by_both_terms_not_by_shape_alone(data, monkeypatch):
     dyed = blob(0)
     dyed.colors = 1 - dyed.colors
     write_object(data / "dyed", dyed, 125.0)  # nearly the twin's shape, not its colour
-    split = {"version": 1, "train": ["dyed", "other", "seen"], "val": ["flat"], "test": ["twin"]}
-    (data / "split.json").write_text(json.dumps(split))
+    write_split(data, train=["dyed", "other", "seen"], val=["flat"], test=["twin"])
     retrieval = Retrieval(open_dataset(data, "train"))
     pictures = torch.cat([retrieval.training.load(uid).images for uid in retrieval.training.uids])
     found = set()
@@ -205,11 +183,7 @@ def test_retrieval_is_by_both_terms_not_by_shape_alone(data, monkeypatch):
 
 
 def evaluate(data, out, *options):
-    places = ["--checkpoint", str(data.parent / "pred"), "--data", str(data), "--out", str(out)]
-    fixed = ["--no-lpips", "--device", "cpu", "--strips", "0", "--sheet", "1"]
-    code = run("eval-views", [*places, *fixed, *options])
-    path = out / "report.json"
-    return code, json.loads(path.read_text()) if path.exists() else None
+    return eval_views(data.parent / "pred", data, out, "--strips", 0, "--sheet", 1, *options)
 
 
 def test_a_whole_report(data, tmp_path, capsys):
@@ -239,8 +213,7 @@ def test_what_cannot_be_had_is_listed(data, tmp_path, capsys):
     assert code == 1 and report["num_failed"] == 0
     assert [item["name"] for item in report["failures"]] == ["flat (retrieval)"]
     assert "retrieval" in report["baselines"] and "flat (retrieval)" in capsys.readouterr().err
-    split = {"version": 1, "train": [], "val": ["flat"], "test": ["twin", "seen", "other"]}
-    (data / "split.json").write_text(json.dumps(split))
+    write_split(data, val=["flat"], test=["twin", "seen", "other"])
     code, report = evaluate(data, tmp_path / "out", "--limit", "2")
     assert code == 0 and "retrieval" not in report["baselines"]
     assert "train split" in report["left_out_baselines"]["retrieval"]

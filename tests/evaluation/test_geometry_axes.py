@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.views import cloud_of
 
 from gamba_warp.cli import run
-from gamba_warp.eval.paired import turn_warnings
 from gamba_warp.eval.shapes.protocol import PRESETS
+from gamba_warp.eval.shapes.table import turn_warnings
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
 
@@ -36,16 +36,7 @@ def bear(*turns):
 def save_gaussians(path, mesh, count=6000):
     """Small Gaussians on the surface of a mesh, in its axes."""
     points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
-    save_ply(
-        path,
-        Gaussians(
-            means=torch.tensor(np.asarray(points), dtype=torch.float32),
-            quats=None,
-            scales=torch.full((count, 3), 0.006),
-            opacities=torch.full((count,), 0.95),
-            colors=torch.full((count, 3), 0.5),
-        ),
-    )
+    save_ply(path, cloud_of(np.asarray(points), 0.006, 0.95, torch.full((3,), 0.5)))
 
 
 def evaluate(capfd, *words):
@@ -170,8 +161,5 @@ def test_one_turn_of_many_is_one_warning():
 def test_every_protocol_states_the_axes():
     for preset in PRESETS.values():
         values = preset.to_json()
-        assert (
-            values["up"]
-            and values["pred_axes"] == "auto"
-            and "unknown" in (values["definitions"]["axes"])
-        )
+        assert values["up"] and values["pred_axes"] == "auto"
+        assert "unknown" in values["definitions"]["axes"]

@@ -6,22 +6,25 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from helpers.micro import to_opengl
+from helpers.views import (
+    around,
+    cloud_of,
+    eval_views,
+    evaluated,
+    straight,
+    write_split,
+    write_views,
+)
 
-from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.load import load_truth
 from gamba_warp.eval.shapes.pairs import find_pairs, out_of_reference
 from gamba_warp.eval.shapes.protocol import PRESETS
-from gamba_warp.eval.views.baselines import Found
-from gamba_warp.eval.views.placing import TrainingMeshes
+from gamba_warp.eval.views.baselines import Found, TrainingMeshes
 from gamba_warp.formats.meshes import Y_TO_Z_UP, load_mesh
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
-from gamba_warp.images import save_image
-from gamba_warp.render import render
 
 SIZE = 32  # that of the thumbnails: the pictures are compared as they are
 # A quarter turn about the vertical axis of ``orbit``: bounding boxes stay bounding boxes.
@@ -42,31 +45,12 @@ def stairs():
     return mesh
 
 
-def write_views(folder, mesh, azimuths, distance):
+def write_mesh_views(folder, mesh, azimuths):
     """Pictures of Gaussians all over the mesh, whose colours follow the place in the file."""
     points, _ = trimesh.sample.sample_surface(mesh, 400, seed=1)
-    means = torch.from_numpy(np.array(points)).float()
-    cloud = Gaussians(
-        means=means,
-        quats=None,
-        scales=torch.full((400, 3), 0.04),
-        opacities=torch.full((400,), 0.95),
-        colors=torch.linspace(0, 1, 400)[:, None].expand(400, 3).contiguous(),
-    )
-    count = len(azimuths)
-    K = intrinsics(SIZE, SIZE)
-    viewmats = orbit(torch.tensor(azimuths), 20.0, distance)
-    cameras = Cameras(viewmats, K.expand(count, 3, 3), SIZE, SIZE)
-    with torch.no_grad():
-        out = render(cloud, cameras)
-    rgba = torch.cat([out.rgb / out.alpha.clamp(min=1e-6), out.alpha], -1)
-    folder.mkdir(parents=True)
-    frames = []
-    for v, pose in enumerate(to_opengl(viewmats)):
-        save_image(folder / f"{v}.png", rgba[v].numpy())
-        frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
-    top = {"w": SIZE, "h": SIZE, "fl_x": float(K[0, 0]), "fl_y": float(K[0, 0]), "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(top))
+    cloud = cloud_of(np.array(points), 0.04, 0.95, torch.linspace(0, 1, 400)[:, None])
+    cameras = around(azimuths, 20.0, 1.6, SIZE)
+    write_views(folder, straight(cloud, cameras), cameras)
     return cloud
 
 
@@ -91,21 +75,16 @@ def world(tmp_path):
     entries.append({"model": "library/s.obj", "uid": "seen", "rotation": rotation})
     entries.append({"model": "library/other.ply", "uid": "other"})
     (meshes / "catalogue.json").write_text(json.dumps({"objects": entries}))
-    cloud = write_views(data / "twin", twin, [25.0, 140.0], 1.6)
-    write_views(data / "seen", turned, [160.0, 295.0, 115.0, 205.0, 25.0], 1.6)
-    split = {"version": 2, "train": ["seen"], "val": [], "test": ["twin"]}
-    (data / "split.json").write_text(json.dumps(split))
+    cloud = write_mesh_views(data / "twin", twin, [25.0, 140.0])
+    write_mesh_views(data / "seen", turned, [160.0, 295.0, 115.0, 205.0, 25.0])
+    write_split(data, train=["seen"], test=["twin"])
     (tmp_path / "pred").mkdir()
     save_ply(tmp_path / "pred" / "twin.ply", cloud)
     return tmp_path
 
 
 def evaluate_views(world, *options):
-    places = ["--checkpoint", str(world / "pred"), "--data", str(world / "data")]
-    fixed = ["--out", str(world / "out"), "--no-lpips", "--device", "cpu", "--sheet", "0"]
-    code = run("eval-views", [*places, *fixed, *options])
-    path = world / "out" / "report.json"
-    return code, json.loads(path.read_text()) if path.exists() else None
+    return eval_views(*(world / n for n in ("pred", "data", "out")), "--sheet", 0, *options)
 
 
 def test_the_placed_mesh_is_the_truth(world, capsys):
@@ -123,10 +102,10 @@ def test_the_placed_mesh_is_the_truth(world, capsys):
     unturned = np.linalg.norm((want @ TURN.T)[:, None] - want[None], axis=-1).min(1)
     assert unturned.max() > 0.2  # so that the mesh as its file has it would be seen
     out = world / "shapes"
-    places = [str(world / "out" / "retrieval"), str(world / "meshes"), "--out", str(out)]
-    options = ["--frame", "reference", "--data", str(world / "data"), "--points", "3000"]
-    assert run("eval-geometry", [*places, *options]) == 0
-    report = json.loads((out / "report.json").read_text())
+    options = ["--frame", "reference", "--data", world / "data", "--points", 3000]
+    files = world / "out" / "retrieval", world / "meshes"
+    code, report = evaluated("eval-geometry", out, *files, *options)
+    assert code == 0
     assert [record["name"] for record in report["objects"]] == ["twin"]  # of three in the library
     assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
     assert report["mean"]["chamfer"] < 1.2 * report["mean"]["noise_floor"]
@@ -158,8 +137,7 @@ def test_what_cannot_be_placed(world, case, capsys):
     if case == "others":
         (meshes / "catalogue.json").unlink()  # the files' own names are those of no object
     if case == "train":
-        split = {"version": 2, "train": [], "val": [], "test": ["twin", "seen"]}
-        (world / "data" / "split.json").write_text(json.dumps(split))
+        write_split(world / "data", test=["twin", "seen"])
     if case == "out":
         places = ["--checkpoint", str(world / "pred"), "--data", str(world / "data")]
         assert run("eval-views", [*places, "--no-lpips", "--save-retrieval", str(meshes)]) == 2
@@ -192,9 +170,9 @@ def test_a_truth_is_turned_as_its_catalogue_says(world):
     turned.vertices = want
     (world / "upright").mkdir()
     turned.export(world / "upright" / "seen.ply")
-    places = [str(world / "upright"), str(world / "meshes"), "--out", str(world / "out")]
-    assert run("eval-geometry", [*places, "--frame", "unit", "--points", "500"]) == 0
-    report = json.loads((world / "out" / "report.json").read_text())
+    words = [world / "upright", world / "meshes", "--frame", "unit", "--points", 500]
+    code, report = evaluated("eval-geometry", world / "out", *words)
+    assert code == 0
     assert report["mean"]["iou"] > 0.99  # rounding may move a voxel's centre across the surface
     with pytest.raises(UserError, match="also stretches"):
         load_truth(path, protocol, np.diag([1.0, 1, 2]).tolist())
@@ -207,10 +185,8 @@ def boxes(folder, **sides):
 
 
 def evaluate_shapes(folder, *options):
-    places = [str(folder / "pred"), str(folder / "gt"), "--out", str(folder / "out")]
-    code = run("eval-geometry", [*places, "--points", "2000", *options])
-    path = folder / "out" / "report.json"
-    return code, json.loads(path.read_text()) if path.exists() else None
+    words = (folder / "pred", folder / "gt", "--points", 2000, *options)
+    return evaluated("eval-geometry", folder / "out", *words)
 
 
 def test_differences_are_paired(tmp_path, capsys):

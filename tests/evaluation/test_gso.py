@@ -5,6 +5,7 @@ import json
 import pytest
 import trimesh
 from helpers import micro
+from helpers.views import eval_views, evaluated
 
 from gamba_warp.cli import run
 from gamba_warp.data import gso
@@ -31,11 +32,10 @@ def data(tmp_path_factory):
 
 def test_views(data, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gso, "SIZE", 24)  # 512 pixels take a minute
-    words = ["--checkpoint", data / "pred", "--data", data / "views", "--out", tmp_path]
-    words += ["--protocol", "gso", "--no-lpips", "--no-baselines", "--sheet", 0, "--strips", 0]
-    assert run("eval-views", [str(word) for word in words]) == 1  # 58 are missing
-    report = json.loads((tmp_path / "report.json").read_text())
+    options = ["--protocol", "gso", "--no-baselines", "--sheet", 0, "--strips", 0]
+    code, report = eval_views(data / "pred", data / "views", tmp_path, *options)
     protocol = report["protocol"]
+    assert code == 1  # 58 are missing
     assert (protocol["size"], protocol["reference"], protocol["views"]) == (24, 0, None)
     assert protocol["uids"] == list(THERE) and protocol["split"] == "test"
     said = protocol["evaluation"]
@@ -57,10 +57,10 @@ def test_its_options_are_its_own(data, capsys):
 
 def test_geometry(data, tmp_path):
     words = [data / "pred", data / "meshes", "--protocol", "gso", "--data", data / "views"]
-    words += ["--points", 256, "--views", 8, "--pixels", 32, "--voxels", 24, "--out", tmp_path]
-    assert run("eval-geometry", [str(word) for word in words]) == 1
-    report = json.loads((tmp_path / "report.json").read_text())
+    words += ["--points", 256, "--views", 8, "--pixels", 32, "--voxels", 24]
+    code, report = evaluated("eval-geometry", tmp_path, *words)
     protocol = report["protocol"]
+    assert code == 1
     assert (protocol["name"], protocol["frame"], protocol["up"]) == ("gso", "reference", "z")
     # Two were compared; of the list 58 are named as missing, and what is not of it has no truth.
     assert report["num_ok"] == 2 and report["evaluation"]["evaluated"] == 2

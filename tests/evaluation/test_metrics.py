@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 from helpers import rel_rms
-from helpers.micro import to_opengl
+from helpers.views import around, eval_views, straight, write_views
 
-from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
 from gamba_warp.conventions import over_another, over_background
 from gamba_warp.errors import UserError
@@ -17,8 +16,8 @@ from gamba_warp.eval.report import (
     intervals_of,
     make_report,
     mean_of,
-    print_summary,
     save_report,
+    summary_lines,
 )
 from gamba_warp.eval.shapes.metrics import surface_metrics, volume_iou
 from gamba_warp.eval.shapes.shape import Points
@@ -26,7 +25,6 @@ from gamba_warp.eval.views.compare import Shown, Truth, compare, render_views
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import METRICS, Metric, mask_iou, on_grounds, psnr, ssim
-from gamba_warp.images import save_image
 from gamba_warp.render import render
 from gamba_warp.versions import import_open3d
 
@@ -45,14 +43,6 @@ def test_psnr_of_equal_pictures_is_bounded():
     assert psnr(a, a) == 100
 
 
-def test_psnr_equals_scikit_image():
-    from skimage.metrics import peak_signal_noise_ratio
-
-    a, b = torch.rand(33, 21, 3), torch.rand(33, 21, 3)
-    want = peak_signal_noise_ratio(a.numpy(), b.numpy(), data_range=1.0)
-    assert abs(float(psnr(a, b)) - want) < 1e-5  # float32 mean there
-
-
 @pytest.mark.parametrize("size", [(11, 11), (33, 21), (64, 40)])
 def test_ssim_equals_scikit_image(size):
     from skimage.metrics import structural_similarity
@@ -62,12 +52,9 @@ def test_ssim_equals_scikit_image(size):
     b[:, : size[0] // 2] = 1.0  # flat regions, as a white background is
     a[:, : size[0] // 3] = 1.0
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    want = [
-        structural_similarity(
-            x.double().numpy(), y.double().numpy(), channel_axis=2, data_range=1.0, **options
-        )
-        for x, y in zip(a, b)
-    ]
+    options |= {"channel_axis": 2, "data_range": 1.0}
+    pairs = zip(a.double().numpy(), b.double().numpy())
+    want = [structural_similarity(x, y, **options) for x, y in pairs]
     assert np.allclose(ssim(a, b).numpy(), want, rtol=0, atol=1e-9)
 
 
@@ -201,35 +188,29 @@ def test_interval_of_few_objects():
     assert intervals_of(many) == intervals_of(many) != intervals_of(many, seed=1)
 
 
-def test_summary_shows_the_interval(tmp_path, capsys):
+def test_summary_shows_the_interval():
     objects = [{"name": n, "status": "ok", "x": v} for n, v in (("a", 1.0), ("b", 3.0))]
     report = make_report({}, objects, {})
     assert report["interval"] == {"x": [1.0, 3.0]}
-    assert print_summary(report, tmp_path) == 0
-    assert "2 [1, 3]" in capsys.readouterr().out
+    assert "2 [1, 3]" in summary_lines(report)[0]
 
 
 def test_equal_to_scikit_image_and_kornia():
-    """Their own settings, in float64: 11x11 windows without padding, all three the same numbers."""
+    """Their own settings, in float64, 11x11 windows without padding: the same numbers."""
     from kornia.metrics import psnr as kornia_psnr
     from kornia.metrics import ssim as kornia_ssim
-    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+    from skimage.metrics import peak_signal_noise_ratio
 
     a = torch.rand(37, 29, 3, dtype=torch.float64)
     b = (a + 0.1 * torch.randn_like(a)).clamp(0, 1)
     planes = [x.permute(2, 0, 1)[None] for x in (a, b)]
-    kornia = (
+    similar = kornia_ssim(*planes, window_size=11, padding="valid").mean().item()
+    assert ssim(a, b).item() == pytest.approx(similar, abs=1e-6)
+    for want in (
         kornia_psnr(*planes, max_val=1.0).item(),
-        kornia_ssim(*planes, window_size=11, padding="valid").mean().item(),
-    )
-    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    pictures = a.numpy(), b.numpy()
-    skimage = (
-        peak_signal_noise_ratio(*pictures, data_range=1.0),
-        structural_similarity(*pictures, channel_axis=2, data_range=1.0, **window),
-    )
-    assert [psnr(a, b).item(), ssim(a, b).item()] == pytest.approx(kornia, abs=1e-6)
-    assert [psnr(a, b).item(), ssim(a, b).item()] == pytest.approx(skimage, abs=1e-6)
+        peak_signal_noise_ratio(a.numpy(), b.numpy(), data_range=1.0),
+    ):
+        assert psnr(a, b).item() == pytest.approx(want, abs=1e-6)
 
 
 # On black and on grey beside white: haze that white hides is seen.
@@ -238,29 +219,17 @@ SIZE, VIEWS = 32, 3
 
 
 def cameras():
-    K = intrinsics(SIZE, SIZE).expand(VIEWS, 3, 3)
-    return Cameras(orbit(torch.arange(VIEWS) * 70.0), K, SIZE, SIZE)
+    return around(torch.arange(VIEWS) * 70.0)
 
 
 def balls(*colors):
     """Balls about the origin, each larger than the one before; all but the first are haze."""
-    count = len(colors)
-    return Gaussians(
-        means=torch.zeros(count, 3),
-        quats=None,
-        scales=0.08 * torch.arange(1, count + 1)[:, None].expand(count, 3),
-        opacities=torch.tensor([0.95] + [0.2] * (count - 1)),
-        colors=torch.tensor(colors),
-    )
+    scales = 0.08 * torch.arange(1, len(colors) + 1)[:, None].expand(-1, 3)
+    opacities = torch.tensor([0.95] + [0.2] * (len(colors) - 1))
+    return Gaussians(torch.zeros(len(colors), 3), None, scales, opacities, torch.tensor(colors))
 
 
 RED, WHITE = [0.9, 0.1, 0.1], [1.0, 1.0, 1.0]
-
-
-def rgba(gaussians):
-    with torch.no_grad():
-        out = render(gaussians, cameras())
-    return torch.cat([out.rgb / out.alpha.clamp(min=1e-6), out.alpha], -1)
 
 
 def test_one_rendering_serves_all_grounds():
@@ -294,14 +263,7 @@ def test_known_values_on_each_ground():
 @pytest.fixture
 def red_ball(tmp_path):
     """A dataset of one ball in data/, and itself in pred/."""
-    frames, views = [], rgba(balls(RED))
-    (tmp_path / "data" / "a").mkdir(parents=True)
-    for v, pose in enumerate(to_opengl(cameras().viewmats)):
-        save_image(tmp_path / "data" / "a" / f"{v}.png", views[v].numpy())
-        frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
-    focal = float(cameras().Ks[0, 0, 0])
-    top = {"w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "frames": frames}
-    (tmp_path / "data" / "a" / "transforms.json").write_text(json.dumps(top))
+    write_views(tmp_path / "data" / "a", straight(balls(RED), cameras()), cameras())
     (tmp_path / "pred").mkdir()
     save_ply(tmp_path / "pred" / "a.ply", balls(RED))
     return tmp_path
@@ -315,10 +277,8 @@ def test_a_metric_of_the_registry_is_everywhere(red_ball, monkeypatch, capsys):
 
     metric = Metric("mean error", mean_error, digits=4, more_is_better=False, on_grounds=True)
     monkeypatch.setitem(METRICS, "mae", metric)
-    places = ["--checkpoint", str(red_ball / "pred"), "--data", str(red_ball / "data")]
-    words = [*places, "--split", "all", "--no-lpips", "--device", "cpu", "--out", str(red_ball)]
-    assert run("eval-views", words) == 0
-    report = json.loads((red_ball / "report.json").read_text())
+    pred, data = red_ball / "pred", red_ball / "data"
+    _, report = eval_views(pred, data, red_ball, "--split", "all")
     for key in ("mae", "mae_black", "mae_grey"):
         assert report["objects"][0][key] == report["mean"][key] < 0.01
         assert report["baselines"]["background"][key] > report["mean"][key]
@@ -341,12 +301,10 @@ def test_a_report_tells_of_haze_that_white_hides(red_ball, capsys):
     tmp_path, found = red_ball, {}
     for name, scene in {"clear": balls(RED), "hazy": balls(RED, WHITE)}.items():
         save_ply(tmp_path / "pred" / "a.ply", scene)
-        places = ["--checkpoint", str(tmp_path / "pred"), "--data", str(tmp_path / "data")]
-        options = ["--split", "all", "--no-lpips", "--device", "cpu", "--sheet", "0"]
-        out = tmp_path / name
-        words = [*places, *options, "--out", str(out), "--save-pictures"]
-        assert run("eval-views", words) == 0
-        found[name] = json.loads((out / "report.json").read_text())
+        options, data = ["--split", "all", "--sheet", 0], tmp_path / "data"
+        words = [tmp_path / "pred", data, tmp_path / name, *options, "--save-pictures"]
+        code, found[name] = eval_views(*words)
+        assert code == 0
     said = capsys.readouterr().out
     assert "PSNR on black" in said and "composited by their alpha" in said
     clear, hazy = (report["mean"] for report in found.values())
@@ -365,9 +323,10 @@ def test_a_report_tells_of_haze_that_white_hides(red_ball, capsys):
     header = (tmp_path / "hazy" / "objects.csv").read_text().partition("\n")[0]
     assert "psnr_black" in report["differences"][0] and "input.psnr_grey" in header
     # What is written of the model, evaluated as another method's pictures, has the same figures.
-    words = ["--predictions", str(tmp_path / "hazy" / "pictures" / "model"), *places[2:], *options]
-    assert run("eval-views", [*words, "--no-baselines", "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)["mean"]
+    written = tmp_path / "hazy" / "pictures" / "model"
+    code, report = eval_views(written, data, tmp_path / "again", *options, "--no-baselines")
+    again = report["mean"]
+    assert code == 0
     assert again["psnr"] > 60
     for key in ("psnr_black", "psnr_grey"):
         assert again[key] == pytest.approx(hazy[key], abs=0.1)

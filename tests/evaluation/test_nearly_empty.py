@@ -1,22 +1,17 @@
 """Views that show next to nothing: counted, in the means, and left out of a second set of means."""
 
-import json
 import math
 
 import pytest
 import torch
-from helpers.micro import to_opengl
+from helpers.views import around, cloud_of, eval_views, write_views
 
-from gamba_warp.cameras import Cameras, intrinsics, orbit
-from gamba_warp.cli import run
 from gamba_warp.eval.averages import bootstrap, median_of, minus, summary_of
 from gamba_warp.eval.views.compare import NEARLY_EMPTY, Truth, summary
 from gamba_warp.eval.views.evaluate import count_nearly_empty
 from gamba_warp.eval.views.table import differences_of, page, table_of, without_nearly_empty
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.image_metrics import on_grounds
-from gamba_warp.images import save_image
 
 SIZE = 40  # 16 of its pixels are exactly 1 %
 
@@ -43,9 +38,7 @@ def test_coverage_is_the_mean_of_alpha():
     images = torch.zeros(2, SIZE, SIZE, 4)
     images[0, :4, :4, 3] = 1.0
     images[1, :20, :20, 3] = 0.5  # glass, in no mask
-    viewmats = orbit(torch.zeros(2))
-    cameras = Cameras(viewmats, intrinsics(SIZE, SIZE).expand(2, 3, 3), SIZE, SIZE)
-    assert Truth("a", images, cameras, [0, 1]).coverage == [0.01, 0.125]
+    assert Truth("a", images, around([0, 0], size=SIZE), [0, 1]).coverage == [0.01, 0.125]
 
 
 def records(*pairs):
@@ -93,35 +86,19 @@ def test_tables():
 
 def test_a_report_has_both(tmp_path, capsys):
     """A speck in one of three views, through the command."""
-    viewmats = orbit(torch.arange(3) * 90.0, 0.0, 1.5)
-    K = intrinsics(SIZE, SIZE)
-    frames = []
+    cameras = around(torch.arange(3) * 90.0, size=SIZE)
+    (tmp_path / "pred").mkdir()
     for uid in ("speck", "whole"):
-        (tmp_path / "data" / uid).mkdir(parents=True)
-        (tmp_path / "pred").mkdir(exist_ok=True)
-        for v, pose in enumerate(to_opengl(viewmats)):
-            rgba = torch.zeros(SIZE, SIZE, 4)
-            side = 3 if uid == "speck" and v == 1 else 12
-            rgba[:side, :side, 3] = 1.0
-            save_image(tmp_path / "data" / uid / f"{v}.png", rgba.numpy())
-            frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
-        top = {"w": SIZE, "h": SIZE, "fl_x": float(K[0, 0]), "fl_y": float(K[0, 0])}
-        (tmp_path / "data" / uid / "transforms.json").write_text(
-            json.dumps(top | {"frames": frames[-3:]})
-        )
-        ball = Gaussians(
-            means=torch.zeros(1, 3),
-            quats=None,
-            scales=torch.full((1, 3), 0.05),
-            opacities=torch.tensor([0.9]),
-            colors=torch.zeros(1, 3),
-        )
+        rgba = torch.zeros(3, SIZE, SIZE, 4)
+        rgba[:, :12, :12, 3] = 1.0
+        if uid == "speck":
+            rgba[1, 3:, :, 3] = rgba[1, :, 3:, 3] = 0.0
+        write_views(tmp_path / "data" / uid, rgba, cameras)
+        ball = cloud_of(torch.zeros(1, 3), 0.05, 0.9, torch.zeros(3))
         save_ply(tmp_path / "pred" / f"{uid}.ply", ball)
-    out = tmp_path / "out"
-    places = ["--checkpoint", str(tmp_path / "pred"), "--data", str(tmp_path / "data")]
-    options = ["--split", "all", "--no-lpips", "--device", "cpu", "--sheet", "0"]
-    assert run("eval-views", [*places, "--out", str(out), *options]) == 0
-    report = json.loads((out / "report.json").read_text())
+    folders = [tmp_path / name for name in ("pred", "data", "out")]
+    code, report = eval_views(*folders, "--split", "all", "--sheet", 0)
+    assert code == 0
     assert report["nearly_empty"] == {"views": 1, "of_views": 6, "objects": 1, "of_objects": 2}
     assert report["protocol"]["nearly_empty"] == 0.01
     speck, whole = report["objects"]

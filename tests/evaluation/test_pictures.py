@@ -1,16 +1,13 @@
 """Folders of pictures that any method rendered: what is matched, refused and said."""
 
-import json
 import shutil
 
 import numpy as np
 import pytest
 import torch
-from helpers.micro import to_opengl
+from helpers.views import around, eval_views, transforms
 from PIL import Image
 
-from gamba_warp.cameras import intrinsics, orbit
-from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views.compare import Shown, ViewsProtocol, load_truth, shown
 from gamba_warp.eval.views.pictures import PicturePredictions, save_pictures
@@ -36,11 +33,8 @@ def rgba(seed, alpha=True):
     return picture[..., :3]
 
 
-def transforms(names, azimuths, size=SIZE):
-    poses = to_opengl(orbit(azimuths, 20.0, 2.0).double()).tolist()
-    focal = float(intrinsics(size, size)[0, 0])
-    frames = [{"file_path": n, "transform_matrix": p} for n, p in zip(names, poses)]
-    return json.dumps({"w": size, "h": size, "fl_x": focal, "fl_y": focal, "frames": frames})
+def poses(names, azimuths):
+    return transforms(names, around(azimuths, 20.0, 2.0, SIZE))
 
 
 AZIMUTHS = torch.arange(VIEWS) * 60.0
@@ -53,7 +47,7 @@ def data(tmp_path):
         folder = tmp_path / "data" / uid
         folder.mkdir(parents=True)
         names = [f"view{v}.png" for v in range(VIEWS)]
-        (folder / "transforms.json").write_text(transforms(names, AZIMUTHS))
+        (folder / "transforms.json").write_text(poses(names, AZIMUTHS))
         for v, name in enumerate(names):
             Image.fromarray(rgba(10 * number + v)).save(folder / name)
         shutil.copytree(folder, tmp_path / "pred" / uid)
@@ -62,11 +56,8 @@ def data(tmp_path):
 
 
 def evaluate(folder, *options):
-    arguments = ["--predictions", folder / "pred", "--data", folder / "data", "--split", "all"]
-    arguments += ["--out", folder / "out", "--no-lpips", "--no-baselines", "--device", "cpu"]
-    code = run("eval-views", [*map(str, arguments), *options])
-    path = folder / "out" / "report.json"
-    return code, json.loads(path.read_text()) if path.exists() else None
+    places = (folder / name for name in ("pred", "data", "out"))
+    return eval_views(*places, "--split", "all", "--no-baselines", *options)
 
 
 def test_by_name_by_number_and_by_camera_is_the_same(data):
@@ -85,7 +76,7 @@ def test_by_name_by_number_and_by_camera_is_the_same(data):
         shutil.copy(folder / "0001.png", folder / "extra.png")
         names = ["extra.png", "0002.png", "0000.png", "0003.png", "0001.png"]
         azimuths = torch.tensor([75.0, 120, 0, 180, 60]) + 0.01
-        (folder / "transforms.json").write_text(transforms(names, azimuths))
+        (folder / "transforms.json").write_text(poses(names, azimuths))
     code, found = evaluate(data)
     assert code == 0
     assert found["objects"][0]["pictures"] == {
@@ -169,19 +160,19 @@ def on_black(folder):
 
 def turned_cameras(folder):
     names = [f"view{v}.png" for v in range(VIEWS)]
-    (folder / "transforms.json").write_text(transforms(names, AZIMUTHS + 3))
+    (folder / "transforms.json").write_text(poses(names, AZIMUTHS + 3))
 
 
 def other_lens(folder):
     names = [f"view{v}.png" for v in range(VIEWS)]
-    text = transforms(names, AZIMUTHS).replace('"fl_x": ', '"fl_x": 1')
+    text = poses(names, AZIMUTHS).replace('"fl_x": ', '"fl_x": 1')
     (folder / "transforms.json").write_text(text)
 
 
 def two_at_one_camera(folder):
     names = [f"view{v}.png" for v in (0, 1, 2, 3)]
     azimuths = torch.tensor([0.0, 60, 120, 120])
-    (folder / "transforms.json").write_text(transforms(names, azimuths))
+    (folder / "transforms.json").write_text(poses(names, azimuths))
 
 
 def no_picture(folder):

@@ -1,4 +1,3 @@
-import json
 import math
 import subprocess
 import sys
@@ -6,9 +5,9 @@ import sys
 import numpy as np
 import pytest
 import torch
-from helpers.micro import to_opengl
+from helpers.views import around, cloud_of, evaluated, straight, write_split, write_views
 
-from gamba_warp.cameras import Cameras, intrinsics, orbit, relative_to_reference
+from gamba_warp.cameras import Cameras, relative_to_reference
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
@@ -16,8 +15,6 @@ from gamba_warp.eval.shapes.pairs import out_of_reference
 from gamba_warp.eval.views import evaluate as module
 from gamba_warp.eval.views.compare import Shown, choose_views
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
-from gamba_warp.images import save_image
 from gamba_warp.model.config import GambaConfig
 
 SIZE = 48
@@ -25,12 +22,11 @@ DISTANCE = 2.25  # of the dataset's cameras: not the model's 1.5
 COLOR = torch.tensor([0.2, 0.6, 1.0])
 
 
-def cameras(count=4):
+def cameras():
     """An orbit in a z-up world."""
     turn = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    azimuths = torch.arange(count) * 77.0 + 20
-    viewmats = orbit(azimuths, 25.0, DISTANCE) @ turn
-    return Cameras(viewmats, intrinsics(SIZE, SIZE, 40.0).expand(count, 3, 3), SIZE, SIZE)
+    ring = around(torch.arange(4) * 77.0 + 20, 25.0, DISTANCE, SIZE, 40.0)
+    return Cameras(ring.viewmats @ turn, ring.Ks, SIZE, SIZE)
 
 
 def paint(gaussians, views):
@@ -46,27 +42,13 @@ def paint(gaussians, views):
 
 
 def one(point):
-    return Gaussians(
-        means=torch.tensor([point]),
-        quats=None,
-        scales=torch.full((1, 3), 0.08),
-        opacities=torch.tensor([0.95]),
-        colors=COLOR[None],
-    )
+    return cloud_of([point], 0.08, 0.95, COLOR)
 
 
-def write_object(folder, point, views=None, drawer=paint):
-    views = cameras() if views is None else views
-    rgb, alpha = drawer(one(point), views)
-    folder.mkdir(parents=True)
-    frames = []
-    for v, pose in enumerate(to_opengl(views.viewmats)):
-        pixels = torch.cat([rgb[v], alpha[v, ..., None]], -1)
-        save_image(folder / f"{v}.png", pixels.numpy())
-        frames.append({"file_path": f"{v}.png", "transform_matrix": pose.tolist()})
-    focal = float(views.Ks[0, 0, 0])
-    top = {"w": SIZE, "h": SIZE, "fl_x": focal, "fl_y": focal, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(top))
+def write_object(folder, point, drawer=paint):
+    drawn = drawer(one(point), cameras())
+    rgba = drawn if torch.is_tensor(drawn) else torch.cat([drawn.rgb, drawn.alpha[..., None]], -1)
+    write_views(folder, rgba, cameras())
 
 
 def in_reference_world(point, reference=0):
@@ -96,13 +78,10 @@ def painted(monkeypatch):
     monkeypatch.setattr(module, "render_views", paint)
 
 
-def evaluate(folder, *options, pred="pred"):
-    places = ["--checkpoint", str(folder / pred), "--data", str(folder / "data")]
-    arguments = [*places, "--out", str(folder / "out"), "--device", "cpu"]
+def evaluate(folder, *options, pred="pred", lpips="--no-lpips"):
     split = [] if "--split" in options else ["--split", "all"]
-    code = run("eval-views", [*arguments, *split, *options])
-    path = folder / "out" / "report.json"
-    return code, json.loads(path.read_text()) if path.exists() else None
+    words = ["--checkpoint", folder / pred, "--data", folder / "data", "--device", "cpu", lpips]
+    return evaluated("eval-views", folder / "out", *words, *split, *options)
 
 
 def test_perfect_predictions(data, painted):
@@ -110,7 +89,7 @@ def test_perfect_predictions(data, painted):
     for reference in (0, 2):
         for uid, point in POINTS.items():
             save_ply(data / "pred" / f"{uid}.ply", one(in_reference_world(point, reference)))
-        options = ["--no-lpips", "--no-baselines", "--reference", str(reference)]
+        options = ["--no-baselines", "--reference", str(reference)]
         code, report = evaluate(data, *options)
         assert code == 0
         # 8-bit rounding of the files only
@@ -128,12 +107,12 @@ def test_perfect_predictions(data, painted):
 
 
 def test_a_wrong_distance_shows(data, painted):
-    _, report = evaluate(data, "--no-lpips", "--distance", "2.5")
+    _, report = evaluate(data, "--distance", "2.5")
     assert report["mean"]["mask_iou"] < 0.99
 
 
 def test_baselines_have_known_values(data, painted):
-    _, report = evaluate(data, "--no-lpips")
+    _, report = evaluate(data)
     empty, copy = report["baselines"]["background"], report["baselines"]["input_copy"]
     rounded = (COLOR * 255 + 0.5).floor() / 255
     mse = 81 / SIZE**2 * float((1 - rounded).square().mean())
@@ -141,7 +120,7 @@ def test_baselines_have_known_values(data, painted):
     assert empty["mask_iou"] == 0
     assert copy["input"]["psnr"] == 100 and copy["input"]["mask_iou"] == 1
     assert copy["psnr"] < 30  # a mean with the input in it would be over 35
-    options = ["--no-lpips", "--no-baselines", "--limit", "1"]
+    options = ["--no-baselines", "--limit", "1"]
     assert evaluate(data, *options)[1]["baselines"] == {}
 
 
@@ -154,7 +133,7 @@ def test_failures_are_listed(data, painted, monkeypatch):
         return Shown(torch.full_like(rgb, torch.nan), alpha)
 
     monkeypatch.setattr(module, "render_views", nan_where_c)
-    code, report = evaluate(data, "--no-lpips")
+    code, report = evaluate(data)
     assert code == 1
     reasons = {item["name"]: item["reason"] for item in report["failures"]}
     assert "No such file" in reasons["a"] and "2.png" in reasons["group/b"]
@@ -165,7 +144,7 @@ def test_failures_are_listed(data, painted, monkeypatch):
 def test_strips_and_views(data, painted):
     from PIL import Image
 
-    _, report = evaluate(data, "--no-lpips", "--views", "3", "--size", "24", "--strips", "1")
+    _, report = evaluate(data, "--views", "3", "--size", "24", "--strips", "1")
     assert report["objects"][0]["views"] == [0, 1, 2]
     files = sorted((data / "out" / "strips").rglob("*.png"))
     assert [path.name for path in files] == ["a.png"]
@@ -184,7 +163,7 @@ def test_choose_views():
 
 def test_lpips_without_weights(data, painted, monkeypatch):
     monkeypatch.setenv("GAMBA_CACHE", str(data / "cache"))
-    code, report = evaluate(data, "--limit", "1")
+    code, report = evaluate(data, "--limit", "1", lpips="--lpips")
     assert code == 0 and report["mean"]["lpips"] is None
     assert "gamba weights lpips" in report["protocol"]["lpips_reason"]
 
@@ -194,7 +173,7 @@ def test_lpips_with_weights(data, painted):
 
     if not lpips_available():
         pytest.skip("the LPIPS weights are not in the cache (gamba weights lpips)")
-    _, report = evaluate(data, "--limit", "1", "--views", "2")
+    _, report = evaluate(data, "--limit", "1", "--views", "2", lpips="--lpips")
     assert report["protocol"]["lpips"] == "VGG16, version 0.1"
     # a prediction that differs by rounding, against an empty picture
     for key in ("lpips", "lpips_black", "lpips_grey"):
@@ -215,9 +194,7 @@ def test_what_cannot_start(data, case, capsys):
     if case in ("limit", "distance"):
         options, message = [f"--{case}", "0"], f"--{case}"
     if case == "split":
-        (data / "data" / "split.json").write_text(
-            json.dumps({"version": 1, "train": ["a", "c", "group/b"], "val": [], "test": []})
-        )
+        write_split(data / "data", train=["a", "c", "group/b"])
         options, message = ["--split", "test"], "test split"
     code, report = evaluate(data, *options, pred=pred)
     assert code == 2 and report is None
@@ -238,35 +215,21 @@ def test_module_entry():
     assert helped.returncode == 0 and "--reference" in helped.stdout
 
 
-@pytest.fixture
-def rasterizer():
-    rasterize = pytest.importorskip("gamba_warp.kernels.rasterize")
-    if not hasattr(rasterize, "rasterization"):
-        pytest.skip("the rasterizer is not there")
-
-
-def straight(gaussians, views):
-    from gamba_warp.render import render
-
-    out = render(gaussians, views)  # on black: the colour is premultiplied
-    return out.rgb / out.alpha.clamp(min=1e-6), out.alpha[..., 0]
-
-
-def test_gaussians_rendered_and_rendered_again(tmp_path, rasterizer):
+def test_gaussians_rendered_and_rendered_again(tmp_path):
     write_object(tmp_path / "data" / "a", POINTS["a"], drawer=straight)
     (tmp_path / "pred").mkdir()
     viewmats = cameras().viewmats
     _, scale = relative_to_reference(viewmats, viewmats[0])
     moved = one(POINTS["a"]).transformed(viewmats[0, :3, :3], torch.zeros(3), float(scale))
     save_ply(tmp_path / "pred" / "a.ply", moved)
-    code, report = evaluate(tmp_path, "--no-lpips")
+    code, report = evaluate(tmp_path)
     assert code == 0
     # 8-bit colour and alpha in the files; the mask's edge may fall on either side
     assert report["mean"]["psnr"] > 48 and report["mean"]["mask_iou"] > 0.95
     assert report["baselines"]["input_copy"]["psnr"] < 40
 
 
-def test_checkpoint(data, rasterizer, capsys):
+def test_checkpoint(data, capsys):
     from gamba_warp.model.checkpoint import save_model
     from gamba_warp.model.gamba import Gamba
 
@@ -275,11 +238,11 @@ def test_checkpoint(data, rasterizer, capsys):
     )
     (data / "model").mkdir()
     save_model(data / "model" / "model.safetensors", Gamba(config))
-    code, report = evaluate(data, "--no-lpips", "--limit", "1", "--views", "2", pred="model")
+    code, report = evaluate(data, "--limit", "1", "--views", "2", pred="model")
     assert code == 0
     assert report["protocol"]["source"]["kind"] == "checkpoint"
     assert report["objects"][0]["gaussians"] == config.num_gaussians
-    few = [*"--no-lpips --limit 1 --views 2 --background-margin 0".split()]
+    few = [*"--limit 1 --views 2 --background-margin 0".split()]
     code, report = evaluate(data, *few, pred="model")
     assert code == 0 and 0 < report["objects"][0]["gaussians"] < config.num_gaussians
     assert report["protocol"]["source"]["background_margin"] == "0"
@@ -288,10 +251,10 @@ def test_checkpoint(data, rasterizer, capsys):
 
 
 def test_saved_gaussians_evaluate_to_the_same(data, painted):
-    code, report = evaluate(data, "--no-lpips", "--save-gaussians")
+    code, report = evaluate(data, "--save-gaussians")
     assert code == 0
     (data / "out" / "report.json").unlink()
-    code, again = evaluate(data, "--no-lpips", pred="out/gaussians")
+    code, again = evaluate(data, pred="out/gaussians")
     assert code == 0 and len(list((data / "out" / "gaussians").rglob("*.ply"))) == len(POINTS)
     assert again["mean"]["psnr"] == report["mean"]["psnr"] > 30
 
@@ -320,7 +283,7 @@ def test_bad_files_stop_no_other_object(data, painted, monkeypatch):
 
     module_evaluate = module.evaluate_object
     monkeypatch.setattr(module, "evaluate_object", evaluate_and_spoil)
-    code, report = evaluate(data, "--no-lpips", "--no-baselines")
+    code, report = evaluate(data, "--no-baselines")
     assert code == 1 and [r["name"] for r in report["objects"] if r["status"] == "ok"] == [
         "group/b"
     ]
@@ -329,6 +292,6 @@ def test_bad_files_stop_no_other_object(data, painted, monkeypatch):
     save_ply(data / "pred" / "new.ply", one(in_reference_world(POINTS["a"])))
     monkeypatch.setattr(module, "evaluate_object", module_evaluate)
     monkeypatch.setattr(module, "contact_sheet", real)
-    code, report = evaluate(data, "--no-lpips", "--no-baselines")
+    code, report = evaluate(data, "--no-baselines")
     assert code == 1 and len(report["failures"]) == 2 and report["num_ok"] == 2
     assert (data / "out" / "contact_sheet.png").exists()

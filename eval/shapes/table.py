@@ -5,23 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from .averages import LEVEL, intervals_of, mean_of, median, median_of, minus
-from .report import OK, flat
-from .tables import cell, markdown
+from ..averages import LEVEL, intervals_of, mean_of, median, median_of, minus
+from ..report import OK, flat
+from ..tables import Column, Row, figures, markdown
 
 PREDICTED = "predicted"  # name of the row of what is under test
 METRICS = (
-    "iou",
-    "chamfer",
-    "chamfer_squared",
-    "accuracy",
-    "completeness",
-    "hausdorff",
-    "fscore",
-    "normal_consistency",
+    *("iou", "chamfer", "chamfer_squared", "accuracy", "completeness", "hausdorff"),
+    *("fscore", "normal_consistency"),
 )
-_SHOWN = {"iou": "Volume IoU", "chamfer": "Chamfer", "normal_consistency": "normal consistency"}
-_DIGITS = 4
+_SHOWN = {
+    "iou": Column("Volume IoU", 4),
+    "chamfer": Column("Chamfer", 4),
+    "normal_consistency": Column("normal consistency", 4),
+}
 # A turn is warned of where it leaves at most such shares of the Chamfer distance: of one object's,
 # or of the mean of many.
 FAR_BETTER, BETTER, MANY = 0.6, 0.9, 5
@@ -56,36 +53,27 @@ def differences_of(objects: list[dict[str, Any]], others: list[dict[str, Any]]) 
 
 def page(report: dict[str, Any]) -> str:
     """The text of ``table.md``, from a report of ``eval-geometry`` with baselines."""
-    rows = {PREDICTED: report, **report["baselines"]}
-    counts = {name: part["num_ok"] for name, part in rows.items()}
-    for name, part in report["differences"].items():
-        label = f"{PREDICTED} - {name}"
-        rows[label], counts[label] = part, part["objects"]
-    keys = _columns(report)
-    lines = {kind: [["", "objects", *keys.values()]] for kind in ("mean", "median")}
-    for name, part in rows.items():
-        intervals = flat(part["interval"], lists=True)
-        for kind, table in lines.items():
-            values, signed = flat(part[kind]), " - " in name
-            ends = intervals if kind == "mean" else {}
-            cells = [cell(values.get(k), ends.get(k), _DIGITS, signed) for k in keys]
-            table.append([name, str(counts[name]), *cells])
-    texts = [
-        markdown(lines["mean"]),
-        f"Means over objects with {100 * LEVEL:g} % bootstrap intervals over objects; differences "
-        "object by object, over the objects that both have. Lengths: the truth's longest side is "
-        "1. Chamfer: less is better.",
-        "Medians over objects:",
-        markdown(lines["median"]),
-    ]
-    return "\n\n".join(texts) + "\n"
-
-
-def _columns(report: dict[str, Any]) -> dict[str, str]:
-    """What the table shows, by key: of the F-scores the one in the middle."""
     thresholds = sorted(report["protocol"]["thresholds"])
     middle = thresholds[len(thresholds) // 2]
-    return _SHOWN | {f"fscore.{middle}": f"F-score at {middle:g}"}
+    columns = _SHOWN | {f"fscore.{middle}": Column(f"F-score at {middle:g}", 4)}
+    parts = {PREDICTED: report, **report["baselines"]}
+    named = [(name, part["num_ok"], part) for name, part in parts.items()]
+    gains = report["differences"].items()
+    named += [(f"{PREDICTED} - {name}", part["objects"], part) for name, part in gains]
+    rows = []
+    for name, count, part in named:
+        of = {key: flat(part[key], lists=True) for key in ("mean", "interval", "median")}
+        shown = {key: {kind: values.get(key) for kind, values in of.items()} for key in columns}
+        rows.append(Row([name, str(count)], shown, " - " in name))
+    means, medians = (
+        markdown(figures(["", "objects"], columns, rows, of)) for of in ("mean", "median")
+    )
+    note = (
+        f"Means over objects with {100 * LEVEL:g} % bootstrap intervals over objects; differences "
+        "object by object, over the objects that both have. Lengths: the truth's longest side is "
+        "1. Chamfer: less is better."
+    )
+    return "\n\n".join([means, note, "Medians over objects:", medians]) + "\n"
 
 
 def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:
@@ -114,21 +102,24 @@ def turn_warnings(done: list[dict[str, Any]]) -> list[str]:
         done: records of the evaluated objects.
     """
     ask = "are the axes right? (--pred-axes, --up, --frame)"
+
+    def straight_and_best(turned: dict[str, float]) -> tuple[float, str, float]:
+        best = min((t for t in turned if t != AS_IS), key=turned.__getitem__)
+        return turned[AS_IS], best, turned[best]
+
     if len(done) >= MANY:
-        means = mean_of([record["chamfer_turned"] for record in done])
-        straight, best = means.pop(AS_IS), min(means, key=means.__getitem__)
-        if means[best] <= BETTER * straight:
+        straight, turn, value = straight_and_best(mean_of([r["chamfer_turned"] for r in done]))
+        if value <= BETTER * straight:
             return [
-                f"the mean Chamfer distance of {len(done)} predictions would be {means[best]:.3g} "
-                f"in place of {straight:.3g} if all were turned by {best}; {ask}"
+                f"the mean Chamfer distance of {len(done)} predictions would be {value:.3g} "
+                f"in place of {straight:.3g} if all were turned by {turn}; {ask}"
             ]
     found: dict[str, list[str]] = {}
     for record in done:
-        values = dict(record["chamfer_turned"])
-        straight, best = values.pop(AS_IS), min(values, key=values.__getitem__)
-        if values[best] < FAR_BETTER * straight:
-            text = f"{record['name']} {values[best]:.3g} in place of {straight:.3g}"
-            found.setdefault(best, []).append(text)
+        straight, turn, value = straight_and_best(record["chamfer_turned"])
+        if value < FAR_BETTER * straight:
+            text = f"{record['name']} {value:.3g} in place of {straight:.3g}"
+            found.setdefault(turn, []).append(text)
     return [
         f"{len(texts)} of {len(done)} predictions would have a far smaller Chamfer distance turned "
         f"by {turn} ({'; '.join(texts[:_NAMED])}{'; ...' if len(texts) > _NAMED else ''}); {ask}"
