@@ -78,14 +78,6 @@ def finite_or_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _checked(record: dict[str, Any]) -> dict[str, Any]:
-    """The record, or that of a failure where one of its numbers is not finite."""
-    try:
-        return check_finite(record) if record["status"] == OK else record
-    except UserError as error:
-        return failure(record["name"], error)
-
-
 def failure(name: str, error: Exception | str) -> dict[str, str]:
     """The record of an object that could not be evaluated; its reason is one line."""
     return {"name": name, "status": FAILED, "reason": first_line(error)}
@@ -130,16 +122,18 @@ def over_objects(objects: list[dict[str, Any]], left_out: tuple[str, ...] = ()) 
         ``objects`` (by name), ``mean, interval`` (of the mean, over objects), ``median, num_ok,
         num_failed`` and ``failures``.
     """
-    objects = sorted(map(_checked, objects), key=lambda record: record["name"])
-    done = [record for record in objects if record["status"] == OK]
+    checked = []
+    for record in sorted(objects, key=lambda record: record["name"]):
+        try:
+            checked.append(check_finite(record) if record["status"] == OK else record)
+        except UserError as error:
+            checked.append(failure(record["name"], error))
+    done = [record for record in checked if record["status"] == OK]
     numbers = [{k: v for k, v in record.items() if k not in left_out} for record in done]
-    failures = [
-        {"name": record["name"], "reason": record["reason"]}
-        for record in objects
-        if record["status"] == FAILED
-    ]
+    failed = [record for record in checked if record["status"] == FAILED]
+    failures = [{"name": record["name"], "reason": record["reason"]} for record in failed]
     return {
-        "objects": objects,
+        "objects": checked,
         "mean": mean_of(numbers),
         "interval": intervals_of(numbers),
         "median": median_of(numbers),
@@ -156,19 +150,17 @@ def json_of(report: dict[str, Any]) -> str:
 
 def csv_of(report: dict[str, Any]) -> str:
     """A line of CSV for each object; keys are ``outer.inner``, lists of words become one text."""
-    rows = [
-        flat({key: " ".join(value) if _is_words(value) else value for key, value in record.items()})
-        for record in report["objects"]
-    ]
+
+    def plain(value: Any) -> Any:
+        words = isinstance(value, list) and all(isinstance(item, str) for item in value)
+        return " ".join(value) if words else value
+
+    rows = [flat({k: plain(v) for k, v in record.items()}) for record in report["objects"]]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)))
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
-
-
-def _is_words(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, str) for item in value)
 
 
 def save_report(report: dict[str, Any], folder: Path) -> None:
@@ -178,14 +170,16 @@ def save_report(report: dict[str, Any], folder: Path) -> None:
         UserError: they cannot be written there; they are then in a temporary folder, if that can be
             written, which the message names.
     """
+
+    def save(place: Path) -> None:
+        write_json(place / "report.json", report)
+        write_text(place / "objects.csv", csv_of(report))
+
     try:
-        write_json(folder / "report.json", report)
-        write_text(folder / "objects.csv", csv_of(report))
+        save(folder)
     except UserError as error:
         try:
-            other = Path(tempfile.mkdtemp(prefix="gamba-report-"))
-            write_json(other / "report.json", report)
-            write_text(other / "objects.csv", csv_of(report))
+            save(other := Path(tempfile.mkdtemp(prefix="gamba-report-")))
         except (OSError, UserError):
             raise error from None
         raise UserError(f"{error}; the report is in {other}") from error

@@ -249,8 +249,8 @@ def evaluate_pair(
     Raises:
         UserError: a file cannot be read or has no surface, or a number is not finite.
     """
-    from .compare import chamfer_by_turn, compare
     from .load import FRAME_AXES, load_prediction, load_truth
+    from .metrics import chamfer_by_turn, compare
 
     stages = Stopwatch(3)
     with stages("load"):

@@ -1,16 +1,21 @@
-"""One picture of the best, median and worst objects of an evaluation."""
+"""Pictures of an evaluation: strips of objects, and a sheet of the best, median and worst."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 from torch import Tensor
 
-from gamba_warp.files import atomic_path
-from gamba_warp.images import to_uint8
+from gamba_warp.files import atomic_path, output_folder
+from gamba_warp.image_metrics import METRICS
+from gamba_warp.images import save_image, to_uint8
+
+from .compare import Truth, choose_views
 
 TILE = 128  # pixels a side; pictures are fitted into it
 _LABEL, _HEADER, _GAP, _LINE = 200, 22, 4, 16  # pixels
@@ -54,6 +59,20 @@ def choose_ranks(count: int, each: int) -> dict[int, str]:
     return dict(sorted(labels.items()))
 
 
+def label(record: dict[str, Any], place: str) -> list[str]:
+    """The lines beside an object's pictures: its name, its place, and its figures."""
+    lines = [record["name"], place]
+    for kind, values in (("novel", record), ("input", record["input"])):
+        known = [
+            f"{metric.title} {values[key]:.{metric.digits}f} {metric.unit}".strip()
+            for key, metric in METRICS.items()
+            if values[key] is not None
+        ]
+        if known:
+            lines += [f"{kind}: {', '.join(known[:2])}", f"    {', '.join(known[2:])}"]
+    return lines
+
+
 def contact_sheet(path: Path, rows: list[Row]) -> None:
     """Writes a PNG: label | input | true novel views | the same predicted, a row an object.
 
@@ -74,13 +93,18 @@ def contact_sheet(path: Path, rows: list[Row]) -> None:
             draw.text((6, top + 4 + k * _LINE), line, fill=grey, font=font)
         for start, pictures in zip(starts, (row.shown[None], row.truth, row.predicted)):
             for k, picture in enumerate(pictures):
-                sheet.paste(_tile(picture), (start + k * step, top))
+                pixels = Image.fromarray(to_uint8(np.asarray(picture.cpu())))
+                tile = ImageOps.pad(pixels, (TILE, TILE), color=(255, 255, 255))
+                edge = (0, 0, TILE - 1, TILE - 1)
+                ImageDraw.Draw(tile).rectangle(edge, outline=(225, 225, 225))
+                sheet.paste(tile, (start + k * step, top))
     with atomic_path(path) as temporary:
         sheet.save(temporary)
 
 
-def _tile(picture: Tensor) -> Image.Image:
-    pixels = to_uint8(np.asarray(picture.cpu()))
-    tile = ImageOps.pad(Image.fromarray(pixels), (TILE, TILE), color=(255, 255, 255))
-    ImageDraw.Draw(tile).rectangle((0, 0, TILE - 1, TILE - 1), outline=(225, 225, 225))
-    return tile
+def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
+    """Writes rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
+    rows = choose_views(len(rgb), 0, count)
+    strips = [torch.cat([truth.rgb[0], rgb[row], truth.rgb[row]], 1) for row in rows]
+    output_folder(path.parent)
+    save_image(path, torch.cat(strips, 0).cpu().numpy())

@@ -9,15 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from gamba_warp.batch import progress_bar
 from gamba_warp.files import output_folder, write_text
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.image_metrics import METRICS
-from gamba_warp.images import save_image
 from gamba_warp.versions import __version__, installed
 
 from ..averages import mean_of
@@ -34,7 +29,7 @@ from .compare import (
     render_views,
     summary,
 )
-from .contact_sheet import RULE, Row, choose_ranks, contact_sheet
+from .contact_sheet import RULE, Row, choose_ranks, contact_sheet, label, save_strips
 from .job import ERRORS, Job, open_job
 from .pictures import Pictures, save_pictures
 from .table import page, tables_of, without_nearly_empty
@@ -63,14 +58,6 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
         else:
             (folder / "contact_sheet.png").unlink(missing_ok=True)  # that of an earlier run
     return report
-
-
-def save_strips(path: Path, rgb: Tensor, truth: Truth, count: int = 4) -> None:
-    """Writes rows of input | prediction | truth: ``count`` views evenly spaced, the input first."""
-    rows = choose_views(len(rgb), 0, count)
-    strips = [torch.cat([truth.rgb[0], rgb[row], truth.rgb[row]], 1) for row in rows]
-    output_folder(path.parent)
-    save_image(path, torch.cat(strips, 0).cpu().numpy())
 
 
 def pictures_of(predicted: Gaussians | Pictures, truth: Truth) -> Pictures:
@@ -207,15 +194,7 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         except ERRORS:  # a file that went bad meanwhile; the report has what it was
             continue
         views = choose_views(len(rgb), 0, SHEET_VIEWS + 1)[1:]
-        lines = [record["name"], f"{group}: {rank + 1} of {len(done)}"]
-        for kind, values in (("novel", record), ("input", record["input"])):
-            if values["psnr"] is not None:
-                known = [
-                    f"{metric.title} {values[key]:.{metric.digits}f} {metric.unit}".strip()
-                    for key, metric in METRICS.items()
-                    if values[key] is not None
-                ]
-                lines += [f"{kind}: {', '.join(known[:2])}", f"    {', '.join(known[2:])}"]
+        lines = label(record, f"{group}: {rank + 1} of {len(done)}")
         rows.append(Row(lines, truth.rgb[0], truth.rgb[views], rgb[views]))
     return rows
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gamba_warp.image_metrics import METRICS, Metric, all_figures, on_grounds
+from gamba_warp.image_metrics import METRICS, all_figures, on_grounds
 
 from ..averages import LEVEL, bootstrap, minus, summary_of
 from ..tables import Column, Row, figures, markdown
@@ -88,79 +88,66 @@ def without_nearly_empty(candidates: dict[str, Records]) -> dict[str, Records]:
     }
 
 
-def means(rows: Rows, signed: bool = False, shown: dict[str, Metric] = METRICS) -> str:
-    """A Markdown table of the rows' means, with their intervals.
+def means(rows: Rows, signed: bool = False) -> str:
+    """A Markdown table of the rows' means on white, with their intervals.
 
     Args:
         rows: those of ``table_of`` or ``differences_of``.
         signed: whether positive means get a plus sign.
-        shown: the figures; those on white unless told.
     """
-    return _markdown(rows, {key: Column(m.head, m.digits) for key, m in shown.items()}, signed)
+    return _markdown(rows, signed, {key: Column(m.head, m.digits) for key, m in METRICS.items()})
 
 
-def _on_grounds(rows: Rows, signed: bool = False) -> str:
-    """As ``means``: of the figures on black and on grey."""
-    return means(rows, signed, on_grounds())
-
-
-def _medians(rows: Rows, signed: bool = False) -> str:
-    """As ``means``: the PSNR of the mean error, and the medians over objects."""
-    columns = {MEAN_ERROR: Column("PSNR of mean error [dB]", METRICS["psnr"].digits)}
-    columns |= {key: Column(f"median {m.head}", m.digits) for key, m in METRICS.items()}
-    errors = [row[MEAN_ERROR] for row in rows]
-    rows = [
-        row | {MEAN_ERROR: {"median": error["value"], "median_interval": error["interval"]}}
-        for row, error in zip(rows, errors)
-    ]
-    return _markdown(rows, columns, signed, "median")
-
-
-def _markdown(rows: Rows, columns: dict[str, Column], signed: bool, of: str = "mean") -> str:
-    names = [[row["views"], row["name"], str(row["objects"])] for row in rows]
-    shown = [Row(name, row, signed) for name, row in zip(names, rows)]
+def _markdown(rows: Rows, signed: bool, columns: dict[str, Column], of: str = "mean") -> str:
+    shown = []
+    for row in rows:
+        error = row[MEAN_ERROR]  # no mean and no median, but beside the medians it stands
+        error = {"median": error["value"], "median_interval": error["interval"]}
+        names = row["views"], row["name"], str(row["objects"])
+        shown.append(Row(names, row | {MEAN_ERROR: error}, signed))
     return markdown(figures(["views", "", "objects"], columns, shown, of))
-
-
-def nearly_empty_line(counts: dict[str, Any]) -> str:
-    """Says how many views are nearly empty, and what counts as such."""
-    few = f"the object covers under {100 * NEARLY_EMPTY:g} % of the true picture"
-    if not counts["views"]:
-        return f"None of the {counts['of_views']} views is nearly empty ({few})."
-    return (
-        f"{counts['views']} of {counts['of_views']} views, of {counts['objects']} of "
-        f"{counts['of_objects']} objects, are nearly empty ({few})."
-    )
 
 
 def page(report: dict[str, Any]) -> str:
     """The text of ``table.md``, from a report of ``eval-views``."""
     counts, lpips = report["nearly_empty"], report["protocol"]["lpips_reason"]
+    few = f"nearly empty (the object covers under {100 * NEARLY_EMPTY:g} % of the true picture)."
+    note = f"None of the {counts['of_views']} views is {few}"
+    if counts["views"]:
+        note = (
+            f"{counts['views']} of {counts['of_views']} views, of {counts['objects']} of "
+            f"{counts['of_objects']} objects, are {few} They count in these tables."
+        )
     parts = [means(report["table"])]
     if report["differences"]:
         parts += ["Differences, object by object:", means(report["differences"], signed=True)]
     parts += [
         f"Means over objects of means over views, with {100 * LEVEL:g} % bootstrap intervals over "
-        "objects. LPIPS: less is better."
-        + (f" LPIPS left out: {lpips}." if lpips else "")
-        + f" {nearly_empty_line(counts)}"
-        + (" They count in these tables." if counts["views"] else "")
+        f"objects. LPIPS: less is better.{f' LPIPS left out: {lpips}.' if lpips else ''} {note}"
     ]
-    more = {
-        "The same on black and on grey, both sides composited by their alpha; means:": _on_grounds,
-        "PSNR of the mean squared error over all views and objects; "
-        "medians over objects:": _medians,
-    }
-    tables = [(title, show, report) for title, show in more.items()]
+    white = {key: Column(m.head, m.digits) for key, m in METRICS.items()}
+    grounds = {key: Column(m.head, m.digits) for key, m in on_grounds().items()}
+    medians = {MEAN_ERROR: Column("PSNR of mean error [dB]", METRICS["psnr"].digits)}
+    medians |= {key: Column(f"median {title}", digits) for key, (title, digits) in white.items()}
+    more = [
+        (
+            "The same on black and on grey, both sides composited by their alpha; means:",
+            *(report, grounds, "mean"),
+        ),
+        (
+            "PSNR of the mean squared error over all views and objects; medians over objects:",
+            *(report, medians, "median"),
+        ),
+    ]
     if counts["views"]:
         title = "Means as above, without the views that are nearly empty:"
-        tables.append((title, means, report["without_nearly_empty"]))
-    for title, show, part in tables:
+        more.append((title, report["without_nearly_empty"], white, "mean"))
+    for title, part, columns, of in more:
         # the rows of novel views; those of the input where there are no novel ones
         rows, gains = (
             [row for row in part[key] if row["views"] == part[key][0]["views"]]
             for key in ("table", "differences")
         )
-        parts += [title, show(rows)] if rows else []
-        parts += [show(gains, signed=True)] if gains else []
+        parts += [title, _markdown(rows, False, columns, of)] if rows else []
+        parts += [_markdown(gains, True, columns, of)] if gains else []
     return "\n\n".join(parts) + "\n"

@@ -9,8 +9,8 @@ from helpers.views import cloud_of, evaluated
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.errors import UserError
-from gamba_warp.eval.shapes.compare import compare, icp, match_moments, syncdreamer_points
 from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
+from gamba_warp.eval.shapes.metrics import compare, icp, match_moments, syncdreamer_points
 from gamba_warp.eval.shapes.occupancy import (
     VOTERS,
     grid_around,

@@ -11,9 +11,8 @@ import trimesh
 from lab.studies.drift import doubled, drift, known_shapes, with_flips, with_hole
 
 from gamba_warp.eval.shapes import occupancy
-from gamba_warp.eval.shapes.compare import compare, shape_iou
 from gamba_warp.eval.shapes.flags import tidied
-from gamba_warp.eval.shapes.metrics import volume_iou
+from gamba_warp.eval.shapes.metrics import compare, shape_iou, volume_iou
 from gamba_warp.eval.shapes.occupancy import RULES, connected_parts, grid_around, solid
 from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Similarity
