@@ -1,4 +1,5 @@
 import math
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from helpers.views import cloud_of, evaluated
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes.load import load_shape, load_truth, to_surface
-from gamba_warp.eval.shapes.metrics import compare, icp, match_moments, syncdreamer_points
+from gamba_warp.eval.shapes.metrics import compare, match_moments, syncdreamer_points
 from gamba_warp.eval.shapes.occupancy import (
     VOTERS,
     grid_around,
@@ -61,14 +62,6 @@ def test_a_shape_and_itself(name):
     # two draws of points differ by the noise floor; the cameras' points do not differ at all
     assert abs(got["chamfer"] - got["noise_floor"]) <= 0.05 * got["noise_floor"]
     assert got["fscore"]["0.02"] > 0.999
-
-
-def test_spheres():
-    got = compare(ball(0.45), ball(0.5), protocol())
-    assert abs(got["iou"] - 0.9**3) < 0.01  # voxels of 1/64
-    assert abs(got["chamfer"] - 0.05) < 0.002  # distances of samples are a little longer
-    assert abs(got["chamfer_squared"] - 0.05**2) < 2e-4
-    assert got["normal_consistency"] > 0.99
 
 
 def test_solid_fills_cavities_and_unites_parts():
@@ -234,21 +227,10 @@ def test_similarity_moves_all_kinds_alike():
     assert np.allclose(mesh.vertices, 2 * cube().vertices @ turn.T + [0.1, 0.2, 0.3])
 
 
-def test_alignment():
-    truth = as_mesh(trimesh.creation.box((1.0, 0.6, 0.3)))
-    small = Similarity(np.eye(3), np.array([0.2, -0.1, 0.05]), 0.5).apply(truth)
-    got = compare(small, truth, protocol(align="scale"))
-    assert abs(got["alignment"]["scale"] - 2) < 0.02 and got["iou"] > 0.95
-    angle = 0.15
-    turn = trimesh.transformations.rotation_matrix(angle, [0, 0, 1])[:3, :3]
-    turned = Similarity(turn, np.array([0.05, 0, 0]), 1.1).apply(truth)
-    points = [sample(mesh, 5000, seed) for seed, mesh in enumerate((turned, truth))]
-    motion, residual = icp(*points)
-    assert np.abs(motion.rotation @ turn - np.eye(3)).max() < 0.03
-    assert residual["fitness"] > 0.99 and residual["inlier_rmse"] < 0.03
-    single = sample(truth, 1, 0)
+def test_a_single_point_cannot_be_aligned():
+    single, points = sample(cube(), 1, 0), sample(cube(), 50, 1)
     with pytest.raises(UserError, match="one"):
-        match_moments(single, points[0])
+        match_moments(single, points)
 
 
 def test_truth_is_normalised_and_turned(tmp_path):
@@ -306,22 +288,22 @@ def test_gaussians_against_a_ball(tmp_path):
     assert report["mean"]["chamfer"] < 0.04 and report["mean"]["iou"] > 0.85
 
 
-@pytest.mark.parametrize("case", ["missing", "empty", "mixed", "few", "data"])
-def test_what_cannot_start(tmp_path, case, capsys):
-    (tmp_path / "pred").mkdir()
+@pytest.mark.parametrize(
+    "case, options, said",
+    [
+        ("missing", [], "pred"),
+        ("empty", [], "pred"),
+        ("mixed", [], "two files"),
+        ("few", ["--voxels", "2"], "--voxels"),
+        ("data", ["--frame", "reference"], "--data"),
+    ],
+)
+def test_what_cannot_start(tmp_path, case, options, said, capsys):
     export(tmp_path / "gt" / "a.obj", trimesh.creation.box((1.0, 1, 1)))
-    options = []
-    if case == "missing":
-        (tmp_path / "pred").rmdir()
     if case == "mixed":
-        (tmp_path / "pred").rmdir()
-        export(tmp_path / "pred.obj", trimesh.creation.box((1.0, 1, 1)))
-        (tmp_path / "pred.obj").rename(tmp_path / "pred")
-    if case == "few":
-        options = ["--voxels", "2"]
-    if case == "data":
-        options = ["--frame", "reference"]
+        shutil.copy(tmp_path / "gt" / "a.obj", tmp_path / "pred")
+    elif case != "missing":
+        (tmp_path / "pred").mkdir()
     code, report = run_geometry(tmp_path, *options)
     assert code == 2 and report is None
-    names = {"few": "--voxels", "data": "--data", "mixed": "two files"}
-    assert names.get(case, str(tmp_path / "pred")) in capsys.readouterr().err
+    assert (str(tmp_path / said) if said == "pred" else said) in capsys.readouterr().err

@@ -6,19 +6,19 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from helpers.children import murderous_pair, talking_pair
+from helpers.gaussians import some
+from helpers.meshes import glb
 
 from gamba_warp.cli import run
 from gamba_warp.errors import UserError
 from gamba_warp.eval.shapes import pairs
 from gamba_warp.eval.shapes.flags import tidied
 from gamba_warp.eval.shapes.load import load_shape
-from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
+from gamba_warp.eval.shapes.protocol import read_protocol
 from gamba_warp.eval.shapes.shape import Mesh
 from gamba_warp.formats.ply import save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.versions import import_open3d
 
 MANY = 10**12
@@ -55,7 +55,7 @@ def faces_of(count, kind="uchar"):
     return [f"element face {count}", f"property list {kind} int vertex_indices"]
 
 
-def glb(accessor, length=None):
+def one_accessor(**accessor):
     tree = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],
@@ -65,11 +65,7 @@ def glb(accessor, length=None):
         "bufferViews": [{"buffer": 0, "byteLength": 36}],
         "buffers": [{"byteLength": 36}],
     }
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, length or 12 + 8 + len(text) + 8 + 36)
-    first = struct.pack("<I4s", length or len(text), b"JSON") + text
-    return head + first + struct.pack("<I4s", 36, b"BIN\0") + bytes(36)
+    return glb(tree, bytes(36))
 
 
 def pcd(count, data, body):
@@ -105,9 +101,10 @@ LIES = {
     "count.off": f"OFF\n{MANY} {MANY} 0\n0 0 0\n0 1 0\n1 0 0\n3 0 1 2\n".encode(),
     "index.obj": f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 {MANY}\n".encode(),
     "long_index.obj": f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 {10**25}\n".encode(),
-    "chunk.glb": glb({"bufferView": 0, "count": 3}, length=2**32 - 1),
-    "count.glb": glb({"bufferView": 0, "count": MANY}),
-    "zeros.glb": glb({"count": MANY}),
+    # the lengths of the file and of its first chunk
+    "chunk.glb": b"glTF\2\0\0\0" + b"\xff" * 8 + one_accessor(bufferView=0, count=3)[16:],
+    "count.glb": one_accessor(bufferView=0, count=MANY),
+    "zeros.glb": one_accessor(count=MANY),
     "raw.pcd": pcd(MANY, "binary", TRIANGLE),
     "text.pcd": pcd(MANY, "ascii", b"0 0 0\n"),
     "packed.pcd": pcd(10**8, "binary_compressed", struct.pack("<II", 20, 12 * 10**8) + bytes(20)),
@@ -146,7 +143,7 @@ def test_true_counts_pass(tmp_path):
         "b.ply": ply([*vertices_of(3), *faces_of(2)], TRIANGLE + quad + FACE),
         "c.ply": ply(vertices_of(3), TRIANGLE),
         "d.ply": ply(BOTH, b"1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n", "ascii"),
-        "e.glb": glb({"bufferView": 0, "count": 3}),
+        "e.glb": one_accessor(bufferView=0, count=3),
         "f.pcd": pcd(3, "binary", TRIANGLE),
         "g.pcd": pcd(3, "ascii", b"1 0 0\n0 1 0\n0 0 1\n"),
         "h.pts": b"3\n1 0 0\n0 1 0\n0 0 1\n",
@@ -198,12 +195,8 @@ def test_bad_files_are_named_and_the_others_done(tmp_path, side, capfd):
 
 
 def test_gaussians_that_lack_an_attribute(tmp_path, capfd):
-    count = 5
     path = tmp_path / "a.ply"
-    gaussians = Gaussians(
-        torch.rand(count, 3), None, torch.rand(count, 3), torch.rand(count), torch.rand(count, 3)
-    )
-    save_ply(path, gaussians)
+    save_ply(path, some(5, rotated=False))
     box().export(tmp_path / "gt.ply")
     for gone in (b"f_dc_1", b"opacity", b"scale_2", b"rot_0"):
         broken = tmp_path / "broken.ply"
@@ -315,47 +308,6 @@ def test_an_evaluation_is_repeated_from_its_report(tmp_path, capfd):
     run("eval-geometry", [str(f) for f in files] + ["--csv", "--points", "100"])
     lines = capfd.readouterr().out.splitlines()
     assert len(lines) == 2 and lines[0].startswith("name,status,chamfer") and "a,ok" in lines[1]
-
-
-def test_protocol_files(tmp_path):
-    path = tmp_path / "p.json"
-    for preset in PRESETS.values():
-        path.write_text(json.dumps(preset.to_json()))
-        assert read_protocol(str(path)) == preset
-    path.write_text('{"name": "syncdreamer", "num_points": 5, "surface": {"voxels": 32}}')
-    read = read_protocol(str(path))
-    assert read.points == "views" and read.num_points == 5 and read.surface.voxels == 32
-
-
-@pytest.mark.parametrize(
-    "text, reason",
-    [
-        ("{", "not valid JSON"),
-        ("[]", "object"),
-        ('{"num_point": 5}', "num_point is unknown"),
-        ('{"num_points": "5"}', "num_points is '5', it must be of type int"),
-        ('{"num_points": true}', "num_points is True"),
-        ('{"num_points": 0}', "num_points is 0, must be at least 1"),
-        ('{"thresholds": 0.1}', "thresholds is 0.1, it must be of type list"),
-        ('{"thresholds": []}', "thresholds"),
-        ('{"thresholds": ["a"]}', "thresholds is 'a'"),
-        ('{"occupancy": "magic"}', "occupancy is 'magic', not one of solid"),
-        ('{"surface": {"voxels": 1.5}}', "surface.voxels is 1.5"),
-        ('{"surface": {"speed": 1}}', "surface.speed is unknown"),
-        ('{"surface": 3}', "surface is 3"),
-        ('{"version": 1}', "version 1"),
-        ('{"definitions": {"chamfer": "mine"}}', "definitions"),
-        (None, "neither default, syncdreamer, gso nor a file"),
-    ],
-)
-def test_bad_protocol_files(tmp_path, text, reason, capsys):
-    path = tmp_path / "p.json"
-    if text is not None:
-        path.write_text(text)
-    arguments = [str(tmp_path / "a"), str(tmp_path / "b"), "--protocol", str(path)]
-    assert run("eval-geometry", arguments) == 2
-    error = capsys.readouterr().err
-    assert reason in error and str(path) in error and error.count("\n") == 1
 
 
 def test_json_or_csv(tmp_path, capsys):

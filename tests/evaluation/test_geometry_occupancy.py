@@ -135,7 +135,7 @@ def test_spheres(radius):
     facets = 5e-4  # how far the balls' faces lie within their spheres
     assert -facets < got["chamfer"] - (0.5 - radius) < slack
     assert -facets < got["hausdorff"] - (0.5 - radius) < 6 * got["noise_floor"]
-    assert abs(got["iou"] - (2 * radius) ** 3) < 0.01
+    assert abs(got["iou"] - (2 * radius) ** 3) < 0.01 and got["normal_consistency"] > 0.99
 
 
 def test_alignment_recovers_scale_and_rotation():
@@ -152,6 +152,7 @@ def test_alignment_recovers_scale_and_rotation():
     alignment = values["icp"]["alignment"]
     assert abs(alignment["scale"] * 0.7 - 1) < 0.02
     assert np.abs(np.array(alignment["rotation"]) @ turn - np.eye(3)).max() < 0.02
+    assert alignment["fitness"] > 0.99 and alignment["inlier_rmse"] < 0.03
     assert abs(values["scale"]["alignment"]["scale"] * 0.7 - 1) < 0.02
 
 

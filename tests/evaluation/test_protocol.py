@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from gamba_warp.cli import run
 from gamba_warp.errors import UserError
 from gamba_warp.eval import report as reports
 from gamba_warp.eval.report import check_finite, csv_of, make_report, save_report
@@ -14,32 +15,59 @@ from gamba_warp.eval.shapes.protocol import PRESETS, checked, read_protocol
 
 
 @pytest.mark.parametrize(
-    "change, reason",
+    "text, reason",
     [
-        ('"distance": NaN', "not valid JSON"),
-        ('"distance": Infinity', "not valid JSON"),
-        ('"distance": 1e999', "out of range"),
-        (f'"distance": 1{"0" * 400}', "distance is too large"),
-        ('"distance": 0', "distance is 0.0, must be at least 0.01 and at most 1,000"),
-        ('"thresholds": [0.1, 0]', "thresholds is 0.0, must be above 0"),
-        ('"num_points": 1000000000', "num_points is 1000000000, must be at least 1 and at most"),
-        ('"iou_voxels": 100000', "iou_voxels is 100000, must be at least 8 and at most 512"),
-        ('"seed": -1', "seed is -1, must be at least 0"),
-        ('"surface": {"truncation": -1}', "surface.truncation is -1.0, must be above 0"),
-        ('"surface": {"voxels": 100000}', "surface.voxels is 100000, must be at least 8"),
-        ('"surface": {"level": 1e300}', "surface.level is 1e+300, must be above 0 and below 1"),
-        ('"surface": {"faces": -1}', "surface.faces is -1, must be at least 0"),
-        (f'"name": "{"x" * 1000}"', "name is over 200 letters"),
-        (f'"thresholds": [{",".join(["0.1"] * 1000)}]', "thresholds must be 1 to 100 numbers"),
-        (f'"surface": {"[" * 5000}', "nested deeper than 32 levels"),
+        ("{", "not valid JSON"),
+        ("[]", "object"),
+        ('{"num_point": 5}', "num_point is unknown"),
+        ('{"num_points": "5"}', "num_points is '5', it must be of type int"),
+        ('{"num_points": true}', "num_points is True"),
+        ('{"num_points": 0}', "num_points is 0, must be at least 1"),
+        ('{"thresholds": 0.1}', "thresholds is 0.1, it must be of type list"),
+        ('{"thresholds": []}', "thresholds"),
+        ('{"thresholds": ["a"]}', "thresholds is 'a'"),
+        ('{"occupancy": "magic"}', "occupancy is 'magic', not one of solid"),
+        ('{"surface": {"voxels": 1.5}}', "surface.voxels is 1.5"),
+        ('{"surface": {"speed": 1}}', "surface.speed is unknown"),
+        ('{"surface": 3}', "surface is 3"),
+        ('{"version": 1}', "version 1"),
+        ('{"definitions": {"chamfer": "mine"}}', "definitions"),
+        ('{"distance": NaN}', "not valid JSON"),
+        ('{"distance": Infinity}', "not valid JSON"),
+        ('{"distance": 1e999}', "out of range"),
+        (f'{{"distance": 1{"0" * 400}}}', "distance is too large"),
+        ('{"distance": 0}', "distance is 0.0, must be at least 0.01 and at most 1,000"),
+        ('{"thresholds": [0.1, 0]}', "thresholds is 0.0, must be above 0"),
+        ('{"num_points": 1000000000}', "num_points is 1000000000, must be at least 1 and at most"),
+        ('{"iou_voxels": 100000}', "iou_voxels is 100000, must be at least 8 and at most 512"),
+        ('{"seed": -1}', "seed is -1, must be at least 0"),
+        ('{"surface": {"truncation": -1}}', "surface.truncation is -1.0, must be above 0"),
+        ('{"surface": {"voxels": 100000}}', "surface.voxels is 100000, must be at least 8"),
+        ('{"surface": {"level": 1e300}}', "surface.level is 1e+300, must be above 0 and below 1"),
+        ('{"surface": {"faces": -1}}', "surface.faces is -1, must be at least 0"),
+        (f'{{"name": "{"x" * 1000}"}}', "name is over 200 letters"),
+        (f'{{"thresholds": [{",".join(["0.1"] * 1000)}]}}', "thresholds must be 1 to 100 numbers"),
+        (f'{{"surface": {"[" * 5000}}}', "nested deeper than 32 levels"),
     ],
 )
-def test_protocols_out_of_range_are_one_line(tmp_path, change, reason):
+def test_bad_protocols_are_one_line(tmp_path, text, reason, capsys):
     path = tmp_path / "p.json"
-    path.write_text(f"{{{change}}}")
-    with pytest.raises(UserError) as caught:
-        read_protocol(str(path))
-    assert reason in str(caught.value) and str(caught.value).startswith(f"{path}: ")
+    path.write_text(text)
+    assert run("eval-geometry", [*map(str, (tmp_path, tmp_path)), "--protocol", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"gamba: {path}: ") and reason in error and error.count("\n") == 1
+
+
+def test_protocol_files(tmp_path, capsys):
+    assert run("eval-geometry", ["a", "b", "--protocol", "absent.json"]) == 2
+    assert "neither default, syncdreamer, gso nor a file" in capsys.readouterr().err
+    path = tmp_path / "p.json"
+    for preset in PRESETS.values():
+        path.write_text(json.dumps(preset.to_json()))
+        assert read_protocol(str(path)) == preset
+    path.write_text('{"name": "syncdreamer", "num_points": 5, "surface": {"voxels": 32}}')
+    read = read_protocol(str(path))
+    assert read.points == "views" and read.num_points == 5 and read.surface.voxels == 32
 
 
 def test_changes_name_what_is_nested_too():

@@ -95,10 +95,8 @@ def test_perfect_predictions(data, painted):
         # 8-bit rounding of the files only
         assert report["mean"]["psnr"] > 55 and report["mean"]["mask_iou"] == 1
         assert report["mean"]["input"]["psnr"] > 55
-        assert report["objects"][0]["views"] == [
-            reference,
-            *(v for v in range(4) if v != reference),
-        ]
+        others = [v for v in range(4) if v != reference]
+        assert report["objects"][0]["views"] == [reference, *others]
     assert [item["name"] for item in report["objects"]] == sorted(POINTS)
     assert report["mean"]["lpips"] is None
     assert report["protocol"]["lpips_reason"] == "not asked for"
@@ -180,25 +178,28 @@ def test_lpips_with_weights(data, painted):
         assert report["mean"][key] < 1e-3 < report["baselines"]["background"][key]
 
 
-@pytest.mark.parametrize("case", ["pred", "data", "empty", "limit", "distance", "split"])
-def test_what_cannot_start(data, case, capsys):
-    options, pred, message = [], "pred", "gamba: "
-    if case == "pred":
-        pred, message = "absent", "absent"
+@pytest.mark.parametrize(
+    "case, options, said",
+    [
+        ("absent", [], "absent"),
+        ("data", [], "no such folder"),
+        ("empty", [], "neither"),
+        ("pred", ["--limit", "0"], "--limit"),
+        ("pred", ["--distance", "0"], "--distance"),
+        ("split", ["--split", "test"], "test split"),
+    ],
+)
+def test_what_cannot_start(data, case, options, said, capsys):
     if case == "data":
         (data / "data").rename(data / "moved")
-        message = "no such folder"
     if case == "empty":
         (data / "empty").mkdir()
-        pred, message = "empty", "neither"
-    if case in ("limit", "distance"):
-        options, message = [f"--{case}", "0"], f"--{case}"
     if case == "split":
         write_split(data / "data", train=["a", "c", "group/b"])
-        options, message = ["--split", "test"], "test split"
-    code, report = evaluate(data, *options, pred=pred)
-    assert code == 2 and report is None
-    assert message in capsys.readouterr().err
+    pred = case if case in ("absent", "empty") else "pred"
+    assert evaluate(data, *options, pred=pred) == (2, None)
+    error = capsys.readouterr().err
+    assert error.startswith("gamba: ") and said in error
 
 
 def test_out_of_the_reference_world(data):
