@@ -74,40 +74,28 @@ def _keys() -> dict[str, list[str]]:
     return {VIEWS: list(all_figures()), SHAPES: list(OF_SHAPES)}
 
 
-class _ViewsRecord(msgspec.Struct):
+class _OfViews(msgspec.Struct):
     """What is used of the record of an object that ``eval-views`` evaluated, beside its figures."""
 
-    name: str
     truth_sha256: str
     views: list[int]
     seconds: dict[str, Number] = {}
 
-    @property
-    def truth(self) -> str:
-        """Says which views were compared."""
-        return f"{self.truth_sha256}, views {self.views}"
 
-
-class _ShapesRecord(msgspec.Struct):
+class _OfShapes(msgspec.Struct):
     """Likewise, of an object that ``eval-geometry`` evaluated."""
 
-    name: str
     gt_sha256: str
     kind: str
 
-    @property
-    def truth(self) -> str:
-        """Says which shape was compared with."""
-        return self.gt_sha256
 
-
-_RECORDS = {VIEWS: _ViewsRecord, SHAPES: _ShapesRecord}
+_RECORDS = {VIEWS: _OfViews, SHAPES: _OfShapes}
+_TRUTH = ("truth_sha256", "views", "gt_sha256")  # what two records of an object must agree in
 
 
 class _Document(msgspec.Struct):
     protocol: dict[str, Any]
     objects: list[dict[str, Any]]
-    versions: dict[str, Any] = {}
 
 
 @dataclass
@@ -118,7 +106,7 @@ class Report:
         path: its file.
         kind: ``VIEWS`` or ``SHAPES``.
         protocol: as the file states it.
-        records: of the objects that were evaluated, by name.
+        records: of the objects that were evaluated, by name; see ``_RECORDS``.
         figures: likewise.
         failed: reasons by name, of those that could not be evaluated.
     """
@@ -132,32 +120,28 @@ class Report:
 
 
 @dataclass
-class Method:
-    """A method and its reports.
+class Compared:
+    """What is compared.
 
     Attributes:
-        name: as the user gave it.
-        reports: by kind.
-        seconds: of an object, as the user stated them; or None.
+        methods: names, in the order of their first report.
+        reports: by kind and method.
+        seconds: of an object, as the user stated them, by method.
+        notes: on what differs between methods without changing what a number means.
     """
 
-    name: str
-    reports: dict[str, Report] = field(default_factory=dict)
-    seconds: float | None = None
+    methods: list[str]
+    reports: dict[str, dict[str, Report]]
+    seconds: dict[str, float]
+    notes: list[str]
 
 
-def read_methods(
-    arguments: tuple[str, ...], seconds: tuple[str, ...]
-) -> tuple[list[Method], list[str]]:
+def read_reports(arguments: tuple[str, ...], seconds: tuple[str, ...]) -> Compared:
     """Reads reports, and checks that they are of one protocol and one truth.
 
     Args:
         arguments: ``NAME=FILE`` each, or a folder with a report.json.
         seconds: ``NAME=SECONDS`` each.
-
-    Returns:
-        The methods in the order of their first report; and remarks on what differs between them
-        without changing what a number means.
 
     Raises:
         UserError: an argument is not of this form, a file is no report, a method has two of one
@@ -165,26 +149,37 @@ def read_methods(
     """
     if len(arguments) > MOST:
         raise UserError(f"{len(arguments)} reports, at most {MOST} are compared")
-    methods: dict[str, Method] = {}
+    methods: dict[str, None] = {}
+    reports: dict[str, dict[str, Report]] = {VIEWS: {}, SHAPES: {}}
     for argument in arguments:
         name, text = _split(argument, "a report.json or its folder")
         report = read_report(Path(text))
-        reports = methods.setdefault(name, Method(name)).reports
-        if report.kind in reports:
+        if name in reports[report.kind]:
             raise UserError(f"{argument}: {name} has a report of {report.kind} already")
-        reports[report.kind] = report
+        methods[name], reports[report.kind][name] = None, report
+    stated: dict[str, float] = {}
     for argument in seconds:
         name, text = _split(argument, "seconds", "--seconds ")
         if name not in methods:
             raise UserError(f"--seconds {argument}: there is no report of {name}")
         try:
-            methods[name].seconds = value = float(text)
+            stated[name] = float(text)
         except ValueError:
-            value = 0.0
-        if not 0 < value < 1e9:
+            stated[name] = 0.0
+        if not 0 < stated[name] < 1e9:
             raise UserError(f"--seconds {argument}: not a number of seconds above 0")
-    found = list(methods.values())
-    return found, [note for kind in (VIEWS, SHAPES) for note in _check_same(found, kind)]
+    notes = []
+    for kind, of in reports.items():
+        for one, other in combinations(of.values(), 2):
+            _check_pair(one, other)
+        for key in _NOTED[kind]:
+            names: dict[str, list[str]] = {}
+            for name, report in of.items():
+                names.setdefault(_shown(report.protocol.get(key)), []).append(name)
+            if len(names) > 1:
+                parts = (f"{value} ({', '.join(who)})" for value, who in names.items())
+                notes.append(f"{kind}: {key} is {'; '.join(parts)}")
+    return Compared(list(methods), reports, stated, notes)
 
 
 def _split(argument: str, what: str, option: str = "") -> tuple[str, str]:
@@ -227,27 +222,6 @@ def read_report(path: Path) -> Report:
     return report
 
 
-def having(methods: list[Method], kind: str) -> dict[str, Report]:
-    """The reports of one kind by the method's name."""
-    return {m.name: m.reports[kind] for m in methods if kind in m.reports}
-
-
-def _check_same(methods: list[Method], kind: str) -> list[str]:
-    """Holds the reports of a kind against one another; returns remarks."""
-    reports = having(methods, kind)
-    for one, other in combinations(reports.values(), 2):
-        _check_pair(one, other)
-    notes = []
-    for key in _NOTED[kind]:
-        names: dict[str, list[str]] = {}
-        for name, report in reports.items():
-            names.setdefault(_shown(report.protocol.get(key)), []).append(name)
-        if len(names) > 1:
-            parts = (f"{value} ({', '.join(who)})" for value, who in names.items())
-            notes.append(f"{kind}: {key} is {'; '.join(parts)}")
-    return notes
-
-
 def _check_pair(first: Report, report: Report) -> None:
     """Raises UserError where two reports of one kind cannot stand in one table."""
     pair = (report, first)
@@ -266,7 +240,8 @@ def _check_pair(first: Report, report: Report) -> None:
                 f"{key} is {_shown(a)}, not {_shown(b)}"
             )
     for uid in sorted(report.records.keys() & first.records.keys()):
-        if report.records[uid].truth != first.records[uid].truth:
+        one, two = ([getattr(r.records[uid], key, None) for key in _TRUTH] for r in pair)
+        if one != two:
             raise UserError(
                 f"{report.path}: {uid} was compared with another truth than in {first.path}"
             )
@@ -276,7 +251,7 @@ def _shown(value: Any) -> str:
     return "absent" if value is None else one_line(str(value), 60)
 
 
-def join(methods: list[Method], against: str | None, notes: list[str]) -> dict[str, Any]:
+def join(compared: Compared, against: str | None) -> dict[str, Any]:
     """Makes the table of methods.
 
     A figure is averaged over the objects for which every method that has this figure at all has a
@@ -284,10 +259,9 @@ def join(methods: list[Method], against: str | None, notes: list[str]) -> dict[s
     them too.
 
     Args:
-        methods: as ``read_methods`` returns them.
+        compared: as ``read_reports`` returns it.
         against: the method that the others are compared with, object by object; the first one if
             None.
-        notes: remarks for the readers.
 
     Returns:
         ``format, version, against, bootstrap, notes``; ``common``: the names of the objects by
@@ -299,26 +273,24 @@ def join(methods: list[Method], against: str | None, notes: list[str]) -> dict[s
     Raises:
         UserError: there is no such method, or no object is common to all.
     """
-    names = [method.name for method in methods]
+    names = compared.methods
     base = names[0] if against is None else against
     if base not in names:
         raise UserError(f"--against {base}: the methods are {', '.join(names)}")
     # by figure, method and object; a method without any value of a figure does not have it
     values: dict[str, dict[str, dict[str, float]]] = {}
+    common: dict[str, list[str]] = {}
     for kind, keys in _keys().items():
+        reports = compared.reports[kind]
         for key in keys:
             found = {
                 name: {uid: value for uid, v in r.figures.items() if (value := v[key]) is not None}
-                for name, r in having(methods, kind).items()
+                for name, r in reports.items()
             }
             values[key] = {name: by_uid for name, by_uid in found.items() if by_uid}
-    common = {
-        key: sorted(set.intersection(*map(set, found.values()))) if found else []
-        for key, found in values.items()
-    }
-    for kind, (first, *_) in _keys().items():
-        reports = having(methods, kind)
-        if reports and not (common[first] and all(r.records for r in reports.values())):
+            uids = map(set, values[key].values())
+            common[key] = sorted(set.intersection(*uids)) if values[key] else []
+        if reports and not (common[keys[0]] and all(r.records for r in reports.values())):
             counts = ", ".join(f"{name} {len(r.records)}" for name, r in reports.items())
             fewest = min(reports.values(), key=lambda report: len(report.records))
             raise UserError(
@@ -334,39 +306,39 @@ def join(methods: list[Method], against: str | None, notes: list[str]) -> dict[s
                 found[key] = summary_of([of[name][uid] - minus[uid] for uid in common[key]])
         return found
 
+    rows = [{"name": n, **_seconds(compared, n, common["psnr"]), **summaries(n)} for n in names]
     return {
         "format": FORMAT,
         "version": __version__,
         "against": base,
         "bootstrap": BOOTSTRAP,
-        "notes": notes,
+        "notes": compared.notes,
         "common": common,
-        "rows": [
-            {"name": m.name, **_seconds(m, common["psnr"]), **summaries(m.name)} for m in methods
-        ],
+        "rows": rows,
         "differences": [
             {"name": f"{name} - {base}", **summaries(name, base)} for name in names if name != base
         ],
-        "missing": {kind: _missing(having(methods, kind)) for kind in (VIEWS, SHAPES)},
+        "missing": {kind: _missing(reports) for kind, reports in compared.reports.items()},
         "reports": {
-            method.name: {
-                kind: {"file": report.path.name, "protocol": report.protocol}
-                for kind, report in method.reports.items()
+            name: {
+                kind: {"file": reports[name].path.name, "protocol": reports[name].protocol}
+                for kind, reports in compared.reports.items()
+                if name in reports
             }
-            for method in methods
+            for name in names
         },
     }
 
 
-def _seconds(method: Method, uids: list[str]) -> dict[str, Any]:
+def _seconds(compared: Compared, name: str, uids: list[str]) -> dict[str, Any]:
     """The time of one object, and where it comes from."""
-    if method.seconds is not None:
-        return {"seconds": method.seconds, "seconds_from": "stated"}
-    report = method.reports.get(VIEWS)
+    if name in compared.seconds:
+        return {"seconds": compared.seconds[name], "seconds_from": "stated"}
+    report = compared.reports[VIEWS].get(name)
     source = report.protocol.get("source") if report else None
     if report and isinstance(source, dict) and source.get("kind") == "checkpoint":
-        records = [report.records[uid] for uid in uids if uid in report.records]
-        known = [r.seconds["predict"] for r in records if "predict" in r.seconds]
+        times = [report.records[uid].seconds for uid in uids if uid in report.records]
+        known = [seconds["predict"] for seconds in times if "predict" in seconds]
         if known:  # the median: the first object's time holds the compilation of the kernels
             return {"seconds": statistics.median(known), "seconds_from": "measured"}
     return {"seconds": None, "seconds_from": None}

@@ -44,11 +44,10 @@ def compare_command(
         raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
     from gamba_warp.files import output_folder, write_json, write_text
 
-    from .compare import CAVEAT, TABLE_1, html_page, join, markdown_page, read_methods
+    from .compare import CAVEAT, TABLE_1, html_page, join, markdown_page, read_reports
     from .report import json_of
 
-    methods, notes = read_methods(reports, seconds)
-    joined = join(methods, against, notes)
+    joined = join(read_reports(reports, seconds), against)
     if paper:
         joined["paper"] = {"caveat": CAVEAT, "table_1": TABLE_1}
     if out is not None:

@@ -285,10 +285,9 @@ def _plan(path: Path, out: Path) -> Any:
 
 def _compare(path: Path, out: Path) -> Any:
     """The table of a report beside itself, as ``gamba compare`` writes it."""
-    from gamba_warp.eval.compare import html_page, join, markdown_page, read_methods
+    from gamba_warp.eval.compare import html_page, join, markdown_page, read_reports
 
-    methods, notes = read_methods((f"a={path}", f"b={path}"), ())
-    joined = join(methods, None, notes)
+    joined = join(read_reports((f"a={path}", f"b={path}"), ()), None)
     json.dumps(joined, allow_nan=False)
     return [markdown_page(joined, True), html_page(joined, True)]
 
