@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -24,35 +24,28 @@ from gamba_warp.gaussians import Gaussians
 from .compare import Shown, Truth, ViewsProtocol, render_views
 
 
+@dataclass
 class Ceiling:
     """The result of ``gamba fit`` on all views of an object, made now or read from its file.
 
     Files are ``<uid>.ply`` in the world of view 0, as ``gamba fit`` writes them.
+
+    Attributes:
+        dataset: whose objects are fitted.
+        protocol: size of the pictures, input view and distance.
+        device: torch device.
+        folder: folder of the files; None: nothing is kept.
+        uids: objects to fit where the folder does not have them with these settings; None: nothing
+            is fitted, and only the files that are there count.
+        config: of the fit.
     """
 
-    def __init__(
-        self,
-        dataset: ViewDataset,
-        protocol: ViewsProtocol,
-        *,
-        device: str,
-        folder: Path | None,
-        uids: list[str] | None = None,
-        config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-    ) -> None:
-        """Nothing is fitted yet.
-
-        Args:
-            dataset: whose objects are fitted.
-            protocol: size of the pictures, input view and distance.
-            device: torch device.
-            folder: folder of the files; None: nothing is kept.
-            uids: objects to fit where the folder does not have them with these settings; None:
-                nothing is fitted, and only the files that are there count.
-            config: of the fit.
-        """
-        self.dataset, self.protocol, self.device = dataset, protocol, torch.device(device)
-        self.folder, self.uids, self.config = folder, uids, config
+    dataset: ViewDataset
+    protocol: ViewsProtocol
+    device: str
+    folder: Path | None
+    uids: list[str] | None = None
+    config: FitConfig = FitConfig()  # noqa: RUF009 (frozen)
 
     def __call__(self, truth: Truth) -> Shown | None:
         """Returns the pictures, or None for an object that is not to be fitted.
@@ -87,7 +80,7 @@ class Ceiling:
             config=self.config,
             held_out=0,
             size=self.protocol.size,
-            device=self.device,
+            device=torch.device(self.device),
         )
         views = load_views(job, uid, list(range(self.dataset.num_views(uid))))
         digest = hashlib.sha256(json.dumps(asdict(self.config)).encode())
@@ -146,13 +139,12 @@ def open_ceiling(
         UserError: neither a number above 0 nor a folder with a file for any of ``uids``.
     """
     if wanted.isdecimal() and int(wanted) > 0:
-        chosen, config = choose_objects(uids, (), int(wanted)), FitConfig(steps=steps)
-        folder = out / "ceiling" if out else None
-        return Ceiling(dataset, protocol, device=device, folder=folder, uids=chosen, config=config)
+        folder, chosen = out / "ceiling" if out else None, choose_objects(uids, (), int(wanted))
+        return Ceiling(dataset, protocol, device, folder, chosen, FitConfig(steps=steps))
     folder = Path(wanted)
     if not folder.is_dir():
         raise UserError(f"--ceiling {wanted}: neither a number above 0 nor a folder")
     folder = folder / "gaussians" if (folder / "gaussians").is_dir() else folder
     if not any((folder / f"{uid}.ply").exists() for uid in uids):
         raise UserError(f"--ceiling {wanted}: has a .ply file of none of the {len(uids)} objects")
-    return Ceiling(dataset, protocol, device=device, folder=folder)
+    return Ceiling(dataset, protocol, device, folder)

@@ -146,8 +146,12 @@ def open_job(options: ViewsOptions) -> Job:
     folder = None if options.out is None else output_folder(options.out)
     ceiling = {}
     if options.ceiling is not None:
-        places = {"device": device, "out": folder, "steps": options.ceiling_steps}
-        ceiling["ceiling"] = open_ceiling(options.ceiling, dataset, uids, protocol, **places)
+        ceiling["ceiling"] = open_ceiling(
+            *(options.ceiling, dataset, uids, protocol),
+            device=device,
+            out=folder,
+            steps=options.ceiling_steps,
+        )
     if options.baselines:
         _add_baselines(job, options)
     job.baselines |= ceiling
