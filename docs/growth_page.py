@@ -16,11 +16,12 @@ import torch
 from lab.studies import growth, growth_errors
 from lab.studies.draw import growth_picture
 from lab.studies.slopes import ERRORS, growth_lines, growth_table
-from page_parts import table, with_parts
+from page_parts import with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
 from gamba_warp.kernels.bench.core.report import groups, machine_line
+from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.measure.suites import make_settings, read_document
 
 HERE = Path(__file__).parent
@@ -99,7 +100,7 @@ def _costs(document: dict) -> str:
     if not rows:
         return "Not measured yet."
     said = said or ["- Nothing grows faster than its work."]
-    return "\n".join([*said, "", table(["case", *header], rows)])
+    return "\n".join([*said, "", markdown(["case", *header], rows)])
 
 
 def _errors(document: dict) -> str:
@@ -108,7 +109,7 @@ def _errors(document: dict) -> str:
     for cases in groups(document).values():
         for case, records in cases.items():
             header, rows = growth_table(records) or ([], [])
-            blocks.append(f"**{case}**\n\n{table(header, rows)}")
+            blocks.append(f"**{case}**\n\n{markdown(header, rows)}")
     return "\n\n".join(blocks) or "Not measured yet."
 
 

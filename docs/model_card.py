@@ -17,10 +17,11 @@ from typing import Any
 
 import msgspec
 import tyro
-from page_parts import table, with_parts
+from page_parts import with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
+from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
 from gamba_warp.pages.card import (
     METRICS,
@@ -116,7 +117,7 @@ def readme_of(text: str, card: ModelCard) -> str:
         ]
         name = "**shipped model**" if row.name == "model" else row.name.replace("_", " ")
         rows.append([name, *texts])
-    results = table([f"{novel[0].objects} objects", *heads], rows)
+    results = markdown([f"{novel[0].objects} objects", *heads], rows)
     return with_parts(text, "docs/model_card.py", {"results": results})
 
 
@@ -135,7 +136,7 @@ def _tables(card: ModelCard) -> list[str]:
                 texts = [cell.text(digits) if cell else "–" for cell, digits in cells]
                 name = "**this model**" if row.name == "model" else row.name.replace("_", " ")
                 lines.append([name, *texts])
-            tables.append(table([*header, *(METRICS[key][0] for key in keys)], lines))
+            tables.append(markdown([*header, *(METRICS[key][0] for key in keys)], lines))
     return tables
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 _MARK = "<!-- {name}: written by {writer} -->"
 
@@ -37,14 +37,3 @@ def with_parts(text: str, writer: str, parts: Mapping[str, str]) -> str:
             raise ValueError(f"no mark {begin if not found else end}")
         text = f"{head}{begin}\n\n{part}\n\n{end}{tail[2]}"
     return text
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown.
-
-    Args:
-        header: of the columns.
-        rows: cells of each row.
-    """
-    lines = [f"| {' | '.join(row)} |" for row in (header, *rows)]
-    return "\n".join([lines[0], "|" + " --- |" * len(header), *lines[1:]])

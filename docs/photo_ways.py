@@ -22,6 +22,7 @@ import numpy as np
 
 from gamba_warp.data.preprocess import plain_matte, shrink
 from gamba_warp.images import load_rgba, save_image
+from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.photo.cutout import fault_of
 from gamba_warp.photo.grabcut import grabcut
 from gamba_warp.photo.matte import Matte
@@ -92,7 +93,7 @@ def compare(model: Path, folder: Path | None, out: Path) -> list[list[str]]:
     rows, sheet = [], []
     for name, path in find(folder):
         if path is None:
-            rows.append([name, "not here"])
+            rows.append([name, "not here", "", ""])
             continue
         rgb = shrink(load_rgba(path), 1024)[..., :3]
         row, cells = [name], [cell(rgb)]
@@ -122,9 +123,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("ways.png"))
     given = parser.parse_args()
-    print("| picture | plain | matting model | GrabCut |\n| --- | --- | --- | --- |")
-    for row in compare(given.model, given.folder, given.out):
-        print("|", " | ".join(row), "|")
+    rows = compare(given.model, given.folder, given.out)
+    print(markdown(["picture", "plain", "matting model", "GrabCut"], rows))
 
 
 if __name__ == "__main__":

@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from lab.studies.parts import WHOLE, parts_of
-from page_parts import table, with_parts
+from page_parts import with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
 from gamba_warp.kernels.bench.core.report import machine_line
+from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.measure.suites import read_document
 
 HERE = Path(__file__).parent
@@ -91,7 +92,7 @@ def _shares(case: _Case) -> str:
     for part in columns[0][1]:
         shares = [sum(parts.get(part, (0.0,))) / whole for whole, parts in columns]
         rows.append([part, *(f"{100 * x:.{1 if x < 0.02 else 0}f} %" for x in shares)])
-    return table(["share of a step", *names], rows)
+    return markdown(["share of a step", *names], rows)
 
 
 def _products(case: _Case) -> str:
@@ -104,7 +105,7 @@ def _products(case: _Case) -> str:
         ["its products alone, ms", *map(case.ms, alone)],
         ["the same, GFLOP/s", *rates],
     ]
-    return table(["", *_PRECISIONS, "float32 by MKL"], rows)
+    return markdown(["", *_PRECISIONS, "float32 by MKL"], rows)
 
 
 def _compared(case: _Case, presets: tuple[str, ...], what: str, angle: bool = False) -> str:
@@ -121,7 +122,7 @@ def _compared(case: _Case, presets: tuple[str, ...], what: str, angle: bool = Fa
         found = [case[f"{preset}, {kind}"] for kind in _PRECISIONS]
         name = f"{preset}, {found[0]['parameters']['weights']} weights"
         rows.append([name, *(" / ".join(map(show, found)) for show in shown.values())])
-    return table([_BOTH, *shown], rows)
+    return markdown([_BOTH, *shown], rows)
 
 
 def _ssim(case: _Case) -> str:
@@ -138,7 +139,7 @@ def _ssim(case: _Case) -> str:
             ]
         )
     header = ["pictures", "kornia, ms", "kernels, ms", "ratio", "error of kornia", "of the kernels"]
-    return table(header, rows)
+    return markdown(header, rows)
 
 
 def _optimizer(case: _Case) -> str:
@@ -148,7 +149,7 @@ def _optimizer(case: _Case) -> str:
     for name, text in (("norm", "norm of the gradient"), ("average", "running average")):
         rows.append([text, "", *(case.ms(f"{name}, {way}") for way in ways[1:])])
     ends = " and ".join(f"{case.ms(f'gradients to {to}')} ms to {to}" for to in ("None", "zero"))
-    return f"{table(['ms', *ways], rows)}\n\nTo set the gradients takes {ends}."
+    return f"{markdown(['ms', *ways], rows)}\n\nTo set the gradients takes {ends}."
 
 
 if __name__ == "__main__":

@@ -65,7 +65,9 @@ ROOMS = {
     "kernels.bench.static": Room(
         "what the CUDA kernels take, told without a GPU", (*_KERNELS, "kernels.bench.core")
     ),
-    "kernels.stress.core": Room("what a case is, the runner, reports", ("versions",)),
+    "kernels.stress.core": Room(
+        "what a case is, the runner, reports", ("versions", "kernels.runtime")
+    ),
     "kernels.stress.oracles": Room(
         "the formulas in float64", ("kernels.stress.core", "kernels.rasterize")
     ),
@@ -92,7 +94,7 @@ ROOMS = {
     "viewer": Room("the 3D viewer and its pages", (*_READERS, "formats")),
     "fitting": Room("one object by optimisation", (*_LIBRARY, "compat")),
     "pages": Room(
-        "pages, turntables",
+        "pages, charts, turntables",
         (*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
     ),
     "measure": Room("benchmark and stress cases that need the model", _MEASURES),
@@ -105,7 +107,7 @@ ROOMS = {
         (*_LIBRARY, "train.config", "train.objective", "train.data", "train.sources"),
         ("pages",),
     ),
-    "eval": Room("the report that both evaluations share", _READERS),
+    "eval": Room("the report that both evaluations share", _RESULTS),
     "eval.views": Room("PSNR, SSIM, LPIPS; baselines", (*_RESULTS, "eval")),
     "eval.shapes": Room("Chamfer, IoU, F-score", (*_RESULTS, "eval")),
     "gpu_check": Room("the checks on a CUDA machine", (*_MEASURES, "measure")),
