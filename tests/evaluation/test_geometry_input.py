@@ -42,6 +42,14 @@ def evaluate(capfd, *arguments):
     return code, json.loads(printed.out) if code != 2 else printed.err
 
 
+def pairs_of(folder, names):
+    for side in ("pred", "gt"):
+        (folder / side).mkdir()
+        for name in names:
+            box().export(folder / side / f"{name}.ply")
+    return folder / "pred", folder / "gt"
+
+
 def ply(elements, body, layout="binary_little_endian"):
     lines = ["ply", f"format {layout} 1.0", *elements, "end_header", ""]
     return "\n".join(lines).encode() + body
@@ -195,16 +203,18 @@ def test_bad_files_are_named_and_the_others_done(tmp_path, side, capfd):
 
 
 def test_gaussians_that_lack_an_attribute(tmp_path, capfd):
-    path = tmp_path / "a.ply"
-    save_ply(path, some(5, rotated=False))
-    box().export(tmp_path / "gt.ply")
-    for gone in (b"f_dc_1", b"opacity", b"scale_2", b"rot_0"):
-        broken = tmp_path / "broken.ply"
-        broken.write_bytes(path.read_bytes().replace(gone, b"other"))
-        code, report = evaluate(capfd, broken, tmp_path / "gt.ply")
-        assert code == 1 and f"no property {gone.decode()}" in report["failures"][0]["reason"]
-    code, report = evaluate(capfd, tmp_path / "gt.ply", path)
-    assert code == 1 and "Gaussians" in report["failures"][0]["reason"]
+    """And Gaussians in place of a truth."""
+    gone = (b"f_dc_1", b"opacity", b"scale_2", b"rot_0")
+    pred, gt = pairs_of(tmp_path, [*map(bytes.decode, gone), "whole"])
+    save_ply(gt / "whole.ply", some(5, rotated=False))
+    for name in gone:
+        content = (gt / "whole.ply").read_bytes().replace(name, b"other")
+        (pred / f"{name.decode()}.ply").write_bytes(content)
+    code, report = evaluate(capfd, pred, gt)
+    reasons = {item["name"]: item["reason"] for item in report["failures"]}
+    assert code == 1 and "Gaussians" in reasons.pop("whole")
+    assert reasons.keys() == set(map(bytes.decode, gone))
+    assert all(f"no property {name}" in reason for name, reason in reasons.items())
 
 
 def changed(faces=None, more=None):
@@ -226,23 +236,30 @@ FLAGGED["nonmanifold"].vertices[8:, 2] *= 2  # now they share an edge
 
 
 @pytest.mark.parametrize("flag", FLAGGED)
-def test_flags(flag, tmp_path, capfd):
+def test_flags(flag):
     mesh, flags = tidied(FLAGGED[flag])
     assert flags == [flag]
     assert tidied(mesh)[1] == [f for f in flags if f not in ("degenerate", "duplicate")]
-    source = FLAGGED[flag]
-    trimesh.Trimesh(source.vertices, source.faces, process=False).export(tmp_path / "a.ply")
-    box().export(tmp_path / "gt.ply")
-    code, report = evaluate(capfd, tmp_path / "a.ply", tmp_path / "gt.ply")
-    record = report["objects"][0]
-    assert code == 0 and record["pred_flags"] == [flag] and record["gt_flags"] == []
-    assert record["pred_closed"] == (flag != "open") and report["flags"]["pred"] == {flag: 1}
-    if flag in ("inverted", "inconsistent", "degenerate", "duplicate"):  # the surface is the same
-        assert record["iou"] == 1 and record["normal_consistency"] > 0.9  # edges
-    code, report = evaluate(capfd, tmp_path / "a.ply", tmp_path / "gt.ply", "--strict")
-    assert code == (0 if flag == "open" else 1)
-    if code:
-        assert f"--strict: {flag}" in report["failures"][0]["reason"]
+
+
+def test_flags_are_told_and_strict_refuses_them(tmp_path, capfd):
+    pred, gt = pairs_of(tmp_path, FLAGGED)
+    for flag, mesh in FLAGGED.items():
+        flagged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        flagged.export(pred / f"{flag}.ply")
+    code, report = evaluate(capfd, pred, gt)
+    assert code == 0 and report["flags"]["pred"] == dict.fromkeys(FLAGGED, 1)
+    for record in report["objects"]:
+        flag = record["name"]
+        assert record["pred_flags"] == [flag] and record["gt_flags"] == []
+        assert record["pred_closed"] == (flag != "open")
+        # the surface is the same
+        if flag in ("inverted", "inconsistent", "degenerate", "duplicate"):
+            assert record["iou"] == 1 and record["normal_consistency"] > 0.9  # edges
+    code, report = evaluate(capfd, pred, gt, "--strict")
+    reasons = {item["name"]: item["reason"] for item in report["failures"]}
+    assert code == 1 and reasons.keys() == FLAGGED.keys() - {"open"}
+    assert all(f"--strict: {flag}" in reason for flag, reason in reasons.items())
 
 
 def test_sound_meshes_have_no_flags():
@@ -256,40 +273,41 @@ def test_units_are_independent_of_the_format(tmp_path, capfd):
     pred = trimesh.creation.icosphere(2, 0.7)
     truth = trimesh.creation.box((1.0, 2.0, 3.0))
     turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z-up to y-up
-    values = []
-    for suffix in (".ply", ".stl", ".off", ".obj", ".glb"):
-        meshes = [mesh.copy() for mesh in (pred, truth)]
-        for name, mesh in zip(("pred", "gt"), meshes):
-            if suffix in (".obj", ".glb"):
+    for suffix in ("ply", "stl", "off", "obj", "glb"):
+        for side, mesh in (("pred", pred.copy()), ("gt", truth.copy())):
+            if suffix in ("obj", "glb"):
                 mesh.apply_transform(turn)
-            mesh.export(tmp_path / (name + suffix))
-        code, report = evaluate(capfd, tmp_path / f"pred{suffix}", tmp_path / f"gt{suffix}")
-        assert code == 0 and report["objects"][0]["gt_normalization"]["scale"] == 1 / 3
-        values.append([report["mean"]["iou"], report["mean"]["chamfer"]])
+            (tmp_path / side).mkdir(exist_ok=True)
+            mesh.export(tmp_path / side / f"{suffix}.{suffix}")
+    code, report = evaluate(capfd, tmp_path / "pred", tmp_path / "gt")
+    assert code == 0 and report["num_ok"] == 5
+    assert {record["gt_normalization"]["scale"] for record in report["objects"]} == {1 / 3}
+    values = [[record["iou"], record["chamfer"]] for record in report["objects"]]
     # text formats round to 1e-8; the order of the faces decides which points are drawn
     assert np.ptp(values, axis=0)[0] < 1e-3 and np.ptp(values, axis=0)[1] < 2e-3
 
 
 def test_point_clouds(tmp_path, capfd):
-    random = np.random.default_rng(0)
-    cloud = random.normal(size=(600, 3))
-    trimesh.PointCloud(cloud).export(tmp_path / "a.ply")
-    trimesh.PointCloud(cloud[:1]).export(tmp_path / "one.ply")
-    np.savetxt(tmp_path / "a.xyz", cloud)
-    code, report = evaluate(capfd, tmp_path / "a.xyz", tmp_path / "a.ply")
-    record = report["objects"][0]
-    assert code == 0 and record["chamfer"] < 1e-6 and record["fscore"]["0.01"] == 1
-    assert record["iou"] is None and "point cloud" in record["iou_reason"]
-    assert record["noise_floor"] > 0.01 and record["normal_consistency"] is None
-    code, report = evaluate(capfd, tmp_path / "one.ply", tmp_path / "a.ply")
-    record = report["objects"][0]
-    assert code == 0 and record["accuracy"] < 1e-6 and record["completeness"] > 0.1
-    assert record["chamfer"] == pytest.approx((record["accuracy"] + record["completeness"]) / 2)
-    assert record["hausdorff"] > record["completeness"]
-    for arguments in (("one.ply", "a.ply", "--align", "icp"), ("a.ply", "one.ply")):
-        files = [tmp_path / word if "." in word else word for word in arguments]
-        code, report = evaluate(capfd, *files)
-        assert code == 1 and "one" in report["failures"][0]["reason"]
+    cloud = np.random.default_rng(0).normal(size=(600, 3))
+    pred, gt = tmp_path / "pred", tmp_path / "gt"
+    pred.mkdir(), gt.mkdir()
+    np.savetxt(pred / "same.xyz", cloud)
+    for path, points in (
+        *((gt / "same.ply", cloud), (pred / "one.ply", cloud[:1]), (gt / "one.ply", cloud)),
+        *((pred / "back.ply", cloud), (gt / "back.ply", cloud[:1])),
+    ):
+        trimesh.PointCloud(points).export(path)
+    code, report = evaluate(capfd, pred, gt)
+    back, one, same = report["objects"]
+    assert same["chamfer"] < 1e-6 and same["fscore"]["0.01"] == 1
+    assert same["iou"] is None and "point cloud" in same["iou_reason"]
+    assert same["noise_floor"] > 0.01 and same["normal_consistency"] is None
+    assert one["accuracy"] < 1e-6 and one["completeness"] > 0.1
+    assert one["chamfer"] == pytest.approx((one["accuracy"] + one["completeness"]) / 2)
+    assert one["hausdorff"] > one["completeness"]
+    assert code == 1 and "one" in back["reason"]
+    code, report = evaluate(capfd, pred / "one.ply", gt / "one.ply", "--align", "icp")
+    assert code == 1 and "one" in report["failures"][0]["reason"]
 
 
 def test_an_evaluation_is_repeated_from_its_report(tmp_path, capfd):
@@ -313,14 +331,6 @@ def test_an_evaluation_is_repeated_from_its_report(tmp_path, capfd):
 def test_json_or_csv(tmp_path, capsys):
     assert run("eval-geometry", [str(tmp_path), str(tmp_path), "--json", "--csv"]) == 2
     assert "--json and --csv" in capsys.readouterr().err
-
-
-def pairs_of(folder, names):
-    for side in ("pred", "gt"):
-        (folder / side).mkdir()
-        for name in names:
-            box().export(folder / side / f"{name}.ply")
-    return folder / "pred", folder / "gt"
 
 
 def test_one_crash_stops_no_other(tmp_path, capfd, monkeypatch):
