@@ -14,7 +14,7 @@ from torch import Tensor
 from ..batch import for_each, progress_bar
 from ..cameras import Cameras, relative_to_reference
 from ..conventions import DEFAULT_DISTANCE, GROUNDS, WHITE, over_another, over_background
-from ..data.dataset import ObjectViews, ViewDataset
+from ..data.dataset import ObjectViews, ViewDataset, evenly
 from ..errors import UserError
 from ..files import output_folder, write_json, write_text
 from ..formats.ply import save_ply
@@ -81,9 +81,7 @@ def choose_objects(uids: list[str], names: tuple[str, ...], limit: int | None) -
     if unknown:
         raise UserError(f"--objects {unknown[0]}: not among the {len(uids)} objects")
     chosen = list(dict.fromkeys(names)) or uids
-    if limit is not None and limit < len(chosen):
-        chosen = [chosen[k * len(chosen) // limit] for k in range(limit)]
-    return chosen
+    return chosen if limit is None else evenly(chosen, limit)
 
 
 def split_views(count: int, held_out: int) -> tuple[list[int], list[int]]:
