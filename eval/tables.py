@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from gamba_warp.kernels.runtime.tables import cell
+from gamba_warp.kernels.runtime.tables import cell as cell
 from gamba_warp.kernels.runtime.tables import markdown as table
 
 Lines = list[list[str]]  # cells by row, the head first

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gamba_warp.errors import UserError
+from gamba_warp.formats.clouds import SUFFIXES as CLOUD_SUFFIXES
 from gamba_warp.formats.clouds import read_cloud
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind
 from gamba_warp.formats.headers import open_shape
@@ -24,7 +25,7 @@ from gamba_warp.surfaces.options import SurfaceOptions
 
 from .flags import STRICT, tidied
 from .protocol import GeometryProtocol
-from .shape import CLOUD_SUFFIXES, SUFFIXES, Mesh, Points, Shape, Similarity
+from .shape import SUFFIXES, Mesh, Points, Shape, Similarity
 
 HUGE = 1e18  # the squares of larger coordinates overflow float32
 ROUNDED = 1e-3  # how far the rotations of a catalogue, texts of few digits, may be from one

@@ -66,7 +66,11 @@ class _Row(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 if TYPE_CHECKING:
-    Row = _Row
+
+    class Row(_Row, frozen=True):
+        """As below."""
+
+        def __getattr__(self, key: str) -> Figure | None: ...
 else:
     _figures = [(key, Figure | None, None) for key in METRICS]
     Row = msgspec.defstruct("Row", _figures, bases=(_Row,), frozen=True, omit_defaults=True)
