@@ -54,12 +54,7 @@ LAUNCHING = KEEPING | {"export", "render", "stress", "gpu-check", "doctor"}
 MODULES = {
     "app": "gamba_warp.app.app_command",
     "train": "gamba_warp.train.command",
-    "data furniture": "gamba_warp.train.data.furniture_command",
-    "data primitives": "gamba_warp.train.data.primitives_command",
-    "data render": "gamba_warp.train.data.render_command",
-    "data pack": "gamba_warp.train.sources.pack_command",
-    "data objaverse": "gamba_warp.train.sources.objaverse_command",
-    "data gso": "gamba_warp.train.sources.gso_command",
+    **{name: "gamba_warp.train.sources.commands" for name in COMMANDS if name[:5] == "data "},
     "ablate": "gamba_warp.ablation.command",
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",

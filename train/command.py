@@ -51,65 +51,60 @@ def expand(arguments: list[str]) -> list[str]:
         UserError: nothing is named, or both, the file is no run's config.json, or there is no
             such recipe.
     """
-    words = [w for word in arguments for w in (word.split("=", 1) if _names(word) else [word])]
+    words = [
+        part
+        for word in arguments
+        for part in (word.split("=", 1) if word.startswith(("--config=", "--recipe=")) else [word])
+    ]
     helped = bool({"-h", "--help"} & {*words})
-    if "--recipe" in words:
-        return _with_recipe(words, helped)
-    if "--config" not in words or helped:
+    chosen = "--recipe" if "--recipe" in words else "--config"
+    if chosen not in words or (helped and chosen == "--config"):
         return arguments
-    at = words.index("--config")
-    if at + 1 == len(words):
-        raise UserError("--config: expected a run's folder or its config.json")
-    before, after = words[:at], words[at + 2 :]
-    data = [before.pop(0)] if before and not before[0].startswith("-") else []
-    taken, *options = _options_of(Path(words[at + 1]))
-    return [*(data or [taken]), *options, *before, *after]
-
-
-def _with_recipe(words: list[str], helped: bool) -> list[str]:
-    """The words with the recipe's before all others; DATA may stand at either end."""
-    if "--config" in words:
+    if {"--recipe", "--config"} <= {*words}:
         raise UserError("--recipe and --config: give one of them")
-    at = words.index("--recipe")
+    at = words.index(chosen)
     if at + 1 == len(words):
-        raise UserError("--recipe: expected the name of a recipe")
-    rest = [*words[:at], *words[at + 2 :]]
+        known = {
+            "--recipe": "the name of a recipe",
+            "--config": "a run's folder or its config.json",
+        }
+        raise UserError(f"{chosen}: expected {known[chosen]}")
+    name, rest = words[at + 1], [*words[:at], *words[at + 2 :]]
     if helped:
-        print(table_of(words[at + 1]) + "\n")
+        print(table_of(name) + "\n")
         return rest
-    taken = recipe_words(words[at + 1], rest, os.environ)
-    announce(taken)
-    data = [rest.pop(0)] if rest and not rest[0].startswith("-") else []
-    return [*data, *taken, *rest]
-
-
-def _names(word: str) -> bool:
-    return word.startswith(("--config=", "--recipe="))
+    # DATA may stand at either end of the words about a recipe, and first where there is a --config.
+    first = rest[:1] if rest and not rest[0].startswith("-") else []
+    if chosen == "--recipe":
+        taken = recipe_words(name, rest, os.environ)
+        announce(taken)
+        return [*first, *taken, *rest[len(first) :]]
+    first = first if at else []
+    data, *taken = _options_of(Path(name))
+    return [*(first or [data]), *taken, *rest[len(first) :]]
 
 
 def _options_of(path: Path) -> list[str]:
     """DATA and the options that a config.json means."""
-    from gamba_warp.untrusted.documents import parse_document
+    from gamba_warp.untrusted.documents import read_document
 
     path = path / "config.json" if path.is_dir() else path
     try:
-        if path.stat().st_size > _MAX_CONFIG:
-            raise UserError(f"{path}: has more than {_MAX_CONFIG:,} bytes")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: no run's config.json can be read there ({error})") from error
-    values = parse_document(text, dict[str, Any], f"{path}: a run's options")
-    known = {"data", "preset", "set", *GROUPS}
-    names = {name for name in values if name not in known}
+        values = read_document(path, dict[str, Any], _MAX_CONFIG)
+    except UserError as error:
+        raise UserError(f"{error}; this is no run's config.json, with a run's options") from error
+    if unknown := sorted(values.keys() - {"data", "preset", "set", *GROUPS}):
+        raise UserError(f"{path}: not the options of a run (unknown {', '.join(unknown)[:200]})")
     for group, kind in GROUPS.items():
         part = values.setdefault(group, {})
         if not isinstance(part, dict):
             raise UserError(f"{path}: {group} is no group of options")
-        if group != "model":  # it follows from the preset and the changes of --set
-            names |= {f"{group}.{name}" for name in part.keys() - {f.name for f in fields(kind)}}
-    if names or "data" not in values or "preset" not in values:
-        what = f"unknown {', '.join(sorted(names)[:5])}" if names else "it names no data or preset"
-        raise UserError(f"{path}: not the options of a run ({what[:200]})")
+        unknown = sorted(part.keys() - {f.name for f in fields(kind)})
+        if unknown and group != "model":  # it follows from the preset and the changes of --set
+            named = ", ".join(f"{group}.{name}" for name in unknown)
+            raise UserError(f"{path}: not the options of a run (unknown {named[:200]})")
+    if "data" not in values or "preset" not in values:
+        raise UserError(f"{path}: not the options of a run (it names no data or preset)")
     words = shlex.split(command_line(values))[2:]
     if recipe := values["run"].get("recipe"):  # the record of it; its options are there already
         words += ["--recipe", str(recipe)]

@@ -25,176 +25,203 @@ RecipeName = Literal["paper", "tiny", "rays"]
 
 @dataclass(frozen=True, kw_only=True)
 class LengthConfig:
-    """How long to train. The schedules end with the steps or epochs, else with the minutes."""
+    """How long to train. The schedules end with the steps or epochs, else with the minutes.
+
+    Attributes:
+        steps: Number of optimizer steps.
+        epochs: Number of passes over the objects, or with --overfit over its views; 400 if no limit
+            is given at all.
+        minutes: Training time, resumed parts included. If it is the only limit, the schedules
+            follow the clock, and two runs are not the same to the bit. A run may be resumed with
+            another length: the learning rate then goes on from where it was, and the rest of its
+            fall ends with the new length. Where the fall was over, or almost so, it first rises
+            again to what a run of the new length has there, over a tenth of the steps that are
+            left, and the command says so.
+    """
 
     steps: _Count | None = None
-    """Number of optimizer steps."""
     epochs: Annotated[float, Meta(gt=0, le=1e9)] | None = None
-    """Number of passes over the objects, or with --overfit over its views; 400 if no limit is
-    given at all."""
     minutes: Minutes | None = None
-    """Training time, resumed parts included. If it is the only limit, the schedules follow the
-    clock, and two runs are not the same to the bit. A run may be resumed with another length: the
-    learning rate then goes on from where it was, and the rest of its fall ends with the new
-    length. Where the fall was over, or almost so, it first rises again to what a run of the new
-    length has there, over a tenth of the steps that are left, and the command says so."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DataConfig:
-    """What a step sees."""
+    """What a step sees.
+
+    Attributes:
+        batch_size: Objects per step and process, before accumulation; 8 if not given, or 1 with
+            --overfit.
+        accumulate: Batches per optimizer step.
+        size: Side of the rendered pictures, pixels.
+        views_first: Novel views per object at the start.
+        views_last: Novel views per object at the end; the number grows in equal shares of the run.
+        views_per_object: A fixed number of novel views, in place of the growing one; 9 with
+            --overfit.
+        background: Colour behind the rendered and the true pictures; "random" draws one for each
+            object and step. The input picture always lies on the model's own background.
+        reference: The view that is the input: any, or always the first; "auto" is first with
+            --overfit.
+        extra: More datasets, whose training objects are added to those of DATA.
+        front_share: Share of the samples whose input is a view from the front: the object's first,
+            or another one at -35 to 35 degrees of azimuth and 0 to 20 of elevation; of the others
+            it is any view.
+        mirror: Share of the samples whose object is mirrored, with its cameras.
+        recolor: Share of the samples whose colour channels change places and gamma.
+        overfit: Train on this one object (uid or number) and validate on its training views: a
+            smoke test.
+        cache: Keep decoded pictures in memory.
+        cache_device: Decode all pictures at the start and keep them on the device that trains, with
+            8 bits a channel. Depth pictures are read when they are used.
+        workers: Threads that decode pictures ahead of the training, and batches that lie ready at
+            most; the number changes no result.
+    """
 
     batch_size: Annotated[int, Meta(ge=1, le=100_000)] | None = None
-    """Objects per step and process, before accumulation; 8 if not given, or 1 with --overfit."""
     accumulate: Annotated[int, Meta(ge=1, le=100_000)] = 1
-    """Batches per optimizer step."""
     size: Annotated[int, Meta(ge=1, le=4096)] = 128
-    """Side of the rendered pictures, pixels."""
     views_first: _Views = 2
-    """Novel views per object at the start."""
     views_last: _Views = 6
-    """Novel views per object at the end; the number grows in equal shares of the run."""
     views_per_object: _Views | None = None
-    """A fixed number of novel views, in place of the growing one; 9 with --overfit."""
     background: Literal["white", "black", "random"] = "white"
-    """Colour behind the rendered and the true pictures; "random" draws one for each object and
-    step. The input picture always lies on the model's own background."""
     reference: Literal["auto", "random", "first"] = "auto"
-    """The view that is the input: any, or always the first; "auto" is first with --overfit."""
     extra: tuple[Path, ...] = ()
-    """More datasets, whose training objects are added to those of DATA."""
     front_share: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    """Share of the samples whose input is a view from the front: the object's first, or another one
-    at -35 to 35 degrees of azimuth and 0 to 20 of elevation; of the others it is any view."""
     mirror: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    """Share of the samples whose object is mirrored, with its cameras."""
     recolor: Annotated[float, Meta(ge=0, le=1)] = 0.0
-    """Share of the samples whose colour channels change places and gamma."""
     overfit: str | None = None
-    """Train on this one object (uid or number) and validate on its training views: a smoke test."""
     cache: bool = False
-    """Keep decoded pictures in memory."""
     cache_device: bool = False
-    """Decode all pictures at the start and keep them on the device that trains, with 8 bits a
-    channel. Depth pictures are read when they are used."""
     workers: Annotated[int, Meta(ge=1, le=1024)] = 1
-    """Threads that decode pictures ahead of the training, and batches that lie ready at most; the
-    number changes no result."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
-    """Weights of the loss (paper eq. loss_train)."""
+    """Weights of the loss (paper eq. loss_train).
+
+    Attributes:
+        mask_weight: Weight of the alpha channel's squared error.
+        lpips: Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" demands them. On a
+            CPU it multiplies a step's time (docs/train-your-own.md).
+        lpips_weight: Weight of LPIPS.
+        lpips_after: Leave LPIPS out for this many steps; it can hold a young model in a white
+            collapse.
+        lpips_crop: Side of a random square, in pixels, that LPIPS compares in one view of each
+            object; 0 compares all views whole, which on a CPU would take most of a step.
+        ssim_weight: Weight of 1 - SSIM; the paper has no such term.
+        novel_weight: Weight of each novel view against the input view, in all terms but LPIPS of
+            crops; the mean over the views stays a mean.
+        depth_weight: Weight of the depth of Gaussians: that of the first layer of "rays" is held to
+            the input view's first surface, that of the last layer to the last. The data needs depth
+            pictures (gamba data render --depth); the paper has no such term.
+        radial_mask: The radial mask constraint on the projected centres (paper Table 2).
+        rdist_weight: Weight of the radial mask constraint at the start.
+        rdist_epochs: Epochs over which the weight of the radial mask constraint falls linearly to
+            0.
+        rdist_share: Largest share of the run in which that weight falls; it matters where the run
+            is short.
+        rdist_steps: Steps over which that weight falls, in place of --rdist-epochs and
+            --rdist-share.
+    """
 
     mask_weight: _Weight = 1.0
-    """Weight of the alpha channel's squared error."""
     lpips: Literal["auto", "on", "off"] = "auto"
-    """Use of LPIPS-VGG: "auto" uses it if its weights are there, "on" demands them. On a CPU it
-    multiplies a step's time (docs/train-your-own.md)."""
     lpips_weight: _Weight = 0.5
-    """Weight of LPIPS."""
     lpips_after: _Every = 0
-    """Leave LPIPS out for this many steps; it can hold a young model in a white collapse."""
     lpips_crop: _Every = 0
-    """Side of a random square, in pixels, that LPIPS compares in one view of each object; 0
-    compares all views whole, which on a CPU would take most of a step."""
     ssim_weight: _Weight = 0.0
-    """Weight of 1 - SSIM; the paper has no such term."""
     novel_weight: _Weight = 1.0
-    """Weight of each novel view against the input view, in all terms but LPIPS of crops; the mean
-    over the views stays a mean."""
     depth_weight: _Weight = 0.0
-    """Weight of the depth of Gaussians: that of the first layer of "rays" is held to the input
-    view's first surface, that of the last layer to the last. The data needs depth pictures (gamba
-    data render --depth); the paper has no such term."""
     radial_mask: bool = True
-    """The radial mask constraint on the projected centres (paper Table 2)."""
     rdist_weight: _Weight = 0.1
-    """Weight of the radial mask constraint at the start."""
     rdist_epochs: Annotated[float, Meta(ge=0, le=1e9)] = 10.0
-    """Epochs over which the weight of the radial mask constraint falls linearly to 0."""
     rdist_share: Annotated[float, Meta(gt=0, le=1)] = 0.25
-    """Largest share of the run in which that weight falls; it matters where the run is short."""
     rdist_steps: _Every | None = None
-    """Steps over which that weight falls, in place of --rdist-epochs and --rdist-share."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptimConfig:
-    """AdamW, and the running average of the weights."""
+    """AdamW, and the running average of the weights.
+
+    Attributes:
+        lr: Peak learning rate; after a warm-up it falls to 0 as --schedule says.
+        schedule: "cosine" falls from the warm-up on, along half a cosine; "trapezoid" stays at the
+            peak and falls linearly at the end, so that a longer run begins as a shorter one does.
+        decay_share: Share of the run in which "trapezoid" falls.
+        warmup_steps: Steps of the linear warm-up, a tenth of the run at most.
+        weight_decay: Weight decay of matrices, except those that a module flags.
+        beta2: Second-moment decay of AdamW.
+        clip: Largest norm of the gradient.
+        ema: Decay of the weights' running average, shorter at the start; 0 turns it off.
+        precision: Precision of the products in the network, by autocast; parameters, losses and
+            rendering stay float32. "auto" is bfloat16 where a trial of 50 ms finds it faster, on
+            all processes, else float32; it chooses anew whenever the run goes on.
+        max_skipped: Give up after so many non-finite steps in a row.
+    """
 
     lr: Annotated[float, Meta(gt=0, le=10)] = 1e-3
-    """Peak learning rate; after a warm-up it falls to 0 as --schedule says."""
     schedule: Literal["cosine", "trapezoid"] = "cosine"
-    """"cosine" falls from the warm-up on, along half a cosine; "trapezoid" stays at the peak and
-    falls linearly at the end, so that a longer run begins as a shorter one does."""
     decay_share: Annotated[float, Meta(gt=0, le=1)] = 0.2
-    """Share of the run in which "trapezoid" falls."""
     warmup_steps: _Every = 100
-    """Steps of the linear warm-up, a tenth of the run at most."""
     weight_decay: Annotated[float, Meta(ge=0, le=100)] = 0.05
-    """Weight decay of matrices, except those that a module flags."""
     beta2: Annotated[float, Meta(ge=0, lt=1)] = 0.95
-    """Second-moment decay of AdamW."""
     clip: Annotated[float, Meta(gt=0, le=1e9)] = 1.0
-    """Largest norm of the gradient."""
     ema: Annotated[float, Meta(ge=0, lt=1)] = 0.999
-    """Decay of the weights' running average, shorter at the start; 0 turns it off."""
     precision: Precision = "float32"
-    """Precision of the products in the network, by autocast; parameters, losses and rendering stay
-    float32. "auto" is bfloat16 where a trial of 50 ms finds it faster, on all processes, else
-    float32; it chooses anew whenever the run goes on."""
     max_skipped: _Count = 20
-    """Give up after so many non-finite steps in a row."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """Files, logging and the machine."""
+    """Files, logging and the machine.
+
+    Attributes:
+        out: Run folder.
+        config: Take the options of another run: its folder, or its config.json. Options beside this
+            one replace those, and so does DATA if it comes first; without --out that run itself
+            goes on.
+        recipe: Options that belong together: "paper" is the paper's training, with 256 objects a
+            step over all processes; "tiny" or "rays" that of the shipped model, at its size.
+            Options beside it win; with --help it shows what the recipe sets, and from where.
+        resume: "auto" goes on where the run folder stands; else "never", or the path of a
+            checkpoint.
+        init: Start from the weights of this model file, checkpoint or run folder (same
+            architecture; the averaged weights where there are such), with a fresh optimizer. A run
+            of other losses or data goes on so, in another --out.
+        encoder_weights: File of the image encoder's weights, or "random" to train one from scratch.
+        log_every: Steps between two lines of the log.
+        val_every: Steps between two validations (and sample pictures); 0 for none.
+        val_objects: Held-out objects to validate on.
+        val_views: Novel views of each of these, evenly spaced in the list; --overfit takes all.
+        save_every: Steps between two checkpoints; one is always saved at the end.
+        keep: Checkpoints kept; the oldest go first.
+        tensorboard: Write TensorBoard files, if it is installed.
+        log: Boards beside TensorBoard: "wandb" is Weights & Biases, which its own settings send
+            where they say (WANDB_PROJECT, WANDB_MODE=offline).
+        device: Device that computes; "auto" is the GPU if there is one.
+        threads: Number of CPU threads; all cores if not given.
+        recompute: Keep only the blocks' inputs for the gradient and run each block again there: the
+            same result in less memory and more time.
+        seed: Seed of the initial weights and of the order of the data.
+    """
 
     out: Path = Path("runs/gamba")
-    """Run folder."""
     config: Path | None = None
-    """Take the options of another run: its folder, or its config.json. Options beside this one
-    replace those, and so does DATA if it comes first; without --out that run itself goes on."""
     recipe: RecipeName | None = None
-    """Options that belong together: "paper" is the paper's training, with 256 objects a step over
-    all processes; "tiny" or "rays" that of the shipped model, at its size. Options beside it win;
-    with --help it shows what the recipe sets, and from where."""
     resume: str = "auto"
-    """"auto" goes on where the run folder stands; else "never", or the path of a checkpoint."""
     init: Path | None = None
-    """Start from the weights of this model file, checkpoint or run folder (same architecture; the
-    averaged weights where there are such), with a fresh optimizer. A run of other losses or data
-    goes on so, in another --out."""
     encoder_weights: str | None = None
-    """File of the image encoder's weights, or "random" to train one from scratch."""
     log_every: _Count = 10
-    """Steps between two lines of the log."""
     val_every: _Every = 500
-    """Steps between two validations (and sample pictures); 0 for none."""
     val_objects: Annotated[int, Meta(ge=0, le=1_000_000)] = 8
-    """Held-out objects to validate on."""
     val_views: Annotated[int, Meta(ge=0, le=100_000)] = 4
-    """Novel views of each of these, evenly spaced in the list; --overfit takes all."""
     save_every: _Count = 500
-    """Steps between two checkpoints; one is always saved at the end."""
     keep: _Count = 2
-    """Checkpoints kept; the oldest go first."""
     tensorboard: bool = True
-    """Write TensorBoard files, if it is installed."""
     log: tuple[Literal["wandb"], ...] = ()
-    """Boards beside TensorBoard: "wandb" is Weights & Biases, which its own settings send where
-    they say (WANDB_PROJECT, WANDB_MODE=offline)."""
     device: DeviceChoice = "auto"
-    """Device that computes; "auto" is the GPU if there is one."""
     threads: Threads | None = None
-    """Number of CPU threads; all cores if not given."""
     recompute: bool = False
-    """Keep only the blocks' inputs for the gradient and run each block again there: the same
-    result in less memory and more time."""
     seed: Seed = 0
-    """Seed of the initial weights and of the order of the data."""
 
     @property
     def boards(self) -> tuple[str, ...]:
@@ -204,14 +231,17 @@ class RunConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Trains a model on posed views (``gamba data render`` makes them)."""
+    """Trains a model on posed views (``gamba data render`` makes them).
+
+    Attributes:
+        data: Dataset folder.
+        preset: Preset of the model.
+        set: Changes to the preset, e.g. prepend=false depth=4; the fields are GambaConfig's.
+    """
 
     data: tyro.conf.Positional[Path]
-    """Dataset folder."""
     preset: Preset = "small"
-    """Preset of the model."""
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FIELD=VALUE ...")] = ()
-    """Changes to the preset, e.g. prepend=false depth=4; the fields are GambaConfig's."""
     length: LengthConfig = field(default_factory=LengthConfig)
     views: DataConfig = field(default_factory=DataConfig)
     loss: LossConfig = field(default_factory=LossConfig)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -28,6 +28,7 @@ from gamba_warp.conventions import Precision
 from gamba_warp.devices import pick_precision
 from gamba_warp.errors import UserError, first_line
 
+Result = TypeVar("Result")
 _MEETING = timedelta(minutes=5)  # processes start at different times
 _LONGEST = timedelta(minutes=30)  # for which they wait for one another later
 _SHOWN = 4  # names of a list that a message shows
@@ -85,9 +86,16 @@ class World:
             dist.all_gather_object(found, value)
         return found
 
-    def first(self, value: Any) -> Any:
-        """Gives every process what the main one has; what torch can pickle, tensors too."""
-        held = [value]
+    def on_main(self, action: Callable[[], Result]) -> Result:
+        """Gives every process what the main one makes; what torch can pickle, tensors too.
+
+        Raises:
+            UserError: as ``together``.
+        """
+        held: list[Any] = [None]
+        with self.together():
+            if self.main:
+                held = [action()]
         if self.size > 1:
             dist.broadcast_object_list(held, 0)
         return held[0]
@@ -124,12 +132,11 @@ class World:
         """
         if self.size == 1:
             return model
+        # Versions of torch name this option differently.
         known = inspect.signature(DistributedDataParallel).parameters
         name = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
-        options: dict[str, Any] = {name: False}
-        if self.device.type == "cuda":
-            options["process_group"] = dist.new_group(backend="nccl")
-        return DistributedDataParallel(model, **options)
+        group = dist.new_group(backend="nccl") if self.device.type == "cuda" else None
+        return DistributedDataParallel(model, process_group=group, **{name: False})
 
     def agree(self, facts: Callable[[], Mapping[str, Mapping[str, object]]]) -> None:
         """Refuses processes that would not do the same work.
@@ -152,25 +159,23 @@ class World:
         if not others:
             return
         (name, there), parts = known[others[0]], []
-        for subject, values in here.items():
-            a, b = values, there[subject]
-            differing = sorted(key for key in {*a, *b} if key not in a or a[key] != b.get(key))
-            shown = []
-            for key in differing[:_SHOWN]:
+        for subject, a in here.items():
+            b, shown = there[subject], []
+            for key in sorted(key for key in {*a, *b} if key not in a or a[key] != b.get(key)):
                 if key not in a or key not in b:
                     shown.append(f"{key} is {'added' if key not in a else 'missing'}")
                 elif re.fullmatch("[0-9a-f]{64}", str(a[key])):  # a hash says nothing to people
                     shown.append(f"{key} is another")
                 else:
                     shown.append(f"{key} is {str(b[key])[:60]}, not {str(a[key])[:60]}")
-            if len(differing) > _SHOWN:
-                shown[-1] += f" and {len(differing) - _SHOWN} more"
+            more = [f"{len(shown) - _SHOWN} more"] if len(shown) > _SHOWN else []
             if shown:
-                parts.append(f"{subject}: {', '.join(shown)}")
-        who = f"process {others[0]} on {name}"
-        if len(others) > 1:
-            who += f", like {len(others) - 1} more,"
-        raise UserError(f"{who} is not set up as process 0 on {host}: {'; '.join(parts)}")
+                parts.append(f"{subject}: {', '.join(shown[:_SHOWN] + more)}")
+        like = f", like {len(others) - 1} more," if len(others) > 1 else ""
+        raise UserError(
+            f"process {others[0]} on {name}{like} is not set up as process 0 on {host}: "
+            f"{'; '.join(parts)}"
+        )
 
 
 @contextmanager
@@ -186,14 +191,15 @@ def world(device: str = "auto") -> Iterator[World]:
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("--device cuda: no CUDA GPU is available")
-    size = int(os.environ.get("WORLD_SIZE", "1"))
-    rank = int(os.environ.get("RANK", "0"))
-    kind = device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-    local = int(os.environ.get("LOCAL_RANK", "0"))
-    chosen = torch.device(kind, local) if kind == "cuda" else torch.device("cpu")
-    if kind == "cuda":
+    size, rank, local = (
+        int(os.environ.get(name, default))
+        for name, default in (("WORLD_SIZE", "1"), ("RANK", "0"), ("LOCAL_RANK", "0"))
+    )
+    chosen = torch.device("cpu")
+    if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         if local >= torch.cuda.device_count():
             raise UserError(f"process {rank} has no GPU: {torch.cuda.device_count()} on this host")
+        chosen = torch.device("cuda", local)
         torch.cuda.set_device(chosen)
     if size == 1:
         yield World(rank=0, size=1, device=chosen)

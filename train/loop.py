@@ -20,14 +20,14 @@ from gamba_warp.kernels.runtime.system import end_signals
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
 
-from .batches import BatchQueue, BatchSource, TrainingData, fixed_batches
+from .batches import Batches, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
 from .config import LengthConfig, TrainConfig
 from .ddp import World
 from .log import RunLog, run_bar, say
 from .objective.losses import Moment, term_weights
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
-from .step import collapse_reason, compute_gradients, health, validate
+from .step import Objective, collapse_reason, compute_gradients, health, validate
 
 
 @contextlib.contextmanager
@@ -78,19 +78,16 @@ class Trainer:
         self._unread: dict[str, str] = {}  # reasons by uid, of objects to validate on
         self._named: set[str] = set()  # uids whose failure was said
         self._saved = self._validated = -1  # the step of the last checkpoint and validation
-        self._source = BatchSource(
-            data.train,
-            model.config,
-            objects=data.objects,
-            batch_size=data.batch_size * world.size,
-            reference=data.reference,
-            views=config.views,
-            seed=config.run.seed,
-            surfaces=config.loss.depth_weight > 0,
-        )
-        self.steps_per_epoch = len(data.objects) / (self._source.batch_size * self.accumulate)
+        self.steps_per_epoch = len(data.objects) / (data.batch_size * world.size * self.accumulate)
         self.schedule = self._schedule(config.length)
-        self.total = self.schedule.total
+        self.total = total = self.schedule.total
+        self._batches = Batches(
+            data,
+            config,
+            world,
+            novel=lambda number: self.novel_views(number // self.accumulate),
+            last=None if total is None else total * self.accumulate,
+        )
 
     def _schedule(self, length: LengthConfig) -> Schedule:
         total = length.steps
@@ -99,18 +96,21 @@ class Trainer:
         return Schedule(self.config.optim, total, length.minutes)
 
     @property
+    def averaged(self) -> Gamba:
+        """The model with the averaged weights, or where there are none the one that trains."""
+        return self.model if self.ema is None else self.ema.model
+
+    @property
     def failures(self) -> dict[str, str]:
         """Reasons by uid, for the objects that could not be read so far."""
-        return self._unread | self._source.failures
+        return self._unread | self._batches.failures
 
     def _name_failures(self) -> None:
         """Warns of each object that could not be read, once."""
-        if self.log is None:
-            return
-        for uid, reason in self.failures.items():
-            if uid not in self._named:
-                self._named.add(uid)
-                self.log.warn(self.step, f"{uid} is skipped: {reason}")
+        for uid in [uid for uid in self.failures if uid not in self._named]:
+            self._named.add(uid)
+            if self.log is not None:
+                self.log.warn(self.step, f"{uid} is skipped: {self.failures[uid]}")
 
     def novel_views(self, step: int) -> int:
         """Returns V, the number of novel views at a step."""
@@ -120,13 +120,12 @@ class Trainer:
         done = self.schedule.progress(step, self.elapsed)
         return novel_views(done, views.views_first, views.views_last)
 
-    def weights(self, validates: bool = False) -> dict[str, float]:
-        """Returns ``term_weights`` at the next step, or for a validation."""
+    def _weights(self, validates: bool = False) -> dict[str, float]:
         epochs = self.step / self.steps_per_epoch
         done = self.schedule.progress(self.step, self.elapsed)
         return term_weights(self.config.loss, Moment(self.step, epochs, done, validates))
 
-    def train_step(self, batches: BatchQueue) -> dict[str, float]:
+    def train_step(self) -> dict[str, float]:
         """Makes one optimizer step; returns its figures, some of them those of its last batch.
 
         With several processes, losses and the model's health are the means over all of them.
@@ -137,20 +136,18 @@ class Trainer:
             UserError: there are too many such steps in a row, or data cannot be read.
         """
         started = time.perf_counter()
-        rate = self.config.optim.lr * self.schedule.share(self.step, self.elapsed)
+        config, batches, first = self.config, self._batches, self.step * self.accumulate
+        rate = config.optim.lr * self.schedule.share(self.step, self.elapsed)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        weights, first, batches.waited = self.weights(), self.step * self.accumulate, 0.0
+        batches.waited = 0.0
         made = compute_gradients(
             self.wrapped,
             self.optimizer,
             map(batches.take, range(first, first + self.accumulate)),
-            weights,
-            clip=self.config.optim.clip,
+            Objective(self._weights(), self.lpips, config.loss.lpips_crop, self.precision),
+            clip=config.optim.clip,
             count=self.accumulate,
-            lpips=self.lpips,
-            lpips_crop=self.config.loss.lpips_crop,
-            precision=self.precision,
         )
         loss, norm = torch.stack([made.loss, made.norm]).tolist()
         loss = self._apply(loss, norm)
@@ -159,7 +156,7 @@ class Trainer:
         figures = {"loss": loss, "grad_norm": norm, "lr": rate}
         figures |= {"seconds": seconds, "wait_share": batches.waited / seconds}
         figures["views_per_second"] = views / seconds
-        if self.step % self.config.run.log_every == 0:
+        if self.step % config.run.log_every == 0:
             terms = made.result.terms.items()
             own = {f"loss_{name}": term.mean().item() for name, term in terms}
             known = health(made.result, made.batch).items()
@@ -204,13 +201,6 @@ class Trainer:
             UserError: as ``train_step``, or the run folder cannot be written.
         """
         minutes = self.config.length.minutes
-        batches = BatchQueue(
-            self._source,
-            self.config.views.workers,
-            lambda number: self.novel_views(number // self.accumulate),
-            self.world,
-            last=None if self.total is None else self.total * self.accumulate,
-        )
         bar = run_bar(self.total, minutes, self.step, self.elapsed / 60, self.world.main)
         began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
@@ -225,19 +215,17 @@ class Trainer:
                     late = minutes is not None and self.elapsed >= 60 * minutes
                     if stop or late or (self.total is not None and self.step >= self.total):
                         break
-                    figures = self.train_step(batches)
-                    self._after_step(figures, bar)
+                    self._after_step(self.train_step(), bar)
                 if not stop:
                     self._validate()
                 self.save()
         finally:
-            batches.close()
+            self._batches.close()
             bar.close()
         if stop:
             return 128 + int(stop)
         if self.world.main:
-            best = self.ema.model if self.ema else self.model
-            save_model(self.config.run.out / "model.safetensors", best)
+            save_model(self.config.run.out / "model.safetensors", self.averaged)
         return 0
 
     def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
@@ -266,38 +254,36 @@ class Trainer:
         if self._validated == self.step or not self.config.run.val_every:
             return
         self._validated = self.step
-        with self.world.together():
-            if self.log is not None and self.data.held_out:
-                model = self.ema.model if self.ema else self.model
-                held_out = fixed_batches(
-                    self.data.validation,
-                    self.model.config,
-                    self.data.held_out,
-                    self.data.val_views,
-                    self.config.views.size,
-                    self._unread,
-                )
-                weights, device = self.weights(validates=True), self.world.device
-                figures, rows = validate(model, held_out, weights, self.lpips, device)
-                self._name_failures()
-                if rows:
-                    self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
-                    text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
-                    say(f"step {self.step}: validation {text}")
-                    name = f"step_{self.step:06d}.png"
-                    self.log.sample(self.step, self.config.run.out / "samples" / name, rows)
-                    self.log.page()
-                else:
-                    self.log.warn(self.step, "no validation: none of its objects can be read")
+        self.world.on_main(self._validate_alone)
+
+    def _validate_alone(self) -> None:
+        if self.log is None or not self.data.held_out:
+            return
+        run, size = self.config.run, self.config.views.size
+        held_out = fixed_batches(self.data, self.model.config, size, self._unread)
+        objective = Objective(self._weights(validates=True), self.lpips)
+        figures, rows = validate(self.averaged, held_out, objective, self.world.device)
+        self._name_failures()
+        if not rows:
+            self.log.warn(self.step, "no validation: none of its objects can be read")
+            return
+        self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
+        text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+        say(f"step {self.step}: validation {text}")
+        self.log.sample(self.step, run.out / "samples" / f"step_{self.step:06d}.png", rows)
+        self.log.page()
 
     def save(self) -> None:
         """Writes a checkpoint on the main process, once per step; the others wait."""
-        with self.world.together():
-            if self.world.main and self._saved != self.step:
+
+        def write() -> None:
+            if self._saved != self.step:
                 models = {"model": self.model} | ({"ema": self.ema.model} if self.ema else {})
                 run = self.config.run
                 save_checkpoint(run.out, self.step, models, self.state(), run.keep)
                 self._saved = self.step
+
+        self.world.on_main(write)
 
     def state(self) -> dict:
         """Returns all that a continued run needs beside the weights: tensors and plain values."""
@@ -327,20 +313,20 @@ class Trainer:
             UserError: the checkpoint is damaged, or belongs to a run with another configuration,
                 data or number of processes; the message names the differing fields.
         """
-        held: Any = None
-        with self.world.together():
-            if self.world.main:
-                mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
-                state, length = read_run(checkpoint, self.config, mine)
-                moments = checked_moments(self.optimizer, state.optimizer, checkpoint / "state.pt")
-                weights = read_weights_of(checkpoint / "model.safetensors", self.model)
-                averages = None
-                if self.ema is not None:
-                    averages = read_weights_of(checkpoint / "ema.safetensors", self.ema.model)
-                held = state, length, moments, weights, averages
-        # Everything was read and checked before any of it is loaded. The processes need no disk in
+
+        def read() -> tuple[Any, ...]:
+            mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
+            state, length = read_run(checkpoint, self.config, mine)
+            moments = checked_moments(self.optimizer, state.optimizer, checkpoint / "state.pt")
+            weights = read_weights_of(checkpoint / "model.safetensors", self.model)
+            averages = None
+            if self.ema is not None:
+                averages = read_weights_of(checkpoint / "ema.safetensors", self.ema.model)
+            return state, length, moments, weights, averages
+
+        # Everything is read and checked before any of it is loaded. The processes need no disk in
         # common: the main one reads.
-        state, length, moments, weights, averages = self.world.first(held)
+        state, length, moments, weights, averages = self.world.on_main(read)
         old = replace(self._schedule(length), since=state.new_length)
         if self.ema is not None:
             self.ema.model.load_stored_state(averages)

@@ -12,12 +12,13 @@ from pathlib import Path
 import torch
 
 from gamba_warp.batch import EXPECTED
+from gamba_warp.data.dataset import evenly
 from gamba_warp.errors import UserError
 from gamba_warp.files import only_process, output_folder, sweep, write_json
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.versions import __version__, installed
 
-from .batches import TrainingData, kept_on, open_data
+from .batches import TrainingData, open_data
 from .boards import check_boards
 from .checkpoint import (
     find_checkpoint,
@@ -52,19 +53,21 @@ def train(config: TrainConfig, world: World) -> int:
         UserError: bad data, options or run folder, or the processes do not have the same.
     """
     run, notes, started = config.run, [], ""
-    checkpoint = log = None
+    log = None
     there = run.out.is_dir()  # one that is not there is made only when nothing is bad
     with contextlib.ExitStack() as held:
+
+        def claim() -> Path | None:
+            check_boards(run.log)
+            if there:
+                held.enter_context(only_process(run.out, "trains"))
+            return find_checkpoint(run.out, run.resume, notes.append)
+
         with world.together():
-            data = kept_on(world.device, config, open_data(config))
-            if world.main:  # the others go by what it finds
-                check_boards(run.log)
-                if there:
-                    held.enter_context(only_process(run.out, "trains"))
-                checkpoint = find_checkpoint(run.out, run.resume, notes.append)
+            data = open_data(config, world.device)
             lpips, warning = open_lpips(config, world.device.type)
         world.agree(lambda: _facts(config, data, world, lpips is not None))
-        checkpoint = world.first(checkpoint)
+        checkpoint = world.on_main(claim)  # the others go by what it finds
         _refuse_newer(world, run.out if run.resume == "auto" else None, checkpoint)
         torch.manual_seed(run.seed)
         # TF32 where there is a GPU; no effect on a CPU. It is meant for the network's products,
@@ -74,7 +77,18 @@ def train(config: TrainConfig, world: World) -> int:
             model = Gamba(config.model_config(), run.encoder_weights)
             model.recompute = run.recompute
             if run.init is not None and checkpoint is None and world.main:  # ``wrap`` sends it
-                started = _load_initial(run.init, config, data, model, notes)
+                path = find_initial(run.init, notes.append)
+                load_weights(path, model)
+                differing = initial_differences(path, config, data.fingerprint)
+                started = f"starts from the weights of {path}, of a run with the same options"
+                if differing is None:
+                    started = (
+                        f"starts from the weights of {path}; of what run they are is not known"
+                    )
+                elif differing:
+                    started = started.replace(
+                        "the same options", f"other {', '.join(differing[:20])}"
+                    )
             model.to(world.device)
             if lpips is not None:
                 lpips.to(world.device)
@@ -111,7 +125,7 @@ def _facts(
     Of the data: SHA-256 by object, of its cameras and, of some objects, of the first picture.
     """
     chosen, contents = sorted(set(data.objects)), {}
-    read = set(chosen[:: max(1, len(chosen) // _PICTURES)])
+    read = evenly(chosen, _PICTURES)
     for index in chosen:
         files = data.train.files(index)
         kinds = f"{len(files.images)} {files.depths is None} {files.backs is None}"
@@ -146,19 +160,6 @@ def _refuse_newer(world: World, out: Path | None, checkpoint: Path | None) -> No
                 f"process {rank} on {other} sees {newer[-1]}, process 0 on {host} does not: start "
                 "with that machine as the first, or give a shared folder as --out"
             )
-
-
-def _load_initial(
-    init: Path, config: TrainConfig, data: TrainingData, model: Gamba, notes: list[str]
-) -> str:
-    """Loads what ``--init`` means into the model, and returns a line about it."""
-    path = find_initial(init, notes.append)
-    load_weights(path, model)
-    differing = initial_differences(path, config, data.fingerprint)
-    if differing is None:
-        return f"starts from the weights of {path}; of what run they are is not known"
-    others = f"other {', '.join(differing[:20])}" if differing else "the same options"
-    return f"starts from the weights of {path}, of a run with {others}"
 
 
 def _announce(trainer: Trainer, log: RunLog, checkpoint: Path | None, notes: list[str]) -> None:

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,6 +28,25 @@ VISIBLE_OPACITY = 0.01  # under this a Gaussian changes no 8-bit pixel by more t
 STRIP_VIEWS, STRIP_OBJECTS = 6, 4  # views and objects of a validation's sample pictures
 
 
+class Objective(NamedTuple):
+    """What a batch is compared by.
+
+    Attributes:
+        weights: those of ``term_weights``; a name that is not there has weight 0, and ``novel``,
+            the weight of each novel view against the input view in all terms that have one value
+            per view, 1.
+        lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
+        lpips_crop: as for ``Seen``.
+        precision: dtype of the products in the network, and of those in LPIPS that bear it; all
+            else is float32.
+    """
+
+    weights: Mapping[str, float]
+    lpips: Callable[[Tensor, Tensor], Tensor] | None = None
+    lpips_crop: int = 0
+    precision: torch.dtype = torch.float32
+
+
 @dataclass
 class Forward:
     """What ``forward`` returns.
@@ -46,27 +66,15 @@ class Forward:
     target: Tensor
 
 
-def forward(
-    model: Callable,
-    batch: Batch,
-    weights: Mapping[str, float],
-    lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
-    precision: torch.dtype = torch.float32,
-    lpips_crop: int = 0,
-) -> Forward:
+def forward(model: Callable, batch: Batch, objective: Objective) -> Forward:
     """Predicts, renders all V+1 views and compares them with the true ones (paper eq. loss_train).
 
     Args:
         model: ``Gamba`` or a wrapper of it.
         batch: a batch on the model's device.
-        weights: those of ``term_weights``; a name that is not there has weight 0, and ``novel``,
-            the weight of each novel view against the input view in all terms that have one value
-            per view, 1.
-        lpips: ``(got, want) -> [.., V]``, used if its weight is not 0.
-        precision: dtype of the products in the network, and of those in LPIPS that bear it; all
-            else is float32.
-        lpips_crop: as for ``Seen``.
+        objective: what it is compared by.
     """
+    weights, lpips, crop, precision = objective
     with network_products(batch.inputs.device, precision):
         gaussians = model(batch.inputs, batch.input_cameras)
     rendering = render(gaussians, batch.cameras, batch.background)
@@ -77,7 +85,7 @@ def forward(
         target,
         batch.targets[..., 3:],
         partial(lpips, precision=precision) if isinstance(lpips, LPIPS) else lpips,
-        lpips_crop,
+        crop,
         gaussians,
         batch.cameras,
         batch.input_cameras,
@@ -106,8 +114,7 @@ def weigh_views(terms: dict[str, Tensor], novel: float, views: int) -> dict[str,
     return terms | {name: term * shares.to(term) for name, term in whole.items()}
 
 
-@dataclass
-class Gradients:
+class Gradients(NamedTuple):
     """What ``compute_gradients`` returns beside the gradients themselves.
 
     Attributes:
@@ -127,13 +134,10 @@ def compute_gradients(
     model: Callable,
     optimizer: torch.optim.Optimizer,
     batches: Iterable[Batch],
-    weights: Mapping[str, float],
+    objective: Objective,
     *,
     clip: float,
     count: int = 1,
-    lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
-    lpips_crop: int = 0,
-    precision: torch.dtype = torch.float32,
 ) -> Gradients:
     """Sets the parameters' gradients to those of the mean loss over some batches, and clips them.
 
@@ -143,12 +147,9 @@ def compute_gradients(
         model: ``Gamba`` or a wrapper of it.
         optimizer: the optimizer whose parameters get gradients; it makes no step here.
         batches: ``count`` batches on the model's device.
-        weights: as for ``forward``, like ``lpips`` and ``precision``.
+        objective: as for ``forward``.
         clip: largest norm of the gradient.
         count: number of batches, >= 1.
-        lpips: see above.
-        lpips_crop: as for ``Seen``.
-        precision: see above.
     """
     optimizer.zero_grad(set_to_none=True)
     losses = []
@@ -157,7 +158,7 @@ def compute_gradients(
         if number < count - 1 and isinstance(model, DistributedDataParallel):
             hold = model.no_sync()
         with hold, network_products(batch.inputs.device):
-            result = forward(model, batch, weights, lpips, precision, lpips_crop)
+            result = forward(model, batch, objective)
             (result.loss / count).backward()
         losses.append(result.loss.detach())
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
@@ -203,11 +204,7 @@ def collapse_reason(figures: Mapping[str, float]) -> str | None:
 
 @torch.no_grad()
 def validate(
-    model: Gamba,
-    batches: Iterable[Batch],
-    weights: Mapping[str, float],
-    lpips: Callable[[Tensor, Tensor], Tensor] | None,
-    device: torch.device,
+    model: Gamba, batches: Iterable[Batch], objective: Objective, device: torch.device
 ) -> tuple[dict[str, float], list[Tensor]]:
     """Computes the validation's figures, as means over objects in float32.
 
@@ -215,8 +212,7 @@ def validate(
         model: the model; it is switched to eval mode, and back.
         batches: batches of one object each on white, the input view first, from
             ``fixed_batches``.
-        weights: weights of the loss terms.
-        lpips: as for ``forward``.
+        objective: as for ``forward``.
         device: the model's device.
 
     Returns:
@@ -233,9 +229,10 @@ def validate(
     rows: list[Tensor] = []
     for batch in batches:
         batch = batch.to(device)
-        result = forward(model, batch, weights, lpips)
+        result = forward(model, batch, objective)
+        measures = _measures(result, batch, objective.lpips)
         figures = {"loss": result.loss.item()}
-        for key, values in _quality(result, batch, lpips).items():
+        for key, values in measures.items():
             figures[f"{key}_input"] = values[0].item()
             if len(values) > 1:
                 figures[f"{key}_novel"] = values[1:].mean().item()
@@ -247,7 +244,7 @@ def validate(
     return {name: sum(values) / len(values) for name, values in sums.items()}, rows
 
 
-def _quality(
+def _measures(
     result: Forward, batch: Batch, lpips: Callable[[Tensor, Tensor], Tensor] | None
 ) -> dict[str, Tensor]:
     """The measures of a validation's object, each ``[V+1]``."""

@@ -9,24 +9,28 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import msgspec
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
+from ..batch import EXPECTED, progress_bar
 from ..cameras import Cameras, from_opengl
 from ..errors import UserError
 from ..files import write_json
-from ..images import load_rgba8
+from ..images import check_size, load_rgba8, open_picture
 from ..untrusted.documents import read_document
-from .decode import read_steps, resized
 from .layouts import LAYOUTS, ObjectFiles, Stored, find_objects
-from .packs import INDEX, PackedObject, open_pack
+from .packs import INDEX, open_pack, read_packed
 
 SPLITS = ("train", "val", "test")
 SPLIT_VERSION = 2  # of what is written; 1 had fewer objects in one group
@@ -144,10 +148,11 @@ def open_dataset(
         raise UserError(f"{root}: no such folder")
     if layout == "auto" and (root / INDEX).exists():
         pack = open_pack(root)
-        packed = {o.uid: o for o in pack.objects if split in ("all", o.split)}
-        if not packed:
+        chosen = [values for values in pack.objects if split in ("all", values.get("split"))]
+        if not chosen:
             raise UserError(f"{root}: none of its {len(pack.objects)} objects is in split {split}")
-        return ViewDataset(packed, "pack", cache, pack.split_version, pack.size)
+        readers = {values["uid"]: partial(read_packed, root, values) for values in chosen}
+        return ViewDataset(readers, "pack", cache, pack.split_version, pack.size)
     layout, folders = find_objects(root, layout)
     if not folders:
         marks = ", ".join(mark for mark, _ in LAYOUTS.values())
@@ -162,7 +167,8 @@ def open_dataset(
         objects = {u: f for u, f in objects.items() if stated.get(u, split_of(u)) == split}
         if not objects:
             raise UserError(f"{root}: none of its {len(folders)} objects is in the {split} split")
-    return ViewDataset(objects, layout, cache, version)
+    readers = {uid: partial(LAYOUTS[layout][1], folder) for uid, folder in objects.items()}
+    return ViewDataset(readers, layout, cache, version)
 
 
 class ViewDataset:
@@ -177,22 +183,21 @@ class ViewDataset:
 
     def __init__(
         self,
-        objects: Mapping[str, Path | PackedObject],
+        readers: Mapping[str, Callable[[], ObjectFiles]],
         layout: str,
         cache: bool,
         split_version: int = SPLIT_VERSION,
         packed_size: int | None = None,
     ) -> None:
-        self.uids = list(objects)
-        self.layout = layout
-        self.split_version = split_version
-        self.packed_size = packed_size
-        self._folders = dict(objects)
-        self._layouts = dict.fromkeys(objects, layout)
+        """``readers`` read the files of each object, by uid; ``cache`` as for ``open_dataset``."""
+        self.uids = list(readers)
+        self.layout, self.split_version, self.packed_size = layout, split_version, packed_size
+        self._readers = dict(readers)
         self._files: dict[str, ObjectFiles] = {}
         # A path and a size give the picture, and the (width, height) of the file.
         self._pictures: dict[tuple, tuple[np.ndarray, tuple[int, int]]] | None
         self._pictures = {} if cache else None
+        self._kept: dict[tuple[str, int], tuple[Tensor, np.ndarray]] = {}
 
     def __len__(self) -> int:
         return len(self.uids)
@@ -203,28 +208,17 @@ class ViewDataset:
         Raises:
             UserError: an object has such a name already.
         """
-        renamed = {uid: f"{name}/{uid}" for uid in other.uids}
-        if twice := sorted(set(renamed.values()) & set(self.uids)):
+        added = {f"{name}/{uid}": reader for uid, reader in other._readers.items()}
+        if twice := sorted(added.keys() & self._readers.keys()):
             raise UserError(f"two objects are called '{twice[0]}'; rename a dataset's folder")
-        folders = {renamed[uid]: folder for uid, folder in other._folders.items()}
-        cache = self._pictures is not None
         sizes = [size for size in (self.packed_size, other.packed_size) if size is not None]
-        made = ViewDataset(
-            self._folders | folders,
+        return ViewDataset(
+            self._readers | added,
             self.layout,
-            cache,
+            self._pictures is not None,
             self.split_version,
             min(sizes, default=None),
         )
-        made._layouts = self._layouts | {renamed[u]: lay for u, lay in other._layouts.items()}
-        return made
-
-    def _uid(self, index: int | str) -> str:
-        if isinstance(index, str):
-            if index not in self._folders:
-                raise UserError(f"no object '{index}' among the {len(self)} of this dataset")
-            return index
-        return self.uids[index]
 
     def files(self, index: int | str) -> ObjectFiles:
         """Returns paths, poses and intrinsics of one object, which are read once.
@@ -234,15 +228,18 @@ class ViewDataset:
         """
         uid = self._uid(index)
         if uid not in self._files:
-            place = self._folders[uid]
             try:
-                if isinstance(place, PackedObject):
-                    self._files[uid] = place.files()
-                else:
-                    self._files[uid] = LAYOUTS[self._layouts[uid]][1](place)
+                self._files[uid] = self._readers[uid]()
             except OSError as error:  # of a folder; the readers name the file otherwise
-                raise UserError(f"{error.filename or place}: {error.strerror or error}") from error
+                raise UserError(f"{error.filename or uid}: {error.strerror or error}") from error
         return self._files[uid]
+
+    def _uid(self, index: int | str) -> str:
+        if not isinstance(index, str):
+            return self.uids[index]
+        if index not in self._readers:
+            raise UserError(f"no object '{index}' among the {len(self)} of this dataset")
+        return index
 
     def num_views(self, index: int | str) -> int:
         """Returns V, the number of views of one object; the errors are those of ``files``."""
@@ -261,6 +258,45 @@ class ViewDataset:
             except UserError as error:
                 bad[uid] = str(error)
         return bad
+
+    def keep(
+        self, objects: Sequence[int], sizes: Sequence[int], device: torch.device, workers: int = 1
+    ) -> None:
+        """Decodes pictures and keeps them on a device, with 8 bits a channel; draws a bar.
+
+        ``load`` gives them on that device from then on, and cameras and depths on the CPU. What it
+        gives is the same to the bit: the pictures are divided there as they are on the CPU.
+
+        Args:
+            objects: indices of those that are kept. One that cannot be read is left out; it raises
+                its error when it is loaded.
+            sizes: heights, pixels.
+            device: where they are kept.
+            workers: number of threads that decode.
+
+        Raises:
+            UserError: the device, a GPU, has no room for them.
+        """
+        if device.type == "cuda":
+            views = sum(self.num_views(index) for index in objects)
+            needed = sum(4 * views * size**2 for size in sizes)
+            free, _ = torch.cuda.mem_get_info(device)
+            if needed > free:
+                raise UserError(
+                    f"--cache-device: {views} views take {needed / 2**30:.1f} GB, of which the GPU "
+                    f"has {free / 2**30:.1f} free"
+                )
+
+        def decode(key: tuple[str, int]) -> None:
+            with suppress(*EXPECTED):
+                pixels, Ks = self.pictures(key[0], None, key[1])
+                self._kept[key] = torch.from_numpy(pixels).to(device), Ks
+
+        keys = [(self.uids[index], size) for index in objects for size in sizes]
+        with ThreadPoolExecutor(workers) as pool:
+            done = pool.map(decode, keys)
+            for _ in progress_bar(done, total=len(keys), desc="decoding", unit="object"):
+                pass
 
     def load(
         self,
@@ -284,17 +320,23 @@ class ViewDataset:
             UserError: a file is missing, broken, or not of the size that the cameras state.
         """
         uid = self._uid(index)
-        files = self.files(uid)
-        images, Ks = self._images(uid, views, size)
-        wanted = range(len(files.images)) if views is None else [int(v) for v in views]
+        files, wanted = self.files(uid), self._wanted(uid, views, size)
+        if size is not None and (uid, size) in self._kept:
+            pixels, Ks = self._kept[uid, size]
+            chosen, Ks = pixels[torch.tensor(wanted, device=pixels.device)], Ks[wanted]
+            # By a tensor: a GPU would divide by a plain number by multiplying with its inverse,
+            # whose last bit is another.
+            images = chosen.float() / torch.tensor(255.0, device=chosen.device)
+        else:
+            pixels, Ks = self.pictures(uid, wanted, size)
+            images = torch.from_numpy(np.divide(pixels, np.float32(255), dtype=np.float32))
         height, width = images.shape[1:3]
-        first = wanted[:depths]
-        viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
         unit = np.float32(files.depth_unit)
         near, far = (
             None if steps is None else torch.from_numpy(steps * unit)
-            for steps in (read_steps(p, first, width, height) for p in (files.depths, files.backs))
+            for steps in self._steps(files, wanted[:depths], width, height)
         )
+        viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
         return ObjectViews(
             uid=uid,
             name=files.name or uid,
@@ -305,12 +347,17 @@ class ViewDataset:
             backs=far,
         )
 
-    def _images(
-        self, uid: str, views: Sequence[int] | None, size: int | None
-    ) -> tuple[Tensor, np.ndarray]:
-        """As ``pictures``, with the pictures in [0, 1] as float32."""
-        pixels, Ks = self.pictures(uid, views, size)
-        return torch.from_numpy(np.divide(pixels, np.float32(255), dtype=np.float32)), Ks
+    def _wanted(self, uid: str, views: Sequence[int] | None, size: int | None) -> list[int]:
+        """The numbers of the views that are asked for, of which there must be some."""
+        count = self.num_views(uid)
+        wanted = list(range(count)) if views is None else [int(v) for v in views]
+        if not wanted:
+            raise UserError(f"{uid}: no views asked for")
+        if outside := [v for v in wanted if not 0 <= v < count]:
+            raise UserError(f"{uid}: view {outside[0]} asked for, it has {count}")
+        if size is not None and size < 1:
+            raise UserError(f"size {size}: must be at least 1")
+        return wanted
 
     def pictures(
         self, index: int | str, views: Sequence[int] | None = None, size: int | None = None
@@ -330,15 +377,7 @@ class ViewDataset:
             UserError: as ``load``.
         """
         uid = self._uid(index)
-        files = self.files(uid)
-        wanted = range(len(files.images)) if views is None else [int(v) for v in views]
-        if not wanted:
-            raise UserError(f"{uid}: no views asked for")
-        outside = [v for v in wanted if not 0 <= v < len(files.images)]
-        if outside:
-            raise UserError(f"{uid}: view {outside[0]} asked for, it has {len(files.images)}")
-        if size is not None and size < 1:
-            raise UserError(f"size {size}: must be at least 1")
+        files, wanted = self.files(uid), self._wanted(uid, views, size)
         pixels: np.ndarray | None = None
         Ks = np.empty((len(wanted), 3, 3))
         for number, v in enumerate(wanted):
@@ -375,28 +414,60 @@ class ViewDataset:
             UserError: as ``load``.
         """
         files = self.files(index)
-        views = range(len(files.images))
-        near, far = (read_steps(p, views, width, height) for p in (files.depths, files.backs))
+        return self._steps(files, range(len(files.images)), width, height)
+
+    def _steps(
+        self, files: ObjectFiles, views: Sequence[int], width: int, height: int
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        near, far = (
+            np.stack([_read_depth(paths[v], width, height) for v in views])
+            if paths and views
+            else None
+            for paths in (files.depths, files.backs)
+        )
         return near, far
 
     def _view(
         self, files: ObjectFiles, view: int, size: int | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Loads RGBA ``[H, W, 4]`` uint8 and K ``[3, 3]`` of one view at the size asked for."""
-        path = files.images[view]
-        key = (path, size)
-        if self._pictures is not None and key in self._pictures:
-            picture, original = self._pictures[key]
-        else:
+        path, stated = files.images[view], files.sizes[view]
+        found = self._pictures.get((path, size)) if self._pictures is not None else None
+        if found is None:
             picture = path.read() if isinstance(path, Stored) else load_rgba8(path)
-            original = (picture.shape[1], picture.shape[0])
-            stated = files.sizes[view]
-            if stated is not None and stated != original:
-                got, want = (f"{w}x{h}" for w, h in (original, stated))
-                raise UserError(f"{path}: is {got}, but its cameras are for {want}")
-            picture = resized(picture, size, path)
+            height, width = picture.shape[:2]
+            if stated not in (None, (width, height)):
+                wanted = f"{stated[0]}x{stated[1]}"
+                raise UserError(f"{path}: is {width}x{height}, but its cameras are for {wanted}")
+            if size not in (None, height):
+                new = (max(1, round(width * size / height)), size)
+                check_size(*new, f"{path}: at height {size}")
+                # PIL premultiplies RGBA by itself, and its box filter is the exact area average, so
+                # that no background bleeds in.
+                kind = Image.Resampling.BOX if size < height else Image.Resampling.BILINEAR
+                picture = np.asarray(Image.fromarray(picture).resize(new, kind))
+            found = picture, (width, height)
             if self._pictures is not None:
-                self._pictures[key] = (picture, original)
-        from_size = (1.0, 1.0) if files.sizes[view] is None else original
+                self._pictures[path, size] = found
+        picture, original = found
+        from_size = (1.0, 1.0) if stated is None else original
         factor = [picture.shape[1] / from_size[0], picture.shape[0] / from_size[1], 1.0]
         return picture, files.Ks[view] * np.array(factor)[:, None]
+
+
+def _read_depth(path: Path | Stored, width: int, height: int) -> np.ndarray:
+    """Reads depth ``[height, width]`` float32 in steps of the file, by its nearest samples."""
+    if isinstance(path, Stored):
+        image = Image.fromarray(path.read())
+        opened = nullcontext(image)
+    else:
+        opened = open_picture(path)
+    with opened as image:
+        if len(image.getbands()) != 1:
+            raise UserError(f"{path}: has {len(image.getbands())} channels, depth has one")
+        if image.size != (width, height):
+            image = image.resize((width, height), Image.Resampling.NEAREST)
+        values = np.asarray(image, dtype=np.float32)
+    if not np.isfinite(values).all() or values.min() < 0:
+        raise UserError(f"{path}: a depth is negative or not finite")
+    return values

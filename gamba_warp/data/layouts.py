@@ -17,12 +17,13 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from ..errors import UserError
 from ..untrusted.arrays import read_array
@@ -40,6 +41,8 @@ SHORTEST, LONGEST = 1e-2, 1e3  # focal lengths, in sides of the picture
 _LARGEST = 1e9  # of any number in a camera file
 _TEXT = 500  # letters of a name or of an attribution
 _DEPTH = 64  # folders within folders
+# What of a lens a frame may state for itself.
+_LENS = {*("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "p1", "p2")}
 PICTURES = (".webp", ".png", ".jpg", ".jpeg")
 
 
@@ -59,6 +62,9 @@ class Stored:
             UserError: it is damaged.
         """
         raise NotImplementedError
+
+
+Sizes = list[tuple[int, int] | None]
 
 
 @dataclass
@@ -88,35 +94,63 @@ class ObjectFiles:
     attribution: dict[str, str] = field(default_factory=dict)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON object. Raises UserError where the file is bad or holds something else."""
-    value = read_document(path, object)
-    if not isinstance(value, dict):
-        raise UserError(f"{path}: expected a JSON object")
-    return value
-
-
-def _pose(value: object, source: str) -> np.ndarray:
-    """Makes a ``[4, 4]`` camera-to-world matrix from 3x4 or 4x4 nested numbers, and checks it."""
+def _matrix(value: object, source: str) -> np.ndarray:
+    """Makes a ``[4, 4]`` matrix of 3x4 or 4x4 nested numbers."""
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{source}: the pose is not a matrix of numbers") from error
     if matrix.shape not in ((3, 4), (4, 4)):
         raise UserError(f"{source}: the pose has shape {matrix.shape}, expected 3x4 or 4x4")
-    if not (np.abs(matrix) <= _LARGEST).all():
-        raise UserError(f"{source}: the pose is not finite, or over {_LARGEST:g}")
-    pose = np.eye(4)
-    pose[:3] = matrix[:3]
-    rotation = pose[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2) or np.linalg.det(rotation) < 0:
-        raise UserError(f"{source}: the pose's 3x3 part is not a rotation")
-    if not NEAREST <= np.linalg.norm(pose[:3, 3]) <= FARTHEST:
-        raise UserError(
-            f"{source}: the camera is {np.linalg.norm(pose[:3, 3]):g} from the object's centre, "
-            f"expected {NEAREST:g} to {FARTHEST:g}"
-        )
-    return pose
+    return np.concatenate([matrix[:3], [[0.0, 0.0, 0.0, 1.0]]])
+
+
+def check_cameras(
+    poses: np.ndarray, Ks: np.ndarray, sizes: Sequence[tuple[int, int] | None], names: Sequence[str]
+) -> None:
+    """Refuses cameras that cannot be those of an object's views.
+
+    Args:
+        poses: ``[V, 4, 4]`` float64, camera to world.
+        Ks: ``[V, 3, 3]`` float64, in pixels of ``sizes``, or in fractions of the unknown size.
+        sizes: V widths and heights, pixels, or None.
+        names: of the V views, for the message.
+
+    Raises:
+        UserError: a pose is no rotation with a place near the object, or a K does not suit the
+            size.
+    """
+    size = np.array([size or (1, 1) for size in sizes])
+    with np.errstate(all="ignore"):  # numbers that are not finite are told below
+        turns, places = poses[:, :3, :3], np.linalg.norm(poses[:, :3, 3], axis=1)
+        square = np.isclose(turns @ turns.swapaxes(1, 2), np.eye(3), atol=1e-2).all((1, 2))
+        focal, center = Ks[:, (0, 1), (0, 1)] / size, Ks[:, :2, 2] / size
+        positive = np.isfinite(Ks).all((1, 2)) & (focal > 0).all(1)
+        sound = {
+            "the pose is not finite, or over {most:g}": (np.abs(poses) <= _LARGEST).all((1, 2)),
+            "the pose's 3x3 part is not a rotation": square & ~(np.linalg.det(turns) < 0),
+            "the camera is {place:g} from the object's centre, expected {near:g} to {far:g}": (
+                (places >= NEAREST) & (places <= FARTHEST)
+            ),
+            "focal lengths must be positive": positive,
+            "focal lengths of {focal[0]:g} and {focal[1]:g} sides of the picture, expected "
+            "{short:g} to {long:g}": ((focal >= SHORTEST) & (focal <= LONGEST)).all(1),
+            "the principal point is far outside the picture": (
+                ((center >= -1) & (center <= 2)).all(1)
+            ),
+        }
+    limits = {
+        "most": _LARGEST,
+        "near": NEAREST,
+        "far": FARTHEST,
+        "short": SHORTEST,
+        "long": LONGEST,
+    }
+    for reason, good in sound.items():
+        if not good.all():
+            view = int(good.argmin())
+            reason = reason.format(place=places[view], focal=focal[view], **limits)
+            raise UserError(f"{names[view]}: {reason}")
 
 
 def _number(values: dict[str, Any], key: str, source: str) -> float:
@@ -140,78 +174,29 @@ def _focal(angle: float, source: str) -> float:
     return 0.5 / math.tan(angle / 2)
 
 
-def _checked(K: np.ndarray, width: float, height: float, source: str) -> np.ndarray:
-    """K ``[3, 3]``, whose focal lengths and principal point suit the picture's size."""
-    size = np.array([width, height])
-    focal, center = np.diag(K)[:2] / size, K[:2, 2] / size
-    if not (np.isfinite(K).all() and (focal > 0).all()):
-        raise UserError(f"{source}: focal lengths must be positive")
-    if not ((focal >= SHORTEST) & (focal <= LONGEST)).all():
-        raise UserError(
-            f"{source}: focal lengths of {focal[0]:g} and {focal[1]:g} sides of the picture, "
-            f"expected {SHORTEST:g} to {LONGEST:g}"
-        )
-    if not ((center >= -1) & (center <= 2)).all():
-        raise UserError(f"{source}: the principal point is far outside the picture")
-    return K
+def _camera_matrix(focal_x: float, focal_y: float, x: float, y: float) -> np.ndarray:
+    return np.array([[focal_x, 0, x], [0, focal_y, y], [0, 0, 1.0]])
 
 
-def check_cameras(poses: np.ndarray, Ks: np.ndarray, width: int, height: int, source: str) -> None:
-    """Refuses cameras that cannot be those of an object's views.
-
-    Args:
-        poses: ``[V, 4, 4]`` float64, camera to world.
-        Ks: ``[V, 3, 3]`` float64.
-        width: of the pictures, pixels.
-        height: see above.
-        source: the file, for the message.
-
-    Raises:
-        UserError: a pose is no rotation with a place near the object, or a K does not suit the
-            size.
-    """
-    for number, (pose, K) in enumerate(zip(poses, Ks)):
-        place = f"{source}: view {number}"
-        _pose(pose, place)
-        _checked(K, width, height, place)
-
-
-def _intrinsics(frame: dict, top: dict, source: str) -> tuple[np.ndarray, tuple[int, int] | None]:
+def _intrinsics(values: dict, source: str) -> tuple[np.ndarray, tuple[int, int] | None]:
     """Reads K and the size of one frame; without a stated size K is in fractions of it."""
-    values = {**top, **frame}
     for key in ("k1", "k2", "k3", "p1", "p2"):
         if values.get(key):
             value = repr(values[key])[:40]
             raise UserError(f"{source}: {key} = {value}: lens distortion is not supported")
     sized = "w" in values and "h" in values
-    width = _side(values, "w", source) if sized else 1
-    height = _side(values, "h", source) if sized else 1
+    width, height = (_side(values, key, source) if sized else 1 for key in "wh")
     if "fl_x" in values and sized:
         focal_x = _number(values, "fl_x", source)
         focal_y = _number(values, "fl_y", source) if "fl_y" in values else focal_x
     elif "camera_angle_x" in values:
-        focal_x = width * _focal(_number(values, "camera_angle_x", source), source)
-        focal_y = focal_x
+        focal_x = focal_y = width * _focal(_number(values, "camera_angle_x", source), source)
     else:
         raise UserError(f"{source}: no camera: needs w, h, fl_x (fl_y, cx, cy), or camera_angle_x")
     center_x = _number(values, "cx", source) if sized and "cx" in values else width / 2
     center_y = _number(values, "cy", source) if sized and "cy" in values else height / 2
-    K = np.array([[focal_x, 0, center_x], [0, focal_y, center_y], [0, 0, 1.0]])
-    return _checked(K, width, height, source), (width, height) if sized else None
-
-
-def _picture(folder: Path, name: object, source: str) -> Path:
-    """Finds the frame's file, of whose name Blender leaves the suffix out."""
-    if not isinstance(name, str) or not name:
-        raise UserError(f"{source}: no file_path")
-    path = inside(folder, name, source)
-    if path.suffix:
-        return path
-    found = [path.with_name(path.name + suffix) for suffix in PICTURES]
-    return next((p for p in found if p.exists()), found[1])
-
-
-Sizes = list[tuple[int, int] | None]
+    K = _camera_matrix(focal_x, focal_y, center_x, center_y)
+    return K, (width, height) if sized else None
 
 
 def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
@@ -228,34 +213,45 @@ def read_cameras(path: Path) -> tuple[np.ndarray, np.ndarray, Sizes]:
 
 
 def _posed_frames(path: Path) -> tuple[dict, list[dict], np.ndarray, np.ndarray, Sizes]:
-    top = _read_json(path)
+    top = read_document(path, object)
+    if not isinstance(top, dict):
+        raise UserError(f"{path}: expected a JSON object")
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: no frames")
     _check_count(len(frames), path)
-    poses, Ks, sizes = [], [], []
-    for i, frame in enumerate(frames):
-        source = f"{path}: frame {i}"
+    poses, lenses, names = [], [], [f"{path}: frame {i}" for i in range(len(frames))]
+    shared = None  # most files state one lens for all frames
+    for frame, source in zip(frames, names):
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
             raise UserError(f"{source}: no transform_matrix")
-        poses.append(_pose(frame["transform_matrix"], source))
-        K, size = _intrinsics(frame, top, source)
-        Ks.append(K)
-        sizes.append(size)
-    return top, frames, np.stack(poses), np.stack(Ks), sizes
+        poses.append(_matrix(frame["transform_matrix"], source))
+        if own := {key: frame[key] for key in _LENS & frame.keys()}:
+            lenses.append(_intrinsics({**top, **own}, source))
+        else:
+            shared = shared or _intrinsics(top, source)
+            lenses.append(shared)
+    Ks, sizes = np.stack([K for K, _ in lenses]), [size for _, size in lenses]
+    check_cameras(np.stack(poses), Ks, sizes, names)
+    return top, frames, np.stack(poses), Ks, sizes
 
 
 def _read_transforms(folder: Path) -> ObjectFiles:
     path = folder / "transforms.json"
     top, frames, poses, Ks, sizes = _posed_frames(path)
-    images, depths, backs = [], [], []
+    files: dict[str, list[Path]] = {"file_path": [], "depth_file_path": [], "back_file_path": []}
     for i, frame in enumerate(frames):
         source = f"{path}: frame {i}"
-        images.append(_picture(folder, frame.get("file_path"), source))
-        for key, paths in (("depth_file_path", depths), ("back_file_path", backs)):
+        if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise UserError(f"{source}: no file_path")
+        for key, paths in files.items():
             if frame.get(key):
                 paths.append(inside(folder, frame[key], source))
-    for paths in (images, depths, backs):
+        picture = files["file_path"][-1]
+        if not picture.suffix:  # Blender leaves it out
+            found = [picture.with_name(picture.name + suffix) for suffix in PICTURES]
+            files["file_path"][-1] = next((p for p in found if p.exists()), found[1])
+    for paths in files.values():
         if repeated := next((p for p, n in Counter(paths).items() if n > 1), None):
             raise UserError(f"{path}: two frames have the picture {repeated.name}")
     depth_unit = _number({"depth_unit": 1e-3, **top}, "depth_unit", str(path))
@@ -264,6 +260,7 @@ def _read_transforms(folder: Path) -> ObjectFiles:
     attribution = top.get("attribution") or {}
     if not isinstance(attribution, dict):
         attribution = {"text": attribution}
+    images, depths, backs = files.values()
     return ObjectFiles(
         images=images,
         camera_to_world=poses,
@@ -272,12 +269,12 @@ def _read_transforms(folder: Path) -> ObjectFiles:
         depths=depths if len(depths) == len(frames) else None,
         backs=backs if len(backs) == len(frames) else None,
         depth_unit=depth_unit,
-        name=_text(top.get("name") or ""),
-        attribution={_text(k): _text(v) for k, v in attribution.items()},
+        name=one_text(top.get("name") or ""),
+        attribution={one_text(k): one_text(v) for k, v in attribution.items()},
     )
 
 
-def _text(value: object) -> str:
+def one_text(value: object) -> str:
     """One line for people, of whatever stands in a field."""
     return " ".join(str(value).split())[:_TEXT]
 
@@ -287,38 +284,43 @@ def _check_count(count: int, path: Path) -> None:
         raise UserError(f"{path}: {count} views, at most {MAX_VIEWS} are read")
 
 
+_Axis = Annotated[list[float], Meta(min_length=3, max_length=3)]
+
+
+class _View(Struct):
+    """What ``NNNNN.json`` of G-Objaverse holds: OpenCV axes, position, angles in radians."""
+
+    x: _Axis
+    y: _Axis
+    z: _Axis
+    origin: _Axis
+    x_fov: float | None = None
+    y_fov: float | None = None
+
+
 def _read_gobjaverse(folder: Path) -> ObjectFiles:
     found = sorted(p for p in (folder / GOBJAVERSE).iterdir() if p.is_dir())
     _check_count(len(found), folder)
-    views = [view for view in found if _is_complete(view)]
+    # A broken link is there, and told when it is read.
+    both = [[view / f"{view.name}{suffix}" for suffix in (".json", ".png")] for view in found]
+    views = [view for view, files in zip(found, both) if all(map(os.path.lexists, files))]
     if not views:
         raise UserError(f"{folder / GOBJAVERSE}: no views that have both picture and camera")
-    poses, Ks = [], []
-    for view in views:
-        path = view / f"{view.name}.json"
-        camera = _read_json(path)
-        missing = [key for key in ("x", "y", "z", "origin") if key not in camera]
-        if missing:
-            raise UserError(f"{path}: no {', '.join(missing)}")
-        axes = [camera["x"], camera["y"], camera["z"], camera["origin"]]
-        if not all(isinstance(axis, list) and len(axis) == 3 for axis in axes):
-            raise UserError(f"{path}: x, y, z and origin must be three numbers each")
-        pose = _pose(list(zip(*axes)), str(path))
+    poses, Ks, names = [], [], [str(view / f"{view.name}.json") for view in views]
+    for name in names:
+        camera = read_document(name, _View)
+        pose = _matrix(list(zip(camera.x, camera.y, camera.z, camera.origin)), name)
         pose[:3, 1:3] *= -1  # OpenCV to OpenGL
         poses.append(pose)
-        focal_x = focal_y = GOBJAVERSE_FOCAL
-        if "x_fov" in camera:
-            focal_x = focal_y = _focal(_number(camera, "x_fov", str(path)), str(path))
-        if "y_fov" in camera:
-            focal_y = _focal(_number(camera, "y_fov", str(path)), str(path))
-        K = np.array([[focal_x, 0, 0.5], [0, focal_y, 0.5], [0, 0, 1.0]])
-        Ks.append(_checked(K, 1, 1, str(path)))
-    images = [inside(view, f"{view.name}.png", str(view)) for view in views]
+        focal_x = GOBJAVERSE_FOCAL if camera.x_fov is None else _focal(camera.x_fov, name)
+        focal_y = focal_x if camera.y_fov is None else _focal(camera.y_fov, name)
+        Ks.append(_camera_matrix(focal_x, focal_y, 0.5, 0.5))
+    check_cameras(np.stack(poses), np.stack(Ks), [None] * len(views), names)
     depths = None
     if (folder / GOBJAVERSE_DEPTH).is_dir():
         depths = [inside(folder, f"{GOBJAVERSE_DEPTH}/{v.name}.png", str(folder)) for v in views]
     return ObjectFiles(
-        images,
+        [inside(view, f"{view.name}.png", str(view)) for view in views],
         np.stack(poses),
         np.stack(Ks),
         [None] * len(views),
@@ -327,31 +329,23 @@ def _read_gobjaverse(folder: Path) -> ObjectFiles:
     )
 
 
-def _is_complete(view: Path) -> bool:
-    """Whether a view has picture and camera; a broken link is there, and told when it is read."""
-    return all(os.path.lexists(view / f"{view.name}{suffix}") for suffix in (".json", ".png"))
-
-
 def _read_openlrm(folder: Path) -> ObjectFiles:
     names = sorted(path.name for path in (folder / "rgba").glob("*.png"))
     if not names:
         raise UserError(f"{folder / 'rgba'}: no views")
     _check_count(len(names), folder)
     images = [inside(folder, f"rgba/{name}", str(folder)) for name in names]
-    source = str(folder / "intrinsics.npy")
-    focal, center, size = read_array(folder / "intrinsics.npy", (3, 2))
+    lens = folder / "intrinsics.npy"
+    focal, center, size = read_array(lens, (3, 2))
     values = {"width": float(size[0]), "height": float(size[1])}
-    width, height = (_side(values, key, source) for key in values)
-    K = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1.0]])
-    K = _checked(K, width, height, source)
-    poses = []
-    for image in images:
-        path = folder / "pose" / f"{image.stem}.npy"
-        pose = _pose(read_array(path, (3, 4)), str(path))
-        pose[:3, 3] *= 0.5  # its objects fill a cube of side 2, ours of side 1
-        poses.append(pose)
+    width, height = (_side(values, key, str(lens)) for key in values)
+    Ks = np.repeat(_camera_matrix(*focal, *center)[None], len(images), 0)
+    paths = [folder / "pose" / f"{image.stem}.npy" for image in images]
+    poses = np.stack([_matrix(read_array(path, (3, 4)), str(path)) for path in paths])
     sizes = [(width, height)] * len(images)
-    return ObjectFiles(images, np.stack(poses), np.repeat(K[None], len(images), 0), sizes)
+    check_cameras(poses, Ks, sizes, [f"{lens}, pose/{path.name}" for path in paths])
+    poses[:, :3, 3] *= 0.5  # its objects fill a cube of side 2, ours of side 1
+    return ObjectFiles(images, poses, Ks, sizes)
 
 
 # Each layout has the name that marks an object's folder, and the folder's reader.
@@ -373,19 +367,12 @@ def find_objects(root: Path, layout: str) -> tuple[str, list[Path]]:
     """
     marks = {mark: name for name, (mark, _) in LAYOUTS.items() if layout in ("auto", name)}
     found = []
-    for name, folder in _walk(root, marks):
-        marks = {mark: n for mark, n in marks.items() if n == name}
-        found.append(folder)
-        layout = name
-    return layout, sorted(found)
-
-
-def _walk(root: Path, marks: dict[str, str]) -> Iterator[tuple[str, Path]]:
     for folder, subfolders, files in os.walk(root):
         if folder.count(os.sep) > str(root).count(os.sep) + _DEPTH:
             raise UserError(f"{root}: its folders are nested deeper than {_DEPTH}")
         subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
-        mark = next((m for m in marks if m in files or m in subfolders), None)
-        if mark is not None:
+        if mark := next((m for m in marks if m in files or m in subfolders), None):
             subfolders.clear()  # an object holds no objects
-            yield marks[mark], Path(folder)
+            marks, layout = {mark: marks[mark]}, marks[mark]
+            found.append(Path(folder))
+    return layout, sorted(found)

@@ -18,10 +18,10 @@ from __future__ import annotations
 
 import mmap
 import stat
-import threading
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,7 +33,7 @@ from ..errors import UserError
 from ..images import MAX_PIXELS
 from ..untrusted.documents import read_document
 from ..untrusted.names import inside, parts_of, plain_name
-from .layouts import MAX_SIDE, MAX_VIEWS, ObjectFiles, Stored, check_cameras
+from .layouts import MAX_SIDE, MAX_VIEWS, ObjectFiles, Stored, check_cameras, one_text
 
 INDEX = "pack.json"
 FORMAT, VERSION = "gamba-pack", 1
@@ -109,26 +109,12 @@ class Index(msgspec.Struct, kw_only=True):
     objects: list[dict[str, Any]] = []
 
 
-@dataclass
-class Pack:
-    """An opened pack.
-
-    Attributes:
-        objects: its objects, not looked at yet.
-        size: height of the pictures; None: what the files had.
-        split_version: of the rule, or of the file, that made the split.
-    """
-
-    objects: list[PackedObject]
-    size: int | None
-    split_version: int
-
-
 def read_index(folder: Path) -> Index:
-    """Reads the index of a pack, finished or not.
+    """Reads the index of a pack, finished or not; its objects come in the order of their names.
 
     Raises:
-        UserError: it cannot be read, is of another version, or is none.
+        UserError: it cannot be read, is of another version, or is none; or an object has no sound
+            name, or two have the same.
     """
     path = folder / INDEX
     index = read_document(path, Index)
@@ -136,212 +122,135 @@ def read_index(folder: Path) -> Index:
         raise UserError(f"{path}: not the index of a pack")
     if index.version != VERSION:
         raise UserError(f"{path}: version {index.version} of packs, this one reads {VERSION}")
+    found: dict[str, dict[str, Any]] = {}
+    for values in index.objects:
+        uid = "/".join(parts_of(values.get("uid"), str(path)))
+        if uid in found:
+            raise UserError(f"{path}: the object {uid} is there twice")
+        found[uid] = values
+    index.objects = [found[uid] for uid in sorted(found)]
     return index
 
 
-def open_pack(folder: str | Path) -> Pack:
-    """Opens a pack, without reading any shard.
+def open_pack(folder: Path) -> Index:
+    """Reads the index of a finished pack, and no shard.
 
     Raises:
-        UserError: its index is bad or unfinished, or two objects have one name.
+        UserError: its index is bad or unfinished, or names no objects.
     """
-    folder = Path(folder)
     index = read_index(folder)
     if not index.finished:
         raise UserError(f"{folder}: an unfinished pack; the command that began it goes on with it")
-    objects = packed_objects(folder, index)
-    if not objects:
+    if not index.objects:
         raise UserError(f"{folder}: the pack holds no objects")
-    return Pack(objects, index.size, index.split_version)
+    return index
 
 
-def packed_objects(folder: Path, index: Index) -> list[PackedObject]:
-    """The objects of an index in the order of their names, not looked at yet.
+def read_packed(folder: Path, values: dict[str, Any]) -> ObjectFiles:
+    """Cameras and pictures of an object; the pictures are checked when they are read.
+
+    Args:
+        folder: of the pack.
+        values: of the object, as the index has them.
 
     Raises:
-        UserError: an object has no sound name, or two have the same.
+        UserError: the index is wrong about it, its shard is missing or too short, or its cameras
+            are damaged or impossible.
     """
-    shards = _Shards(folder)
-    found: dict[str, PackedObject] = {}
-    for values in index.objects:
-        uid, source = values.get("uid"), str(folder / INDEX)
-        parts_of(uid, source)
-        assert isinstance(uid, str)  # parts_of refuses all else
-        if uid in found:
-            raise UserError(f"{source}: the object {uid} is there twice")
-        found[uid] = PackedObject(uid, values, shards)
-    return [found[uid] for uid in sorted(found)]
+    name = f"{folder / INDEX}: {values['uid']}"
+    try:
+        entry = msgspec.convert(values, Entry)
+    except msgspec.ValidationError as error:
+        raise UserError(f"{name}: {error}") from error
+    if entry.width * entry.height > MAX_PIXELS:
+        raise UserError(f"{name}: {entry.width}x{entry.height} is over {MAX_PIXELS >> 20} MP")
+    shard = inside(folder, plain_name(entry.shard, str(folder / INDEX)), str(folder))
+    place = f"{shard}: {entry.uid}"
+    shape, depth_type = (entry.height, entry.width), np.dtype(entry.depth_type).newbyteorder("<")
+    kinds = {"images": ((*shape, 4), np.dtype(np.uint8))}
+    kinds |= dict.fromkeys(KINDS[1:], (shape, depth_type))
+    data = _read(shard, entry.cameras, entry.views * COLUMNS * 8)
+    if zlib.crc32(data) != entry.crc:
+        raise UserError(f"{place}: damaged (cameras of another checksum)")
+    rows = np.frombuffer(data, "<f8").reshape(entry.views, COLUMNS).astype(np.float64)
+    sums = rows[:, _K:]
+    if not (np.isfinite(rows).all() and ((sums >= 0) & (sums < 1 << 32)).all()):
+        raise UserError(f"{place}: its cameras are not finite numbers")
+    poses, Ks = rows[:, :_POSE].reshape(-1, 4, 4), rows[:, _POSE:_K].reshape(-1, 3, 3)
+    sizes: list[tuple[int, int] | None] = [(entry.width, entry.height)] * entry.views
+    check_cameras(poses, Ks, sizes, [f"{place}: view {view}" for view in range(entry.views)])
+
+    def stored(kind: str) -> Sequence[Stored] | None:
+        start, (shape, dtype) = getattr(entry, kind), kinds[kind]
+        if start is None:
+            return None
+        length = dtype.itemsize * int(np.prod(shape))
+        _read(shard, start, entry.views * length)  # looks whether it is long enough
+        return [
+            _Picture(shard, start + view * length, shape, dtype, int(crc), f"{name}, {kind} {view}")
+            for view, crc in enumerate(sums[:, KINDS.index(kind)])
+        ]
+
+    return ObjectFiles(
+        images=stored("images") or [],
+        camera_to_world=poses,
+        Ks=Ks,
+        sizes=sizes,
+        depths=stored("depths"),
+        backs=stored("backs"),
+        depth_unit=entry.depth_unit,
+        name=one_text(entry.name),
+        attribution={one_text(k): one_text(v) for k, v in entry.attribution.items()},
+    )
 
 
-class _Shards:
-    """The shards of a pack, each mapped when it is first used; a copy for a process maps anew."""
+@dataclass(eq=False)
+class _Picture(Stored):
+    """One picture in a shard, which may be a part of the map itself; checked when first read."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._maps: dict[str, mmap.mmap] = {}
-        self._lock = threading.Lock()
-
-    def __getstate__(self) -> Path:
-        return self.folder
-
-    def __setstate__(self, folder: Path) -> None:
-        self.__init__(folder)
-
-    def read(self, name: str, start: int, count: int) -> memoryview:
-        """``count`` bytes from ``start``.
-
-        Raises:
-            UserError: there is no such shard, or it is too short.
-        """
-        with self._lock:
-            if name not in self._maps:
-                self._maps[name] = self._opened(name)
-            data = self._maps[name]
-        # The file may have been cut short since; reading behind its end would kill the process.
-        if start + count > min(len(data), data.size()):
-            at_most = f"{data.size():,} bytes, {start + count:,} are needed"
-            raise UserError(f"{self.folder / name}: cut short ({at_most})")
-        return memoryview(data)[start : start + count]
-
-    def _opened(self, name: str) -> mmap.mmap:
-        path = inside(self.folder, plain_name(name, str(self.folder / INDEX)), str(self.folder))
-        try:
-            if not stat.S_ISREG(path.stat().st_mode):
-                raise UserError(f"{path}: not a plain file")
-            with path.open("rb") as file:
-                return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError) as error:  # ValueError: an empty file
-            reason = getattr(error, "strerror", None) or "the shard is empty"
-            raise UserError(f"{path}: {reason}") from error
-
-
-class PackedObject:
-    """An object in a pack.
-
-    Attributes:
-        uid: its name within the dataset.
-        split: "train", "val", "test", or what else the index says.
-    """
-
-    def __init__(self, uid: str, values: dict[str, Any], shards: _Shards) -> None:
-        self.uid, self.split = uid, values.get("split")
-        self._values, self._shards = values, shards
-        self._entry: Entry | None = None
-        self._sums = np.empty(0)
-        self._checked: set[tuple[str, int]] = set()
+    shard: Path
+    start: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    crc: int
+    name: str
+    checked: bool = False
 
     def __str__(self) -> str:
-        return f"{self._shards.folder / INDEX}: {self.uid}"
-
-    def entry(self) -> Entry:
-        """What the index says, checked by itself.
-
-        Raises:
-            UserError: a value is missing, of another type, or out of its range.
-        """
-        try:
-            entry = msgspec.convert(self._values, Entry)
-        except msgspec.ValidationError as error:
-            raise UserError(f"{self}: {error}") from error
-        if entry.width * entry.height > MAX_PIXELS:
-            raise UserError(f"{self}: {entry.width}x{entry.height} is over {MAX_PIXELS >> 20} MP")
-        return entry
-
-    def files(self) -> ObjectFiles:
-        """Cameras and pictures of the object; the pictures are checked when they are read.
-
-        Raises:
-            UserError: the index is wrong about it, its shard is missing or too short, or its
-                cameras are damaged or impossible.
-        """
-        entry = self.entry()
-        for kind in KINDS:  # reading maps the shard, and looks whether it is long enough
-            if (start := getattr(entry, kind)) is not None:
-                self._shards.read(entry.shard, start, entry.views * _bytes(entry, kind))
-        data = self._shards.read(entry.shard, entry.cameras, entry.views * COLUMNS * 8)
-        if zlib.crc32(data) != entry.crc:
-            raise UserError(f"{self._place(entry)}: damaged (cameras of another checksum)")
-        rows = np.frombuffer(data, "<f8").reshape(entry.views, COLUMNS).astype(np.float64)
-        sums = rows[:, _K:]
-        if not (np.isfinite(rows).all() and ((sums >= 0) & (sums < 1 << 32)).all()):
-            raise UserError(f"{self._place(entry)}: its cameras are not finite numbers")
-        poses, Ks = rows[:, :_POSE].reshape(-1, 4, 4), rows[:, _POSE:_K].reshape(-1, 3, 3)
-        check_cameras(poses, Ks, entry.width, entry.height, self._place(entry))
-        self._entry, self._sums = entry, sums
-
-        def stored(kind: str) -> Sequence[Stored] | None:
-            if getattr(entry, kind) is None:
-                return None
-            return [_PackedPicture(self, kind, view) for view in range(entry.views)]
-
-        return ObjectFiles(
-            images=stored("images") or [],
-            camera_to_world=poses,
-            Ks=Ks,
-            sizes=[(entry.width, entry.height)] * entry.views,
-            depths=stored("depths"),
-            backs=stored("backs"),
-            depth_unit=entry.depth_unit,
-            name=_line(entry.name),
-            attribution={_line(k): _line(v) for k, v in entry.attribution.items()},
-        )
-
-    def _place(self, entry: Entry) -> str:
-        return f"{self._shards.folder / entry.shard}: {self.uid}"
-
-    def read(self, kind: str, view: int) -> np.ndarray:
-        """The picture of one view, after ``files``; its checksum is looked at once.
-
-        Args:
-            kind: one of ``KINDS``.
-            view: number of the view.
-
-        Returns:
-            As ``Stored.read``; it may be a part of the shard itself, which cannot be written.
-
-        Raises:
-            UserError: the shard is too short by now, or the picture is damaged.
-        """
-        entry = self._entry
-        assert entry is not None
-        length = _bytes(entry, kind)
-        data = self._shards.read(entry.shard, getattr(entry, kind) + view * length, length)
-        if (kind, view) not in self._checked:
-            if zlib.crc32(data) != self._sums[view, KINDS.index(kind)]:
-                what = f"view {view} of its {kind} has another checksum"
-                raise UserError(f"{self._place(entry)}: damaged ({what})")
-            self._checked.add((kind, view))
-        if kind == "images":
-            return np.frombuffer(data, np.uint8).reshape(entry.height, entry.width, 4)
-        dtype = "<u2" if entry.depth_type == "uint16" else "<f4"
-        steps = np.frombuffer(data, dtype).reshape(entry.height, entry.width).astype(np.float32)
-        if not (np.isfinite(steps).all() and steps.min() >= 0):
-            raise UserError(f"{self._place(entry)}: a depth is negative or not finite")
-        return steps
-
-
-@dataclass(frozen=True, eq=False)
-class _PackedPicture(Stored):
-    """One picture in a pack."""
-
-    object: PackedObject
-    kind: str
-    view: int
-
-    def __str__(self) -> str:
-        return f"{self.object}, {self.kind} {self.view}"
+        return self.name
 
     def read(self) -> np.ndarray:
-        return self.object.read(self.kind, self.view)
+        data = _read(self.shard, self.start, self.dtype.itemsize * int(np.prod(self.shape)))
+        if not self.checked and zlib.crc32(data) != self.crc:
+            raise UserError(f"{self.shard}: {self.name}: damaged (it has another checksum)")
+        self.checked = True
+        values = np.frombuffer(data, self.dtype).reshape(self.shape)
+        return values if len(self.shape) == 3 else values.astype(np.float32)
 
 
-def _bytes(entry: Entry, kind: str) -> int:
-    """Bytes of one view."""
-    values = entry.width * entry.height
-    if kind == "images":
-        return 4 * values
-    return values * (2 if entry.depth_type == "uint16" else 4)
+def _read(path: Path, start: int, count: int) -> memoryview:
+    """``count`` bytes of a shard from ``start``.
+
+    Raises:
+        UserError: there is no such shard, or it is too short.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise UserError(f"{path}: not a plain file")
+        # Reading behind the end of a file that was cut short since would kill the process.
+        if start + count > status.st_size:
+            raise UserError(
+                f"{path}: cut short ({status.st_size:,} bytes, {start + count:,} are needed)"
+            )
+        data = _mapped(path, status.st_ino, status.st_mtime_ns, status.st_size)
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror or error}") from error
+    return memoryview(data)[start : start + count]
 
 
-def _line(text: str) -> str:
-    return " ".join(text.split())[:500]
+@lru_cache(maxsize=256)  # in each process
+def _mapped(path: Path, *status: int) -> mmap.mmap:
+    """The map of a file; one that was written anew has another ``status``."""
+    with path.open("rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

@@ -2,7 +2,8 @@
 
 import threading
 import time
-from functools import partial
+from concurrent.futures import CancelledError
+from contextlib import suppress
 
 import pytest
 import torch
@@ -11,11 +12,12 @@ from helpers.micro import ALONE, lines, run
 from safetensors.torch import load_file
 
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.data.prefetch import Prefetcher
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
-from gamba_warp.train.batches import BatchQueue, BatchSource
+from gamba_warp.train.batches import Batches, open_data
 from gamba_warp.train.ddp import World
+
+GPU = torch.device("cuda", 0)
 
 
 @pytest.fixture(scope="module")
@@ -23,18 +25,10 @@ def data(tmp_path_factory):
     return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds", objects=6)
 
 
-def source_of(root, batch_size=3, **views):
-    options = micro.options(root, root, views={"background": "random", **views})
-    dataset = open_dataset(root, "train")
-    return BatchSource(
-        dataset,
-        options.model_config(),
-        objects=list(range(len(dataset))),
-        batch_size=batch_size,
-        reference=None,
-        views=options.views,
-        seed=5,
-    )
+def batches_of(root, batch_size=3, workers=1, world=ALONE, novel=lambda _: 0, last=None):
+    views = {"background": "random", "batch_size": batch_size, "workers": workers}
+    config = micro.options(root, root, views=views, run={"seed": 5})
+    return Batches(open_data(config), config, world, novel, last)
 
 
 def same(a, b):
@@ -50,11 +44,10 @@ def test_the_queue_gives_the_batches_of_the_source(data, workers):
     def novel(number):
         return number % 3  # another number at every batch, so that a mix-up would show
 
-    alone = source_of(data)
-    queue = BatchQueue(source_of(data), workers, novel, ALONE, last=7)
+    ahead = batches_of(data, workers=workers, novel=novel, last=7)
     for number in range(7):
-        same(queue.take(number), alone.batch(number, novel(number)))
-    queue.close()
+        same(ahead.take(number), batches_of(data).batch(number, novel(number)))
+    ahead.close()
 
 
 def test_a_run_has_the_same_weights_for_any_number_of_threads(data, tmp_path):
@@ -69,10 +62,8 @@ def test_a_run_has_the_same_weights_for_any_number_of_threads(data, tmp_path):
 
 
 def test_each_process_takes_its_part(data):
-    whole = source_of(data, batch_size=4)
-    parts = [
-        BatchQueue(source_of(data, 4), 2, lambda _: 1, World(r, 2, ALONE.device)) for r in (0, 1)
-    ]
+    whole = batches_of(data, 4)
+    parts = [batches_of(data, 2, 2, World(r, 2, ALONE.device), lambda _: 1) for r in (0, 1)]
     for number in range(3):
         uids = [uid for part in parts for uid in part.take(number).uids]
         assert uids == whole.batch(number, 1).uids
@@ -81,19 +72,14 @@ def test_each_process_takes_its_part(data):
 
 
 def test_no_more_batches_are_begun_than_there_are_threads_ahead(data):
-    begun = []
-    source = source_of(data, batch_size=1)
-    prepare = source.prepare
-    source.prepare = lambda number, novel: begun.append(number) or prepare(number, novel)
-    queue = BatchQueue(source, 3, lambda _: 0, ALONE, last=6)
-    queue.take(0)
-    queue.close()
-    assert set(begun) <= {0, 1, 2, 3}
-    queue = BatchQueue(source, 3, lambda _: 0, ALONE, last=6)
-    begun.clear()
-    for number in range(6):
-        queue.take(number)
-    queue.close()
+    for taken in (1, 6):
+        begun, made = [], batches_of(data, 1, 3, last=6)
+        prepare = made.prepare
+        made.prepare = lambda number, novel: begun.append(number) or prepare(number, novel)  # noqa: B023
+        for number in range(taken):
+            made.take(number)
+        made.close()
+        assert len(begun) == len(set(begun)) and set(begun) <= set(range(taken + 3))
     assert sorted(begun) == list(range(6)), "each once, and none behind the last"
 
 
@@ -101,7 +87,7 @@ def test_no_more_batches_are_begun_than_there_are_threads_ahead(data):
 def test_an_error_is_raised_in_its_step(data, workers, monkeypatch):
     """More than half of the objects go bad one after the other: always in the same batch."""
     real = batches.load_sample
-    order = [source_of(data, 1).sample(n, 0).uids[0] for n in range(5)]
+    order = [batches_of(data, 1).sample(n, 0).uids[0] for n in range(5)]
 
     def load(dataset, index, *rest):
         if dataset.uids[index] in order[1:4]:
@@ -109,14 +95,13 @@ def test_an_error_is_raised_in_its_step(data, workers, monkeypatch):
         return real(dataset, index, *rest)
 
     monkeypatch.setattr(batches, "load_sample", load)
-    source = source_of(data, 1)
-    queue = BatchQueue(source, workers, lambda _: 0, ALONE)
-    assert queue.take(0).uids == order[:1] and not source.failures
+    made = batches_of(data, 1, workers)
+    assert made.take(0).uids == order[:1] and not made.failures
     with pytest.raises(
         UserError, match=r"^3 of 5 objects cannot be read; the last: cloud.: spoilt"
     ):
-        queue.take(1)
-    queue.close()
+        made.take(1)
+    made.close()
 
 
 def test_a_defect_of_the_program_is_raised_in_its_step(data, monkeypatch):
@@ -129,26 +114,31 @@ def test_a_defect_of_the_program_is_raised_in_its_step(data, monkeypatch):
         return real(*arguments)
 
     monkeypatch.setattr(batches, "load_sample", load)
-    queue = BatchQueue(source_of(data, 2), 1, lambda _: 0, ALONE)
-    queue.take(0)
+    made = batches_of(data, 2)
+    made.take(0)
     with pytest.raises(KeyError, match="defect"):
-        queue.take(1)
-    queue.close()
+        made.take(1)
+    made.close()
 
 
-def test_closing_waits_for_one_part_of_each_thread():
-    """Of a batch of 50 slow parts, only those that have begun are finished."""
-    done, began = [], threading.Event()
+def test_closing_waits_for_one_sample_of_each_thread(data):
+    """Of a batch of 50 slow samples, only those that have begun are finished."""
+    done, began, made = [], threading.Event(), batches_of(data, 50, 2)
 
-    def slow(number):
+    def slow(number, novel):
         began.set()
         time.sleep(0.05)
         done.append(number)
 
-    threads = Prefetcher(2)
-    threads.submit("batch", [partial(slow, n) for n in range(50)], len)
+    made.prepare = slow
+
+    def take():
+        with suppress(CancelledError):
+            made.take(0)
+
+    threading.Thread(target=take).start()
     began.wait()
-    threads.close()
+    made.close()
     assert len(done) <= 4
 
 
@@ -166,18 +156,16 @@ def test_a_gpu_gets_pinned_batches(data, monkeypatch):
         return tensor
 
     monkeypatch.setattr(torch.Tensor, "to", fake)
-    queue = BatchQueue(
-        source_of(data), 1, lambda _: 1, World(0, 1, torch.device("cuda", 0)), last=1
-    )
-    batch = queue.take(0)
-    queue.close()
+    made = batches_of(data, world=World(0, 1, GPU), novel=lambda _: 1, last=1)
+    batch = made.take(0)
+    made.close()
     tensors = (batch.inputs, batch.targets, batch.background, batch.cameras.Ks)
     assert all(tensor.shape in asked for tensor in tensors)
     assert len(asked) == len(moved) == 7 and all(moved)
     asked.clear()
-    queue = BatchQueue(source_of(data), 1, lambda _: 1, ALONE, last=1)
-    queue.take(0)
-    queue.close()
+    made = batches_of(data, last=1)
+    made.take(0)
+    made.close()
     assert not asked, "the CPU's way is left alone"
 
 
@@ -197,7 +185,7 @@ def test_kept_pictures_need_no_file_any_more(tmp_path):
     config = micro.options(root, root, views={"cache_device": True, "size": 12})
     before = open_dataset(root, "train")
     want = before.load("cloudb", [3, 1], 12)
-    kept = batches.kept_on(torch.device("cpu"), config, batches.open_data(config)).train
+    kept = open_data(config, torch.device("cpu")).train
     for path in root.rglob("*.png"):
         path.unlink()
     got = kept.load("cloudb", [3, 1], 12)
@@ -218,7 +206,7 @@ def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
         torch, "tensor", lambda *a, device=None, real=torch.tensor, **k: real(*a, **k)
     )
     with pytest.raises(UserError, match=r"^--cache-device: 30 views take 0.0 GB"):
-        batches.kept_on(torch.device("cuda", 0), config, batches.open_data(config))
+        open_data(config, GPU)
 
 
 def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):
@@ -226,6 +214,6 @@ def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):
 
     write_pack(data, tmp_path / "pack", PackSettings(size=8), 1)
     config = micro.options(tmp_path / "pack", tmp_path)
-    assert "is packed at 8 pixels" in batches.open_data(config).notes[-1]
+    assert "is packed at 8 pixels" in open_data(config).notes[-1]
     write_pack(data, tmp_path / "large", PackSettings(size=16), 1)
-    assert not batches.open_data(micro.options(tmp_path / "large", tmp_path)).notes
+    assert not open_data(micro.options(tmp_path / "large", tmp_path)).notes

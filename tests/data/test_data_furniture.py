@@ -7,6 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from helpers.meshes import render_views
 from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset, split_of
@@ -14,8 +15,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.train.data import furniture
 from gamba_warp.train.data.furniture import read_properties
-from gamba_warp.train.data.furniture_command import data_furniture_command
-from gamba_warp.train.data.render_command import data_render_command
+from gamba_warp.train.sources.commands import data_furniture_command
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 PROPERTIES = r"""# a comment = not a value
@@ -94,7 +94,7 @@ def test_package_to_views(tmp_path):
     assert len({m.group for m in meshes}) == 1  # numbered variants stay together
     assert meshes[0].rotation is None and meshes[1].rotation == [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
 
-    assert data_render_command(out, tmp_path / "data", views=1, size=16, workers=1) == 0
+    assert render_views(out, tmp_path / "data", views=1, size=16, workers=1) == 0
     assert len(open_dataset(tmp_path / "data", split_of(meshes[0].group))) == 2
     assert data_furniture_command(out, tree=tmp_path) == 0  # again, from the other kind of source
     assert json.loads((out / "catalogue.json").read_text())["objects"] == entries

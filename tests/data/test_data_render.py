@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 from helpers.children import murderous_object
-from helpers.meshes import MTL, QUAD, write_quad
+from helpers.meshes import MTL, QUAD, render_views, write_quad
 from PIL import Image
 
 from gamba_warp.cameras import from_opengl, intrinsics
@@ -22,7 +22,6 @@ from gamba_warp.formats.meshes import load_mesh, to_linear
 from gamba_warp.train.data import render
 from gamba_warp.train.data.poses import look_at_origin, nearest_distance, sample_poses
 from gamba_warp.train.data.raycast import Lights, RayCaster
-from gamba_warp.train.data.render_command import data_render_command
 
 FOV = 49.1
 # even light from everywhere: what is drawn is the surface's own colour
@@ -93,7 +92,7 @@ def test_pixels_colours_and_depth_agree_with_the_cameras(tmp_path):
     axis = np.abs(normals).argmax(1)
     colors[np.arange(12), axis] = 255  # faces across x red, y green, z blue
     write_box(folder / "box.ply", face_colors=colors)
-    data_render_command(folder, tmp_path / "data", views=5, size=33, depth=True, workers=1)
+    render_views(folder, tmp_path / "data", views=5, size=33, depth=True, workers=1)
     data = open_dataset(tmp_path / "data")
     assert data.uids == ["box"]
     got = data.load(0)
@@ -200,27 +199,27 @@ def contents(folder):
 
 def test_same_seed_same_files_and_shards_add_up(meshes, tmp_path):
     options = dict(views=2, size=16, workers=1)
-    assert data_render_command(meshes, tmp_path / "one", **options) == 0
+    assert render_views(meshes, tmp_path / "one", **options) == 0
     for i in range(2):
-        assert data_render_command(meshes, tmp_path / "two", shard=f"{i}/2", **options) == 0
+        assert render_views(meshes, tmp_path / "two", shard=f"{i}/2", **options) == 0
     one = contents(tmp_path / "one")
     assert one == contents(tmp_path / "two")
     assert {n.split("/")[0] for n in one} == {"a", "b", "sub-c", "split.json"}
-    data_render_command(meshes, tmp_path / "other", seed=1, **options)
+    render_views(meshes, tmp_path / "other", seed=1, **options)
     assert contents(tmp_path / "other")["a/000.webp"] != one["a/000.webp"]
 
 
 def test_two_workers_write_the_same_files(meshes, tmp_path):
     options = dict(views=1, size=16)
-    data_render_command(meshes, tmp_path / "one", workers=1, **options)
-    data_render_command(meshes, tmp_path / "two", workers=2, **options)
+    render_views(meshes, tmp_path / "one", workers=1, **options)
+    render_views(meshes, tmp_path / "two", workers=2, **options)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
 def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
     out = tmp_path / "data"
     options = dict(views=2, size=16, workers=1)
-    data_render_command(meshes, out, **options)
+    render_views(meshes, out, **options)
     before = contents(out)
     times = {name: (out / name / "000.webp").stat().st_mtime_ns for name in ("a", "sub-c")}
     shutil.rmtree(out / "b")
@@ -230,13 +229,13 @@ def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
     for path in (part / "000.webp", part):
         os.utime(path, (path.stat().st_mtime - 2 * 86400,) * 2)
     assert len(open_dataset(out)) == 2
-    assert data_render_command(meshes, out, **options) == 0
+    assert render_views(meshes, out, **options) == 0
     assert "2 of 3 objects already in" in capsys.readouterr().out
     assert contents(out) == before
     for name, time in times.items():
         assert (out / name / "000.webp").stat().st_mtime_ns == time
     with pytest.raises(UserError, match="rendered with other settings"):
-        data_render_command(meshes, out, views=3, size=16, workers=1)
+        render_views(meshes, out, views=3, size=16, workers=1)
 
 
 def test_failures_are_listed_and_do_not_stop_the_rest(meshes, tmp_path, capsys):
@@ -268,7 +267,7 @@ def test_catalogue_names_and_groups(meshes, tmp_path):
     twin = {**entry, "uid": "box-2", "model": "b.ply"}
     (meshes / "catalogue.json").write_text(json.dumps({"objects": [entry, twin]}))
     out = tmp_path / "data"
-    data_render_command(meshes, out, views=1, size=16, workers=1, format="png")
+    render_views(meshes, out, views=1, size=16, workers=1, format="png")
     views = open_dataset(out).load("box-1")
     assert (views.name, views.attribution) == ("A box", {"creator": "me"})
     stored = json.loads((out / "box-1" / "transforms.json").read_text())
@@ -278,7 +277,7 @@ def test_catalogue_names_and_groups(meshes, tmp_path):
     # A catalogue with better groups needs no new pictures.
     better = {"objects": [{**entry, "group": "g5"}, {**twin, "group": "g3"}]}
     (meshes / "catalogue.json").write_text(json.dumps(better))
-    data_render_command(meshes, out, views=1, size=16, workers=1, format="png")
+    render_views(meshes, out, views=1, size=16, workers=1, format="png")
     parts = json.loads((out / "split.json").read_text())
     assert parts["version"] == 2
     assert [split_of(group) for group in ("g5", "g3")] == ["test", "train"]
@@ -313,25 +312,25 @@ def test_uids_of_paths(tmp_path):
 )
 def test_bad_options(meshes, tmp_path, options, message):
     with pytest.raises(UserError, match=message):
-        data_render_command(meshes, tmp_path / "data", **options)
+        render_views(meshes, tmp_path / "data", **options)
 
 
 def test_bad_folders(meshes, tmp_path):
     with pytest.raises(UserError, match="no such folder"):
-        data_render_command(tmp_path / "nowhere", tmp_path / "data")
+        render_views(tmp_path / "nowhere", tmp_path / "data")
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="no mesh files"):
-        data_render_command(tmp_path / "empty", tmp_path / "data")
+        render_views(tmp_path / "empty", tmp_path / "data")
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write into"):
-        data_render_command(meshes, tmp_path / "file")
+        render_views(meshes, tmp_path / "file")
     (meshes / "catalogue.json").write_text('{"objects": [{}]}')
     with pytest.raises(UserError, match="catalogue.json"):
-        data_render_command(meshes, tmp_path / "data")
+        render_views(meshes, tmp_path / "data")
 
 
 def test_limit(meshes, tmp_path):
-    assert data_render_command(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
+    assert render_views(meshes, tmp_path / "data", views=1, size=16, limit=2, workers=1) == 0
     assert len(open_dataset(tmp_path / "data")) == 2
 
 
@@ -363,7 +362,7 @@ def test_hostile_catalogues_are_one_line(tmp_path, entry, reason):
     entries = [{"uid": "box", "model": "a.ply", **entry}]
     (folder / "catalogue.json").write_text(json.dumps({"objects": entries}))
     with pytest.raises(UserError) as caught:
-        data_render_command(folder, tmp_path / "out", views=1, size=16, workers=1)
+        render_views(folder, tmp_path / "out", views=1, size=16, workers=1)
     message = str(caught.value)
     assert "catalogue.json: " in message and reason in message and "\n" not in message
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
@@ -387,10 +386,10 @@ def test_long_and_odd_names_of_files_are_fit_for_folders(tmp_path):
 
 def test_a_damaged_object_in_the_dataset_stops_no_other(meshes, tmp_path, capsys):
     out, options = tmp_path / "data", dict(views=1, size=16, workers=1)
-    data_render_command(meshes, out, **options)
+    render_views(meshes, out, **options)
     (out / "a" / "transforms.json").write_text("")
     shutil.rmtree(out / "b")
-    assert data_render_command(meshes, out, **options) == 1
+    assert render_views(meshes, out, **options) == 1
     captured = capsys.readouterr()
     assert "1 of 3 objects already in" in captured.out and "rendered 1 object into" in captured.out
     assert "failed: a: " in captured.err and "remove" in captured.err

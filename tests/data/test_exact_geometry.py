@@ -125,7 +125,7 @@ def test_ssim_keeps_all_digits():
 def test_a_whole_step_rounds_in_the_network_alone(cameras, tmp_path, monkeypatch):
     """A training step whose model is no network: what is left is geometry, losses and rendering."""
     from gamba_warp.train.batches import Batch
-    from gamba_warp.train.step import compute_gradients, health
+    from gamba_warp.train.step import Objective, compute_gradients, health
 
     cloud = micro.cloud(2)
     leaf = torch.nn.Parameter(cloud.means[None].clone())
@@ -141,7 +141,7 @@ def test_a_whole_step_rounds_in_the_network_alone(cameras, tmp_path, monkeypatch
     weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "lpips": 0.0, "rdist": 0.1}
     optimizer = torch.optim.SGD([leaf], lr=0.1)
     with Products() as seen:
-        made = compute_gradients(model, optimizer, [batch], weights, clip=1.0)
+        made = compute_gradients(model, optimizer, [batch], Objective(weights), clip=1.0)
         health(made.result, batch)
     assert not seen.rounded and made.norm > 0
 

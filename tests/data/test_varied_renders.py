@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.meshes import render_views
 
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
@@ -13,9 +14,8 @@ from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.train.data import primitives
 from gamba_warp.train.data.poses import FRONT, front_views, look_at_origin, sample_poses
-from gamba_warp.train.data.primitives_command import data_primitives_command
 from gamba_warp.train.data.raycast import Lights
-from gamba_warp.train.data.render_command import data_render_command
+from gamba_warp.train.sources.commands import data_primitives_command
 
 QUICK = {"views": 3, "size": 17, "workers": 1}
 
@@ -35,7 +35,7 @@ def cameras_of(folder, uid):
 
 def test_stretch_and_field_of_view_are_drawn_for_each_object_and_stated(boxes, tmp_path):
     out = tmp_path / "data"
-    data_render_command(boxes, out, stretch=1.5, fov_spread=1.3, depth=True, **QUICK)
+    render_views(boxes, out, stretch=1.5, fov_spread=1.3, depth=True, **QUICK)
     found = [cameras_of(out, uid) for uid in ("a", "b")]
     half = 17 / 2
     angles = [2 * np.degrees(np.arctan(half / one["fl_x"])) for one in found]
@@ -58,16 +58,16 @@ def test_stretch_and_field_of_view_are_drawn_for_each_object_and_stated(boxes, t
 
 def test_without_the_new_options_nothing_changes_and_older_sets_go_on(boxes, tmp_path, capsys):
     out = tmp_path / "data"
-    data_render_command(boxes, out, **QUICK)
+    render_views(boxes, out, **QUICK)
     path = out / "a" / "transforms.json"
     values = json.loads(path.read_text())
     for name in ("fronts", "spread", "stretch", "fov_spread", "light"):
         del values["settings"][name]
     path.write_text(json.dumps(values))
-    assert data_render_command(boxes, out, **QUICK) == 0
+    assert render_views(boxes, out, **QUICK) == 0
     assert "2 of 2 objects already in" in capsys.readouterr().out
     with pytest.raises(UserError, match="rendered with other settings"):
-        data_render_command(boxes, out, stretch=1.2, **QUICK)
+        render_views(boxes, out, stretch=1.2, **QUICK)
 
 
 def test_only_the_objects_of_one_part(tmp_path):
@@ -77,7 +77,7 @@ def test_only_the_objects_of_one_part(tmp_path):
         trimesh.creation.box().export(tmp_path / "meshes" / f"{name}.ply")
     wanted = sorted(name for name in names if split_of(name) == "train")
     assert 0 < len(wanted) < 12
-    data_render_command(
+    render_views(
         *(tmp_path / "meshes", tmp_path / "data"), views=1, size=8, workers=1, split="train"
     )
     assert open_dataset(tmp_path / "data").uids == wanted
@@ -86,7 +86,7 @@ def test_only_the_objects_of_one_part(tmp_path):
 def test_fields_of_view_that_no_camera_has_are_refused(boxes, tmp_path):
     for options in ({"fov": 100.0, "fov_spread": 1.3}, {"fov": 6.0, "fov_spread": 1.3}):
         with pytest.raises(UserError, match="--fov-spread 1.3: makes fields of view outside"):
-            data_render_command(boxes, tmp_path / "data", **options)
+            render_views(boxes, tmp_path / "data", **options)
     assert not (tmp_path / "data").exists()
 
 

@@ -12,7 +12,7 @@ from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
 from train.data.samples import Batch
-from train.step import forward
+from train.step import Objective, forward
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_graph_can_hold_a_training_step(on_paper, radial):
         optimizer = torch.optim.AdamW(parameters, lr=rate, foreach=True, capturable=True)
     weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2, "rdist": radial}
     with Watch() as watch:
-        result = forward(model, batch, weights)
+        result = forward(model, batch, Objective(weights))
         dry_run.run_backward([result.loss])
         for p in parameters:
             p.grad = torch.empty_like(p)

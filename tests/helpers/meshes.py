@@ -6,6 +6,9 @@ import struct
 import numpy as np
 from PIL import Image
 
+from gamba_warp.train.data.poses import Settings
+from gamba_warp.train.sources.commands import Share, data_render_command
+
 QUAD = """mtllib quad.mtl
 v -1 0 0
 v 1 0 0
@@ -40,3 +43,10 @@ def glb(tree: dict | bytes, binary: bytes) -> bytes:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def render_views(folder, out, **options):
+    """``gamba data render`` with options by their names; returns the exit code."""
+    own = {name: options.pop(name) for name in ("split", "workers") if name in options}
+    share = {name: options.pop(name) for name in ("shard", "limit") if name in options}
+    return data_render_command(folder, out, Settings(**options), Share(**share), **own)

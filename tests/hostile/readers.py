@@ -196,7 +196,7 @@ def _gso(path: Path, out: Path) -> Any:
     from gamba_warp.data import gso
     from gamba_warp.formats.catalogue import find_meshes
     from gamba_warp.formats.meshes import load_mesh
-    from gamba_warp.train.sources.gso_views import take_models
+    from gamba_warp.train.sources.gso import take_models
 
     names = gso.NAMES[:2]
     failures = take_models(path, out / "gso", names)

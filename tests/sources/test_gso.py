@@ -16,7 +16,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.train.data.poses import nearest_distance, ring_poses
-from gamba_warp.train.sources.gso_models import attribution_of, find_models, take_model
+from gamba_warp.train.sources.gso import attribution_of, find_models, take_model
 
 FIRST, SECOND, THIRD = gso.NAMES[:3]
 

@@ -186,14 +186,17 @@ def test_damaged_objects_leave_nothing(tmp_path, capsys):
     write_tar(source / "8.tar", {"8/campos_512_v4/../../../00000/00000.png": b"x"})
     (source / "9.tar").write_bytes(b"no tar")
     write_object(source / "6", "readme", views=2)
-    (source / "6" / "campos_512_v4" / "00001" / "00001.json").write_text('{"x": 1}')
+    (source / "6" / "campos_512_v4" / "00001" / "00001.json").write_text('{"x": [1, 0, 0]}')
     words = [tmp_path / "out", "--source", tmp_path / "set", "--min-views", 1]
     assert data(*words) == 1
     told = capsys.readouterr().err.splitlines()
     reasons = {line.split(": ")[1]: line for line in told if line.startswith("left out: ")}
     assert sorted(reasons) == ["0/6", "0/7", "0/8", "0/9"]
     assert "is there twice" in reasons["0/7"] and "leaves its folder" in reasons["0/8"]
-    assert "00001.json: no y, z, origin" in reasons["0/6"] and PART not in reasons["0/6"]
+    assert (
+        "00001.json: Object missing required field `y`" in reasons["0/6"]
+        and PART not in reasons["0/6"]
+    )
     assert not list((tmp_path / "out").rglob("campos_512_v4"))
     assert data(tmp_path / "set", "--source", tmp_path / "set") == 2
     assert data(tmp_path / "out", "--source", tmp_path / "nowhere") == 2

@@ -1,13 +1,14 @@
 """Objects that cannot be read: counted, named, passed over, and too many of them end the run."""
 
+from dataclasses import replace
+
 import pytest
 from helpers import micro
 from helpers.micro import ALONE, lines
 
-from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.train import batches
-from gamba_warp.train.batches import BatchSource, fixed_batches
+from gamba_warp.train.batches import Batches, fixed_batches, open_data
 from gamba_warp.train.run import train
 
 
@@ -24,17 +25,9 @@ def spoil(root, *names):
 
 
 def source_of(root):
-    options = micro.options(root, root, views={"background": "white"})
-    dataset = open_dataset(root, "train", cache=False)
-    return BatchSource(
-        dataset,
-        options.model_config(),
-        objects=list(range(len(dataset))),
-        batch_size=1,
-        reference=0,
-        views=options.views,
-        seed=0,
-    )
+    views = {"background": "white", "batch_size": 1, "reference": "first"}
+    config = micro.options(root, root, views=views)
+    return Batches(open_data(config), config, ALONE)
 
 
 def test_objects_that_go_bad_during_a_run_are_passed_over(root):
@@ -82,10 +75,10 @@ def test_whatever_one_object_raises_stops_no_other(root, monkeypatch, error):
 
 
 def test_a_validation_passes_over_what_it_cannot_read(root):
-    config, failures = micro.options(root, root).model_config(), {}
-    dataset = open_dataset(root, "train")
+    config, failures = micro.options(root, root, run={"val_views": 1}), {}
+    data = replace(open_data(config), validation=None, held_out=[0, 1, 2])
     spoil(root, "b")
-    found = fixed_batches(dataset, config, [0, 1, 2], 1, micro.SIZE, failures)
+    found = fixed_batches(data, config.model_config(), micro.SIZE, failures)
     assert [batch.uids for batch in found] == [["clouda"], ["cloudc"]]
     assert list(failures) == ["cloudb"]
 

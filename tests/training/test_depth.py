@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 from helpers import micro
+from helpers.meshes import render_views
 from helpers.micro import lines, run
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
@@ -14,7 +15,6 @@ from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.train.batches import load_sample
-from gamba_warp.train.data.render_command import data_render_command
 from gamba_warp.train.data.samples import Change
 from gamba_warp.train.objective.losses import DEPTH_BEND, depth_loss
 
@@ -29,7 +29,7 @@ def boxes(tmp_path_factory):
     (root / "meshes").mkdir()
     for name in ("a", "b"):
         trimesh.creation.box(extents=SIDES).export(root / "meshes" / f"{name}.ply")
-    data_render_command(root / "meshes", root / "data", views=5, size=16, depth=True, workers=1)
+    render_views(root / "meshes", root / "data", views=5, size=16, depth=True, workers=1)
     split = {"version": 2, "train": ["a"], "val": ["b"], "test": []}
     (root / "data" / "split.json").write_text(json.dumps(split))
     return root / "data"

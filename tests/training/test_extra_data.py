@@ -1,6 +1,7 @@
 """Training objects from several datasets, and inputs from the front."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from helpers import micro
 
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
-from gamba_warp.train.batches import BatchSource, open_data
+from gamba_warp.train.batches import Batches, open_data
 from gamba_warp.train.data.poses import front_views
 
 
@@ -57,19 +58,12 @@ def test_one_set_twice_is_refused(roots, tmp_path):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_inputs_are_from_the_front_as_often_as_told(roots, tmp_path, share):
     options = micro.options(roots[0], tmp_path, views={"front_share": share})
-    dataset = open_dataset(roots[0], "train")
+    data = replace(open_data(options), objects=[0])
+    dataset = data.train
     poses = dataset.files(0).camera_to_world
     # The clouds' cameras stand 60° apart; the one at the front is not the first.
     assert front_views(poses) == [0, micro.VIEWS // 2] or len(front_views(poses)) >= 1
-    source = BatchSource(
-        dataset,
-        options.model_config(),
-        objects=[0],
-        batch_size=1,
-        reference=None,
-        views=options.views,
-        seed=0,
-    )
+    source = Batches(data, options, micro.ALONE)
     views = dataset.load(0)
     seen = set()
     for number in range(40):

@@ -208,7 +208,9 @@ def test_a_validation_is_of_pictures_in_range(monkeypatch):
     batch = SimpleNamespace(targets=torch.ones(1, 2, 4, 4, 4), to=lambda device: batch)
     result = SimpleNamespace(loss=torch.zeros(()), rendering=shown, target=target, terms={})
     monkeypatch.setattr(step, "forward", lambda *_: result)
-    figures, _ = step.validate(torch.nn.Identity(), [batch], {}, None, torch.device("cpu"))
+    figures, _ = step.validate(
+        torch.nn.Identity(), [batch], step.Objective({}), torch.device("cpu")
+    )
     assert figures["psnr_input"] == figures["psnr_novel"] == 100
 
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,53 +34,10 @@ from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 
-from .poses import SPREAD, ring_poses, sample_poses
+from .poses import Settings, ring_poses, sample_poses
 from .raycast import Lights, RayCaster
 
 DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides the pixels; every ``transforms.json`` keeps it.
-
-    Attributes:
-        views: number of views of an object.
-        size: side of the square pictures, pixels.
-        fov: vertical field of view, degrees.
-        seed: seed of cameras and lights.
-        depth: whether depth pictures are written, too, of the first surface and of the last.
-        format: "webp-lossless" or "png".
-        up: the axis that points up in the files, "y" or "z", or "auto" by the suffix.
-        fronts: number of views from the front; the first ones.
-        spread: largest share by which a camera stands further than it must.
-        stretch: each object is stretched along each of the world's axes by a factor between
-            1 / stretch and this, drawn by the object; 1: as it is.
-        fov_spread: each object has a field of view of its own between fov / fov_spread and
-            fov · fov_spread; 1: all have ``fov``.
-        light: "usual", or "varied" with larger differences between objects.
-        poses: "drawn", or "gso": those of that evaluation, the input view first.
-    """
-
-    views: int
-    size: int
-    fov: float
-    seed: int
-    depth: bool
-    format: str
-    up: str
-    fronts: int = 1
-    spread: float = SPREAD
-    stretch: float = 1.0
-    fov_spread: float = 1.0
-    light: str = "usual"
-    poses: str = "drawn"
-
-    def drawn(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-        """Draws the stretch along the file's axes ``[3]`` and the field of view of an object."""
-        stretch = np.exp(rng.uniform(-1, 1, 3) * np.log(self.stretch))
-        fov = self.fov * float(np.exp(rng.uniform(-1, 1) * np.log(self.fov_spread)))
-        return stretch, fov
 
 
 def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
@@ -109,8 +65,22 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
     else:
         poses = sample_poses(used, settings.views, fov, rng, settings.fronts, settings.spread)
     plain_name(mesh.uid, str(mesh.path))
+    suffix, options = "webp", {"lossless": True, "method": 2, "quality": 50}
+    if settings.format == "png":
+        suffix, options = "png", {}
     with atomic_folder(out / mesh.uid) as part:
-        frames = [_write_view(caster, pose, fov, i, part, settings) for i, pose in enumerate(poses)]
+        frames = []
+        for index, pose in enumerate(poses):
+            picture, depth = caster.render(pose, settings.size, fov)
+            frame = {"file_path": f"{index:03d}.{suffix}", "transform_matrix": pose.tolist()}
+            Image.fromarray(to_uint8(picture)).save(part / frame["file_path"], **options)
+            if settings.depth:
+                backs = caster.last_depth(pose, settings.size, fov)
+                for which, values in (("depth", depth), ("back", backs)):
+                    steps = np.clip(np.rint(values / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+                    frame[f"{which}_file_path"] = f"{index:03d}_{which}.png"
+                    Image.fromarray(steps).save(part / frame[f"{which}_file_path"])
+            frames.append(frame)
         K = intrinsics(settings.size, settings.size, fov).double()
         values = {
             "uid": mesh.uid,
@@ -134,26 +104,6 @@ def render_object(mesh: Mesh, out: Path, settings: Settings) -> list[str]:
             values["depth_unit"] = DEPTH_UNIT
         write_json(part / "transforms.json", values)
     return model.warnings
-
-
-def _write_view(
-    caster: RayCaster, pose: np.ndarray, fov: float, index: int, folder: Path, settings: Settings
-) -> dict:
-    picture, depth = caster.render(pose, settings.size, fov)
-    suffix = "png" if settings.format == "png" else "webp"
-    options = {} if suffix == "png" else {"lossless": True, "method": 2, "quality": 50}
-    name = f"{index:03d}.{suffix}"
-    Image.fromarray(to_uint8(picture)).save(folder / name, **options)
-    frame = {"file_path": name, "transform_matrix": pose.tolist()}
-    if settings.depth:
-        for which, values in (
-            ("depth", depth),
-            ("back", caster.last_depth(pose, settings.size, fov)),
-        ):
-            steps = np.clip(np.rint(values / DEPTH_UNIT), 0, 65535).astype(np.uint16)
-            frame[f"{which}_file_path"] = f"{index:03d}_{which}.png"
-            Image.fromarray(steps).save(folder / frame[f"{which}_file_path"])
-    return frame
 
 
 def still_missing(
@@ -236,18 +186,6 @@ def render_meshes(
     changed = {uid: group for uid, group in (groups or {}).items() if uid in stored}
     write_split(out, stored | changed)
     return warnings, failures
-
-
-def parse_shard(shard: str) -> tuple[int, int]:
-    """The numbers i and n of ``i/n``.
-
-    Raises:
-        UserError: it is not of that form, or not 0 <= i < n.
-    """
-    match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", shard)
-    if not match or not int(match[1]) < int(match[2]):
-        raise UserError(f"--shard {shard[:40]}: expected i/n with 0 <= i < n, such as 0/4")
-    return int(match[1]), int(match[2])
 
 
 def _attempt(mesh: Mesh, out: Path, settings: Settings, threads: int) -> list[str] | str:

@@ -17,7 +17,6 @@ from pathlib import Path
 import tyro
 
 from gamba_warp.batch import progress_bar
-from gamba_warp.conventions import DEFAULT_FOV
 from gamba_warp.data.dataset import split_of, write_split
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, output_folder
@@ -25,11 +24,10 @@ from gamba_warp.formats.catalogue import Mesh, find_meshes
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import load_rgba
 
-from .render import Settings, render_object
+from .poses import Settings
+from .render import render_object
 
-SETTINGS = Settings(
-    views=24, size=128, fov=DEFAULT_FOV, seed=0, depth=False, format="webp-lossless", up="auto"
-)
+SETTINGS = Settings()  # the command's own
 
 OBJECTS = """
 blendswap-cc-0-barrel blendswap-cc-0-basketball blendswap-cc-0-chairwithcushion

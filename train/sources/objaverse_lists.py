@@ -129,10 +129,10 @@ class Lists:
     """The files that choose objects.
 
     Attributes:
-        index: of G-Objaverse, or None.
-        uids: only objects that each of these lists names.
-        without: no objects that one of these lists names.
-        quality: ``category_annotation.json``: no objects of the category ``POOR``; or None.
+        index: gobjaverse_280k_index_to_objaverse.json; lists by Objaverse's names need it.
+        uids: take only what each of these lists names (lvis-annotations.json.gz, ...).
+        without: take nothing that one of these lists names (gobjaverse_280k_Poor-quality.json).
+        quality: category_annotation.json: leave out what it calls Poor-quality.
     """
 
     index: Path | None = None

@@ -8,8 +8,9 @@ import json
 import tarfile
 import zlib
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -24,10 +25,9 @@ from gamba_warp.data.packs import (
     VERSION,
     Entry,
     Index,
-    packed_objects,
     read_index,
+    read_packed,
 )
-from gamba_warp.data.prefetch import Prefetcher
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_path, only_process, output_folder, write_text
 from gamba_warp.untrusted.documents import MAX_BYTES
@@ -37,6 +37,9 @@ _ALIGNED = 64  # bytes; an object begins at a multiple
 _AHEAD = 2  # objects decoded ahead, by thread
 _ABOUT = ("uid", "name", "split", "attribution", "depth_unit")  # what a tar says of an object
 SUFFIXES = {"arrays": "bin", "webdataset": "tar"}
+
+# One object as it is written: its entry, and its arrays by their names in the index.
+Block = tuple[Entry, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -54,18 +57,6 @@ class PackSettings:
     split: str = "all"
     shards: str = "arrays"
     shard_bytes: int = 256 << 20
-
-
-@dataclass
-class _Block:
-    """One object as it is written: its arrays by their names in the index, and its entry."""
-
-    entry: Entry
-    arrays: dict[str, np.ndarray]
-
-    @property
-    def size(self) -> int:
-        return sum(array.nbytes for array in self.arrays.values())
 
 
 @dataclass
@@ -108,13 +99,12 @@ def write_pack(
         splits = {values["uid"]: str(values.get("split")) for values in read_index(data).objects}
     else:
         splits = splits_of(data, dataset.uids)
-    before = _begun(out, settings)  # before the folder is made
+    index = _begun(out, settings)  # before the folder is made
     out = output_folder(out)
     with only_process(out, "packs"):
-        index = before or Index(format=FORMAT, version=VERSION)
         index.size, index.split, index.shards = settings.size, settings.split, settings.shards
         index.split_version = dataset.split_version
-        index.objects = _whole(out, index)
+        index.objects = [values for values in index.objects if _is_whole(out, values)]
         known = {values["uid"] for values in index.objects}
         wanted = dataset.uids[:limit]
         todo = [uid for uid in wanted if uid not in known]
@@ -124,10 +114,12 @@ def write_pack(
                 if path.name not in named:
                     path.unlink(missing_ok=True)
         failures: dict[str, str] = {}
-        blocks = _blocks(dataset, todo, splits, settings, workers, failures)
         if todo or not index.finished:
             index.finished = False
-            _write_shards(out, index, blocks, settings)
+            with closing(
+                _blocks(dataset, todo, splits, settings.size, workers, failures)
+            ) as blocks:
+                _write_shards(out, index, blocks, settings)
             index.finished = True
             if index.objects:
                 _write_index(out, index)
@@ -138,62 +130,56 @@ def write_pack(
     return Packed(len(todo) - len(failures), there, len(shards), failures)
 
 
-def _begun(out: Path, settings: PackSettings) -> Index | None:
-    """The index of a pack that is there already; a folder of anything else is refused."""
+def _begun(out: Path, settings: PackSettings) -> Index:
+    """The index of a pack that is there, or a new one; a folder of anything else is refused."""
     if (out / INDEX).exists():
         index = read_index(out)
         old = {"--size": index.size, "--split": index.split, "--format": index.shards}
-        new = dict(zip(old, (settings.size, settings.split, settings.shards)))
-        for name, value in old.items():
-            if value != new[name]:
-                raise UserError(f"{out}: holds a pack of {name} {value}, not {new[name]}")
+        for (name, value), new in zip(
+            old.items(), (settings.size, settings.split, settings.shards)
+        ):
+            if value != new:
+                raise UserError(f"{out}: holds a pack of {name} {value}, not {new}")
         return index
-    if out.is_dir():
-        strange = [p.name for p in sorted(out.iterdir()) if not p.name.startswith(".")]
-        strange = [name for name in strange if not name.startswith("shard-")]
-        if strange:
-            raise UserError(f"{out}: holds other files ({strange[0]}); give an empty folder")
-    return None
+    names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    if strange := [name for name in names if not name.startswith((".", "shard-"))]:
+        raise UserError(f"{out}: holds other files ({strange[0]}); give an empty folder")
+    return Index(format=FORMAT, version=VERSION)
 
 
-def _whole(out: Path, index: Index) -> list[dict]:
-    """Those objects of an index whose shard is there and long enough, with sound cameras."""
-    good = []
-    by_uid = {values["uid"]: values for values in index.objects if "uid" in values}
-    for packed in packed_objects(out, index):
-        try:
-            packed.files()
-        except UserError:
-            continue
-        good.append(by_uid[packed.uid])
-    return good
+def _is_whole(out: Path, values: dict) -> bool:
+    """Whether an object's shard is there and long enough, with sound cameras."""
+    try:
+        read_packed(out, values)
+    except UserError:
+        return False
+    return True
 
 
 def _blocks(
     dataset: ViewDataset,
     uids: list[str],
     splits: dict[str, str],
-    settings: PackSettings,
+    size: int | None,
     workers: int,
     failures: dict[str, str],
-) -> Iterator[_Block]:
+) -> Iterator[Block]:
     """Yields the objects that can be read, in their order, decoded ahead on threads."""
-    threads: Prefetcher[_Block, _Block] = Prefetcher(workers)
+    pool, waiting = ThreadPoolExecutor(workers), dict[str, Future[Block]]()
     try:
         for number, uid in enumerate(progress_bar(uids, desc="packing", unit="object")):
             for ahead in uids[number : number + 1 + _AHEAD * workers]:
-                if ahead not in threads:
-                    part = partial(_block, dataset, ahead, splits[ahead], settings.size)
-                    threads.submit(ahead, [part], lambda made: made[0])
+                if ahead not in waiting:
+                    waiting[ahead] = pool.submit(_block, dataset, ahead, splits[ahead], size)
             try:
-                yield threads.take(uid)
+                yield waiting.pop(uid).result()
             except EXPECTED as error:
                 failures[uid] = first_line(error)
     finally:
-        threads.close()
+        pool.shutdown(cancel_futures=True)
 
 
-def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> _Block:
+def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> Block:
     """Decodes one object."""
     parts_of(uid, f"the object {uid!r}")
     files = dataset.files(uid)
@@ -224,41 +210,31 @@ def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> _Blo
         name=files.name,
         attribution=files.attribution,
     )
-    return _Block(entry, {"cameras": cameras, **arrays})
+    return entry, {"cameras": cameras, **arrays}
 
 
-def _write_shards(
-    out: Path, index: Index, blocks: Iterator[_Block], settings: PackSettings
-) -> None:
+def _write_shards(out: Path, index: Index, blocks: Iterator[Block], settings: PackSettings) -> None:
     """Writes all objects; the index names a shard as soon as it is whole."""
-    write = _write_tar if settings.shards == "webdataset" else _write_arrays
-    suffix = SUFFIXES[settings.shards]
-    free = (n for n in itertools.count() if not (out / _name(n, suffix)).exists())
-    try:
-        for first in blocks:
-            path = out / _name(next(free), suffix)
-            taken = _until(itertools.chain([first], blocks), settings.shard_bytes)
-            entries = write(path, taken, len(index.objects))
-            index.objects += [msgspec.to_builtins(entry) for entry in entries]
-            try:
-                _write_index(out, index)
-            except BaseException:
-                path.unlink(missing_ok=True)  # nothing names it
-                raise
-    finally:
-        blocks.close()  # pyright: ignore[reportAttributeAccessIssue]: a generator's, ends the threads
+    names = (f"shard-{n:05d}.{SUFFIXES[settings.shards]}" for n in itertools.count())
+    free = (out / name for name in names if not (out / name).exists())
+    for first in blocks:
+        path = next(free)
+        taken = _until(itertools.chain([first], blocks), settings.shard_bytes)
+        entries = _write_shard(path, taken, len(index.objects))
+        index.objects += [msgspec.to_builtins(entry) for entry in entries]
+        try:
+            _write_index(out, index)
+        except BaseException:
+            path.unlink(missing_ok=True)  # nothing names it
+            raise
 
 
-def _name(number: int, suffix: str) -> str:
-    return f"shard-{number:05d}.{suffix}"
-
-
-def _until(blocks: Iterator[_Block], limit: int) -> Iterator[_Block]:
+def _until(blocks: Iterator[Block], limit: int) -> Iterator[Block]:
     """The next blocks, up to the one with which they pass ``limit`` bytes."""
     size = 0
     for block in blocks:
         yield block
-        size += block.size
+        size += sum(array.nbytes for array in block[1].values())
         if size >= limit:
             return
 
@@ -273,43 +249,39 @@ def _write_index(out: Path, index: Index) -> None:
     write_text(out / INDEX, text + "\n")
 
 
-def _write_arrays(path: Path, blocks: Iterator[_Block], number: int) -> list[Entry]:
-    """Writes a shard of bare arrays, one after the other."""
+def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[Entry]:
+    """Writes a shard: bare arrays one after the other, or a WebDataset.
+
+    That has ``NUMBER.json`` and a ``.npy`` an array of each object, from ``number`` on.
+    """
     entries = []
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        for block in blocks:
-            file.write(bytes(-file.tell() % _ALIGNED))
-            starts = {}
-            for kind, array in block.arrays.items():
-                starts[kind] = file.tell()
-                file.write(np.ascontiguousarray(array).data)
-            entries.append(msgspec.structs.replace(block.entry, shard=path.name, **starts))
-    return entries
-
-
-def _write_tar(path: Path, blocks: Iterator[_Block], number: int) -> list[Entry]:
-    """Writes a shard as a WebDataset: of each object ``NUMBER.json`` and a ``.npy`` an array."""
-    entries = []
-    with (
-        atomic_path(path) as temporary,
-        open(temporary, "wb") as file,
-        tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar,
-    ):
+        tar = None
+        if path.suffix == ".tar":
+            tar = tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)
 
         def add(name: str, content: bytes) -> None:
             member = tarfile.TarInfo(name)
             member.size, member.mode = len(content), 0o444
             tar.addfile(member, io.BytesIO(content))
 
-        for key, block in zip((f"{number + n:08d}" for n in itertools.count()), blocks):
+        for key, (entry, arrays) in enumerate(blocks, number):
             starts = {}
-            for kind, array in sorted(block.arrays.items()):
-                npy = io.BytesIO()
-                np.save(npy, np.ascontiguousarray(array))
-                # The array is the last part of what follows the header.
-                starts[kind] = file.tell() + tarfile.BLOCKSIZE + npy.tell() - array.nbytes
-                add(f"{key}.{kind}.npy", npy.getvalue())
-            about = {name: getattr(block.entry, name) for name in _ABOUT}
-            add(f"{key}.json", json.dumps(about).encode())
-            entries.append(msgspec.structs.replace(block.entry, shard=path.name, **starts))
+            if tar is None:
+                file.write(bytes(-file.tell() % _ALIGNED))
+                for kind, array in arrays.items():
+                    starts[kind] = file.tell()
+                    file.write(np.ascontiguousarray(array).data)
+            else:
+                for kind, array in sorted(arrays.items()):
+                    npy = io.BytesIO()
+                    np.save(npy, np.ascontiguousarray(array))
+                    # The array is the last part of what follows the header.
+                    starts[kind] = file.tell() + tarfile.BLOCKSIZE + npy.tell() - array.nbytes
+                    add(f"{key:08d}.{kind}.npy", npy.getvalue())
+                about = {name: getattr(entry, name) for name in _ABOUT}
+                add(f"{key:08d}.json", json.dumps(about).encode())
+            entries.append(msgspec.structs.replace(entry, shard=path.name, **starts))
+        if tar is not None:
+            tar.close()
     return entries

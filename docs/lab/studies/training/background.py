@@ -18,7 +18,7 @@ from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.patches import foreground_patches
 from gamba_warp.render import render
 from gamba_warp.train.data.samples import Batch
-from gamba_warp.train.step import compute_gradients
+from gamba_warp.train.step import Objective, compute_gradients
 
 from .made_up import BOTH, NOVEL, SPREAD, WEIGHTS, step_model, step_source
 
@@ -47,7 +47,9 @@ class _Covered:
     def gradients(self, margin: int, batch: Batch | None = None) -> dict[str, Tensor]:
         """Makes the gradients of the weights; this is timed too."""
         run = partial(self._run, margin)
-        compute_gradients(run, self.optimizer, [batch or self.batch], WEIGHTS, clip=math.inf)
+        compute_gradients(
+            run, self.optimizer, [batch or self.batch], Objective(WEIGHTS), clip=math.inf
+        )
         named = self.model.named_parameters()
         return {name: p.grad for name, p in named if p.grad is not None}
 

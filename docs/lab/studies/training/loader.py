@@ -14,12 +14,10 @@ import torch
 
 from gamba_warp.cameras import orbit
 from gamba_warp.data.dataset import ViewDataset, open_dataset
-from gamba_warp.data.resident import ResidentViews
 from gamba_warp.images import save_image
 from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
-from gamba_warp.model.config import PRESETS
-from gamba_warp.train.batches import BatchQueue, BatchSource
-from gamba_warp.train.config import DataConfig
+from gamba_warp.train.batches import Batches, TrainingData
+from gamba_warp.train.config import DataConfig, TrainConfig
 from gamba_warp.train.ddp import World
 from gamba_warp.train.sources.pack import PackSettings, write_pack
 
@@ -62,19 +60,23 @@ def targets(settings: Settings) -> list[Target]:
 class _Loader:
     """Batches of a dataset; ``folder`` is kept for as long as they are."""
 
-    source: BatchSource
+    dataset: ViewDataset
+    objects: list[int]
     world: World
     batches: int
     folder: tempfile.TemporaryDirectory
 
     def run(self) -> None:
         """Takes all batches; this is what is timed."""
-        queue = BatchQueue(self.source, _WORKERS, lambda _: _NOVEL, self.world, self.batches)
+        views = DataConfig(size=_SIZE, mirror=0.5, recolor=0.3, workers=_WORKERS)
+        config = TrainConfig(data=Path(self.folder.name), preset="rays", views=views)
+        data = TrainingData(self.dataset, self.objects, batch_size=_BATCH)
+        batches = Batches(data, config, self.world, lambda _: _NOVEL, self.batches)
         try:
             for number in range(self.batches):
-                queue.take(number)
+                batches.take(number)
         finally:
-            queue.close()
+            batches.close()
         if self.world.device.type == "cuda":
             torch.cuda.synchronize(self.world.device)
 
@@ -99,14 +101,14 @@ def _build(settings: Settings) -> list[Variant]:
     for index in objects:
         cached.pictures(index, None, _SIZE)
     write_pack(data, root / "pack", PackSettings(_SIZE), _WORKERS, len(objects))
-    pack = open_dataset(root / "pack")
-    resident = ResidentViews(pack, objects, [_SIZE], settings.device, _WORKERS)
+    pack, resident = open_dataset(root / "pack"), open_dataset(root / "pack")
+    resident.keep(objects, [_SIZE], settings.device, _WORKERS)
     made: dict[str, ViewDataset] = {"files": files, "files, --cache": cached}
     made |= {_PACK: pack, "pack, --cache-device": resident}
     world, batches = World(0, 1, settings.device), _BATCHES[settings.level]
     variants = []
     for name, dataset in made.items():
-        loader = _Loader(_source(dataset, objects), world, batches, folder)
+        loader = _Loader(dataset, objects, world, batches, folder)
         variants.append(
             Variant(
                 name=name,
@@ -119,18 +121,6 @@ def _build(settings: Settings) -> list[Variant]:
             )
         )
     return variants
-
-
-def _source(dataset: ViewDataset, objects: list[int]) -> BatchSource:
-    return BatchSource(
-        dataset,
-        PRESETS["rays"],
-        objects=objects,
-        batch_size=_BATCH,
-        reference=None,
-        views=DataConfig(size=_SIZE, mirror=0.5, recolor=0.3),
-        seed=0,
-    )
 
 
 def _write_object(folder: Path, seed: int) -> None:

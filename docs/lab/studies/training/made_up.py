@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -15,8 +16,9 @@ from gamba_warp.kernels.bench import Settings
 from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.train.batches import BatchSource
-from gamba_warp.train.config import DataConfig
+from gamba_warp.train.batches import Batches, TrainingData
+from gamba_warp.train.config import DataConfig, TrainConfig
+from gamba_warp.train.ddp import World
 
 OP, BOTH = "step", "forward+backward"
 BATCH, NOVEL, SIZE = 4, 3, 128
@@ -96,7 +98,7 @@ def step_model(name: str, settings: Settings) -> tuple[Gamba, bool]:
 
 def step_source(
     config: GambaConfig, settings: Settings, batch: int, covered: float = _COVERED
-) -> BatchSource:
+) -> Batches:
     """Batches of the folder that was given, or of made-up views with the same silhouettes."""
     spread = (SPREAD[i % len(SPREAD)] if covered < 1 else 1.0 for i in range(batch))
     shares = [min(1.0, covered * factor) for factor in spread]
@@ -105,15 +107,14 @@ def step_source(
     if settings.data is not None:
         data = open_dataset(settings.data, cache=True)
     views = DataConfig(size=size, mirror=0.5, recolor=0.3)
-    return BatchSource(
-        data,
-        config,
-        objects=list(range(len(data.uids))),
-        batch_size=batch,
-        reference=None,
-        views=views,
-        seed=0,
+    objects = list(range(len(data.uids)))
+    made = Batches(
+        TrainingData(data, objects, batch_size=batch),
+        TrainConfig(data=Path("made-up"), views=views),
+        World(0, 1, torch.device("cpu")),
     )
+    made.model = config
+    return made
 
 
 def views(settings: Settings, count: int) -> Tensor:

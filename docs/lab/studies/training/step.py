@@ -17,7 +17,7 @@ from gamba_warp.kernels.bench import Case, Error, Key, Settings, Target, Variant
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.config import OptimConfig
 from gamba_warp.train.optim import Ema, build_optimizer
-from gamba_warp.train.step import compute_gradients
+from gamba_warp.train.step import Objective, compute_gradients
 from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
@@ -159,11 +159,8 @@ class _Step:
             self._network,
             self.optimizer,
             [batch],
-            self.weights,
+            Objective(self.weights, self.lpips, _CROP, self.precision),
             clip=self.clip,
-            lpips=self.lpips,
-            lpips_crop=_CROP,
-            precision=self.precision,
         )
         with record_function("optimizer"):
             self.optimizer.step()
@@ -241,9 +238,8 @@ class _Precise:
 
     def gradient(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:
         """Makes the gradient of all weights, and the pictures; this is what is timed."""
-        made = compute_gradients(
-            self.model, self.optimizer, [self.batch], WEIGHTS, clip=math.inf, precision=precision
-        )
+        objective = Objective(WEIGHTS, precision=precision)
+        made = compute_gradients(self.model, self.optimizer, [self.batch], objective, clip=math.inf)
         grads = [p.grad.flatten() for p in self.model.parameters() if p.grad is not None]
         return torch.cat(grads), made.result.rendering.rgb.detach()
 

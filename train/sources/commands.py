@@ -1,0 +1,290 @@
+"""The commands that make data: ``gamba data furniture``, ``primitives``, ``render`` and the others.
+
+They parse, call and print. What is there already is skipped, so a command that was stopped goes on;
+what fails is told on stderr, and the exit code is then 1.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import tyro
+from msgspec import Meta
+
+from gamba_warp.batch import counted
+from gamba_warp.errors import UserError
+from gamba_warp.files import output_folder, write_json
+from gamba_warp.untrusted.ranges import Seed, ranged
+
+from ..data.poses import Settings
+from .objaverse_lists import Lists
+
+Item = TypeVar("Item")
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+_SHOWN = 20  # objects of Objaverse that are told one by one; the record has all
+
+
+@dataclass(frozen=True)
+class Share:
+    """Which of the objects a command works on.
+
+    Attributes:
+        shard: i/n takes every n-th object from the i-th, for n machines.
+        limit: stop after this many objects.
+    """
+
+    shard: str = "0/1"
+    limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None
+
+    @property
+    def numbers(self) -> tuple[int, int]:
+        """I and n.
+
+        Raises:
+            UserError: the shard is not of the form i/n, or not 0 <= i < n.
+        """
+        match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", self.shard)
+        if not match or not int(match[1]) < int(match[2]):
+            raise UserError(f"--shard {self.shard[:40]}: expected i/n with 0 <= i < n, such as 0/4")
+        return int(match[1]), int(match[2])
+
+    def of(self, items: Sequence[Item]) -> Sequence[Item]:
+        """Those of the items."""
+        first, count = self.numbers
+        return items[first::count][: self.limit]
+
+
+def _told(failures: Mapping[str, str], what: str, warnings: Mapping[str, list[str]]) -> int:
+    """Says what failed and what was missing; returns the exit code."""
+    for name, lines in sorted(warnings.items()):
+        print(f"warning: {name}: {'; '.join(lines)}")
+    for name, reason in sorted(failures.items()):
+        print(f"{what}: {name}: {reason}", file=sys.stderr)
+    return 1 if failures else 0
+
+
+def data_furniture_command(out: Out, deb: Path | None = None, tree: Path | None = None) -> int:
+    """Get 820 free textured models with icons: Sweet Home 3D's libraries, from Debian's package.
+
+    Without --deb or --tree: an installed package is used, else apt-get downloads it (125 MB).
+
+    Args:
+        out: folder for the models, their icons and catalogue.json; 400 MB.
+        deb: the package file sweethome3d-furniture_*.deb, if you have it.
+        tree: a folder that holds the .sh3f files, if you have them.
+    """
+    from ..data.furniture import get_furniture
+
+    count = get_furniture(out, deb, tree)
+    print(f"{count} models in {out}; next: gamba data render {out} --out DATA")
+    return 0
+
+
+@ranged
+def data_primitives_command(
+    out: Out, count: Annotated[int, Meta(ge=1, le=100_000)] = 200, seed: Seed = 0
+) -> int:
+    """Make objects of simple solids with made-up textures, free of anybody's rights (.glb).
+
+    An object depends on the seed and its number alone; those that are there already are kept.
+
+    Args:
+        out: folder for the models and catalogue.json.
+        count: number of objects.
+        seed: seed of all objects.
+    """
+    from ..data.primitives import make_primitives
+
+    make_primitives(out, count, seed)
+    print(f"{count} models in {out}; next: gamba data render {out} --out DATA")
+    return 0
+
+
+@ranged
+def data_render_command(
+    folder: tyro.conf.Positional[Path],
+    out: Out,
+    settings: tyro.conf.OmitArgPrefixes[Settings],
+    share: tyro.conf.OmitArgPrefixes[Share],
+    split: Literal["all", "train", "val", "test"] = "all",
+    workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
+) -> int:
+    """Render posed RGBA views of every mesh in a folder (.obj .glb .gltf .ply .stl .off).
+
+    Objects that are already there are skipped, so a run that was stopped goes on where it was.
+
+    Args:
+        folder: meshes, at any depth; a catalogue.json in it may give names and attribution.
+        out: the dataset to make or to go on with.
+        settings: how they are rendered.
+        share: which of them.
+        split: render only the objects that lie in this part of the set.
+        workers: number of processes; 0 means one per core.
+    """
+    from gamba_warp.data.dataset import split_of
+    from gamba_warp.formats.catalogue import find_meshes
+
+    from ..data.render import render_meshes, still_missing
+
+    fov, spread = settings.fov, settings.fov_spread
+    if fov / spread < 5 or fov * spread > 120:
+        raise UserError(f"--fov-spread {spread:g}: makes fields of view outside 5 to 120 degrees")
+    meshes = find_meshes(folder)
+    groups = {mesh.uid: mesh.group for mesh in meshes}
+    meshes = share.of([m for m in meshes if split in ("all", split_of(m.group))])
+    out = output_folder(out)
+    todo, damaged = still_missing(meshes, out, settings)
+    if done := len(meshes) - len(todo) - len(damaged):
+        print(f"{done} of {counted(len(meshes), 'object')} already in {out}")
+    warnings, failures = render_meshes(todo, out, settings, workers, groups)
+    rendered, failures = len(todo) - len(failures), failures | damaged
+    code = _told(failures, "failed", warnings)
+    print(f"rendered {counted(rendered, 'object')} into {out}, {len(failures)} failed")
+    return code
+
+
+@ranged
+def data_pack_command(
+    data: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    size: Annotated[int, Meta(ge=1, le=4096)] | None = 128,
+    split: Literal["all", "train", "val", "test"] = "all",
+    format: Literal["arrays", "webdataset"] = "arrays",
+    shard_mb: Annotated[int, Meta(ge=1, le=100_000)] = 256,
+    limit: Annotated[int, Meta(ge=1, le=10**9)] | None = None,
+    workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
+) -> int:
+    """Decode the views of a dataset once, and write them into a few large files.
+
+    Every command that takes a dataset takes the pack. Its views at SIZE are those of the files, to
+    the bit; larger ones are enlarged. A command that was stopped goes on with the next shard.
+
+    Args:
+        data: the dataset.
+        out: folder of the pack to make or to go on with.
+        size: height of the pictures, pixels; None keeps that of the files.
+        split: pack only the objects of this part of the set.
+        format: arrays that are mapped into memory, or WebDataset's .tar files of the same arrays.
+        shard_mb: a file ends with the object that passes this size, megabytes.
+        limit: stop after this many objects.
+        workers: number of threads that decode; 0 means one per core.
+    """
+    from gamba_warp.kernels.runtime.system import cores
+
+    from .pack import PackSettings, write_pack
+
+    settings = PackSettings(size, split, format, shard_mb << 20)
+    done = write_pack(data, out, settings, workers or cores(), limit)
+    if done.there:
+        print(f"{counted(done.there, 'object')} in {out} already")
+    made = f"packed {counted(done.written, 'object')} into {out}, {counted(done.shards, 'shard')}"
+    print(f"{made}, {len(done.failures)} failed")
+    return _told(done.failures, "failed", {})
+
+
+@ranged
+def data_objaverse_command(
+    out: tyro.conf.Positional[Path],
+    source: str,
+    lists: tyro.conf.OmitArgPrefixes[Lists],
+    share: tyro.conf.OmitArgPrefixes[Share],
+    min_views: Annotated[int, Meta(ge=1, le=10_000)] = 40,
+    copy: bool = False,
+    depth: bool = False,
+    workers: Annotated[int, Meta(ge=1, le=256)] = 1,
+) -> int:
+    """Make a dataset of a local copy of G-Objaverse, or download Objaverse's meshes.
+
+    Folders are linked, tars unpacked as far as training needs them. What is there is skipped, so a
+    run that was stopped goes on. OUT/objaverse.json records the choice. docs/datasets.md has the
+    commands for the paper's training set.
+
+    Args:
+        out: folder to make or to go on with.
+        source: folder of G-Objaverse (folders or tars); or "objaverse": meshes by that package.
+        lists: which objects.
+        share: which of them.
+        min_views: complete views that an object of G-Objaverse must have; published are 40.
+        copy: copy the files of folders in place of linking them.
+        depth: also make depth pictures of the _nd.exr files; needs the package OpenEXR.
+        workers: downloads at once.
+    """
+    from .objaverse_depth import check_package
+    from .objaverse_meshes import PACKAGE, load_package, take_meshes
+    from .objaverse_views import find_rendered, take_views
+
+    first, count = share.numbers
+    if depth:
+        check_package()
+    if meshes := source == PACKAGE:
+        load_package()
+    objects = {} if meshes else find_rendered(Path(source))
+    if not meshes and out.resolve() == Path(source).resolve():
+        raise UserError(f"{out}: is --source itself; choose another folder")
+    chosen = lists.choose(None if meshes else objects)
+    names = share.of(chosen.names)
+    out = output_folder(out)
+    for what, number in chosen.counts.items():
+        print(f"{number:>9,} {what}")
+    if meshes:
+        taken, failures = take_meshes(names, out, workers)
+    else:
+        taken, failures = take_views(objects, names, out, min_views, copy, depth)
+    record = out / ("objaverse.json" if count == 1 else f"objaverse.{first}-{count}.json")
+    known = {name: chosen.uids[name] for name in names if name in chosen.uids}
+    about = {"source": source, "counts": chosen.counts, "shard": share.shard, "objects": len(names)}
+    write_json(record, about | {"objaverse": known, "left_out": failures})
+    there = len(names) - taken - len(failures)
+    found = f"{there:,} were there, {len(failures):,} left out"
+    print(f"{counted(taken, 'object')} put into {out}, {found}")
+    for name, reason in list(failures.items())[:_SHOWN]:
+        print(f"left out: {name}: {reason}", file=sys.stderr)
+    if (rest := len(failures) - _SHOWN) > 0:
+        print(f"left out: {rest:,} more, see {record}", file=sys.stderr)
+    following = "gamba data render {} --size 512 --out DATA" if meshes else "gamba train {} ..."
+    print(f"next: {following.format(out)}")
+    return 1 if failures else 0
+
+
+@ranged
+def data_gso_command(
+    out: tyro.conf.Positional[Path],
+    source: Path,
+    share: tyro.conf.OmitArgPrefixes[Share],
+    size: Annotated[int, Meta(ge=8, le=4096)] = 512,
+    workers: Annotated[int, Meta(ge=0, le=1024)] = 0,
+) -> int:
+    """Make the evaluation "gso" of a copy of Google Scanned Objects: 60 objects, 24 views of each.
+
+    Writes OUT/views (a dataset, all of it the test split; view 0 is the input) and OUT/meshes. What
+    is there is skipped, so a run that was stopped goes on. Objects that SOURCE lacks are named;
+    the exit code is then 1.
+
+    Args:
+        out: folder to make or to go on with.
+        source: folder of the set: a folder or a zip of each model, as the Fuel server gives them.
+        share: which of them.
+        size: pixels a side; the evaluation's are 512.
+        workers: number of processes that render; 0 means one per core.
+    """
+    from gamba_warp.data.gso import NAMES
+
+    from .gso import make_views, take_models
+
+    names = share.of(NAMES)
+    out = output_folder(out)
+    failures = take_models(source, out, names)
+    made, warnings, failed = make_views(out, names, size, workers)
+    failures |= failed
+    code = _told(failures, "missing", warnings)
+    views, missing = out / "views", f"{len(failures)} of {len(names)} missing"
+    print(f"rendered {counted(made, 'object')} into {views}, {missing}")
+    print(f"next: gamba eval-views --protocol gso --checkpoint MODEL --data {views} --out EVAL")
+    geometry = f"gamba eval-geometry EVAL/gaussians {out / 'meshes'}"
+    print(f"      {geometry} --protocol gso --data {views}")
+    return code
