@@ -75,9 +75,8 @@ class World:
 
     def mean(self, figures: dict[str, float]) -> dict[str, float]:
         """Averages each figure over all processes, which must have the same names of figures."""
-        names = sorted(figures)
-        sums = self.total(*(figures[name] for name in names))
-        return {name: value / self.size for name, value in zip(names, sums)}
+        sums = self.total(*(figures[name] for name in sorted(figures)))
+        return {name: value / self.size for name, value in zip(sorted(figures), sums)}
 
     def gather(self, value: Any) -> list[Any]:
         """Gives every process what each of them has, by rank; what torch can pickle."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import torch
 from torch import Tensor
@@ -77,8 +77,7 @@ class RunLog:
 
     def write(self, event: str, step: int, **values: object) -> None:
         """Writes a line; numbers that are not finite become null."""
-        line = {"event": event, "step": step, "time": round(time.time(), 3)}
-        line |= {name: _plain(value) for name, value in values.items()}
+        line = {"event": event, "step": step, "time": round(time.time(), 3), **_plain(values)}
         data = (json.dumps(line) + "\n").encode()
         with self._guarded("log.jsonl"):
             size = os.fstat(self._file.fileno()).st_size
@@ -149,7 +148,7 @@ class Quiet:
             self._stream.flush()
 
 
-def _plain(value: object) -> object:
+def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.6g}") if math.isfinite(value) else None
     if isinstance(value, dict):

@@ -68,6 +68,8 @@ class Trainer:
         self.model = model
         self.optimizer = build_optimizer(model, config.optim.weight_decay, config.optim.beta2)
         self.ema = Ema(model, config.optim.ema) if config.optim.ema else None
+        # By the stem of their files; the last is the one that is used.
+        self.models = {"model": model} | ({"ema": self.ema.model} if self.ema else {})
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self.wrapped = world.wrap(model)
         self.precision = world.precision(config.optim.precision, model.config.width)
@@ -94,11 +96,6 @@ class Trainer:
         if total is None and (length.epochs or not length.minutes):
             total = math.ceil((length.epochs or 400) * self.steps_per_epoch)
         return Schedule(self.config.optim, total, length.minutes)
-
-    @property
-    def averaged(self) -> Gamba:
-        """The model with the averaged weights, or where there are none the one that trains."""
-        return self.model if self.ema is None else self.ema.model
 
     @property
     def failures(self) -> dict[str, str]:
@@ -150,7 +147,10 @@ class Trainer:
             count=self.accumulate,
         )
         loss, norm = torch.stack([made.loss, made.norm]).tolist()
-        loss = self._apply(loss, norm)
+        bad = not (math.isfinite(loss) and math.isfinite(norm))
+        number, total = self.world.total(bad, loss)  # so that all processes do alike
+        self._apply(number > 0, "gradient" if math.isfinite(total) else "loss")
+        loss = total / self.world.size
         seconds = time.perf_counter() - started
         views = made.batch.cameras.viewmats[..., 0, 0].numel() * self.accumulate * self.world.size
         figures = {"loss": loss, "grad_norm": norm, "lr": rate}
@@ -163,33 +163,24 @@ class Trainer:
             figures |= self.world.mean(own | {name: value.item() for name, value in known})
         return figures
 
-    def _apply(self, loss: float, norm: float) -> float:
-        """Updates the weights or skips the step, on all processes alike, and counts the step.
-
-        Returns:
-            The mean loss over the processes.
-        """
-        bad = not (math.isfinite(loss) and math.isfinite(norm))
-        number, loss = self.world.total(bad, loss)
-        bad, loss = number > 0, loss / self.world.size
+    def _apply(self, bad: bool, what: str) -> None:
+        """Updates the weights, or skips the step because of ``what``, and counts the step."""
         self.step += 1
         if not bad:
             self.skipped_in_row = 0
             self.optimizer.step()
             if self.ema is not None:
                 self.ema.update()
-            return loss
+            return
         self.skipped += 1
         self.skipped_in_row += 1
         if self.log is not None:
-            what = "loss" if not math.isfinite(loss) else "gradient"
             self.log.warn(self.step, f"step {self.step} skipped: its {what} is not finite")
         if self.skipped_in_row >= self.config.optim.max_skipped:
             raise UserError(
                 f"{self.skipped_in_row} steps in a row were not finite (step {self.step}); "
                 "lower --lr, or resume from an older checkpoint"
             )
-        return loss
 
     def run(self) -> int:
         """Trains until the end, the time limit or a signal, and then saves a checkpoint.
@@ -225,7 +216,8 @@ class Trainer:
         if stop:
             return 128 + int(stop)
         if self.world.main:
-            save_model(self.config.run.out / "model.safetensors", self.averaged)
+            best = [*self.models.values()][-1]
+            save_model(self.config.run.out / "model.safetensors", best)
         return 0
 
     def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
@@ -262,7 +254,8 @@ class Trainer:
         run, size = self.config.run, self.config.views.size
         held_out = fixed_batches(self.data, self.model.config, size, self._unread)
         objective = Objective(self._weights(validates=True), self.lpips)
-        figures, rows = validate(self.averaged, held_out, objective, self.world.device)
+        best = [*self.models.values()][-1]
+        figures, rows = validate(best, held_out, objective, self.world.device)
         self._name_failures()
         if not rows:
             self.log.warn(self.step, "no validation: none of its objects can be read")
@@ -278,9 +271,8 @@ class Trainer:
 
         def write() -> None:
             if self._saved != self.step:
-                models = {"model": self.model} | ({"ema": self.ema.model} if self.ema else {})
                 run = self.config.run
-                save_checkpoint(run.out, self.step, models, self.state(), run.keep)
+                save_checkpoint(run.out, self.step, self.models, self.state(), run.keep)
                 self._saved = self.step
 
         self.world.on_main(write)
@@ -318,20 +310,18 @@ class Trainer:
             mine = {"objects": self.data.fingerprint, "world_size": self.world.size}
             state, length = read_run(checkpoint, self.config, mine)
             moments = checked_moments(self.optimizer, state.optimizer, checkpoint / "state.pt")
-            weights = read_weights_of(checkpoint / "model.safetensors", self.model)
-            averages = None
-            if self.ema is not None:
-                averages = read_weights_of(checkpoint / "ema.safetensors", self.ema.model)
-            return state, length, moments, weights, averages
+            files = {name: checkpoint / f"{name}.safetensors" for name in self.models}
+            weights = {n: read_weights_of(files[n], model) for n, model in self.models.items()}
+            return state, length, moments, weights
 
         # Everything is read and checked before any of it is loaded. The processes need no disk in
         # common: the main one reads.
-        state, length, moments, weights, averages = self.world.on_main(read)
+        state, length, moments, weights = self.world.on_main(read)
         old = replace(self._schedule(length), since=state.new_length)
+        for name, model in self.models.items():
+            model.load_stored_state(weights[name])
         if self.ema is not None:
-            self.ema.model.load_stored_state(averages)
             self.ema.updates = state.ema_updates
-        self.model.load_stored_state(weights)
         self.optimizer.load_state_dict(moments)
         self.step, self.skipped = state.step, state.skipped
         self.skipped_in_row, self.elapsed = state.skipped_in_row, state.elapsed

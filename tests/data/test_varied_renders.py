@@ -144,7 +144,7 @@ def test_primitives_are_the_same_again_and_differ_from_one_another(tmp_path, cap
     assert meshes[2].path.read_bytes() == b"kept as it is"
 
 
-@pytest.mark.parametrize("plan", [*primitives.PLANS, primitives._composition])
+@pytest.mark.parametrize("plan", [*primitives.PLANS, primitives.composition])
 def test_every_plan_makes_sound_textured_solids(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(primitives, "PLANS", [plan])
     rng = np.random.default_rng([len(plan.__name__), 1])
@@ -163,7 +163,7 @@ def test_textures_are_colours_and_have_their_patterns():
         values = pattern(rng)
         assert values.shape == (primitives.TEXTURE,) * 2
         assert values.min() >= 0 and values.max() <= 1
-        assert pattern is primitives._flat or np.ptp(values) > 0.3
+        assert pattern is primitives.flat or np.ptp(values) > 0.3
 
 
 def test_another_catalogue_is_not_overwritten(tmp_path):

@@ -6,8 +6,8 @@ from helpers.published.gobjaverse import SIZE, camera, members, write_object, wr
 
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.train.sources import objaverse_depth
-from gamba_warp.train.sources.objaverse_depth import depth_steps
+from gamba_warp.train.sources import objaverse_views
+from gamba_warp.train.sources.objaverse_views import depth_steps
 
 VIEWS = 3
 
@@ -23,7 +23,7 @@ def test_what_is_no_surface_is_zero():
 
 def test_without_the_package_it_is_one_line(tmp_path, monkeypatch, capsys):
     write_object(tmp_path / "set" / "0" / "1", "readme", VIEWS)
-    monkeypatch.setattr(objaverse_depth, "find_spec", lambda name: None)
+    monkeypatch.setattr(objaverse_views, "find_spec", lambda name: None)
     words = [str(tmp_path / "out"), "--source", str(tmp_path / "set"), "--depth"]
     assert run("data objaverse", words) == 2
     assert capsys.readouterr().err == "gamba: --depth: needs the package OpenEXR: " + (

@@ -53,13 +53,10 @@ def draw_change(rng: np.random.Generator, mirror: float, recolor: float) -> Chan
     # As many numbers whatever the chances, so that one does not change what the other draws.
     first, second, power = rng.random(3)
     order = rng.permutation(3)
-    change = Change(mirror=bool(first < mirror))
-    if second < recolor:
-        gamma = float(MAX_GAMMA ** (2 * power - 1))
-        change = replace(
-            change, channels=(int(order[0]), int(order[1]), int(order[2])), gamma=gamma
-        )
-    return change
+    if second >= recolor:
+        return Change(bool(first < mirror))
+    channels = (int(order[0]), int(order[1]), int(order[2]))
+    return Change(bool(first < mirror), channels, float(MAX_GAMMA ** (2 * power - 1)))
 
 
 def mirrored(views: ObjectViews) -> ObjectViews:
@@ -105,28 +102,41 @@ class Batch:
         """Returns the same batch on a device; a GPU gets it beside other work if it is pinned."""
         if device.type == "cpu":
             return self
-        return self._map(lambda values: values.to(device, non_blocking=True))
+        return _combined([self], lambda values: values[0].to(device, non_blocking=True))
 
     def pinned(self) -> Batch:
         """Returns the same batch, its tensors on the CPU in page-locked memory.
 
         Only from there does a GPU copy while the host goes on.
         """
-        return self._map(lambda v: v.pin_memory() if v.device.type == "cpu" else v)
+        return _combined([self], lambda v: v[0].pin_memory() if v[0].device.type == "cpu" else v[0])
 
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Batch:
-        def cameras(c: Cameras) -> Cameras:
-            return replace(c, viewmats=change(c.viewmats), Ks=change(c.Ks))
 
-        return Batch(
-            uids=self.uids,
-            inputs=change(self.inputs),
-            input_cameras=cameras(self.input_cameras),
-            targets=change(self.targets),
-            cameras=cameras(self.cameras),
-            background=change(self.background),
-            surfaces=None if self.surfaces is None else change(self.surfaces),
-        )
+def join(samples: list[Batch]) -> Batch:
+    """Joins samples to one batch; all must have the same number of views."""
+    return _combined(samples, torch.cat)
+
+
+def _combined(batches: list[Batch], make: Callable[[list[Tensor]], Tensor]) -> Batch:
+    """A batch each of whose tensors is made of those of some batches."""
+
+    def tensors(of: Callable[[Batch], Tensor]) -> Tensor:
+        return make([of(batch) for batch in batches])
+
+    def cameras(of: Callable[[Batch], Cameras]) -> Cameras:
+        viewmats, Ks = (tensors(lambda b, n=name: getattr(of(b), n)) for name in ("viewmats", "Ks"))
+        return replace(of(batches[0]), viewmats=viewmats, Ks=Ks)
+
+    surfaces = [batch.surfaces for batch in batches if batch.surfaces is not None]
+    return Batch(
+        uids=[uid for batch in batches for uid in batch.uids],
+        inputs=tensors(lambda b: b.inputs),
+        input_cameras=cameras(lambda b: b.input_cameras),
+        targets=tensors(lambda b: b.targets),
+        cameras=cameras(lambda b: b.cameras),
+        background=tensors(lambda b: b.background),
+        surfaces=make(surfaces) if surfaces else None,
+    )
 
 
 def load_sample(
@@ -182,29 +192,6 @@ def load_sample(
         cameras=relative_cameras(target.cameras, config.distance)[None],
         background=background.reshape(1, 1, 3),
         surfaces=found,
-    )
-
-
-def join(samples: list[Batch]) -> Batch:
-    """Joins samples to one batch; all must have the same number of views."""
-    surfaces = [s.surfaces for s in samples if s.surfaces is not None]
-    return Batch(
-        uids=[uid for s in samples for uid in s.uids],
-        inputs=torch.cat([s.inputs for s in samples]),
-        input_cameras=_join_cameras([s.input_cameras for s in samples]),
-        targets=torch.cat([s.targets for s in samples]),
-        cameras=_join_cameras([s.cameras for s in samples]),
-        background=torch.cat([s.background for s in samples]),
-        surfaces=torch.cat(surfaces) if surfaces else None,
-    )
-
-
-def _join_cameras(cameras: list[Cameras]) -> Cameras:
-    return Cameras(
-        torch.cat([c.viewmats for c in cameras]),
-        torch.cat([c.Ks for c in cameras]),
-        cameras[0].width,
-        cameras[0].height,
     )
 
 

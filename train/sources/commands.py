@@ -214,9 +214,8 @@ def data_objaverse_command(
         depth: also make depth pictures of the _nd.exr files; needs the package OpenEXR.
         workers: downloads at once.
     """
-    from .objaverse_depth import check_package
     from .objaverse_meshes import PACKAGE, load_package, take_meshes
-    from .objaverse_views import find_rendered, take_views
+    from .objaverse_views import check_package, find_rendered, take_views
 
     first, count = share.numbers
     if depth:

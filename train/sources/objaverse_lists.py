@@ -154,36 +154,32 @@ class Lists:
         index = {} if self.index is None else read_index(self.index)
         if there is None and not self.uids:
             raise UserError("--uids: needed, so that not all of Objaverse is downloaded")
-        found = Choice(sorted(there or ()), {}, index)
-        if there is not None:
-            found.counts["in the source"] = len(found.names)
+        found, meshes = Choice(sorted(there or ()), {}, index), there is None
+        counts = found.counts
+        if not meshes:
+            counts["in the source"] = len(found.names)
         for path in self.uids:
-            names = self._translated(read_list(path), index, there is None, path)
-            first = not found.counts
-            found.names = sorted(names if first else names & {*found.names})
-            what = f"in {path.name}" if first else f"of them also in {path.name}"
-            found.counts[what] = len(found.names)
+            names = self._translated(read_list(path), index, meshes, path)
+            what = f"of them also in {path.name}" if counts else f"in {path.name}"
+            found.names = sorted(names & {*found.names} if counts else names)
+            counts[what] = len(found.names)
         for path in self.without:
-            names = self._translated(read_list(path), index, there is None, path)
+            names = self._translated(read_list(path), index, meshes, path)
             found.names = [name for name in found.names if name not in names]
-            found.counts[f"left without {path.name}"] = len(found.names)
+            counts[f"left without {path.name}"] = len(found.names)
         if self.quality is not None:
-            self._leave_out_poor(found, index, there is None)
+            if not meshes and not index:
+                raise UserError(f"{self.quality}: has names of Objaverse; give --index, too")
+            labels = read_quality(self.quality)
+            label_of = {n: labels.get(n if meshes else index.get(n, "")) for n in found.names}
+            known = sum(label is not None for label in label_of.values())
+            counts[f"with a category in {self.quality.name}"] = known
+            found.names = [name for name in found.names if label_of[name] != POOR]
+            counts[f"left without {POOR}"] = len(found.names)
         if not found.names:
-            told = ", ".join(f"{count} {what}" for what, count in found.counts.items())
+            told = ", ".join(f"{count} {what}" for what, count in counts.items())
             raise UserError(f"no object is left ({told})")
         return found
-
-    def _leave_out_poor(self, found: Choice, index: Mapping[str, str], meshes: bool) -> None:
-        assert self.quality is not None
-        if not meshes and not index:
-            raise UserError(f"{self.quality}: has names of Objaverse; give --index, too")
-        labels = read_quality(self.quality)
-        uid_of = {name: name if meshes else index.get(name, "") for name in found.names}
-        known = [name for name in found.names if uid_of[name] in labels]
-        found.names = [name for name in found.names if labels.get(uid_of[name]) != POOR]
-        found.counts[f"with a category in {self.quality.name}"] = len(known)
-        found.counts[f"left without {POOR}"] = len(found.names)
 
     def _translated(
         self, names: set[str], index: Mapping[str, str], meshes: bool, path: Path

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gamba_warp.batch import progress_bar
+from gamba_warp.data.layouts import one_text
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_path, output_folder, write_json
 from gamba_warp.formats.catalogue import CATALOGUE
@@ -62,7 +63,10 @@ def take_meshes(names: Sequence[str], out: Path, processes: int) -> tuple[int, d
                 except UserError as error:
                     failures[name] = str(error)
             progress.update(len(batch))
-    write_catalogue(out)
+    annotations = sorted((out / ANNOTATIONS).glob("[!.]*.json"))
+    there = [path for path in annotations if (out / f"{path.stem}.glb").is_file()]
+    entries = [read_document(path, dict[str, Any]) for path in there]
+    write_json(out / CATALOGUE, {"objects": entries})
     return len(wanted) - len(failures), failures
 
 
@@ -82,33 +86,18 @@ def _put(name: str, path: str | None, known: Any, out: Path) -> None:
     """Puts one file, a second name of that in the package's cache where the disk allows it."""
     if path is None or not Path(path).is_file():
         raise UserError("Objaverse has no such object")
-    write_json(out / ANNOTATIONS / f"{name}.json", _entry(name, known))
+    known = known if isinstance(known, dict) else {}
+    user = known.get("user")
+    values = {**known, "user": user.get("displayName") if isinstance(user, dict) else user}
+    entry = {
+        "model": f"{name}.glb",
+        "uid": name,
+        "name": " ".join(str(known.get("name") or name).split())[:200],
+        "attribution": {f: one_text(values[key]) for f, key in _FIELDS.items() if values.get(key)},
+    }
+    write_json(out / ANNOTATIONS / f"{name}.json", entry)
     with atomic_path(out / f"{name}.glb") as temporary:
         try:
             os.link(path, temporary)
         except OSError:
             shutil.copyfile(path, temporary)
-
-
-def _entry(name: str, known: Any) -> dict[str, Any]:
-    """The catalogue's entry of one object."""
-    known = known if isinstance(known, dict) else {}
-    user = known.get("user")
-    values = {**known, "user": user.get("displayName") if isinstance(user, dict) else user}
-    attribution = {
-        field: " ".join(str(values[key]).split())[:500]
-        for field, key in _FIELDS.items()
-        if values.get(key)
-    }
-    title = " ".join(str(known.get("name") or name).split())[:200]
-    return {"model": f"{name}.glb", "uid": name, "name": title, "attribution": attribution}
-
-
-def write_catalogue(out: Path) -> int:
-    """Writes ``catalogue.json`` of the files in ``out``; returns how many there are."""
-    entries = []
-    for path in sorted((out / ANNOTATIONS).glob("[!.]*.json")):
-        if (out / f"{path.stem}.glb").is_file():
-            entries.append(read_document(path, dict[str, Any]))
-    write_json(out / CATALOGUE, {"objects": entries})
-    return len(entries)

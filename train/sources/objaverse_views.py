@@ -2,7 +2,9 @@
 
 The set is published as ``dictionary_id/instance_id/campos_512_v4/NNNNN/NNNNN.png`` and seven more
 files a view; as a tar of each object, ``dictionary_id/instance_id.tar``; and by a script that
-leaves out the folder ``campos_512_v4``. Training needs a view's picture and camera alone.
+leaves out the folder ``campos_512_v4``. Training needs a view's picture and camera alone, and for
+depth its ``_nd.exr`` (normal and depth); the package OpenEXR reads that, a native library, so in a
+child process that may be lost.
 """
 
 from __future__ import annotations
@@ -12,25 +14,36 @@ import re
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from gamba_warp.batch import progress_bar
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.data.layouts import GOBJAVERSE, GOBJAVERSE_DEPTH, ObjectFiles
+from gamba_warp.data.layouts import GOBJAVERSE, GOBJAVERSE_DEPTH, GOBJAVERSE_DEPTH_UNIT, ObjectFiles
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, atomic_folder
+from gamba_warp.images import MAX_PIXELS
 from gamba_warp.untrusted.archives import open_tar
+from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_bytes
 from gamba_warp.untrusted.names import inside
-
-from .objaverse_depth import MOST, SUFFIX, DepthFile, convert
 
 VIEWS = 40  # of an object: two orbits, top and bottom
 _NUMBER = re.compile(r"[0-9]{1,12}")
 _MEMBER = re.compile(r"(?:[^/]+/){0,3}?([0-9]{5})/\1(\.png|\.json|_nd\.exr)")
 _MOST = {".png": 64 << 20, ".json": 1 << 20}  # bytes; pictures have 0.2 MB
+
+
+SUFFIX = "_nd.exr"
+MOST = 64 << 20  # bytes of a file; they have 2 to 4 MB
+# Half the diagonal of the unit cube that holds the object: what is nearer or further is no surface,
+# as the set's own example says.
+_REACH = 3**0.5 / 2
+_SECONDS, _MEMORY = 600.0, 4 << 30  # of an object's 40 files, which take 2 s and 0.7 GB
 
 
 def find_rendered(source: Path) -> dict[str, Path]:
@@ -44,16 +57,16 @@ def find_rendered(source: Path) -> dict[str, Path]:
     """
     if not source.is_dir():
         raise UserError(f"--source {source}: no such folder")
-    found: dict[str, Path] = {}
-    for top in (source, source / "savedata"):
-        for group in sorted(top.iterdir()) if top.is_dir() else ():
-            if _NUMBER.fullmatch(group.name) and group.is_dir():
-                for entry in os.scandir(group):
-                    name = entry.name.removesuffix(".tar")
-                    plain = name == entry.name
-                    if _NUMBER.fullmatch(name) and entry.is_dir() == plain:
-                        if plain or f"{group.name}/{name}" not in found:
-                            found[f"{group.name}/{name}"] = Path(entry.path)
+    entries = [
+        (f"{group.name}/{path.name.removesuffix('.tar')}", path)
+        for top in (source, source / "savedata")
+        for group in (sorted(top.iterdir()) if top.is_dir() else ())
+        if _NUMBER.fullmatch(group.name) and group.is_dir()
+        for path in group.iterdir()
+        if _NUMBER.fullmatch(path.name.removesuffix(".tar"))
+        and path.is_dir() is not path.name.endswith(".tar")
+    ]
+    found = dict(sorted(entries, key=lambda entry: entry[1].is_dir()))  # folders last, so they stay
     if not found:
         raise UserError(
             f"--source {source}: holds no objects of G-Objaverse (0/10010, 0/10010.tar)"
@@ -108,12 +121,22 @@ def _take(path: Path, target: Path, least: int, copy: bool, depth: bool) -> None
     names = {p.name for p in target.iterdir()} if target.is_dir() else set()
     broken = (target / GOBJAVERSE).is_symlink() and names <= {GOBJAVERSE, GOBJAVERSE_DEPTH}
     with atomic_folder(target, replace=broken) as part:
+        made, views = part / GOBJAVERSE, _views_of(path)
         if path.is_file():
-            _unpack(path, part / GOBJAVERSE, _MOST)
+            _unpack(path, made, _MOST)
         elif copy:
-            _copy(_views_of(path), part / GOBJAVERSE)
+            for view in sorted(p for p in views.iterdir() if re.fullmatch("[0-9]{5}", p.name)):
+                for suffix, most in _MOST.items():
+                    file = inside(views, f"{view.name}/{view.name}{suffix}", str(views))
+                    if file.is_file():
+                        (made / view.name).mkdir(parents=True, exist_ok=True)
+                        (made / view.name / file.name).write_bytes(read_bytes(file, most))
         else:
-            _link(_views_of(path), part / GOBJAVERSE)
+            try:
+                made.symlink_to(views.resolve(), target_is_directory=True)
+            except OSError as error:
+                reason = error.strerror or error
+                raise UserError(f"{made.name}: cannot be linked ({reason}); give --copy") from error
         files = _checked(part, path, least)
         if depth:
             (part / GOBJAVERSE_DEPTH).mkdir()
@@ -123,26 +146,6 @@ def _take(path: Path, target: Path, least: int, copy: bool, depth: bool) -> None
 def _views_of(path: Path) -> Path:
     """The folder of an object's views."""
     return path / GOBJAVERSE if (path / GOBJAVERSE).is_dir() else path
-
-
-def _link(views: Path, target: Path) -> None:
-    try:
-        target.symlink_to(views.resolve(), target_is_directory=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise UserError(f"{target.name}: cannot be linked ({reason}); give --copy") from error
-
-
-def _copy(views: Path, target: Path) -> None:
-    target.mkdir()
-    for view in sorted(views.iterdir()):
-        for suffix, most in _MOST.items():
-            if not re.fullmatch("[0-9]{5}", view.name):
-                continue
-            file = inside(views, f"{view.name}/{view.name}{suffix}", str(views))
-            if file.is_file():
-                (target / view.name).mkdir(exist_ok=True)
-                (target / view.name / file.name).write_bytes(read_bytes(file, most))
 
 
 def _unpack(path: Path, target: Path, most: Mapping[str, int]) -> None:
@@ -193,3 +196,78 @@ def _add_depth(files: ObjectFiles, target: Path, path: Path) -> None:
             convert(wanted)
         except UserError as error:
             raise UserError(f"{path}: {error}") from error
+
+
+class DepthFile(NamedTuple):
+    """One view's depth.
+
+    Attributes:
+        source: the ``_nd.exr`` file.
+        target: the picture to write.
+        distance: of the camera from the object's centre, object units.
+    """
+
+    source: Path
+    target: Path
+    distance: float
+
+
+def check_package() -> None:
+    """Raises UserError where the package OpenEXR is not installed."""
+    if find_spec("OpenEXR") is None:
+        raise UserError("--depth: needs the package OpenEXR: pip install OpenEXR")
+
+
+def convert(files: Sequence[DepthFile]) -> None:
+    """Writes the depth of one object's views, in a child process.
+
+    Raises:
+        UserError: a file is missing, damaged, or has no depth.
+    """
+    for file in files:
+        if not file.source.is_file():
+            raise UserError(f"{file.source.name}: no such file")
+        if file.source.stat().st_size > MOST:
+            raise UserError(f"{file.source.name}: over {MOST >> 20} MB")
+    for _, result in run_each(_convert, [tuple(files)], seconds=_SECONDS, memory=_MEMORY):
+        if isinstance(result, Failed):
+            raise UserError(f"{SUFFIX.lstrip('_')} files: {result.reason}")
+
+
+def _convert(files: Sequence[DepthFile]) -> None:
+    """In the child."""
+    import OpenEXR  # pyright: ignore[reportMissingImports]: optional
+
+    for source, target, distance in files:
+        try:
+            header = OpenEXR.File(str(source), separate_channels=True, header_only=True).header()
+            low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
+            if not 0 < int(np.prod(high - low + 1)) <= MAX_PIXELS:
+                reason = f"has more than {MAX_PIXELS >> 20} megapixels, or none"
+                raise UserError(f"{source.name}: {reason}")
+            channels = OpenEXR.File(str(source), separate_channels=True).channels()
+            depth = np.asarray(channels["A"].pixels, dtype=np.float32)
+        except UserError:
+            raise
+        except KeyError as error:
+            raise UserError(f"{source.name}: has no fourth channel, the depth") from error
+        except Exception as error:  # the library's own kinds
+            raise UserError(f"{source.name}: cannot be read ({error})") from error
+        Image.fromarray(depth_steps(depth, distance)).save(target)
+
+
+def depth_steps(depth: np.ndarray, distance: float) -> np.ndarray:
+    """Depth along the optical axis as a 16-bit picture of steps of ``GOBJAVERSE_DEPTH_UNIT``.
+
+    Args:
+        depth: ``[H, W]`` float32, object units; not finite or out of the object's reach where
+            there is no surface.
+        distance: of the camera from the object's centre, object units.
+
+    Returns:
+        ``[H, W]`` uint16; 0 where there is no surface.
+    """
+    with np.errstate(invalid="ignore"):
+        there = np.isfinite(depth) & (np.abs(depth - distance) <= _REACH)
+    steps = np.rint(np.where(there, depth, 0) / GOBJAVERSE_DEPTH_UNIT)
+    return np.clip(steps, 0, 65535).astype(np.uint16)
