@@ -135,7 +135,8 @@ class World:
         known = inspect.signature(DistributedDataParallel).parameters
         name = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
         group = dist.new_group(backend="nccl") if self.device.type == "cuda" else None
-        return DistributedDataParallel(model, process_group=group, **{name: False})
+        options: dict[str, Any] = {name: False, "process_group": group}
+        return DistributedDataParallel(model, **options)
 
     def agree(self, facts: Callable[[], Mapping[str, Mapping[str, object]]]) -> None:
         """Refuses processes that would not do the same work.

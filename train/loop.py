@@ -246,25 +246,26 @@ class Trainer:
         if self._validated == self.step or not self.config.run.val_every:
             return
         self._validated = self.step
-        self.world.on_main(self._validate_alone)
 
-    def _validate_alone(self) -> None:
-        if self.log is None or not self.data.held_out:
-            return
-        run, size = self.config.run, self.config.views.size
-        held_out = fixed_batches(self.data, self.model.config, size, self._unread)
-        objective = Objective(self._weights(validates=True), self.lpips)
-        best = [*self.models.values()][-1]
-        figures, rows = validate(best, held_out, objective, self.world.device)
-        self._name_failures()
-        if not rows:
-            self.log.warn(self.step, "no validation: none of its objects can be read")
-            return
-        self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
-        text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
-        say(f"step {self.step}: validation {text}")
-        self.log.sample(self.step, run.out / "samples" / f"step_{self.step:06d}.png", rows)
-        self.log.page()
+        def alone() -> None:
+            if self.log is None or not self.data.held_out:
+                return
+            run, best = self.config.run, [*self.models.values()][-1]
+            size, weights = self.config.views.size, self._weights(validates=True)
+            held_out = fixed_batches(self.data, self.model.config, size, self._unread)
+            objective = Objective(weights, self.lpips)
+            figures, rows = validate(best, held_out, objective, self.world.device)
+            self._name_failures()
+            if not rows:
+                self.log.warn(self.step, "no validation: none of its objects can be read")
+                return
+            self.log.write("val", self.step, minutes=self.elapsed / 60, **figures)
+            text = " ".join(f"{name} {value:.4g}" for name, value in figures.items())
+            say(f"step {self.step}: validation {text}")
+            self.log.sample(self.step, run.out / "samples" / f"step_{self.step:06d}.png", rows)
+            self.log.page()
+
+        self.world.on_main(alone)
 
     def save(self) -> None:
         """Writes a checkpoint on the main process, once per step; the others wait."""

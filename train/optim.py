@@ -180,8 +180,13 @@ class Schedule:
             return self._planned(step, total)
         if total <= began:
             return self.since.share
-        if not self.since.rises:
-            return self._rest(step, total, began)
+        if not self.since.rises:  # the rest of the fall, from there to 0 at the new end
+            share, left = self.since.share, (total - step) / (total - began)
+            if self.optim.schedule == "trapezoid":
+                falls = min(self.optim.decay_share * total, total - began)
+                return share * _clamped((total - step) / falls)
+            phase = math.acos(2 * share - 1) / math.pi
+            return _half_cosine(1 - (1 - phase) * left)
         rise = min(1.0, (step - began + 1) / (_RISE * (total - began) + 1))
         return self.since.share + rise * (self._planned(step, total) - self.since.share)
 
@@ -195,15 +200,6 @@ class Schedule:
         if self.optim.schedule == "trapezoid":
             return _clamped((total - step) / (self.optim.decay_share * total))
         return _half_cosine((step - warmup) / max(1e-12, total - warmup))
-
-    def _rest(self, step: float, total: float, began: float) -> float:
-        """The rest of the fall, from the rate at the change to 0 at the new end."""
-        share, left = self.since.share, (total - step) / (total - began)
-        if self.optim.schedule == "trapezoid":
-            falls = min(self.optim.decay_share * total, total - began)
-            return share * _clamped((total - step) / falls)
-        phase = math.acos(2 * share - 1) / math.pi
-        return _half_cosine(1 - (1 - phase) * left)
 
     def after(self, old: Schedule, step: int, elapsed: float) -> tuple[Schedule, str | None]:
         """Goes on where a run of perhaps another length stands.

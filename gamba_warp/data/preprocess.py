@@ -63,7 +63,16 @@ def prepare(
     cut = mask is not None or has_alpha(rgba)
     rgba = shrink(rgba, WORKING_SIZE)
     if not cut:
-        rgba = _cut_out(path, rgba[..., :3], segmenter)
+        rgb = rgba[..., :3]
+        matte = plain_matte(rgb)
+        if matte is None and segmenter is None:
+            raise UserError(
+                f"{path}: cannot tell object from background; give a picture with a transparent or "
+                "plain background, --mask FILE, or --sam FILE (a Segment Anything checkpoint)"
+            )
+        if matte is None and segmenter is not None:
+            matte = np.dstack([rgb, segmenter(rgb)]).astype(np.float32)
+        rgba = cast(np.ndarray, matte)
     try:
         return recenter(rgba)
     except ValueError as error:
@@ -87,18 +96,6 @@ def read_mask(mask: str | Path, path: str | Path) -> np.ndarray:
         raise UserError(f"{mask}: the mask is {stated[0]} but {path} is {stated[1]}")
     values = load_rgba(mask, longest=WORKING_SIZE)
     return values[..., :3].mean(-1) * values[..., 3]
-
-
-def _cut_out(path: str | Path, rgb: np.ndarray, segmenter: Segmenter | None) -> np.ndarray:
-    rgba = plain_matte(rgb)
-    if rgba is not None:
-        return rgba
-    if segmenter is None:
-        raise UserError(
-            f"{path}: cannot tell object from background; give a picture with a transparent or "
-            "plain background, --mask FILE, or --sam FILE (a Segment Anything checkpoint)"
-        )
-    return np.dstack([rgb, segmenter(rgb)]).astype(np.float32)
 
 
 def plain_matte(rgb: np.ndarray) -> np.ndarray | None:
@@ -240,20 +237,16 @@ class SamSegmenter:
         except ImportError as error:
             raise UserError("--sam needs kornia 0.9, and so Python 3.11 or newer") from error
         try:
-            config = SamConfig(model_type=self._model_type(path), checkpoint=str(path))
+            # Its tensors are as large as it says, before kornia reads it.
+            positions = read_torch(path).get("image_encoder.pos_embed")
+            kind = "mobile_sam" if positions is None else self._WIDTHS[positions.shape[-1]]
+            config = SamConfig(model_type=kind, checkpoint=str(path))
             self._prompter = VisualPrompter(config, device=torch.device(device))
         except Exception as error:  # torch.load raises errors of many types on other files
             reason = first_line(error)
             raise UserError(
                 f"--sam {path}: not a Segment Anything checkpoint ({reason})"
             ) from error
-
-    def _model_type(self, path: Path) -> str:
-        state = read_torch(path)  # its tensors are as large as it says, before kornia reads it
-        positions = state.get("image_encoder.pos_embed")
-        if positions is None:
-            return "mobile_sam"
-        return self._WIDTHS[positions.shape[-1]]
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
         """Returns alpha ``[H, W]`` float32, 0 or 1, from RGB ``[H, W, 3]`` in [0, 1]."""

@@ -8,8 +8,8 @@ from contextlib import suppress
 import pytest
 import torch
 from helpers import micro
-from helpers.micro import ALONE, lines, run
-from safetensors.torch import load_file
+from helpers.micro import ALONE, lines, run, same_weights
+from helpers.refusals import refused
 
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
@@ -55,8 +55,7 @@ def test_a_run_has_the_same_weights_for_any_number_of_threads(data, tmp_path):
     for workers in (1, 3):
         changed = {"views": {**views, "workers": workers}, "length": {"steps": 4}}
         assert run(data, tmp_path / str(workers), **changed) == 0
-    one, three = (load_file(tmp_path / name / "model.safetensors") for name in "13")
-    assert all(torch.equal(one[name], three[name]) for name in one)
+    assert same_weights(*(tmp_path / name / "model.safetensors" for name in "13"))
     losses = [[r["loss"] for r in lines(tmp_path / name, "train")] for name in "13"]
     assert losses[0] == losses[1] and len(losses[0]) == 4
 
@@ -97,10 +96,7 @@ def test_an_error_is_raised_in_its_step(data, workers, monkeypatch):
     monkeypatch.setattr(batches, "load_sample", load)
     made = batches_of(data, 1, workers)
     assert made.take(0).uids == order[:1] and not made.failures
-    with pytest.raises(
-        UserError, match=r"^3 of 5 objects cannot be read; the last: cloud.: spoilt"
-    ):
-        made.take(1)
+    refused(r"^3 of 5 objects cannot be read; the last: cloud.: spoilt", made.take, 1)
     made.close()
 
 
@@ -175,8 +171,7 @@ def test_pictures_kept_on_the_device_train_as_the_files_do(data, tmp_path):
     for kept in (False, True):
         changed = {"views": {**views, "cache_device": kept}, "length": {"steps": 3}}
         assert run(data, tmp_path / str(kept), **changed) == 0
-    files, device = (load_file(tmp_path / f"{k}/model.safetensors") for k in (False, True))
-    assert all(torch.equal(files[name], device[name]) for name in files)
+    assert same_weights(*(tmp_path / f"{kept}/model.safetensors" for kept in (False, True)))
 
 
 def test_kept_pictures_need_no_file_any_more(tmp_path):
@@ -193,10 +188,8 @@ def test_kept_pictures_need_no_file_any_more(tmp_path):
     assert torch.equal(got.cameras.Ks, want.cameras.Ks)
     assert kept.load(1, size=micro.SIZE).images.shape == (6, 16, 16, 4)
     for views, size, reason in (([6], 12, "view 6"), ([], 12, "no views"), (None, 9, "no such")):
-        with pytest.raises(UserError, match=reason):
-            kept.load("cloudb", views, size)
-    with pytest.raises(UserError, match="clouda/.*png"):
-        kept.load("clouda", [0], 12)
+        refused(reason, kept.load, "cloudb", views, size)
+    refused("clouda/.*png", kept.load, "clouda", [0], 12)
 
 
 def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
@@ -205,8 +198,7 @@ def test_a_gpu_without_room_for_the_pictures_is_told(data, monkeypatch):
     monkeypatch.setattr(
         torch, "tensor", lambda *a, device=None, real=torch.tensor, **k: real(*a, **k)
     )
-    with pytest.raises(UserError, match=r"^--cache-device: 30 views take 0.0 GB"):
-        open_data(config, GPU)
+    refused(r"^--cache-device: 30 views take 0.0 GB", open_data, config, GPU)
 
 
 def test_a_small_pack_for_a_large_training_is_told(data, tmp_path):

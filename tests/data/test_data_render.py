@@ -10,12 +10,12 @@ import torch
 import trimesh
 from helpers.children import murderous_object
 from helpers.meshes import MTL, QUAD, render_views, write_quad
+from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.cameras import from_opengl, intrinsics
 from gamba_warp.cli import run
 from gamba_warp.data.dataset import open_dataset, split_of
-from gamba_warp.errors import UserError
 from gamba_warp.files import PART
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import load_mesh, to_linear
@@ -234,8 +234,7 @@ def test_resume_renders_only_what_is_missing(meshes, tmp_path, capsys):
     assert contents(out) == before
     for name, time in times.items():
         assert (out / name / "000.webp").stat().st_mtime_ns == time
-    with pytest.raises(UserError, match="rendered with other settings"):
-        render_views(meshes, out, views=3, size=16, workers=1)
+    refused("rendered with other settings", render_views, meshes, out, views=3, size=16, workers=1)
 
 
 def test_failures_are_listed_and_do_not_stop_the_rest(meshes, tmp_path, capsys):
@@ -290,8 +289,7 @@ def test_uids_of_paths(tmp_path):
     assert [mesh.uid for mesh in find_meshes(tmp_path)] == ["chair", "chair-stl", "old_chair_2_"]
     entries = [{"uid": "same", "model": name} for name in ("chair/chair.ply", "chair.stl")]
     (tmp_path / "catalogue.json").write_text(json.dumps({"objects": entries}))
-    with pytest.raises(UserError, match="would both be 'same'"):
-        find_meshes(tmp_path)
+    refused("would both be 'same'", find_meshes, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -311,22 +309,17 @@ def test_uids_of_paths(tmp_path):
     ],
 )
 def test_bad_options(meshes, tmp_path, options, message):
-    with pytest.raises(UserError, match=message):
-        render_views(meshes, tmp_path / "data", **options)
+    refused(message, render_views, meshes, tmp_path / "data", **options)
 
 
 def test_bad_folders(meshes, tmp_path):
-    with pytest.raises(UserError, match="no such folder"):
-        render_views(tmp_path / "nowhere", tmp_path / "data")
+    refused("no such folder", render_views, tmp_path / "nowhere", tmp_path / "data")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match="no mesh files"):
-        render_views(tmp_path / "empty", tmp_path / "data")
+    refused("no mesh files", render_views, tmp_path / "empty", tmp_path / "data")
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot write into"):
-        render_views(meshes, tmp_path / "file")
+    refused("cannot write into", render_views, meshes, tmp_path / "file")
     (meshes / "catalogue.json").write_text('{"objects": [{}]}')
-    with pytest.raises(UserError, match="catalogue.json"):
-        render_views(meshes, tmp_path / "data")
+    refused("catalogue.json", render_views, meshes, tmp_path / "data")
 
 
 def test_limit(meshes, tmp_path):
@@ -361,10 +354,8 @@ def test_hostile_catalogues_are_one_line(tmp_path, entry, reason):
     write_box(folder / "a.ply")
     entries = [{"uid": "box", "model": "a.ply", **entry}]
     (folder / "catalogue.json").write_text(json.dumps({"objects": entries}))
-    with pytest.raises(UserError) as caught:
-        render_views(folder, tmp_path / "out", views=1, size=16, workers=1)
-    message = str(caught.value)
-    assert "catalogue.json: " in message and reason in message and "\n" not in message
+    message = refused(None, render_views, folder, tmp_path / "out", views=1, size=16, workers=1)
+    assert "catalogue.json: " in message and reason in message
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 
@@ -372,8 +363,7 @@ def test_the_same_model_twice(tmp_path):
     write_box(tmp_path / "a.ply")
     entries = [{"uid": uid, "model": name} for uid, name in (("x", "a.ply"), ("y", "./a.ply"))]
     (tmp_path / "catalogue.json").write_text(json.dumps({"objects": entries}))
-    with pytest.raises(UserError, match="is there twice"):
-        find_meshes(tmp_path)
+    refused("is there twice", find_meshes, tmp_path)
 
 
 def test_long_and_odd_names_of_files_are_fit_for_folders(tmp_path):

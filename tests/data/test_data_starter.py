@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers.refusals import refused
 
 from gamba_warp.data.dataset import SPLITS, open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.images import load_rgba
 from gamba_warp.train.data.starter import starter
 from gamba_warp.versions import import_open3d
@@ -82,6 +82,5 @@ def test_geometry_lies_in_the_views_frame(uid):
 
 def test_folders_of_others_are_not_removed(tmp_path):
     (tmp_path / "out" / "data").mkdir(parents=True)
-    with pytest.raises(UserError, match="data: was not made by this command"):
-        starter(tmp_path / "furniture", tmp_path / "out")
+    refused("data: was not made by this command", starter, tmp_path / "furniture", tmp_path / "out")
     assert (tmp_path / "out" / "data").is_dir()

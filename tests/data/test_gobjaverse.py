@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.published.gobjaverse import ELEVATION, VIEWS, camera, write_object
+from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.errors import UserError
 from gamba_warp.model.posing import relative_cameras
 
 
@@ -74,8 +74,7 @@ def test_views_that_lack_a_file_are_passed_over(tmp_path, suffix):
     for view in views.iterdir():
         for path in view.glob("?????.png"):
             path.unlink()
-    with pytest.raises(UserError, match="no views that have both picture and camera"):
-        open_dataset(tmp_path).load(0)
+    refused("no views that have both picture and camera", open_dataset(tmp_path).load, 0)
 
 
 def test_depth_beside_the_views(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 from helpers.meshes import render_views
+from helpers.refusals import refused
 
 from gamba_warp.data.dataset import open_dataset, split_of
 from gamba_warp.errors import UserError
@@ -66,8 +67,7 @@ def test_without_the_new_options_nothing_changes_and_older_sets_go_on(boxes, tmp
     path.write_text(json.dumps(values))
     assert render_views(boxes, out, **QUICK) == 0
     assert "2 of 2 objects already in" in capsys.readouterr().out
-    with pytest.raises(UserError, match="rendered with other settings"):
-        render_views(boxes, out, stretch=1.2, **QUICK)
+    refused("rendered with other settings", render_views, boxes, out, stretch=1.2, **QUICK)
 
 
 def test_only_the_objects_of_one_part(tmp_path):
@@ -169,6 +169,5 @@ def test_textures_are_colours_and_have_their_patterns():
 def test_another_catalogue_is_not_overwritten(tmp_path):
     (tmp_path / "catalogue.json").write_text('{"objects": []}')
     (tmp_path / "chair.glb").write_bytes(b"")
-    with pytest.raises(UserError, match="there are other objects"):
-        data_primitives_command(tmp_path, count=1)
+    refused("there are other objects", data_primitives_command, tmp_path, count=1)
     assert (tmp_path / "catalogue.json").read_text() == '{"objects": []}'

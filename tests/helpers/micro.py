@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
@@ -117,6 +118,12 @@ def options(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dic
 def run(data: Path, out: Path, model: tuple[str, ...] = MODEL, **groups: dict) -> int:
     """Trains with ``options`` in this process alone; returns the exit code."""
     return train(options(data, out, model, **groups), ALONE)
+
+
+def same_weights(a: Path, b: Path) -> bool:
+    """Whether two files of weights hold the same tensors, to the bit."""
+    one, other = load_file(a), load_file(b)
+    return one.keys() == other.keys() and all(torch.equal(one[n], other[n]) for n in one)
 
 
 def lines(out: Path, event: str) -> list[dict]:

@@ -6,7 +6,6 @@ import signal
 
 import pytest
 import torch
-from helpers import micro
 from helpers.disk import full_at
 from helpers.micro import run
 
@@ -17,11 +16,6 @@ from gamba_warp.files import PART, only_process
 from gamba_warp.train import loop
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.log import Quiet, RunLog, say
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds", 2)
 
 
 def leftovers(folder):

@@ -8,7 +8,8 @@ import pytest
 import torch
 import tyro
 from helpers import micro
-from helpers.micro import lines, run
+from helpers.micro import lines, run, same_weights
+from helpers.refusals import refused
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -23,21 +24,11 @@ STILL = {"optim": {"lr": 1e-30, "weight_decay": 0.0, "ema": 0.0}, "length": {"st
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds")
-
-
-@pytest.fixture(scope="module")
 def done(data, tmp_path_factory):
     """A run of eight steps, with a checkpoint at four."""
     out = tmp_path_factory.mktemp("runs") / "done"
     assert run(data, out, length={"steps": 8}, run={"save_every": 4}, optim={"ema": 0.5}) == 0
     return out
-
-
-def same(a, b):
-    a, b = load_file(a), load_file(b)
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 @pytest.mark.parametrize("total", [6, 12])
@@ -95,14 +86,12 @@ def test_init_takes_a_checkpoint_a_run_or_a_model(data, done, tmp_path, capsys):
     for number, (source, wanted) in enumerate(sources.items()):
         out = tmp_path / str(number)
         assert run(data, out, run={"init": source}, **STILL) == 0
-        assert same(out / "model.safetensors", wanted)
+        assert same_weights(out / "model.safetensors", wanted)
     assert "of what run they are is not known" in capsys.readouterr().out
     for file in ("ema.safetensors", "model.safetensors"):
-        assert not same(newest / file, list_checkpoints(done)[0] / file)
-    with pytest.raises(UserError, match="holds neither a model nor a checkpoint"):
-        run(data, tmp_path / "x", run={"init": data})
-    with pytest.raises(UserError, match="no such file"):
-        run(data, tmp_path / "x", run={"init": tmp_path / "none"})
+        assert not same_weights(newest / file, list_checkpoints(done)[0] / file)
+    refused("holds neither a model nor a checkpoint", run, data, tmp_path / "x", run={"init": data})
+    refused("no such file", run, data, tmp_path / "x", run={"init": tmp_path / "none"})
     assert not (tmp_path / "x").exists()
 
 
@@ -112,7 +101,7 @@ def test_init_passes_over_a_damaged_checkpoint(data, done, tmp_path, capsys):
     first, last = list_checkpoints(copy)
     (last / "ema.safetensors").write_bytes(b"")
     assert run(data, tmp_path / "a", run={"init": copy}, **STILL) == 0
-    assert same(tmp_path / "a" / "model.safetensors", first / "ema.safetensors")
+    assert same_weights(tmp_path / "a" / "model.safetensors", first / "ema.safetensors")
     assert f"going on from {first}" in capsys.readouterr().out
     with pytest.raises(UserError, match="--init .*step_000008/ema.safetensors: damaged"):
         run(data, tmp_path / "b", run={"init": last}, **STILL)

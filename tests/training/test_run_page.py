@@ -7,19 +7,13 @@ import re
 import xml.etree.ElementTree as ET
 
 import pytest
-from helpers import micro
 from helpers.micro import run
+from helpers.refusals import refused
 
 from gamba_warp import cli
-from gamba_warp.errors import UserError
 from gamba_warp.pages.curves import draw_curves
 from gamba_warp.pages.run import write_run_page
 from gamba_warp.pages.run_log import read_run_log
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return micro.write_dataset(tmp_path_factory.mktemp("data") / "clouds")
 
 
 def write(path, *lines):
@@ -97,11 +91,9 @@ def test_a_log_without_figures_gives_a_sentence(tmp_path, content):
 
 
 def test_no_log_is_one_line(tmp_path):
-    with pytest.raises(UserError, match=r"log\.jsonl: no such file"):
-        draw_curves(read_run_log(tmp_path / "log.jsonl"))
+    refused(r"log\.jsonl: no such file", read_run_log, tmp_path / "log.jsonl")
     (tmp_path / "log.jsonl").mkdir()
-    with pytest.raises(UserError, match="not a plain file"):
-        write_run_page(tmp_path)
+    refused("not a plain file", write_run_page, tmp_path)
     assert not (tmp_path / "index.html").exists()
 
 

@@ -155,7 +155,17 @@ def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
         if INSTALLED.is_dir():
             return INSTALLED
         deb = _download(scratch)
-    _unpack_deb(deb, scratch)
+    # A .deb is an ar archive that holds a tar.
+    with tempfile.TemporaryFile(dir=scratch) as data:
+        name = read_ar(deb, "data.tar", data)
+        with open_tar(data, f"{deb}: {name}", scratch) as members:
+            for member in members:
+                if member.name.endswith(".sh3f"):
+                    file = scratch / plain_name(PurePosixPath(member.name).name, str(deb))
+                    if file.exists():
+                        raise UserError(f"{deb}: {file.name} is there twice")
+                    with file.open("wb") as target:
+                        shutil.copyfileobj(member.file, target)
     return scratch
 
 
@@ -176,20 +186,6 @@ def _download(folder: Path) -> Path:
         reason = (result.stderr.strip().splitlines() or ["no file came"])[-1]
         raise UserError(f"apt-get download {PACKAGE}: {reason}; or give the file by --deb")
     return files[0]
-
-
-def _unpack_deb(deb: Path, folder: Path) -> None:
-    """Puts the .sh3f files of a .deb (an ar archive that holds a tar) into ``folder``."""
-    with tempfile.TemporaryFile(dir=folder) as data:
-        name = read_ar(deb, "data.tar", data)
-        with open_tar(data, f"{deb}: {name}", folder) as members:
-            for member in members:
-                if member.name.endswith(".sh3f"):
-                    file = folder / plain_name(PurePosixPath(member.name).name, str(deb))
-                    if file.exists():
-                        raise UserError(f"{deb}: {file.name} is there twice")
-                    with file.open("wb") as target:
-                        shutil.copyfileobj(member.file, target)
 
 
 def read_properties(data: bytes) -> dict[str, str]:

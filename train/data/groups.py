@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,7 +55,22 @@ def split_groups(objects: Sequence[Named]) -> dict[str, str]:
             uid = above[uid]
         return uid
 
-    for uids in _together(objects):
+    # What belongs together by one of the rules.
+    found: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    named: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for item in objects:
+        words = words_of(item.name)
+        found["kind", item.library, words[-1]].append(item.uid)
+        if len(words) == 1:
+            found["alone", words[0]].append(item.uid)
+        for texture in item.textures:
+            found["texture", texture].append(item.uid)
+        named[(item.library, *words)].append(item.uid)
+    for whole in list(named):
+        for count in range(3, len(whole)):  # the library, and two words at least
+            if named.get(whole[:count]):
+                found[("begins", *whole[:count])] += named[whole[:count]] + named[whole]
+    for uids in found.values():
         for uid in uids:
             above[top(uid)] = top(uids[0])
     kinds: dict[str, Counter[str]] = defaultdict(Counter)
@@ -95,22 +110,3 @@ def _named_files(path: Path, line: bytes) -> Iterator[Path]:
 def words_of(name: str) -> list[str]:
     """The words of a name before any number, in small letters; the name itself if it has none."""
     return [word.lower() for word in re.findall(r"[^\W\d_]+", re.split(r"\d", name)[0]) or [name]]
-
-
-def _together(objects: Sequence[Named]) -> Iterable[list[str]]:
-    """Lists of uids that belong together by one of the rules."""
-    found: dict[tuple[str, ...], list[str]] = defaultdict(list)
-    named: dict[tuple[str, ...], list[str]] = defaultdict(list)
-    for item in objects:
-        words = words_of(item.name)
-        found["kind", item.library, words[-1]].append(item.uid)
-        if len(words) == 1:
-            found["alone", words[0]].append(item.uid)
-        for texture in item.textures:
-            found["texture", texture].append(item.uid)
-        named[(item.library, *words)].append(item.uid)
-    for whole in list(named):
-        for count in range(3, len(whole)):  # the library, and two words at least
-            if named.get(whole[:count]):
-                found[("begins", *whole[:count])] += named[whole[:count]] + named[whole]
-    return found.values()

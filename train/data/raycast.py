@@ -94,12 +94,9 @@ class _Textures:
         color = self.colors[material]
         color[:, :3] *= color[:, 3:]
         some = np.flatnonzero(self.textured[material])
-        if len(some):
-            color[some] *= self._bilinear(material[some], uv[some], level[some])
-        return color
-
-    def _bilinear(self, material: np.ndarray, uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Samples ``[P, 4]`` linear RGBA, colour premultiplied, of textures that wrap around."""
+        if not len(some):
+            return color
+        material, uv, level = material[some], uv[some], level[some]
         level = np.clip(level, 0, self.starts.shape[1] - 1)
         start = self.starts[material, level]
         width, height = self.widths[material, level], self.heights[material, level]
@@ -115,7 +112,8 @@ class _Textures:
                 weight = wx * wy * (texel[:, 3] * np.float32(1 / 255))
                 out[:, :3] += weight[:, None] * _TO_LINEAR[texel[:, :3]]
                 out[:, 3] += weight
-        return out
+        color[some] *= out
+        return color
 
 
 def _halvings(texture: np.ndarray | None) -> list[np.ndarray]:

@@ -20,7 +20,7 @@ from gamba_warp.batch import progress_bar
 from gamba_warp.data.dataset import split_of, write_split
 from gamba_warp.errors import UserError
 from gamba_warp.files import atomic_path, output_folder
-from gamba_warp.formats.catalogue import Mesh, find_meshes
+from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import load_rgba
 
@@ -91,7 +91,14 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
     if leaked:
         raise UserError(f"the icon of {leaked[0]} is of a training object")
     output_folder(out)
-    rows = [_row(meshes[uid]) for uid in sorted({*OBJECTS, *ICONS})]
+    rows = []
+    for uid in sorted({*OBJECTS, *ICONS}):
+        mesh, folders = meshes[uid], ["icons"] if uid in ICONS else []
+        if uid in OBJECTS:
+            part = split_of(mesh.group)
+            folders = [f"data ({part})", *(["meshes"] if part != "train" else []), *folders]
+        known = (mesh.attribution[name] for name in ("creator", "licence", "source"))
+        rows.append("| " + " | ".join([f"`{uid}`", mesh.name, ", ".join(folders), *known]) + " |")
     with atomic_path(out / "ATTRIBUTION.md") as temporary:
         temporary.write_text(INTRO + "\n".join(rows) + "\n", encoding="utf-8")
     for folder in made:
@@ -111,18 +118,6 @@ def starter(furniture: tyro.conf.Positional[Path], out: Path) -> None:
         if load_rgba(source)[..., 3].min() > 0:
             raise UserError(f"{source}: has no transparent background")
         shutil.copyfile(source, out / "icons" / source.name)
-
-
-def _row(mesh: Mesh) -> str:
-    known = mesh.attribution
-    folders = []
-    if mesh.uid in OBJECTS:
-        part = split_of(mesh.group)
-        folders += [f"data ({part})"] + (["meshes"] if part != "train" else [])
-    folders += ["icons"] if mesh.uid in ICONS else []
-    cells = [f"`{mesh.uid}`", mesh.name, ", ".join(folders)]
-    cells += [known["creator"], known["licence"], known["source"]]
-    return "| " + " | ".join(cells) + " |"
 
 
 if __name__ == "__main__":

@@ -220,17 +220,6 @@ def _lpips(seen: Seen) -> Tensor | None:
     return None if seen.lpips is None else seen.lpips(*pair)
 
 
-def _depth(seen: Seen) -> Tensor | None:
-    if seen.surfaces is None:
-        return None
-    return depth_loss(seen.gaussians, seen.config.ray_layers, seen.input_cameras, seen.surfaces)
-
-
-def _radial(seen: Seen) -> Tensor:
-    contours = contour_distances(seen.target_alpha[..., 0])
-    return radial_mask_loss(seen.gaussians.means, seen.cameras, contours)
-
-
 # In the order in which they are added up. A new term is one entry here, and its weight an option.
 TERMS: dict[str, Term] = {
     "rgb": Term(lambda loss, at: 1.0, lambda s: mse(s.rgb, s.target), "MSE and mask", True),
@@ -246,8 +235,22 @@ TERMS: dict[str, Term] = {
         "LPIPS",
     ),
     "ssim": Term(lambda loss, at: loss.ssim_weight, lambda s: structure(s.rgb, s.target), "SSIM"),
-    "depth": Term(lambda loss, at: 0.0 if at.validates else loss.depth_weight, _depth, "depth"),
-    "rdist": Term(radial_weight, _radial, "radial mask"),
+    "depth": Term(
+        lambda loss, at: 0.0 if at.validates else loss.depth_weight,
+        lambda s: (
+            None
+            if s.surfaces is None
+            else depth_loss(s.gaussians, s.config.ray_layers, s.input_cameras, s.surfaces)
+        ),
+        "depth",
+    ),
+    "rdist": Term(
+        radial_weight,
+        lambda s: radial_mask_loss(
+            s.gaussians.means, s.cameras, contour_distances(s.target_alpha[..., 0])
+        ),
+        "radial mask",
+    ),
 }
 
 

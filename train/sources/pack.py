@@ -7,9 +7,9 @@ import itertools
 import json
 import tarfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -104,7 +104,11 @@ def write_pack(
     with only_process(out, "packs"):
         index.size, index.split, index.shards = settings.size, settings.split, settings.shards
         index.split_version = dataset.split_version
-        index.objects = [values for values in index.objects if _is_whole(out, values)]
+        stored, index.objects = index.objects, []
+        for values in stored:  # those whose shard is there and long enough, with sound cameras
+            with suppress(UserError):
+                read_packed(out, values)
+                index.objects.append(values)
         known = {values["uid"] for values in index.objects}
         wanted = dataset.uids[:limit]
         todo = [uid for uid in wanted if uid not in known]
@@ -147,15 +151,6 @@ def _begun(out: Path, settings: PackSettings) -> Index:
     return Index(format=FORMAT, version=VERSION)
 
 
-def _is_whole(out: Path, values: dict) -> bool:
-    """Whether an object's shard is there and long enough, with sound cameras."""
-    try:
-        read_packed(out, values)
-    except UserError:
-        return False
-    return True
-
-
 def _blocks(
     dataset: ViewDataset,
     uids: list[str],
@@ -163,7 +158,7 @@ def _blocks(
     size: int | None,
     workers: int,
     failures: dict[str, str],
-) -> Iterator[Block]:
+) -> Generator[Block, None, None]:
     """Yields the objects that can be read, in their order, decoded ahead on threads."""
     pool, waiting = ThreadPoolExecutor(workers), dict[str, Future[Block]]()
     try:
@@ -260,7 +255,7 @@ def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[Entry
         if path.suffix == ".tar":
             tar = tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)
 
-        def add(name: str, content: bytes) -> None:
+        def add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
             member = tarfile.TarInfo(name)
             member.size, member.mode = len(content), 0o444
             tar.addfile(member, io.BytesIO(content))
@@ -278,9 +273,9 @@ def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[Entry
                     np.save(npy, np.ascontiguousarray(array))
                     # The array is the last part of what follows the header.
                     starts[kind] = file.tell() + tarfile.BLOCKSIZE + npy.tell() - array.nbytes
-                    add(f"{key:08d}.{kind}.npy", npy.getvalue())
+                    add(tar, f"{key:08d}.{kind}.npy", npy.getvalue())
                 about = {name: getattr(entry, name) for name in _ABOUT}
-                add(f"{key:08d}.json", json.dumps(about).encode())
+                add(tar, f"{key:08d}.json", json.dumps(about).encode())
             entries.append(msgspec.structs.replace(entry, shard=path.name, **starts))
         if tar is not None:
             tar.close()
