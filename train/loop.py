@@ -204,6 +204,8 @@ class Trainer:
                     self.elapsed, stop, senders = self.world.total(clock, *signals)
                     stop /= max(1.0, senders)
                     late = minutes is not None and self.elapsed >= 60 * minutes
+                    if minutes is not None:
+                        bar.update(min(minutes, self.elapsed / 60) - bar.n)
                     if stop or late or (self.total is not None and self.step >= self.total):
                         break
                     self._after_step(self.train_step(), bar)
@@ -222,7 +224,8 @@ class Trainer:
 
     def _after_step(self, figures: dict[str, float], bar: tqdm) -> None:
         run, minutes = self.config.run, self.config.length.minutes
-        bar.update(1 if minutes is None else min(minutes, self.elapsed / 60) - bar.n)
+        if minutes is None:
+            bar.update(1)
         self._name_failures()
         if self.log is not None and self.step % run.log_every == 0:
             shown = {"loss": f"{figures['loss']:.4f}", "psnr": f"{figures['psnr']:.1f}"}

@@ -115,8 +115,9 @@ def test_links_of_the_other_layouts_stay_inside(tmp_path):
         ({"frame": {"transform_matrix": np.eye(3, 4, 0).tolist() + [[5e8] * 4]}}, "is 0 from"),
         ({"frame": {"camera_angle_x": 4, "fl_x": None}}, "fl_x is None"),
         ({"frame": {"transform_matrix": np.diag([-1.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
+        ({"frame": {"transform_matrix": np.diag([2.0, 1, 1, 1]).tolist()}}, "is not a rotation"),
     ],
-    ids=range(28),
+    ids=range(29),
 )
 def test_numbers_without_sense_are_one_line(tmp_path, values, message):
     transforms(tmp_path / "x", **values)

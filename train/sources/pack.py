@@ -17,17 +17,8 @@ import msgspec
 import numpy as np
 
 from gamba_warp.batch import EXPECTED, progress_bar
+from gamba_warp.data import packs
 from gamba_warp.data.dataset import ViewDataset, open_dataset, splits_of
-from gamba_warp.data.packs import (
-    FORMAT,
-    INDEX,
-    KINDS,
-    VERSION,
-    Entry,
-    Index,
-    read_index,
-    read_packed,
-)
 from gamba_warp.errors import UserError, first_line
 from gamba_warp.files import atomic_path, only_process, output_folder, write_text
 from gamba_warp.untrusted.documents import MAX_BYTES
@@ -39,7 +30,7 @@ _ABOUT = ("uid", "name", "split", "attribution", "depth_unit")  # what a tar say
 SUFFIXES = {"arrays": "bin", "webdataset": "tar"}
 
 # One object as it is written: its entry, and its arrays by their names in the index.
-Block = tuple[Entry, dict[str, np.ndarray]]
+Block = tuple[packs.Entry, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -96,7 +87,9 @@ def write_pack(
     """
     dataset = open_dataset(data, settings.split)
     if dataset.layout == "pack":  # whose splits stand in its index
-        splits = {values["uid"]: str(values.get("split")) for values in read_index(data).objects}
+        splits = {
+            values["uid"]: str(values.get("split")) for values in packs.read_index(data).objects
+        }
     else:
         splits = splits_of(data, dataset.uids)
     index = _begun(out, settings)  # before the folder is made
@@ -107,7 +100,7 @@ def write_pack(
         stored, index.objects = index.objects, []
         for values in stored:  # those whose shard is there and long enough, with sound cameras
             with suppress(UserError):
-                read_packed(out, values)
+                packs.read_packed(out, values)
                 index.objects.append(values)
         known = {values["uid"] for values in index.objects}
         wanted = dataset.uids[:limit]
@@ -134,10 +127,10 @@ def write_pack(
     return Packed(len(todo) - len(failures), there, len(shards), failures)
 
 
-def _begun(out: Path, settings: PackSettings) -> Index:
+def _begun(out: Path, settings: PackSettings) -> packs.Index:
     """The index of a pack that is there, or a new one; a folder of anything else is refused."""
-    if (out / INDEX).exists():
-        index = read_index(out)
+    if (out / packs.INDEX).exists():
+        index = packs.read_index(out)
         old = {"--size": index.size, "--split": index.split, "--format": index.shards}
         for (name, value), new in zip(
             old.items(), (settings.size, settings.split, settings.shards)
@@ -148,7 +141,7 @@ def _begun(out: Path, settings: PackSettings) -> Index:
     names = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
     if strange := [name for name in names if not name.startswith((".", "shard-"))]:
         raise UserError(f"{out}: holds other files ({strange[0]}); give an empty folder")
-    return Index(format=FORMAT, version=VERSION)
+    return packs.Index(format=packs.FORMAT, version=packs.VERSION)
 
 
 def _blocks(
@@ -180,17 +173,17 @@ def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> Bloc
     files = dataset.files(uid)
     images, Ks = dataset.pictures(uid, None, size)
     views, height, width = images.shape[:3]
-    steps = dict(zip(KINDS[1:], dataset.depth_steps(uid, width, height)))
+    steps = dict(zip(packs.KINDS[1:], dataset.depth_steps(uid, width, height)))
     steps = {kind: values for kind, values in steps.items() if values is not None}
     whole = all((v == np.floor(v)).all() and v.max() < 1 << 16 for v in steps.values())
     dtype = np.dtype("<u2" if whole else "<f4")
     arrays = {"images": images, **{kind: values.astype(dtype) for kind, values in steps.items()}}
-    sums = np.zeros((views, len(KINDS)))
+    sums = np.zeros((views, len(packs.KINDS)))
     for kind, array in arrays.items():
-        sums[:, KINDS.index(kind)] = [zlib.crc32(view) for view in array]
+        sums[:, packs.KINDS.index(kind)] = [zlib.crc32(view) for view in array]
     poses = files.camera_to_world.reshape(views, -1)
     cameras = np.concatenate([poses, Ks.reshape(views, -1), sums], 1).astype("<f8")
-    entry = Entry(
+    entry = packs.Entry(
         uid=uid,
         split=split,  # pyright: ignore[reportArgumentType]: one of three, as it comes
         shard="",
@@ -208,7 +201,9 @@ def _block(dataset: ViewDataset, uid: str, split: str, size: int | None) -> Bloc
     return entry, {"cameras": cameras, **arrays}
 
 
-def _write_shards(out: Path, index: Index, blocks: Iterator[Block], settings: PackSettings) -> None:
+def _write_shards(
+    out: Path, index: packs.Index, blocks: Iterator[Block], settings: PackSettings
+) -> None:
     """Writes all objects; the index names a shard as soon as it is whole."""
     names = (f"shard-{n:05d}.{SUFFIXES[settings.shards]}" for n in itertools.count())
     free = (out / name for name in names if not (out / name).exists())
@@ -234,17 +229,17 @@ def _until(blocks: Iterator[Block], limit: int) -> Iterator[Block]:
             return
 
 
-def _write_index(out: Path, index: Index) -> None:
+def _write_index(out: Path, index: packs.Index) -> None:
     text = msgspec.json.encode(index).decode()
     if len(text) > MAX_BYTES:
         raise UserError(
             f"{out}: the index would be over {MAX_BYTES >> 20} MB, which is not read; make several "
             "packs of parts of the dataset, and train on them with --extra"
         )
-    write_text(out / INDEX, text + "\n")
+    write_text(out / packs.INDEX, text + "\n")
 
 
-def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[Entry]:
+def _write_shard(path: Path, blocks: Iterator[Block], number: int) -> list[packs.Entry]:
     """Writes a shard: bare arrays one after the other, or a WebDataset.
 
     That has ``NUMBER.json`` and a ``.npy`` an array of each object, from ``number`` on.
