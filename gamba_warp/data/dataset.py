@@ -334,7 +334,7 @@ class ViewDataset:
         unit = np.float32(files.depth_unit)
         near, far = (
             None if steps is None else torch.from_numpy(steps * unit)
-            for steps in self._steps(files, wanted[:depths], width, height)
+            for steps in self.depth_steps(uid, width, height, wanted[:depths])
         )
         viewmats = from_opengl(torch.from_numpy(files.camera_to_world[wanted])).float()
         return ObjectViews(
@@ -398,14 +398,15 @@ class ViewDataset:
         return pixels, Ks
 
     def depth_steps(
-        self, index: int | str, width: int, height: int
+        self, index: int | str, width: int, height: int, views: Sequence[int] | None = None
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Reads all depth pictures of an object, of its first and of its last surfaces.
+        """Reads depth pictures of an object, of its first and of its last surfaces.
 
         Args:
             index: as for ``load``.
             width: of the pictures, pixels.
             height: see above.
+            views: numbers of the views; None means all.
 
         Returns:
             Each ``[V, height, width]`` float32 in steps of ``files(index).depth_unit``, or None.
@@ -414,14 +415,10 @@ class ViewDataset:
             UserError: as ``load``.
         """
         files = self.files(index)
-        return self._steps(files, range(len(files.images)), width, height)
-
-    def _steps(
-        self, files: ObjectFiles, views: Sequence[int], width: int, height: int
-    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        chosen = range(len(files.images)) if views is None else views
         near, far = (
-            np.stack([_read_depth(paths[v], width, height) for v in views])
-            if paths and views
+            np.stack([_read_depth(paths[v], width, height) for v in chosen])
+            if paths and chosen
             else None
             for paths in (files.depths, files.backs)
         )

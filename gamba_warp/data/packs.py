@@ -16,7 +16,9 @@ lie in it uncompressed.
 
 from __future__ import annotations
 
+import math
 import mmap
+import os
 import stat
 import zlib
 from collections.abc import Sequence
@@ -184,7 +186,7 @@ def read_packed(folder: Path, values: dict[str, Any]) -> ObjectFiles:
         start, (shape, dtype) = getattr(entry, kind), kinds[kind]
         if start is None:
             return None
-        length = dtype.itemsize * int(np.prod(shape))
+        length = dtype.itemsize * math.prod(shape)
         _read(shard, start, entry.views * length)  # looks whether it is long enough
         return [
             _Picture(shard, start + view * length, shape, dtype, int(crc), f"{name}, {kind} {view}")
@@ -220,7 +222,7 @@ class _Picture(Stored):
         return self.name
 
     def read(self) -> np.ndarray:
-        data = _read(self.shard, self.start, self.dtype.itemsize * int(np.prod(self.shape)))
+        data = _read(self.shard, self.start, self.dtype.itemsize * math.prod(self.shape))
         if not self.checked and zlib.crc32(data) != self.crc:
             raise UserError(f"{self.shard}: {self.name}: damaged (it has another checksum)")
         self.checked = True
@@ -235,7 +237,7 @@ def _read(path: Path, start: int, count: int) -> memoryview:
         UserError: there is no such shard, or it is too short.
     """
     try:
-        status = path.stat()
+        status = os.stat(path)
         if not stat.S_ISREG(status.st_mode):
             raise UserError(f"{path}: not a plain file")
         # Reading behind the end of a file that was cut short since would kill the process.
