@@ -166,6 +166,11 @@ class Seen(NamedTuple):
     surfaces: Tensor | None = None
     config: Any = None
 
+    def compared(self) -> tuple[Tensor, Tensor]:
+        """The pictures that LPIPS compares, rendered and true; each call draws other crops."""
+        pair = self.rgb, self.target
+        return random_crops(*pair, self.lpips_crop) if self.lpips_crop else pair
+
 
 class Moment(NamedTuple):
     """Where a run stands.
@@ -213,13 +218,6 @@ def radial_weight(loss: LossConfig, at: Moment) -> float:
     return loss.rdist_weight * max(0.0, left) if loss.radial_mask and not at.validates else 0.0
 
 
-def _lpips(seen: Seen) -> Tensor | None:
-    pair = seen.rgb, seen.target
-    if seen.lpips_crop and seen.lpips is not None:
-        pair = random_crops(*pair, seen.lpips_crop)
-    return None if seen.lpips is None else seen.lpips(*pair)
-
-
 # In the order in which they are added up. A new term is one entry here, and its weight an option.
 TERMS: dict[str, Term] = {
     "rgb": Term(lambda loss, at: 1.0, lambda s: mse(s.rgb, s.target), "MSE and mask", True),
@@ -231,7 +229,7 @@ TERMS: dict[str, Term] = {
     ),
     "lpips": Term(
         lambda loss, at: loss.lpips_weight if at.validates or at.step >= loss.lpips_after else 0.0,
-        _lpips,
+        lambda s: None if s.lpips is None else s.lpips(*s.compared()),
         "LPIPS",
     ),
     "ssim": Term(lambda loss, at: loss.ssim_weight, lambda s: structure(s.rgb, s.target), "SSIM"),
