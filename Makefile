@@ -75,6 +75,7 @@ docs: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	git ls-files -z '*.h' '*.inl' | xargs -0r $(BIN)/clang-format --dry-run --Werror
 	@rm -rf build
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build .
 	$(BIN)/python -m zipfile --extract build/*.whl $(WHEEL)
@@ -83,6 +84,7 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	git ls-files -z '*.h' '*.inl' | xargs -0r $(BIN)/clang-format -i
 
 # docs/architecture.svg and the table of docs/architecture.md, from today's imports.
 architecture: $(STAMP)

@@ -135,5 +135,9 @@ def test_the_wheel_holds_the_model_its_card_two_pictures_and_whose_they_are(whee
     assert own - icons == {"ATTRIBUTION.md", "rays.json", "rays.safetensors"}
     assert card["steps"] > 0 and len(icons) == 2
     assert all(f"`{Path(icon).stem}`" in text for icon in icons)
+    sources = {
+        str(p.relative_to(ROOT)) for e in ("*.h", "*.inl") for p in ROOT.glob(f"kernels/**/{e}")
+    }
+    assert {f"gamba_warp/{name}" for name in sources} <= names
     assert wheel.stat().st_size < 12e6
     assert not any("tests" in name.split("/") for name in names)
