@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -20,7 +21,8 @@ from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
-from ..kernels.selective_scan.cuda.tuning import Tuning, use_tuning
+from ..kernels.selective_scan.cuda import launch as cuda_scan
+from ..kernels.selective_scan.cuda.launch import Tuning
 from .graphs import captured, no_wait, raster_graph, same, step_graph, within
 
 # Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
@@ -73,7 +75,7 @@ def checks(quick: bool) -> Iterator[Check]:
     for shape in SCANS[: few and 1]:
         yield Check(f"scan {shape}, bfloat16", partial(_scan, shape, torch.bfloat16))
     for tuning in TUNINGS:
-        text = ", ".join(f"{name} {value}" for name, value in vars(tuning).items())
+        text = ", ".join(f"{name} {value}" for name, value in tuning._asdict().items())
         yield Check(f"scan, {text}", partial(_tuned, tuning), cuda=True)
     for shape in CONVS[:few]:
         yield Check(f"convolution {shape}", partial(_conv, shape))
@@ -106,7 +108,7 @@ def _scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> str:
 
 
 def _tuned(tuning: Tuning, device: torch.device) -> str:
-    with use_tuning(tuning):
+    with patch.object(cuda_scan, "FORCED", tuning):
         return _scan(SCANS[3], torch.float32, device)
 
 

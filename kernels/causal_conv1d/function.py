@@ -1,10 +1,11 @@
-"""The public convolution: it checks its arguments and calls the operators of ``ops.py``."""
+"""The public convolution, and causal-conv1d's own: checks of arguments, and ``ops.py``."""
 
 from typing import Literal, overload
 
 import torch
 from torch import Tensor
 
+from ..runtime.views import tokens_first
 from .kernels import TAPS
 from .ops import conv
 
@@ -68,18 +69,6 @@ def causal_conv1d(
         TypeError: an argument is not a tensor or has another dtype.
         ValueError: a shape, a device or ``activation`` is not one of the above.
     """
-    _check(x, weight, bias, activation, initial_state)
-    out = conv(x, weight, bias, initial_state, activation is not None)
-    if not return_final_state:
-        return out
-    history = weight.shape[1] - 1
-    if initial_state is None:
-        initial_state = x.new_zeros(x.shape[0], history, x.shape[2])
-    recent = torch.cat([initial_state, x[:, max(0, x.shape[1] - history) :]], 1)
-    return out, recent[:, recent.shape[1] - history :]
-
-
-def _check(x, weight, bias, activation, initial_state) -> None:
     tensors = {"x": x, "weight": weight, "bias": bias, "initial_state": initial_state}
     for name, value in tensors.items():
         if value is None and name in ("bias", "initial_state"):
@@ -104,3 +93,57 @@ def _check(x, weight, bias, activation, initial_state) -> None:
         raise TypeError(f"initial_state has dtype {initial_state.dtype}, x has {x.dtype}")
     if activation not in ACTIVATIONS:
         raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")
+    out = conv(x, weight, bias, initial_state, activation is not None)
+    if not return_final_state:
+        return out
+    history = weight.shape[1] - 1
+    if initial_state is None:
+        initial_state = x.new_zeros(x.shape[0], history, x.shape[2])
+    recent = torch.cat([initial_state, x[:, max(0, x.shape[1] - history) :]], 1)
+    return out, recent[:, recent.shape[1] - history :]
+
+
+def causal_conv1d_fn(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    seq_idx: None = None,
+    initial_states: Tensor | None = None,
+    return_final_states: bool = False,
+    final_states_out: Tensor | None = None,
+    activation: str | None = None,
+) -> Tensor | tuple[Tensor, Tensor]:
+    """Does what causal-conv1d's ``causal_conv1d_fn`` does, with the same arguments and layout.
+
+    Args:
+        x: ``[B, D, L]`` float32, bfloat16 or float16.
+        weight: ``[D, W]``, W from 2 to 4.
+        bias: ``[D]``, or None.
+        seq_idx: must be None.
+        initial_states: ``[B, D, W-1]``, or None.
+        return_final_states: also return ``[B, D, W-1]``.
+        final_states_out: where to write the final states, or None.
+        activation: None, "silu" or "swish".
+
+    Returns:
+        ``[B, D, L]`` in x's dtype, and the final states if asked for.
+
+    Raises:
+        TypeError: as ``causal_conv1d``.
+        ValueError: as ``causal_conv1d``; also for a ``seq_idx``.
+    """
+    if seq_idx is not None:
+        raise ValueError("seq_idx is given; packed sequences are not supported")
+    out, final = causal_conv1d(
+        tokens_first(x, "x"),
+        weight,
+        bias,
+        activation=activation,
+        initial_state=tokens_first(initial_states, "initial_states"),
+        return_final_state=True,
+    )
+    out, final = out.transpose(1, 2), final.transpose(1, 2)
+    if final_states_out is not None:
+        with torch.no_grad():
+            final_states_out.copy_(final)
+    return (out, final) if return_final_states else out

@@ -5,6 +5,7 @@ floats, one thread each, on CUDA. Equations 1 and 2 of README.md.
 """
 
 import functools
+from pathlib import Path
 from typing import no_type_check
 
 import torch
@@ -12,8 +13,8 @@ import warp as wp
 
 from ..runtime import rows as cpu_values
 from ..runtime import scalars as cuda_values
-from ..runtime.lanes import WARP_DTYPES
-from .cpu import strip as cpu_strip
+from ..runtime.lanes import ACTIVATIONS, PRELUDE, WARP_DTYPES
+from ..runtime.native import native
 
 TAPS = 4
 STRIP = 16  # tokens of a forward task; few, because each row may lie in another page
@@ -40,9 +41,32 @@ def _strip(device_type: str, io: torch.dtype):
     same bits, takes 1.1 to 1.4 times as long there.
     """
     value, channels_of_value, load, store, times, fma, sigmoid = _values(device_type, io)
-    if channels_of_value > 1:
-        return cpu_strip(io)
     scalar = WARP_DTYPES[io]
+    if channels_of_value > 1:
+        text = native(Path(__file__).with_name("strip.inl"))
+
+        @wp.func_native(PRELUDE + ACTIVATIONS + cpu_values.ROWS + text)
+        def strip(
+            x_in: wp.array3d(dtype=scalar),
+            b: int,
+            t0: int,
+            count: int,
+            d: int,
+            width: int,
+            w0: value,
+            w1: value,
+            w2: value,
+            w3: value,
+            bias: value,
+            first: value,
+            second: value,
+            third: value,
+            use_silu: int,
+            stream: int,
+            y_out: wp.array3d(dtype=scalar),
+        ): ...
+
+        return strip
 
     @wp.func
     @no_type_check

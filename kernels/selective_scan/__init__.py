@@ -1,6 +1,5 @@
 """Mamba's selective scan, on CUDA and on the CPU."""
 
-from .dropin import selective_scan_fn
-from .function import selective_scan, selective_scan_state
+from .function import selective_scan, selective_scan_fn, selective_scan_state
 
 __all__ = ["selective_scan", "selective_scan_fn", "selective_scan_state"]

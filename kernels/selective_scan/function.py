@@ -1,4 +1,4 @@
-"""The public scan: it checks its arguments and calls the operators of ``ops.py``."""
+"""The public scan, and mamba-ssm's own: checks of their arguments, and a call of ``ops.py``."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
+from ..runtime.views import tokens_first
 from . import ops
+from .problem import DISCRETIZATIONS, Scan
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
-DISCRETIZATIONS = ("mamba", "bilinear", "zoh")
 MAX_STATES = 256
 
 
@@ -53,7 +54,7 @@ def _check_common(u, delta, A, delta_bias, initial_state, discretization) -> int
     if u.device.type not in ("cpu", "cuda"):
         raise ValueError(f"u is on {u.device}, allowed are cpu and cuda")
     if discretization not in DISCRETIZATIONS:
-        raise ValueError(f"discretization is {discretization!r}, allowed: {DISCRETIZATIONS}")
+        raise ValueError(f"discretization is {discretization!r}, allowed: {(*DISCRETIZATIONS,)}")
     batch, _, channels = u.shape
     states = A.shape[1] if isinstance(A, Tensor) and A.dim() == 2 else 0
     _check("A", A, (channels, states), (torch.float32,), u.device)
@@ -68,8 +69,12 @@ def _check_common(u, delta, A, delta_bias, initial_state, discretization) -> int
     return states
 
 
-def _saves(tensors: tuple[Tensor | None, ...]) -> bool:
-    return torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors)
+def _scan(*args) -> tuple[Tensor, Tensor]:
+    """Runs what the fields of a ``Scan`` say, and keeps states if a gradient may be asked for."""
+    tensors = (x for x in args if isinstance(x, Tensor))
+    save = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    out, last, _ = ops.scan(*Scan(*args, save))
+    return out, last
 
 
 @overload
@@ -171,9 +176,8 @@ def selective_scan(
         _check("D", D, (u.shape[2],), DTYPES, u.device)
     if z is not None:
         _check("z", z, tuple(u.shape), (u.dtype,), u.device)
-    tensors = (u, delta, A, B, C, D, z, delta_bias, initial_state)
-    options = delta_softplus, discretization, _saves(tensors), ops.tuning_now(u)
-    out, last, _ = ops.scan(*tensors, *options)
+    args = (u, delta, A, B, C, D, z, delta_bias, initial_state, delta_softplus, discretization)
+    out, last = _scan(*args)
     return (out, last) if return_last_state else out
 
 
@@ -208,7 +212,89 @@ def selective_scan_state(
         ValueError: as ``selective_scan``.
     """
     states = _check_common(u, delta, A, delta_bias, initial_state, discretization)
-    tensors = (u, delta, A, _check_groups("B", B, u, states), delta_bias, initial_state)
-    options = delta_softplus, discretization, _saves(tensors), ops.tuning_now(u)
-    last, _ = ops.state(*tensors, *options)
-    return last
+    B = _check_groups("B", B, u, states)
+    tensors = (u, delta, A, B, None, None, None, delta_bias, initial_state)  # no C, D and z
+    return _scan(*tensors, delta_softplus, discretization)[1]
+
+
+def input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:
+    """Brings (D, N), (B, N, L) or (B, G, N, L) to ``[B, L, G, N]``."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"{name} is {type(x).__name__}, must be a tensor")
+    if x.is_complex():
+        raise TypeError(f"{name} has dtype {x.dtype}; complex states are not supported")
+    if x.dim() == 2:
+        # in float32: the sum of its gradient over all tokens would not fit in x's few bits
+        return x.float().expand(u.shape[0], u.shape[2], *x.shape)
+    if x.dim() == 3:
+        return x.transpose(1, 2)[:, :, None]
+    if x.dim() == 4:
+        return x.permute(0, 3, 1, 2)
+    raise ValueError(f"{name} has shape {tuple(x.shape)}; must be (D, N), (B, N, L), (B, G, N, L)")
+
+
+def _grouped(x: Tensor, groups: int) -> Tensor:
+    """Brings ``[B, L, G, N]`` to more groups if they are a multiple, in float32 as their sum."""
+    if x.shape[2] == groups or x.shape[2] == 0 or groups % x.shape[2]:
+        return x
+    if x.shape[2] == 1:  # without a copy
+        return x.float().expand(-1, -1, groups, -1)
+    return x.float().repeat_interleave(groups // x.shape[2], dim=2)
+
+
+def selective_scan_fn(
+    u: Tensor,
+    delta: Tensor,
+    A: Tensor,
+    B: Tensor,
+    C: Tensor,
+    D: Tensor | None = None,
+    z: Tensor | None = None,
+    delta_bias: Tensor | None = None,
+    delta_softplus: bool = False,
+    return_last_state: bool = False,
+) -> Tensor | tuple[Tensor, Tensor]:
+    """Does what mamba-ssm's ``selective_scan_fn`` does, with the same arguments and layout.
+
+    Args:
+        u: ``[B, D, L]`` float32, bfloat16 or float16; likewise delta and z.
+        delta: as u.
+        A: ``[D, N]`` float32.
+        B: (D, N) constant, (B, N, L), or (B, G, N, L).
+        C: as B, on its own.
+        D: ``[D]``, or None.
+        z: as u, or None.
+        delta_bias: ``[D]``, or None.
+        delta_softplus: whether softplus is applied to delta.
+        return_last_state: also return ``[B, D, N]`` float32 (its gradient flows here).
+
+    Returns:
+        ``[B, D, L]`` in u's dtype, with channels adjacent in memory.
+
+    Raises:
+        TypeError: as ``selective_scan``; also for complex A, B or C.
+        ValueError: as ``selective_scan``.
+    """
+    if isinstance(A, Tensor) and A.is_complex():
+        raise TypeError(f"A has dtype {A.dtype}; complex states are not supported")
+    u = tokens_first(u, "u")
+    if not isinstance(u, Tensor):
+        raise TypeError(f"u is {type(u).__name__}, must be a tensor")
+    tokens = u.transpose(1, 2)
+    B, C = input_matrix(B, tokens, "B"), input_matrix(C, tokens, "C")
+    groups = max(B.shape[2], C.shape[2])
+    B, C = _grouped(B, groups), _grouped(C, groups)
+    out, last = selective_scan(
+        u,
+        tokens_first(delta, "delta"),
+        A,
+        B,
+        C,
+        D,
+        tokens_first(z, "z"),
+        delta_bias,
+        delta_softplus,
+        return_last_state=True,
+    )
+    out = out.transpose(1, 2)
+    return (out, last) if return_last_state else out

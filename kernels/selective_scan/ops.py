@@ -1,141 +1,93 @@
 """The scan as torch operators: fake results, gradients, and a kernel by device."""
 
-from typing import List
+from __future__ import annotations
 
 import torch
 from torch import Tensor
 
 from ..runtime.start import without_compiler
 from .cpu import launch as cpu
-from .cpu import tuning as cpu_tuning
-from .cuda import tuning as cuda_tuning
+from .problem import Scan
+
+_SCAN = (
+    "Tensor u, Tensor delta, Tensor A, Tensor B, Tensor? C, Tensor? D, Tensor? z, "
+    "Tensor? delta_bias, Tensor? initial_state, bool softplus, str discretization, bool save"
+)
 
 
-def _implementation(tensor: Tensor):
-    if tensor.device.type == "cpu":
+def _implementation(x: Scan):
+    if x.u.device.type == "cpu":
         return cpu
     from .cuda import launch as cuda
 
     return cuda
 
 
-def tuning_now(tensor: Tensor) -> list[int]:
-    """The tuning that ``use_tuning`` asks for on the tensor's device, as the operators take it.
-
-    It is read once, when a scan begins, and goes with the saved tensors to the gradient. It is
-    empty where the operators choose by the shape alone, which is the same in both directions.
-    """
-    tuning = (cpu_tuning if tensor.device.type == "cpu" else cuda_tuning).current()
-    return [] if tuning is None else tuning.numbers()
-
-
-def _wanted(like: tuple, needs: list[bool]) -> list[Tensor]:
-    return [
-        torch.empty_like(x, memory_format=torch.contiguous_format)
-        for x, needed in zip(like, needs)
-        if needed
-    ]
-
-
-def _placed(grads: list[Tensor], needs: list[bool]) -> tuple[Tensor | None, ...]:
-    found = iter(grads)
-    return tuple(next(found) if needed else None for needed in needs)
-
-
-def _need_saved(ctx) -> None:
-    if not ctx.saved:
-        raise RuntimeError("selective_scan: this call kept nothing for a gradient")
-
-
 @without_compiler
-@torch.library.custom_op("gamba_warp::selective_scan", mutates_args=())
-def scan(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None,
-    z: Tensor | None,
-    delta_bias: Tensor | None,
-    initial_state: Tensor | None,
-    softplus: bool,
-    discretization: str,
-    save: bool,
-    tuning: List[int],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """``(out, last state, saved states)`` of checked tensors; B and C are ``[B, L, G, N]``.
-
-    ``tuning`` is that of ``tuning_now``.
-    """
-    run = _implementation(u).forward
-    return run(
-        u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save, tuning
-    )
+@torch.library.custom_op(
+    "gamba_warp::selective_scan",
+    mutates_args=(),
+    schema=f"({_SCAN}) -> (Tensor, Tensor, Tensor)",
+)
+def scan(*args) -> tuple[Tensor, Tensor, Tensor]:
+    """``(out, last state, saved states)`` of the fields of a ``Scan``; without C, out is empty."""
+    x = Scan(*args)
+    return _implementation(x).forward(x)
 
 
 @scan.register_fake
-def _(u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save, tuning):
-    out = torch.empty_like(u, memory_format=torch.contiguous_format)
-    last = A.new_empty(u.shape[0], *A.shape)
-    return out, last, A.new_empty(_implementation(u).saved_shape(u, A, B, save, tuning))
+def _(*args):
+    x = Scan(*args)
+    out = torch.empty_like(x.u, memory_format=torch.contiguous_format)
+    last = x.A.new_empty(x.u.shape[0], *x.A.shape)
+    saved = x.A.new_empty(_implementation(x).saved_shape(x))
+    return out if x.C is not None else out.new_empty(x.u.shape[0], 0, x.u.shape[2]), last, saved
 
 
 @without_compiler
-@torch.library.custom_op("gamba_warp::selective_scan_backward", mutates_args=())
-def _scan_backward(
-    dout: Tensor,
-    dlast: Tensor | None,
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    C: Tensor,
-    D: Tensor | None,
-    z: Tensor | None,
-    delta_bias: Tensor | None,
-    saved: Tensor,
-    softplus: bool,
-    discretization: str,
-    needs: List[bool],
-    tuning: List[int],
-) -> List[Tensor]:
-    run = _implementation(u).backward
-    grads = run(
-        dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs,
-        tuning,
-    )  # fmt: skip
+@torch.library.custom_op(
+    "gamba_warp::selective_scan_backward",
+    mutates_args=(),
+    schema=f"(Tensor? dout, Tensor? dlast, Tensor saved, bool[] needs, {_SCAN}) -> Tensor[]",
+)
+def _scan_backward(dout, dlast, saved, needs, *args) -> list[Tensor]:
+    x = Scan(*args)
+    grads = _implementation(x).backward(dout, dlast, x, saved, needs)
     return [grad for grad in grads if grad is not None]
 
 
 @_scan_backward.register_fake
-def _(
-    dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs, tuning
-):
-    state = A.new_empty(u.shape[0], *A.shape)
-    return _wanted((u, delta, A, B, C, D, z, delta_bias, state), needs)
+def _(dout, dlast, saved, needs, *args):
+    x = Scan(*args)
+    state = x.A.new_empty(x.u.shape[0], *x.A.shape)
+    return [
+        torch.empty_like(tensor, memory_format=torch.contiguous_format)
+        for tensor, needed in zip((*x[:8], state), needs)
+        if needed
+    ]
 
 
 def _setup_context(ctx, inputs, output):
-    u, delta, A, B, C, D, z, delta_bias, _, softplus, discretization, save, tuning = inputs
+    x = Scan(*inputs)
     _, _, saved = output
     ctx.mark_non_differentiable(saved)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(u, delta, A, B, C, D, z, delta_bias, saved)
-    ctx.softplus, ctx.discretization, ctx.saved, ctx.tuning = softplus, discretization, save, tuning
+    ctx.save_for_backward(*x[:8], saved)
+    ctx.options = x[9:]
 
 
 def _gradient(ctx, dout, dlast, _):
-    _need_saved(ctx)
-    u, delta, A, B, C, D, z, delta_bias, saved = ctx.saved_tensors
+    *tensors, saved = ctx.saved_tensors
+    x = Scan(*tensors, None, *ctx.options)
+    if not x.save:
+        raise RuntimeError("selective_scan: this call kept nothing for a gradient")
     needs = list(ctx.needs_input_grad[:9])
-    if dout is None:
-        dout = u.new_zeros(1, 1, u.shape[2]).expand_as(u)
-    grads = _scan_backward(
-        dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved,
-        ctx.softplus, ctx.discretization, needs, ctx.tuning,
-    )  # fmt: skip
-    return (*_placed(grads, needs), None, None, None, None)
+    if x.C is None:
+        dout = None
+    elif dout is None:
+        dout = x.u.new_zeros(1, 1, x.u.shape[2]).expand_as(x.u)
+    grads = iter(_scan_backward(dout, dlast, saved, needs, *x))
+    return (*(next(grads) if needed else None for needed in needs), None, None, None)
 
 
 def _no_second_gradient(ctx, *grads):
@@ -144,74 +96,3 @@ def _no_second_gradient(ctx, *grads):
 
 scan.register_autograd(_gradient, setup_context=_setup_context)
 _scan_backward.register_autograd(_no_second_gradient)
-
-
-@without_compiler
-@torch.library.custom_op("gamba_warp::selective_scan_state", mutates_args=())
-def state(
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    delta_bias: Tensor | None,
-    initial_state: Tensor | None,
-    softplus: bool,
-    discretization: str,
-    save: bool,
-    tuning: List[int],
-) -> tuple[Tensor, Tensor]:
-    """``(last state, saved states)`` of checked tensors; B is ``[B, L, G, N]``."""
-    run = _implementation(u).final_state
-    return run(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning)
-
-
-@state.register_fake
-def _(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning):
-    saved = _implementation(u).saved_shape(u, A, B, save, tuning)
-    return A.new_empty(u.shape[0], *A.shape), A.new_empty(saved)
-
-
-@without_compiler
-@torch.library.custom_op("gamba_warp::selective_scan_state_backward", mutates_args=())
-def _state_backward(
-    dlast: Tensor,
-    u: Tensor,
-    delta: Tensor,
-    A: Tensor,
-    B: Tensor,
-    delta_bias: Tensor | None,
-    saved: Tensor,
-    softplus: bool,
-    discretization: str,
-    needs: List[bool],
-    tuning: List[int],
-) -> List[Tensor]:
-    run = _implementation(u).final_state_backward
-    grads = run(dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs, tuning)
-    return [grad for grad in grads if grad is not None]
-
-
-@_state_backward.register_fake
-def _(dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs, tuning):
-    return _wanted((u, delta, A, B, delta_bias, dlast), needs)
-
-
-def _state_setup_context(ctx, inputs, output):
-    u, delta, A, B, delta_bias, _, softplus, discretization, save, tuning = inputs
-    _, saved = output
-    ctx.mark_non_differentiable(saved)
-    ctx.save_for_backward(u, delta, A, B, delta_bias, saved)
-    ctx.softplus, ctx.discretization, ctx.saved, ctx.tuning = softplus, discretization, save, tuning
-
-
-def _state_gradient(ctx, dlast, _):
-    _need_saved(ctx)
-    needs = list(ctx.needs_input_grad[:6])
-    grads = _state_backward(
-        dlast, *ctx.saved_tensors, ctx.softplus, ctx.discretization, needs, ctx.tuning
-    )
-    return (*_placed(grads, needs), None, None, None, None)
-
-
-state.register_autograd(_state_gradient, setup_context=_state_setup_context)
-_state_backward.register_autograd(_no_second_gradient)

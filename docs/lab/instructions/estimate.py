@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from gamba_warp.kernels.selective_scan.cuda import backward, forward
-from gamba_warp.kernels.selective_scan.cuda.blocks import MARK, BlockShape, block_shape
-from gamba_warp.kernels.selective_scan.cuda.tokens import SUB, UNROLL
-from gamba_warp.kernels.selective_scan.cuda.tuning import choose
+from gamba_warp.kernels.selective_scan.cuda.blocks import MARK, SUB, UNROLL, BlockShape, block_shape
+from gamba_warp.kernels.selective_scan.cuda.launch import choose
 
 from .sass import Turns
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
+from unittest.mock import patch
 
 import torch
 
@@ -19,10 +19,12 @@ from gamba_warp.kernels.bench.cases.scan_problem import (
     make_variant,
 )
 from gamba_warp.kernels.bench.core.case import make_cases
-from gamba_warp.kernels.selective_scan.cpu import tuning as cpu_tuning
-from gamba_warp.kernels.selective_scan.cuda import tuning as cuda_tuning
+from gamba_warp.kernels.selective_scan.cpu import launch as cpu
+from gamba_warp.kernels.selective_scan.cuda import launch as cuda
 
 from .probe import probe_rate, probe_scan
+
+on_cpu, on_cuda = partial(patch.object, cpu, "TUNING"), partial(patch.object, cuda, "FORCED")
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -105,13 +107,13 @@ def exponential(settings: Settings) -> list[Variant]:
     float32's own rounding; each degree less saves a few percent and errs 10 to 50 times as much.
     With AVX-512 the default is a table of 16 and a cubic; elsewhere it is degree 5.
     """
-    problem, default, made = _shorter(settings), cpu_tuning.Tuning(), []
+    problem, default, made = _shorter(settings), cpu.Tuning(), []
     for degree in (3, 5) if settings.level == "quick" else (2, 3, 4, 5, 6):
-        choice = replace(default, degree=degree, table=False)
+        choice = default._replace(degree=degree, table=False)
         pair = make_pair(problem, f"degree {degree}")
         for variant in pair:
             variant.limit = TRADE_LIMIT
-        made += on_kernels(cpu_tuning.use_tuning, choice, pair)
+        made += on_kernels(on_cpu, choice, pair)
     return made + make_pair(problem, "default", default=True)
 
 
@@ -119,13 +121,13 @@ def spacings(settings: Settings) -> list[Variant]:
     """Tokens between the states that the forward keeps and from which the gradient begins anew.
     Saved: what the forward keeps beside its inputs.
     """
-    problem, default, made = _shorter(settings), cpu_tuning.Tuning(), []
+    problem, default, made = _shorter(settings), cpu.Tuning(), []
     for chunk in (32, 64) if settings.level == "quick" else (16, 32, 64, 128, 256):
-        choice = replace(default, chunk=chunk, strip=min(chunk, default.strip))
+        choice = default._replace(chunk=chunk, strip=min(chunk, default.strip))
         (both,) = [make_variant(problem, f"every {chunk}", BOTH, default=choice == default)]
         both.work = partial(count_memory, problem, BOTH)
         both.parameters["spacing"] = chunk
-        made += on_kernels(cpu_tuning.use_tuning, choice, [both])
+        made += on_kernels(on_cpu, choice, [both])
     return made
 
 
@@ -133,11 +135,11 @@ def chunks(settings: Settings) -> list[Variant]:
     """Tokens that the CPU's forward walks at once for one state. The gradient walks those between
     two kept states, see "boundary spacing".
     """
-    problem, default, made = _shorter(settings), cpu_tuning.Tuning(), []
+    problem, default, made = _shorter(settings), cpu.Tuning(), []
     for strip in (32, 64) if settings.level == "quick" else (8, 16, 32, 64, 128, 256):
-        choice = replace(default, strip=strip, chunk=max(strip, default.chunk))
+        choice = default._replace(strip=strip, chunk=max(strip, default.chunk))
         pair = [make_variant(problem, f"{strip} tokens", default=choice == default)]
-        made += on_kernels(cpu_tuning.use_tuning, choice, pair)
+        made += on_kernels(on_cpu, choice, pair)
     return made
 
 
@@ -147,7 +149,7 @@ def cuda_tunings(settings: Settings) -> list[Variant]:
     """
     problem = make_problem(settings)
     (batch, length, width), states = problem.inputs["u"].shape, problem.inputs["A"].shape[1]
-    chosen = cuda_tuning.scan_tuning((batch, length, width), states, 1, problem.device)
+    chosen = cuda.scan_tuning((batch, length, width), states, 1, problem.device)
     made = make_pair(problem, "chosen by itself", default=True)
     changes = [{"segments": n, "back_segments": n} for n in (1, 4, 16, 64)]
     changes += [
@@ -156,7 +158,5 @@ def cuda_tunings(settings: Settings) -> list[Variant]:
     ]
     for change in changes:
         name = ", ".join(f"{k} {v}" for k, v in change.items() if not k.startswith("back_"))
-        made += on_kernels(
-            cuda_tuning.use_tuning, replace(chosen, **change), make_pair(problem, name)
-        )
+        made += on_kernels(on_cuda, chosen._replace(**change), make_pair(problem, name))
     return made

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ...runtime.lanes import W, lanes
@@ -13,25 +14,86 @@ from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.rows import streams
 from ...runtime.views import lane_contiguous, view
+from ..problem import DISCRETIZATIONS, Scan
 from . import kernels
-from .decays import SCALES
-from .kernels import SPAN, Sizes
-from .layout import Layout
-from .recurrence import NEED_DB, NEED_DC, NEED_DH, NEED_DZ
-from .tuning import Tuning
+from .kernels import BLOCKS, FEW, NEEDS, SPAN, Kind, Sizes, Tuning
 
+TUNING = Tuning()
+SEGMENT = 4  # chunks of a segment at least
 _FIELDS = tuple(Sizes.__annotations__)
 
 
-def _sizes(
-    layout: Layout, softplus: bool, use_z: bool, needs: int = 0, results: Sequence[Tensor] = ()
-) -> Sizes:
-    y = layout
-    return _struct(
-        *(y.length, y.segment, y.segments, y.batch, y.states, y.groups, y.group_width),
-        *(y.group_blocks, y.span, int(softplus), int(use_z), needs),
-        int(y.group_width % W == 0 and streams(results)),
-    )
+class Layout:
+    """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded.
+
+    A task is a segment of one batch element's tokens and a span of blocks of one group. The blocks
+    of a span are walked side by side, so that rows are read in long parts. Segments are for inputs
+    with too few channels for torch's threads; finding their first states costs a second walk.
+    """
+
+    def __init__(self, u: Tensor, A: Tensor, B: Tensor, most: int, chunk: int, split: bool = True):
+        """
+        Args:
+            u: ``[B, L, D]``.
+            A: ``[D, N]``.
+            B: ``[B, L, G, N]``.
+            most: blocks of a span at most, a multiple of BLOCKS.
+            chunk: tokens; a state is saved at the start of each chunk.
+            split: whether there may be several segments.
+        """
+        self.batch, self.length, self.channels = u.shape
+        self.states, self.groups = A.shape[1], B.shape[2]
+        self.group_width = self.channels // self.groups
+        self.group_blocks = -(-self.group_width // W)
+        self.blocks = self.groups * self.group_blocks
+        self.chunks = -(-self.length // chunk)
+        threads = torch.get_num_threads()
+        per_thread = max(1, min(self.group_blocks, -(-self.batch * self.blocks // threads)))
+        self.span = min(most, -(-per_thread // BLOCKS) * BLOCKS)
+        spans = self.batch * self.groups * -(-self.group_blocks // self.span)
+        self.segments = 1
+        if split and 0 < spans < threads:
+            self.segments = max(1, min(-(-threads // spans), self.length // (SEGMENT * chunk)))
+        self.segment = max(1, -(-self.chunks // self.segments)) * chunk
+        self.segments = max(1, -(-self.length // self.segment))
+        self.tasks = self.segments * spans
+        self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
+
+    def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
+        """Brings ``[.., D, *]`` to float32 ``[.., blocks, *, W]``; None becomes zeros.
+
+        The result may lie in the memory of ``x``.
+        """
+        if x is None:
+            return torch.zeros(*lead, self.blocks, W)
+        n = len(lead)
+        tail, x = tuple(x.shape[n + 1 :]), x.float()
+        if missing := self.group_blocks * W - self.group_width:
+            x = x.reshape(*lead, self.groups, self.group_width, *tail)
+            x = F.pad(x, (0, 0) * len(tail) + (0, missing))
+        x = x.reshape(*lead, self.blocks, W, *tail)
+        return x.movedim(n + 1, -1).contiguous()
+
+    def unpack(self, x: Tensor, lead: tuple[int, ...] = ()) -> Tensor:
+        """The inverse of ``pack``, dense, in the memory of ``x`` if that is its order."""
+        n = len(lead)
+        tail, x = tuple(x.shape[n + 1 : -1]), x.movedim(-1, n + 1)
+        if self.group_blocks * W > self.group_width:
+            x = x.reshape(*lead, self.groups, self.group_blocks * W, *tail)
+            x = x.narrow(n + 1, 0, self.group_width)
+        return x.reshape(*lead, self.channels, *tail).contiguous()
+
+    def states_of(self, x: Tensor | None) -> Tensor:
+        """Packs states ``[B, D, N]``, or None for 0, to ``[B, blocks, N, W]``."""
+        if x is None:
+            return torch.zeros(self.batch, self.blocks, self.states, W)
+        return self.pack(x, (self.batch,))
+
+    def total(self, parts: Tensor, dtype: torch.dtype) -> Tensor:
+        """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
+        of_group = -(-self.group_blocks // BLOCKS)
+        x = parts.view(self.batch, self.groups, of_group, self.states, self.length).sum(2)
+        return x.permute(0, 3, 1, 2).to(dtype, memory_format=torch.contiguous_format)
 
 
 @functools.lru_cache(256)  # to fill one takes as long as a short scan
@@ -67,194 +129,153 @@ def _entries(x: Tensor) -> Tensor:
     return x if x.stride(-1) == 1 or x.shape[-1] == 1 else x.contiguous()
 
 
+def _flat(states: Tensor):
+    return view(states.flatten(0, 1), lanes)
+
+
 class _Operands:
-    """What the launches of one call share, by name."""
+    """What the launches of one call share."""
 
-    def __init__(self, layout, tuning, u, delta, A, z, delta_bias, discretization):
-        self.layout = layout
-        self.kinds = (tuning, u.dtype, delta.dtype, discretization)
-        self.u, self.delta = lane_contiguous(u), lane_contiguous(delta)
-        self.z = self.u if z is None else lane_contiguous(z)
-        self.a, self.widest = view(layout.pack(A), lanes), view(layout.pack(A.abs().amax(1)), lanes)
-        self.bias = view(layout.pack(delta_bias), lanes)
+    def __init__(self, x: Scan, split: bool = True):
+        states = x.A.shape[1]
+        tuning = TUNING._replace(walked=TUNING.walked or (2 if states <= FEW else 4))
+        self.layout = y = Layout(x.u, x.A, x.B, SPAN, tuning.chunk, split)
+        self.kind = Kind(x.u.dtype, x.delta.dtype, x.discretization, tuning)
+        self.options = int(x.softplus), int(x.z is not None)
+        u, delta = lane_contiguous(x.u), lane_contiguous(x.delta)
+        zero = torch.zeros(y.channels, 1)
+        skip, bias = (zero if v is None else v.float()[:, None] for v in (x.D, x.delta_bias))
+        channel = torch.cat([x.A, x.A.abs().amax(1, keepdim=True), skip, bias], 1)
+        z = u if x.z is None else lane_contiguous(x.z)
+        self.inputs = [u, delta, z, view(y.pack(channel), lanes)]
+        self.b = _entries(x.B)
+        self.c = self.b if x.C is None else _entries(x.C)
 
-    def run(self, kernel, inputs: list, outputs: list, **options) -> None:
-        """Launches a kernel of ``kernels.py``; inputs that are names are looked up here."""
-        inputs = [getattr(self, x) if isinstance(x, str) else x for x in inputs]
-        parallel_launch(kernel(*self.kinds, **options), self.layout.tasks, inputs, outputs)
+    def run(self, kernel, inputs: list, outputs: list, needs=0, results=()) -> None:
+        """Launches a kernel of ``kernels.py``; ``results`` may go past the caches."""
+        y = self.layout
+        stream = int(y.group_width % W == 0 and streams(results))
+        sizes = _struct(
+            *(y.length, y.segment, y.segments, y.batch, y.states, y.groups, y.group_width),
+            *(y.group_blocks, y.span, *self.options, needs, stream),
+        )
+        parallel_launch(kernel, y.tasks, [sizes, *self.inputs, *inputs], outputs)
 
     def states(self, fill: float = 0.0) -> Tensor:
         y = self.layout
         return torch.full((y.segments, y.batch, y.blocks, y.states, W), fill)
 
-    def starts(self, save: bool) -> Tensor:
-        y = self.layout
-        return empty((y.batch, y.chunks if save else 0, y.blocks, y.states, W), torch.float32)
+    def accumulate(self, h: Tensor, starts: Tensor) -> Tensor:
+        """Brings the pairs ``h`` from before each segment to after it: the decays' products."""
+        product = _pairs(self.states(1.0))
+        kernel = kernels.forward_kernel(self.kind, output=False)
+        u = self.inputs[0]
+        outputs = [_flat(h), _flat(product), view(starts, lanes), u]
+        self.run(kernel, [self.b, self.b], outputs)
+        return _values(product)
 
 
-def _flat(states: Tensor):
-    return view(states.flatten(0, 1), lanes)
+def saved_shape(x: Scan) -> tuple[int, ...]:
+    """The shape of the saved states that ``forward`` returns."""
+    y = Layout(x.u, x.A, x.B, SPAN, TUNING.chunk)
+    return (y.batch, y.chunks if x.save else 0, y.blocks, y.states, W)
 
 
-def _accumulate(s: _Operands, sizes: Sizes, b: Tensor, h: Tensor, starts: Tensor) -> Tensor:
-    """Brings the pairs ``h`` from before each segment to after it; returns the decays' products."""
-    product = _pairs(s.states(1.0))
-    s.run(
-        kernels.forward_kernel,
-        [sizes, "u", "delta", "u", "a", "widest", b, b, "bias", "bias"],
-        [_flat(h), _flat(product), view(starts, lanes), s.u],
-        output=False,
-    )
-    return _values(product)
-
-
-def forward(
-    u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save, tuning
-):
+def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
     """Runs the scan on the CPU.
 
-    Arguments as ``selective_scan`` with B, C ``[B, L, G, N]``; ``save`` keeps the states that
-    ``backward`` starts from; ``tuning`` holds the numbers of a ``Tuning``, which ``backward`` must
-    get as well; if it is empty, they are the default's.
-
     Returns:
-        ``out [B, L, D]``, the last state ``[B, D, N]`` and the saved states (a private layout).
+        ``out [B, L, D]``, without tokens where there is no C, the last state ``[B, D, N]``, and
+        the saved states that ``backward`` starts from (a private layout).
     """
-    tuning = Tuning(*tuning).forward(A.shape[1])
-    layout = Layout(u, A, B, SPAN, tuning.chunk)
-    s = _Operands(layout, tuning, u, delta, A, z, delta_bias, discretization)
-    b = _entries(B)
-    h = layout.states_of(initial_state)[None]
-    if layout.segments > 1:
+    read = x.C is not None
+    s = _Operands(x, split=read or not x.save)
+    y, starts = s.layout, empty(saved_shape(x), torch.float32)
+    out = empty(x.u.shape if read else (y.batch, 0, y.channels), x.u.dtype)
+    h = y.states_of(x.initial_state)[None]
+    if y.segments > 1:
         local = _pairs(s.states())
-        sizes = _sizes(layout, softplus, z is not None)
-        product = _accumulate(s, sizes, b, local, s.starts(False))
-        h = _carry(h[0], _values(local), product)
-    h, starts = _pairs(h), s.starts(save)
-    out = empty(u.shape, u.dtype)
-    sizes = _sizes(layout, softplus, z is not None, results=[out])
-    s.run(
-        kernels.forward_kernel,
-        [
-            sizes, "u", "delta", "z", "a", "widest", b, _entries(C),
-            view(layout.pack(D), lanes), "bias",
-        ],
-        [_flat(h), _flat(h), view(starts, lanes), out],
-        output=True,
-    )  # fmt: skip
-    return out, layout.unpack(_values(h)[-1], (layout.batch,)), starts
-
-
-def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning):
-    """The last state alone, ``[B, D, N]``, and the saved states; arguments as ``forward``."""
-    tuning = Tuning(*tuning).forward(A.shape[1])
-    layout = Layout(u, A, B, SPAN, tuning.chunk, split=not save)
-    s = _Operands(layout, tuning, u, delta, A, None, delta_bias, discretization)
-    h, starts = layout.states_of(initial_state)[None], s.starts(save)
-    if layout.segments > 1:
-        first, h = h[0], s.states()
+        product = s.accumulate(local, starts[:, :0])
+        local = _values(local)
+        h = _carry(h[0], local, product)
+        if not read:
+            last = torch.addcmul(local[-1:], product[-1:], h[-1:])
+            return out, y.unpack(last[-1], (y.batch,)), starts
     h = _pairs(h)
-    product = _accumulate(s, _sizes(layout, softplus, False), _entries(B), h, starts)
-    h = _values(h)
-    if layout.segments > 1:
-        h = torch.addcmul(h[-1:], product[-1:], _carry(first, h, product)[-1:])
-    return layout.unpack(h[-1], (layout.batch,)), starts
-
-
-def _carry_back(s: _Operands, sizes: Sizes, c: Tensor, dout: Tensor, dlast) -> Tensor:
-    """The gradient of the state after each segment; that after the last one is ``dlast``."""
-    dh = s.layout.states_of(dlast)[None]
-    if s.layout.segments == 1:
-        return dh
-    if not sizes.needs & NEED_DH:
-        return s.states()
-    local, product = _pairs(s.states()), _pairs(s.states(1.0))
-    s.run(
-        kernels.gradient_states_kernel,
-        [sizes, "u", "delta", "z", "a", "widest", c, "bias", dout],
-        [_flat(local), _flat(product)],
-    )
-    local, product = _values(local), _values(product)
-    return _carry(dh[0], local.flip(0), product.flip(0)).flip(0).contiguous()
+    if read:
+        kernel = kernels.forward_kernel(s.kind, output=True)
+        outputs = [_flat(h), _flat(h), view(starts, lanes), out]
+        s.run(kernel, [s.b, s.c], outputs, results=[out])
+    else:
+        s.accumulate(h, starts)
+    return out, y.unpack(_values(h)[-1], (y.batch,)), starts
 
 
 def backward(
-    dout, dlast, u, delta, A, B, C, D, z, delta_bias, starts, softplus, discretization, needs,
-    tuning,
-):  # fmt: skip
+    dout: Tensor | None, dlast: Tensor | None, x: Scan, starts: Tensor, needs: Sequence[bool]
+) -> list[Tensor | None]:
     """Gradients of ``forward`` from those of its output and last state.
 
     Args:
-        needs: nine booleans for u, delta, A, B, C, D, z, delta_bias, initial_state.
-        tuning: that of ``forward``.
+        dout: of the output; None for 0.
+        dlast: of the last state; None for 0.
+        x: the arguments of ``forward``, of which the first state is not read.
+        starts: the saved states.
+        needs: nine booleans for the tensors of ``x`` in their order.
 
     Returns:
         Nine tensors, None where not needed.
     """
-    tuning = Tuning(*tuning)
-    layout = Layout(u, A, B, SPAN, tuning.chunk)
-    s = _Operands(layout, tuning, u, delta, A, z, delta_bias, discretization)
+    s = _Operands(x)
+    y, chunk = s.layout, s.kind.tuning.chunk
     need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
     through = need_u or need_delta or need_A or need_B or need_bias or need_h
-    flags = NEED_DZ * need_z + NEED_DC * need_C + NEED_DB * need_B + NEED_DH * through
+    wanted = dict(zip(NEEDS, (need_z, need_C, need_B, through)))
+    flags = sum(NEEDS[name] for name, need in wanted.items() if need)
+    dout = x.u.new_zeros(1, 1, y.channels).expand_as(x.u) if dout is None else dout
     dout = lane_contiguous(dout)
-    b, c = _entries(B), _entries(C)
+    if x.C is None:
+        s.c = torch.zeros(1, 1, 1, y.states).expand_as(s.b)
 
     def like(x: Tensor, needed: bool) -> Tensor:
         return empty(x.shape if needed else (x.shape[0], 0, x.shape[2]), x.dtype)
 
-    def partial(needed: bool) -> tuple[Tensor, Tensor]:
-        rows = layout.states if needed else 0
-        sums = torch.empty(layout.tasks, rows * tuning.chunk, W)
-        return sums, empty((layout.parts, rows * layout.length), torch.float32)
+    def parts(needed: bool) -> Tensor:
+        return empty((y.parts, y.states * y.length if needed else 0), torch.float32)
 
-    du, ddelta, dz = like(u, need_u), like(delta, need_delta), like(u, need_z)
-    sizes = _sizes(layout, softplus, z is not None, flags, [du, ddelta, dz])
-    dh = _pairs(_carry_back(s, sizes, c, dout, dlast))
-    da = s.states()
-    dskip, dbias = torch.empty(2, layout.batch, layout.chunks, layout.blocks, W)
-    db_lanes, db = partial(need_B)
-    dc_lanes, dc = partial(need_C)
+    dh = y.states_of(dlast)[None]
+    if y.segments > 1 and through:  # the gradient of the state after each segment
+        local, product = _pairs(s.states()), _pairs(s.states(1.0))
+        kernel = kernels.gradient_states_kernel(s.kind)
+        s.run(kernel, [s.c, dout], [_flat(local), _flat(product)])
+        local, product = _values(local).flip(0), _values(product).flip(0)
+        dh = _carry(dh[0], local, product).flip(0).contiguous()
+    elif y.segments > 1:
+        dh = s.states()
+    dh, da = _pairs(dh), s.states()
+    du, ddelta, dz = like(x.u, need_u), like(x.delta, need_delta), like(x.u, need_z)
+    db, dc = parts(need_B), parts(need_C)
+    dchannel = torch.empty(y.batch, y.chunks, 2, y.blocks, W)
+    sums = torch.empty(y.tasks, 2 * y.states * chunk if need_B or need_C else 0, W)
     s.run(
-        kernels.backward_kernel,
+        kernels.backward_kernel(s.kind),
+        [s.b, s.c, view(starts, lanes), dout],
         [
-            sizes, "u", "delta", "z", "a", "widest", b, c, view(layout.pack(D), lanes), "bias",
-            view(starts, lanes), dout,
+            view(sums, lanes), _flat(dh), du, ddelta, dz, _flat(da), db, dc, view(dchannel, lanes),
         ],
-        [
-            view(db_lanes, lanes), view(dc_lanes, lanes), _flat(dh), du, ddelta, dz,
-            _flat(da), db, dc, view(dskip, lanes), view(dbias, lanes),
-        ],
+        flags,
+        [du, ddelta, dz],
     )  # fmt: skip
+    scale = DISCRETIZATIONS[x.discretization].scale
     values = (
         lambda: du,
         lambda: ddelta,
-        lambda: layout.unpack(da.sum((0, 1))) / SCALES[discretization],
-        lambda: layout.total(db, B.dtype),
-        lambda: layout.total(dc, C.dtype),
-        lambda: layout.unpack(dskip.sum((0, 1))).to(D.dtype),
+        lambda: y.unpack(da.sum((0, 1))) / scale,
+        lambda: y.total(db, x.B.dtype),
+        lambda: y.total(dc, x.C.dtype),
+        lambda: y.unpack(dchannel[:, :, 0].sum((0, 1))).to(x.D.dtype),
         lambda: dz,
-        lambda: layout.unpack(dbias.sum((0, 1))).to(delta_bias.dtype),
-        lambda: layout.unpack(_values(dh)[0], (layout.batch,)),
+        lambda: y.unpack(dchannel[:, :, 1].sum((0, 1))).to(x.delta_bias.dtype),
+        lambda: y.unpack(_values(dh)[0], (y.batch,)),
     )
     return [value() if needed else None for value, needed in zip(values, needs)]
-
-
-def final_state_backward(
-    dlast, u, delta, A, B, delta_bias, starts, softplus, discretization, needs, tuning
-):
-    """Gradients of ``final_state``; ``needs`` for u, delta, A, B, delta_bias, initial_state."""
-    dout = u.new_zeros(1, 1, u.shape[2]).expand_as(u)
-    need_u, need_delta, need_A, need_B, need_bias, need_h = needs
-    grads = backward(
-        dout, dlast, u, delta, A, B, torch.zeros_like(B), None, None, delta_bias, starts,
-        softplus, discretization,
-        (need_u, need_delta, need_A, need_B, False, False, False, need_bias, need_h), tuning,
-    )  # fmt: skip
-    return [grads[i] for i in (0, 1, 2, 3, 7, 8)]
-
-
-def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool, tuning) -> tuple[int, ...]:
-    """The shape of the saved states that ``forward`` returns."""
-    layout = Layout(u, A, B, SPAN, Tuning(*tuning).chunk)
-    return (layout.batch, layout.chunks if save else 0, layout.blocks, layout.states, W)

@@ -7,78 +7,26 @@ kernels do not take is left to the caller: both functions then return None and t
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from ...runtime.lanes import ACTIVATIONS, PRELUDE, W, flush_denormals, restore_denormals
 from ...runtime.launch import parallel_launch
+from ...runtime.native import native
 
 _PLAIN = (Tensor, torch.nn.Parameter)  # no fake tensor, which has no memory
 _FEW = 64  # tasks of sixteen channels below which one thread is as fast as several
 
+_HERE, _HEAD = Path(__file__).parent, PRELUDE + ACTIVATIONS
 _MATRIX, _VECTOR = wp.array2d[wp.float32], wp.array[wp.float32]
 _STATES = wp.array3d[wp.float32]
 
-_CONV = """
-const float* x = (const float*)((const char*)x_in.data + (size_t)b * x_in.strides[0]) + d;
-const float* w = weight_in.data + (size_t)d * taps;
-float* seen = state_out.data + ((size_t)b * channels + d) * taps;
-F sum = bias_in.shape[0] ? *(const F*)(bias_in.data + d) : F{};
-for (int c = 0; c < 16; ++c, seen += taps, w += taps) {
-    float old = 0.0f;
-    for (int k = 0; k < taps - 1; ++k) {
-        seen[k] = seen[k + 1];
-        old += seen[k] * w[k];
-    }
-    seen[taps - 1] = x[c];
-    sum[c] += old + x[c] * w[taps - 1];
-}
-*(F*)(x_out.data + (size_t)b * channels + d) = use_silu ? sum * sigmoid_(sum) : sum;
-"""
 
-_SUM = """
-typedef float Eight __attribute__((vector_size(32)));
-typedef float Four __attribute__((vector_size(16)));
-auto sum_ = [](F v) -> float {
-    const Eight e = __builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7)
-        + __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
-    const Four f = __builtin_shufflevector(e, e, 0, 1, 2, 3)
-        + __builtin_shufflevector(e, e, 4, 5, 6, 7);
-    return (f[0] + f[1]) + (f[2] + f[3]);
-};
-auto row_ = [&](auto& array) -> const float* {
-    return (const float*)((const char*)array.data + (size_t)b * array.strides[0]);
-};
-"""
-_SCAN = """
-F step = *(const F*)(row_(dt_in) + d);
-if (bias_in.shape[0]) step += *(const F*)(bias_in.data + d);
-if (use_softplus) step = softplus_(step);
-const F u = *(const F*)(row_(x_in) + d), du = step * u, rate = step * LOG2E;
-F y = skip_in.shape[0] ? *(const F*)(skip_in.data + d) * u : F{};
-for (int n = 0; n < states; n += 16) {
-    const F b_n = *(const F*)(row_(b_in) + n), c_n = *(const F*)(row_(c_in) + n);
-    const float* a = a_in.data + (size_t)d * states + n;
-    float* h = state_out.data + ((size_t)b * channels + d) * states + n;
-    for (int c = 0; c < 16; ++c, a += states, h += states) {
-        const F log = *(const F*)a;
-        const F slope = logs ? -exp2_(log * LOG2E) : log;
-        const F next = fma_(*(F*)h, exp2_(slope * rate[c]), b_n * du[c]);
-        *(F*)h = next;
-        y[c] += sum_(next * c_n);
-    }
-}
-if (z_in.shape[0]) {
-    const F z = *(const F*)(row_(z_in) + d);
-    y *= z * sigmoid_(z);
-}
-*(F*)(y_out.data + (size_t)b * channels + d) = y;
-"""
-
-
-@wp.func_native(PRELUDE + ACTIVATIONS + _CONV)
-def _conv_leaf(
+@wp.func_native(_HEAD + native(_HERE / "conv_step.inl"))
+def conv_leaf(
     x_in: _MATRIX,
     weight_in: _MATRIX,
     bias_in: _VECTOR,
@@ -92,8 +40,8 @@ def _conv_leaf(
 ): ...
 
 
-@wp.func_native(PRELUDE + ACTIVATIONS + _SUM + _SCAN)
-def _scan_leaf(
+@wp.func_native(_HEAD + native(_HERE / "scan_step.inl"))
+def scan_leaf(
     x_in: _MATRIX,
     dt_in: _MATRIX,
     a_in: _MATRIX,
@@ -114,7 +62,7 @@ def _scan_leaf(
 
 
 @wp.kernel(enable_backward=False)
-def _conv_step(
+def conv_kernel(
     offset: wp.int32,
     blocks: int,
     taps: int,
@@ -128,11 +76,11 @@ def _conv_step(
     i = offset + wp.tid()
     b = i // blocks
     d = (i - b * blocks) * 16
-    _conv_leaf(x_in, weight_in, bias_in, b, d, blocks * 16, taps, use_silu, state_out, x_out)
+    conv_leaf(x_in, weight_in, bias_in, b, d, blocks * 16, taps, use_silu, state_out, x_out)
 
 
 @wp.kernel(enable_backward=False)
-def _scan_step(
+def scan_kernel(
     offset: wp.int32,
     blocks: int,
     states: int,
@@ -140,11 +88,11 @@ def _scan_step(
     logs: int,
     x_in: _MATRIX,
     dt_in: _MATRIX,
-    a_in: _MATRIX,
     b_in: _MATRIX,
     c_in: _MATRIX,
-    skip_in: _VECTOR,
     z_in: _MATRIX,
+    a_in: _MATRIX,
+    skip_in: _VECTOR,
     bias_in: _VECTOR,
     state_out: _STATES,
     y_out: _MATRIX,
@@ -153,7 +101,7 @@ def _scan_step(
     b = i // blocks
     d = (i - b * blocks) * 16
     before = flush_denormals()
-    _scan_leaf(
+    scan_leaf(
         x_in, dt_in, a_in, b_in, c_in, skip_in, z_in, bias_in,
         b, d, blocks * 16, states, use_softplus, logs, state_out, y_out,
     )  # fmt: skip
@@ -175,22 +123,13 @@ def conv_step(
     Returns:
         ``[B, D]``; None, and nothing done, where an argument is not as above.
     """
-    if not isinstance(x, Tensor) or not isinstance(weight, Tensor):
+    tensors = isinstance(state, Tensor) and isinstance(weight, Tensor)
+    if not tensors or state.dim() != 3 or weight.dim() != 2:
         return None
-    if x.dim() != 2 or weight.dim() != 2 or x.shape[1] % W:
-        return None
-    (batch, channels), taps = x.shape, weight.shape[1]
-    whole = [(weight, (channels, taps)), (state, (batch, channels, taps))]
-    if bias is not None:
-        whole.append((bias, (channels,)))
-    if not _fit([(x, (batch, channels))], whole):
-        return None
-    out = x.new_empty(batch, channels)
-    sizes = [channels // W, taps, int(silu)]
-    inputs = [x, weight, _or_none(bias, x)]
-    _launch(_conv_step, batch * channels // W, [*sizes, *inputs, state, out])
-    _changed(state)
-    return out
+    channels, taps = weight.shape
+    rows, whole = [(x, (len(state), channels))], [(weight, (channels, taps))]
+    sizes = [taps, int(silu)]
+    return _step(conv_kernel, state, taps, sizes, rows, whole, [(bias, (channels,))])
 
 
 def scan_step(
@@ -224,54 +163,48 @@ def scan_step(
     Returns:
         ``[B, D]``; None, and nothing done, where an argument is not as above.
     """
-    if not isinstance(state, Tensor) or state.dim() != 3:
+    if not isinstance(state, Tensor) or state.dim() != 3 or state.shape[2] % W:
         return None
     batch, channels, states = state.shape
-    if channels % W or states % W:
-        return None
-    token, matrix = (batch, channels), (batch, states)
+    token, matrix, vector = (batch, channels), (batch, states), (channels,)
     rows = [(x, token), (dt, token), (B, matrix), (C, matrix)]
-    whole = [(state, state.shape), (A, (channels, states))]
     if z is not None:
         rows.append((z, token))
-    whole += [(v, (channels,)) for v in (D, dt_bias) if v is not None]
-    if not _fit(rows, whole):
+    whole = [(A, (channels, states))]
+    sizes = [states, int(dt_softplus), int(logs)]
+    return _step(scan_kernel, state, states, sizes, rows, whole, [(D, vector), (dt_bias, vector)])
+
+
+def _step(kernel, state: Tensor, last: int, sizes: list, rows, whole, vectors) -> Tensor | None:
+    """Launches a kernel if all are float32 tensors in memory, of the shapes beside them.
+
+    Args:
+        kernel: of sixteen channels; its tensors are these, then the state and the result.
+        state: ``[B, D, last]``, whole.
+        last: of the state's shape.
+        sizes: the kernel's.
+        rows: tensors whose last dimension is dense; a fifth is the gate, and may be left out.
+        whole: contiguous tensors.
+        vectors: contiguous too, or None.
+    """
+    (batch, channels), x = rows[0][1], rows[0][0]
+    given = [*whole, *((v, shape) for v, shape in vectors if v is not None)]
+    given.append((state, (batch, channels, last)))
+    if torch.compiler.is_compiling() or channels % W:
+        return None
+    for v, shape in rows + given:
+        if type(v) not in _PLAIN or v.dtype != torch.float32 or v.shape != shape or not v.is_cpu:
+            return None
+    if not all(v.is_contiguous() for v, _ in given) or any(v.stride(1) != 1 for v, _ in rows):
         return None
     out = x.new_empty(batch, channels)
-    sizes = [channels // W, states, int(dt_softplus), int(logs)]
-    gate = x.new_empty(0, 1) if z is None else z
-    inputs = [x, dt, A, B, C, _or_none(D, x), gate, _or_none(dt_bias, x)]
-    _launch(_scan_step, batch * channels // W, [*sizes, *inputs, state, out])
-    _changed(state)
-    return out
-
-
-def _fit(rows: list[tuple], whole: list[tuple]) -> bool:
-    """Whether all are float32 tensors in memory, of their shapes, with dense rows, or whole."""
-    if torch.compiler.is_compiling():
-        return False
-    for x, shape in rows + whole:
-        if type(x) not in _PLAIN or x.dtype != torch.float32 or x.shape != shape or not x.is_cpu:
-            return False
-    for x, _ in whole:
-        if not x.is_contiguous():
-            return False
-    for x, _ in rows:
-        if x.stride(1) != 1:
-            return False
-    return True
-
-
-def _or_none(vector: Tensor | None, like: Tensor) -> Tensor:
-    return like.new_empty(0) if vector is None else vector
-
-
-def _changed(state: Tensor) -> None:
-    """Tells torch that a kernel wrote into the state: a gradient that needs the old one fails."""
-    if not state.is_inference():
-        torch.autograd.graph.increment_version(state)
-
-
-def _launch(kernel, tasks: int, arguments: list) -> None:
+    if len(rows) == 4:
+        rows = [*rows, (x.new_empty(0, 1), ())]
+    inputs = [v for v, _ in rows + whole] + [x.new_empty(0) if v is None else v for v, _ in vectors]
+    tasks = batch * channels // W
     threads = torch.get_num_threads() if tasks >= _FEW else 1
+    arguments = [channels // W, *sizes, *inputs, state, out]
     parallel_launch(kernel, tasks, arguments, threads=threads)
+    if not state.is_inference():  # a gradient that needs the old state is to fail
+        torch.autograd.graph.increment_version(state)
+    return out

@@ -13,9 +13,12 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import LOG2E, sigmoid, softplus, softplus_slope
+from ...runtime.scalars import sigmoid, softplus, softplus_slope
+from ...runtime.views import struct
+from ..problem import DISCRETIZATIONS, macros
 from .blocks import (
     MARK,
+    SUB,
     BlockShape,
     Place,
     Sizes,
@@ -30,13 +33,22 @@ from .blocks import (
     widening,
 )
 from .groups import Groups, group_io, group_shared, row_io
-from .retreat import retreating, token_stride, totalling
-from .tokens import SUB, marking
 
 MARK_TILE = 16  # tokens of a tile of the walk that marks
 TILE = 8  # and of the walk back
 # Chunks whose sums are added in a row: equal terms in a row round to the same side.
 RUN = 16
+
+
+@struct
+class Tile:
+    """The tokens of a tile of the walk back."""
+
+    t0: int
+    left: int  # tokens that are there
+    mark: int  # of the chunk, that before the first token
+    subs: int  # marks of the tile
+    product: wp.int64  # where the block's products for dB and dC begin
 
 
 # The number, unknown to the compiler: what is computed from it is not kept in registers.
@@ -47,20 +59,6 @@ RUN = 16
     return x;
 """)
 def _anew(x: int) -> int: ...
-
-
-def _layout(g: Groups, flags: frozenset, use_z: bool) -> tuple[dict, int]:
-    f = g.shape
-    sums, products = f.lanes * g.lane_stride, g.tokens * token_stride(f)
-    parts = {"STEP": g.size, "DU": g.size, "U": g.size, "SLOPE": g.size}
-    parts |= {"B": g.tokens * f.padded}
-    if "read" in flags:
-        parts |= {"DY": g.size, "C": g.tokens * f.padded}
-        parts |= {"GATE": g.size} if use_z else {}
-    parts |= {"Y": sums} if "y" in flags else {}
-    parts |= {"S": sums, "P": sums} if "through" in flags else {}
-    parts |= {name: products for name, flag in (("DB", "dB"), ("DC", "dC")) if flag in flags}
-    return offsets(parts)
 
 
 @functools.cache
@@ -77,6 +75,7 @@ def backward_kernel(
     """
     io, delta_io, matrix = dtypes
     scalar, delta_scalar, matrix_scalar = (WARP_DTYPES[x] for x in dtypes)
+    read, through = "read" in flags, "through" in flags
     place = placing(f)
     vec, read_states, write_states = states_io(f)
     pair, join, first_half, second_half = halves(f)
@@ -87,9 +86,18 @@ def backward_kernel(
     _, _, fetch_delta, store_delta = group_io(g, delta_io)
     widen, widen_delta = widening(io), widening(delta_io)
     step_of = stepping(delta_io, use_softplus)
-    at, size = _layout(g, flags, use_z)
+
+    sums, products = f.lanes * g.lane_stride, g.tokens * (f.slots + 1) * f.width
+    parts = {"STEP": g.size, "DU": g.size, "U": g.size, "SLOPE": g.size, "B": g.tokens * f.padded}
+    if read:
+        parts |= {"DY": g.size, "C": g.tokens * f.padded} | ({"GATE": g.size} if use_z else {})
+    parts |= {"Y": sums} if "y" in flags else {}
+    parts |= {"S": sums, "P": sums} if through else {}
+    parts |= {name: products for name, flag in (("DB", "dB"), ("DC", "dC")) if flag in flags}
+    at, size = offsets(parts)
     mark_at, mark_size = offsets({"STEP": m.size, "DU": m.size, "B": MARK_TILE * f.padded})
     size = max(size, 2 * mark_size)
+    at = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P", "DB", "DC"), 0) | at
     arena_type, _, _ = arena_io(size)
     marked, put_mark, _, _ = group_shared(m, size)
     own, put, get, sum_lanes = group_shared(g, size)
@@ -97,50 +105,54 @@ def backward_kernel(
     _, _, put_matrix = matrix_io(f, matrix, TILE, size)
     origin_matrix, fetch_matrix = row_io(f, matrix, TILE)
     _, fetch_mark_matrix = row_io(f, matrix, MARK_TILE)
-    mark = marking(f, mode, MARK_TILE, tuple(mark_at.items()), size)
-    retreat = retreating(g, mode, tuple(at.items()), size, flags)
-    total = totalling(g, tuple(at.items()), size, flags)
-    scale = 1.0 if mode == "bilinear" else LOG2E
+    scale = DISCRETIZATIONS[mode].scale
     marks_size = MARK // SUB * f.walks * f.held + 4
-    read = "read" in flags
     # without outputs 168 registers do, which a compiler left alone exceeds or undercuts with spills
     resident = 1 if read or f.walks > 1 else max(1, 3 * 128 // f.block)
     bounds = (f.block, resident) if resident > 1 else f.block
-    at = dict.fromkeys(("DY", "C", "GATE", "Y", "S", "P"), 0) | at
 
-    @wp.func
-    def set_marks(
-        p: Place, arena: arena_type, marks_out: wp.array(dtype=float), t0: int, end: int,
-        bias: float, a: vec, h: vec, u_at: wp.uint64, delta_at: wp.uint64, b_at: wp.uint64,
-        u_in: wp.array3d(dtype=scalar),
-        delta_in: wp.array3d(dtype=delta_scalar),
-        b_in: wp.array4d(dtype=matrix_scalar),
-    ):  # fmt: skip
-        subs = (end - t0 + wp.static(SUB - 1)) / wp.static(SUB)
-        t = t0 + p.row * wp.static(m.adjacent)
-        u = fetch_mark(u_in, u_at, t, end - 1)
-        delta = fetch_mark_delta(delta_in, delta_at, t, end - 1)
-        b = fetch_mark_matrix(b_in, b_at, p.lane, p.states, t0, end - 1)
-        for tile in range((end - t0 + wp.static(MARK_TILE - 1)) / wp.static(MARK_TILE)):
-            base = (tile % 2) * wp.static(mark_size)
-            left = wp.where(p.active != 0, end - t, 0)
-            steps = marked()
-            inputs = marked()
-            for i in range(wp.static(m.count)):
-                steps[i] = step_of(delta[i], bias, wp.static(m.token(i)) < left)
-                inputs[i] = steps[i] * widen(u[i])
-            put_mark(arena, base + wp.static(mark_at["STEP"]), p.c, p.row, steps)
-            put_mark(arena, base + wp.static(mark_at["DU"]), p.c, p.row, inputs)
-            put_mark_matrix(arena, base + wp.static(mark_at["B"]), p, b)
-            sync()
-            t += wp.static(MARK_TILE)
-            u = fetch_mark(u_in, u_at, t, end - 1)
-            delta = fetch_mark_delta(delta_in, delta_at, t, end - 1)
-            b = fetch_mark_matrix(
-                b_in, b_at, p.lane, p.states, t - p.row * wp.static(m.adjacent), end - 1
-            )
-            h = mark(arena, base, marks_out, tile, subs, p.slot, p.q, a, h)
-        sync()
+    # a thread takes so many sums for dB and dC at a time
+    wanted = ("dB" in flags) + ("dC" in flags)
+    every = wanted * g.tokens * f.width
+    taken = max([v for v in (1, 2, 4) if f.width % v == 0 and every // v >= f.block] or [1])
+    constants = {"MARK": MARK, "SUB": SUB, "TAKEN": taken, "READ": read, "THROUGH": through}
+    constants |= {"NEED_DB": "dB" in flags, "NEED_DC": "dC" in flags, "NEED_Y": "y" in flags}
+    constants |= macros(mode)
+    back = constants | {f"AT_{name}": place for name, place in at.items()}
+    marking = constants | {f"AT_{name}": place for name, place in mark_at.items()}
+
+    @wp.func_native(m.text("mark.inl", **marking))
+    def mark(
+        arena: arena_type,
+        base: int,
+        marks_out: wp.array(dtype=float),
+        tile: int,
+        count: int,
+        p: Place,
+        a: vec,
+        h: vec,
+    ) -> vec: ...
+
+    @wp.func_native(g.text("reverse.inl", **back))
+    def reverse(
+        arena: arena_type,
+        marks_in: wp.array(dtype=float),
+        tile: Tile,
+        p: Place,
+        a: vec,
+        both: pair,
+        db_out: wp.array3d(dtype=float),
+        dc_out: wp.array3d(dtype=float),
+    ) -> pair: ...
+
+    @wp.func_native(g.text("total.inl", **back))
+    def total(
+        arena: arena_type,
+        tile: Tile,
+        p: Place,
+        db_out: wp.array3d(dtype=float),
+        dc_out: wp.array3d(dtype=float),
+    ): ...
 
     @wp.func
     @no_type_check
@@ -164,10 +176,10 @@ def backward_kernel(
             steps[i] = wp.where(inside, step, 0.0)
             u[i] = widen(u_raw[i])
             inputs[i] = steps[i] * u[i]
-        put(arena, wp.static(at["STEP"]), p.c, p.row, steps)
-        put(arena, wp.static(at["DU"]), p.c, p.row, inputs)
-        put(arena, wp.static(at["U"]), p.c, p.row, u)
-        put(arena, wp.static(at["SLOPE"]), p.c, p.row, slopes)
+        put(arena, wp.static(at["STEP"]), p, steps)
+        put(arena, wp.static(at["DU"]), p, inputs)
+        put(arena, wp.static(at["U"]), p, u)
+        put(arena, wp.static(at["SLOPE"]), p, slopes)
         if wp.static(read):
             dys = own()
             gates = own()
@@ -178,50 +190,9 @@ def backward_kernel(
                     s = sigmoid(z)
                     gates[i] = dys[i] * s * (1.0 + z * (1.0 - s))
                     dys[i] = dys[i] * z * s
-            put(arena, wp.static(at["DY"]), p.c, p.row, dys)
+            put(arena, wp.static(at["DY"]), p, dys)
             if wp.static(use_z):
-                put(arena, wp.static(at["GATE"]), p.c, p.row, gates)
-
-    @wp.func
-    @no_type_check
-    def finish(
-        p: Place, arena: arena_type, t: int, left: int, skip: float,
-        du_at: wp.uint64, ddelta_at: wp.uint64, dz_at: wp.uint64,
-        du_out: wp.array3d(dtype=scalar),
-        ddelta_out: wp.array3d(dtype=delta_scalar),
-        dz_out: wp.array3d(dtype=scalar),
-    ) -> wp.vec2:  # fmt: skip
-        # equations 9 and 11; the terms of dD and ddelta_bias
-        dskip = wp.float32(0.0)
-        dbias = wp.float32(0.0)
-        u = get(arena, wp.static(at["U"]), p.c, p.row)
-        dys = own()
-        if wp.static(read):
-            dys = get(arena, wp.static(at["DY"]), p.c, p.row)
-        if wp.static("y" in flags):
-            y = sum_lanes(arena, wp.static(at["Y"]), p.c, p.row)
-            gates = get(arena, wp.static(at["GATE"]), p.c, p.row)
-            for i in range(wp.static(g.count)):
-                inside = wp.static(g.token(i)) < left
-                dz = gates[i] * (y[i] + skip * u[i])
-                store(dz_out, dz_at, t + wp.static(g.token(i)), inside, dz)
-        if wp.static("through" in flags):
-            s = sum_lanes(arena, wp.static(at["S"]), p.c, p.row)
-            d = sum_lanes(arena, wp.static(at["P"]), p.c, p.row)
-            steps = get(arena, wp.static(at["STEP"]), p.c, p.row)
-            slopes = get(arena, wp.static(at["SLOPE"]), p.c, p.row)
-            for i in range(wp.static(g.count)):
-                inside = wp.static(g.token(i)) < left
-                ddelta = (d[i] * wp.static(1.0 / scale) + u[i] * s[i]) * slopes[i]
-                dbias += wp.where(inside, ddelta, 0.0)
-                if wp.static("du" in flags):
-                    du = steps[i] * s[i] + skip * dys[i]
-                    store(du_out, du_at, t + wp.static(g.token(i)), inside, du)
-                if wp.static("ddelta" in flags):
-                    store_delta(ddelta_out, ddelta_at, t + wp.static(g.token(i)), inside, ddelta)
-        for i in range(wp.static(g.count)):
-            dskip += dys[i] * u[i]
-        return wp.vec2(dskip, dbias)
+                put(arena, wp.static(at["GATE"]), p, gates)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds, grid_stride=False)
     @no_type_check
@@ -276,9 +247,35 @@ def backward_kernel(
             chunk = p.begin + (chunks - 1 - back) * wp.static(MARK)
             end = wp.min(chunk + wp.static(MARK), p.end)
             h = read_states(starts_in, starts + chunk / wp.static(MARK), p)
-            set_marks(
-                p, arena, marks, chunk, end, bias, a, h, u_at, delta_at, b_at, u_in, delta_in, b_in
-            )  # fmt: skip
+            # the walk that marks
+            subs = (end - chunk + wp.static(SUB - 1)) / wp.static(SUB)
+            t = chunk + p.row * wp.static(m.adjacent)
+            u_mark = fetch_mark(u_in, u_at, t, end - 1)
+            delta_mark = fetch_mark_delta(delta_in, delta_at, t, end - 1)
+            b_mark = fetch_mark_matrix(b_in, b_at, p, chunk, end - 1)
+            for again in range((end - chunk + wp.static(MARK_TILE - 1)) / wp.static(MARK_TILE)):
+                base = (again % 2) * wp.static(mark_size)
+                left = wp.where(p.active != 0, end - t, 0)
+                steps = marked()
+                inputs = marked()
+                for i in range(wp.static(m.count)):
+                    steps[i] = step_of(delta_mark[i], bias, wp.static(m.token(i)) < left)
+                    inputs[i] = steps[i] * widen(u_mark[i])
+                put_mark(arena, base + wp.static(mark_at["STEP"]), p, steps)
+                put_mark(arena, base + wp.static(mark_at["DU"]), p, inputs)
+                put_mark_matrix(arena, base + wp.static(mark_at["B"]), p, b_mark)
+                sync()
+                t += wp.static(MARK_TILE)
+                u_mark = fetch_mark(u_in, u_at, t, end - 1)
+                delta_mark = fetch_mark_delta(delta_in, delta_at, t, end - 1)
+                b_mark = fetch_mark_matrix(
+                    b_in, b_at, p, t - p.row * wp.static(m.adjacent), end - 1
+                )
+                h = mark(arena, base, marks, again, subs, p, a, h)
+            sync()
+            # the walk back
+            tile = Tile()
+            tile.product = product
             tiles = (end - chunk + wp.static(TILE - 1)) / wp.static(TILE)
             t0 = chunk + (tiles - 1) * wp.static(TILE)
             t = t0 + p.row * wp.static(g.adjacent)
@@ -286,11 +283,11 @@ def backward_kernel(
             delta_raw = fetch_delta(delta_in, delta_at, t, end - 1)
             z_raw = raw()
             dout_raw = raw()
-            b_raw = fetch_matrix(b_in, b_at, lane, p.states, t0, end - 1)
+            b_raw = fetch_matrix(b_in, b_at, p, t0, end - 1)
             c_raw = b_raw
             if wp.static(read):
                 dout_raw = fetch(dout_in, dout_at, t, end - 1)
-                c_raw = fetch_matrix(c_in, c_at, lane, p.states, t0, end - 1)
+                c_raw = fetch_matrix(c_in, c_at, p, t0, end - 1)
                 if wp.static(use_z):
                     z_raw = fetch(z_in, z_at, t, end - 1)
             for again in range(tiles):
@@ -302,31 +299,57 @@ def backward_kernel(
                     put_matrix(arena, wp.static(at["C"]), p, c_raw)
                 put_matrix(arena, wp.static(at["B"]), p, b_raw)
                 sync()
-                first = (t0 - chunk) / wp.static(SUB)
-                subs = wp.min(
+                tile.t0 = t0
+                tile.left = end - t0
+                tile.mark = (t0 - chunk) / wp.static(SUB)
+                tile.subs = wp.min(
                     (end - t0 + wp.static(SUB - 1)) / wp.static(SUB), wp.static(TILE // SUB)
                 )
-                state = retreat(
-                    arena, 0, marks, first, subs, p.slot, p.q, lane, p.states,
-                    t0, end - t0, product, a, state, db_out, dc_out,
-                )  # fmt: skip
+                state = reverse(arena, marks, tile, p, a, state, db_out, dc_out)
                 # their loads are on their way while the sums are completed
                 before = wp.max(t0 - wp.static(TILE), chunk)
                 ahead = before + p.row * wp.static(g.adjacent)
                 u_raw = fetch(u_in, u_at, ahead, end - 1)
                 delta_raw = fetch_delta(delta_in, delta_at, ahead, end - 1)
-                b_raw = fetch_matrix(b_in, b_at, lane, p.states, before, end - 1)
+                b_raw = fetch_matrix(b_in, b_at, p, before, end - 1)
                 if wp.static(read):
                     dout_raw = fetch(dout_in, dout_at, ahead, end - 1)
-                    c_raw = fetch_matrix(c_in, c_at, lane, p.states, before, end - 1)
+                    c_raw = fetch_matrix(c_in, c_at, p, before, end - 1)
                     if wp.static(use_z):
                         z_raw = fetch(z_in, z_at, ahead, end - 1)
-                total(
-                    arena, 0, p.slot, lane, p.states, t0, end - t0, product, db_out, dc_out
-                )  # fmt: skip
-                sums += finish(
-                    p, arena, t, left, skip, du_at, ddelta_at, dz_at, du_out, ddelta_out, dz_out
-                )  # fmt: skip
+                total(arena, tile, p, db_out, dc_out)
+                # equations 9 and 11; the terms of dD and ddelta_bias
+                dskip = wp.float32(0.0)
+                dbias = wp.float32(0.0)
+                u = get(arena, wp.static(at["U"]), p)
+                dys = own()
+                if wp.static(read):
+                    dys = get(arena, wp.static(at["DY"]), p)
+                if wp.static("y" in flags):
+                    y = sum_lanes(arena, wp.static(at["Y"]), p)
+                    gates = get(arena, wp.static(at["GATE"]), p)
+                    for i in range(wp.static(g.count)):
+                        inside = wp.static(g.token(i)) < left
+                        dz = gates[i] * (y[i] + skip * u[i])
+                        store(dz_out, dz_at, t + wp.static(g.token(i)), inside, dz)
+                if wp.static(through):
+                    s = sum_lanes(arena, wp.static(at["S"]), p)
+                    d = sum_lanes(arena, wp.static(at["P"]), p)
+                    step = get(arena, wp.static(at["STEP"]), p)
+                    slopes = get(arena, wp.static(at["SLOPE"]), p)
+                    for i in range(wp.static(g.count)):
+                        inside = wp.static(g.token(i)) < left
+                        ddelta = (d[i] * wp.static(1.0 / scale) + u[i] * s[i]) * slopes[i]
+                        dbias += wp.where(inside, ddelta, 0.0)
+                        own_t = t + wp.static(g.token(i))
+                        if wp.static("du" in flags):
+                            du = step[i] * s[i] + skip * dys[i]
+                            store(du_out, du_at, own_t, inside, du)
+                        if wp.static("ddelta" in flags):
+                            store_delta(ddelta_out, ddelta_at, own_t, inside, ddelta)
+                for i in range(wp.static(g.count)):
+                    dskip += dys[i] * u[i]
+                sums += wp.vec2(dskip, dbias)
             sync()
             # the chunk's sums join those of its run, which begin at 0 in memory
             e = place(sizes, _anew(index), _anew(lane))

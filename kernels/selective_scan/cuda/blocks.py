@@ -4,21 +4,30 @@ A block holds adjacent channels of one group. For the recurrence a thread owns `
 ``states`` of them (an outer product, so that what it reads from shared memory is used more than
 once), and ``lanes`` threads share a channel; for loads, stores and what depends on a channel alone,
 a thread owns one channel and every ``rows``-th token, so that a warp touches adjacent addresses.
+The loops are C++ in the files beside this one, for a CPU as well, where the tests run it.
 """
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import no_type_check
 
 import torch
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import WIDE, softplus
+from ...runtime.native import native
+from ...runtime.scalars import EXP2, RECIPROCAL, WIDE, softplus
 from ...runtime.views import struct
+from ..problem import macros
 
 STATES = 16  # of a state block, the most that a channel holds in registers
 MARK = 64  # tokens between the states that the forward saves for the gradient
+SUB = 4  # tokens whose states and decays the gradient holds in registers
+UNROLL = 4  # tokens whose sums wait in registers, so that their loads need not wait for stores
+
+_HERE = Path(__file__).parent
+_HEAD = EXP2 + RECIPROCAL + WIDE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +75,11 @@ class BlockShape:
         """Floats between the lanes' partial sums, against bank conflicts."""
         return 32 // self.lanes if self.lanes > 1 else 0
 
+    def text(self, file: str, **macros: object) -> str:
+        """C++ of a file beside this one for blocks of this shape."""
+        shape = {name.upper(): value for name, value in vars(self).items()}
+        return _HEAD + native(_HERE / file, **shape, **macros)
+
 
 def block_shape(block: int, channels: int, states: int, total: int) -> BlockShape:
     """The block shape for ``total`` states; the others are a tuning's, of a block or a thread."""
@@ -77,17 +91,21 @@ def block_shape(block: int, channels: int, states: int, total: int) -> BlockShap
 
 # A type, an integer of its bits, and the float that such an integer means.
 BITS = {
-    torch.float32: ("float", "unsigned", "float f; memcpy(&f, &bits, 4); return f;"),
-    torch.float16: (
-        "wp::float16",
-        "unsigned short",
-        "wp::half h; h.u = (unsigned short)bits; return wp::half_to_float(h);",
-    ),
-    torch.bfloat16: (
-        "wp::bfloat16",
-        "unsigned short",
-        "unsigned v = bits << 16; float f; memcpy(&f, &v, 4); return f;",
-    ),
+    torch.float32: {
+        "ELEMENT": "float",
+        "WORD": "unsigned",
+        "WIDEN": "float f; memcpy(&f, &bits, 4); return f;",
+    },
+    torch.float16: {
+        "ELEMENT": "wp::float16",
+        "WORD": "unsigned short",
+        "WIDEN": "wp::half h; h.u = (unsigned short)bits; return wp::half_to_float(h);",
+    },
+    torch.bfloat16: {
+        "ELEMENT": "wp::bfloat16",
+        "WORD": "unsigned short",
+        "WIDEN": "unsigned v = bits << 16; float f; memcpy(&f, &v, 4); return f;",
+    },
 }
 
 
@@ -95,7 +113,7 @@ BITS = {
 def widening(io: torch.dtype):
     """Makes the function that turns the bits of an ``io`` into a float."""
 
-    @wp.func_native(BITS[io][2])
+    @wp.func_native(BITS[io]["WIDEN"])
     def widen(bits: wp.uint32) -> float: ...
 
     return widen
@@ -221,46 +239,11 @@ def states_io(f: BlockShape):
     """
     vec = wp.types.vector(f.walks * f.held, wp.float32)
 
-    def loop(array: str, body: str) -> str:
-        return f"""
-float* row = {array}.data + (size_t)i * ({array}.strides[0] / 4);
-WP_PRAGMA_UNROLL
-for (int k = 0; k < {f.walks * f.held}; ++k) {{
-    const int c = slot * {f.channels} + k % {f.held} / {f.states};
-    const int n = k / {f.held} * {f.width} + q * {f.states} + k % {f.states};
-    float* at = row + (size_t)(d0 + c) * states + n;
-    {body}
-}}
-"""
+    @wp.func_native(f.text("states.inl", LOAD=True))
+    def read(states: wp.array3d(dtype=float), i: int, p: Place) -> vec: ...
 
-    @wp.func_native(
-        f"wp::vec_t<{f.walks * f.held}, float> h;"
-        + loop("x_in", "h.c[k] = c < count && n < states ? *at : 0.0f;")
-        + "return h;"
-    )
-    def load(
-        x_in: wp.array3d(dtype=float), i: int, d0: int, count: int, states: int, slot: int, q: int
-    ) -> vec: ...
-
-    @wp.func_native(loop("x_out", "if (c < count && n < states) *at = h.c[k];"))
-    def store(
-        x_out: wp.array3d(dtype=float),
-        i: int,
-        d0: int,
-        count: int,
-        states: int,
-        slot: int,
-        q: int,
-        h: vec,
-    ): ...
-
-    @wp.func
-    def read(x_in: wp.array3d(dtype=float), i: int, p: Place) -> vec:
-        return load(x_in, i, p.d0, p.count, p.states, p.slot, p.q)
-
-    @wp.func
-    def write(x_out: wp.array3d(dtype=float), i: int, p: Place, h: vec):
-        store(x_out, i, p.d0, p.count, p.states, p.slot, p.q, h)
+    @wp.func_native(f.text("states.inl", LOAD=False))
+    def write(states: wp.array3d(dtype=float), i: int, p: Place, h: vec): ...
 
     return vec, read, write
 
@@ -296,38 +279,18 @@ def channel_io(f: BlockShape, io: torch.dtype, tokens: int):
     converting would wait for them. Elements from ``end`` on are 0.
     """
     scalar = WARP_DTYPES[io]
-    element, word, _ = BITS[io]
     count = tokens // f.rows
     raw = wp.types.vector(count, wp.uint32)
 
-    def address(array: str) -> str:
-        return f"""
-{WIDE}
-char* at = (char*)(({element}*){array}.data + d) + wide_(b, {array}.strides[0]);
-at += wide_(t, {array}.strides[1]);
-"""
-
-    snippet = f"""
-{address("x_in")}
-wp::vec_t<{count}, unsigned> r;
-const long long step = wide_({f.rows}, x_in.strides[1]);
-WP_PRAGMA_UNROLL
-for (int i = 0; i < {count}; ++i, at += step) {{
-    r.c[i] = 0;
-    if ({f.rows} * i < left) r.c[i] = *(const {word}*)at;
-}}
-return r;
-"""
-
-    @wp.func_native(snippet)
-    def fetch_own(x_in: wp.array3d(dtype=scalar), b: int, d: int, t: int, left: int) -> raw: ...
+    @wp.func_native(f.text("load_channel.inl", COUNT=count, **BITS[io]))
+    def load(x_in: wp.array3d(dtype=scalar), p: Place, t: int, left: int) -> raw: ...
 
     @wp.func
     def fetch(x_in: wp.array3d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
         left = wp.where(t0 < 0, 0, end - t0 - p.row)  # there is no tile before the first
-        return fetch_own(x_in, p.b, p.d, t0 + p.row, left)
+        return load(x_in, p, t0 + p.row, left)
 
-    @wp.func_native(f"{address('x_out')} *({element}*)at = ({element})v;")
+    @wp.func_native(f.text("store_channel.inl", **BITS[io]))
     def store(x_out: wp.array3d(dtype=scalar), b: int, d: int, t: int, v: float): ...
 
     return count, raw, fetch, store
@@ -342,37 +305,14 @@ def matrix_io(f: BlockShape, io: torch.dtype, tokens: int, arena_size: int):
     raw = wp.types.vector(count, wp.uint32)
     arena_type, put, _ = arena_io(arena_size)
     widen = widening(io)
-    snippet = f"""
-{WIDE}
-const char* from = (const char*)x_in.data + wide_(b, x_in.strides[0]);
-from += wide_(group, x_in.strides[2]);
-wp::vec_t<{count}, unsigned> r;
-WP_PRAGMA_UNROLL
-for (int i = 0; i < {count}; ++i) {{
-    const int e = {f.block} * i + lane, t = e / {f.padded}, n = e % {f.padded};
-    r.c[i] = 0;
-    if (t < left && n < states && e < {size})
-        r.c[i] = *(const {BITS[io][1]}*)(
-            from + wide_(n, x_in.strides[3]) + wide_(t0 + t, x_in.strides[1]));
-}}
-return r;
-"""
 
-    @wp.func_native(snippet)
-    def fetch_all(
-        x_in: wp.array4d(dtype=scalar),
-        b: int,
-        group: int,
-        lane: int,
-        states: int,
-        t0: int,
-        left: int,
-    ) -> raw: ...
+    @wp.func_native(f.text("load_matrix.inl", COUNT=count, TOKENS=tokens, **BITS[io]))
+    def load(x_in: wp.array4d(dtype=scalar), p: Place, t0: int, left: int) -> raw: ...
 
     @wp.func
     def fetch(x_in: wp.array4d(dtype=scalar), p: Place, t0: int, end: int) -> raw:
         left = wp.where(t0 < 0, 0, end - t0)
-        return fetch_all(x_in, p.b, p.group, p.lane, p.states, t0, left)
+        return load(x_in, p, t0, left)
 
     @wp.func
     def put_rows(arena: arena_type, base: int, p: Place, r: raw):
@@ -384,3 +324,32 @@ return r;
                 put(arena, base + e, widen(r[i]))
 
     return raw, fetch, put_rows
+
+
+@functools.cache
+def recurrence(
+    f: BlockShape, mode: str, tokens: int, at: tuple, arena_size: int, read: bool, reverse: bool
+):
+    """The recurrence over a tile, and for rules whose decays are no exponentials their product.
+
+    Equations are those of README.md. The operands of a tile are floats in shared memory, channels
+    or states adjacent. Tokens past the end have δ = 0 and change nothing. Forward it is equation 1,
+    and with ``read`` the sums of equation 5 as partial sums of the lanes; in reverse it is equation
+    6, dh from after a tile to before it.
+
+    Args:
+        at: pairs (name, offset) of ``STEP, IN, W`` (δ, and δu and B, or dy and C), with ``read`` of
+            ``C, Y``.
+    """
+    vec = wp.types.vector(f.walks * f.held, wp.float32)
+    arena_type, _, _ = arena_io(arena_size)
+    offset = {"AT_C": 0, "AT_Y": 0} | {f"AT_{name}": place for name, place in at}
+    text = functools.partial(f.text, TOKENS=tokens, **macros(mode), **offset)
+
+    @wp.func_native(text("advance.inl", UNROLL=UNROLL, READ=read, REVERSE=reverse))
+    def advance(arena: arena_type, base: int, p: Place, a: vec, h: vec) -> vec: ...
+
+    @wp.func_native(text("decay.inl"))
+    def decay(arena: arena_type, base: int, p: Place, a: vec, h: vec) -> vec: ...
+
+    return advance, decay

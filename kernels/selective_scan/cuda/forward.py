@@ -12,7 +12,8 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import LOG2E, sigmoid
+from ...runtime.scalars import sigmoid
+from ..problem import DISCRETIZATIONS
 from .blocks import (
     MARK,
     BlockShape,
@@ -23,25 +24,17 @@ from .blocks import (
     matrix_io,
     offsets,
     placing,
+    recurrence,
     states_io,
     stepping,
     sync,
     widening,
 )
-from .tokens import advancing, decaying
 
 
 def tile_tokens(f: BlockShape) -> int:
     """Tokens of a tile: fewer where B and C of very many states would fill shared memory."""
     return 16 if f.padded <= 128 else 8
-
-
-def _layout(f: BlockShape, read: bool) -> tuple[dict, int]:
-    tokens = tile_tokens(f)
-    parts = {"STEP": tokens * f.span, "IN": tokens * f.span, "W": tokens * f.padded}
-    if read:
-        parts |= {"C": tokens * f.padded, "Y": f.lanes * (tokens * f.span + f.pad)}
-    return offsets(parts)
 
 
 @functools.cache
@@ -70,13 +63,15 @@ def forward_kernel(
     count, raw, fetch, store = channel_io(f, io, tokens)
     _, _, fetch_delta, _ = channel_io(f, delta_io, tokens)
     widen, step_of = widening(io), stepping(delta_io, use_softplus)
-    at, size = _layout(f, read)
+    parts = {"STEP": tokens * f.span, "IN": tokens * f.span, "W": tokens * f.padded}
+    if read:
+        parts |= {"C": tokens * f.padded, "Y": f.lanes * (tokens * f.span + f.pad)}
+    at, size = offsets(parts)
     arena_type, put, get = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, tokens, 2 * size)
-    advance = advancing(f, mode, tokens, tuple(at.items()), 2 * size, read, False)
-    decay = decaying(f, mode, tokens, tuple(at.items()), 2 * size)
-    multiply = summary and mode == "bilinear"
-    scale = 1.0 if mode == "bilinear" else LOG2E
+    advance, decay = recurrence(f, mode, tokens, tuple(at.items()), 2 * size, read, False)
+    rule = DISCRETIZATIONS[mode]
+    multiply, scale = summary and not rule.exponential, rule.scale
 
     @wp.func
     def finish(
@@ -168,8 +163,8 @@ def forward_kernel(
                 if sizes.save != 0 and t0 % MARK == 0:
                     write_states(saved_out, row + (t0 - p.begin) / MARK, p, h)
             if wp.static(multiply):
-                product = decay(arena, base, p.slot, p.q, a, product)
-            h = advance(arena, base, p.slot, p.q, a, h)
+                product = decay(arena, base, p, a, product)
+            h = advance(arena, base, p, a, h)
         if wp.static(read):
             sync()
             t0 = p.begin + (tiles - 1) * wp.static(tokens)

@@ -1,107 +1,273 @@
-"""The scan on CUDA: launches and sums around the kernels of ``forward.py`` and ``backward.py``.
+"""The scan on CUDA: operands, launches and sums around the kernels.
 
-``tuning.py`` chooses among them: a ``tuning`` is empty or holds the numbers of a ``Tuning``. All
-runs on torch's current stream, without synchronisation, in memory from torch's allocator.
+All runs on torch's current stream, without synchronisation, in memory from torch's allocator. One
+pass over the whole sequence computes each exponential once, but gives the machine only batch x
+channels to do at once. Cut into segments, all run at once, and each but the last is walked twice:
+first from zero for what it adds, then from its right state.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple, no_type_check
+
 import torch
+import warp as wp
 from torch import Tensor
 
+from ...runtime.launch import cuda_launch
+from ...runtime.recording import multiprocessors_of
+from ...runtime.scalars import LOG2E, exp2
 from ...runtime.views import lane_contiguous
+from ..problem import DISCRETIZATIONS, Scan
 from .backward import RUN, backward_kernel
-from .blocks import MARK
+from .blocks import MARK, Sizes, block_shape
 from .forward import forward_kernel
-from .operands import Operands
 from .summary import summary_kernel
 
-
-def forward(
-    u, delta, A, B, C, D, z, delta_bias, initial_state, softplus, discretization, save, tuning
-):
-    """Runs the scan on CUDA; arguments and results as ``cpu.forward``."""
-    o = Operands(u, delta, A, B, C, D, z, delta_bias, initial_state, tuning, back=False)
-    return _forward(o, softplus, discretization, save, True)
+MOST_SEGMENTS = 256  # the carry between them is serial
+RESIDENT = (3, 2)  # blocks of a multiprocessor, by their registers: forward, gradient
+OVERHEAD = 16  # tokens
 
 
-def final_state(u, delta, A, B, delta_bias, initial_state, softplus, discretization, save, tuning):
-    """The last state ``[B, D, N]`` of ``forward`` alone, and the saved states."""
-    o = Operands(u, delta, A, B, B, None, None, delta_bias, initial_state, tuning, back=False)
-    _, last, saved = _forward(o, softplus, discretization, save, False)
-    return last, saved
+class Tuning(NamedTuple):
+    """A choice of kernels; results differ between choices by rounding only.
+
+    Attributes:
+        segments: of the sequence in the forward, at most; 1 is one launch, more are three.
+        channels: of a thread in the forward.
+        states: of a thread in the forward; 16 / states threads share a channel.
+        back_segments: as ``segments``, of the gradient.
+        back_channels: as ``channels``, of the gradient.
+        back_states: as ``states``, of the gradient.
+        block: threads of a block, a multiple of 32.
+    """
+
+    segments: int = 1
+    channels: int = 2
+    states: int = 4
+    back_segments: int = 1
+    back_channels: int = 2
+    back_states: int = 4
+    block: int = 128
 
 
-def _forward(o: Operands, softplus: bool, mode: str, save: bool, read: bool):
+FORCED: Tuning | None = None  # what every scan on CUDA runs on, for tests and studies to set
+
+
+@functools.cache
+def choose(
+    batch: int, length: int, channels: int, states: int, groups: int, multiprocessors: int
+) -> Tuning:
+    """The tuning for a shape on a device of so many multiprocessors.
+
+    The model: a multiprocessor holds ``RESIDENT`` blocks at a time, and k blocks at once take
+    k + 1/2 times as long as one would take at its full rate. P segments are walked (2 - 1/P) times
+    in the forward; the gradient's walks are longer, so that they cost (4 - 1/P) / 3. Beginning
+    and ending a segment costs as much as ``OVERHEAD`` tokens. No GPU has timed it.
+    """
+    tuning = Tuning()
+    if not batch or not length:
+        return tuning
+    units = -(-length // MARK)
+
+    def segments(per_thread: tuple[int, int], resident: int, walks: float) -> int:
+        shape = block_shape(tuning.block, *per_thread, states)
+        blocks = batch * groups * -(-(channels // groups) // shape.span)
+
+        def cost(count: int) -> float:
+            load = -(-blocks * count // multiprocessors)
+            rounds = -(-load // resident)
+            work = (walks + 1 - 1 / count) / walks / count
+            return work * (load + 0.5 * rounds) * (1 + OVERHEAD * count / length)
+
+        return min(range(1, min(units, MOST_SEGMENTS) + 1), key=cost)
+
+    return tuning._replace(
+        segments=segments((tuning.channels, tuning.states), RESIDENT[0], 1.0),
+        back_segments=segments((tuning.back_channels, tuning.back_states), RESIDENT[1], 3.0),
+    )
+
+
+def scan_tuning(shape: Sequence[int], states: int, groups: int, device: torch.device) -> Tuning:
+    """The tuning that a scan runs on.
+
+    On a CPU, where only tests run these kernels, it is the default one, without segments.
+
+    Args:
+        shape: of u, ``[B, L, D]``.
+        states: N.
+        groups: G.
+        device: of the tensors.
+    """
+    if FORCED is not None:
+        return FORCED
+    if device.type != "cuda":
+        return Tuning()
+    return choose(*shape, states, groups, multiprocessors_of(device))
+
+
+@functools.cache
+def _carry_kernel(exponential: bool, reverse: bool):
+    @wp.kernel(enable_backward=False, module="unique")
+    @no_type_check
+    def carry(
+        # in
+        segments: int,
+        states: int,
+        a_in: wp.array2d(dtype=float),
+        decay_in: wp.array3d(dtype=float),
+        # in and out
+        local_out: wp.array2d(dtype=float),
+        state_out: wp.array2d(dtype=float),
+    ):
+        b, i = wp.tid()
+        h = state_out[b, i]
+        d = i / states
+        n = i % states
+        for k in range(segments):
+            segment = k
+            if wp.static(reverse):
+                segment = segments - 1 - k
+            at = b * segments + segment
+            own = local_out[at, i]
+            local_out[at, i] = h
+            decay = wp.float32(0.0)
+            if wp.static(exponential):
+                total = wp.float32(0.0)
+                for row in range(decay_in.shape[1]):
+                    total += decay_in[at, row, d]
+                decay = exp2(wp.static(LOG2E) * a_in[d, n] * total)
+            else:
+                decay = decay_in[at, d, n]
+            h = decay * h + own
+
+    return carry
+
+
+class _Operands:
+    """The tensors of one scan as the kernels take them, and how it is cut.
+
+    ``state`` is a new, dense ``[B, D, N]``: the first state, or the gradient of the last. ``shape``
+    is the block shape; ``back`` says that the gradient runs.
+    """
+
+    def __init__(self, x: Scan, state: Tensor | None, back: bool):
+        self.batch, self.length, self.channels = x.u.shape
+        self.states, self.groups, self.device = x.A.shape[1], x.B.shape[2], x.u.device
+        tuning = scan_tuning(x.u.shape, self.states, self.groups, self.device)
+        per_thread, segments = (tuning.channels, tuning.states), tuning.segments
+        if back:
+            per_thread = (tuning.back_channels, tuning.back_states)
+            segments = tuning.back_segments
+        self.shape = block_shape(tuning.block, *per_thread, self.states)
+        self.marks = -(-self.length // MARK)
+        self.segment = -(-max(self.marks, 1) // segments) * MARK
+        self.segments = -(-self.length // self.segment)
+        self.parts = -(-(self.channels // self.groups) // self.shape.span)
+
+        C = x.B if x.C is None else x.C
+        matrix = x.B.dtype if x.B.dtype == C.dtype else torch.float32
+        self.mode, self.softplus, self.use_z = x.discretization, x.softplus, x.z is not None
+        self.exponential = DISCRETIZATIONS[self.mode].exponential
+        self.dtypes = (x.u.dtype, x.delta.dtype, matrix)
+        self.u, self.delta = lane_contiguous(x.u), lane_contiguous(x.delta)
+        self.z = self.u if x.z is None else lane_contiguous(x.z)
+        self.A = x.A.float().contiguous()
+        self.B, self.C = x.B.to(matrix), C.to(matrix)
+        zero = torch.zeros(self.channels, device=self.device)
+        self.skip, self.bias = (
+            zero if v is None else v.float().contiguous() for v in (x.D, x.delta_bias)
+        )
+        if state is None:
+            self.state = torch.zeros(self.batch, self.channels, self.states, device=self.device)
+        else:
+            self.state = state.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
+
+    def empty(self, *shape: int) -> Tensor:
+        return torch.empty(shape, device=self.device)
+
+    def inputs(self, save: bool = False) -> list:
+        """What the forward and the gradient begin with."""
+        sizes = Sizes()
+        sizes.length, sizes.states, sizes.groups = self.length, self.states, self.groups
+        sizes.group_width = self.channels // self.groups
+        sizes.parts, sizes.segments, sizes.segment = self.parts, self.segments, self.segment
+        sizes.save = int(save)
+        tensors = self.u, self.delta, self.z, self.A[None], self.B, self.C, self.skip, self.bias
+        return [sizes, *tensors]
+
+    def launch(self, kernel: Any, inputs: list, outputs: list) -> None:
+        blocks = self.batch * self.segments * self.groups * self.parts
+        threads = self.shape.block
+        dim = (blocks, threads)
+        cuda_launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
+
+    def carried(self, kernel: Any, inputs: list, outputs: list, reverse: bool):
+        """The state that enters each segment, from a kernel of what each adds and its decay."""
+        rows, width = self.batch * self.segments, self.channels * self.states
+        local = self.empty(rows, self.channels, self.states)
+        decay = torch.empty_like(local)
+        if self.exponential:
+            decay = self.empty(rows, self.shape.rows, self.channels)
+        self.launch(kernel, inputs, [local, decay, *outputs])
+        cuda_launch(
+            _carry_kernel(self.exponential, reverse),
+            (self.batch, width),
+            [self.segments, self.states, self.A, decay],
+            [local.view(-1, width), self.state.view(-1, width)],
+            device=self.device,
+            block_dim=128,
+        )
+        return local
+
+
+def saved_shape(x: Scan) -> tuple[int, ...]:
+    """The shape of the saved states that ``forward`` returns, whatever the tuning."""
+    return (x.u.shape[0], -(-x.u.shape[1] // MARK) if x.save else 0, *x.A.shape)
+
+
+def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
+    """Runs the scan on CUDA; results as those of the CPU's."""
+    read = x.C is not None
+    o = _Operands(x, x.initial_state, back=False)
     shape = (o.batch, o.length if read else 0, o.channels)
     out = torch.empty(shape, dtype=o.u.dtype, device=o.device)
-    saved = o.empty(o.batch, o.marks if save else 0, o.channels, o.states)
+    saved = o.empty(*saved_shape(x))
     if not o.u.numel():
         return out, o.state, saved
-    inputs = [o.u, o.delta, o.z, o.A[None], o.B, o.C, o.skip, o.bias]
+    first, none = o.state, o.empty(0, 0, 0)
     flat = saved.view(-1, o.channels, o.states)
-    first, decay = o.state, o.empty(0, 0, 0)
+    kernel = functools.partial(forward_kernel, o.dtypes, o.mode, o.shape)
     if o.segments > 1:
-        first, decay = o.summary(mode)
-        kernel = forward_kernel(o.dtypes, mode, o.shape, False, True, softplus, False)
-        o.launch(kernel, [o.sizes(), *inputs, o.state], [first, decay, flat, out])
-        o.carry(mode, False, first, decay)
+        inputs = [*o.inputs(), o.state]
+        first = o.carried(kernel(False, True, o.softplus, False), inputs, [flat, out], False)
     last = torch.empty_like(o.state)
-    kernel = forward_kernel(o.dtypes, mode, o.shape, read, False, softplus, o.use_z and read)
-    o.launch(kernel, [o.sizes(save), *inputs, first], [last, decay, flat, out])
+    outputs = [last, none, flat, out]
+    chosen = kernel(read, False, o.softplus, o.use_z and read)
+    o.launch(chosen, [*o.inputs(x.save), first], outputs)
     return out, last, saved
 
 
 def backward(
-    dout, dlast, u, delta, A, B, C, D, z, delta_bias, saved, softplus, discretization, needs,
-    tuning,
-):  # fmt: skip
-    """Gradients of ``forward``; arguments and results as ``cpu.backward``."""
-    o = Operands(u, delta, A, B, C, D, z, delta_bias, dlast, tuning, back=True)
-    grads = _backward(o, dout, saved, softplus, discretization, needs)
-    dtypes = [None if x is None else x.dtype for x in (u, delta, A, B, C, D, z, delta_bias, A)]
-    return _wanted(grads, needs, dtypes)
-
-
-def final_state_backward(
-    dlast, u, delta, A, B, delta_bias, saved, softplus, discretization, needs, tuning
-):
-    """Gradients of ``final_state``: six, for u, delta, A, B, delta_bias and the initial state."""
-    o = Operands(u, delta, A, B, B, None, None, delta_bias, dlast, tuning, back=True)
-    u_, delta_, A_, B_, bias_, state_ = needs
-    needs = (u_, delta_, A_, B_, False, False, False, bias_, state_)
-    grads = _backward(o, None, saved, softplus, discretization, needs)
-    dtypes = [None if x is None else x.dtype for x in (u, delta, A, B, B, u, u, delta_bias, A)]
-    grads = _wanted(grads, needs, dtypes)
-    return [grads[i] for i in (0, 1, 2, 3, 7, 8)]
-
-
-def _wanted(grads: list, needs, dtypes: list) -> list:
-    """Nine gradients in the types of their tensors, None where not needed."""
-    return [
-        grad().to(dtype) if needed else None for grad, needed, dtype in zip(grads, needs, dtypes)
-    ]
-
-
-def _flags(needs, read: bool, use_z: bool) -> frozenset:
-    """What the kernel computes; see ``backward_kernel``."""
-    u, delta, A, B, C, _, z, bias, state = needs
-    flags = {
+    dout: Tensor | None, dlast: Tensor | None, x: Scan, saved: Tensor, needs: Sequence[bool]
+) -> list[Tensor | None]:
+    """Gradients of ``forward``; arguments and results as those of the CPU's."""
+    o = _Operands(x, dlast, back=True)
+    read = dout is not None
+    need_u, need_delta, need_A, need_B, need_C, _, need_z, need_bias, need_h = needs
+    wanted = {
         "read": read,
-        "du": u,
-        "ddelta": delta,
-        "dz": z,
-        "y": z and use_z and read,
-        "dB": B,
-        "dC": C and read,
-        "through": u or delta or A or B or bias or state,
+        "du": need_u,
+        "ddelta": need_delta,
+        "dz": need_z,
+        "y": need_z and o.use_z and read,
+        "dB": need_B,
+        "dC": need_C and read,
+        "through": need_u or need_delta or need_A or need_B or need_bias or need_h,
     }
-    return frozenset(name for name, on in flags.items() if on)
-
-
-def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str, needs) -> list:
-    """Nine functions that give the gradients."""
-    flags = _flags(needs, dout is not None, o.use_z)
+    flags = frozenset(name for name, on in wanted.items() if on)
 
     def like(x: Tensor, flag: str) -> Tensor:
         return torch.empty(x.shape if flag in flags else (0, 0, 0), dtype=x.dtype, device=o.device)
@@ -123,20 +289,19 @@ def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str
     if o.u.numel():
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state
-        if o.segments > 1:
-            last = _carry_back(o, dout, softplus, mode, "read" in flags)
-        kernel = backward_kernel(o.dtypes, mode, o.shape, softplus, o.use_z, flags)
+        if o.segments > 1:  # the gradient of the state after each segment
+            sizes, _, delta, z, A, _, C, _, bias = o.inputs()
+            kernel = summary_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, read)
+            last = o.carried(kernel, [sizes, delta, z, A, C, bias, dout], [], True)
+        kernel = backward_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, flags)
         o.launch(
             kernel,
-            [
-                o.sizes(), o.u, o.delta, o.z, o.A[None], o.B, o.C, o.skip, o.bias, dout,
-                saved.view(-1, o.channels, o.states), last,
-            ],
+            [*o.inputs(), dout, saved.view(-1, o.channels, o.states), last],
             [dfirst, du, ddelta, dz, da, db, dc, dskip, dbias],
-        )  # fmt: skip
+        )
     else:
         dfirst = o.state
-    return [
+    values = (
         lambda: du,
         lambda: ddelta,
         lambda: da.sum(0),
@@ -146,18 +311,9 @@ def _backward(o: Operands, dout: Tensor | None, saved, softplus: bool, mode: str
         lambda: dz,
         lambda: dbias.sum((0, 1)),
         lambda: dfirst,
+    )
+    tensors = (*x[:8], x.A)
+    return [
+        value().to(tensor.dtype) if needed else None
+        for value, tensor, needed in zip(values, tensors, needs)
     ]
-
-
-def _carry_back(o: Operands, dout: Tensor, softplus: bool, mode: str, read: bool) -> Tensor:
-    """The gradient of the state after each segment."""
-    last, decay = o.summary(mode)
-    kernel = summary_kernel(o.dtypes, mode, o.shape, softplus, o.use_z, read)
-    o.launch(kernel, [o.sizes(), o.delta, o.z, o.A[None], o.C, o.bias, dout], [last, decay])
-    o.carry(mode, True, last, decay)
-    return last
-
-
-def saved_shape(u: Tensor, A: Tensor, B: Tensor, save: bool, tuning) -> tuple[int, ...]:
-    """The shape of the saved states that ``forward`` returns, whatever the tuning."""
-    return (u.shape[0], -(-u.shape[1] // MARK) if save else 0, *A.shape)

@@ -10,7 +10,8 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import LOG2E, sigmoid
+from ...runtime.scalars import sigmoid
+from ..problem import DISCRETIZATIONS
 from .blocks import (
     BlockShape,
     Sizes,
@@ -19,12 +20,12 @@ from .blocks import (
     matrix_io,
     offsets,
     placing,
+    recurrence,
     states_io,
     stepping,
     sync,
     widening,
 )
-from .tokens import advancing, decaying
 
 TILE = 16  # tokens
 
@@ -47,10 +48,9 @@ def summary_kernel(
     at, size = offsets({"STEP": TILE * f.span, "IN": TILE * f.span, "W": TILE * f.padded})
     arena_type, put, _ = arena_io(2 * size)
     _, fetch_matrix, put_matrix = matrix_io(f, matrix, TILE, 2 * size)
-    retreat = advancing(f, mode, TILE, tuple(at.items()), 2 * size, False, True)
-    decay = decaying(f, mode, TILE, tuple(at.items()), 2 * size)
-    multiply = mode == "bilinear"
-    scale = 1.0 if multiply else LOG2E
+    reverse, decay = recurrence(f, mode, TILE, tuple(at.items()), 2 * size, False, True)
+    rule = DISCRETIZATIONS[mode]
+    multiply, scale = not rule.exponential, rule.scale
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=f.block, grid_stride=False)
     @no_type_check
@@ -108,8 +108,8 @@ def summary_kernel(
             if wp.static(use_z):
                 z = fetch(z_in, p, t0, end)
             if wp.static(multiply):
-                product = decay(arena, base, p.slot, p.q, a, product)
-            dh = retreat(arena, base, p.slot, p.q, a, dh)
+                product = decay(arena, base, p, a, product)
+            dh = reverse(arena, base, p, a, dh)
         write_states(first_out, p.at, p, dh)
         if wp.static(multiply):
             write_states(decay_out, p.at, p, product)

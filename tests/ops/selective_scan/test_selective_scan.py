@@ -3,19 +3,27 @@
 import pytest
 import torch
 from helpers import assert_rel_rms, rel_rms
-from helpers.scan import FORWARD, compare, leaves, make, oracle
+from helpers.scan import (
+    FORWARD,
+    compare,
+    every_discretization,
+    leaves,
+    make,
+    on_threads,
+    oracle,
+)
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_fn
+from gamba_warp.kernels.selective_scan.cpu import launch as cpu
+from gamba_warp.kernels.selective_scan.problem import Scan
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 
 
 @pytest.fixture(autouse=True)
 def _two_threads():
     """Enough for the kernels' splitting; more only make the oracle's small loops wait."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+    with on_threads(2):
+        yield
 
 
 @pytest.mark.parametrize(
@@ -31,14 +39,14 @@ def _two_threads():
     ],
 )
 def test_matches_oracle(batch, length, channels, states, groups):
-    compare(make(batch, length, channels, states, groups), delta_softplus=True)
+    compare(make(batch, length, channels, states, groups))
 
 
 @pytest.mark.parametrize("discretization", ["bilinear", "zoh"])
 def test_other_discretizations(discretization):
     inputs = make(2, 130, 21, 5)
     inputs["A"][:, 0] = -1e-3  # x near 0, where (e^x - 1) / x needs its series
-    compare(inputs, delta_softplus=True, discretization=discretization)
+    compare(inputs, discretization=discretization)
 
 
 def test_without_options():
@@ -47,19 +55,19 @@ def test_without_options():
     inputs = {k: inputs[k] for k in ("u", "delta", "A", "B", "C")}
     inputs["delta"] = inputs["delta"].exp()
     inputs["B"], inputs["C"] = inputs["B"][:, :, 0], inputs["C"][:, :, 0]
-    compare(inputs)
+    compare(inputs, delta_softplus=False)
 
 
 @pytest.mark.parametrize("dtype, limit", [(torch.bfloat16, 4e-3), (torch.float16, 5e-4)])
 def test_half_precision(dtype, limit):
     """Limits: the rounding of the dtype itself, 2^-9 and 2^-12 at most, on output only."""
-    compare(make(2, 65, 37, 3, dtype=dtype), limit, limit, delta_softplus=True)
+    compare(make(2, 65, 37, 3, dtype=dtype), limit)
 
 
 def test_delta_may_have_its_own_dtype():
     inputs = make(1, 20, 18, 3, dtype=torch.bfloat16)
     inputs["delta"] = inputs["delta"].float()
-    compare(inputs, 4e-3, 4e-3, delta_softplus=True)
+    compare(inputs, 4e-3)
 
 
 @pytest.mark.parametrize("name", ["u", "delta", "A", "B", "C", "D", "z", "delta_bias"])
@@ -76,29 +84,22 @@ def test_one_gradient_alone(name):
 
 
 def test_unneeded_gradients_are_not_computed():
-    from gamba_warp.kernels.selective_scan.cpu import launch as cpu
-
-    inputs = make(1, 10, 5, 2)
-    names = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
-    tensors = [inputs[k] for k in names]
-    out, _, saved = cpu.forward(*tensors, None, True, "mamba", True, ())
-    needs = [name == "C" for name in names] + [False]
-    back = torch.ones_like(out), None, *tensors, saved, True, "mamba"
-    grads = cpu.backward(*back, needs, ())
+    x = Scan(*make(1, 10, 5, 2).values(), True, "mamba", True)
+    out, _, saved = cpu.forward(x)
+    needs = [name == "C" for name in x._fields[:9]]
+    grads = cpu.backward(torch.ones_like(out), None, x, saved, needs)
     assert [g is not None for g in grads] == needs
 
 
-def test_oracle_gradients_by_finite_differences():
+@every_discretization
+def test_oracle_gradients_by_finite_differences(discretization):
     inputs = leaves(make(1, 4, 3, 2), torch.float64)
-    for discretization in ("mamba", "bilinear", "zoh"):
 
-        def run(*values, discretization=discretization):
-            named = dict(zip(inputs, values))
-            return selective_scan_reference(
-                **named, delta_softplus=True, discretization=discretization
-            )
+    def run(*values):
+        options = {"delta_softplus": True, "discretization": discretization}
+        return selective_scan_reference(**dict(zip(inputs, values)), **options)
 
-        assert torch.autograd.gradcheck(run, tuple(inputs.values()), fast_mode=True)
+    assert torch.autograd.gradcheck(run, tuple(inputs.values()), fast_mode=True)
 
 
 def test_one_step_by_hand():
@@ -134,14 +135,10 @@ def test_repeatable_and_independent_of_threads():
     inputs = make(2, 200, 150, 5)
 
     def run(threads):
-        before = torch.get_num_threads()
-        torch.set_num_threads(threads)
-        try:
+        with on_threads(threads):
             mine = leaves(inputs)
             out = selective_scan(**mine, delta_softplus=True)
             return [out, *torch.autograd.grad(out.square().sum(), [*mine.values()])]
-        finally:
-            torch.set_num_threads(before)
 
     first = run(1)
     for again in (run(1), run(2)):
@@ -166,7 +163,7 @@ def test_extreme_steps():
     inputs["delta"][:, ::3] = torch.tensor([-100.0, 19.999, 20.001, 100.0, 0, -20]).repeat(3)
     inputs["A"][:, 0], inputs["A"][:, 1] = 0.0, -1e4
     del inputs["delta_bias"]
-    compare(inputs, delta_softplus=True)
+    compare(inputs)
 
 
 def test_small_steps_keep_relative_accuracy():
@@ -174,7 +171,7 @@ def test_small_steps_keep_relative_accuracy():
     inputs = make(1, 20, 16, 2)
     inputs["delta"] = torch.full((1, 20, 16), -18.0)
     inputs = {k: inputs[k] for k in ("u", "delta", "A", "B", "C")}
-    compare(inputs, delta_softplus=True)
+    compare(inputs)
 
 
 def test_slow_decay_has_no_drift():
@@ -191,7 +188,7 @@ def test_slow_decay_has_no_drift():
 def test_growing_states_and_nan_are_passed_on():
     inputs = make(1, 20, 17, 2)
     inputs["A"] = inputs["A"].abs() * 0.01
-    compare(inputs, delta_softplus=True)
+    compare(inputs)
     inputs["u"][0, 5, 3] = torch.nan
     out = selective_scan(**inputs, delta_softplus=True)
     bad = torch.isnan(out[0])
@@ -256,14 +253,44 @@ def test_no_second_derivative():
         grad.sum().backward()
 
 
-def test_operator_contract():
+@pytest.mark.parametrize("read", [True, False])
+def test_operator_contract(read):
     """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
-    inputs = leaves(make(2, 7, 5, 2))
-    options = True, "mamba", True, [16, 8, 5]
-    operators = torch.ops.gamba_warp
-    torch.library.opcheck(operators.selective_scan.default, (*inputs.values(), *options))
-    state = [inputs[k] for k in ("u", "delta", "A", "B", "delta_bias", "initial_state")]
-    torch.library.opcheck(operators.selective_scan_state.default, (*state, *options))
+    x = Scan(*leaves(make(2, 7, 5, 2)).values(), True, "mamba", True)
+    x = x if read else x._replace(C=None, D=None, z=None)
+    torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, tuple(x))
+
+
+def test_a_compiled_scan_is_the_scan():
+    inputs = make(1, 150, 17, 3)
+
+    def layer(u):
+        return selective_scan(**{**inputs, "u": u}, delta_softplus=True)
+
+    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+    u, v = (inputs["u"].clone().requires_grad_() for _ in range(2))
+    got, want = compiled(u), layer(v)
+    (grad,) = torch.autograd.grad(got.square().sum(), u)
+    assert torch.equal(got, want)
+    assert torch.equal(grad, *torch.autograd.grad(want.square().sum(), v))
+
+
+@pytest.mark.parametrize("walked, walked_back", [(1, 1), (2, 5)])
+def test_states_walked_at_once_change_no_bit(walked, walked_back, monkeypatch):
+    """Five states are a walk of four and one left over, or five, or two, two and one."""
+    inputs, results = make(2, 173, 24, 5), []
+    for tuning in (cpu.TUNING, cpu.Tuning(walked=walked, walked_back=walked_back)):
+        monkeypatch.setattr(cpu, "TUNING", tuning)
+        mine = leaves(inputs)
+        out = selective_scan(**mine, delta_softplus=True)
+        results.append([out, *torch.autograd.grad(out.square().sum(), [*mine.values()])])
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+@pytest.mark.parametrize("table", [True, False])
+def test_the_polynomial_without_avx_512_is_as_exact_as_the_table(table, monkeypatch):
+    monkeypatch.setattr(cpu, "TUNING", cpu.Tuning(table=table))
+    compare(make(1, 300, 20, 4))
 
 
 @pytest.mark.parametrize("constant", ["", "B", "C"])

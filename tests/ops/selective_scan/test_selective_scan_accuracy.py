@@ -6,9 +6,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 from helpers import assert_rel_rms
-from helpers.scan import leaves, make
+from helpers.scan import compare, every_discretization, leaves, make, on_threads
+from helpers.scan import oracle as one_by_one
 
-from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
+from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 
 PIECE = 256
@@ -16,7 +17,7 @@ SLOW = {"slow": -1e-6, "growing": 1e-6}  # kinds, and A of all states
 TINY = 1e-30  # below, decays held at 2^-126 and numbers flushed to 0 are all that is seen
 
 
-def oracle(u, delta, A, B, C, D, z, delta_bias, initial_state):
+def oracle(u, delta, A, B, C, D, z, delta_bias, initial_state, **options):
     """The scan in float64, pieces of tokens side by side: from 0, then from their first states."""
     step = F.softplus(delta + delta_bias, threshold=1e9)
     x = step[..., None] * A
@@ -76,24 +77,8 @@ def problem(kind, length, channels=16, states=2):
 
 
 def check(kind, length):
-    inputs = problem(kind, length)
-    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
-    out, last = selective_scan(**mine, delta_softplus=True, return_last_state=True)
-    want, want_last = oracle(**theirs)
-    forward, state, gradient = 1e-6, 1e-6, 1e-5
-    if kind in SLOW:  # measured below 1e-6; with decays rounded to float32 up to 4e-4
-        gradient = 2e-6
-    assert_rel_rms(out, want, forward, "out")
-    assert_rel_rms(last, want_last, state, "last state")
-    v, v_last = torch.randn_like(out), torch.randn_like(last)
-    grads = torch.autograd.grad((out * v).sum() + (last * v_last).sum(), [*mine.values()])
-    total = (want * v.double()).sum() + (want_last * v_last.double()).sum()
-    wants = torch.autograd.grad(total, [*theirs.values()])
-    for name, got, expected in zip(mine, grads, wants):
-        if expected.abs().max() < TINY:
-            assert got.abs().max() < TINY, name
-        else:
-            assert_rel_rms(got, expected, gradient, f"gradient of {name}")
+    gradient = 2e-6 if kind in SLOW else 1e-5  # measured below 1e-6; with f in float32 up to 4e-4
+    compare(problem(kind, length), 1e-6, gradient, 1e-6, exact=oracle, tiny=TINY)
 
 
 def test_oracle_is_the_reference():
@@ -104,26 +89,15 @@ def test_oracle_is_the_reference():
     assert_rel_rms(last, want_last, 1e-13, "last state")
 
 
-KINDS = (
-    "random",
-    "steps off",
-    "steps at 20",
-    "steps on",
-    *SLOW,
-    "slow at times",
-    "fast",
-    "constant",
-    "alternating",
-)
+KINDS = ("random", "steps off", "steps at 20", "steps on", *SLOW, "slow at times", "fast")
+KINDS += ("constant", "alternating")
 
 
 @pytest.fixture
 def threads(request):
     """On two threads these few channels are cut into segments, on one they are not."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield
-    torch.set_num_threads(before)
+    with on_threads(request.param):
+        yield
 
 
 @pytest.mark.parametrize("threads", [2], indirect=True)
@@ -141,25 +115,14 @@ def test_at_65536_tokens(kind, threads):
 
 
 @pytest.mark.parametrize("threads", [1, 2], indirect=True)
-@pytest.mark.parametrize("discretization", ["mamba", "bilinear", "zoh"])
+@every_discretization
 def test_slow_decays_of_every_discretization(discretization, threads):
     inputs = problem("slow", 2000, channels=5)
     inputs["A"] *= torch.tensor([1.0, 300.0])
-    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
-    options = {"delta_softplus": True, "discretization": discretization}
-    out, last = selective_scan(**mine, **options, return_last_state=True)
-    want, want_last = selective_scan_reference(**theirs, **options)
-    assert_rel_rms(
-        out, want, 5e-7, "out"
-    )  # measured below 2e-7; with decays rounded to float32 2e-6
-    assert_rel_rms(last, want_last, 5e-7, "last state")
-    state = ("u", "delta", "A", "B", "delta_bias", "initial_state")
-    alone = selective_scan_state(**{k: inputs[k] for k in state}, **options)
-    assert_rel_rms(alone, want_last, 5e-7, "last state alone")
-    grads = torch.autograd.grad(out.sum() + last.sum(), [*mine.values()])
-    wants = torch.autograd.grad(want.sum() + want_last.sum(), [*theirs.values()])
-    for name, got, expected in zip(mine, grads, wants):
-        assert_rel_rms(got, expected, 2e-6, f"gradient of {name}")
+    # measured below 2e-7; with decays rounded to float32 2e-6
+    options = {"exact": one_by_one, "discretization": discretization}
+    ones = (torch.ones_like, torch.ones_like)
+    compare(inputs, 5e-7, 2e-6, 5e-7, alone=True, cotangents=ones, **options)
 
 
 def constant(length):
@@ -185,26 +148,13 @@ def test_a_constant_input_beside_a_fast_channel(discretization, length, threads)
     Measured below 1e-7 and, in sums over all tokens, 1.7e-6. With f alone: outputs and states up
     to 3e-5, the gradients of delta and delta_bias up to 8e-5, at 4,003 tokens 2e-6 and 8e-6.
     """
-    inputs = constant(length)
-    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
-    options = {"delta_softplus": True, "discretization": discretization}
-    out, last = selective_scan(**mine, **options, return_last_state=True)
-    if length > 10000:
-        want, want_last = oracle(**theirs)
-    else:
-        want, want_last = selective_scan_reference(**theirs, **options)
-    assert_rel_rms(out, want, 5e-7, "out")
-    assert_rel_rms(last, want_last, 5e-7, "last state")
-    state = ("u", "delta", "A", "B", "delta_bias", "initial_state")
-    alone = selective_scan_state(**{k: inputs[k] for k in state}, **options)
-    assert_rel_rms(alone, want_last, 5e-7, "last state alone")
-    grads = torch.autograd.grad(out.sum(), [*mine.values()])
-    wants = torch.autograd.grad(want.sum(), [*theirs.values()])
-    for name, got, expected in zip(mine, grads, wants):
-        assert_rel_rms(got, expected, 3e-6, f"gradient of {name}")
+    exact = oracle if length > 10000 else one_by_one
+    sums = (torch.ones_like, torch.zeros_like)
+    options = {"alone": True, "exact": exact, "discretization": discretization}
+    compare(constant(length), 5e-7, 3e-6, 5e-7, cotangents=sums, **options)
 
 
-@pytest.mark.parametrize("discretization", ["mamba", "bilinear", "zoh"])
+@every_discretization
 def test_a_fast_channel_has_the_same_bits_beside_slow_ones(discretization):
     """The walk of slow decays leaves the arithmetic of the channels in it that are not slow."""
     results = []

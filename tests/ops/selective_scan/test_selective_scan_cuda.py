@@ -1,22 +1,18 @@
 """The scan's CUDA kernels without a GPU: small shapes on CPU blocks."""
 
-import contextlib
-
 import pytest
 import torch
 import warp as wp
 from helpers import assert_rel_rms
-from helpers.scan import leaves, make
+from helpers.scan import STATE, leaves, make, oracle
 
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
-from gamba_warp.kernels.selective_scan.cuda.tuning import Tuning, choose, use_tuning
-from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
+from gamba_warp.kernels.selective_scan.cuda.launch import Tuning, choose
+from gamba_warp.kernels.selective_scan.problem import Scan
 
-ORDER = ("u", "delta", "A", "B", "C", "D", "z", "delta_bias")
-NAMES = (*ORDER, "initial_state")
-STATE = ("u", "delta", "A", "B", "delta_bias", "initial_state")
+NAMES = Scan._fields[:9]
 LIMIT = 2e-6  # float32 sums of a few hundred terms; measured below 6e-7
 
 
@@ -34,25 +30,25 @@ def cpu_blocks(monkeypatch):
         monkeypatch.setattr(torch, name, poisoned)
 
 
-def run(module, inputs, discretization, v_out, v_last, softplus=True, needs=None, tuning=()):
+@pytest.fixture
+def tuned(monkeypatch):
+    return lambda tuning: monkeypatch.setattr(cuda, "FORCED", tuning)
+
+
+def run(module, inputs, discretization, v_out, v_last, softplus=True, needs=None):
     """Outputs, last state and the gradients that are needed (of all inputs), by name."""
-    tensors = [inputs.get(k) for k in ORDER]
-    state = inputs.get("initial_state")
-    out, last, saved = module.forward(*tensors, state, softplus, discretization, True, tuning)
-    needs = [k in (needs or inputs) for k in NAMES]
-    back = v_out, v_last, *tensors, saved, softplus, discretization
-    grads = module.backward(*back, needs, tuning)
-    return {"out": out, "last": last} | {
-        name: grad for name, grad in zip(NAMES, grads) if grad is not None
-    }
+    x = Scan(*(inputs.get(k) for k in NAMES), softplus, discretization, True)
+    out, last, saved = module.forward(x)
+    grads = module.backward(v_out, v_last, x, saved, [k in (needs or inputs) for k in NAMES])
+    got = {"out": out} if v_out is not None else {}
+    return got | {"last": last} | {k: g for k, g in zip(NAMES, grads) if g is not None}
 
 
 def exact(inputs, discretization, v_out, v_last, softplus=True):
     """The same from the float64 oracle; ``v_out`` None for the gradients of the last state."""
     inputs = leaves(inputs, torch.float64)
-    out, last = selective_scan_reference(
-        **inputs, delta_softplus=softplus, discretization=discretization
-    )
+    options = {"delta_softplus": softplus, "discretization": discretization}
+    out, last = oracle(**{"C": torch.zeros_like(inputs["B"])} | inputs, **options)
     total = (last * v_last.double()).sum()
     if v_out is not None:
         total = total + (out * v_out.double()).sum()
@@ -83,10 +79,13 @@ SEGMENTS = Tuning(segments=3, back_segments=2)
         ((1, 139, 20, 3, 1), "zoh", SEGMENTS),
     ],
 )
-def test_block_kernels_equal_lane_kernels_and_oracle(cpu_blocks, shape, discretization, tuning):
+def test_block_kernels_equal_lane_kernels_and_oracle(
+    cpu_blocks, tuned, shape, discretization, tuning
+):
+    tuned(tuning)
     inputs = make(*shape)
     v_out, v_last = cotangents(inputs)
-    blocks = run(cuda, inputs, discretization, v_out, v_last, tuning=tuning.numbers())
+    blocks = run(cuda, inputs, discretization, v_out, v_last)
     assert_all(blocks, exact(inputs, discretization, v_out, v_last))
     assert_all(blocks, run(cpu, inputs, discretization, v_out, v_last))
 
@@ -133,7 +132,7 @@ def test_half_precision(cpu_blocks, dtype, limit):
 
 def test_without_options_and_with_strides(cpu_blocks):
     """B and C are slices of one matrix, u and dout rows of wider ones, as projections give them."""
-    inputs = {k: v for k, v in make(2, 70, 21, 3).items() if k in ORDER[:5]}
+    inputs = {k: v for k, v in make(2, 70, 21, 3).items() if k in NAMES[:5]}
     inputs["delta"] = inputs["delta"].exp()
     both = torch.cat([inputs["B"], inputs["C"]], -1)
     inputs["B"], inputs["C"] = both[..., :3], both[..., 3:]
@@ -155,12 +154,13 @@ TUNINGS = [
 ]
 
 
-def test_tunings_differ_by_rounding_only(cpu_blocks):
+def test_tunings_differ_by_rounding_only(cpu_blocks, tuned):
     inputs = make(1, 200, 70, 16)
     v_out, v_last = cotangents(inputs)
     results = []
     for tuning in TUNINGS:
-        results.append(run(cuda, inputs, "mamba", v_out, v_last, tuning=tuning.numbers()))
+        tuned(tuning)
+        results.append(run(cuda, inputs, "mamba", v_out, v_last))
     for result in results[1:]:
         assert_all(result, results[0], 1e-6)  # rounding of sums in another order
         assert any(not torch.equal(result[k], results[0][k]) for k in result)  # it was another
@@ -187,21 +187,16 @@ def test_one_gradient_alone(cpu_blocks, name):
 
 @pytest.mark.parametrize("tuning", [Tuning(), SEGMENTS])
 @pytest.mark.parametrize("states", [3, 16])
-def test_final_state(cpu_blocks, tuning, states):
+def test_final_state(cpu_blocks, tuned, tuning, states):
+    tuned(tuning)
     inputs = make(2, 139, 21, states)
     _, v_last = cotangents(inputs)
-    wants = exact(inputs, "mamba", None, v_last)
-    tensors = [inputs[k] for k in STATE]
-    needs, numbers = [True] * 6, tuning.numbers()
-    last, saved = cuda.final_state(*tensors, True, "mamba", True, numbers)
-    back = v_last, *tensors[:5], saved, True, "mamba"
-    grads = cuda.final_state_backward(*back, needs, numbers)
-    assert_rel_rms(last, wants["last"], LIMIT, "last")
-    for name, grad in zip(STATE, grads):
-        assert_rel_rms(grad, wants[name], LIMIT, name)
-    needs[0] = needs[3] = False
-    grads = cuda.final_state_backward(*back, needs, numbers)
-    assert [grad is None for grad in grads] == [not need for need in needs]
+    inputs = {k: inputs[k] for k in STATE}
+    got = run(cuda, inputs, "mamba", None, v_last)
+    assert set(got) == {"last", *STATE}
+    assert_all(got, exact(inputs, "mamba", None, v_last))
+    needs = ("delta", "A", "delta_bias", "initial_state")
+    assert set(run(cuda, inputs, "mamba", None, v_last, needs=needs)) == {"last", *needs}
 
 
 @pytest.mark.parametrize("batch, length", [(0, 5), (2, 0)])
@@ -211,11 +206,11 @@ def test_empty(batch, length):
     got = run(cuda, inputs, "mamba", v_out, v_last)
     assert torch.equal(got["last"], inputs["initial_state"])
     assert torch.equal(got["initial_state"], v_last)
-    for name in ORDER:
+    for name in NAMES[:8]:
         assert got[name].shape == inputs[name].shape
         assert not got[name].any(), name
-    last, _ = cuda.final_state(*[inputs[k] for k in STATE], True, "mamba", False, ())
-    assert torch.equal(last, inputs["initial_state"])
+    alone = run(cuda, {k: inputs[k] for k in STATE}, "mamba", None, v_last)
+    assert torch.equal(alone["last"], inputs["initial_state"])
 
 
 def test_sums_need_blocks():
@@ -255,12 +250,12 @@ def gpu_gradients(inputs, v_out, v_last):
 @pytest.mark.parametrize("dtype, limit", [(torch.float32, 1e-5), (torch.bfloat16, 4e-3)])
 @pytest.mark.parametrize("tuning", [None, *TUNINGS])
 @pytest.mark.parametrize("shape", [(2, 577, 70, 16, 1), (1, 65, 40, 3, 2), (1, 100, 20, 40, 1)])
-def test_on_a_gpu(shape, tuning, dtype, limit):
+def test_on_a_gpu(tuned, shape, tuning, dtype, limit):
+    tuned(tuning)
     inputs = make(*shape, dtype=dtype)
     v_out, v_last = cotangents(inputs)
     want = exact(inputs, "mamba", v_out, v_last)
-    with use_tuning(tuning) if tuning else contextlib.nullcontext():
-        first, second = (gpu_gradients(inputs, v_out, v_last) for _ in range(2))
+    first, second = (gpu_gradients(inputs, v_out, v_last) for _ in range(2))
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
         # the exponential of the GPU errs by up to 2^-22 a step

@@ -3,75 +3,67 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.scan import compare, leaves, make, oracle
+from helpers.scan import STATE, compare, every_discretization, leaves, make, on_threads, oracle
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
-from gamba_warp.kernels.selective_scan.cpu.layout import Layout
+from gamba_warp.kernels.selective_scan.cpu.launch import Layout
 
-NAMES = ("u", "delta", "A", "B", "delta_bias", "initial_state")
+
+def state_of(*shape):
+    inputs = make(*shape)
+    return {name: inputs[name] for name in STATE}
 
 
 @pytest.fixture(params=[2, 5])
 def threads(request):
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
+    with on_threads(request.param):
+        yield request.param
 
 
-@pytest.mark.parametrize("discretization", ["mamba", "bilinear", "zoh"])
+@every_discretization
 @pytest.mark.parametrize("shape", [(2, 70, 35, 5, 1), (1, 1, 12, 3, 3), (1, 131, 80, 16, 2)])
 def test_state_matches_oracle(shape, discretization):
-    inputs = make(*shape)
+    inputs = state_of(*shape)
     options = {"delta_softplus": True, "discretization": discretization}
-    mine = leaves({name: inputs[name] for name in NAMES})
-    theirs = leaves({name: inputs[name] for name in NAMES}, torch.float64)
+    mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
     last = selective_scan_state(**mine, **options)
     _, want = oracle(**theirs, C=torch.zeros_like(theirs["B"]), **options)
     assert_rel_rms(last, want, 1e-6, "last state")
     v = torch.randn_like(last)
     grads = torch.autograd.grad((last * v).sum(), [*mine.values()])
     wants = torch.autograd.grad((want * v.double()).sum(), [*theirs.values()])
-    for name, got, expected in zip(NAMES, grads, wants):
+    for name, got, expected in zip(STATE, grads, wants):
         assert_rel_rms(got, expected, 1e-5, f"gradient of {name}")
 
 
 def test_state_is_that_of_the_scan():
     inputs = make(2, 67, 19, 4)
     _, last = selective_scan(**inputs, delta_softplus=True, return_last_state=True)
-    alone = {name: inputs[name] for name in NAMES}
+    alone = {name: inputs[name] for name in STATE}
     assert torch.equal(selective_scan_state(**alone, delta_softplus=True), last)
 
 
 def test_state_of_no_tokens_is_the_first():
-    inputs = {name: make(2, 0, 5, 3)[name] for name in NAMES}
+    inputs = state_of(2, 0, 5, 3)
     got = selective_scan_state(**inputs, delta_softplus=True)
     assert torch.equal(got, inputs["initial_state"])
 
 
 def test_state_refuses_bad_input():
-    inputs = {name: make(1, 4, 5, 3)[name] for name in NAMES}
+    inputs = state_of(1, 4, 5, 3)
     with pytest.raises(ValueError, match="initial_state has shape"):
         selective_scan_state(**inputs | {"initial_state": torch.zeros(1, 5, 2)})
     with pytest.raises(TypeError, match="B is NoneType"):
         selective_scan_state(**inputs | {"B": None})
 
 
-@pytest.mark.parametrize("discretization", ["mamba", "bilinear", "zoh"])
+@every_discretization
 def test_segments_match_oracle(threads, discretization):
     """Too few channels for the threads: the tokens are cut, and states carried over the cuts."""
     inputs = make(1, 1111, 21, 3)
     layout = Layout(inputs["u"], inputs["A"], inputs["B"], 4, 64)
     assert layout.segments == {2: 2, 5: 4}[threads]
-    compare(inputs, delta_softplus=True, discretization=discretization)
-    alone = {name: inputs[name] for name in NAMES}
-    _, want = oracle(
-        **{k: v.double() for k, v in inputs.items()},
-        delta_softplus=True,
-        discretization=discretization,
-    )
-    got = selective_scan_state(**alone, delta_softplus=True, discretization=discretization)
-    assert_rel_rms(got, want, 2e-6, "last state")
+    compare(inputs, alone=True, discretization=discretization)
 
 
 def test_segments_are_repeatable(threads):
@@ -86,4 +78,4 @@ def test_decays_beyond_the_quick_exponential(wild):
     inputs = make(1, 70, 70, 3)
     inputs["delta"][:, 40:50, 20:30] = wild
     inputs["A"][25] = -40.0
-    compare(inputs, delta_softplus=True)
+    compare(inputs)

@@ -1,0 +1,53 @@
+// A step's decay f and weight g on the CPU, and their slopes: equations 2 to 4 and 10. x = rate A,
+// where the rate holds log2(e) if f is an exponential (SCALE).
+
+// rise is f - 1, exact where f is slow, and any number elsewhere. Tame: |x| <= 125.
+struct Tame {
+    enum { TAME = true };
+};
+struct Wild {
+    enum { TAME = false };
+};
+const float LN2 = 0.6931471805599453f;
+auto within_ = [&](F x, float most) -> I { return (x <= most) & (x >= -most); };
+auto factors_ = [&](F x, auto range, F& rise, F& g) __attribute__((always_inline)) -> F {
+    constexpr bool TAME = decltype(range)::TAME;
+    if constexpr (MODE == MAMBA) {
+        g = splat(1.0f);
+        if constexpr (TAME) return exp2_rise_(x, rise);
+        return rise = exp2_(x);
+    } else if constexpr (MODE == BILINEAR) {
+        g = 1.0f / (1.0f - 0.5f * x), rise = x * g;
+        return fma_(x, g, splat(1.0f));
+    } else {  // g = (f - 1) / (x ln 2), where f - 1 is summed without the rounding of f
+        auto tamed = [&](F x) __attribute__((always_inline)) -> F {
+            F near, low, part;
+            const F p = exp2_parts_(x, near, low, part);
+            rise = part * p;
+            const F less = fma_(near, rise + low, near - 1.0f);
+            g = within_(x, 0.03125f) ? p * LOG2E : less / (x * LN2);  // |x| <= 1/32: f - 1 = x p
+            return fma_(near, rise, near);
+        };
+        if constexpr (TAME) return tamed(x);
+        const I calm = within_(x, 125.0f);
+        const F near = tamed(calm ? x : F{}), far = exp2_(x);
+        g = calm ? g : (far - 1.0f) / (x * LN2);
+        return rise = calm ? near : far;
+    }
+};
+// The slopes of f and g, where WEIGHTED: for zoh dg is a polynomial where f - g would cancel.
+auto slopes_ = [&](F x, F f, F g, F& df, F& dg) __attribute__((always_inline)) {
+    if constexpr (MODE == BILINEAR) {
+        df = g * g, dg = 0.5f * df;
+    } else {
+        const F xe = x * LN2;
+        F slope = splat(1.7469932608e-4f);
+        slope = fma_(slope, xe, splat(1.20015557571e-3f));
+        slope = fma_(slope, xe, splat(6.9443082995e-3f));
+        slope = fma_(slope, xe, splat(3.33321221218e-2f));
+        slope = fma_(slope, xe, splat(0.12500000425576f));
+        slope = fma_(slope, xe, splat(0.33333337119712f));
+        slope = fma_(slope, xe, splat(0.5f));
+        df = f, dg = within_(xe, 0.5f) ? slope : (df - g) / xe;
+    }
+};

@@ -1,0 +1,46 @@
+// Walks the recurrence over a tile and keeps the state before every SUB tokens. δ and δu are
+// ``[token / 4, channel, 4]``, as in groups.py.
+#include "shape.h"
+#include "discretize.h"
+// Local memory, up to 1 KB per channel: too much for registers, and left to the cache where shared
+// memory would limit the number of blocks.
+float* const marks = (float*)(((size_t)marks_out.data + 15) & ~(size_t)15);
+float* const s = arena.data.ptr + base;
+const int channel = p.slot * CHANNELS;
+WP_PRAGMA_NO_UNROLL
+for (int walk = 0; walk < WALKS; ++walk) {
+    const int state = walk * WIDTH + p.q * STATES;
+    float hn[HELD], an[HELD];
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < HELD; ++k) hn[k] = h.c[walk * HELD + k], an[k] = a.c[walk * HELD + k];
+    WP_PRAGMA_NO_UNROLL
+    for (int sub = 0; sub < TOKENS / SUB; ++sub) {
+        const int mark = tile * (TOKENS / SUB) + sub;
+        if (mark >= count) break;
+        store_(marks + (walk * (MARK / SUB) + mark) * HELD, hn);
+        if (mark + 1 == count) break;
+        float r[CHANNELS][SUB], x[CHANNELS][SUB];
+        WP_PRAGMA_UNROLL
+        for (int i = 0; i < CHANNELS; ++i) {
+            const int own = (sub * SPAN + channel + i) * SUB;
+            load_(s + AT_STEP + own, r[i]);
+            load_(s + AT_DU + own, x[i]);
+        }
+        WP_PRAGMA_UNROLL
+        for (int t = 0; t < SUB; ++t) {
+            float w[STATES];
+            load_(s + AT_B + (sub * SUB + t) * PADDED + state, w);
+            WP_PRAGMA_UNROLL
+            for (int i = 0; i < CHANNELS; ++i) WP_PRAGMA_UNROLL
+            for (int j = 0; j < STATES; ++j) {
+                const int k = i * STATES + j;
+                float f, g;
+                factors_(r[i][t], an[k], f, g);
+                hn[k] = f * hn[k] + g * (x[i][t] * w[j]);
+            }
+        }
+    }
+    WP_PRAGMA_UNROLL
+    for (int k = 0; k < HELD; ++k) h.c[walk * HELD + k] = hn[k];
+}
+return h;
