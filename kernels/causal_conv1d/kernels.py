@@ -46,7 +46,7 @@ def _strip(device_type: str, io: torch.dtype):
         text = native(Path(__file__).with_name("strip.inl"))
 
         @wp.func_native(PRELUDE + ACTIVATIONS + cpu_values.ROWS + text)
-        def strip(
+        def lanes_strip(
             x_in: wp.array3d(dtype=scalar),
             b: int,
             t0: int,
@@ -66,7 +66,7 @@ def _strip(device_type: str, io: torch.dtype):
             y_out: wp.array3d(dtype=scalar),
         ): ...
 
-        return strip
+        return lanes_strip
 
     @wp.func
     @no_type_check

@@ -69,11 +69,11 @@ def _check_common(u, delta, A, delta_bias, initial_state, discretization) -> int
     return states
 
 
-def _scan(*args) -> tuple[Tensor, Tensor]:
-    """Runs what the fields of a ``Scan`` say, and keeps states if a gradient may be asked for."""
-    tensors = (x for x in args if isinstance(x, Tensor))
-    save = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-    out, last, _ = ops.scan(*Scan(*args, save))
+def _run(x: Scan) -> tuple[Tensor, Tensor]:
+    """Output and last state; keeps the states between if a gradient may be asked for."""
+    tensors = (v for v in x if isinstance(v, Tensor))
+    save = torch.is_grad_enabled() and any(v.requires_grad for v in tensors)
+    out, last, _ = ops.scan(*x._replace(save=save))
     return out, last
 
 
@@ -176,8 +176,8 @@ def selective_scan(
         _check("D", D, (u.shape[2],), DTYPES, u.device)
     if z is not None:
         _check("z", z, tuple(u.shape), (u.dtype,), u.device)
-    args = (u, delta, A, B, C, D, z, delta_bias, initial_state, delta_softplus, discretization)
-    out, last = _scan(*args)
+    tensors = (u, delta, A, B, C, D, z, delta_bias, initial_state)
+    out, last = _run(Scan(*tensors, delta_softplus, discretization, False))
     return (out, last) if return_last_state else out
 
 
@@ -214,7 +214,7 @@ def selective_scan_state(
     states = _check_common(u, delta, A, delta_bias, initial_state, discretization)
     B = _check_groups("B", B, u, states)
     tensors = (u, delta, A, B, None, None, None, delta_bias, initial_state)  # no C, D and z
-    return _scan(*tensors, delta_softplus, discretization)[1]
+    return _run(Scan(*tensors, delta_softplus, discretization, False))[1]
 
 
 def input_matrix(x: Tensor, u: Tensor, name: str) -> Tensor:

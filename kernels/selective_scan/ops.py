@@ -63,7 +63,7 @@ def _(dout, dlast, saved, needs, *args):
     return [
         torch.empty_like(tensor, memory_format=torch.contiguous_format)
         for tensor, needed in zip((*x[:8], state), needs)
-        if needed
+        if needed and tensor is not None
     ]
 
 
@@ -78,7 +78,7 @@ def _setup_context(ctx, inputs, output):
 
 def _gradient(ctx, dout, dlast, _):
     *tensors, saved = ctx.saved_tensors
-    x = Scan(*tensors, None, *ctx.options)
+    x = Scan._make((*tensors, None, *ctx.options))
     if not x.save:
         raise RuntimeError("selective_scan: this call kept nothing for a gradient")
     needs = list(ctx.needs_input_grad[:9])

@@ -20,8 +20,10 @@ every_discretization = pytest.mark.parametrize("discretization", DISCRETIZATIONS
 def on_threads(count):
     before = torch.get_num_threads()
     torch.set_num_threads(count)
-    yield
-    torch.set_num_threads(before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def make(batch, length, channels, states, groups=1, dtype=torch.float32):
@@ -53,6 +55,41 @@ def oracle(*args, **kwargs):
         return selective_scan_reference(*args, **kwargs)
 
 
+def assert_gradients(ours, exact, limit, half=0.0, cotangents=(torch.randn_like,) * 2, tiny=0.0):
+    """Compares all gradients by name.
+
+    Args:
+        ours: the leaves by name, and what is computed from them.
+        exact: the same in float64.
+        limit: of float32 gradients.
+        half: of those in half precision.
+        cotangents: made like each of the results.
+        tiny: below it, a gradient counts as 0.
+    """
+    (mine, outs), (theirs, wants) = ours, exact
+    made = [v(x) for v, x in zip(cotangents, outs)]
+    total = sum((x * v).sum() for x, v in zip(outs, made))
+    want_total = sum((x * v.double()).sum() for x, v in zip(wants, made))
+    grads = torch.autograd.grad(total, [*mine.values()])
+    expected = torch.autograd.grad(want_total, [*theirs.values()])
+    for (name, x), got, want in zip(mine.items(), grads, expected):
+        assert got.dtype == x.dtype, name
+        if want.abs().max() < tiny:
+            assert got.abs().max() < tiny, name
+        else:
+            bound = limit if got.dtype == torch.float32 else half
+            assert_rel_rms(got, want, bound, f"gradient of {name}")
+
+
+def assert_gradient_alone(function, inputs, name, **options):
+    """The gradient of one input has the same bits, whichever others are asked for."""
+    results = []
+    for asked in (leaves(inputs), {**inputs, name: leaves(inputs)[name]}):
+        out = function(**asked, **options)
+        results.append(torch.autograd.grad(out.square().sum(), asked[name])[0])
+    assert torch.equal(*results)
+
+
 def compare(inputs, forward=FORWARD, gradient=GRADIENT, state=2e-6, **options):
     """Runs both sides with random cotangents for the output and the last state.
 
@@ -75,15 +112,6 @@ def compare(inputs, forward=FORWARD, gradient=GRADIENT, state=2e-6, **options):
     if alone:
         got = selective_scan_state(**{k: inputs[k] for k in STATE}, **options)
         assert_rel_rms(got, want_last, state, "last state alone")
-    v_out, v_last = (v(x) for v, x in zip(cotangents, (out, last)))
-    grads = torch.autograd.grad((out * v_out).sum() + (last * v_last).sum(), [*mine.values()])
-    wants = torch.autograd.grad(
-        (want * v_out.double()).sum() + (want_last * v_last.double()).sum(), [*theirs.values()]
-    )
-    for name, got, expected in zip(mine, grads, wants):
-        assert got.dtype == inputs[name].dtype, name
-        if expected.abs().max() < tiny:
-            assert got.abs().max() < tiny, name
-        else:
-            limit = gradient if got.dtype == torch.float32 else max(forward, 1e-5)
-            assert_rel_rms(got, expected, limit, f"gradient of {name}")
+    limits = gradient, max(forward, 1e-5)
+    sides = (mine, (out, last)), (theirs, (want, want_last))
+    assert_gradients(*sides, *limits, cotangents, tiny)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -89,11 +90,11 @@ class Layout:
             return torch.zeros(self.batch, self.blocks, self.states, W)
         return self.pack(x, (self.batch,))
 
-    def total(self, parts: Tensor, dtype: torch.dtype) -> Tensor:
+    def total(self, parts: Tensor) -> Tensor:
         """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
         of_group = -(-self.group_blocks // BLOCKS)
         x = parts.view(self.batch, self.groups, of_group, self.states, self.length).sum(2)
-        return x.permute(0, 3, 1, 2).to(dtype, memory_format=torch.contiguous_format)
+        return x.permute(0, 3, 1, 2)
 
 
 @functools.lru_cache(256)  # to fill one takes as long as a short scan
@@ -271,11 +272,16 @@ def backward(
         lambda: du,
         lambda: ddelta,
         lambda: y.unpack(da.sum((0, 1))) / scale,
-        lambda: y.total(db, x.B.dtype),
-        lambda: y.total(dc, x.C.dtype),
-        lambda: y.unpack(dchannel[:, :, 0].sum((0, 1))).to(x.D.dtype),
+        lambda: y.total(db),
+        lambda: y.total(dc),
+        lambda: y.unpack(dchannel[:, :, 0].sum((0, 1))),
         lambda: dz,
-        lambda: y.unpack(dchannel[:, :, 1].sum((0, 1))).to(x.delta_bias.dtype),
+        lambda: y.unpack(dchannel[:, :, 1].sum((0, 1))),
         lambda: y.unpack(_values(dh)[0], (y.batch,)),
     )
-    return [value() if needed else None for value, needed in zip(values, needs)]
+    tensors: tuple[Any, ...] = (*x[:8], x.A)
+    dense = torch.contiguous_format
+    return [
+        value().to(tensor.dtype, memory_format=dense) if needed else None
+        for value, tensor, needed in zip(values, tensors, needs)
+    ]

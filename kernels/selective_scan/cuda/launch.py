@@ -312,7 +312,7 @@ def backward(
         lambda: dbias.sum((0, 1)),
         lambda: dfirst,
     )
-    tensors = (*x[:8], x.A)
+    tensors: tuple[Any, ...] = (*x[:8], x.A)
     return [
         value().to(tensor.dtype) if needed else None
         for value, tensor, needed in zip(values, tensors, needs)

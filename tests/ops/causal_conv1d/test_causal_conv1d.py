@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.kernels import conv_inputs as make
-from helpers.scan import leaves
+from helpers.scan import assert_gradient_alone, assert_gradients, leaves
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
@@ -20,13 +20,7 @@ def compare(inputs, activation, forward=FORWARD, gradient=GRADIENT):
     want, want_final = causal_conv1d_reference(**theirs, activation=activation)
     assert_rel_rms(out, want, forward, "out")
     assert torch.equal(final.double(), want_final)
-    v_out, v_final = torch.randn_like(out), torch.randn_like(final)
-    grads = torch.autograd.grad((out * v_out).sum() + (final * v_final).sum(), [*mine.values()])
-    total = (want * v_out.double()).sum() + (want_final * v_final.double()).sum()
-    for name, got, expected in zip(mine, grads, torch.autograd.grad(total, [*theirs.values()])):
-        assert got.dtype == inputs[name].dtype, name
-        limit = gradient if got.dtype != torch.float32 else GRADIENT
-        assert_rel_rms(got, expected, limit, f"gradient of {name}")
+    assert_gradients((mine, (out, final)), (theirs, (want, want_final)), GRADIENT, gradient)
 
 
 @pytest.mark.parametrize("activation", [None, "silu"])
@@ -104,13 +98,7 @@ def test_bfloat16_rounds_to_the_nearest(channels):
 
 @pytest.mark.parametrize("name", ["x", "weight", "bias", "initial_state"])
 def test_one_gradient_alone(name):
-    inputs = make(2, 30, 20, 4)
-    everything = leaves(inputs)
-    out = causal_conv1d(**everything, activation="silu")
-    want = torch.autograd.grad(out.square().sum(), everything[name])[0]
-    inputs[name].requires_grad_()
-    out = causal_conv1d(**inputs, activation="silu")
-    assert torch.equal(torch.autograd.grad(out.square().sum(), inputs[name])[0], want)
+    assert_gradient_alone(causal_conv1d, make(2, 30, 20, 4), name, activation="silu")
 
 
 @pytest.mark.parametrize("batch, length", [(0, 5), (2, 0)])

@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.kernels import conv_inputs as make
-from helpers.scan import leaves
+from helpers.scan import assert_gradients, leaves
 
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, kernels, ops
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
@@ -17,8 +17,6 @@ def test_convolution_kernels(monkeypatch, use_silu):
     exact = leaves(inputs, torch.float64)
     activation = "silu" if use_silu else None
     out, _ = causal_conv1d_reference(**exact, activation=activation)
-    v_out = torch.randn_like(inputs["x"])
-    wants = torch.autograd.grad((out * v_out.double()).sum(), [*exact.values()])
     as_cuda = kernels._values
     monkeypatch.setattr(kernels, "_values", lambda _, io: as_cuda("cuda", io))
     monkeypatch.setattr(ops, "cpu_values", ops.cuda_values)
@@ -28,10 +26,8 @@ def test_convolution_kernels(monkeypatch, use_silu):
     try:
         mine = leaves(inputs)
         got = causal_conv1d(**mine, activation=activation)
-        grads = torch.autograd.grad((got * v_out).sum(), [*mine.values()])
+        assert_gradients((mine, [got]), (exact, [out]), 2e-6)
     finally:
         for cached in caches:
             cached.cache_clear()
     assert_rel_rms(got, out, 2e-7, "out")
-    for name, grad, want in zip(mine, grads, wants):
-        assert_rel_rms(grad, want, 2e-6, f"gradient of {name}")

@@ -5,6 +5,7 @@ import torch
 from helpers import assert_rel_rms, rel_rms
 from helpers.scan import (
     FORWARD,
+    assert_gradient_alone,
     compare,
     every_discretization,
     leaves,
@@ -58,29 +59,23 @@ def test_without_options():
     compare(inputs, delta_softplus=False)
 
 
-@pytest.mark.parametrize("dtype, limit", [(torch.bfloat16, 4e-3), (torch.float16, 5e-4)])
-def test_half_precision(dtype, limit):
+@pytest.mark.parametrize(
+    "dtype, of_delta, limit",
+    [
+        (torch.bfloat16, torch.bfloat16, 4e-3),
+        (torch.float16, torch.float16, 5e-4),
+        (torch.bfloat16, torch.float32, 4e-3),
+    ],
+)
+def test_half_precision(dtype, of_delta, limit):
     """Limits: the rounding of the dtype itself, 2^-9 and 2^-12 at most, on output only."""
-    compare(make(2, 65, 37, 3, dtype=dtype), limit)
-
-
-def test_delta_may_have_its_own_dtype():
-    inputs = make(1, 20, 18, 3, dtype=torch.bfloat16)
-    inputs["delta"] = inputs["delta"].float()
-    compare(inputs, 4e-3)
+    inputs = make(2, 65, 37, 3, dtype=dtype)
+    compare(inputs | {"delta": inputs["delta"].to(of_delta)}, limit)
 
 
 @pytest.mark.parametrize("name", ["u", "delta", "A", "B", "C", "D", "z", "delta_bias"])
 def test_one_gradient_alone(name):
-    """A gradient does not depend on which others are asked for."""
-    inputs = make(2, 70, 20, 3)
-    everything = leaves(inputs)
-    out = selective_scan(**everything, delta_softplus=True)
-    v_out = torch.randn_like(out)
-    want = torch.autograd.grad((out * v_out).sum(), everything[name])[0]
-    inputs[name].requires_grad_()
-    out = selective_scan(**inputs, delta_softplus=True)
-    assert torch.equal(torch.autograd.grad((out * v_out).sum(), inputs[name])[0], want)
+    assert_gradient_alone(selective_scan, make(2, 70, 20, 3), name, delta_softplus=True)
 
 
 def test_unneeded_gradients_are_not_computed():
@@ -172,17 +167,6 @@ def test_small_steps_keep_relative_accuracy():
     inputs["delta"] = torch.full((1, 20, 16), -18.0)
     inputs = {k: inputs[k] for k in ("u", "delta", "A", "B", "C")}
     compare(inputs)
-
-
-def test_slow_decay_has_no_drift():
-    """A constant decay of 1 - 1e-3 for 4000 steps: a biased exp would show a thousandfold."""
-    one = torch.ones(1, 4000, 16)
-    inputs = {"u": one, "delta": one * 1e-3, "A": -torch.ones(16, 1)}
-    matrices = {"B": one[..., :1], "C": one[..., :1]}
-    out = selective_scan(**inputs, **matrices)
-    want, _ = oracle(**{k: v.double() for k, v in {**inputs, **matrices}.items()})
-    # the float32 decay itself is off by up to 2^-25, which 1 / (1 - decay) magnifies by 1000
-    assert rel_rms(out, want) < 3e-5
 
 
 def test_growing_states_and_nan_are_passed_on():

@@ -76,9 +76,10 @@ def problem(kind, length, channels=16, states=2):
     return inputs
 
 
-def check(kind, length):
+def check(kind, length, threads):
     gradient = 2e-6 if kind in SLOW else 1e-5  # measured below 1e-6; with f in float32 up to 4e-4
-    compare(problem(kind, length), 1e-6, gradient, 1e-6, exact=oracle, tiny=TINY)
+    with on_threads(threads):
+        compare(problem(kind, length), 1e-6, gradient, 1e-6, exact=oracle, tiny=TINY)
 
 
 def test_oracle_is_the_reference():
@@ -89,32 +90,24 @@ def test_oracle_is_the_reference():
     assert_rel_rms(last, want_last, 1e-13, "last state")
 
 
+# On two threads these few channels are cut into segments, on one they are not.
+both = pytest.mark.parametrize("threads", [1, 2])
 KINDS = ("random", "steps off", "steps at 20", "steps on", *SLOW, "slow at times", "fast")
 KINDS += ("constant", "alternating")
 
 
-@pytest.fixture
-def threads(request):
-    """On two threads these few channels are cut into segments, on one they are not."""
-    with on_threads(request.param):
-        yield
-
-
-@pytest.mark.parametrize("threads", [2], indirect=True)
 @pytest.mark.parametrize("kind", KINDS)
-def test_at_the_papers_length(kind, threads):
-    check(kind, 16961)
+def test_at_the_papers_length(kind):
+    check(kind, 16961, 2)
 
 
-@pytest.mark.parametrize(
-    "kind, threads", [("random", 2), ("slow", 1), ("slow", 2)], indirect=["threads"]
-)
+@pytest.mark.parametrize("kind, threads", [("random", 2), ("slow", 1), ("slow", 2)])
 def test_at_65536_tokens(kind, threads):
     """Where a state forgets nothing, its error may not grow with the number of tokens."""
-    check(kind, 65536)
+    check(kind, 65536, threads)
 
 
-@pytest.mark.parametrize("threads", [1, 2], indirect=True)
+@both
 @every_discretization
 def test_slow_decays_of_every_discretization(discretization, threads):
     inputs = problem("slow", 2000, channels=5)
@@ -122,7 +115,8 @@ def test_slow_decays_of_every_discretization(discretization, threads):
     # measured below 2e-7; with decays rounded to float32 2e-6
     options = {"exact": one_by_one, "discretization": discretization}
     ones = (torch.ones_like, torch.ones_like)
-    compare(inputs, 5e-7, 2e-6, 5e-7, alone=True, cotangents=ones, **options)
+    with on_threads(threads):
+        compare(inputs, 5e-7, 2e-6, 5e-7, alone=True, cotangents=ones, **options)
 
 
 def constant(length):
@@ -138,7 +132,7 @@ def constant(length):
     return inputs | {k: torch.ones_like(inputs[k]) for k in ("u", "B", "C", "z")}
 
 
-@pytest.mark.parametrize("threads", [1, 2], indirect=True)
+@both
 @pytest.mark.parametrize(
     "discretization, length", [("mamba", 16961), ("mamba", 4003), ("bilinear", 4003), ("zoh", 4003)]
 )
@@ -151,7 +145,8 @@ def test_a_constant_input_beside_a_fast_channel(discretization, length, threads)
     exact = oracle if length > 10000 else one_by_one
     sums = (torch.ones_like, torch.zeros_like)
     options = {"alone": True, "exact": exact, "discretization": discretization}
-    compare(constant(length), 5e-7, 3e-6, 5e-7, cotangents=sums, **options)
+    with on_threads(threads):
+        compare(constant(length), 5e-7, 3e-6, 5e-7, cotangents=sums, **options)
 
 
 @every_discretization

@@ -3,7 +3,16 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.scan import STATE, compare, every_discretization, leaves, make, on_threads, oracle
+from helpers.scan import (
+    STATE,
+    assert_gradients,
+    compare,
+    every_discretization,
+    leaves,
+    make,
+    on_threads,
+    oracle,
+)
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.cpu.launch import Layout
@@ -29,11 +38,7 @@ def test_state_matches_oracle(shape, discretization):
     last = selective_scan_state(**mine, **options)
     _, want = oracle(**theirs, C=torch.zeros_like(theirs["B"]), **options)
     assert_rel_rms(last, want, 1e-6, "last state")
-    v = torch.randn_like(last)
-    grads = torch.autograd.grad((last * v).sum(), [*mine.values()])
-    wants = torch.autograd.grad((want * v.double()).sum(), [*theirs.values()])
-    for name, got, expected in zip(STATE, grads, wants):
-        assert_rel_rms(got, expected, 1e-5, f"gradient of {name}")
+    assert_gradients((mine, [last]), (theirs, [want]), 1e-5)
 
 
 def test_state_is_that_of_the_scan():

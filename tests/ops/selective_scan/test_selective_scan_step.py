@@ -3,10 +3,12 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers.scan import on_threads
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gamba_warp.compat.mamba_ssm import Mamba
 from gamba_warp.kernels.selective_scan.cpu.step import conv_step, scan_step
+from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 
 # A few roundings of sums of at most 33 float32 numbers, and exponentials good to a last bit.
 CLOSE = 1e-6
@@ -24,14 +26,15 @@ def operands(batch, channels, states):
     return torch.randn(batch, channels, states), x, dt, A, B, C, *torch.randn(2, channels), z
 
 
-def oracle(state, x, dt, A, B, C, D, bias, z, softplus):
-    state, x, dt, A, B, C = (v.double() for v in (state, x, dt, A, B, C))
-    dt = dt if bias is None else dt + bias.double()
-    dt = F.softplus(dt) if softplus else dt
-    state = state * torch.exp(dt[..., None] * A) + (dt * x)[..., None] * B[:, None]
-    out = (state * C[:, None]).sum(-1)
-    out = out if D is None else out + D.double() * x
-    return state, out if z is None else out * F.silu(z.double())
+def oracle(state, *tensors, softplus):
+    """State and output in float64 by the reference, for a sequence of one token."""
+    state, *tensors = (None if v is None else v.double() for v in (state, *tensors))
+    x, dt, A, B, C, D, bias, z = tensors
+    x, dt, B, C, z = (None if v is None else v[:, None] for v in (x, dt, B, C, z))
+    out, state = selective_scan_reference(
+        x, dt, A, B, C, D, z, bias, delta_softplus=softplus, initial_state=state
+    )
+    return state, out[:, 0]
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -42,13 +45,9 @@ def test_scan_equals_float64(batch, channels, states, options, threads):
     if not options:
         D = bias = z = None
         dt = dt.abs()
-    after, want = oracle(state, x, dt, A, B, C, D, bias, z, options)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
+    after, want = oracle(state, x, dt, A, B, C, D, bias, z, softplus=options)
+    with on_threads(threads):
         got = scan_step(state, x, dt, A, B, C, D, z, bias, options)
-    finally:
-        torch.set_num_threads(before)
     assert far(got, want) < CLOSE and far(state, after) < CLOSE
 
 
