@@ -13,7 +13,7 @@ import warp as wp
 
 from ..runtime import rows as cpu_values
 from ..runtime import scalars as cuda_values
-from ..runtime.lanes import ACTIVATIONS, PRELUDE, WARP_DTYPES
+from ..runtime.lanes import PRELUDE, WARP_DTYPES
 from ..runtime.native import native
 
 TAPS = 4
@@ -45,7 +45,7 @@ def _strip(device_type: str, io: torch.dtype):
     if channels_of_value > 1:
         text = native(Path(__file__).with_name("strip.inl"))
 
-        @wp.func_native(PRELUDE + ACTIVATIONS + cpu_values.ROWS + text)
+        @wp.func_native(PRELUDE + cpu_values.ROWS + text)
         def lanes_strip(
             x_in: wp.array3d(dtype=scalar),
             b: int,

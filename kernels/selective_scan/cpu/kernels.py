@@ -14,7 +14,6 @@ import torch
 import warp as wp
 
 from ...runtime.lanes import (
-    ACTIVATIONS,
     WARP_DTYPES,
     W,
     flush_denormals,
@@ -87,7 +86,7 @@ class Kind(NamedTuple):
             _HERE / file, **macros(self.discretization), **limits, **NEEDS, SCALE=rule.scale,
             GRADIENT=gradient, OUTPUT=output, TOKENS=tokens, AT_ONCE=at_once, BLOCKS=BLOCKS,
         )  # fmt: skip
-        return prelude(tuning.degree, tuning.table) + ACTIVATIONS + ROWS + text
+        return prelude(tuning.degree, tuning.table) + ROWS + text
 
 
 @struct

@@ -13,14 +13,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ...runtime.lanes import ACTIVATIONS, PRELUDE, W, flush_denormals, restore_denormals
+from ...runtime.lanes import PRELUDE, W, flush_denormals, restore_denormals
 from ...runtime.launch import parallel_launch
 from ...runtime.native import native
 
 _PLAIN = (Tensor, torch.nn.Parameter)  # no fake tensor, which has no memory
 _FEW = 64  # tasks of sixteen channels below which one thread is as fast as several
 
-_HERE, _HEAD = Path(__file__).parent, PRELUDE + ACTIVATIONS
+_HERE, _HEAD = Path(__file__).parent, PRELUDE
 _MATRIX, _VECTOR = wp.array2d[wp.float32], wp.array[wp.float32]
 _STATES = wp.array3d[wp.float32]
 

@@ -1,0 +1,119 @@
+// Arithmetic on sixteen lanes. DEGREE: of the polynomial in exp2_parts_ and exp2_rise_; TABLE:
+// whether a table takes its place where the processor has AVX-512.
+#include "vectors.h"
+#if TABLE && defined(__AVX512F__)
+#define TABLED true
+#else
+#define TABLED false
+#endif
+auto fma_ = [](F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
+// max(top, |x|) by their bits, so that NaN is the greatest
+auto wider_ = [](F top, F x) -> F {
+    I i = (I)x & 0x7fffffff;
+    return (F)(i > (I)top ? i : (I)top);
+};
+// whether |x| <= 125 in all lanes
+auto tame_ = [](F x) -> bool { return !__builtin_reduce_or(~((x <= 125.0f) & (x >= -125.0f))); };
+const float LOG2E = 1.44269504088896341f;
+const F shifter = splat(12583039.0f);
+
+// (2^x - 1) / x for |x| <= 1/2: minimax polynomials, so that 2^x - 1 keeps its relative accuracy
+// for small x: the errors of slow decays add up over thousands of steps. Highest power first.
+constexpr float POWER_2[] = {0.2398640364408493f, 0.7029417753219604f};
+constexpr float POWER_3[] = {5.500893294811249e-2f, 0.24221095442771912f, 0.6932829022407532f};
+constexpr float POWER_4[] = {
+    9.582852944731712e-3f, 5.5906426161527634e-2f, 0.24024099111557007f, 0.6931241750717163f};
+constexpr float POWER_5[] = {1.3400436146184802e-3f, 9.666373021900654e-3f, 5.550333112478256e-2f,
+    0.2402234822511673f, 0.6931471824645996f};
+constexpr float POWER_6[] = {1.546973508084193e-4f, 1.3390866806730628e-3f, 9.618030861020088e-3f,
+    5.5503569543361664e-2f, 0.24022650718688965f, 0.6931471824645996f};
+auto horner_ = [&](F x, const auto& c) __attribute__((always_inline)) -> F {
+    F p = splat(c[0]);
+#pragma unroll
+    for (int i = 1; i < (int)(sizeof(c) / sizeof(float)); ++i) p = fma_(p, x, splat(c[i]));
+    return p;
+};
+
+// exp2 rounds to an integer by adding 1.5 * 2^23 (+127, the exponent bias), and takes the
+// polynomial of the rest. NaN stays NaN.
+auto exp2_clamped_ = [&](F x) -> F {
+    F r = x + shifter;
+    F f = x - (r - shifter);
+    return fma_(horner_(f, POWER_6), f, splat(1.0f)) * (F)((I)r << 23);
+};
+auto exp2_ = [&](F x) -> F {
+    x = x < -126.0f ? splat(-126.0f) : x;
+    return exp2_clamped_(x > 128.0f ? splat(128.0f) : x);
+};
+// e^-|x|; NaN gives 2^-126
+auto decay_ = [&](F x) -> F {
+    x = (F)((I)x | (int)0x80000000) * LOG2E;
+    return exp2_clamped_(x > -126.0f ? x : splat(-126.0f));
+};
+// p for |x| <= 125 and no NaN, of another degree: 2^x is near (1 + low) (1 + f p), where near is a
+// float32 and low what that rounds away. If |x| < 1/32, near is 1, low is 0 and f is x.
+auto exp2_parts_ = [&](F x, F& near, F& low, F& f) -> F {
+#if TABLED
+    // From a table of 2^(i/16), which one instruction reads, and a cubic of what is left, |f| <=
+    // 1/32: one multiplication less than degree 5, and a smaller error. What the index adds to the
+    // exponent is taken from the table beforehand. 786432 = 1.5 * 2^19 rounds to sixteenths.
+    const F plain = splat(786432.0f);
+    const I table = {1065353216, 1065200323, 1065063874, 1064944595, 1064843248, 1064760626,
+        1064697559, 1064654911, 1064633587, 1064634532, 1064658730, 1064707212, 1064781053,
+        1064881375, 1065009351, 1065166205};
+    // what float32 rounds away of 2^(i/16), relative to it
+    const F lows = {0.0f, 4.628547078944223e-08f, -1.199215704517087e-08f, 4.7297823435599184e-08f,
+        3.193418085523092e-08f, 3.621057320657428e-08f, -3.099072076739873e-08f,
+        -7.475213226193489e-09f, 1.7114271333440456e-08f, -3.047683416745883e-08f,
+        5.233334210430485e-09f, 6.107591543624835e-09f, -1.4719605534452285e-08f,
+        -5.258795177098818e-09f, -6.1282597885181644e-09f, 5.140609271592211e-09f};
+    F r = x + plain;
+    f = x - (r - plain);
+    near = (F)((I)__builtin_ia32_permvarsi512(table, (I)r) + ((I)r << 19));
+    low = (F)__builtin_ia32_permvarsi512((I)lows, (I)r);
+    F p = splat(0.05550522f);
+    p = fma_(p, f, splat(0.24023214f));
+    return fma_(p, f, splat(0.69314718f));
+#else
+    const F plain = splat(12582912.0f);
+    F r = x + plain;
+    f = x - (r - plain);
+    near = (F)(((I)r << 23) + 0x3f800000), low = F{};
+    if constexpr (DEGREE == 2) return horner_(f, POWER_2);
+    else if constexpr (DEGREE == 3) return horner_(f, POWER_3);
+    else if constexpr (DEGREE == 4) return horner_(f, POWER_4);
+    else if constexpr (DEGREE == 5) return horner_(f, POWER_5);
+    else return horner_(f, POWER_6);
+#endif
+};
+// 2^x of the same x. Where |x| < 1/32, rise is 2^x - 1 and keeps what 2^x rounds away; elsewhere it
+// is some number.
+auto exp2_rise_ = [&](F x, F& rise) -> F {
+    F near, low, f;
+    const F p = exp2_parts_(x, near, low, f);
+    rise = f * p;
+    if constexpr (TABLED) return fma_(near, rise, near);
+    else return (F)((I)fma_(p, f, splat(1.0f)) + ((I)near - 0x3f800000));
+};
+
+// softplus(x) = max(x, 0) + log1p(e), e = exp(-|x|), log1p(e) = 2 atanh(e / (2 + e)): no branch,
+// relatively accurate for x << 0, and x itself in float32 well before 20. NaN stays NaN.
+// Here from s = e / (2 + e).
+auto softplus_of_ = [&](F v, F s) -> F {
+    F w = s * s;
+    F p = splat(0.1401223282424694f);
+    p = fma_(p, w, splat(0.13999569703388653f));
+    p = fma_(p, w, splat(0.20010849594358543f));
+    p = fma_(p, w, splat(0.33333206564805135f));
+    p = fma_(p, w, splat(1.0f));
+    return fma_(s + s, p, F{} > v ? F{} : v);
+};
+auto softplus_ = [&](F v) -> F {
+    F e = decay_(v);
+    return softplus_of_(v, e / (e + 2.0f));
+};
+auto sigmoid_ = [&](F v) -> F {
+    F e = decay_(v);
+    return (v < 0.0f ? e : splat(1.0f)) / (e + 1.0f);
+};
+#undef TABLED
