@@ -1,15 +1,13 @@
 """What is scanned, and the rules by which a step of the continuous state becomes f and g.
 
-A rule (equations 2 to 4 of README.md) is an entry here, with the oracle's formula, and a branch in
-``cpu/discretize.h`` and in ``cuda/discretize.h``.
+A rule (equations 2 to 4 of README.md) is an entry here, a branch on both devices in
+``discretize.h``, and the oracle's formula in ``reference.py``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from ..runtime.scalars import LOG2E
@@ -47,23 +45,14 @@ class Scan(NamedTuple):
     save: bool
 
 
-def _zoh(x: Tensor) -> tuple[Tensor, Tensor]:
-    small = x.abs() < 1e-5
-    safe = torch.where(small, torch.ones_like(x), x)
-    series = 1 + x / 2 + x * x / 6 + x * x * x / 24
-    return torch.exp(x), torch.where(small, series, torch.expm1(safe) / safe)
-
-
 class Discretization(NamedTuple):
     """A rule.
 
     Attributes:
-        factors: of x = δA, f and g of the step h ← f·h + g·δ·B·u, in the dtype of x.
         exponential: whether f is e^x: then a product of f is one exponential of a sum.
         weighted: whether g is not 1.
     """
 
-    factors: Callable[[Tensor], tuple[Tensor, Tensor]]
     exponential: bool = True
     weighted: bool = True
 
@@ -74,15 +63,14 @@ class Discretization(NamedTuple):
 
 
 DISCRETIZATIONS = {
-    "mamba": Discretization(lambda x: (torch.exp(x), torch.ones_like(x)), weighted=False),
-    "bilinear": Discretization(
-        lambda x: ((1 + x / 2) / (1 - x / 2), 1 / (1 - x / 2)), exponential=False
-    ),
-    "zoh": Discretization(_zoh),
+    "mamba": Discretization(weighted=False),
+    "bilinear": Discretization(exponential=False),
+    "zoh": Discretization(),
 }
 
 
-def macros(name: str) -> dict[str, object]:
+def macros(name: str, on_cpu: bool) -> dict[str, object]:
     """For the kernels' C++: MODE is that of the numbers MAMBA, BILINEAR, ZOH."""
     numbers: dict[str, object] = {key.upper(): i for i, key in enumerate(DISCRETIZATIONS)}
-    return numbers | {"MODE": name.upper(), "WEIGHTED": DISCRETIZATIONS[name].weighted}
+    numbers |= {"MODE": name.upper(), "WEIGHTED": DISCRETIZATIONS[name].weighted}
+    return numbers | {"ON_CPU": on_cpu}

@@ -83,7 +83,7 @@ class Kind(NamedTuple):
         share = min(1.0, 64 / tuning.chunk)
         limits = {"SLOWEST": SLOWEST * share, "MODERATE": MODERATE * share}
         text = native(
-            _HERE / file, **macros(self.discretization), **limits, **NEEDS, SCALE=rule.scale,
+            _HERE / file, **macros(self.discretization, True), **limits, **NEEDS, SCALE=rule.scale,
             GRADIENT=gradient, OUTPUT=output, TOKENS=tokens, AT_ONCE=at_once, BLOCKS=BLOCKS,
         )  # fmt: skip
         return prelude(tuning.degree, tuning.table) + ROWS + text

@@ -1,5 +1,5 @@
 // States while they are walked, and the loop over them.
-#include "discretize.h"
+#include "../discretize.h"
 
 // f of a slow decay is so near to 1 that float32 rounds most of what it says away. So a channel
 // that is slow for all tokens of a walk takes f - 1 as well, which float32 holds to its last bit.

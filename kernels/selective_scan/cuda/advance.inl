@@ -1,7 +1,7 @@
 // The recurrence over a tile: equation 1, and with READ the sums of equation 5 as partial sums of
 // the lanes. In REVERSE it is equation 6, dh from after a tile to before it.
 #include "shape.h"
-#include "discretize.h"
+#include "../discretize.h"
 float* const s = arena.data.ptr + base;
 const int channel = p.slot * CHANNELS;
 WP_PRAGMA_NO_UNROLL

@@ -344,7 +344,7 @@ def recurrence(
     vec = wp.types.vector(f.walks * f.held, wp.float32)
     arena_type, _, _ = arena_io(arena_size)
     offset = {"AT_C": 0, "AT_Y": 0} | {f"AT_{name}": place for name, place in at}
-    text = functools.partial(f.text, TOKENS=tokens, **macros(mode), **offset)
+    text = functools.partial(f.text, TOKENS=tokens, **macros(mode, False), **offset)
 
     @wp.func_native(text("advance.inl", UNROLL=UNROLL, READ=read, REVERSE=reverse))
     def advance(arena: arena_type, base: int, p: Place, a: vec, h: vec) -> vec: ...

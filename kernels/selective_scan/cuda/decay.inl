@@ -1,6 +1,6 @@
 // Multiplies a tile's decays into ``h``, for the rules whose decays are no exponentials.
 #include "shape.h"
-#include "discretize.h"
+#include "../discretize.h"
 float* const s = arena.data.ptr + base;
 const int channel = p.slot * CHANNELS;
 for (int t = 0; t < TOKENS; ++t) WP_PRAGMA_UNROLL

@@ -1,7 +1,7 @@
 // Walks the recurrence over a tile and keeps the state before every SUB tokens. δ and δu are
 // ``[token / 4, channel, 4]``, as in groups.py.
 #include "shape.h"
-#include "discretize.h"
+#include "../discretize.h"
 // Local memory, up to 1 KB per channel: too much for registers, and left to the cache where shared
 // memory would limit the number of blocks.
 float* const marks = (float*)(((size_t)marks_out.data + 15) & ~(size_t)15);

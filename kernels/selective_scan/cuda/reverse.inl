@@ -3,7 +3,7 @@
 // after the tokens to before them. Sums over states leave the threads as partial sums of the lanes,
 // SUB tokens as one vector; sums over channels are completed over the block and stored.
 #include "shape.h"
-#include "discretize.h"
+#include "../discretize.h"
 #include "total.h"
 float* const marks = (float*)(((size_t)marks_in.data + 15) & ~(size_t)15);
 float* const s = arena.data.ptr;
