@@ -79,12 +79,36 @@ def _describe(tensor: Tensor, dtype, name: str) -> Any:
     return type(made).from_buffer_copy(made)  # a copy that does not keep the tensor alive
 
 
-def array(tensor: Tensor, dtype=None) -> Any:
-    """A Warp array of a tensor, for a field of a Warp struct; None in a dry run, as ``view``."""
-    if recorder() is not None:
-        return None
-    _start()
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+class Packed:
+    """A Warp struct as a launch takes it, made of tensors and numbers.
+
+    An instance of the struct itself would take 10 µs for each array that it is given; this takes
+    what ``view`` does, so that kernels may have structs of arrays. The tensors are kept alive.
+
+    Args:
+        cls: from ``struct``.
+        *values: of its fields, in their order: numbers, contiguous tensors (each is viewed with the
+            leading dimensions that the field's array does not have as one), or None: no array.
+    """
+
+    def __init__(self, cls: Any, *values: Any) -> None:
+        fields = zip(cls.vars.items(), values, strict=True)
+        self._fields = {
+            name: _flat_view(x, var.type) if isinstance(x, Tensor) else x
+            for (name, var), x in fields
+            if x is not None
+        }
+        found = {name: x for name, x in self._fields.items() if x is not None}
+        self._made = cls.ctype(**found)
+
+    def __ctype__(self) -> Any:
+        return self._made
+
+
+def _flat_view(tensor: Tensor, kind: Any) -> Any:
+    kept = kind.ndim - 1 + len(getattr(kind.dtype, "_shape_", ()))
+    inner = tensor.shape[tensor.dim() - kept :] if kept else ()
+    return view(tensor.view(-1, *inner), kind.dtype)
 
 
 def struct(cls: type[_Class]) -> type[_Class]:

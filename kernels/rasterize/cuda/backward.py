@@ -10,31 +10,24 @@ from typing import no_type_check
 
 import warp as wp
 
+from ...runtime.views import struct
 from ..skip import UNUSED, ZERO_UPSTREAM
 from ..tiles import Picture
-from .complete import completing, shared_size
-from .leaves import (
-    exp2,
-    exponent,
-    load,
-    load1,
-    load2,
-    load3,
-    load_int,
-    load_stop,
-    lowest_bit,
-    reciprocal,
-    sheared,
-)
+from . import leaves as L
 from .warp import (
+    CHUNK,
     HEIGHT,
+    PITCH,
     RECORD,
     STOP,
     SUB_TILES,
     WARP,
     WIDTH,
     Gaussians,
+    Lists,
+    Pixels,
     Place,
+    Walked,
     first_block,
     kernel_options,
     placing,
@@ -43,35 +36,108 @@ from .warp import (
     touching,
 )
 
+wp.set_module_options({"enable_backward": False})
+
 _BLOCKS = (1 << STOP) - 1
-_ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
-_UNUSED = wp.constant(UNUSED)
 
 
-def _warps(channels: int) -> int:
-    """How many of a multiprocessor there are registers for."""
-    return 20 if channels < 4 else 16
+@struct
+class Rows:
+    """What a gradient's launch leaves: sums of pairs or Gaussians, and which tiles it skipped."""
+
+    sums: wp.array2d[wp.float32]
+    skipped: wp.array[wp.int32]
+
+
+@wp.func
+def columns_of_moments(channels: int) -> int:
+    # six for each chunk of channels: a chunk is a launch, and has its own sums of h
+    return (channels + wp.static(CHUNK - 1)) / wp.static(CHUNK) * 6
+
+
+def row_length(channels: int) -> int:
+    """Values in a row: the moments of each chunk, then the channels."""
+    return -(-channels // CHUNK) * 6 + channels
+
+
+def _shared_size(channels: int, geometry: bool) -> int:
+    """Floats of a warp's shared memory: records, rows, and sums of the pairs of a completion."""
+    values = channels + (6 if geometry else 0)
+    return WARP * RECORD + WARP + WARP // values * values * PITCH
+
+
+@functools.cache
+def _completing(channels: int, geometry: bool, listed: bool):
+    """How many pairs wait for the sums of their lanes, and the functions that leave and add these.
+
+    A row has six moments for each chunk of channels, then the channels. If ``listed``, it is a
+    pair's and is written; else it is a Gaussian's, and the pair is added to it.
+    """
+    moments = 6 if geometry else 0
+    values = moments + channels  # how many sums a pair has
+    slots = WARP // values  # pairs whose sums are completed at once, with a lane for each sum
+    rows_at = WARP * RECORD
+    sums_at = rows_at + WARP
+    memory = shared_memory(_shared_size(channels, geometry))
+    arena_type = memory.arena
+    values_type = wp.types.vector(values, wp.float32)
+
+    @wp.func
+    def leave(arena: arena_type, lane: wp.int32, slot: wp.int32, row: wp.int32, sums: values_type):
+        # stores a lane's sums of a pair, to be completed together with those of other pairs
+        at = wp.static(sums_at) + slot * wp.static(values * PITCH) + lane
+        for v in range(wp.static(values)):
+            memory.put(arena, at + wp.static(v * PITCH), sums[v])
+        memory.put_int(arena, wp.static(rows_at) + slot, row)
+
+    @wp.func
+    def complete(
+        arena: arena_type,
+        gaussians: Gaussians,
+        lane: wp.int32,
+        count: wp.int32,
+        v_pairs: wp.array2d[wp.float32],
+    ):
+        # each lane adds up one value of one of the stored pairs, over the 32 lanes
+        if lane < count * wp.static(values):
+            at = wp.static(sums_at) + lane * PITCH
+            total = memory.get4(arena, at)
+            for i in range(1, wp.static(WARP // 4)):
+                total += memory.get4(arena, at + 4 * i)
+            value = (total[0] + total[1]) + (total[2] + total[3])
+            row = wp.int64(memory.get_int(arena, wp.static(rows_at) + lane / wp.static(values)))
+            before = columns_of_moments(gaussians.channels)
+            row *= wp.int64(before + gaussians.channels)
+            column = lane % wp.static(values)
+            if column >= wp.static(moments):
+                column += before - wp.static(moments) + gaussians.first
+            else:
+                column += columns_of_moments(gaussians.first)
+            if wp.static(not listed):
+                value += L.load(v_pairs, row, column)
+            L.store(v_pairs, row, column, value)
+
+    return slots, leave, complete
 
 
 @functools.cache
 def _walking(channels: int, geometry: bool, parts: int, listed: bool):
-    """The function that walks a part of a tile, whose pairs are numbered from ``begin`` on.
+    """The function that walks a part of a tile.
 
     Unless ``listed``, the tiles of a view share one list, as in ``forward.py``, and the bits of
     its pairs; what a tile's own test rules out is taken away from these.
     """
     moments = 6 if geometry else 0
-    values = moments + channels
-    size = shared_size(channels, geometry)
+    size = _shared_size(channels, geometry)
     memory = shared_memory(size)
     arena_type = memory.arena
-    slots, leave, complete = completing(channels, geometry, listed)
-    place, touched, stage = placing(parts), touching(parts), staging(channels, size)
+    slots, leave, complete = _completing(channels, geometry, listed)
+    touched, stage = touching(parts), staging(channels, size)
     pixels = SUB_TILES // parts  # how many a lane has
     part_blocks = (1 << 16 // parts) - 1
     part_stops = (1 << pixels) - 1
     pixels_type = wp.types.vector(pixels, wp.float32)
-    values_type = wp.types.vector(values, wp.float32)
+    values_type = wp.types.vector(moments + channels, wp.float32)
     upstream_type = wp.types.matrix((pixels, channels), wp.float32)
 
     @wp.func
@@ -82,31 +148,23 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
         return blocks & wanted | stops << STOP
 
     @wp.func
-    def row_of(rows: wp.array[wp.int32], k: wp.int32) -> wp.int32:
-        row = k
-        if wp.static(listed):
-            row = load_int(rows, k)
-        return row
-
-    @wp.func
     def of_tile(
         picture: Picture,
         gaussians: Gaussians,
+        lists: Lists,
         corner: wp.vec2,
-        pairs: wp.array[wp.int32],
-        offsets: wp.array[wp.int32],
         k: wp.int32,
         bits: wp.int32,
     ):
         # of a pair's bits, which are those of all tiles together, what this tile's test leaves
         left = wp.int32(0)
-        if load_int(offsets, k) != load_int(offsets, k + 1):
-            g = load_int(pairs, k)
+        if L.load_int(lists.offsets, k) != L.load_int(lists.offsets, k + 1):
+            g = L.load_int(lists.order, k)
             mask = touched(
                 corner,
-                load2(gaussians.means2d, g),
-                load3(gaussians.conics, g),
-                load1(gaussians.opacities, g),
+                L.load2(gaussians.means2d, g),
+                L.load3(gaussians.conics, g),
+                L.load1(gaussians.opacities, g),
                 picture.alpha_min,
             )
             for j in range(wp.static(pixels)):
@@ -116,91 +174,79 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
 
     @wp.func
     @no_type_check
-    def start(
+    def walk(
         picture: Picture,
         gaussians: Gaussians,
+        lists: Lists,
+        transmittances: wp.array2d[wp.float32],  # in one struct, these four would spill registers
+        stops: wp.array2d[wp.int32],
+        blocks: wp.array[wp.int32],
+        walked_in: wp.array[wp.int32],
+        v_pixels_in: Pixels,
+        rows_out: Rows,
+        arena: arena_type,
         p: Place,
-        walked: wp.int32,
-        transmittances: wp.array2d[wp.float32],
-        v_renders: wp.array2d[wp.float32],
-        v_alphas: wp.array2d[wp.float32],
     ):
-        # the lane's pixels before the walk, and bits of the blocks whose upstream gradient is not 0
+        if wp.static(listed):
+            begin = lists.starts[p.tile]
+            walked = walked_in[p.tile]
+        else:
+            begin = p.image * picture.num
+            walked = -walked_in[p.tile]
+        # T is as forward left it, negative until the walk comes to where the pixel stopped; R is
+        # that of README eq. 10, less the gradient of alpha, which is the same for all pairs
         T = pixels_type()
         R = pixels_type()
         upstream = upstream_type()
         first = p.pixel * wp.int64(gaussians.channels) + wp.int64(gaussians.first)
-        some = wp.int32(0)
+        some = wp.int32(0)  # bits of the blocks whose upstream gradient is not 0
         for j in range(wp.static(pixels)):
             if walked > 0:
-                T[j] = load(transmittances, p.place, j * WARP)
+                T[j] = L.load(transmittances, p.place, j * WARP)
             if T[j] != 0.0:
                 step = j // 2 * HEIGHT * picture.width + j % 2 * WIDTH
                 largest = wp.float32(0.0)
                 if gaussians.first == 0:
-                    R[j] = -load(v_alphas, p.pixel, step)
+                    R[j] = -L.load(v_pixels_in.alphas, p.pixel, step)
                     largest += wp.abs(R[j])
                 step *= gaussians.channels
                 for c in range(wp.static(channels)):
-                    upstream[j, c] = load(v_renders, first, step + c)
+                    upstream[j, c] = L.load(v_pixels_in.renders, first, step + c)
                     largest += wp.abs(upstream[j, c])
                 # NaN is not taken for zero
                 if not (largest <= 0.0):
                     some |= wp.static(3 << first_block(j))
-        return T, R, upstream, some
-
-    @wp.func
-    @no_type_check
-    def walk(
-        picture: Picture,
-        gaussians: Gaussians,
-        arena: arena_type,
-        index: wp.int32,
-        lane: wp.int32,
-        begin: wp.int32,
-        pairs_in: wp.array[wp.int32],
-        rows_in: wp.array[wp.int32],
-        transmittances_in: wp.array2d[wp.float32],
-        stops_in: wp.array2d[wp.int32],
-        blocks_in: wp.array[wp.int32],
-        walked_in: wp.array[wp.int32],
-        v_renders_in: wp.array2d[wp.float32],
-        v_alphas_in: wp.array2d[wp.float32],
-        v_pairs_out: wp.array2d[wp.float32],
-        skipped_out: wp.array[wp.int32],
-    ):
-        p = place(picture, index, lane)
-        walked = walked_in[p.tile] * wp.static(1 if listed else -1)
-        # T is as forward left it, negative until the walk comes to where the pixel stopped; R is
-        # that of README eq. 10, less the gradient of alpha, which is the same for all pairs
-        T, R, upstream, some = start(
-            picture, gaussians, p, walked, transmittances_in, v_renders_in, v_alphas_in
-        )
-        if (picture.skip & _ZERO_UPSTREAM) == 0:
+        if (picture.skip & ZERO_UPSTREAM) == 0:
             some = wp.static(part_blocks)
-        wanted = memory.any_of(arena, lane, some)
+        wanted = memory.any_of(arena, p.lane, some)
         if wanted == 0:
             walked = 0
-        if walked > 0 and lane == 0:
-            skipped_out[p.tile] = 0
+        if walked > 0 and p.lane == 0:
+            rows_out.skipped[p.tile] = 0
 
         waiting = wp.int32(0)
         for done in range(0, walked, WARP):
-            k = begin + walked - 1 - done - lane
+            k = begin + walked - 1 - done - p.lane
             bits = wp.int32(0)
             if k >= begin:
-                bits = of_part(load_int(blocks_in, k), p.part, wanted)
-                if (picture.skip & _UNUSED) == 0:
+                bits = of_part(L.load_int(blocks, k), p.part, wanted)
+                if (picture.skip & UNUSED) == 0:
                     bits |= wanted
                 if wp.static(not listed):
-                    bits = of_tile(picture, gaussians, p.corner, pairs_in, rows_in, k, bits)
+                    bits = of_tile(picture, gaussians, lists, p.corner, k, bits)
                 if bits != 0:
-                    row = row_of(rows_in, k) * wp.static(parts) + p.part
-                    stage(arena, picture, gaussians, lane, load_int(pairs_in, k), bits, row)
-            todo = memory.ballot(arena, lane, bits)
+                    if wp.static(listed):
+                        row = L.load_int(lists.rows, k)
+                        g = L.load_int(lists.pairs, k)
+                    else:
+                        row = k
+                        g = L.load_int(lists.order, k)
+                    row = row * wp.static(parts) + p.part
+                    stage(arena, picture, gaussians, p.lane, g, bits, row)
+            todo = memory.ballot(arena, p.lane, bits)
             memory.sync()
             while todo != 0:
-                i = lowest_bit(todo)
+                i = L.lowest_bit(todo)
                 todo &= todo - 1
                 shape = memory.get4(arena, i * RECORD)
                 level = memory.get4(arena, i * RECORD + 4)
@@ -210,11 +256,11 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                 for j in range(wp.static(pixels)):
                     if (bits & wp.static(3 << first_block(j))) != 0:
                         dy = p.y[j // 2] - shape[1]
-                        u = sheared(shape[3], p.x[j % 2] - shape[0], dy)
-                        alpha = exp2(exponent(shape[2], level[0], level[1], u, dy))
+                        u = L.sheared(shape[3], p.x[j % 2] - shape[0], dy)
+                        alpha = L.exp2(L.exponent(shape[2], level[0], level[1], u, dy))
                         clamped = wp.min(alpha, picture.alpha_max)
                         if alpha >= picture.alpha_min and T[j] > 0.0:
-                            T[j] = T[j] * reciprocal(1.0 - clamped)
+                            T[j] = T[j] * L.reciprocal(1.0 - clamped)
                             weight = T[j] * clamped
                             for c in range(wp.static(channels)):
                                 sums[wp.static(moments) + c] += weight * upstream[j, c]
@@ -234,11 +280,11 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                                     sums[4] += hu * dy
                                     sums[5] += hy * dy
                 if (bits & wp.static(_BLOCKS)) != 0:
-                    leave(arena, lane, waiting, memory.get_int(arena, i * RECORD + 7), sums)
+                    leave(arena, p.lane, waiting, memory.get_int(arena, i * RECORD + 7), sums)
                     waiting += 1
                     if waiting == wp.static(slots):
                         memory.sync()
-                        complete(arena, gaussians, lane, waiting, v_pairs_out)
+                        complete(arena, gaussians, p.lane, waiting, rows_out.sums)
                         memory.sync()
                         waiting = 0
                 if (bits >> STOP) != 0:
@@ -247,114 +293,86 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                     for j in range(wp.static(pixels)):
                         if (bits & wp.static(1 << (STOP + j))) != 0:
                             if T[j] < 0.0:
-                                if load_stop(stops_in, p.place, j * WARP) == k:
+                                if L.load_stop(stops, p.place, j * WARP) == k:
                                     T[j] = -T[j]
             memory.sync()
         memory.sync()
-        complete(arena, gaussians, lane, waiting, v_pairs_out)
+        complete(arena, gaussians, p.lane, waiting, rows_out.sums)
 
     return walk
 
 
 @functools.cache
-def backward_kernel(channels: int, geometry: bool, parts: int):
-    """The kernel for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
+def backward_kernels(channels: int, geometry: bool, parts: int):
+    """The kernels for so many channels, at most 4, and parts of a tile: 1, 2 or 4.
 
-    Without ``geometry`` it is for colours alone. Each part has a row of its own for a pair.
+    Without ``geometry`` they are for colours alone. ``composite_vjp`` has a warp for each part of a
+    tile, and rows of pairs; ``composite_vjp_unlisted`` one for a part of each tile of a view, and
+    rows of Gaussians, numbered as ``lists_in.order``.
     """
-    size, walk = shared_size(channels, geometry), _walking(channels, geometry, parts, True)
+    size, place = _shared_size(channels, geometry), placing(parts)
+    options = kernel_options(20 if channels < 4 else 16)  # warps that there are registers for
+    walk = _walking(channels, geometry, parts, True)
+    walk_unlisted = _walking(channels, geometry, parts, False)
 
-    @wp.kernel(**kernel_options(_warps(channels)))
+    @wp.kernel(**options)
     @no_type_check
     def composite_vjp(
         picture: Picture,
         gaussians: Gaussians,
-        pairs_in: wp.array[wp.int32],
-        rows_in: wp.array[wp.int32],
-        starts_in: wp.array[wp.int32],
-        transmittances_in: wp.array2d[wp.float32],
-        stops_in: wp.array2d[wp.int32],
-        blocks_in: wp.array[wp.int32],
-        walked_in: wp.array[wp.int32],
-        v_renders_in: wp.array2d[wp.float32],
-        v_alphas_in: wp.array2d[wp.float32],
-        v_pairs_out: wp.array2d[wp.float32],
-        skipped_out: wp.array[wp.int32],
+        lists_in: Lists,
+        walked_in: Walked,
+        v_pixels_in: Pixels,
+        rows_out: Rows,
     ):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
+        p = place(picture, index, lane)
         walk(
             picture,
             gaussians,
+            lists_in,
+            walked_in.transmittances,
+            walked_in.stops,
+            walked_in.blocks,
+            walked_in.walked,
+            v_pixels_in,
+            rows_out,
             arena,
-            index,
-            lane,
-            starts_in[index // wp.static(parts)],
-            pairs_in,
-            rows_in,
-            transmittances_in,
-            stops_in,
-            blocks_in,
-            walked_in,
-            v_renders_in,
-            v_alphas_in,
-            v_pairs_out,
-            skipped_out,
+            p,
         )
 
-    return composite_vjp
-
-
-@functools.cache
-def unlisted_kernel(channels: int, geometry: bool, parts: int):
-    """The kernel that makes the sums where ``count_in`` pairs have no room in ``blocks_in``.
-
-    A warp has a part of each tile of a view. A row is of a Gaussian's number in ``order_in``.
-    """
-    size, walk = shared_size(channels, geometry), _walking(channels, geometry, parts, False)
-
-    @wp.kernel(**kernel_options(_warps(channels)))
+    @wp.kernel(**options)
     @no_type_check
     def composite_vjp_unlisted(
         picture: Picture,
         gaussians: Gaussians,
-        order_in: wp.array[wp.int32],
-        offsets_in: wp.array[wp.int32],
-        count_in: wp.array[wp.int64],
-        transmittances_in: wp.array2d[wp.float32],
-        stops_in: wp.array2d[wp.int32],
-        blocks_in: wp.array[wp.int32],
-        walked_in: wp.array[wp.int32],
-        v_renders_in: wp.array2d[wp.float32],
-        v_alphas_in: wp.array2d[wp.float32],
-        v_pairs_out: wp.array2d[wp.float32],
-        skipped_out: wp.array[wp.int32],
+        lists_in: Lists,
+        walked_in: Walked,
+        v_pixels_in: Pixels,
+        rows_out: Rows,
     ):
         worker, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
         image = worker // wp.static(parts)
         tiles = picture.tiles_x * picture.tiles_y
-        if count_in[0] <= wp.int64(blocks_in.shape[0]):
+        if lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0]):
             tiles = 0
         for tile in range(tiles):
             tile += image * picture.tiles_x * picture.tiles_y
-            walk(
+            p = place(picture, tile * wp.static(parts) + worker % wp.static(parts), lane)
+            walk_unlisted(
                 picture,
                 gaussians,
+                lists_in,
+                walked_in.transmittances,
+                walked_in.stops,
+                walked_in.blocks,
+                walked_in.walked,
+                v_pixels_in,
+                rows_out,
                 arena,
-                tile * wp.static(parts) + worker % wp.static(parts),
-                lane,
-                image * picture.num,
-                order_in,
-                offsets_in,
-                transmittances_in,
-                stops_in,
-                blocks_in,
-                walked_in,
-                v_renders_in,
-                v_alphas_in,
-                v_pairs_out,
-                skipped_out,
+                p,
             )
 
-    return composite_vjp_unlisted
+    return composite_vjp, composite_vjp_unlisted

@@ -6,6 +6,7 @@ of each makes what the lists had no room for, and else ends at once. README.md Â
 maths, CUDA.md the design.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -14,12 +15,12 @@ from torch import Tensor
 
 from ...runtime.launch import cuda_launch
 from ...runtime.recording import multiprocessors_of
-from ...runtime.views import array
+from ...runtime.views import Packed
 from ..tiles import Bins, PairGradients, Picture, Walk
-from . import backward, forward
-from .complete import row_length
+from .backward import Rows, backward_kernels, row_length
+from .forward import forward_kernels
 from .reduce import reduce_rows
-from .warp import CHUNK, WARP, Gaussians
+from .warp import CHUNK, WARP, Gaussians, Lists, Pixels, Walked
 
 
 def parts_of_tile(tiles: int, device: torch.device) -> int:
@@ -35,18 +36,29 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
     return 4 if tiles <= few else 2 if tiles <= 2 * few else 1
 
 
-def _gaussians(
-    means2d: Tensor, conics: Tensor, view_opacities: Tensor, colors: Tensor
-) -> Gaussians:
-    if means2d.device.type == "cpu" and not wp.config.enable_cpu_blocks:
+def _launch(
+    kernels: Callable[[int], tuple[Any, Any]],
+    warps: tuple[int, int],
+    picture: Picture,
+    splats: list[Tensor],
+    inputs: list,
+    outputs: list,
+) -> None:
+    """Launches both ``kernels`` of each chunk of channels, with so many warps.
+
+    ``splats`` are means2d, conics, opacities and colors.
+    """
+    colors = splats[-1]
+    if colors.device.type == "cpu" and not wp.config.enable_cpu_blocks:
         raise ValueError("device is cpu: these kernels run there with enable_cpu_blocks only")
-    gaussians = Gaussians()
-    gaussians.means2d = array(means2d.view(-1, 2), wp.vec2)
-    gaussians.conics = array(conics.view(-1, 3), wp.vec3)
-    gaussians.opacities = array(view_opacities.view(-1))
-    gaussians.colors = array(colors)
-    gaussians.channels = colors.shape[1]
-    return gaussians
+    channels = colors.shape[1]
+    for first in range(0, channels if warps[0] else 0, CHUNK):
+        gaussians = Packed(Gaussians, *splats, channels, first)
+        for kernel, count in zip(kernels(min(CHUNK, channels - first)), warps):
+            arguments = [picture, gaussians, *inputs]
+            cuda_launch(
+                kernel, (count, WARP), arguments, outputs, device=colors.device, block_dim=WARP
+            )
 
 
 def composite_forward(
@@ -64,7 +76,6 @@ def composite_forward(
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
     """
     images, channels = means2d.shape[0], colors.shape[1]
-    gaussians = _gaussians(means2d, conics, view_opacities, colors)
     tiles = images * picture.tiles_x * picture.tiles_y
     renders = colors.new_empty(images, picture.height, picture.width, channels)
     alphas = colors.new_empty(images, picture.height, picture.width, 1)
@@ -76,23 +87,14 @@ def composite_forward(
         walked=bins.pairs.new_zeros(tiles),
         blocks_walked=bins.pairs.new_zeros(tiles, dtype=torch.int64),
     )
-    outputs = [
-        walk.transmittances,
-        walk.stops,
-        walk.blocks,
-        walk.walked,
-        walk.blocks_walked,
-        renders.view(-1, channels),
-        alphas.view(-1, 1),
-    ]
-    unlisted = [bins.order, bins.offsets, bins.count.view(1)]
-    for first in range(0, channels if tiles else 0, CHUNK):
-        gaussians.first, here = first, min(CHUNK, channels - first)
-        for kernel, lists in (
-            (forward.forward_kernel(here, parts), [bins.pairs, bins.starts]),
-            (forward.unlisted_kernel(here, parts), unlisted),
-        ):
-            _launch(kernel, tiles * parts, [picture, gaussians, *lists], outputs, colors.device)
+    _launch(
+        lambda count: forward_kernels(count, parts),
+        (tiles * parts, tiles * parts),
+        picture,
+        [means2d, conics, view_opacities, colors],
+        [Packed(Lists, *bins)],
+        [Packed(Walked, *walk), Packed(Pixels, renders, alphas)],
+    )
     return renders, alphas, walk
 
 
@@ -111,38 +113,15 @@ def composite_backward(
 ) -> tuple[PairGradients, Tensor]:
     """As ``composite_backward`` of the CPU; ``tuning`` is not read."""
     tiles, channels = walk.walked.numel(), colors.shape[1]
-    gaussians = _gaussians(means2d, conics, view_opacities, colors)
     parts = parts_of_tile(tiles, colors.device)
     v_pairs = colors.new_zeros(bins.pairs.numel(), parts, row_length(channels))
     skipped = torch.ones_like(walk.walked)
-    inputs = [
-        walk.transmittances,
-        walk.stops,
-        walk.blocks,
-        walk.walked,
-        v_renders.view(-1, channels),
-        v_alphas.view(-1, 1),
-    ]
-    outputs = [v_pairs.flatten(0, 1), skipped]
-    unlisted = [bins.order, bins.offsets, bins.count.view(1)]
-    for first in range(0, channels if tiles else 0, CHUNK):
-        gaussians.first, here = first, min(CHUNK, channels - first)
-        for kernel, warps, lists in (
-            (
-                backward.backward_kernel(here, geometry, parts),
-                tiles * parts,
-                [bins.pairs, bins.rows, bins.starts],
-            ),
-            (
-                backward.unlisted_kernel(here, geometry, parts),
-                means2d.shape[0] * parts,
-                unlisted,
-            ),
-        ):
-            arguments = [picture, gaussians, *lists, *inputs]
-            _launch(kernel, warps, arguments, outputs, colors.device)
+    _launch(
+        lambda count: backward_kernels(count, geometry, parts),
+        (tiles * parts, means2d.shape[0] * parts),
+        picture,
+        [means2d, conics, view_opacities, colors],
+        [Packed(Lists, *bins), Packed(Walked, *walk), Packed(Pixels, v_renders, v_alphas)],
+        [Packed(Rows, v_pairs, skipped)],
+    )
     return reduce_rows(v_pairs, bins, conics, view_opacities, geometry), skipped
-
-
-def _launch(kernel: Any, warps: int, inputs: list, outputs: list, device: torch.device) -> None:
-    cuda_launch(kernel, (warps, WARP), inputs, outputs, device=device, block_dim=WARP)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ...runtime.launch import launch
 from ...runtime.views import vectors
 from ..tiles import Bins, PairGradients
-from .complete import columns_of_moments, row_length
+from .backward import columns_of_moments, row_length
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,7 +14,7 @@ import warp as wp
 from ...runtime.views import struct
 from ..constants import TILE
 from ..tiles import Picture, color_row, q_limit
-from .leaves import load, load1, load2, load3, reciprocal, root
+from . import leaves as L
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,10 +29,9 @@ CHUNK = 4  # a launch has at most so many channels
 # An integer that branches change in place; Warp would keep a copy of a plain one for each branch.
 word = wp.types.vector(1, wp.int32)
 
-_TILE = wp.constant(TILE)
-_LOG2_E_HALF = wp.constant(0.72134752044)  # exp(-q/2) = 2^(-this q)
+_LOG2_E_HALF = 0.72134752044  # exp(-q/2) = 2^(-this q)
 # The rounding of a position: the test of a sub-tile may keep too much, never too little.
-_SLACK_PIXELS = wp.constant(0.01)
+_SLACK_PIXELS = 0.01
 
 
 def first_block(j: int) -> int:
@@ -153,6 +152,9 @@ def shared_memory(size: int) -> Memory:
 class Place:
     """Where a warp and a lane work."""
 
+    index: wp.int32  # of the warp's part among those of all tiles
+    lane: wp.int32
+    image: wp.int32
     tile: wp.int32
     part: wp.int32  # which part of the tile
     px: wp.int32  # the lane's pixel in the first sub-tile
@@ -173,14 +175,18 @@ def placing(parts: int):
     @no_type_check
     def place(picture: Picture, index: wp.int32, lane: wp.int32) -> Place:
         p = Place()
+        p.index = index
+        p.lane = lane
         p.tile = index // wp.static(parts)
         p.part = index % wp.static(parts)
-        image = p.tile // (picture.tiles_x * picture.tiles_y)
-        x = p.tile % picture.tiles_x * _TILE
-        y = p.tile // picture.tiles_x % picture.tiles_y * _TILE + p.part * wp.static(TILE // parts)
+        p.image = p.tile // (picture.tiles_x * picture.tiles_y)
+        x = p.tile % picture.tiles_x * TILE
+        y = p.tile // picture.tiles_x % picture.tiles_y * TILE + p.part * wp.static(TILE // parts)
         p.px = x + lane % WIDTH
         p.py = y + lane // WIDTH
-        p.pixel = wp.int64(image * picture.height + p.py) * wp.int64(picture.width) + wp.int64(p.px)
+        p.pixel = wp.int64(p.image * picture.height + p.py) * wp.int64(picture.width) + wp.int64(
+            p.px
+        )
         p.place = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
         for i in range(2):
             p.x[i] = float(p.px + i * WIDTH) + 0.5
@@ -204,10 +210,10 @@ def touching(parts: int):
         # bit j: the ellipse alpha >= alpha_min touches sub-tile j
         a, k, e = conic[0], conic[1], conic[2]
         limit = q_limit(opacity, alpha_min)
-        reach = root(limit * reciprocal(e))
-        over_a = reciprocal(a)
+        reach = L.root(limit * L.reciprocal(e))
+        over_a = L.reciprocal(a)
         # top = -k a sqrt(limit / (a e (a k² + e)))
-        top = -k * a * reach * root(over_a * reciprocal(a * k * k + e))
+        top = -k * a * reach * L.root(over_a * L.reciprocal(a * k * k + e))
         x = corner[0] - mean[0]
         y = corner[1] - mean[1]
         bits = word()
@@ -217,8 +223,8 @@ def touching(parts: int):
             if y0 <= y1:
                 right = wp.clamp(top, y0, y1)
                 left = wp.clamp(-top, y0, y1)
-                x1 = root(wp.max(limit - e * right * right, 0.0) * over_a) - k * right
-                x0 = -root(wp.max(limit - e * left * left, 0.0) * over_a) - k * left
+                x1 = L.root(wp.max(limit - e * right * right, 0.0) * over_a) - k * right
+                x0 = -L.root(wp.max(limit - e * left * left, 0.0) * over_a) - k * left
                 x1 += _SLACK_PIXELS - x
                 x0 -= _SLACK_PIXELS + x
                 for column in range(2):
@@ -239,6 +245,38 @@ class Gaussians:
     colors: wp.array2d[wp.float32]
     channels: int  # how many ``colors`` has
     first: int  # the first channel of this launch
+
+
+@struct
+class Lists:
+    """``Bins``, in its order."""
+
+    order: wp.array[wp.int32]
+    offsets: wp.array[wp.int32]
+    pairs: wp.array[wp.int32]
+    rows: wp.array[wp.int32]
+    starts: wp.array[wp.int32]
+    box_pairs: wp.array[wp.int64]
+    count: wp.array[wp.int64]
+
+
+@struct
+class Walked:
+    """``Walk``, in its order."""
+
+    transmittances: wp.array2d[wp.float32]
+    stops: wp.array2d[wp.int32]
+    blocks: wp.array[wp.int32]
+    walked: wp.array[wp.int32]
+    blocks_walked: wp.array[wp.int64]
+
+
+@struct
+class Pixels:
+    """The pictures, or the gradient that comes from them; by pixels of all of them."""
+
+    renders: wp.array2d[wp.float32]
+    alphas: wp.array2d[wp.float32]
 
 
 @functools.cache
@@ -262,15 +300,15 @@ def staging(channels: int, size: int):
         row: wp.int32,
     ):
         at = lane * RECORD
-        mean = load2(gaussians.means2d, g)
-        conic = load3(gaussians.conics, g)
+        mean = L.load2(gaussians.means2d, g)
+        conic = L.load3(gaussians.conics, g)
         memory.put4(arena, at, wp.vec4(mean[0], mean[1], -_LOG2_E_HALF * conic[0], conic[1]))
         memory.put(arena, at + 4, -_LOG2_E_HALF * conic[2])
-        memory.put(arena, at + 5, wp.log2(load1(gaussians.opacities, g)))
+        memory.put(arena, at + 5, wp.log2(L.load1(gaussians.opacities, g)))
         memory.put_int(arena, at + 6, bits)
         memory.put_int(arena, at + 7, row)
         source = wp.int64(color_row(picture, g)) * wp.int64(gaussians.channels)
         for c in range(wp.static(channels)):
-            memory.put(arena, at + 8 + c, load(gaussians.colors, source, gaussians.first + c))
+            memory.put(arena, at + 8 + c, L.load(gaussians.colors, source, gaussians.first + c))
 
     return stage

@@ -9,7 +9,7 @@ import warp as wp
 from gamba_warp.kernels.runtime import views
 from gamba_warp.kernels.runtime.launch import cuda_launch
 from gamba_warp.kernels.runtime.recording import Recorder, multiprocessors_of, recording
-from gamba_warp.kernels.runtime.views import array, vectors, view
+from gamba_warp.kernels.runtime.views import Packed, struct, vectors, view
 
 
 class _Cleared(dict):
@@ -27,6 +27,33 @@ def test_a_cache_that_another_thread_clears(monkeypatch):
     assert made.data == x.data_ptr() and tuple(made.shape)[:2] == (2, 3)
 
 
+@struct
+class _Points:
+    places: wp.array[wp.vec3]
+    rows: wp.array2d[wp.float32]
+    absent: wp.array[wp.int32]
+    count: int
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _row_sums(points: _Points, out: wp.array[float]):
+    i = wp.tid()
+    out[i] = points.places[i][2] + points.rows[i, 1] + float(points.count)
+    if points.absent:
+        out[i] = 0.0
+
+
+def test_a_struct_of_arrays_for_a_launch():
+    """Leading dimensions count as one, None is no array, and what does not fit is refused."""
+    places, rows, out = torch.randn(2, 3, 3), torch.randn(2, 3, 4), torch.zeros(6)
+    cuda_launch(_row_sums, 6, [Packed(_Points, places, rows, None, 7)], [out], device=out.device)
+    assert torch.equal(out, (places[..., 2] + rows[..., 1] + 7).flatten())
+    with pytest.raises(TypeError, match="int64"):
+        Packed(_Points, places.long(), rows, None, 7)
+    with pytest.raises(ValueError, match="shorter"):
+        Packed(_Points, places, rows)
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def _never(x_out: wp.array[float]):
     x_out[wp.tid()] = 1.0
@@ -38,7 +65,7 @@ def test_a_dry_run_tells_and_does_nothing(monkeypatch):
     told, device, x = [], torch.device("cuda"), torch.zeros(6)
     with recording(Recorder(lambda *launch: told.append(launch), 77)):
         assert multiprocessors_of(device) == multiprocessors_of(torch.device("cuda:3")) == 77
-        assert view(x) is None and array(x) is None and vectors(x, wp.vec3) is None
+        assert view(x) is None and vectors(x, wp.vec3) is None
         cuda_launch(_never, 6, [], [x], device=device, block_dim=32)
         cuda_launch(_never, (2, 3), [], [x], device=x.device)
         with ThreadPoolExecutor(1) as pool:
