@@ -21,8 +21,15 @@ from .cpu.project_vjp import vjp_on_lanes
 from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
-from .project import LensOptions, Projected, make_lens, project_forward, project_on_threads
-from .project_vjp import Cotangents, Gradients, Wanted, project_backward
+from .project import (
+    PROJECTED_SIZES,
+    LensOptions,
+    Projected,
+    make_lens,
+    project_backward,
+    project_forward,
+    project_on_threads,
+)
 from .skip import UNASKED
 from .tiles import Bins, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
 
@@ -35,7 +42,7 @@ def _compositor(device: torch.device):
 
 
 def _projector(device: torch.device) -> Callable[..., None]:
-    return project_on_lanes if device.type == "cpu" else partial(project_on_threads, device=device)
+    return project_on_lanes if device.type == "cpu" else project_on_threads
 
 
 @without_compiler
@@ -51,56 +58,37 @@ def project(
     lens: List[float],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """``project_forward`` as an operator, with the numbers of ``LensOptions``."""
-    gaussians = means, quats, scales, opacities, colors
-    run = _projector(means.device)
-    p = project_forward(*gaussians, viewmats, Ks, make_lens(LensOptions(*lens)), run)
+    inputs = means, quats, scales, opacities, colors, viewmats, Ks
+    p = project_forward(inputs, make_lens(LensOptions(*lens)), _projector(means.device))
     return p.means2d, p.conics, p.depths, p.view_opacities, p.extents, p.status
 
 
 @project.register_fake
 def _(means, quats, scales, opacities, colors, viewmats, Ks, lens):
     shape = (*viewmats.shape[:2], means.shape[1])
-    sizes = ((2,), (3,), (), (), (2,))
-    floats = tuple(means.new_empty(*shape, *size) for size in sizes)
+    floats = tuple(means.new_empty(*shape, *size) for size in PROJECTED_SIZES)
     return *floats, means.new_empty(shape, dtype=torch.int32)
 
 
 @without_compiler
 @torch.library.custom_op(_OP + "project_vjp", mutates_args=())
 def _project_vjp(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
+    inputs: List[Tensor | None],
     lens: List[float],
     conics: Tensor,
     status: Tensor,
     cotangents: List[Tensor],
     wanted: List[bool],
 ) -> List[Tensor]:
-    grads = project_backward(
-        means,
-        quats,
-        scales,
-        opacities,
-        viewmats,
-        Ks,
-        make_lens(LensOptions(*lens)),
-        conics,
-        status,
-        Cotangents(*cotangents),
-        Wanted(*wanted),
-        vjp_on_lanes if means.device.type == "cpu" else None,
-    )
+    on_lanes = vjp_on_lanes if conics.device.type == "cpu" else None
+    kept = make_lens(LensOptions(*lens)), conics, status
+    grads = project_backward(inputs, *kept, cotangents, wanted, on_lanes)
     return [g for g in grads if g is not None]
 
 
 @_project_vjp.register_fake
-def _(means, quats, scales, opacities, viewmats, Ks, lens, conics, status, cotangents, wanted):
-    inputs = (means, quats, scales, opacities, viewmats)
-    return [torch.empty_like(x) for x, want in zip(inputs, wanted) if want]
+def _(inputs, lens, conics, status, cotangents, wanted):
+    return [torch.empty_like(x) for x, want in zip(inputs[:5], wanted) if want]
 
 
 def _project_setup(ctx, inputs, output):
@@ -112,19 +100,17 @@ def _project_setup(ctx, inputs, output):
     ctx.save_for_backward(means, quats, scales, opacities, viewmats, Ks, *kept)
 
 
-def _project_backward(ctx, v_means2d, v_conics, v_depths, v_view_opacities, _extents, _status):
+def _project_backward(ctx, *cotangents):
     *inputs, conics, status = ctx.saved_tensors
     means, quats, scales, opacities, _, viewmats, _, _ = ctx.needs_input_grad
-    wanted = Wanted(means, quats, scales, opacities, viewmats)
-    cotangents = Cotangents(v_means2d, v_conics, v_depths, v_view_opacities)
-    sizes = ((2,), (3,), (), ())
-    cotangents = [
+    wanted = [means, quats, scales, opacities, viewmats]
+    given = [
         conics.new_zeros(*status.shape, *size) if v is None else v.contiguous()
-        for v, size in zip(cotangents, sizes)
+        for v, size in zip(cotangents, PROJECTED_SIZES[:4])
     ]
-    grads = iter(_project_vjp(*inputs, ctx.lens, conics, status, cotangents, list(wanted)))
-    v = Gradients(*(next(grads) if want else None for want in wanted))
-    return v.means, v.quats, v.scales, v.opacities, None, v.viewmats, None, None
+    grads = iter(_project_vjp(inputs, ctx.lens, conics, status, given, wanted))
+    *v_gaussians, v_viewmats = (next(grads) if want else None for want in wanted)
+    return *v_gaussians, None, v_viewmats, None, None
 
 
 project.register_autograd(_project_backward, setup_context=_project_setup)

@@ -1,11 +1,12 @@
-"""3D Gaussians to 2D: culling and the EWA projection.
+"""3D Gaussians to 2D: culling, the EWA projection, and its gradient.
 
-One thread per (view, Gaussian). README.md §1 holds the maths; ``project_vjp.py`` the gradient.
+Forward has a thread for each (view, Gaussian). The gradient has one for each Gaussian, which loops
+over its views: sums over views are then in a fixed order. README.md §1 and §4 hold the maths.
 """
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import torch
 import warp as wp
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from ..runtime.launch import launch
 from ..runtime.memory import empty
-from ..runtime.views import struct, vectors
+from ..runtime.views import Packed, struct, vectors
 from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 
 wp.set_module_options({"enable_backward": False})
@@ -24,15 +25,7 @@ mat23 = wp.types.matrix((2, 3), wp.float32)
 VISIBLE, NEAR, FAR, NOT_FINITE, TRANSPARENT, OUTSIDE, SMALL = range(7)
 STATUS_NAMES = ("visible", "near", "far", "not_finite", "transparent", "outside", "small")
 
-_MARGIN = wp.constant(FRUSTUM_MARGIN)
-COMPENSATION_FLOOR = wp.constant(COMPENSATION_MIN)
-_VISIBLE = wp.constant(VISIBLE)
-_NEAR = wp.constant(NEAR)
-_FAR = wp.constant(FAR)
-_NOT_FINITE = wp.constant(NOT_FINITE)
-_TRANSPARENT = wp.constant(TRANSPARENT)
-_OUTSIDE = wp.constant(OUTSIDE)
-_SMALL = wp.constant(SMALL)
+_SHORTEST = 1e-30  # the gradient of a shorter quaternion leaves float32's range
 
 
 class LensOptions(NamedTuple):
@@ -88,6 +81,9 @@ class Projected(NamedTuple):
     status: Tensor
 
 
+PROJECTED_SIZES = ((2,), (3,), (), (), (2,))  # of ``Projected``'s floats, after [B, V, N]
+
+
 @struct
 class Lens:
     """The scalars of a projection's launch: picture size and thresholds."""
@@ -104,19 +100,38 @@ class Lens:
     rounded: int
 
 
+_GAUSSIANS = wp.vec3, wp.vec4, wp.vec3, wp.float32  # means, quats, scales, opacities
+_CAMERAS = wp.mat44, wp.mat33
+_SPLATS = wp.vec2, wp.vec3, wp.float32, wp.float32, wp.vec2, wp.int32  # as ``Projected``
+
+
+@struct
+class Scene:
+    """Gaussians and cameras as a launch takes them, or their gradients."""
+
+    means: wp.array[wp.vec3]
+    quats: wp.array[wp.vec4]
+    scales: wp.array[wp.vec3]
+    opacities: wp.array[wp.float32]
+    viewmats: wp.array[wp.mat44]
+    Ks: wp.array[wp.mat33]
+
+
+@struct
+class Splats:
+    """``Projected`` as a launch takes it, by view-major Gaussians, or its gradients."""
+
+    means2d: wp.array[wp.vec2]
+    conics: wp.array[wp.vec3]
+    depths: wp.array[wp.float32]
+    opacities: wp.array[wp.float32]
+    extents: wp.array[wp.vec2]
+    status: wp.array[wp.int32]
+
+
 @wp.func
-def rotation_of(viewmat: wp.mat44) -> wp.mat33:
-    return wp.mat33(
-        viewmat[0, 0],
-        viewmat[0, 1],
-        viewmat[0, 2],
-        viewmat[1, 0],
-        viewmat[1, 1],
-        viewmat[1, 2],
-        viewmat[2, 0],
-        viewmat[2, 1],
-        viewmat[2, 2],
-    )
+def rotation_of(m: wp.mat44) -> wp.mat33:
+    return wp.mat33(m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2])
 
 
 @wp.func
@@ -164,7 +179,7 @@ def unit(q: wp.vec4) -> wp.vec4:
 @wp.func
 def slope_bounds(center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.vec2:
     # README eq. 2: the picture and a margin around it
-    margin = _MARGIN * 0.5 * size / focal
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
     return wp.vec2(-(center / focal + margin), (size - center) / focal + margin)
 
 
@@ -206,37 +221,27 @@ def _project(
     num: wp.int32,
     colors_per_view: wp.int32,
     lens: Lens,
-    means_in: wp.array[wp.vec3],
-    quats_in: wp.array[wp.vec4],
-    scales_in: wp.array[wp.vec3],
-    opacities_in: wp.array[wp.float32],
+    scene_in: Scene,
     colors_in: wp.array2d[wp.float32],
-    viewmats_in: wp.array[wp.mat44],
-    Ks_in: wp.array[wp.mat33],
-    means2d_out: wp.array[wp.vec2],
-    conics_out: wp.array[wp.vec3],
-    depths_out: wp.array[wp.float32],
-    view_opacities_out: wp.array[wp.float32],
-    extents_out: wp.array[wp.vec2],
-    status_out: wp.array[wp.int32],
+    splats_out: Splats,
 ):
     i = offset + wp.tid()
     image = i // num
     g = (image // views) * num + i % num
-    means2d_out[i] = wp.vec2(0.0, 0.0)
-    conics_out[i] = wp.vec3(1.0, 0.0, 1.0)
-    depths_out[i] = 0.0
-    view_opacities_out[i] = 0.0
-    extents_out[i] = wp.vec2(0.0, 0.0)
+    splats_out.means2d[i] = wp.vec2(0.0, 0.0)
+    splats_out.conics[i] = wp.vec3(1.0, 0.0, 1.0)
+    splats_out.depths[i] = 0.0
+    splats_out.opacities[i] = 0.0
+    splats_out.extents[i] = wp.vec2(0.0, 0.0)
 
-    mean = means_in[g]
-    scale = scales_in[g]
-    opacity = opacities_in[g]
-    viewmat = viewmats_in[image]
+    mean = scene_in.means[g]
+    scale = scene_in.scales[g]
+    opacity = scene_in.opacities[g]
+    viewmat = scene_in.viewmats[image]
     t = rotation_of(viewmat) * mean + translation_of(viewmat)
     finite = _finite3(mean) and _finite3(scale) and wp.isfinite(opacity) and _finite3(t)
-    if quats_in:
-        q = quats_in[g]
+    if scene_in.quats:
+        q = scene_in.quats[g]
         finite = finite and wp.isfinite(wp.dot(wp.abs(q), wp.vec4(0.25, 0.25, 0.25, 0.25)))
     row = g
     if colors_per_view != 0:
@@ -245,22 +250,22 @@ def _project(
         finite = finite and wp.isfinite(colors_in[row, c])
     # Every cull is written so that NaN fails it, and comes before the first division by z.
     if not finite:
-        status_out[i] = _NOT_FINITE
+        splats_out.status[i] = NOT_FINITE
         return
     if not (t[2] >= lens.near_plane):
-        status_out[i] = _NEAR
+        splats_out.status[i] = NEAR
         return
     if not (t[2] <= lens.far_plane):
-        status_out[i] = _FAR
+        splats_out.status[i] = FAR
         return
     if not (opacity >= lens.alpha_min):
-        status_out[i] = _TRANSPARENT
+        splats_out.status[i] = TRANSPARENT
         return
 
-    K = Ks_in[image]
+    K = scene_in.Ks[image]
     M = jacobian(t, K, lens) * rotation_of(viewmat)
-    if quats_in:
-        M = M * rotation(unit(quats_in[g]))
+    if scene_in.quats:
+        M = M * rotation(unit(scene_in.quats[g]))
     M = M * wp.diag(scale)
     m0 = row_of(M, 0)
     m1 = row_of(M, 1)
@@ -273,12 +278,12 @@ def _project(
     a = syy / det
     center = wp.vec2(K[0, 0] * t[0] / t[2] + K[0, 2], K[1, 1] * t[1] / t[2] + K[1, 2])
     if not (wp.isfinite(det) and a > 0.0 and wp.isfinite(center[0]) and wp.isfinite(center[1])):
-        status_out[i] = _NOT_FINITE
+        splats_out.status[i] = NOT_FINITE
         return
     if lens.antialiased != 0:
-        opacity *= wp.max(COMPENSATION_FLOOR, wp.sqrt(det0 / det))
+        opacity *= wp.max(COMPENSATION_MIN, wp.sqrt(det0 / det))
         if not (opacity >= lens.alpha_min):
-            status_out[i] = _TRANSPARENT
+            splats_out.status[i] = TRANSPARENT
             return
     cut = wp.sqrt(2.0 * wp.log(opacity / lens.alpha_min))
     extent = wp.vec2(cut * wp.sqrt(sxx), cut * wp.sqrt(syy))
@@ -286,19 +291,179 @@ def _project(
     if lens.rounded != 0:
         reach = wp.vec2(wp.ceil(extent[0]), wp.ceil(extent[1]))
     if reach[0] <= lens.radius_clip and reach[1] <= lens.radius_clip:
-        status_out[i] = _SMALL
+        splats_out.status[i] = SMALL
         return
     inside_x = center[0] + reach[0] >= 0.0 and center[0] - reach[0] <= lens.width
     inside_y = center[1] + reach[1] >= 0.0 and center[1] - reach[1] <= lens.height
     if not (inside_x and inside_y):
-        status_out[i] = _OUTSIDE
+        splats_out.status[i] = OUTSIDE
         return
-    status_out[i] = _VISIBLE
-    means2d_out[i] = center
-    conics_out[i] = wp.vec3(a, -sxy / syy, 1.0 / syy)
-    depths_out[i] = t[2]
-    view_opacities_out[i] = opacity
-    extents_out[i] = extent
+    splats_out.status[i] = VISIBLE
+    splats_out.means2d[i] = center
+    splats_out.conics[i] = wp.vec3(a, -sxy / syy, 1.0 / syy)
+    splats_out.depths[i] = t[2]
+    splats_out.opacities[i] = opacity
+    splats_out.extents[i] = extent
+
+
+@wp.func
+@no_type_check
+def _slope_vjp(
+    p: wp.float32,
+    z: wp.float32,
+    center: wp.float32,
+    size: wp.float32,
+    focal: wp.float32,
+    v: wp.float32,
+) -> wp.vec2:
+    # gradient of j = -focal·slope(x/z)/z to (x, z), p = x/z; a clamped slope is a constant
+    s = slope(p, center, size, focal)
+    f = v * focal / (z * z)
+    if p == s:
+        return wp.vec2(-f, 2.0 * f * s)
+    return wp.vec2(0.0, f * s)
+
+
+@wp.func
+@no_type_check
+def _rotation_vjp(q: wp.vec4, v: wp.mat33) -> wp.vec4:
+    # through the matrix of a unit quaternion, then through the normalisation, less its 1/|q|
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    vq = 2.0 * wp.vec4(
+        x * (v[2, 1] - v[1, 2]) + y * (v[0, 2] - v[2, 0]) + z * (v[1, 0] - v[0, 1]),
+        -2.0 * x * (v[1, 1] + v[2, 2])
+        + y * (v[0, 1] + v[1, 0])
+        + z * (v[0, 2] + v[2, 0])
+        + w * (v[2, 1] - v[1, 2]),
+        x * (v[0, 1] + v[1, 0])
+        - 2.0 * y * (v[0, 0] + v[2, 2])
+        + z * (v[1, 2] + v[2, 1])
+        + w * (v[0, 2] - v[2, 0]),
+        x * (v[0, 2] + v[2, 0])
+        + y * (v[1, 2] + v[2, 1])
+        - 2.0 * z * (v[0, 0] + v[1, 1])
+        + w * (v[1, 0] - v[0, 1]),
+    )
+    return vq - q * wp.dot(q, vq)
+
+
+@wp.func
+@no_type_check
+def _all_zero(v: Splats, i: wp.int32) -> bool:
+    # exactly: NaN is not
+    return (
+        v.means2d[i] == wp.vec2(0.0, 0.0)
+        and v.conics[i] == wp.vec3(0.0, 0.0, 0.0)
+        and v.depths[i] == 0.0
+        and v.opacities[i] == 0.0
+    )
+
+
+@wp.kernel
+@no_type_check
+def _project_vjp(
+    offset: wp.int32,
+    views: wp.int32,
+    num: wp.int32,
+    lens: Lens,
+    scene_in: Scene,
+    splats_in: Splats,
+    v_splats_in: Splats,
+    v_scene_out: Scene,
+    v_viewmats_out: wp.array3d[wp.float32],
+):
+    g = offset + wp.tid()
+    b = g // num
+    scale = scene_in.scales[g]
+    q = wp.vec4(1.0, 0.0, 0.0, 0.0)
+    R = wp.identity(n=3, dtype=wp.float32)
+    if scene_in.quats:
+        q = unit(scene_in.quats[g])
+        R = rotation(q)
+    v_mean = wp.vec3(0.0, 0.0, 0.0)
+    v_R = wp.mat33()
+    v_scale = wp.vec3(0.0, 0.0, 0.0)
+    v_opacity = wp.float32(0.0)
+    for view_index in range(views):
+        image = b * views + view_index
+        i = image * num + g % num
+        unused = lens.skip_unused != 0 and _all_zero(v_splats_in, i)
+        if splats_in.status[i] == VISIBLE and not unused:
+            viewmat = scene_in.viewmats[image]
+            W = rotation_of(viewmat)
+            t = W * scene_in.means[g] + translation_of(viewmat)
+            K = scene_in.Ks[image]
+            J = jacobian(t, K, lens)
+            P = J * W
+            N = P * R
+            M = N * wp.diag(scale)
+            m0 = row_of(M, 0)
+            m1 = row_of(M, 1)
+
+            # README eq. 8: the conic's gradient to the covariance's
+            conic = splats_in.conics[i]
+            a, k, e = conic[0], conic[1], conic[2]
+            v = v_splats_in.conics[i]
+            n = wp.cross(m0, m1)
+            across = e * (lens.eps2d * m0 + wp.cross(m1, n))
+            v_across = -2.0 * a * a * v[0]
+            v_m0 = v_across * across - e * v[1] * m1
+            v_m1 = (v_across * k - e * v[1]) * across - e * (v[1] * k + 2.0 * e * v[2]) * m1
+
+            v_o = v_splats_in.opacities[i]
+            if lens.antialiased != 0:
+                # README eq. 9: the factor sqrt(det0 / det), det0 = |m0 × m1|²
+                det0 = wp.dot(n, n)
+                trace = wp.dot(m0, m0) + wp.dot(m1, m1)
+                det = det0 + lens.eps2d * trace + lens.eps2d * lens.eps2d
+                factor = wp.sqrt(det0 / det)
+                if factor > COMPENSATION_MIN:
+                    v_factor = v_o * scene_in.opacities[g]
+                    v_det0 = 0.5 * v_factor / (factor * det)
+                    v_det = -0.5 * v_factor * factor / det
+                    v_n = 2.0 * (v_det0 + v_det) * n
+                    v_m0 += wp.cross(m1, v_n) + 2.0 * v_det * lens.eps2d * m0
+                    v_m1 += wp.cross(v_n, m0) + 2.0 * v_det * lens.eps2d * m1
+                v_o *= wp.max(COMPENSATION_MIN, factor)
+            v_opacity += v_o
+
+            v_M = mat23(v_m0[0], v_m0[1], v_m0[2], v_m1[0], v_m1[1], v_m1[2])
+            v_scale += wp.cw_mul(row_of(N, 0), v_m0) + wp.cw_mul(row_of(N, 1), v_m1)
+            v_N = v_M * wp.diag(scale)
+            v_R += wp.transpose(P) * v_N
+            v_P = v_N * wp.transpose(R)
+            v_J = v_P * wp.transpose(W)
+            z = t[2]
+            v_u = v_splats_in.means2d[i]
+            v_x = _slope_vjp(t[0] / z, z, K[0, 2], lens.width, K[0, 0], v_J[0, 2])
+            v_y = _slope_vjp(t[1] / z, z, K[1, 2], lens.height, K[1, 1], v_J[1, 2])
+            v_t = wp.vec3(
+                v_x[0] + v_u[0] * K[0, 0] / z,
+                v_y[0] + v_u[1] * K[1, 1] / z,
+                v_x[1]
+                + v_y[1]
+                + v_splats_in.depths[i]
+                - (v_J[0, 0] * K[0, 0] + v_J[1, 1] * K[1, 1]) / (z * z)
+                - (v_u[0] * K[0, 0] * t[0] + v_u[1] * K[1, 1] * t[1]) / (z * z),
+            )
+            v_mean += wp.transpose(W) * v_t
+            if v_viewmats_out:
+                v_W = wp.transpose(J) * v_P + wp.outer(v_t, scene_in.means[g])
+                for r in range(3):
+                    for c in range(3):
+                        v_viewmats_out[image, g % num, 4 * r + c] = v_W[r, c]
+                    v_viewmats_out[image, g % num, 4 * r + 3] = v_t[r]
+    if v_scene_out.means:
+        v_scene_out.means[g] = v_mean
+    if v_scene_out.scales:
+        v_scene_out.scales[g] = v_scale
+    if v_scene_out.opacities:
+        v_scene_out.opacities[g] = v_opacity
+    if v_scene_out.quats:
+        size = quat_size(scene_in.quats[g])
+        v_scene_out.quats[g] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        if size > _SHORTEST:
+            v_scene_out.quats[g] = _rotation_vjp(q, v_R) / size
 
 
 @functools.lru_cache(maxsize=256)
@@ -322,15 +487,7 @@ def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> 
 
 
 def project_on_threads(
-    images: int,
-    views: int,
-    num: int,
-    colors_per_view: int,
-    lens: Lens,
-    inputs: list,
-    outputs: list,
-    *,
-    device: torch.device,
+    images: int, views: int, num: int, colors_per_view: int, lens: Lens, inputs: list, outputs: list
 ) -> None:
     """Runs the projection of B objects into V views each, a thread for each (view, Gaussian).
 
@@ -340,61 +497,91 @@ def project_on_threads(
         num: Gaussians of an object, at least 1.
         colors_per_view: 1 if each view has colours of its own, otherwise 0.
         lens: from ``make_lens``.
-        inputs: of the kernel, from the means on.
-        outputs: of the kernel.
-        device: of the tensors.
+        inputs: flat views of the inputs of ``project_forward``, in their order.
+        outputs: flat views of what it returns.
     """
-    numbers = [views, num, colors_per_view, lens]
-    launch(_project, images * num, [*numbers, *inputs], outputs, device)
+    *gaussians, colors, viewmats, Ks = inputs
+    scene = Packed(Scene, *gaussians, viewmats, Ks)
+    inputs = [views, num, colors_per_view, lens, scene, colors]
+    launch(_project, images * num, inputs, [Packed(Splats, *outputs)], colors.device)
 
 
 def project_forward(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    lens: Lens,
-    run: Callable[..., None],
+    inputs: Sequence[Any], lens: Lens, run: Callable[..., None] = project_on_threads
 ) -> Projected:
     """Projects B objects of N Gaussians into V views each; float32, contiguous tensors.
 
     Args:
-        means: ``[B, N, 3]``.
-        quats: ``[B, N, 4]`` or None.
-        scales: ``[B, N, 3]``.
-        opacities: ``[B, N]``.
-        colors: ``[B, N, C]`` or ``[B, V, N, C]``, only to cull what is not finite.
-        viewmats: ``[B, V, 4, 4]``.
-        Ks: ``[B, V, 3, 3]``.
+        inputs: means ``[B, N, 3]``, quats ``[B, N, 4]`` or None, scales ``[B, N, 3]``, opacities
+            ``[B, N]``; colors ``[B, N, C]`` or ``[B, V, N, C]``, only to cull what is not finite;
+            viewmats ``[B, V, 4, 4]`` and Ks ``[B, V, 3, 3]``.
         lens: from ``make_lens``.
-        run: launcher of the device, ``project_on_threads`` or ``cpu/project.py``'s.
+        run: launcher of the device.
     """
-    (batch, views), num = viewmats.shape[:2], means.shape[1]
-    shape = (batch, views, num)
-    sizes, device = ((2,), (3,), (), (), (2,)), means.device
-    floats = (empty_on(device, [*shape, *size], torch.float32) for size in sizes)
-    means2d, conics, depths, view_opacities, extents = floats
-    status = empty_on(device, shape, torch.int32)
-    inputs = [
-        vectors(means, wp.vec3),
-        vectors(quats, wp.vec4),
-        vectors(scales, wp.vec3),
-        opacities.view(-1),
-        colors.view(-1, colors.shape[-1]),
-        vectors(viewmats, wp.mat44),
-        vectors(Ks, wp.mat33),
+    *gaussians, colors, viewmats, Ks = inputs
+    (batch, views), num, device = viewmats.shape[:2], colors.shape[-2], colors.device
+    projected = Projected(
+        *(empty_on(device, [batch, views, num, *size], torch.float32) for size in PROJECTED_SIZES),
+        status=empty_on(device, [batch, views, num], torch.int32),
+    )
+    if projected.status.numel():
+        cameras = map(vectors, (viewmats, Ks), _CAMERAS)
+        flat = [*map(vectors, gaussians, _GAUSSIANS), colors.view(-1, colors.shape[-1]), *cameras]
+        outputs = list(map(vectors, projected, _SPLATS))
+        run(batch * views, views, num, int(colors.dim() == 4), lens, flat, outputs)
+    return projected
+
+
+def project_backward(
+    inputs: Sequence[Any],
+    lens: Lens,
+    conics: Tensor,
+    status: Tensor,
+    cotangents: Sequence[Tensor],
+    wanted: Sequence[bool],
+    on_lanes: Callable[..., None] | None,
+) -> list[Tensor | None]:
+    """Gradients of ``project_forward`` by means, quats, scales, opacities and viewmats.
+
+    Args:
+        inputs: as given forward, without the colors.
+        lens: as given forward.
+        conics: as returned forward.
+        status: as returned forward.
+        cotangents: of means2d, conics, depths and view_opacities; contiguous.
+        wanted: of which of the five the gradient is asked for; the others are None.
+        on_lanes: the device's launcher where neither viewmats nor antialiasing are asked for, that
+            of ``cpu/project_vjp.py``, or None.
+    """
+    *gaussians, viewmats, Ks = inputs
+    (batch, views, num), means = status.shape, gaussians[0]
+    # the kernel writes all of a gradient, where there is a view
+    grads = [
+        None
+        if x is None or not want
+        else empty_on(x.device, x.shape, x.dtype)
+        if status.numel()
+        else torch.zeros_like(x)
+        for x, want in zip(gaussians, wanted)
     ]
-    outputs = [
-        vectors(means2d, wp.vec2),
-        vectors(conics, wp.vec3),
-        depths.view(-1),
-        view_opacities.view(-1),
-        vectors(extents, wp.vec2),
-        status.view(-1),
-    ]
+    v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[4] else None
     if status.numel():
-        run(batch * views, views, num, int(colors.dim() == 4), lens, inputs, outputs)
-    return Projected(means2d, conics, depths, view_opacities, extents, status)
+        flat = list(map(vectors, gaussians, _GAUSSIANS))
+        cameras = list(map(vectors, (viewmats, Ks), _CAMERAS))
+        kept = vectors(conics, wp.vec3), status.view(-1)
+        v_splats, outputs = map(vectors, cotangents, _SPLATS), map(vectors, grads, _GAUSSIANS)
+        if on_lanes and v_viewmats is None and not lens.antialiased:
+            given = [*flat[:3], *cameras, *kept, *v_splats]
+            on_lanes(batch, views, num, lens, given, list(outputs))
+        else:
+            given = [
+                Packed(Scene, *flat, *cameras),
+                Packed(Splats, None, kept[0], None, None, None, kept[1]),
+                Packed(Splats, *v_splats, None, None),
+            ]
+            results = [Packed(Scene, *outputs, None, None), v_viewmats]
+            launch(_project_vjp, batch * num, [views, num, lens, *given], results, means.device)
+    if v_viewmats is not None:
+        v_viewmats = v_viewmats.sum(1).view(batch, views, 3, 4)
+        v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))
+    return [*grads, v_viewmats]

@@ -11,9 +11,11 @@ import warp as wp
 from torch import Tensor
 
 from ..runtime.launch import launch
-from ..runtime.views import vectors
+from ..runtime.views import Packed
 from .constants import ALPHA_MAX, ALPHA_MIN
 from .meta import Meta
+from .project import Splats
+from .tiles import Grid, Lists, make_grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,60 +24,49 @@ wp.set_module_options({"enable_backward": False})
 @no_type_check
 def _quantile(
     offset: wp.int32,
-    width: wp.int32,
-    height: wp.int32,
-    tiles_x: wp.int32,
-    tiles: wp.int32,
-    num: wp.int32,
-    shift: wp.int32,
+    grid: Grid,
     transmittance: wp.float32,
     limit: wp.float32,
-    alpha_min: wp.float32,
     alpha_max: wp.float32,
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    depths_in: wp.array[wp.float32],
-    pairs_in: wp.array[wp.int32],
-    starts_in: wp.array[wp.int32],
-    order_in: wp.array[wp.int32],
-    offsets_in: wp.array[wp.int32],
-    count_in: wp.array[wp.int64],
+    splats_in: Splats,
+    lists_in: Lists,
     depths_out: wp.array[wp.float32],
 ):
     pixel = offset + wp.tid()
-    image = pixel // (width * height)
-    x = pixel % width
-    y = pixel // width % height
-    tile = image * tiles + (y >> shift) * tiles_x + (x >> shift)
+    image = pixel // (grid.width * grid.height)
+    x = pixel % grid.width
+    y = pixel // grid.width % grid.height
+    tile = (
+        image * grid.tiles_x * grid.tiles_y + (y >> grid.shift) * grid.tiles_x + (x >> grid.shift)
+    )
     clear = wp.float32(1.0)  # a variable: plain literals would be constants in the loop
     depth = wp.float32(0.0)
-    k = starts_in[tile]
-    end = starts_in[tile + 1]
+    k = lists_in.starts[tile]
+    end = lists_in.starts[tile + 1]
     # where the pairs had no room, the list is that of all Gaussians of the view
-    listed = count_in[0] <= wp.int64(pairs_in.shape[0])
+    listed = lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0])
     if not listed:
-        k = image * num
-        end = k + num
+        k = image * grid.num
+        end = k + grid.num
     while k < end:
         g = wp.int32(-1)
         if listed:
-            g = pairs_in[k]
-        elif offsets_in[k] != offsets_in[k + 1]:
-            g = order_in[k]
+            g = lists_in.pairs[k]
+        elif lists_in.offsets[k] != lists_in.offsets[k + 1]:
+            g = lists_in.order[k]
         if g < 0:
             k += 1
             continue
-        conic = conics_in[g]
-        dy = float(y) + 0.5 - means2d_in[g][1]
-        dx = float(x) + 0.5 - means2d_in[g][0] + conic[1] * dy
+        conic = splats_in.conics[g]
+        dy = float(y) + 0.5 - splats_in.means2d[g][1]
+        dx = float(x) + 0.5 - splats_in.means2d[g][0] + conic[1] * dy
         q = conic[0] * dx * dx + conic[2] * dy * dy
         if q <= limit:
-            alpha = wp.min(alpha_max, view_opacities_in[g] * wp.exp(-0.5 * q))
-            if alpha >= alpha_min:
+            alpha = wp.min(alpha_max, splats_in.opacities[g] * wp.exp(-0.5 * q))
+            if alpha >= grid.alpha_min:
                 clear *= 1.0 - alpha
                 if clear <= transmittance:
-                    depth = depths_in[g]
+                    depth = splats_in.depths[g]
                     k = end
         k += 1
     depths_out[pixel] = depth
@@ -111,16 +102,9 @@ def depth_quantile(
     cut, centers = meta.tiling, meta["depths"].detach()
     depths = centers.new_empty(*centers.shape[:-1], cut.height, cut.width, 1)
     limit = 2 * math.log(1 / alpha_min) + 1e-3  # where q is larger, no opacity reaches alpha_min
-    sizes = [cut.width, cut.height, cut.tiles_x, cut.count, centers.shape[-1], cut.shift]
-    limits = [transmittance, limit, alpha_min, alpha_max]
-    splats = [
-        vectors(meta["means2d"].detach().contiguous(), wp.vec2),
-        vectors(meta["conics"].detach().contiguous(), wp.vec3),
-        meta["opacities"].detach().flatten(),
-        centers.flatten(),
-    ]
-    bins = meta.bins
-    lists = [bins.pairs, bins.starts, bins.order, bins.offsets, bins.count.view(1)]
-    inputs = [*sizes, *limits, *splats, *lists]
+    grid = make_grid(cut, num=centers.shape[-1], alpha_min=alpha_min, skip=0)
+    of = (meta[name].detach().contiguous() for name in ("means2d", "conics", "depths", "opacities"))
+    splats, lists = Packed(Splats, *of, None, None), Packed(Lists, *meta.bins)
+    inputs = [grid, transmittance, limit, alpha_max, splats, lists]
     launch(_quantile, depths.numel(), inputs, [depths.view(-1)], depths.device)
     return depths

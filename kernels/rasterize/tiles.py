@@ -20,9 +20,6 @@ wp.set_module_options({"enable_backward": False})
 
 # Rounding of q, relative and absolute; the test may keep too much, never too little.
 SLACK, SLACK_ABS = 1.0 + 1e-4, 1e-4
-_SLACK = wp.constant(SLACK)
-_SLACK_ABS = wp.constant(SLACK_ABS)
-_TILE_TEST = wp.constant(TILE_TEST)
 
 
 class Tiling(NamedTuple):
@@ -84,6 +81,19 @@ class Bins(NamedTuple):
     starts: Tensor
     box_pairs: Tensor
     count: Tensor
+
+
+@struct
+class Lists:
+    """``Bins`` as a launch takes them."""
+
+    order: wp.array[wp.int32]
+    offsets: wp.array[wp.int32]
+    pairs: wp.array[wp.int32]
+    rows: wp.array[wp.int32]
+    starts: wp.array[wp.int32]
+    box_pairs: wp.array[wp.int64]
+    count: wp.array[wp.int64]
 
 
 class Walk(NamedTuple):
@@ -255,7 +265,7 @@ def tile_rows(grid: Grid, y: wp.float32, extent: wp.float32) -> wp.vec2i:
 
 @wp.func
 def q_limit(opacity: wp.float32, alpha_min: wp.float32) -> wp.float32:
-    return 2.0 * wp.log(opacity / alpha_min) * _SLACK + _SLACK_ABS
+    return 2.0 * wp.log(opacity / alpha_min) * SLACK + SLACK_ABS
 
 
 @wp.func
@@ -284,7 +294,7 @@ def _box_columns(grid: Grid, x: wp.float32, extent: wp.float32) -> wp.vec2i:
 @no_type_check
 def tile_columns(grid: Grid, ellipse: Ellipse, extent: wp.vec2, ty: wp.int32) -> wp.vec2i:
     # README eq. 6: columns of row ty that the ellipse touches; first > last: none
-    if (grid.skip & _TILE_TEST) == 0:
+    if (grid.skip & TILE_TEST) == 0:
         return _box_columns(grid, ellipse.mean[0], extent[0])
     # exact numbers first, the mean once: rounding must not turn one row of pixels into none
     y0 = wp.max(float(ty << grid.shift) + 0.5 - ellipse.mean[1], -ellipse.reach)

@@ -122,10 +122,10 @@ def lane_contiguous(tensor: Tensor) -> Tensor:
 
 
 def vectors(tensor: Tensor | None, dtype):
-    """A contiguous tensor as a flat Warp array of vectors or matrices; None stays None."""
+    """A contiguous tensor as a flat Warp array of numbers, vectors or matrices; None stays None."""
     if tensor is None:
         return None
-    return view(tensor.view(-1, *dtype._shape_), dtype)
+    return view(tensor.view(-1, *getattr(dtype, "_shape_", ())), dtype)
 
 
 @overload

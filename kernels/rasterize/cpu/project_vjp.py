@@ -1,5 +1,5 @@
 """The gradient of the projection on the CPU: sixteen Gaussians as lanes, and the same bits as the
-kernel of ``../project_vjp.py``, whose operations are done here in the same order. README.md §4 has
+kernel of ``../project.py``, whose operations are done here in the same order. README.md §4 has
 the maths. Gradients of antialiasing and of viewmats are that kernel's alone.
 """
 

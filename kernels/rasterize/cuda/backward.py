@@ -12,7 +12,7 @@ import warp as wp
 
 from ...runtime.views import struct
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import Picture
+from ..tiles import Lists, Picture
 from . import leaves as L
 from .warp import (
     CHUNK,
@@ -24,7 +24,6 @@ from .warp import (
     WARP,
     WIDTH,
     Gaussians,
-    Lists,
     Pixels,
     Place,
     Walked,

@@ -13,6 +13,8 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
+from ...runtime.views import Packed
+from ..project import Splats
 from ..skip import TILE_TEST
 from ..tiles import Bins, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
 from . import capacity
@@ -25,22 +27,19 @@ wp.set_module_options({"enable_backward": False})
 def _count(
     offset: wp.int32,
     grid: Grid,
+    splats_in: Splats,
     order_in: wp.array[wp.int32],
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    extents_in: wp.array[wp.vec2],
     counts_out: wp.array[wp.int32],
     box_counts_out: wp.array[wp.int64],
 ):
     j = offset + wp.tid()
     i = order_in[j]
-    extent = extents_in[i]
+    extent = splats_in.extents[i]
     count = wp.int32(0)
     box_count = wp.int64(0)
     if extent[0] > 0.0:
-        limit = q_limit(view_opacities_in[i], grid.alpha_min)
-        ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
+        limit = q_limit(splats_in.opacities[i], grid.alpha_min)
+        ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
         rows = tile_rows(grid, ellipse.mean[1], extent[1])
         for ty in range(rows[0], rows[1] + 1):
             columns = tile_columns(grid, ellipse, extent, ty)
@@ -55,11 +54,8 @@ def _count(
 def _emit(
     offset: wp.int32,
     grid: Grid,
+    splats_in: Splats,
     order_in: wp.array[wp.int32],
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    extents_in: wp.array[wp.vec2],
     offsets_in: wp.array[wp.int32],
     count_in: wp.array[wp.int64],
     tiles_out: wp.array[wp.int32],
@@ -68,10 +64,10 @@ def _emit(
     j = offset + wp.tid()
     i = order_in[j]
     p = offsets_in[j]
-    extent = extents_in[i]
+    extent = splats_in.extents[i]
     if extent[0] > 0.0 and count_in[0] <= wp.int64(tiles_out.shape[0]):
-        limit = q_limit(view_opacities_in[i], grid.alpha_min)
-        ellipse = make_ellipse(means2d_in[i], conics_in[i], limit)
+        limit = q_limit(splats_in.opacities[i], grid.alpha_min)
+        ellipse = make_ellipse(splats_in.means2d[i], splats_in.conics[i], limit)
         rows = tile_rows(grid, ellipse.mean[1], extent[1])
         for ty in range(rows[0], rows[1] + 1):
             columns = tile_columns(grid, ellipse, extent, ty)
@@ -101,14 +97,16 @@ def bin_views(
     order = order.view(-1).int()
     counts = torch.empty_like(order)
     box_counts = torch.empty_like(order, dtype=torch.int64)
-    launch(_count, order.numel(), [grid, order, *inputs], [counts, box_counts], device)
+    means2d, conics, opacities, extents = inputs
+    splats = Packed(Splats, means2d, conics, None, opacities, extents, None)
+    launch(_count, order.numel(), [grid, splats, order], [counts, box_counts], device)
     offsets = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0))
     count, offsets = offsets[-1].clone(), offsets.int()
     room = _room(grid, depths, count, check, exact)
     tiles = images * grid.tiles_x * grid.tiles_y
     # what stays free has the number behind the last tile's, so that it comes last
     tile_of, gaussians = order.new_full((room,), tiles), order.new_zeros(room)
-    inputs = [grid, order, *inputs, offsets, count.view(1)]
+    inputs = [grid, splats, order, offsets, count.view(1)]
     launch(_emit, order.numel() if room else 0, inputs, [tile_of, gaussians], device)
     sorted_tiles, rows = torch.sort(tile_of, stable=True)
     # not bincount: on CUDA it reads the largest value back

@@ -16,11 +16,11 @@ from torch import Tensor
 from ...runtime.launch import cuda_launch
 from ...runtime.recording import multiprocessors_of
 from ...runtime.views import Packed
-from ..tiles import Bins, PairGradients, Picture, Walk
+from ..tiles import Bins, Lists, PairGradients, Picture, Walk
 from .backward import Rows, backward_kernels, row_length
 from .forward import forward_kernels
 from .reduce import reduce_rows
-from .warp import CHUNK, WARP, Gaussians, Lists, Pixels, Walked
+from .warp import CHUNK, WARP, Gaussians, Pixels, Walked
 
 
 def parts_of_tile(tiles: int, device: torch.device) -> int:

@@ -10,7 +10,7 @@ from typing import no_type_check
 import warp as wp
 
 from ..skip import BLOCK_TEST, STOPPED
-from ..tiles import Picture
+from ..tiles import Lists, Picture
 from . import leaves as L
 from .warp import (
     HEIGHT,
@@ -20,7 +20,6 @@ from .warp import (
     WARP,
     WIDTH,
     Gaussians,
-    Lists,
     Pixels,
     Place,
     Walked,

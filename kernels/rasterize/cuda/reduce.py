@@ -10,7 +10,8 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.views import vectors
+from ...runtime.views import Packed
+from ..project import Splats
 from ..tiles import Bins, PairGradients
 from .backward import columns_of_moments, row_length
 
@@ -57,11 +58,8 @@ def _finish(
     order_in: wp.array[wp.int32],
     offsets_in: wp.array[wp.int32],
     sums_in: wp.array3d[wp.float32],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    v_means2d_out: wp.array[wp.vec2],
-    v_conics_out: wp.array[wp.vec3],
-    v_view_opacities_out: wp.array[wp.float32],
+    splats_in: Splats,
+    v_splats_out: Splats,
     v_colors_out: wp.array2d[wp.float32],
 ):
     j = offset + wp.tid()
@@ -69,7 +67,7 @@ def _finish(
     first = columns_of_moments(v_colors_out.shape[1])
     for c in range(v_colors_out.shape[1]):
         v_colors_out[i, c] = _over_parts(sums_in, j, first + c)
-    if v_means2d_out:
+    if v_splats_out.means2d:
         h = wp.float32(0.0)
         hu = wp.float32(0.0)
         hy = wp.float32(0.0)
@@ -84,14 +82,14 @@ def _finish(
             huy += _over_parts(sums_in, j, at + 4)
             hyy += _over_parts(sums_in, j, at + 5)
         # README eq. 11: moments of h to the gradients
-        conic = conics_in[i]
+        conic = splats_in.conics[i]
         a, k, e = conic[0], conic[1], conic[2]
-        v_means2d_out[i] = wp.vec2(a * hu, a * k * hu + e * hy)
-        v_conics_out[i] = wp.vec3(-0.5 * huu, -a * huy, -0.5 * hyy)
+        v_splats_out.means2d[i] = wp.vec2(a * hu, a * k * hu + e * hy)
+        v_splats_out.conics[i] = wp.vec3(-0.5 * huu, -a * huy, -0.5 * hyy)
         v_opacity = wp.float32(0.0)
         if offsets_in[j + 1] != offsets_in[j]:
-            v_opacity = h / view_opacities_in[i]
-        v_view_opacities_out[i] = v_opacity
+            v_opacity = h / splats_in.opacities[i]
+        v_splats_out.opacities[i] = v_opacity
 
 
 def reduce_rows(
@@ -130,11 +128,12 @@ def reduce_rows(
     launch(
         _finish,
         count,
-        [bins.order, bins.offsets, sums, vectors(conics, wp.vec3), view_opacities.view(-1)],
         [
-            vectors(v_means2d, wp.vec2),
-            vectors(v_conics, wp.vec3),
-            None if v_opacities is None else v_opacities.view(-1),
+            *(bins.order, bins.offsets, sums),
+            Packed(Splats, None, conics, None, view_opacities, None, None),
+        ],
+        [
+            Packed(Splats, v_means2d, v_conics, None, v_opacities, None, None),
             v_colors.view(-1, channels),
         ],
         conics.device,

@@ -248,19 +248,6 @@ class Gaussians:
 
 
 @struct
-class Lists:
-    """``Bins``, in its order."""
-
-    order: wp.array[wp.int32]
-    offsets: wp.array[wp.int32]
-    pairs: wp.array[wp.int32]
-    rows: wp.array[wp.int32]
-    starts: wp.array[wp.int32]
-    box_pairs: wp.array[wp.int64]
-    count: wp.array[wp.int64]
-
-
-@struct
 class Walked:
     """``Walk``, in its order."""
 

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-import warp as wp
 from helpers.raster import NAMES, leaves, make
 
 from gamba_warp.kernels.rasterize import Skip, project, rasterization
@@ -10,10 +9,8 @@ from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
-from gamba_warp.kernels.rasterize.project import LensOptions, Projected, make_lens
+from gamba_warp.kernels.rasterize.project import LensOptions, make_lens
 from gamba_warp.kernels.rasterize.tiles import PairGradients
-from gamba_warp.kernels.runtime.launch import launch
-from gamba_warp.kernels.runtime.views import vectors
 
 LISTS = ("pairs", "starts", "box_pairs")
 
@@ -130,35 +127,6 @@ def test_too_many_pairs(monkeypatch):
         rasterization(**make(1, 1, 90, 37, 53, size=0.3))
 
 
-def scalar_projection(inputs, viewmats, Ks, lens) -> Projected:
-    """The kernel of one Gaussian a thread, which is CUDA's."""
-    means, quats, scales, opacities, colors = inputs
-    shape = (*viewmats.shape[:2], means.shape[1])
-    floats = [torch.full((*shape, *size), 7.0) for size in ((2,), (3,), (), (), (2,))]
-    made = Projected(*floats, torch.full(shape, 7, dtype=torch.int32))
-    sizes = [shape[1], shape[2], int(colors.dim() == 4), lens]
-    outputs = [
-        vectors(made.means2d, wp.vec2),
-        vectors(made.conics, wp.vec3),
-        made.depths.view(-1),
-        made.view_opacities.view(-1),
-        vectors(made.extents, wp.vec2),
-        made.status.view(-1),
-    ]
-    arguments = [
-        *sizes,
-        vectors(means, wp.vec3),
-        vectors(quats, wp.vec4),
-        vectors(scales, wp.vec3),
-        opacities.view(-1),
-        colors.view(-1, colors.shape[-1]),
-        vectors(viewmats, wp.mat44),
-        vectors(Ks, wp.mat33),
-    ]
-    launch(project._project, made.status.numel(), arguments, outputs, means.device)
-    return made
-
-
 @pytest.mark.parametrize(
     "num, rotated, antialiased, rounded, channels",
     [(1037, True, 0, 0, 3), (530, True, 1, 0, 1), (77, False, 0, 1, 5), (9, True, 0, 0, 18)],
@@ -181,8 +149,8 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     options |= dict(eps2d=0.3, alpha_min=1 / 255, antialiased=antialiased, rounded=rounded)
     lens = make_lens(LensOptions(skip_unused=1, **options))
     inputs = means, quats if rotated else None, scales, opacities, colors
-    got = project.project_forward(*inputs, viewmats, Ks, lens, project_on_lanes)
-    want = scalar_projection(inputs, viewmats, Ks, lens)
+    got = project.project_forward([*inputs, viewmats, Ks], lens, project_on_lanes)
+    want = project.project_forward([*inputs, viewmats, Ks], lens)
     for name, value in want._asdict().items():
         assert torch.equal(getattr(got, name), value), name
     assert len(got.status.unique()) >= (5 if num > 500 else 3)
