@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .checks import check_inputs
 from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
-from .cpu.tuning import Tuning, tuning_for
+from .cpu.tuning import tuning_for
 from .harmonics import colors_from_harmonics
 from .meta import Drawn, Meta
 from .ops import bin_op, composite, project
@@ -121,47 +121,25 @@ def rasterization(
     colors_per_view, channels = channels.dim() == 4, channels.reshape(-1, channels.shape[-1])
     size = Size(width, height, views, int(colors_per_view), skip.bits())
     limits = Limits(alpha_min, alpha_max, t_min)
-    renders, alphas, meta = _draw(per_view, channels, size, limits, tuning)
+    *splats, status = (x.detach() for x in per_view)
+    bins = Bins(*bin_op(*splats, width, height, alpha_min, size.skip, tuning.numbers()))
+    skipped = None if torch.compiler.is_compiling() else bins.box_pairs.new_full((), -1)
+    drawn = per_view.means2d, per_view.conics, per_view.view_opacities, channels
+    choices = list(size), list(limits), tuning.numbers()
+    renders, alphas, *walk = composite(*drawn, list(bins), *choices, skipped)
     renders = _finish(render_mode, renders, alphas, backgrounds)
-    _describe(meta, projected)
     renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
+    meta = Meta(Drawn(splats, size, limits, tuning), bins, Walk(*walk), status, skipped)
+    # under gsplat's names
+    meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
+    meta.update(opacities=projected.view_opacities, radii=projected.extents.ceil().int())
+    meta.update(width=width, height=height, tile_size=tuning.tile)
     return renders, alphas, meta
 
 
 def _flat(x: Tensor | None, size: int, lead: int) -> Tensor | None:
     """One batch dimension of the given size for the leading ones; contiguous float32."""
     return None if x is None else x.reshape(size, *x.shape[lead:]).float().contiguous()
-
-
-def _draw(
-    splats: Projected, channels: Tensor, size: Size, limits: Limits, tuning: Tuning
-) -> tuple[Tensor, Tensor, Meta]:
-    """Makes the lists of I views and blends them: ``[I, H, W, C]``, ``[I, H, W, 1]``, counts."""
-    means2d, conics, depths, opacities, extents, status = (x.detach() for x in splats)
-    parts = means2d, conics, depths, opacities, extents
-    picture = size.width, size.height, limits.alpha_min, size.skip
-    bins = Bins(*bin_op(*parts, *picture, tuning.numbers()))
-    skipped = None if torch.compiler.is_compiling() else bins.box_pairs.new_full((), -1)
-    renders, alphas, *walk = composite(
-        splats.means2d,
-        splats.conics,
-        splats.view_opacities,
-        channels,
-        list(bins),
-        list(size),
-        list(limits),
-        tuning.numbers(),
-        skipped,
-    )
-    drawn = Drawn(parts, size, limits, tuning)
-    return renders, alphas, Meta(drawn, bins, Walk(*walk), status, skipped)
-
-
-def _describe(meta: Meta, projected: Projected) -> None:
-    """What gsplat's ``meta`` has under the same names."""
-    meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
-    meta.update(opacities=projected.view_opacities, radii=projected.extents.ceil().int())
-    meta.update(width=meta.tiling.width, height=meta.tiling.height, tile_size=meta.tiling.tile)
 
 
 def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Counts of the work that a call did, computed only when somebody looks."""
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ class Drawn(NamedTuple):
         tuning: what ``composite`` was given.
     """
 
-    splats: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+    splats: Sequence[Tensor]
     size: Size
     limits: Limits
     tuning: Tuning
@@ -71,36 +72,31 @@ class Meta(dict):
     def __missing__(self, key: str):
         if key == "tiles_skipped":
             return None if self._skipped is None or self._skipped < 0 else int(self._skipped)
-        counts = {
-            "culled": self._culled,
-            "pairs_box": lambda: int(self.bins.box_pairs),
-            "pairs": lambda: int(self.bins.count),
-            "pairs_walked": lambda: int(self._walk.walked.sum(dtype=torch.int64)),
-            "blocks_walked": lambda: int(self._walk.blocks_walked.sum()),
-            "blocks_used": self._blocks_used,
-            "pairs_used": lambda: int((self._walk.blocks != 0).sum()),
-            "gaussians_used": self._gaussians_used,
-            "tiles": lambda: self.bins.starts.numel() - 1,
-            "tiles_empty": lambda: int((self.bins.starts.diff() == 0).sum()),
-        }
-        if key not in counts:
+        if key not in _COUNTS:
             raise KeyError(key)
-        if key not in ("culled", "pairs_box", "pairs", "tiles"):
-            self._make_room()
-        self[key] = counts[key]()
+        walks = key not in ("culled", "pairs_box", "pairs", "tiles")
+        if walks and int(self.bins.count) > self.bins.pairs.numel():  # there was no room
+            self.bins, self._walk = self._drawn.listed()
+        self[key] = _COUNTS[key](self.bins, self._walk, self._status)
         return self[key]
 
-    def _make_room(self) -> None:
-        if int(self.bins.count) > self.bins.pairs.numel():
-            self.bins, self._walk = self._drawn.listed()
 
-    def _culled(self) -> dict[str, int]:
-        counts = torch.bincount(self._status.view(-1), minlength=len(STATUS_NAMES)).tolist()
-        return dict(zip(STATUS_NAMES[1:], counts[1:]))
+def _culled(bins: Bins, walk: Walk, status: Tensor) -> dict[str, int]:
+    counts = torch.bincount(status.view(-1), minlength=len(STATUS_NAMES)).tolist()
+    return dict(zip(STATUS_NAMES[1:], counts[1:]))
 
-    def _blocks_used(self) -> int:
-        blocks = self._walk.blocks
-        return sum(int((blocks >> b & 1).sum()) for b in range(16))
 
-    def _gaussians_used(self) -> int:
-        return self.bins.pairs[self._walk.blocks != 0].unique().numel()
+_COUNTS: dict[str, Callable[[Bins, Walk, Tensor], Any]] = {
+    "culled": _culled,
+    "pairs_box": lambda bins, walk, status: int(bins.box_pairs),
+    "pairs": lambda bins, walk, status: int(bins.count),
+    "pairs_walked": lambda bins, walk, status: int(walk.walked.sum(dtype=torch.int64)),
+    "blocks_walked": lambda bins, walk, status: int(walk.blocks_walked.sum()),
+    "blocks_used": lambda bins, walk, status: sum(
+        int((walk.blocks >> b & 1).sum()) for b in range(16)
+    ),
+    "pairs_used": lambda bins, walk, status: int((walk.blocks != 0).sum()),
+    "gaussians_used": lambda bins, walk, status: bins.pairs[walk.blocks != 0].unique().numel(),
+    "tiles": lambda bins, walk, status: bins.starts.numel() - 1,
+    "tiles_empty": lambda bins, walk, status: int((bins.starts.diff() == 0).sum()),
+}

@@ -116,56 +116,6 @@ def _project_backward(ctx, *cotangents):
 project.register_autograd(_project_backward, setup_context=_project_setup)
 
 
-def bin_gaussians(
-    means2d: Tensor,
-    conics: Tensor,
-    depths: Tensor,
-    view_opacities: Tensor,
-    extents: Tensor,
-    width: int,
-    height: int,
-    alpha_min: float,
-    skip: int,
-    tile: int,
-    exact: bool = False,
-) -> Bins:
-    """Makes the tile lists of all views; on CUDA without waiting for the number of pairs.
-
-    There the first call of a shape reads that number back, and later ones take the room that was
-    needed before: ``cuda/capacity.py``.
-
-    Args:
-        means2d: ``[I, N, 2]``, and so on as ``project_forward`` returns them, with I = B * V.
-        conics: ``[I, N, 3]``.
-        depths: ``[I, N]``.
-        view_opacities: ``[I, N]``.
-        extents: ``[I, N, 2]``, zero where culled.
-        width: pixels.
-        height: pixels.
-        alpha_min: what is fainter than this is not drawn.
-        skip: from ``Skip.bits``.
-        tile: side of a tile, pixels.
-        exact: lists as long as there are pairs; on CUDA the number is read back for that.
-
-    Raises:
-        ValueError: there are more than 2^31 - 1 pairs, or more tiles. On CUDA a number of pairs
-            that is not read back is not refused: the pictures are then made without lists.
-        RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
-    """
-    images, num = depths.shape
-    tiling = Tiling(width, height, tile)
-    if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
-        raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
-    grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
-    inputs = [
-        vectors(means2d, wp.vec2),
-        vectors(conics, wp.vec3),
-        view_opacities.view(-1),
-        vectors(extents, wp.vec2),
-    ]
-    return _bin_views(depths.device, exact)(grid, depths, inputs, _refuse_too_many)
-
-
 def _bin_views(device: torch.device, exact: bool) -> Callable[..., Bins]:
     return bin_cpu.bin_views if device.type == "cpu" else partial(bin_cuda.bin_views, exact=exact)
 
@@ -193,23 +143,46 @@ def bin_op(
     tuning: List[int],
     exact: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """``bin_gaussians`` as an operator, with the numbers of a ``Tuning``, whose tile it takes.
+    """Makes the tile lists of all views, ``Bins``; on CUDA without waiting for the number of pairs.
 
-    The length of the lists is known only at run time.
+    There the first call of a shape reads that number back, and later ones take the room that was
+    needed before: ``cuda/capacity.py``. The length of the lists is known only at run time.
+
+    Args:
+        means2d: ``[I, N, 2]``, and so on as ``project_forward`` returns them, with I = B * V.
+        conics: ``[I, N, 3]``.
+        depths: ``[I, N]``.
+        view_opacities: ``[I, N]``.
+        extents: ``[I, N, 2]``, zero where culled.
+        width: pixels.
+        height: pixels.
+        alpha_min: what is fainter than this is not drawn.
+        skip: from ``Skip.bits``.
+        tuning: numbers of a ``Tuning``, whose tile is taken.
+        exact: lists as long as there are pairs; on CUDA the number is read back for that.
+
+    Raises:
+        ValueError: there are more than 2^31 - 1 pairs, or more tiles. On CUDA a number of pairs
+            that is not read back is not refused: the pictures are then made without lists.
+        RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
     """
-    per_view = means2d, conics, depths, view_opacities, extents
-    b = bin_gaussians(*per_view, width, height, alpha_min, skip, Tuning(*tuning).tile, exact)
-    return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs, b.count
+    images, num = depths.shape
+    tiling = Tiling(width, height, Tuning(*tuning).tile)
+    if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
+        raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
+    grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
+    tensors, kinds = (means2d, conics, view_opacities, extents), (wp.vec2, wp.vec3, None, wp.vec2)
+    inputs = list(map(vectors, tensors, kinds))
+    return tuple(_bin_views(depths.device, exact)(grid, depths, inputs, _refuse_too_many))
 
 
 @bin_op.register_fake
-def _(
-    means2d, conics, depths, opacity, extents, width, height, alpha_min, skip, tuning, exact=False
-):
-    def ints(*shape):
-        return depths.new_empty(shape, dtype=torch.int32)
+def _(means2d, conics, depths, *rest):
+    def ints(*shape, dtype=torch.int32):
+        return depths.new_empty(shape, dtype=dtype)
 
-    tiling = Tiling(width, height, Tuning(*tuning).tile)
+    width, height, tuning = rest[2], rest[3], rest[6]
+    tiles = depths.shape[0] * Tiling(width, height, Tuning(*tuning).tile).count
     count, pairs = depths.numel(), torch.library.get_ctx().new_dynamic_size()
     return tuple(
         Bins(
@@ -217,9 +190,9 @@ def _(
             offsets=ints(count + 1),
             pairs=ints(pairs),
             rows=ints(pairs),
-            starts=ints(depths.shape[0] * tiling.count + 1),
-            box_pairs=depths.new_empty((), dtype=torch.int64),
-            count=depths.new_empty((), dtype=torch.int64),
+            starts=ints(tiles + 1),
+            box_pairs=ints(dtype=torch.int64),
+            count=ints(dtype=torch.int64),
         )
     )
 
@@ -244,17 +217,10 @@ def composite(
     tuning, and backward keeps it. Backward counts the tiles that it skips into ``skipped``, int64
     without dimensions.
     """
-    renders, alphas, walk = _compositor(means2d.device).composite_forward(
-        means2d,
-        conics,
-        view_opacities,
-        colors,
-        Bins(*bins),
-        _picture(means2d, size, limits, tuning),
-        Tuning(*tuning),
-    )
-    w = walk.transmittances, walk.stops, walk.blocks, walk.walked, walk.blocks_walked
-    return renders, alphas, *w
+    splats = means2d, conics, view_opacities, colors
+    given = Bins(*bins), _picture(means2d, size, limits, tuning), Tuning(*tuning)
+    renders, alphas, walk = _compositor(means2d.device).composite_forward(*splats, *given)
+    return renders, alphas, *walk
 
 
 def _picture(means2d: Tensor, size: list[int], limits: list[float], tuning: list[int]) -> Picture:
@@ -263,9 +229,9 @@ def _picture(means2d: Tensor, size: list[int], limits: list[float], tuning: list
 
 
 @composite.register_fake
-def _(means2d, conics, view_opacities, colors, bins, size, limits, tuning, skipped):
+def _(means2d, conics, view_opacities, colors, bins, size, *rest):
     width, height = Size(*size).width, Size(*size).height
-    images, pairs, tuning = means2d.shape[0], Bins(*bins).pairs, Tuning(*tuning)
+    images, pairs, tuning = means2d.shape[0], Bins(*bins).pairs, Tuning(*rest[1])
     tiles = images * Tiling(width, height, tuning.tile).count
     walk = Walk(
         transmittances=colors.new_empty(tiles * tuning.blocks, 16),
@@ -281,90 +247,59 @@ def _(means2d, conics, view_opacities, colors, bins, size, limits, tuning, skipp
 @without_compiler
 @torch.library.custom_op(_OP + "composite_vjp", mutates_args=())
 def _composite_vjp(
-    means2d: Tensor,
-    conics: Tensor,
-    view_opacities: Tensor,
-    colors: Tensor,
+    splats: List[Tensor],
     bins: List[Tensor],
     size: List[int],
     limits: List[float],
     tuning: List[int],
     walk: List[Tensor],
-    v_renders: Tensor,
-    v_alphas: Tensor,
+    v_pixels: List[Tensor],
     geometry: bool,
 ) -> List[Tensor]:
-    grads, skipped = _compositor(means2d.device).composite_backward(
-        means2d,
-        conics,
-        view_opacities,
-        colors,
-        Bins(*bins),
-        _picture(means2d, size, limits, tuning),
-        Tuning(*tuning),
-        Walk(*walk),
-        v_renders,
-        v_alphas,
-        geometry,
-    )
+    picture, chosen = _picture(splats[0], size, limits, tuning), Tuning(*tuning)
+    given = *splats, Bins(*bins), picture, chosen, Walk(*walk), *v_pixels, geometry
+    grads, skipped = _compositor(splats[0].device).composite_backward(*given)
     return [skipped, *(g for g in grads if g is not None)]
 
 
 @_composite_vjp.register_fake
-def _(means2d, conics, view_opacities, colors, bins, size, limits, tuning, walk, *rest):
-    v_colors = colors.new_empty(*view_opacities.shape, colors.shape[1])
-    skipped = torch.empty_like(Walk(*walk).walked)
-    geometry = rest[-1]
-    if not geometry:
-        return [skipped, v_colors]
-    return [skipped, *map(torch.empty_like, (means2d, conics, view_opacities)), v_colors]
+def _(splats, bins, size, limits, tuning, walk, v_pixels, geometry):
+    *geometries, colors = splats
+    v_colors = colors.new_empty(*splats[2].shape, colors.shape[1])
+    v_geometry = map(torch.empty_like, geometries) if geometry else ()
+    return [torch.empty_like(Walk(*walk).walked), *v_geometry, v_colors]
 
 
 def _composite_setup(ctx, inputs, output):
-    means2d, conics, view_opacities, colors, bins, size, limits, tuning, ctx.skipped = inputs
-    ctx.size, ctx.limits, ctx.tuning = size, limits, tuning
+    *splats, bins, ctx.size, ctx.limits, ctx.tuning, ctx.skipped = inputs
     renders, alphas, *walk = output
     ctx.mark_non_differentiable(*walk)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(means2d, conics, view_opacities, colors, *bins, *walk)
+    ctx.save_for_backward(*splats, *bins, *walk)
     ctx.shapes = renders.shape, alphas.shape
 
 
-def _shaped(gradient: Tensor, value: Tensor) -> Tensor:
-    # without a view there is nothing to sum
-    return gradient.reshape(value.shape) if gradient.numel() else torch.zeros_like(value)
-
-
-def _composite_backward(ctx, v_renders, v_alphas, *_):
-    means2d, conics, view_opacities, colors, *rest = ctx.saved_tensors
-    bins, walk = rest[: len(Bins._fields)], rest[len(Bins._fields) :]
-    v_renders = colors.new_zeros(ctx.shapes[0]) if v_renders is None else v_renders
-    v_alphas = colors.new_zeros(ctx.shapes[1]) if v_alphas is None else v_alphas
-    needs, size = ctx.needs_input_grad, Size(*ctx.size)
+def _composite_backward(ctx, *cotangents):
+    splats, rest = list(ctx.saved_tensors[:4]), ctx.saved_tensors[4:]
+    bins, walk = list(rest[: len(Bins._fields)]), list(rest[len(Bins._fields) :])
+    colors, needs, size = splats[3], ctx.needs_input_grad, Size(*ctx.size)
+    v_pixels = [
+        colors.new_zeros(shape) if v is None else v.contiguous()
+        for v, shape in zip(cotangents, ctx.shapes)
+    ]
     geometry = any(needs[:3]) or not size.skip & UNASKED
-    skipped, *v_geometry, v_colors = _composite_vjp(
-        means2d,
-        conics,
-        view_opacities,
-        colors,
-        bins,
-        ctx.size,
-        ctx.limits,
-        ctx.tuning,
-        walk,
-        v_renders.contiguous(),
-        v_alphas.contiguous(),
-        geometry,
-    )
-    v_means2d, v_conics, v_view_opacities = v_geometry if geometry else (None, None, None)
+    options = ctx.size, ctx.limits, ctx.tuning
+    skipped, *grads, v_colors = _composite_vjp(splats, bins, *options, walk, v_pixels, geometry)
     if ctx.skipped is not None:
         ctx.skipped.copy_(skipped.sum())
     if not size.colors_per_view and size.views:
         images, num, channels = v_colors.shape
         v_colors = v_colors.view(images // size.views, size.views, num, channels).sum(1)
-    v_colors = _shaped(v_colors, colors) if needs[3] else None
-    grads = (x if need else None for x, need in zip((v_means2d, v_conics, v_view_opacities), needs))
-    return *grads, v_colors, [None] * len(bins), None, None, None, None
+    # without a view there is nothing to sum
+    v_colors = v_colors.reshape(colors.shape) if v_colors.numel() else torch.zeros_like(colors)
+    grads = [*(grads or [None] * 3), v_colors]
+    grads = (x if need else None for x, need in zip(grads, needs))
+    return *grads, [None] * len(bins), None, None, None, None
 
 
 composite.register_autograd(_composite_backward, setup_context=_composite_setup)

@@ -278,7 +278,7 @@ def composite_forward(
         conics: ``[I, N, 3]``.
         view_opacities: ``[I, N]``.
         colors: ``[rows, C]``, rows = B * N, or I * N if ``picture.colors_per_view``.
-        bins: from ``bin_gaussians``.
+        bins: from ``bin_op``.
         picture: from ``make_picture``, with the tuning's tile.
         tuning: the choice of kernels; the lists were made with its tile.
 

@@ -1,6 +1,6 @@
 """Real spherical harmonics up to degree 4, in torch (autograd gives the gradients).
 
-The operator of ``function.py`` takes this for what its kernels do not: other dtypes than float32,
+The operator of ``ops.py`` takes this for what its kernels do not: other dtypes than float32,
 other devices, very many channels. In float64 it is the oracle of the kernels.
 """
 

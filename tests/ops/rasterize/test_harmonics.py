@@ -124,8 +124,8 @@ def test_channels(device, channels):
 
 
 def test_many_channels_take_the_formula(device, monkeypatch):
-    monkeypatch.delattr(cpu, "harmonics_forward")
-    monkeypatch.delattr(cuda, "harmonics_forward")
+    monkeypatch.delattr(cpu, "forward_kernel")
+    monkeypatch.delattr(cuda, "forward_kernel")
     check(1, make(1, 1, num=5, channels=65))
 
 
