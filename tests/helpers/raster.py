@@ -43,6 +43,13 @@ def make(batch=2, views=3, num=60, width=37, height=53, channels=3, size=0.06):
     )
 
 
+def crowded(channels=3, num=90):
+    """Some pixels stop early, some alphas are clamped; lists of up to three batches of a warp."""
+    scene = make(1, 2, num=num, width=37, height=21, channels=channels, size=0.15)
+    scene["opacities"][:, ::2] = 0.9999
+    return scene
+
+
 def mapped(scene, function):
     """The scene with ``function`` of each tensor."""
     return {k: function(v) if isinstance(v, torch.Tensor) else v for k, v in scene.items()}

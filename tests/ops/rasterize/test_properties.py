@@ -50,15 +50,6 @@ def test_order_and_transmittance():
     assert abs(alphas[0, 15, 16, 0] - 0.875) < 1e-6
 
 
-def test_equal_depths_go_by_index():
-    scene = one()
-    scene["means"] = scene["means"].repeat(2, 1)
-    scene["scales"], scene["opacities"] = torch.full((2, 3), 5.0), torch.tensor([0.5, 0.5])
-    scene["colors"] = torch.eye(3)[:2]
-    renders, _, _ = rasterization(**scene)
-    assert (renders[0, 15, 16] - torch.tensor([0.5, 0.25, 0.0])).abs().max() < 1e-6
-
-
 def test_clamped_alpha_has_no_gradient():
     scene = leaves(one(opacity=0.999), torch.float32)
     renders, _, _ = rasterization(**scene)
@@ -79,17 +70,9 @@ def test_stops_before_falling_to_the_limit():
 
 
 BAD = {
-    "nan mean": ("means", math.nan, "not_finite"),
-    "inf mean": ("means", math.inf, "not_finite"),
-    "nan scale": ("scales", math.nan, "not_finite"),
-    "inf scale": ("scales", math.inf, "not_finite"),
     "huge scale": ("scales", 1e30, "not_finite"),
-    "nan quat": ("quats", math.nan, "not_finite"),
-    "nan opacity": ("opacities", math.nan, "not_finite"),
     "negative opacity": ("opacities", -1.0, "transparent"),
     "faint": ("opacities", 1e-3, "transparent"),
-    "nan color": ("colors", math.nan, "not_finite"),
-    "inf color": ("colors", -math.inf, "not_finite"),
     "far away": ("means", 1e20, None),
 }
 
@@ -138,11 +121,6 @@ def test_other_culls():
     assert rasterization(**one(mean=(9.0, 0.0, 2.0)))[2]["culled"]["outside"] == 1
     assert rasterization(**one(), radius_clip=30.0)[2]["culled"]["small"] == 1
     assert rasterization(**one(), radius_clip=5.0)[2]["culled"]["small"] == 0
-
-
-def test_huge_gaussian_covers_everything():
-    renders, alphas, _ = rasterization(**one(scale=1e6, opacity=0.5))
-    assert (alphas - 0.5).abs().max() < 1e-5 and torch.isfinite(renders).all()
 
 
 @pytest.mark.parametrize("batch, views, num", [(2, 3, 0), (2, 0, 5), (0, 2, 5), (1, 1, 1)])

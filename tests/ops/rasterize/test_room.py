@@ -1,17 +1,13 @@
 """Lists with room on CUDA, on CPU blocks: no wait for counts, and the same bits without room."""
 
-from functools import partial
-
 import pytest
 import torch
-import warp as wp
+from helpers import raster
 from helpers.kernels import Watch
 from helpers.raster import leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, depth_quantile, lists_outgrown, ops, rasterization
-from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
+from gamba_warp.kernels.rasterize import Skip, depth_quantile, lists_outgrown, rasterization
 from gamba_warp.kernels.rasterize.cuda import capacity
-from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 
 CPU = torch.device("cpu")
 READ_BACK = {"aten::item", "aten::_local_scalar_dense"}
@@ -21,21 +17,11 @@ COUNTS = (
 )
 
 
-@pytest.fixture
-def on_blocks(monkeypatch):
-    """CUDA's lists and compositor in place of the CPU's, as real blocks, with nothing known yet."""
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-
-    def switch(parts=1):
-        monkeypatch.setattr(
-            ops, "_bin_views", lambda device, exact: partial(bin_cuda.bin_views, exact=exact)
-        )
-        monkeypatch.setattr(ops, "_compositor", lambda device: composite_cuda)
-        monkeypatch.setattr(composite_cuda, "parts_of_tile", lambda tiles, device: parts)
-
-    capacity.forget()
-    yield switch
-    capacity.forget()
+def crowded(channels=3, num=90):
+    """As the helper's, and some Gaussians are culled."""
+    scene = raster.crowded(channels, num)
+    scene["opacities"][:, 1::9] = 0.001
+    return scene
 
 
 def the_room():
@@ -64,14 +50,6 @@ def render(scene, mode="RGB", **options):
     return {"renders": renders, "alphas": alphas, "depths": depths} | dict(zip(wanted, grads)), meta
 
 
-def crowded(channels=3, num=90):
-    """Some pixels stop early, some alphas are clamped; some Gaussians are culled."""
-    scene = make(1, 2, num=num, width=37, height=21, channels=channels, size=0.15)
-    scene["opacities"][:, ::2] = 0.9999
-    scene["opacities"][:, 1::9] = 0.001
-    return scene
-
-
 @pytest.mark.parametrize(
     "channels, mode, parts, skip",
     [
@@ -85,7 +63,7 @@ def test_without_room_the_bits_are_the_same(on_blocks, channels, mode, parts, sk
     scene = crowded(channels)
     options = {} if skip else {"skip": Skip.from_bits(0)}
     lanes, _ = render(scene, mode, **options)
-    on_blocks(parts)
+    on_blocks(parts, lists=True)
     want, meta = render(scene, mode, **options)
     listed = meta.bins.pairs.numel()
     assert listed > meta["pairs"] > 180  # the lists had room, and had to have it
@@ -103,7 +81,7 @@ def test_without_room_the_bits_are_the_same(on_blocks, channels, mode, parts, sk
 def test_colours_alone_without_room(on_blocks):
     """Another kernel, without moments."""
     scene = {k: v for k, v in crowded().items() if k != "backgrounds"}
-    on_blocks(2)
+    on_blocks(2, lists=True)
     results = []
     for _ in range(2):
         colors = scene["colors"].clone().requires_grad_()
@@ -117,7 +95,7 @@ def test_colours_alone_without_room(on_blocks):
 def test_room_grows_with_what_was_told(on_blocks):
     """A scene that grows has no room once; then it has."""
     scene = crowded()
-    on_blocks()
+    on_blocks(lists=True)
     render(scene)
     first = the_room().capacity
     scene["scales"] = scene["scales"] * 4
@@ -152,7 +130,7 @@ def test_room_shrinks_slowly():
 
 def test_about_as_many_gaussians_share_their_room(on_blocks):
     """A model of pictures gives another number each time; each would be read back else."""
-    on_blocks()
+    on_blocks(lists=True)
     rasterization(**crowded(num=90))
     for num, read in ((95, 0), (96, 0), (97, 1)):
         scene = crowded(num=num)
@@ -175,7 +153,7 @@ def test_nothing_to_see(on_blocks, num, views, far):
     scene = make(1, views, num=num, width=21, height=19)
     if far:
         scene["means"] += 1000.0
-    on_blocks(2)
+    on_blocks(2, lists=True)
     for _ in range(2):
         result, meta = render(scene)
         assert not result["alphas"].any() and not result["means"].any()
@@ -187,7 +165,7 @@ def test_nothing_to_see(on_blocks, num, views, far):
 def test_a_first_scene_may_be_empty(on_blocks):
     """Then the second has no room, and its picture is right."""
     scene = crowded()
-    on_blocks()
+    on_blocks(lists=True)
     want, _ = render(scene)
     capacity.forget()
     rasterization(**scene | {"means": scene["means"] + 1000.0})
@@ -199,7 +177,7 @@ def test_a_first_scene_may_be_empty(on_blocks):
 def test_no_call_but_the_first_reads_a_number_back(on_blocks):
     scene = crowded(6)
     tensors = leaves(scene, torch.float32)
-    on_blocks()
+    on_blocks(lists=True)
 
     def call():
         renders, alphas, meta = rasterization(**tensors, render_mode="RGB+ED")
@@ -223,7 +201,7 @@ def test_no_call_but_the_first_reads_a_number_back(on_blocks):
 
 def test_a_graph_needs_a_call_before_it(on_blocks, monkeypatch):
     scene = crowded()
-    on_blocks()
+    on_blocks(lists=True)
     monkeypatch.setattr(capacity, "is_capturing", lambda device: True)
     with pytest.raises(RuntimeError, match="never rendered"):
         rasterization(**scene)
@@ -232,7 +210,7 @@ def test_a_graph_needs_a_call_before_it(on_blocks, monkeypatch):
 def test_a_graph_is_told_to_be_too_small(on_blocks, monkeypatch):
     """A capture keeps its room; ``lists_outgrown`` says when replays need more."""
     scene = crowded()
-    on_blocks()
+    on_blocks(lists=True)
     rasterization(**scene)
     assert not lists_outgrown()
     with monkeypatch.context() as capture:
