@@ -173,7 +173,8 @@ def bin_op(
     grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
     tensors, kinds = (means2d, conics, view_opacities, extents), (wp.vec2, wp.vec3, None, wp.vec2)
     inputs = list(map(vectors, tensors, kinds))
-    return tuple(_bin_views(depths.device, exact)(grid, depths, inputs, _refuse_too_many))
+    b = _bin_views(depths.device, exact)(grid, depths, inputs, _refuse_too_many)
+    return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs, b.count
 
 
 @bin_op.register_fake
@@ -219,8 +220,8 @@ def composite(
     """
     splats = means2d, conics, view_opacities, colors
     given = Bins(*bins), _picture(means2d, size, limits, tuning), Tuning(*tuning)
-    renders, alphas, walk = _compositor(means2d.device).composite_forward(*splats, *given)
-    return renders, alphas, *walk
+    renders, alphas, w = _compositor(means2d.device).composite_forward(*splats, *given)
+    return renders, alphas, w.transmittances, w.stops, w.blocks, w.walked, w.blocks_walked
 
 
 def _picture(means2d: Tensor, size: list[int], limits: list[float], tuning: list[int]) -> Picture:
@@ -256,9 +257,21 @@ def _composite_vjp(
     v_pixels: List[Tensor],
     geometry: bool,
 ) -> List[Tensor]:
-    picture, chosen = _picture(splats[0], size, limits, tuning), Tuning(*tuning)
-    given = *splats, Bins(*bins), picture, chosen, Walk(*walk), *v_pixels, geometry
-    grads, skipped = _compositor(splats[0].device).composite_backward(*given)
+    means2d, conics, view_opacities, colors = splats
+    v_renders, v_alphas = v_pixels
+    grads, skipped = _compositor(means2d.device).composite_backward(
+        means2d,
+        conics,
+        view_opacities,
+        colors,
+        Bins(*bins),
+        _picture(means2d, size, limits, tuning),
+        Tuning(*tuning),
+        Walk(*walk),
+        v_renders,
+        v_alphas,
+        geometry,
+    )
     return [skipped, *(g for g in grads if g is not None)]
 
 

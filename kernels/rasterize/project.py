@@ -177,6 +177,7 @@ def unit(q: wp.vec4) -> wp.vec4:
 
 
 @wp.func
+@no_type_check
 def slope_bounds(center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.vec2:
     # README eq. 2: the picture and a margin around it
     margin = FRUSTUM_MARGIN * 0.5 * size / focal

@@ -264,6 +264,7 @@ def tile_rows(grid: Grid, y: wp.float32, extent: wp.float32) -> wp.vec2i:
 
 
 @wp.func
+@no_type_check
 def q_limit(opacity: wp.float32, alpha_min: wp.float32) -> wp.float32:
     return 2.0 * wp.log(opacity / alpha_min) * SLACK + SLACK_ABS
 
