@@ -26,13 +26,8 @@ EXACT = 1e-5  # float32 against float64: a few hundred roundings
 GRADIENT = 1e-4
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small operations: on a busy machine threads would only wait."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+# Small operations: on a busy machine threads would only wait.
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def scene_of(num=300, **changes):

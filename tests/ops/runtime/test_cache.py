@@ -1,4 +1,4 @@
-"""Importing the package changes nothing of Warp's, and says where its kernels can be kept."""
+"""A new process: what imports and first calls load, change, and say of the folder of kernels."""
 
 import os
 import subprocess
@@ -20,6 +20,31 @@ CALLS = """
 import torch
 from gamba_warp.kernels import causal_conv1d
 causal_conv1d(torch.randn(1, 7, 5), torch.randn(5, 4))
+"""
+
+COMPILER = """
+import sys
+import torch
+from gamba_warp.kernels import causal_conv1d
+
+x, weight = torch.randn(1, 7, 5), torch.randn(5, 4, requires_grad=True)
+plain = causal_conv1d(x, weight)
+plain.sum().backward()
+assert "torch._dynamo" not in sys.modules, "the first call has imported torch's compiler"
+
+def layer(x):
+    return causal_conv1d(torch.sin(x), weight).cos()
+
+eager = layer(x)
+compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+assert torch.equal(compiled(x), eager)
+# Once the compiler is there, it passes over the operator's body as for every operator of torch.
+torch._dynamo.reset()
+torch._dynamo.utils.counters.clear()
+assert torch.equal(torch.compile(layer, backend="eager")(x), eager)
+assert not torch._dynamo.utils.counters["graph_break"]
+assert torch.equal(causal_conv1d(x, weight), plain)
+print("done")
 """
 
 
@@ -56,3 +81,8 @@ def test_a_kernel_that_cannot_be_kept_is_one_line(tmp_path):
     last = done.stderr.splitlines()[-1]
     assert done.returncode == 1 and str(Path("kernels")) in last, done.stderr
     assert "WARP_CACHE_PATH names another folder" in last
+
+
+def test_an_operator_loads_no_compiler_and_compiles_when_asked():
+    done = python(COMPILER)
+    assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stderr
