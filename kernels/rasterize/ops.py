@@ -16,8 +16,7 @@ from ..runtime.start import without_compiler
 from ..runtime.views import vectors
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
-from .cpu.project import project_on_lanes
-from .cpu.project_vjp import vjp_on_lanes
+from .cpu.project import project_on_lanes, vjp_on_lanes
 from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda

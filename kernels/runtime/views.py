@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, TypeVar, cast, overload
 
 import warp as wp
@@ -92,23 +93,28 @@ class Packed:
     """
 
     def __init__(self, cls: Any, *values: Any) -> None:
-        fields = zip(cls.vars.items(), values, strict=True)
-        self._fields = {
-            name: _flat_view(x, var.type) if isinstance(x, Tensor) else x
-            for (name, var), x in fields
-            if x is not None
-        }
-        found = {name: x for name, x in self._fields.items() if x is not None}
-        self._made = cls.ctype(**found)
+        made = self._values = []
+        for x, (dtype, inner, empty) in zip(values, _fields(cls), strict=True):
+            if isinstance(x, Tensor):
+                if x.dim() != inner + 1:
+                    x = x.view(-1, *x.shape[x.dim() - inner :]) if inner else x.view(-1)
+                x = view(x, dtype)
+            made.append(empty if x is None else x)
+        self._made = cls.ctype(*made)
 
     def __ctype__(self) -> Any:
         return self._made
 
 
-def _flat_view(tensor: Tensor, kind: Any) -> Any:
-    kept = kind.ndim - 1 + len(getattr(kind.dtype, "_shape_", ()))
-    inner = tensor.shape[tensor.dim() - kept :] if kept else ()
-    return view(tensor.view(-1, *inner), kind.dtype)
+@functools.cache
+def _fields(cls: Any) -> list[tuple[Any, int, Any]]:
+    """Of each field its dtype, the dimensions after the first, and what it is without an array."""
+    empty, fields = cls.ctype(), []
+    for name, var in cls.vars.items():
+        dtype = getattr(var.type, "dtype", None)
+        inner = getattr(var.type, "ndim", 1) - 1 + len(getattr(dtype, "_shape_", ()))
+        fields.append((dtype, inner, getattr(empty, name)))
+    return fields
 
 
 def struct(cls: type[_Class]) -> type[_Class]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .constants import WINDOW
-from .cpu.launch import dissimilarity_on_lanes
+from .lanes import dissimilarity_on_lanes
 from .products import dissimilarity_by_products
 
 

@@ -1,4 +1,4 @@
-"""1 - SSIM by matrix products in torch: for GPUs, and for other dtypes than float32.
+"""1 - SSIM by matrix products in torch, for GPUs and for other dtypes than float32.
 
 A mean over the window along rows or columns is a product with a matrix that is zero but for a band,
 so a product makes ``_TILE`` columns of it at a time.
@@ -7,16 +7,36 @@ so a product makes ``_TILE`` columns of it at a time.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from .constants import C1, C2, EDGE, SIGMA, WINDOW
-from .parts import box_of_windows, groups
 
 _TILE = 32  # columns of a banded product
 _TOGETHER = 1 << 17  # numbers of the pictures that a CPU takes together, two of 128²
+
+
+def groups(
+    size: int, got: Tensor, want: Tensor, slopes: Tensor | None
+) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+    """Pictures that are computed together, at most ``size``, with the views of their slopes."""
+    for i in range(0, len(got), size):
+        part = slice(i, i + size)
+        yield got[part], want[part], None if slopes is None else slopes[part]
+
+
+def box_of_windows(unequal: Tensor) -> tuple[slice, slice] | None:
+    """The rows and columns of all windows that hold a True of ``[H, W]``; None if there is none."""
+    sides = []
+    for axis in (1, 0):
+        found = unequal.any(axis).nonzero()[:, 0].tolist()
+        if not found:
+            return None
+        sides.append(slice(max(0, found[0] - EDGE), found[-1] + EDGE + 1))
+    return sides[0], sides[1]
 
 
 def dissimilarity_by_products(
@@ -82,9 +102,9 @@ def _compute(got: Tensor, want: Tensor, slope: Tensor | None, band: Tensor) -> T
 def _band(like: Tensor) -> Tensor:
     """SSIM's Gaussian window as the band of a matrix: ``[_TILE + 10, _TILE]``."""
     rows = torch.arange(_TILE + EDGE, device=like.device)  # no copy from the host
-    places = (rows[:, None] - rows[:_TILE]).double()
-    weights = torch.exp(-(places - WINDOW // 2).square() / (2 * SIGMA**2))
-    weights = torch.where((places >= 0) & (places < WINDOW), weights, 0.0)
+    offsets = (rows[:, None] - rows[:_TILE]).double()
+    weights = torch.exp(-(offsets - WINDOW // 2).square() / (2 * SIGMA**2))
+    weights = torch.where((offsets >= 0) & (offsets < WINDOW), weights, 0.0)
     return (weights / weights[:WINDOW, 0].sum()).to(like.dtype)
 
 

@@ -18,8 +18,8 @@ def dissimilarity_reference(got: Tensor, want: Tensor) -> Tensor:
     Returns:
         ``[P]``.
     """
-    places = torch.arange(WINDOW, dtype=torch.float64, device=got.device) - WINDOW // 2
-    line = torch.exp(-places.square() / (2 * SIGMA**2))
+    offsets = torch.arange(WINDOW, dtype=torch.float64, device=got.device) - WINDOW // 2
+    line = torch.exp(-offsets.square() / (2 * SIGMA**2))
     weights = (line[:, None] * line / line.sum() ** 2).to(got)
     a, b = (x.unfold(1, WINDOW, 1).unfold(2, WINDOW, 1) for x in (got, want))
 

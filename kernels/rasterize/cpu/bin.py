@@ -1,271 +1,133 @@
-"""Tile lists on the CPU: a radix sort by depth, then counting and writing straight into place.
+"""Tile lists on the CPU: windows of tiles, sixteen Gaussians at a time, and a radix sort.
 
-Which tiles a Gaussian touches is found in the order of the Gaussians, beside the sort. Then the
-Gaussians of a view, front to back, are cut into parts, one task each. Counting gives the pairs
-of each (part, tile); their running sum is where each part writes its pairs of each tile.
+The Gaussians of a view are cut into parts, one task each. ``count`` finds the tiles of each
+Gaussian, leaves them as a window of 4 x 4 tiles, and finds how many intersections each (part, tile)
+has; their running sum is where ``scatter`` writes. Views of few Gaussians are sorted by depth
+before that. A sort of a million Gaussians, and every later step in that random order, would wait
+for memory: those go as they lie, and each list, which fits the nearest cache, is sorted at the end.
+README.md §2 holds the maths.
 """
 
 from collections.abc import Callable
-from typing import no_type_check
+from pathlib import Path
+from typing import Any, no_type_check
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import parallel_launch
-from ..tiles import Bins, Ellipse, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
-from .bin_many import MANY, bin_many
-from .places import place_pairs
+from ...runtime.memory import empty
+from ...runtime.native import native
+from ...runtime.views import Packed, struct
+from ..project import Splats
+from ..skip import TILE_TEST
+from ..tiles import SLACK, SLACK_ABS, Bins, Grid, Lists
 
 wp.set_module_options({"enable_backward": False})
 
-_BITS = wp.constant(11)
-_DIGITS = wp.constant(2048)
-# A Gaussian's record: number of pairs, first and last row of tiles, columns of the first rows,
-# two numbers of 16 bits each: a picture has at most 2^12 tiles in a row.
-_COUNT, _FIRST_ROW, _LAST_ROW, _SPANS = (wp.constant(i) for i in range(4))
-_ROWS = wp.constant(9)
-_RECORD = 12
-_AHEAD = wp.constant(12)  # Gaussians that pass while a record comes from memory
+MANY = 1 << 15  # Gaussians of a view from which sorting each list is quicker
 _PARTS_PER_THREAD = 4  # more than 1, since Gaussians differ in size, and so do parts
 
-
-@wp.func_native("""
-const int* record = records.data + (size_t)i * records.shape[1];
-__builtin_prefetch(record);
-__builtin_prefetch(record + records.shape[1] - 1);
-""")
-def _fetch(records: wp.array2d[wp.int32], i: wp.int32):
-    """Prefetches a record: records are read in the order of depth, which is a random one."""
-    ...
+_HERE = Path(__file__).parent
+_DEFINES = {"SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "TILE_TEST": TILE_TEST}
 
 
-@wp.func
-@no_type_check
-def _next_place(counts: wp.array3d[wp.int32], image: int, turn: int, key: int) -> int:
-    digit = (key >> (turn * _BITS)) & (_DIGITS - 1)
-    place = counts[image, turn, digit]
-    counts[image, turn, digit] = place + 1
-    return place
+@struct
+class Work:
+    """What passes between the steps: of groups of 16 Gaussians, and of the parts."""
+
+    corners: wp.array[wp.int32]  # [groups * 16] first tile of each window
+    windows: wp.array[wp.int16]  # [groups * 16] its bits
+    counts: wp.array2d[wp.int32]  # [parts, tiles] intersections, then where the next one goes
+    totals: wp.array[wp.int64]  # [parts] intersections
+    boxes: wp.array[wp.int64]  # [parts] likewise, of boxes
+    numbers: wp.array[wp.int32]  # [parts] the number of the first intersection
 
 
-@wp.func
-@no_type_check
-def _sort_view(
-    image: wp.int32,
-    depths: wp.array2d[wp.float32],
-    keys: wp.array3d[wp.int32],
-    places: wp.array2d[wp.int32],
-    counts: wp.array3d[wp.int32],
-    order: wp.array2d[wp.int32],
-):
-    # front to back, equal depths by index; keys, places and counts are room to work
-    num = depths.shape[1]
-    for digit in range(_DIGITS):
-        for turn in range(3):
-            counts[image, turn, digit] = 0
-    for i in range(num):
-        # depths are not negative: their bits are ordered as they are
-        key = wp.cast(depths[image, i], wp.int32)
-        for turn in range(3):
-            digit = (key >> (turn * _BITS)) & (_DIGITS - 1)
-            counts[image, turn, digit] = counts[image, turn, digit] + 1
-    for turn in range(3):
-        total = wp.int32(0)
-        for digit in range(_DIGITS):
-            count = counts[image, turn, digit]
-            counts[image, turn, digit] = total
-            total += count
-    for i in range(num):
-        key = wp.cast(depths[image, i], wp.int32)
-        place = _next_place(counts, image, 0, key)
-        keys[image, 0, place] = key
-        order[image, place] = i
-    for i in range(num):
-        key = keys[image, 0, i]
-        place = _next_place(counts, image, 1, key)
-        keys[image, 1, place] = key
-        places[image, place] = order[image, i]
-    for i in range(num):
-        place = _next_place(counts, image, 2, keys[image, 1, i])
-        order[image, place] = image * num + places[image, i]
+@wp.func_native(native(_HERE / "sort.inl"))
+def _sort_worker(
+    worker: int,
+    count: int,
+    splats: Splats,
+    staged: wp.array2d[wp.int32],
+    counter: wp.array[wp.int32],
+    workspace: wp.array2d[wp.int64],
+    lists: Lists,
+): ...
 
 
-@wp.func
-@no_type_check
-def _part(num: wp.int32, part: wp.int32, parts: wp.int32) -> wp.int32:
-    # where a part begins; num * part may not fit an int32
-    return wp.int32(wp.int64(num) * wp.int64(part) / wp.int64(parts))
+@wp.func_native(native(_HERE / "count.inl", **_DEFINES))
+def _count_part(task: int, parts: int, grid: Grid, splats: Splats, lists: Lists, work: Work): ...
 
 
-@wp.func
-@no_type_check
-def _ellipse(
+@wp.func_native(native(_HERE / "offsets.inl"))
+def _running_sums(parts: int, work: Work, lists: Lists): ...
+
+
+@wp.func_native(native(_HERE / "scatter.inl", **_DEFINES))
+def _scatter_part(
+    task: int,
+    parts: int,
     grid: Grid,
-    means2d: wp.array[wp.vec2],
-    conics: wp.array[wp.vec3],
-    view_opacities: wp.array[wp.float32],
-    i: wp.int32,
-) -> Ellipse:
-    limit = q_limit(view_opacities[i], grid.alpha_min)
-    return make_ellipse(means2d[i], conics[i], limit)
+    splats: Splats,
+    work: Work,
+    lists: Lists,
+    staged: wp.array2d[wp.int32],
+): ...
 
 
 @wp.kernel
 @no_type_check
-def _prepare(
-    offset: wp.int32,
-    grid: Grid,
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    extents_in: wp.array[wp.vec2],
-    depths_in: wp.array2d[wp.float32],
-    keys_out: wp.array3d[wp.int32],
-    places_out: wp.array2d[wp.int32],
-    digits_out: wp.array3d[wp.int32],
-    order_out: wp.array2d[wp.int32],
-    records_out: wp.array2d[wp.int32],
-    box_counts_out: wp.array[wp.int64],
+def _sort(
+    offset: int,
+    count: int,
+    splats_in: Splats,
+    staged_in: wp.array2d[wp.int32],
+    counter_out: wp.array[wp.int32],
+    workspace_out: wp.array2d[wp.int64],
+    lists_out: Lists,
 ):
-    """The first tasks each sort a view, the others each make records of some Gaussians."""
-    images = depths_in.shape[0]
-    task = offset + wp.tid() - images
-    if task < 0:
-        _sort_view(task + images, depths_in, keys_out, places_out, digits_out, order_out)
-        return
-    total = records_out.shape[0]
-    parts = box_counts_out.shape[0]
-    box_count = wp.int64(0)
-    for i in range(_part(total, task, parts), _part(total, task + 1, parts)):
-        extent = extents_in[i]
-        count = wp.int32(0)
-        rows = wp.vec2i(0, -1)
-        if extent[0] > 0.0:
-            ellipse = _ellipse(grid, means2d_in, conics_in, view_opacities_in, i)
-            rows = tile_rows(grid, ellipse.mean[1], extent[1])
-            for ty in range(rows[0], rows[1] + 1):
-                columns = tile_columns(grid, ellipse, extent, ty)
-                if ty - rows[0] < _ROWS:
-                    records_out[i, _SPANS + ty - rows[0]] = columns[0] | columns[1] << 16
-                count += wp.max(columns[1] - columns[0] + 1, 0)
-            box_count += box_pairs(grid, ellipse.mean, extent)
-        records_out[i, _COUNT] = count
-        records_out[i, _FIRST_ROW] = rows[0]
-        records_out[i, _LAST_ROW] = rows[1]
-    box_counts_out[task] = box_count
-
-
-@wp.func
-@no_type_check
-def _columns(
-    grid: Grid,
-    means2d: wp.array[wp.vec2],
-    conics: wp.array[wp.vec3],
-    view_opacities: wp.array[wp.float32],
-    extents: wp.array[wp.vec2],
-    records: wp.array2d[wp.int32],
-    i: wp.int32,
-    ty: wp.int32,
-) -> wp.vec2i:
-    row = ty - records[i, _FIRST_ROW]
-    if row < _ROWS:
-        span = records[i, _SPANS + row]
-        return wp.vec2i(span & 0xFFFF, span >> 16)
-    ellipse = _ellipse(grid, means2d, conics, view_opacities, i)
-    return tile_columns(grid, ellipse, extents[i], ty)
+    """A task is a worker; ``counter`` is the next list, ``workspace`` holds two of a worker."""
+    worker = offset + wp.tid()
+    _sort_worker(worker, count, splats_in, staged_in, counter_out, workspace_out, lists_out)
 
 
 @wp.kernel
 @no_type_check
-def _count(
-    offset: wp.int32,
-    grid: Grid,
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    extents_in: wp.array[wp.vec2],
-    order_in: wp.array[wp.int32],
-    records_in: wp.array2d[wp.int32],
-    counts_out: wp.array4d[wp.int32],
-    totals_out: wp.array[wp.int64],
-):
-    """Counts hold zeros at first, and a column more than there are tiles in a row."""
-    task = offset + wp.tid()
-    parts = counts_out.shape[1]
-    image = task // parts
-    part = task % parts
-    total = wp.int64(0)
-    for j in range(
-        image * grid.num + _part(grid.num, part, parts),
-        image * grid.num + _part(grid.num, part + 1, parts),
-    ):
-        i = order_in[j]
-        _fetch(records_in, order_in[wp.min(j + _AHEAD, order_in.shape[0] - 1)])
-        total += wp.int64(records_in[i, _COUNT])
-        for ty in range(records_in[i, _FIRST_ROW], records_in[i, _LAST_ROW] + 1):
-            columns = _columns(
-                grid, means2d_in, conics_in, view_opacities_in, extents_in, records_in, i, ty
-            )
-            if columns[0] <= columns[1]:
-                # how the number of pairs changes from tile to tile, until all are through
-                end = columns[1] + 1
-                counts_out[image, part, ty, columns[0]] = (
-                    counts_out[image, part, ty, columns[0]] + 1
-                )
-                counts_out[image, part, ty, end] = counts_out[image, part, ty, end] - 1
-    totals_out[task] = total
-    for ty in range(grid.tiles_y):
-        count = wp.int32(0)
-        for tx in range(grid.tiles_x):
-            count += counts_out[image, part, ty, tx]
-            counts_out[image, part, ty, tx] = count
+def _count(offset: int, parts: int, grid: Grid, splats_in: Splats, lists_in: Lists, work_out: Work):
+    _count_part(offset + wp.tid(), parts, grid, splats_in, lists_in, work_out)
 
 
 @wp.kernel
 @no_type_check
-def _emit(
-    offset: wp.int32,
+def _offsets(offset: int, parts: int, work_out: Work, lists_out: Lists):
+    _running_sums(parts, work_out, lists_out)
+
+
+@wp.kernel
+@no_type_check
+def _scatter(
+    offset: int,
+    parts: int,
     grid: Grid,
-    means2d_in: wp.array[wp.vec2],
-    conics_in: wp.array[wp.vec3],
-    view_opacities_in: wp.array[wp.float32],
-    extents_in: wp.array[wp.vec2],
-    order_in: wp.array[wp.int32],
-    records_in: wp.array2d[wp.int32],
-    numbers_in: wp.array[wp.int32],
-    cursors_out: wp.array4d[wp.int32],
-    offsets_out: wp.array[wp.int32],
-    pairs_out: wp.array[wp.int32],
-    rows_out: wp.array[wp.int32],
+    splats_in: Splats,
+    work_out: Work,
+    lists_out: Lists,
+    staged_out: wp.array2d[wp.int32],
 ):
-    """Cursors hold, at first, the place of the first pair of each (part, tile)."""
-    task = offset + wp.tid()
-    parts = cursors_out.shape[1]
-    image = task // parts
-    part = task % parts
-    p = numbers_in[task]
-    for j in range(
-        image * grid.num + _part(grid.num, part, parts),
-        image * grid.num + _part(grid.num, part + 1, parts),
-    ):
-        i = order_in[j]
-        _fetch(records_in, order_in[wp.min(j + _AHEAD, order_in.shape[0] - 1)])
-        offsets_out[j] = p
-        for ty in range(records_in[i, _FIRST_ROW], records_in[i, _LAST_ROW] + 1):
-            columns = _columns(
-                grid, means2d_in, conics_in, view_opacities_in, extents_in, records_in, i, ty
-            )
-            for tx in range(columns[0], columns[1] + 1):
-                place = cursors_out[image, part, ty, tx]
-                cursors_out[image, part, ty, tx] = place + 1
-                pairs_out[place] = i
-                rows_out[place] = p
-                p += 1
+    _scatter_part(offset + wp.tid(), parts, grid, splats_in, work_out, lists_out, staged_out)
+
+
+def _sort_lists(count: int, longest: int, splats: Packed, staged: Any, lists: Packed) -> None:
+    workers = torch.get_num_threads()
+    counter = torch.zeros(1, dtype=torch.int32)
+    workspace = torch.empty(workers, 2 * max(longest, 1), dtype=torch.int64)
+    parallel_launch(_sort, workers, [count, splats, staged, counter, workspace, lists])
 
 
 def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None]) -> Bins:
-    """Makes the lists; ``check`` is given the number of pairs before they are made.
+    """Makes the lists; ``check`` is given the number of intersections before they are made.
 
     Args:
         grid: from ``make_grid``.
@@ -274,37 +136,38 @@ def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], N
         check: raises if there are too many.
     """
     images, num = depths.shape
-    if images and num >= MANY:
-        return bin_many(grid, depths, inputs, check)
-    most = _PARTS_PER_THREAD * torch.get_num_threads()
+    means2d, conics, opacities, extents = inputs
+    tiles, most = grid.tiles_x * grid.tiles_y, _PARTS_PER_THREAD * torch.get_num_threads()
     parts = 1 if images >= most else most
-    order, records, boxes = _sorted_and_recorded(grid, depths, inputs, most)
-    counts = order.new_zeros(images, parts, grid.tiles_y, grid.tiles_x + 1)
-    totals = boxes.new_empty(images * parts)
-    tasks = images * parts
-    inputs = [grid, *inputs, order, records]
-    parallel_launch(_count, tasks, inputs, [counts, totals], pieces=tasks)
-    offsets = order.new_empty(images * num + 1)
-    places = place_pairs(counts, totals, boxes, offsets, grid.tiles_x, check)
-    pairs, rows = (order.new_empty(places.total) for _ in range(2))
-    outputs = [counts, offsets, pairs, rows]
-    parallel_launch(_emit, tasks, [*inputs, places.numbers], outputs, pieces=tasks)
-    return Bins(order, offsets, pairs, rows, places.starts, places.box_pairs, places.count)
-
-
-def _sorted_and_recorded(
-    grid: Grid, depths: Tensor, inputs: list, parts: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """``order``, the records ``[I * N, 12]``, and pairs of boxes by ``parts`` of the Gaussians."""
-    images, num = depths.shape
-    order = torch.empty(images, num, dtype=torch.int32)
-    box_counts = torch.empty(parts, dtype=torch.int64)
-    records = order.new_empty(images * num, _RECORD)
-    room = [order.new_empty(images, 2, num), torch.empty_like(order)]
-    outputs = [*room, order.new_empty(images, 3, 1 << 11), order, records, box_counts]
-    tasks = images + parts
-    if depths.numel():
-        parallel_launch(_prepare, tasks, [grid, *inputs, depths], outputs, pieces=tasks)
-    else:
-        box_counts.zero_()
-    return order.view(-1), records, box_counts
+    tasks, groups, by_depth = images * parts, images * -(-num // 16), num < MANY
+    order, offsets = (empty([images * num + i], torch.int32) for i in range(2))
+    starts = order.new_empty(images * tiles + 1)
+    count, box_count = (torch.empty((), dtype=torch.int64) for _ in range(2))
+    splats = Packed(Splats, means2d, conics, depths, opacities, extents, None)
+    work = Packed(
+        Work,
+        empty([groups * 16], torch.int32),
+        empty([groups * 16], torch.int16),
+        order.new_zeros(tasks, tiles),
+        count.new_empty(tasks),
+        count.new_empty(tasks),
+        order.new_empty(tasks),
+    )
+    if not by_depth:
+        torch.arange(images * num, out=order)
+    ordered = order if by_depth else None  # none: by index
+    lists = Packed(Lists, ordered, offsets, None, None, starts, box_count, count)
+    if by_depth and images:
+        _sort_lists(images, num, splats, None, lists)
+    parallel_launch(_count, tasks, [parts, grid, splats, lists, work], pieces=tasks)
+    parallel_launch(_offsets, 1, [parts, work, lists])
+    total = int(count)
+    check(total)
+    intersections, rows = (empty([total], torch.int32) for _ in range(2))
+    bins = Bins(order, offsets, intersections, rows, starts, box_count, count)
+    lists = Packed(Lists, ordered, *bins[1:])
+    staged = None if by_depth else empty([total, 3], torch.int32)
+    parallel_launch(_scatter, tasks, [parts, grid, splats, work, lists, staged], pieces=tasks)
+    if total and not by_depth:
+        _sort_lists(images * tiles, int(starts.diff().max()), splats, staged, lists)
+    return bins

@@ -1,13 +1,15 @@
 """Compositing on the CPU: threads take tile after tile, 16 lanes = the pixels of a 4 x 4 block.
 
-A tile of 16 x 16 pixels is 16 such blocks (``tuning.py`` has other sizes). For each Gaussian of the
-tile its blocks are tested at once (lanes = blocks), and only those that the ellipse touches are
-evaluated (lanes = pixels). The gradient walks back to front and writes one row per (tile, Gaussian)
-pair; rows are summed by Gaussian afterwards, without atomics. README.md §3 and §5 hold the maths.
+A tile of 16 x 16 pixels is 16 such blocks (``tuning.py`` has other sizes). The gradient walks back
+to front and writes one row per (tile, Gaussian) intersection; rows are summed by Gaussian
+afterwards, by one thread and without atomics: the same bits every time. README.md §3 and §5 hold
+the maths.
 """
 
 import functools
-from typing import no_type_check
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, no_type_check
 
 import torch
 import warp as wp
@@ -15,251 +17,173 @@ from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from ...runtime.views import vectors, view
+from ...runtime.native import native
+from ...runtime.views import Packed, struct
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
-from ..tiles import Bins, PairGradients, Picture, Walk, color_row, q_limit
-from . import lanes as L
-from .blend import blend_leaves
-from .lanes import block_leaves, lanes, lanes_int
-from .reduce import reduce_rows
+from ..tiles import SLACK, SLACK_ABS, Bins, Lists, PairGradients, Picture, Walk
 from .tuning import Tuning
 
-# To unroll the loops over blocks and pixels would take the compiler long, for no gain.
-_OPTIONS = {"enable_backward": False, "max_unroll": 1}
+_HERE = Path(__file__).parent
+_OPTIONS = {"enable_backward": False}
+_RUN = 1024  # Gaussians of a task of the sums
+_PIECES_PER_THREAD = 8
 
-_BLOCK_TEST = wp.constant(BLOCK_TEST)
-_STOPPED = wp.constant(STOPPED)
-_EMPTY_TILES = wp.constant(EMPTY_TILES)
-_ZERO_UPSTREAM = wp.constant(ZERO_UPSTREAM)
-_UNUSED = wp.constant(UNUSED)
-_AHEAD = wp.constant(8)  # pairs that pass while a Gaussian comes from memory
-_NEVER = wp.constant(2**31 - 1)
-_EXP2 = wp.constant(-0.72134752044)  # exp(-q/2) = 2^(_EXP2 q)
+# The coefficients of 2^f by degree of the polynomial, those of the highest power first.
+_EXP2 = {
+    2: (0.23842893540859222, 0.7034479975700378, 1.0004431009292603),
+    3: (0.0551716685295105, 0.2426111251115799, 0.6932609677314758, 0.9999280571937561),
+    4: (
+        *(9.570102207362652e-3, 5.591785907745361e-2, 0.240247443318367),
+        *(0.6931217908859253, 0.9999992847442627),
+    ),
+    5: (
+        *(1.32764715e-3, 9.67554133e-3, 5.55071327e-2),
+        *(0.240221197, 0.693146967, 1.00000007),
+    ),
+}
+
+
+def _polynomial(degree: int) -> str:
+    """C++ that makes p of f; degree 5 goes in pairs, which is a shorter chain than Horner's."""
+    c = [f"(F{{}} + {value!r}f)" for value in _EXP2[degree]]
+    if degree < 5:
+        steps = "".join(f" p = fma_(p, f, {value});" for value in c[1:])
+        return f"F p = {c[0]};{steps}"
+    high, middle, low = (f"fma_({c[i]}, f, {c[i + 1]})" for i in (0, 2, 4))
+    return f"const F f2 = f * f; const F p = fma_(fma_({high}, f2, {middle}), f2, {low});"
+
+
+@struct
+class Gaussians:
+    """What is composited: the Gaussians of I views, and their colours; or their gradients."""
+
+    means2d: wp.array[wp.vec2]
+    conics: wp.array[wp.vec3]
+    opacities: wp.array[wp.float32]
+    colors: wp.array2d[wp.float32]
+
+
+@struct
+class Walked:
+    """``Walk``, in its order."""
+
+    transmittances: wp.array2d[wp.float32]
+    stops: wp.array2d[wp.int32]
+    blocks: wp.array[wp.int32]
+    walked: wp.array[wp.int32]
+    blocks_walked: wp.array[wp.int64]
+
+
+@struct
+class Pixels:
+    """The pictures, or their gradients."""
+
+    renders: wp.array[wp.float32]
+    alphas: wp.array[wp.float32]
+
+
+@struct
+class Workers:
+    """What the workers of a launch share, the next tile to take, and what each has of its own."""
+
+    counter: wp.array[wp.int32]
+    workspace: wp.array[wp.float32]
+
+
+@struct
+class Rows:
+    """The sums of each intersection: six moments of h (README eq. 11) and the colours."""
+
+    sums: wp.array2d[wp.float32]  # [P, 6 + C]
+    written: wp.array[wp.uint8]  # [P], 0 where a row was not written and is not read
+    skipped: wp.array[wp.int32]  # [tiles], 1 where a tile was not walked
+    geometry: int  # whether anything but colours is asked for
 
 
 @functools.cache
-def _forward_kernel(tuning: Tuning):
-    columns, blocks, side = tuning.columns, tuning.blocks, tuning.tile
-    leaves, blend = block_leaves(tuning), blend_leaves(tuning).blend
-    first_x, first_y, touched = leaves.first_x, leaves.first_y, leaves.touched
+def _kernels(tuning: Tuning) -> SimpleNamespace:
+    """The kernels ``forward`` and ``backward`` of a tuning."""
+    lanes = range(16)
+    starts_x = [4 * (b % tuning.columns) // tuning.width * tuning.width for b in lanes]
+    starts_y = [4 * (b // tuning.columns) // tuning.height * tuning.height for b in lanes]
+    defines: dict[str, Any] = {
+        **{"TILE": tuning.tile, "WIDTH": tuning.width, "HEIGHT": tuning.height},
+        "COLUMN_STARTS": f"{{{', '.join(map(str, starts_x))}}}",
+        "ROW_STARTS": f"{{{', '.join(map(str, starts_y))}}}",
+        "POLYNOMIAL": _polynomial(tuning.degree),
+        **{"SLACK": SLACK, "SLACK_ABS": SLACK_ABS, "BLOCK_TEST": BLOCK_TEST, "STOPPED": STOPPED},
+        **{"EMPTY_TILES": EMPTY_TILES, "ZERO_UPSTREAM": ZERO_UPSTREAM, "UNUSED": UNUSED},
+    }
+
+    @wp.func_native(native(_HERE / "composite.inl", **defines))
+    def blend(
+        worker: int,
+        picture: Picture,
+        splats: Gaussians,
+        lists: Lists,
+        walk: Walked,
+        pixels: Pixels,
+        workers: Workers,
+    ): ...
+
+    @wp.func_native(native(_HERE / "composite_vjp.inl", **defines))
+    def unblend(
+        worker: int,
+        picture: Picture,
+        splats: Gaussians,
+        lists: Lists,
+        walk: Walked,
+        pixels: Pixels,
+        workers: Workers,
+        rows: Rows,
+    ): ...
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     @no_type_check
     def composite(
-        offset: wp.int32,
+        offset: int,
         picture: Picture,
-        tiles: wp.int32,
-        means2d_in: wp.array[wp.vec2],
-        conics_in: wp.array[wp.vec3],
-        view_opacities_in: wp.array[wp.float32],
-        colors_in: wp.array2d[wp.float32],
-        pairs_in: wp.array[wp.int32],
-        starts_in: wp.array[wp.int32],
-        counter_out: wp.array[wp.int32],
-        room_out: wp.array2d[lanes],
-        transmittances_out: wp.array[lanes],
-        stops_out: wp.array[lanes_int],
-        blocks_out: wp.array[wp.int32],
-        walked_out: wp.array[wp.int32],
-        blocks_walked_out: wp.array[wp.int64],
-        renders_out: wp.array4d[wp.float32],
-        alphas_out: wp.array4d[wp.float32],
+        splats_in: Gaussians,
+        lists_in: Lists,
+        walk_out: Walked,
+        pixels_out: Pixels,
+        workers_out: Workers,
     ):
-        """``counter`` is the next tile to take, ``room`` holds a worker's sums of colours."""
         worker = offset + wp.tid()
-        channels = colors_in.shape[1]
-        tile = L.take(counter_out)
-        while tile < tiles:
-            begin = starts_in[tile]
-            end = starts_in[tile + 1]
-            walked_out[tile] = 0
-            blocks_walked_out[tile] = wp.int64(0)
-            if begin < end or (picture.skip & _EMPTY_TILES) == 0:
-                image = tile // (picture.tiles_x * picture.tiles_y)
-                x = tile % picture.tiles_x * side
-                y = tile // picture.tiles_x % picture.tiles_y * side
-                xs = first_x(float(x) + 0.5)
-                ys = first_y(float(y) + 0.5)
-                first = tile * blocks
-                for b in range(blocks):
-                    transmittances_out[first + b] = lanes(1.0)
-                    stops_out[first + b] = lanes_int(_NEVER)
-                for i in range(blocks * channels):
-                    room_out[worker, i] = lanes(0.0)
-
-                inside = L.blocks_inside(picture.width - x, picture.height - y, columns)
-                alive = inside
-                evaluated = wp.int64(0)
-                k = begin
-                while k < end and alive != 0:
-                    g = pairs_in[k]
-                    later = pairs_in[wp.min(k + _AHEAD, end - 1)]
-                    row = color_row(picture, later)
-                    L.fetch(means2d_in, conics_in, view_opacities_in, colors_in, later, row)
-                    mean = means2d_in[g]
-                    conic = conics_in[g]
-                    shear = conic[1]
-                    opacity = view_opacities_in[g]
-                    bits = alive
-                    if (picture.skip & _BLOCK_TEST) != 0:
-                        slope = -conic[0] * shear / (conic[0] * shear * shear + conic[2])
-                        limit = q_limit(opacity, picture.alpha_min)
-                        bits = alive & touched(
-                            xs, ys, mean[0], mean[1], conic[0], shear, conic[2], slope, limit
-                        )
-                    used = wp.int32(0)
-                    if bits != 0:
-                        used = blend(
-                            bits,
-                            k,
-                            float(x) + 0.5 - mean[0],
-                            float(y) + 0.5 - mean[1],
-                            shear,
-                            _EXP2 * conic[0],
-                            _EXP2 * conic[2],
-                            opacity,
-                            picture.alpha_min,
-                            picture.alpha_max,
-                            picture.t_min,
-                            colors_in,
-                            color_row(picture, g),
-                            first,
-                            worker,
-                            transmittances_out,
-                            stops_out,
-                            room_out,
-                        )
-                        evaluated += wp.int64(L.count_bits(bits))
-                        if (picture.skip & _STOPPED) != 0:
-                            alive = alive & ~(used >> 16)
-                    blocks_out[k] = used & 0xFFFF
-                    k += 1
-                walked_out[tile] = k - begin
-                blocks_walked_out[tile] = evaluated
-
-                while inside != 0:
-                    b = L.lowest_bit(inside)
-                    inside = inside & (inside - 1)
-                    px = x + (b % columns) * 4
-                    py = y + (b // columns) * 4
-                    L.store_block(
-                        alphas_out, image, py, px, 0, L.coverage(transmittances_out[first + b])
-                    )
-                    for c in range(channels):
-                        L.store_block(
-                            renders_out, image, py, px, c, room_out[worker, b * channels + c]
-                        )
-            tile = L.take(counter_out)
-
-    return composite
-
-
-@functools.cache
-def _backward_kernel(tuning: Tuning):
-    columns, blocks, side = tuning.columns, tuning.blocks, tuning.tile
-    unblend = blend_leaves(tuning).unblend
+        blend(worker, picture, splats_in, lists_in, walk_out, pixels_out, workers_out)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     @no_type_check
     def composite_vjp(
-        offset: wp.int32,
+        offset: int,
         picture: Picture,
-        tiles: wp.int32,
-        geometry: wp.int32,
-        means2d_in: wp.array[wp.vec2],
-        conics_in: wp.array[wp.vec3],
-        view_opacities_in: wp.array[wp.float32],
-        colors_in: wp.array2d[wp.float32],
-        pairs_in: wp.array[wp.int32],
-        rows_in: wp.array[wp.int32],
-        starts_in: wp.array[wp.int32],
-        transmittances_in: wp.array[lanes],
-        stops_in: wp.array[lanes_int],
-        blocks_in: wp.array[wp.int32],
-        walked_in: wp.array[wp.int32],
-        v_renders_in: wp.array4d[wp.float32],
-        v_alphas_in: wp.array4d[wp.float32],
-        counter_out: wp.array[wp.int32],
-        room_out: wp.array2d[lanes],
-        v_pairs_out: wp.array2d[wp.float32],
-        written_out: wp.array[wp.uint8],
-        skipped_out: wp.array[wp.int32],
+        splats_in: Gaussians,
+        lists_in: Lists,
+        walk_in: Walked,
+        v_pixels_in: Pixels,
+        workers_out: Workers,
+        rows_out: Rows,
     ):
-        """``counter`` is the next tile to take, ``room`` is as ``unblend`` has it."""
         worker = offset + wp.tid()
-        channels = colors_in.shape[1]
-        upstream = 32 + channels
-        tile = L.take(counter_out)
-        while tile < tiles:
-            image = tile // (picture.tiles_x * picture.tiles_y)
-            x = tile % picture.tiles_x * side
-            y = tile // picture.tiles_x % picture.tiles_y * side
-            first = tile * blocks
-            any_v = wp.int32(0)
-            inside = wp.int32(0)
-            if walked_in[tile] > 0:
-                inside = L.blocks_inside(picture.width - x, picture.height - y, columns)
-            every = inside
-            while inside != 0:
-                b = L.lowest_bit(inside)
-                inside = inside & (inside - 1)
-                px = x + (b % columns) * 4
-                py = y + (b // columns) * 4
-                place = upstream + b * (channels + 1)
-                v_alpha = L.load_block(v_alphas_in, image, py, px, 0)
-                room_out[worker, place + channels] = v_alpha
-                any_v = any_v | L.any_nonzero(v_alpha)
-                for c in range(channels):
-                    v_c = L.load_block(v_renders_in, image, py, px, c)
-                    room_out[worker, place + c] = v_c
-                    any_v = any_v | L.any_nonzero(v_c)
-            wanted = any_v != 0 or ((picture.skip & _ZERO_UPSTREAM) == 0 and every != 0)
-            skipped_out[tile] = wp.where(wanted, 0, 1)
-            if wanted:
-                for b in range(blocks):
-                    room_out[worker, b] = L.absolute(transmittances_in[first + b])
-                    room_out[worker, 16 + b] = lanes(0.0)
-                k = starts_in[tile] + walked_in[tile] - 1
-                while k >= starts_in[tile]:
-                    bits = blocks_in[k]
-                    later = wp.max(k - _AHEAD, starts_in[tile])
-                    if blocks_in[later] != 0:
-                        L.fetch_row(v_pairs_out, written_out, rows_in[later])
-                        later = pairs_in[later]
-                        row = color_row(picture, later)
-                        L.fetch(means2d_in, conics_in, view_opacities_in, colors_in, later, row)
-                    if (picture.skip & _UNUSED) == 0:
-                        bits = every
-                    if bits != 0:
-                        g = pairs_in[k]
-                        mean = means2d_in[g]
-                        conic = conics_in[g]
-                        unblend(
-                            bits,
-                            k,
-                            geometry,
-                            float(x) + 0.5 - mean[0],
-                            float(y) + 0.5 - mean[1],
-                            conic[1],
-                            _EXP2 * conic[0],
-                            _EXP2 * conic[2],
-                            view_opacities_in[g],
-                            picture.alpha_min,
-                            picture.alpha_max,
-                            colors_in,
-                            color_row(picture, g),
-                            first,
-                            worker,
-                            stops_in,
-                            room_out,
-                            rows_in[k],
-                            v_pairs_out,
-                        )
-                        written_out[rows_in[k]] = wp.uint8(1)
-                    k -= 1
-            tile = L.take(counter_out)
+        unblend(worker, picture, splats_in, lists_in, walk_in, v_pixels_in, workers_out, rows_out)
 
-    return composite_vjp
+    return SimpleNamespace(forward=composite, backward=composite_vjp)
+
+
+@wp.func_native(native(_HERE / "sums.inl", RUN=_RUN))
+def _sum_run(begin: int, splats: Gaussians, lists: Lists, rows: Rows, v: Gaussians): ...
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _sum_rows(offset: int, splats_in: Gaussians, lists_in: Lists, rows_in: Rows, v_out: Gaussians):
+    _sum_run((offset + wp.tid()) * wp.static(_RUN), splats_in, lists_in, rows_in, v_out)
+
+
+def _workers(size: int) -> Packed:
+    """Room for ``size`` lanes of each worker."""
+    workspace = torch.empty(torch.get_num_threads() * size * 16)
+    return Packed(Workers, torch.zeros(1, dtype=torch.int32), workspace)
 
 
 def composite_forward(
@@ -278,7 +202,7 @@ def composite_forward(
         conics: ``[I, N, 3]``.
         view_opacities: ``[I, N]``.
         colors: ``[rows, C]``, rows = B * N, or I * N if ``picture.colors_per_view``.
-        bins: from ``bin_op``.
+        bins: from ``bin_gaussians``.
         picture: from ``make_picture``, with the tuning's tile.
         tuning: the choice of kernels; the lists were made with its tile.
 
@@ -289,7 +213,7 @@ def composite_forward(
     tiles = images * picture.tiles_x * picture.tiles_y
     renders = colors.new_zeros(images, picture.height, picture.width, channels)
     alphas = colors.new_zeros(images, picture.height, picture.width, 1)
-    workers, blocks = torch.get_num_threads(), tuning.blocks
+    blocks = tuning.blocks
     walk = Walk(
         transmittances=colors.new_empty(tiles * blocks, 16),
         stops=bins.pairs.new_empty(tiles * blocks, 16),
@@ -297,31 +221,15 @@ def composite_forward(
         walked=bins.pairs.new_empty(tiles),
         blocks_walked=bins.pairs.new_empty(tiles, dtype=torch.int64),
     )
-    parallel_launch(
-        _forward_kernel(tuning),
-        workers,
-        [
-            picture,
-            tiles,
-            vectors(means2d, wp.vec2),
-            vectors(conics, wp.vec3),
-            view_opacities.view(-1),
-            colors,
-            bins.pairs,
-            bins.starts,
-        ],
-        [
-            bins.pairs.new_zeros(1),
-            view(colors.new_empty(workers, 16 * channels, 16), lanes),
-            view(walk.transmittances, lanes),
-            view(walk.stops, lanes_int),
-            walk.blocks,
-            walk.walked,
-            walk.blocks_walked,
-            renders,
-            alphas,
-        ],
-    )
+    arguments = [
+        picture,
+        Packed(Gaussians, means2d, conics, view_opacities, colors),
+        Packed(Lists, *bins),
+        Packed(Walked, *walk),
+        Packed(Pixels, renders, alphas),
+        _workers(tuning.blocks * channels),
+    ]
+    parallel_launch(_kernels(tuning).forward, torch.get_num_threads(), arguments)
     return renders, alphas, walk
 
 
@@ -356,38 +264,53 @@ def composite_backward(
     Returns:
         The gradients and ``skipped [tiles]`` int32, 1 where a tile was not walked.
     """
-    tiles, channels = walk.walked.numel(), colors.shape[1]
-    v_pairs = empty([bins.pairs.numel(), 6 + channels], torch.float32)
+    channels = colors.shape[1]
+    sums = empty([bins.pairs.numel(), 6 + channels], torch.float32)
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     skipped = torch.empty_like(walk.walked)
-    workers, room = torch.get_num_threads(), 32 + channels + 16 * (channels + 1)
-    parallel_launch(
-        _backward_kernel(tuning),
-        workers,
-        [
-            picture,
-            tiles,
-            int(geometry),
-            vectors(means2d, wp.vec2),
-            vectors(conics, wp.vec3),
-            view_opacities.view(-1),
-            colors,
-            bins.pairs,
-            bins.rows,
-            bins.starts,
-            view(walk.transmittances, lanes),
-            view(walk.stops, lanes_int),
-            walk.blocks,
-            walk.walked,
-            v_renders,
-            v_alphas,
-        ],
-        [
-            bins.pairs.new_zeros(1),
-            view(colors.new_empty(workers, room, 16), lanes),
-            v_pairs,
-            written,
-            skipped,
-        ],
+    arguments = [
+        picture,
+        Packed(Gaussians, means2d, conics, view_opacities, colors),
+        Packed(Lists, *bins),
+        Packed(Walked, *walk),
+        Packed(Pixels, v_renders, v_alphas),
+        _workers(channels + tuning.blocks * (channels + 1)),
+        Packed(Rows, sums, written, skipped, int(geometry)),
+    ]
+    parallel_launch(_kernels(tuning).backward, torch.get_num_threads(), arguments)
+    return reduce_rows(sums, written, bins, conics, view_opacities, geometry), skipped
+
+
+def reduce_rows(
+    sums: Tensor,
+    written: Tensor,
+    bins: Bins,
+    conics: Tensor,
+    view_opacities: Tensor,
+    geometry: bool,
+) -> PairGradients:
+    """Sums rows by (view, Gaussian), in the order in which intersections are numbered.
+
+    Args:
+        sums: ``[P, 6 + C]``: six moments of h (README eq. 11), then the colours.
+        written: ``[P]`` uint8, 0 where a row was not written and is not read.
+        bins: as forward.
+        conics: ``[I, N, 3]``.
+        view_opacities: ``[I, N]``.
+        geometry: whether anything but colours is asked for.
+    """
+    lead, channels = view_opacities.shape, sums.shape[1] - 6
+    v_means2d, v_conics, v_opacities = (
+        empty([*lead, *size], torch.float32) if geometry else None for size in ((2,), (3,), ())
     )
-    return reduce_rows(v_pairs, written, bins, conics, view_opacities, geometry), skipped
+    v = PairGradients(v_means2d, v_conics, v_opacities, empty([*lead, channels], torch.float32))
+    arguments = [
+        Packed(Gaussians, None, conics, view_opacities, None),
+        Packed(Lists, *bins),
+        Packed(Rows, sums, written, None, int(geometry)),
+        Packed(Gaussians, *v),
+    ]
+    tasks = -(-bins.order.numel() // _RUN)
+    pieces = min(tasks, _PIECES_PER_THREAD * torch.get_num_threads())
+    parallel_launch(_sum_rows, tasks, arguments, pieces=pieces)
+    return v

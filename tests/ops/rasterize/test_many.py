@@ -1,14 +1,17 @@
-"""Lists of many Gaussians, which are sorted tile by tile, and the kernels that go with them."""
+"""The CPU's tile lists, sorted by view or tile by tile, and the kernels that go with them."""
+
+from functools import partial
 
 import pytest
 import torch
 from helpers.raster import NAMES, leaves, make
 
-from gamba_warp.kernels.rasterize import Skip, project, rasterization
+from gamba_warp.kernels.rasterize import Skip, ops, project, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
+from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.project import LensOptions, make_lens
 from gamba_warp.kernels.rasterize.tiles import PairGradients
 
@@ -27,20 +30,23 @@ def call(scene, **options):
     return {"renders": renders, "alphas": alphas, **found}, meta
 
 
-def both_ways(monkeypatch, scene, **options):
-    """The results of ``call`` with the lists of few Gaussians, and with those of many."""
-    made = []
+def assert_same(want, got):
+    for name, value in want[0].items():
+        assert torch.equal(got[0][name], value), name
+    for name in LISTS:
+        assert torch.equal(getattr(got[1].bins, name), getattr(want[1].bins, name)), name
+
+
+def assert_lists(monkeypatch, scene, **options):
+    """Lists sorted before they are written or after are those of CUDA's scalar kernels."""
+    with monkeypatch.context() as patch:
+        scalar = partial(bin_cuda.bin_views, exact=True)
+        patch.setattr(ops, "_bin_views", lambda device, exact: scalar)
+        want = call(scene, **options)
     for many in (1 << 30, 0):
         monkeypatch.setattr(bin_cpu, "MANY", many)
-        made.append(call(scene, **options))
-    return made
-
-
-def assert_same(few, many):
-    for name, value in few[0].items():
-        assert torch.equal(many[0][name], value), name
-    for name in LISTS:
-        assert torch.equal(getattr(many[1].bins, name), getattr(few[1].bins, name)), name
+        assert_same(want, call(scene, **options))
+    return want[1]
 
 
 @pytest.mark.parametrize("size", [0.004, 0.03, 0.5])  # from a pixel to most rows of tiles
@@ -49,19 +55,17 @@ def test_same_lists_pictures_and_gradients(monkeypatch, size, shape):
     scene = make(2, 2, 333, *shape, size=size)
     scene["opacities"][0, :50] = 1e-3  # culled
     scene["means"][1, :50, 2] = torch.nan
-    few, many = both_ways(monkeypatch, scene)
-    assert_same(few, many)
-    assert few[1]["pairs"] > 100
+    assert assert_lists(monkeypatch, scene)["pairs"] > 100
 
 
 @pytest.mark.parametrize("options", [{"skip": Skip(tile_test=False)}, {"render_mode": "RGB+ED"}])
 def test_same_with_options(monkeypatch, options):
-    assert_same(*both_ways(monkeypatch, make(1, 2, 200, 50, 70), **options))
+    assert_lists(monkeypatch, make(1, 2, 200, 50, 70), **options)
 
 
 def test_same_with_another_tile(monkeypatch):
     with use_tuning(Tuning(tile=8)):
-        assert_same(*both_ways(monkeypatch, make(1, 2, 200, 50, 70)))
+        assert_lists(monkeypatch, make(1, 2, 200, 50, 70))
 
 
 def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):

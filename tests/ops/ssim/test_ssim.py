@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from gamba_warp.kernels.ssim import dissimilarity
-from gamba_warp.kernels.ssim.cpu import launch
+from gamba_warp.kernels.ssim import dissimilarity, lanes
 from gamba_warp.kernels.ssim.reference import dissimilarity_reference
 
 
@@ -28,7 +27,7 @@ def truth(got, want):
 )
 @pytest.mark.parametrize("together", [1, 1 << 20])
 def test_value_and_gradient_are_those_of_the_definition(monkeypatch, shape, together):
-    monkeypatch.setattr(launch, "_TOGETHER", together)
+    monkeypatch.setattr(lanes, "_TOGETHER", together)
     got, want = pictures(shape)
     value, slope = dissimilarity(got, want, True)
     wanted, gradient = truth(got, want)

@@ -1,1 +1,0 @@
-"""The kernels of 1 - SSIM for CPUs."""

@@ -1,0 +1,139 @@
+"""1 - SSIM of float32 pictures on a CPU: sixteen adjacent numbers of a row at a time.
+
+Four kernels, each a file of C++ with what they share in ``rows.h``; README.md has the formulas.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, no_type_check
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ..runtime.launch import parallel_launch
+from ..runtime.native import native
+from ..runtime.views import Packed, struct
+from .constants import C1, C2, EDGE, SIGMA, WINDOW
+from .products import box_of_windows, groups
+
+_LANES = 16
+_STRIP = 8  # rows of windows of a task, whose values are summed before they are stored
+# Pictures of a launch have at most so many numbers: what lies between two launches is some ten
+# times as large, and should stay in the cache.
+_TOGETHER = 1 << 18
+
+
+@struct
+class Maps:
+    """Pictures and what lies between the launches; without a slope the last three are none."""
+
+    channels: int
+    scale: float  # 1 / windows of a picture, all channels
+    got: wp.array3d[wp.float32]
+    want: wp.array3d[wp.float32]
+    shift: wp.array3d[wp.float32]  # [P, 1, E], what is taken off the sums
+    hor: wp.array3d[wp.float32]
+    values: wp.array3d[wp.float32]
+    by: wp.array3d[wp.float32]
+    col: wp.array3d[wp.float32]
+    slope: wp.array3d[wp.float32]
+
+
+def _weights() -> str:
+    """The window's eleven weights of a row, as C++ text."""
+    offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    line = torch.exp(-offsets.square() / (2 * SIGMA**2))
+    return f"{{{', '.join(f'{float(w)!r}f' for w in line / line.sum())}}}"
+
+
+_DEFINES = {"WEIGHTS": _weights(), "STRIP": _STRIP, "TWO_C1": 2 * C1, "TWO_C2": 2 * C2}
+
+
+def _kernel(name: str) -> Any:
+    """The kernel of a file: a task for each row, or strip of rows, and sixteen numbers of it."""
+
+    @wp.func_native(native(Path(__file__).with_name(f"{name}.inl"), **_DEFINES))
+    def run(task: int, group: int, maps: Maps): ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    @no_type_check
+    def kernel(offset: int, maps_out: Maps):
+        task, group = wp.tid()
+        run(offset + task, group, maps_out)
+
+    return kernel
+
+
+_across, _down, _up, _back = map(_kernel, ("across", "down", "up", "back"))
+
+
+def dissimilarity_on_lanes(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tensor | None]:
+    """Computes ``dissimilarity`` of float32 pictures on the CPU.
+
+    Args:
+        got: ``[P, H, W, C]`` without a gradient.
+        want: the same shape.
+        slope: whether the derivative is wanted.
+
+    Returns:
+        Values ``[P]`` and the slope ``[P, H, W, C]`` or None.
+    """
+    got, want = got.contiguous(), want.contiguous()
+    slopes = torch.zeros_like(got) if slope else None
+    size = max(1, min(len(got), _TOGETHER // max(1, got[:1].numel())))
+    height, width, channels = got.shape[1:]
+    most = sum(map(math.prod, _between(size, height, width, channels, slope)))
+    scratch = got.new_empty(max(most, got[:size].numel()))
+    values = [_compute(*group, scratch) for group in groups(size, got, want, slopes)]
+    return torch.cat(values) if values else got.new_zeros(0), slopes
+
+
+def _between(
+    count: int, height: int, width: int, channels: int, slope: bool
+) -> list[tuple[int, int, int]]:
+    """The shapes of what lies between launches: ``hor, values``, and for a slope ``by, col``."""
+    rows, inner = height - EDGE, (width - EDGE) * channels
+    shapes = [(count, 4 * height, inner), (count, -(-rows // _STRIP), inner)]
+    if not slope:
+        return shapes
+    return [*shapes, (count, 3 * rows, inner), (count, 3 * height, inner + 2 * EDGE * channels)]
+
+
+def _compute(got: Tensor, want: Tensor, slope: Tensor | None, scratch: Tensor) -> Tensor:
+    """Values ``[n]`` of pictures that are computed together; the slope goes into ``slope``."""
+    windows = (got.shape[1] - EDGE) * (got.shape[2] - EDGE) * got.shape[3]
+    # Reductions of bool are slow. A difference of float32 is 0 only between equal numbers.
+    apart = torch.sub(got, want, out=scratch[: got.numel()].view(got.shape)).abs_().amax(0)
+    box = box_of_windows((apart != 0).any(-1))
+    if box is None:
+        return got.new_zeros(len(got))
+    got, want = got[:, box[0], box[1]], want[:, box[0], box[1]]
+    count, height, width, channels = got.shape
+    shapes = _between(count, height, width, channels, slope is not None)
+    sizes = [math.prod(shape) for shape in shapes]
+    pieces = scratch[: sum(sizes)].split(sizes)
+    hor, values, *between = (x.view(shape) for x, shape in zip(pieces, shapes))
+    # Twice the corner's colour, for every pixel of a row.
+    shift = (2 * want[:, :1, :1]).repeat(1, 1, width, 1).flatten(2)
+    by, col, out = (None,) * 3 if slope is None else (*between, _rows(slope[:, box[0], box[1]]))
+    a, b = _rows(got), _rows(want)
+    maps = Packed(Maps, channels, 1 / windows, a, b, shift, hor, values, by, col, out)
+    inner, outer = (-(-x.shape[2] // _LANES) for x in (hor, a))
+    parallel_launch(_across, (count * height, inner), [maps])
+    parallel_launch(_down, (count * values.shape[1], inner), [maps])
+    if col is not None:
+        edge = EDGE * channels
+        col[..., :edge] = col[..., -edge:] = 0
+        parallel_launch(_up, (count * height, inner), [maps])
+        parallel_launch(_back, (count * height, outer), [maps])
+    return values.sum((1, 2)) / windows
+
+
+def _rows(pictures: Tensor) -> Tensor:
+    """``[P, H, W, C]``, whose rows are dense, as ``[P, H, W · C]`` without a copy."""
+    count, height, width, channels = pictures.shape
+    strides = (*pictures.stride()[:2], 1)
+    return pictures.as_strided((count, height, width * channels), strides)
