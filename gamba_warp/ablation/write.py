@@ -11,8 +11,9 @@ import numpy as np
 from ..errors import UserError
 from ..files import write_json, write_text
 from ..images import load_rgba
-from ..pages.curves import Chart, draw_charts
-from ..pages.page import Section, demo_page, svg_chart
+from ..pages.charts import Axis, Point, Series, chart
+from ..pages.curves import Chart, curves_section
+from ..pages.page import Section, demo_page
 from ..pages.run_log import read_run_log
 from .figures import RowResult, SeedResult, collect, empty_psnr
 from .jobs import STRIPS, Settings
@@ -55,13 +56,10 @@ def _needed(series: Mapping[str, Any]) -> list[Section]:
     found = []
     for name, part in series.items():
         text = " ".join([DEFINITION, *needed_sentences(part)])
-        points = []
-        if part["quality"] is not None:
-            points = [
-                (float(np.log2(n)), 100 * q) for n, q in zip(part["numbers"], part["quality"])
-            ]
-        chart = svg_chart({name: points}, "quality [%] over log2 of the number of Gaussians")
-        found.append(Section(f"How many Gaussians are needed: {name}", text, fragment=chart))
+        points = [Point(n, 100 * q) for n, q in zip(part["numbers"], part["quality"] or ())]
+        axes = Axis("Gaussians", values=part["numbers"]), Axis("quality [%]", False)
+        drawn = chart([Series(name, points, "straight")], *axes)
+        found.append(Section(f"How many Gaussians are needed: {name}", text, charts=[drawn]))
     return found
 
 
@@ -92,7 +90,7 @@ def _curves(results: list[RowResult], compare_with: str | None) -> list[Section]
                 lines[trained[compare_with or ""].row.label] = f"{key} of another"
             charts.append(Chart(label, lines, logarithmic))
         text = f"Seed {min(trained[name].seeds)}; the minutes are those of {title}."
-        found.append(Section(f"Curves: {title}", text, fragment=draw_charts(charts, record)))
+        found.append(curves_section(f"Curves: {title}", text, record, charts))
     return found
 
 

@@ -18,7 +18,7 @@ from ..formats.ply import load_ply
 from ..gaussians import Gaussians
 from ..images import load_rgba
 from .card import OF_GROUNDS, OF_PICTURES, about_model, read_card
-from .curves import draw_curves
+from .curves import curves_section
 from .page import Section, demo_page
 from .run_log import read_run_log
 from .turntable import turntable_frames
@@ -179,7 +179,7 @@ def _trained_here(results: DemoResults, strips: list[Path]) -> list[Section]:
         f"objects of the starter set, for {record.step:,} steps{_compared(results.shipped)}. Its "
         "curves show that training works, its pictures what more of it is for."
     )
-    sections = [Section("Trained here", text, fragment=draw_curves(record))]
+    sections = [curves_section("Trained here", text, record)]
     for strip in strips:
         other = results.views_here / "strips" / strip.name
         if other.exists():

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import html
-import io
 import json
 import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
 from ..errors import UserError
-from ..images import load_rgba, to_uint8
+from ..images import load_rgba
 from .card import OF_PICTURES
-from .curves import draw_curves
-from .page import Section, data_uri, demo_page
+from .curves import curves_section
+from .page import Section, demo_page
 from .run_log import RunRecord, read_run_log
 
 PAGE = "index.html"
@@ -40,7 +35,7 @@ def write_run_page(run: Path, path: Path | None = None) -> Path:
     record = read_run_log(run / "log.jsonl")
     sections = [
         Section("Run", table=_facts(record)),
-        Section("Curves", _about_curves(record), fragment=draw_curves(record)),
+        curves_section("Curves", _about_curves(record), record),
         *_validation(record),
         *_samples(run),
         *_warnings(record),
@@ -142,15 +137,7 @@ def _samples(run: Path) -> list[Section]:
         f"Held-out objects at step {step:,}: in each pair of rows the true views are above and "
         "the predicted ones below; the first column is the input view."
     )
-    return [Section("Pictures", text, fragment=_webp(picture))]
-
-
-def _webp(picture: np.ndarray) -> str:
-    # A quarter of a PNG's size, and no difference that one sees.
-    content = io.BytesIO()
-    Image.fromarray(to_uint8(picture)).save(content, "WEBP", quality=85)
-    source = data_uri(content.getvalue(), "image/webp")
-    return f'<img class="strip" alt="sample pictures" src="{source}">'
+    return [Section("Pictures", text, strip=picture)]
 
 
 def _warnings(record: RunRecord) -> list[Section]:
@@ -164,10 +151,7 @@ def _warnings(record: RunRecord) -> list[Section]:
 
 def _configuration(record: RunRecord) -> list[Section]:
     config, command = record.start.get("config"), record.start.get("command")
-    parts = []
-    if isinstance(command, str):
-        parts.append(f"<pre>{html.escape(command[:10_000])}</pre>")
+    section = Section("Command", code=command[:10_000] if isinstance(command, str) else "")
     if isinstance(config, dict):
-        text = html.escape(json.dumps(config, indent=2)[:30_000])
-        parts.append(f"<details><summary>All options</summary><pre>{text}</pre></details>")
-    return [Section("Command", fragment="\n".join(parts))] if parts else []
+        section.details = {"All options": json.dumps(config, indent=2)[:30_000]}
+    return [section] if section.code or section.details else []

@@ -12,7 +12,8 @@ from helpers.gaussians import some
 from PIL import Image, features
 
 from gamba_warp.errors import UserError
-from gamba_warp.pages.page import Section, demo_page, reconstruction_page, svg_chart
+from gamba_warp.pages.charts import Axis, Point, Series, chart
+from gamba_warp.pages.page import Section, demo_page, page_text, reconstruction_page
 
 
 class Page(html.parser.HTMLParser):
@@ -68,8 +69,7 @@ def full(title="A chair", **changes):
         views={"Predicted": pictures(3, 8, 8, 3), "Truth": pictures(2, 8, 8, 3)},
         header=("", "PSNR"),
         table=[("input", 24.3456), ("novel", 19), ("note", "n/a")],
-        curves={"loss": [(0, 1.0), (10, 0.1)]},
-        curves_label="loss",
+        charts=[chart([Series("loss", [Point(0, 1.0), Point(10, 0.1)])], *2 * [Axis("x", False)])],
     )
     return Section(title, **{**values, **changes})
 
@@ -129,13 +129,19 @@ def test_pictures_come_back_from_the_page(tmp_path):
 
 def test_text_is_escaped(tmp_path):
     nasty = '</script><b onload="x">&'
-    section = Section(nasty, text=nasty, table=[(nasty, 1)], header=(nasty, nasty))
-    section.views, section.curves = {nasty: pictures(1, 4, 4, 3)}, {nasty: [(0, 1), (1, 2)]}
-    section.curves_label = nasty
+    section = Section(nasty, text=nasty, header=(nasty, nasty), code=nasty)
+    section.table, section.details = [(nasty, 1), (1.5, nasty)], {nasty: nasty}
+    section.views, section.files = {nasty: pictures(1, 4, 4, 3)}, [nasty]
+    section.links = {nasty: frames(1)[0]}
+    points = [Point(0, 1, nasty), Point(1, 2)]
+    axes = Axis(nasty, False), Axis(nasty, False)
+    section.charts = [chart([Series(nasty, points)], *axes, name=nasty, tooltips=[(0.5, nasty)])]
     demo_page(tmp_path / "a.html", [section], title=nasty, text=nasty)
     page = Page(tmp_path / "a.html")
     assert not page.all("b") and "</script><b" not in page.source
-    assert page.text.count(nasty) == 11
+    assert page.text.count(nasty) == 21
+    assert page.all("svg")[0]["aria-label"] == nasty
+    assert "&lt;b&gt;" in page_text("", "", [Section("", charts=["<b>"])]), "a text is no SVG"
 
 
 def test_tables_show_numbers_to_four_digits(tmp_path):
@@ -144,6 +150,12 @@ def test_tables_show_numbers_to_four_digits(tmp_path):
     source = Page(tmp_path / "a.html").source
     for text in ("<td>a</td>", ">24.35<", ">1e-07<", ">12,345<"):
         assert text in source
+    rows = [("-1.5", "2 to 3", "0.5 [0.4, 0.6]", "reached"), ("5 %", "n/a", "-", "b [c]")]
+    written = page_text("", "", [Section("t", table=rows, header="abcd"), Section("", table=rows)])
+    for text in ("-1.5", "2 to 3", "5 %"):
+        assert f'<td class="number">{text}</td>' in written and f"<td>{text}</td>" in written
+    assert "<td>0.5 <span>[0.4, 0.6]</span></td>" in written and "<td>b [c]</td>" in written
+    assert '<td class="reached">reached</td>' in written
 
 
 def test_a_bare_section_and_no_sections(tmp_path):
@@ -153,40 +165,36 @@ def test_a_bare_section_and_no_sections(tmp_path):
     assert Page(tmp_path / "a.html").all("h1")
 
 
-def points(svg):
-    return [
-        [tuple(map(float, pair.split(","))) for pair in line.split()]
-        for line in re.findall(r'points="([^"]*)"', svg)
-    ]
+def drawn(ends=None, logarithmic=False, **lines):
+    """A chart of lines of pairs, and the places of their points."""
+    series = [Series(name, [Point(*p) for p in pairs], "curve") for name, pairs in lines.items()]
+    svg = chart(series, Axis("steps", False, ends=ends), Axis("y", logarithmic))
+    found = [re.findall(r"[^ ,]+", line) for line in re.findall(r'points="([^"]*)"', svg)]
+    return svg, [list(zip(map(float, at[::2]), map(float, at[1::2]))) for at in found]
 
 
 def test_charts_place_their_points():
-    svg = svg_chart({"a": [(0, 0), (50, 5), (100, 10)], "b": [(100, 0)]}, "y")
-    first, second = points(svg)
+    svg, (first, second) = drawn((0, 100), a=[(0, 0), (50, 5), (100, 10)], b=[(100, 0)])
     left, middle, right = first
     assert left[0] < middle[0] < right[0] and left[1] > middle[1] > right[1]  # y grows downwards
-    assert left[0] > 0 and right[0] < 640 and left[1] < 240 and right[1] > 16  # inside the viewBox
+    assert left[0] > 0 and right[0] < 600 and left[1] < 380 and right[1] > 31  # inside the viewBox
     assert middle == pytest.approx(((left[0] + right[0]) / 2, (left[1] + right[1]) / 2), abs=0.1)
     assert second == [pytest.approx((right[0], left[1]), abs=0.1)]
-    for tick in (">0<", ">100<", ">10<", ">y<"):
-        assert tick in svg
-    assert "logarithmic" not in svg
-
-
-def test_a_wide_range_is_drawn_logarithmically():
-    ((a, b, c),) = points(svg_chart({"a": [(0, 1), (1, 0.1), (2, 0.01)]}))
+    for text in (">0<", ">100<", ">10<", ">y<", ">steps<", ">a<"):
+        assert text in svg
+    _, ((a, b, c),) = drawn(logarithmic=True, a=[(0, 1), (1, 0.1), (2, 0.01)])
     assert b[1] - a[1] == pytest.approx(c[1] - b[1], abs=0.2)
 
 
 @pytest.mark.parametrize("values", [[], [(0, float("nan"))], [(float("inf"), 1)]])
 def test_charts_without_points_are_left_out(values):
-    assert svg_chart({"a": values}) == ""
+    assert drawn(a=values) == ("", [])
 
 
 @pytest.mark.parametrize("values", [[(3, 7)], [(0, 5), (9, 5)], [(0, -3), (1, 1e9)], [(2, 0)]])
 def test_degenerate_charts_stay_finite(values):
-    svg = svg_chart({"a": values})
-    assert "nan" not in svg and "inf" not in svg and len(points(svg)[0]) == len(values)
+    svg, (line,) = drawn(a=values)
+    assert "nan" not in svg and "inf" not in svg and len(line) == len(values)
 
 
 def test_a_page_that_cannot_be_written():

@@ -11,7 +11,7 @@ from helpers.micro import run
 from helpers.refusals import refused
 
 from gamba_warp import cli
-from gamba_warp.pages.curves import draw_curves
+from gamba_warp.pages.curves import curves_section
 from gamba_warp.pages.run import write_run_page
 from gamba_warp.pages.run_log import read_run_log
 
@@ -27,8 +27,13 @@ def line(event, step, seconds=0.0, **values):
     return {"event": event, "step": step, "time": 1e9 + seconds, **values}
 
 
+def curves(path):
+    return curves_section("Curves", "", read_run_log(path))
+
+
 def svgs(text):
-    """The charts by title, parsed."""
+    """The charts of a page or of a section by title, parsed."""
+    text = text if isinstance(text, str) else "".join(text.charts)
     found = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
     return {svg.get("aria-label"): svg for svg in map(ET.fromstring, found)}
 
@@ -49,7 +54,7 @@ def test_training_writes_its_page(data, tmp_path, capsys):
     assert re.search(r"\ntraining 0\.\d+\nheld out 0\.\d+$", last)
     for part in ("Last validation", "data:image/webp", "gamba train", "--steps 4", "Held out: 1"):
         assert part in text, part
-    assert '"novel_weight"'.replace('"', "&quot;") in text
+    assert '"novel_weight"' in html.unescape(text)
     assert not re.search(r"(src|href)=\"(?!data:)", text), "it loads nothing"
     page = tmp_path / "seen.html"
     assert cli.run("view", [str(out), "--out", str(page), "--no-open-browser"]) == 0
@@ -86,12 +91,12 @@ def test_a_page_in_the_middle_says_so(tmp_path):
 def test_a_log_without_figures_gives_a_sentence(tmp_path, content):
     path = tmp_path / "log.jsonl"
     path.write_bytes(content)
-    assert draw_curves(read_run_log(path)) == "<p>The log holds no figures yet.</p>"
-    assert write_run_page(tmp_path).exists()
+    assert not curves(path).charts
+    assert "<p>The log holds no figures yet.</p>" in write_run_page(tmp_path).read_text()
 
 
 def test_no_log_is_one_line(tmp_path):
-    refused(r"log\.jsonl: no such file", read_run_log, tmp_path / "log.jsonl")
+    refused(r"log\.jsonl: no such file", curves, tmp_path / "log.jsonl")
     (tmp_path / "log.jsonl").mkdir()
     refused("not a plain file", write_run_page, tmp_path)
     assert not (tmp_path / "index.html").exists()
@@ -124,7 +129,7 @@ def test_lines_that_are_no_lines_of_a_log_are_passed_over(tmp_path):
     record = read_run_log(write(tmp_path / "log.jsonl", *bad, *good))
     assert set(record.series) == {"train.loss"}
     assert list(record.series["train.loss"].values) == [0.1, 0.05]
-    assert "Loss" in svgs(draw_curves(read_run_log(tmp_path / "log.jsonl")))
+    assert "Loss" in svgs(curves(tmp_path / "log.jsonl"))
     assert "<b>" not in write_run_page(tmp_path).read_text()
 
 
@@ -157,9 +162,9 @@ def long_log(path, every=25, total=40_000):
 
 
 def test_a_long_run_stays_small_and_its_values_are_right(tmp_path):
-    text = draw_curves(read_run_log(long_log(tmp_path / "log.jsonl")))
-    assert len(text) < 200_000
-    charts = svgs(text)
+    section = curves(long_log(tmp_path / "log.jsonl"))
+    assert len("".join(section.charts)) < 200_000
+    charts = svgs(section)
     assert len(charts["Loss"].findall(".//circle")) == 0  # eighty validations, thinned
     assert "logarithmic" in charts["Loss"][0].text
     rows = tooltips(charts["Learning rate"])
@@ -176,7 +181,7 @@ def _step(text):
 
 def test_one_point_and_equal_values_are_drawn(tmp_path):
     path = write(tmp_path / "log.jsonl", line("train", 0, loss=0.0, psnr=-5.0))
-    charts = svgs(draw_curves(read_run_log(path)))
+    charts = svgs(curves(path))
     for name, y in (("Loss", "0"), ("PSNR, dB", "-5")):
         (circle,) = charts[name].iter("circle")
         assert float(circle.get("cx")) >= 0 and y in [t.text for t in charts[name].iter("text")]

@@ -1,0 +1,249 @@
+"""Charts as inline SVG: points, lines, bands, logarithmic axes; the page sets the colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from .templates import render
+
+WIDTH, HEIGHT = 600, 380  # of a chart, pixels
+COLOURS = 6  # that the style sheet has, --s0 to --s5
+_LEFT, _RIGHT, _TOP, _BOTTOM = 74, 24, 46, 46  # margins, pixels
+_CHARACTER, _LINE = 6.4, 13.0  # size of a label's character, pixels
+_FEW = 20  # points of a line that are drawn larger
+
+
+@dataclass(frozen=True)
+class Point:
+    """One figure.
+
+    Attributes:
+        x: where it lies.
+        y: the figure.
+        label: is drawn beside it.
+        mark: "", "default" (a ring around it) or "peer" (a square).
+        spread: low and high end of the band around it.
+    """
+
+    x: float
+    y: float
+    label: str = ""
+    mark: str = ""
+    spread: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Series:
+    """Points of one colour.
+
+    Attributes:
+        name: in the legend, if it has letters.
+        points: in the order of the line.
+        line: "" or "straight"; "steps", "guide" and "curve" hide the points.
+        colour: number of its colour; None: its place among the series.
+    """
+
+    name: str
+    points: Sequence[Point]
+    line: str = ""
+    colour: int | None = None
+
+
+@dataclass(frozen=True)
+class Axis:
+    """What an axis shows.
+
+    Attributes:
+        label: with the unit.
+        logarithmic: whether it is.
+        values: its ticks, if they are given.
+        ends: its ends; None: those of the points, with room.
+        rows: ticks in several rows, each with its name: places and texts.
+    """
+
+    label: str
+    logarithmic: bool = True
+    values: Sequence[float] = ()
+    ends: tuple[float, float] | None = None
+    rows: Sequence[tuple[str, Sequence[tuple[float, str]]]] = ()
+
+
+def pareto(points: Sequence[Point]) -> list[Point]:
+    """Returns, by x, the points that no other one equals or beats in both x and y (less wins)."""
+    front: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.x, p.y)):
+        if not front or point.y < front[-1].y:
+            front.append(point)
+    return front
+
+
+def chart(
+    series: Sequence[Series],
+    x: Axis,
+    y: Axis,
+    *,
+    name: str = "",
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    tooltips: Sequence[tuple[float, str]] = (),
+) -> Markup | str:
+    """Draws a chart.
+
+    Points that are not finite, or not positive on a logarithmic axis, are left out.
+
+    Args:
+        series: what is drawn, each over the one before.
+        x: the horizontal axis.
+        y: the vertical axis, whose label is the chart's title.
+        name: for those who do not see it; the title, if not given.
+        size: width and height, pixels of its own measure.
+        tooltips: texts of columns of the chart by their x, rising.
+
+    Returns:
+        The ``<svg>`` element, or an empty text if there is nothing to show.
+    """
+    found = [
+        (s, [p for p in s.points if _fits(p.x, x) and _fits(p.y, y)], i)
+        for i, s in enumerate(series)
+    ]
+    found = [(s, points, i) for s, points, i in found if points]
+    if not found:
+        return ""
+    shown = [point for _, points, _ in found for point in points]
+    left, right, top, bottom = _LEFT, size[0] - _RIGHT, _TOP, size[1] - _BOTTOM
+    to_x = _Scale([p.x for p in shown], x, left, right)
+    ends = [value for p in shown for value in (p.y, *(p.spread or ()))]
+    to_y = _Scale([value for value in ends if _fits(value, y)], y, bottom, top)
+    drawn, named = [], []
+    for s, points, place in found:
+        colour = (place if s.colour is None else s.colour) % COLOURS
+        placed = [(to_x(p.x), to_y(p.y)) for p in points]
+        path = placed
+        if s.line == "steps":  # the line shows the least y that can be had for at most x
+            corners = [(after[0], at[1]) for at, after in zip(placed, placed[1:])]
+            path = [p for pair in zip(placed, [*corners, placed[-1]]) for p in pair]
+        spreads = [(at[0], p.spread) for at, p in zip(placed, points) if p.spread]
+        band = [(at, to_y(spread[1])) for at, spread in spreads]
+        band += [(at, to_y(spread[0])) for at, spread in reversed(spreads)]
+        dots = [] if s.line in ("steps", "guide", "curve") else list(zip(placed, points))
+        named += [(at, p.label) for at, p in dots if p.label]
+        drawn.append(
+            {
+                "colour": f"var(--s{colour})",
+                "name": s.name,
+                "line": s.line,
+                "path": _path(path),
+                "band": _path(band),
+                "radius": 4.5 if not s.line else 3 if len(points) <= _FEW else 2.2,
+                "dots": [
+                    (at, p, f"{p.label}: {p.x:.4g}, {p.y:.3g}".lstrip(": ")) for at, p in dots
+                ],
+            }
+        )
+    edges = [to_x(at) for at, _ in tooltips]
+    edges = [left, *((a + b) / 2 for a, b in zip(edges, edges[1:])), right]
+    ticks = [("", [(value, number(value)) for value in x.values or to_x.ticks()])]
+    return render(
+        "chart.svg",
+        **{"size": size, "left": left, "right": right, "top": top, "bottom": bottom},
+        **{"x": x, "y": y, "name": name or y.label, "series": drawn},
+        rows=[(text, [(to_x(v), t) for v, t in marks]) for text, marks in x.rows or ticks],
+        ticks=[(to_y(value), number(value)) for value in y.values or to_y.ticks()],
+        labels=_labels(named, size[0], bottom),
+        slots=[(a, max(1.0, b - a), text) for a, b, (_, text) in zip(edges, edges[1:], tooltips)],
+    )
+
+
+def number(value: float) -> str:
+    """A figure on an axis or in a legend, in up to six digits or as a power of ten."""
+    if value and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+    return f"{value:,.6g}"
+
+
+def _fits(value: float, axis: Axis) -> bool:
+    return math.isfinite(value) and (value > 0 or not axis.logarithmic)
+
+
+def _path(points: Sequence[tuple[float, float]]) -> str:
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+
+
+class _Scale:
+    """The map from figures to pixels, with room at both ends; ``low`` and ``high`` bound it."""
+
+    def __init__(self, values: Sequence[float], axis: Axis, start: float, end: float) -> None:
+        self._start, self._end, self._logarithmic = start, end, axis.logarithmic
+        self._bend = math.log10 if axis.logarithmic else float
+        self._only = values[0] if min(values) == max(values) and axis.ends is None else None
+        low, high = (self._bend(value) for value in axis.ends or (min(values), max(values)))
+        if axis.ends is None:
+            room = 0.08 * (high - low) or (0.3 if axis.logarithmic else abs(high) or 1.0)
+            if axis.logarithmic:  # at least a factor of 2.5, so that noise does not look like more
+                room = max(room, (0.4 - high + low) / 2)
+            low, high = low - room, high + room
+        self._low, self._high = low, high
+        # A stranger's figures may leave no room in the range of numbers.
+        self.low = 10 ** max(low, -300.0) if axis.logarithmic else low
+        self.high = 10 ** min(high, 300.0) if axis.logarithmic else high
+
+    def __call__(self, value: float) -> float:
+        part = (self._bend(value) - self._low) / (self._high - self._low)
+        return self._start + (self._end - self._start) * part
+
+    def ticks(self) -> list[float]:
+        """Round values within the bounds; where all figures are one, that one."""
+        if self._only is not None and not self._logarithmic:
+            return [self._only]
+        return round_values(self.low, self.high, self._logarithmic)
+
+
+def round_values(low: float, high: float, logarithmic: bool = False) -> list[float]:
+    """Round values within bounds, multiples of 1, 2 or 5 times a power of ten.
+
+    Args:
+        low: lower bound; above 0 if ``logarithmic``.
+        high: upper bound, above ``low``.
+        logarithmic: whether the axis is; within a short span of one there are more values.
+    """
+    if logarithmic:
+        powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+        close = high < 8 * low
+        leads = (1, 1.5, 2, 3, 4, 5, 6, 7, 8) if close else (1, 2, 5) if high < 200 * low else (1,)
+        values = [float(f"{lead}e{power}") for power in powers for lead in leads]
+    else:
+        raw = (high - low) / 5
+        unit = 10.0 ** math.floor(math.log10(raw))
+        step = next(unit * lead for lead in (1, 2, 5, 10) if unit * lead >= raw)
+        values = [step * i for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
+    return [value for value in values if low <= value <= high]
+
+
+def _labels(
+    named: Sequence[tuple[tuple[float, float], str]], width: float, bottom: float
+) -> list[tuple[float, float, str]]:
+    """Puts texts beside their points, each at the first position that hides nothing."""
+    taken = [(x - 9, y - 9, x + 9, y + 9) for (x, y), _ in named]
+    found = []
+    for (x, y), text in named:
+        length = _CHARACTER * len(text)
+        boxes = [
+            (left, y + lines * _LINE - 7, left + length, y + lines * _LINE + 7)
+            for lines in (0, -1, 1, -2, 2, -3, 3, -4, 4)
+            for left in (x + 12, x - 12 - length)
+        ]
+        free = (
+            box
+            for box in boxes
+            if box[0] >= 2 and box[2] <= width and box[1] >= _TOP - 16 and box[3] <= bottom
+            if not any(
+                box[0] < t[2] and t[0] < box[2] and box[1] < t[3] and t[1] < box[3] for t in taken
+            )
+        )
+        box = next(free, boxes[0])
+        taken.append(box)
+        found.append((box[0], box[3] - 3, text))
+    return found
