@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from msgspec import Meta
@@ -18,8 +18,8 @@ from ..versions import NEEDS, require
 
 if TYPE_CHECKING:
     from .jobs import Settings
-    from .plan import Plan, Row
-    from .run import Task
+    from .plan import Row
+    from .tasks import Task
 
 _Count = Annotated[int, Meta(ge=1, le=1_000_000)]
 
@@ -73,173 +73,134 @@ def ablate_command(
         retry: Run rows again that failed.
         dry_run: Print the commands and about how long they take, and do nothing.
     """
+    import sys
+
+    from msgspec.structs import replace
+    from tqdm import tqdm
+
+    from ..batch import check_not_read, progress_bar
+    from ..files import only_process, output_folder
     from ..kernels.runtime.system import cores
-    from .jobs import budget_of, check
-    from .plan import named, open_plan
+    from .jobs import Settings, budget_of, check
+    from .plan import keep_plan, named, open_plan
+    from .run import row_line, run_tasks
+    from .tasks import task_of
 
     chosen = open_plan(plan)
     if steps is not None and minutes is not None:
         raise UserError("--steps and --minutes: give one of them")
-    changes: dict[str, Any] = {"split": split, "objects": objects, "views": views, "size": size}
+    changes = {"split": split, "objects": objects, "views": views, "size": size}
     changes["geometry_objects"] = geometry_objects
+    evaluation = replace(
+        chosen.evaluation, **{name: value for name, value in changes.items() if value is not None}
+    )
+    folder = Path("out/ablation") / chosen.name if out is None else out
+    true = None if meshes is None else meshes.resolve()
     with named(plan):
         budget = budget_of(chosen, steps, minutes)
-        settings = _settings(chosen, data, out, budget, meshes, device, changes)
-        check(chosen, settings, chosen.rows)
+        settings = Settings(chosen, data.resolve(), folder, evaluation, budget, true, device)
+        check(settings)
     wanted = [chosen.row(name) for name in dict.fromkeys(rows)] or chosen.rows
     if len({*seeds}) != len(seeds):
         raise UserError("--seeds: one is there twice")
-    _check_inputs(chosen, settings, wanted)
-    if threads is None:
-        threads = max(1, cores() // jobs)
+    _check_inputs(settings, wanted)
     if meshes is not None:
         require(*NEEDS["eval-geometry"])
+    threads = threads or max(1, cores() // jobs)
+
+    def find_tasks() -> list[Task]:
+        pairs = [
+            p for row in wanted for p in enumerate((row, n) for n in seeds or chosen.seeds_of(row))
+        ]
+        # All rows have one seed before one has two.
+        found = [task_of(settings, *pair) for _, pair in sorted(pairs, key=lambda pair: pair[0])]
+        for task in found:
+            if task.changed and not restart:
+                raise UserError(
+                    f"row {task.name}: was run with another plan: {task.changed}; give --restart "
+                    "(what is another now is done anew) or another --out"
+                )
+            if task.record.status == "failed" and retry:
+                task.record.status = "begun"
+        return found
+
     if dry_run:
         from .estimate import print_plan
 
-        tasks = _tasks(chosen, settings, wanted, seeds, restart, retry)
-        by_row = {row.name: [t for t in tasks if t.record.row == row.name] for row in wanted}
-        print_plan(chosen, settings, by_row, jobs, threads)
+        print_plan(settings, find_tasks(), jobs, threads)
         return 0
-    return _run(chosen, settings, wanted, seeds, (jobs, threads), restart, retry)
+    check_not_read([settings.out / "table.json"], [settings.data, settings.meshes])
+    out = output_folder(settings.out)
+    with only_process(out, "runs an ablation"):
+        keep_plan(chosen, out)
+        tasks = find_tasks()
+        for task in tasks:
+            if task.changed:
+                task.begin_anew()
+        todo = [task for task in tasks if task.record.status == "begun"]
+        for task in tasks:
+            if task not in todo:
+                print(f"{row_line(task)} (before)", flush=True)
+        tqdm.monitor_interval = 0  # its thread could hold a lock at the moment of a fork
+        with progress_bar(total=len(tasks), initial=len(tasks) - len(todo), unit="run") as bar:
+
+            def ended(task: Task) -> None:
+                tqdm.write(row_line(task), sys.stdout)
+                sys.stdout.flush()
+                bar.update()
+
+            code = run_tasks(todo, jobs, threads, ended)
+        if code:
+            print("stopped; the same command goes on from here")
+            return code
+        from .page import write_results  # not before: see ``_check_inputs``
+
+        bad = write_results(settings)
+        print(f"wrote {out / 'table.md'}, table.json and index.html")
+        return 1 if bad or any(task.record.status != "ok" for task in tasks) else 0
 
 
-def _settings(
-    plan: Plan,
-    data: Path,
-    out: Path | None,
-    budget: tuple[str, float],
-    meshes: Path | None,
-    device: DeviceChoice,
-    changes: dict[str, Any],
-) -> Settings:
-    import msgspec
+def _check_inputs(settings: Settings, rows: list[Row]) -> None:
+    """Checks what the commands will read, in a child.
 
-    from .jobs import Settings
-
-    evaluation = msgspec.structs.replace(
-        plan.evaluation, **{name: value for name, value in changes.items() if value is not None}
-    )
-    folder = Path("out/ablation") / plan.name if out is None else out
-    true = None if meshes is None else meshes.resolve()
-    return Settings(data.resolve(), folder, evaluation, budget, true, device)
-
-
-def _check_inputs(plan: Plan, settings: Settings, rows: list[Row]) -> None:
-    """Checks what the commands will read, in a child: see ``run.open_inputs``."""
+    What a command's process held before it became that command counts as its memory, so the process
+    that starts commands must not load torch.
+    """
     from ..untrusted.children import Failed, end_idle, run_each
     from .jobs import train_config
-    from .run import open_inputs
 
     weights = []
     for row in rows:
-        config = train_config(plan, row, settings) if row.kind == "train" else None
-        model = config and config.model_config()
-        if model and (model.encoder == "vgg16" and model.prepend):
-            weights.append(row.name)
-        elif config and config.loss.lpips == "on":
-            weights.append(row.name)
+        if row.kind == "train":
+            config = train_config(settings, row)
+            model = config.model_config()
+            if config.loss.lpips == "on" or (model.encoder == "vgg16" and model.prepend):
+                weights.append(row.name)
     for _, answer in run_each(open_inputs, [(settings, weights)]):
         if isinstance(answer, Failed):
             raise UserError(answer.reason)
     end_idle()
 
 
-def _tasks(
-    plan: Plan,
-    settings: Settings,
-    rows: list[Row],
-    seeds: tuple[int, ...],
-    restart: bool,
-    retry: bool,
-    clean: bool = False,
-) -> list[Task]:
-    """The wanted rows with their seeds, and what of each is done.
-
-    Seeds are the outer loop: all rows have one seed before one has two.
+def open_inputs(given: tuple[Settings, list[str]]) -> None:
+    """Opens what the commands of an ablation will read.
 
     Args:
-        plan: the plan.
-        settings: what is the same for every row.
-        rows: those wanted.
-        seeds: in place of the plan's; none for those.
-        restart: whether commands that are others now are done anew.
-        retry: whether rows that failed are run again.
-        clean: whether what is done anew is removed here.
+        given: what is the same for every row, and the names of the rows that need VGG16.
 
     Raises:
-        UserError: a row was run with other commands, and not ``restart``.
+        UserError: something is not there.
     """
-    from .jobs import stages
-    from .record import begin_anew, changed, new_record, read_record, row_folder
-    from .run import Task
+    from ..data.dataset import open_dataset
+    from ..devices import pick_device
+    from ..vision.weights import FETCH, lpips_available
 
-    found = []
-    for row in rows:
-        for rank, seed in enumerate(seeds or plan.seeds_of(row)):
-            made = stages(plan, row, seed, settings)
-            folder, record = row_folder(settings.out, row.name, seed), None
-            record = read_record(folder)
-            wanted = new_record(row.name, seed, made)
-            name = f"{row.name}, seed {seed}"
-            if record is not None and (other := changed(record, wanted)):
-                if not restart:
-                    raise UserError(
-                        f"row {name}: was run with another plan: {other}; give --restart (what is "
-                        "another now is done anew) or another --out"
-                    )
-                record = begin_anew(folder, record, wanted) if clean else wanted
-            if record is not None and record.status == "failed" and retry:
-                record.status, record.reason = "begun", ""
-            task = Task(name, folder, made, record or wanted, settings.evaluation.geometry_objects)
-            found.append((rank, task))
-    return [task for _, task in sorted(found, key=lambda pair: pair[0])]
-
-
-def _run(
-    plan: Plan,
-    settings: Settings,
-    rows: list[Row],
-    seeds: tuple[int, ...],
-    how: tuple[int, int],
-    restart: bool,
-    retry: bool,
-) -> int:
-    """Runs what is not done, and writes the results."""
-    import sys
-
-    from tqdm import tqdm
-
-    from ..batch import check_not_read, progress_bar
-    from ..files import only_process, output_folder
-    from .plan import keep_plan
-    from .run import row_line, run_tasks
-
-    check_not_read([settings.out / "table.json"], [settings.data, settings.meshes])
-    out = output_folder(settings.out)
-    with only_process(out, "runs an ablation"):
-        keep_plan(plan, out)
-        tasks = _tasks(plan, settings, rows, seeds, restart, retry, clean=True)
-        todo = [task for task in tasks if task.record.status == "begun"]
-        for task in tasks:
-            if task not in todo:
-                print(f"{row_line(plan, task)} (before)", flush=True)
-        tqdm.monitor_interval = 0  # its thread could hold a lock at the moment of a fork
-        begun = len(tasks) - len(todo)
-        with progress_bar(total=len(tasks), initial=begun, unit="run") as bar:
-
-            def ended(task: Task) -> None:
-                tqdm.write(row_line(plan, task), sys.stdout)
-                sys.stdout.flush()
-                bar.update()
-
-            code = run_tasks(todo, *how, ended)
-        if code:
-            print("stopped; the same command goes on from here")
-            return code
-        from .write import write_results  # not before: see ``run.open_inputs``
-
-        bad = write_results(plan, settings, out)
-        print(f"wrote {out / 'table.md'}, table.json and index.html")
-        unfinished = [task for task in tasks if task.record.status != "ok"]
-        return 1 if bad or unfinished else 0
+    settings, weights = given
+    pick_device(settings.device)
+    for split in ("train", settings.evaluation.split):
+        if not open_dataset(settings.data, split).uids:
+            raise UserError(f"{settings.data}: its part {split} has no objects")
+    if settings.meshes is not None and not settings.meshes.is_dir():
+        raise UserError(f"--meshes {settings.meshes}: no such folder")
+    if weights and not lpips_available():
+        raise UserError(f"row {weights[0]}: needs the weights of VGG16; fetch them with: {FETCH}")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 
 from .figures import read_facts
 from .jobs import Settings, fit_options, train_config
-from .plan import Plan, Row
-from .run import Task
+from .plan import Row
+from .tasks import Task
 
 # Seconds on one core of a desktop of about 2020, one row alone. They are fits by eye to a few runs,
 # and a machine, an encoder or LPIPS in the loss may differ by a factor of three.
@@ -17,26 +16,23 @@ _VIEW, _SHAPE, _FIT, _START = 1.3, 9.0, 4e-6, 15.0
 _GAIN = 0.7  # n threads are n^0.7 times as fast as one
 
 
-def row_minutes(
-    plan: Plan, row: Row, settings: Settings, threads: int, known: float | None
-) -> float:
+def row_minutes(settings: Settings, row: Row, threads: int, known: float | None) -> float:
     """About how long a row takes with one seed, minutes.
 
     Args:
-        plan: of the row.
+        settings: the plan, and what is the same for every row.
         row: of the plan.
-        settings: what is the same for every row.
         threads: of each command.
         known: seconds of a step of this row, where it ran before; None: by its size.
     """
     faster, what = threads**_GAIN, settings.evaluation
     shapes = 0.0
     if row.kind == "fit":
-        fit = fit_options(plan, row)
+        fit = fit_options(settings, row)
         step = known or (_STEP + _FIT * fit.gaussians) / faster
         objects, spent = fit.limit, step * fit.steps * fit.limit
     else:
-        config = train_config(plan, row, settings)
+        config = train_config(settings, row)
         model, name = config.model_config(), settings.budget[0]
         views = config.views.views_per_object
         views = 1 + (config.views.views_last if views is None else views)
@@ -52,34 +48,29 @@ def row_minutes(
     return (spent + shapes + _START) / 60
 
 
-def print_plan(
-    plan: Plan, settings: Settings, tasks: Mapping[str, list[Task]], jobs: int, threads: int
-) -> None:
+def print_plan(settings: Settings, tasks: list[Task], jobs: int, threads: int) -> None:
     """Prints the commands of every row and an estimate of the time.
 
     Args:
-        plan: the plan.
-        settings: what is the same for every row.
-        tasks: by the row's name, one for each seed.
+        settings: the plan, and what is the same for every row.
+        tasks: rows with their seeds.
         jobs: rows at once.
         threads: of each command.
     """
     total = 0.0
-    for name, seeds in tasks.items():
-        row = plan.row(name)
+    for name in dict.fromkeys(task.row.name for task in tasks):
+        seeds = [task for task in tasks if task.row.name == name]
         steps = [read_facts(task.folder / "run" / "log.jsonl").step_seconds for task in seeds]
         known = next((step for step in steps if step is not None), None)
-        minutes = row_minutes(plan, row, settings, threads, known)
-        todo = [task for task in seeds if task.record.status == "begun"]
-        total += minutes * len(todo)
-        print(f"{name}: {row.label}, about {minutes:.1f} minutes a seed")
+        minutes = row_minutes(settings, seeds[0].row, threads, known)
+        print(f"{name}: {seeds[0].row.label}, about {minutes:.1f} minutes a seed")
         for task in seeds:
-            done = "" if task in todo else f" ({task.record.status} before)"
-            print(f"  {task.name}{done}")
+            done = task.record.status != "begun" and not task.changed
+            total += 0 if done else minutes
+            print(f"  {task.name}{f' ({task.record.status} before)' if done else ''}")
             for stage in task.stages:
                 print(f"    gamba {shlex.join(stage.words_in(task.folder))}")
-    count = sum(map(len, tasks.values()))
     print(
-        f"{count} runs, {jobs} at once with {threads} threads each: roughly "
+        f"{len(tasks)} runs, {jobs} at once with {threads} threads each: roughly "
         f"{total / jobs / 60:.1f} hours of what is not done (within a factor of three)"
     )

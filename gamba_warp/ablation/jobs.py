@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import json
 from collections.abc import Sequence
@@ -27,14 +26,15 @@ RESERVED = ("data", "set", "preset", "out", "config", "resume", "init", "seed", 
 RESERVED += ("threads", "tensorboard")
 BUDGET = ("steps", "epochs", "minutes")
 STRIPS = 4  # objects whose pictures are on the page
-ROW = Path("ROW")  # stands for the row's folder in the commands that are kept
+ROW = "ROW"  # stands for the row's folder in the commands that are kept
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is the same for every row.
+    """A plan, and what is the same for every row of it.
 
     Attributes:
+        plan: the plan.
         data: the dataset.
         out: folder of the ablation.
         evaluation: what every row is evaluated on.
@@ -43,6 +43,7 @@ class Settings:
         device: of all commands that have the option.
     """
 
+    plan: Plan
     data: Path
     out: Path
     evaluation: Evaluation
@@ -51,24 +52,28 @@ class Settings:
     device: DeviceChoice
 
 
-@dataclass(frozen=True)
 class Stage:
     """One command of a row.
 
     Attributes:
-        name: "train", "views", "shapes" or "fit".
+        name: "train", "views", "shapes" or "fit"; its results lie in a folder.
         words: of the command, without ``gamba``; ``ROW`` stands for the row's folder.
-        makes: the file, in the row's folder, that is there when it has ended well.
+        folder: name of the folder of the results, in that of the row.
+        makes: the file in it that is there when the command has ended well.
     """
 
-    name: str
-    words: tuple[str, ...]
-    makes: str
+    def __init__(self, name: str, *words: object, makes: str = "report.json") -> None:
+        self.name, self.folder = name, FOLDERS[name]
+        self.words = [*map(str, words), "--out", f"{ROW}/{self.folder}"]
+        self.makes = f"{self.folder}/{makes}"
 
     def words_in(self, folder: Path) -> list[str]:
         """The words with the row's folder in its place."""
         mark = f"{ROW}/"
         return [str(folder / w.removeprefix(mark)) if w.startswith(mark) else w for w in self.words]
+
+
+FOLDERS = {"train": "run", "views": "views", "shapes": "shapes", "fit": "fit"}
 
 
 def budget_of(plan: Plan, steps: int | None, minutes: float | None) -> tuple[str, float]:
@@ -78,14 +83,12 @@ def budget_of(plan: Plan, steps: int | None, minutes: float | None) -> tuple[str
         UserError: there is none or more than one, or a row has one of its own.
     """
     for row in plan.rows:
-        own = [name for name in _plain(row.options) if name in BUDGET and row.kind == "train"]
+        own = [name for name in _merged(row.options) if name in BUDGET and row.kind == "train"]
         if own:
             raise UserError(f"row {row.name}: {own[0]}: the budget is the same for every row")
     given: dict[str, Any] = {"steps": steps, "minutes": minutes}
     given = {name: value for name, value in given.items() if value is not None}
-    if not given:
-        options = _plain(plan.base.options)
-        given = {name: options[name] for name in BUDGET if options.get(name) is not None}
+    given = given or {n: v for n, v in _merged(plan.base.options).items() if n in BUDGET}
     if len(given) != 1 or "epochs" in given:
         raise UserError("the budget of a row: expected steps or minutes, once")
     ((name, value),) = given.items()
@@ -94,92 +97,64 @@ def budget_of(plan: Plan, steps: int | None, minutes: float | None) -> tuple[str
     return name, value
 
 
-def stages(plan: Plan, row: Row, seed: int, settings: Settings) -> list[Stage]:
+def stages(settings: Settings, row: Row, seed: int) -> list[Stage]:
     """The commands of a row, in their order.
 
     Raises:
         UserError: an option or a field of the row is wrong; names the row.
     """
+    what, distance = settings.evaluation, None
+    alike = ["--seed", seed, "--device", settings.device]
     if row.kind == "fit":
-        return _fit_stages(plan, row, seed, settings)
-    what = settings.evaluation
-    config = train_config(plan, row, settings)
-    views = ["eval-views", "--checkpoint", f"{ROW}/run/model.safetensors"]
-    views += ["--data", settings.data, "--split", what.split, "--limit", what.objects]
-    views += ["--views", what.views, *(["--size", what.size] if what.size else [])]
-    views += ["--strips", STRIPS, "--sheet", 0, "--no-baselines", "--device", settings.device]
-    views += ["--save-gaussians"] if settings.meshes else []
-    if row.background_margin is not None:
-        views += ["--background-margin", row.background_margin]
-    made = [
-        _stage("train", [*train_words(plan, row, settings), *_run_words(seed, settings)], _MODEL),
-        _stage("views", [*views, "--out", f"{ROW}/views"], "views/report.json"),
-    ]
-    if settings.meshes:
-        distance = config.model_config().distance
-        made.append(_shapes(settings, "views/gaussians", distance))
+        words: list[object] = ["fit", settings.data, "--split", what.split]
+        for name, value in msgspec.to_builtins(fit_options(settings, row)).items():
+            words += [] if value is None else [option(name), value]
+        made = [Stage("fit", *words, *alike)]
+    else:
+        distance = train_config(settings, row).model_config().distance
+        words = ["eval-views", "--checkpoint", f"{ROW}/run/model.safetensors"]
+        words += ["--data", settings.data, "--split", what.split, "--limit", what.objects]
+        words += ["--views", what.views, *(["--size", what.size] if what.size else [])]
+        words += ["--strips", STRIPS, "--sheet", 0, "--no-baselines", "--device", settings.device]
+        words += ["--save-gaussians"] if settings.meshes else []
+        if row.background_margin is not None:
+            words += ["--background-margin", row.background_margin]
+        training = [*train_words(settings, row), *alike, "--no-tensorboard"]
+        made = [Stage("train", *training, makes="model.safetensors"), Stage("views", *words)]
+    if settings.meshes:  # of all objects, or of some that ``run.choose`` copies
+        count = what.geometry_objects
+        folder = f"{made[-1].folder}/gaussians" if count is None else f"chosen-{count}"
+        words = ["eval-geometry", f"{ROW}/{folder}", settings.meshes, "--frame", "reference"]
+        words += ["--data", settings.data]
+        if distance is not None and distance != DEFAULT_DISTANCE:
+            words += ["--distance", distance]
+        made.append(Stage("shapes", *words))
     return made
 
 
-_MODEL = "run/model.safetensors"
-
-
-def _run_words(seed: int, settings: Settings) -> list[object]:
-    words: list[object] = ["--seed", seed, "--device", settings.device, "--no-tensorboard"]
-    return [*words, "--out", f"{ROW}/run"]
-
-
-def _fit_stages(plan: Plan, row: Row, seed: int, settings: Settings) -> list[Stage]:
-    options = fit_options(plan, row)
-    words: list[object] = ["fit", settings.data, "--split", settings.evaluation.split]
-    for name, value in msgspec.to_builtins(options).items():
-        words += [] if value is None else [option(name), value]
-    words += ["--seed", seed, "--device", settings.device, "--out", f"{ROW}/fit"]
-    made = [_stage("fit", words, "fit/report.json")]
-    return [*made, _shapes(settings, "fit/gaussians", None)] if settings.meshes else made
-
-
-def _shapes(settings: Settings, predicted: str, distance: float | None) -> Stage:
-    """The evaluation of shapes, of all objects or of some that ``shapes.choose`` copies."""
-    count = settings.evaluation.geometry_objects
-    folder = predicted if count is None else f"chosen-{count}"
-    words = ["eval-geometry", f"{ROW}/{folder}", settings.meshes, "--frame", "reference"]
-    words += ["--data", settings.data]
-    if distance is not None and distance != DEFAULT_DISTANCE:
-        words += ["--distance", distance]
-    return _stage("shapes", [*words, "--out", f"{ROW}/shapes"], "shapes/report.json")
-
-
-def _stage(name: str, words: Sequence[object], makes: str) -> Stage:
-    return Stage(name, tuple(map(str, words)), makes)
-
-
-def fit_options(plan: Plan, row: Row) -> FitOptions:
+def fit_options(settings: Settings, row: Row) -> FitOptions:
     """The options of a row's fit. Raises UserError, which names the row."""
-    values = _merged(_plain(plan.base.fit), _plain(row.options))
     try:
-        return msgspec.convert(values, FitOptions)
+        return msgspec.convert(_merged(settings.plan.base.fit, row.options), FitOptions)
     except msgspec.ValidationError as error:
         raise UserError(f"row {row.name}: gamba fit: {error}") from error
 
 
-def gaussians_of(plan: Plan, row: Row, settings: Settings) -> int:
+def gaussians_of(settings: Settings, row: Row) -> int:
     """N, the number of Gaussians of a row (with the decoder "rays" the most there can be)."""
     if row.kind == "fit":
-        return fit_options(plan, row).gaussians
-    return train_config(plan, row, settings).model_config().num_gaussians
+        return fit_options(settings, row).gaussians
+    return train_config(settings, row).model_config().num_gaussians
 
 
-def train_words(plan: Plan, row: Row, settings: Settings) -> list[str]:
+def train_words(settings: Settings, row: Row) -> list[str]:
     """Words of a row's training: what it is trained on, with which model, how and how long."""
-    words: list[str] = ["train", str(settings.data), "--preset", plan.base.preset]
-    changes = _merged(_plain(plan.base.set), _plain(row.set))
-    if changes:
+    base = settings.plan.base
+    words: list[str] = ["train", str(settings.data), "--preset", base.preset]
+    if changes := _merged(base.set, row.set):
         words += ["--set", *(f"{name}={_text(value)}" for name, value in changes.items())]
-    options = _merged(_plain(plan.base.options), _plain(row.options))
-    name, value = settings.budget
-    options = {n: v for n, v in options.items() if n not in BUDGET} | {name: value}
-    for name, value in options.items():
+    options = {n: v for n, v in _merged(base.options, row.options).items() if n not in BUDGET}
+    for name, value in {**options, settings.budget[0]: settings.budget[1]}.items():
         words += _option_words(name, value)
     return words
 
@@ -194,42 +169,36 @@ def _text(value: Value) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _plain(values: Values) -> Values:
-    """The same, names with underscores."""
-    return {name.replace("-", "_"): value for name, value in values.items()}
-
-
-def _merged(base: Values, row: Values) -> Values:
-    both = {**base, **row}
+def _merged(*groups: Values) -> Values:
+    """Groups joined, the later ones first; null takes away; names with underscores."""
+    both = {name.replace("-", "_"): value for group in groups for name, value in group.items()}
     return {name: value for name, value in both.items() if value is not None}
 
 
-def train_config(plan: Plan, row: Row, settings: Settings) -> TrainConfig:
+def train_config(settings: Settings, row: Row) -> TrainConfig:
     """The options of a row's training, as ``gamba train`` parses them.
 
     Raises:
         UserError: one of them is unknown, or its value is wrong; names the row.
     """
+    base = settings.plan.base
     try:
-        _check_names(plan, row)
-        return _parsed(train_words(plan, row, settings)[1:])
+        _check_names(settings.plan, row)
+        return _parsed(train_words(settings, row)[1:])
     except UserError as error:
         raise UserError(f"row {row.name}: {error}") from error
     except SystemExit:
-        pass
-    reason = "gamba train does not take its options"
-    preset = ["--preset", plan.base.preset]
-    options = _merged(_plain(plan.base.options), _plain(row.options))
-    tried = [preset, *(_option_words(name, value) for name, value in options.items())]
-    for words in tried:  # each for itself, to name the one that is wrong
-        try:
+        wrong = "its options"
+    options = _merged(base.options, row.options).items()
+    for words in (["--preset", base.preset], *(_option_words(*pair) for pair in options)):
+        try:  # each for itself, to name the one that is wrong
             _parsed([str(settings.data), *words])
         except SystemExit:
-            reason = f"gamba train does not take {' '.join(words)}"
+            wrong = " ".join(words)
             break
         except UserError:
             continue
-    raise UserError(f"row {row.name}: {reason}")
+    raise UserError(f"row {row.name}: gamba train does not take {wrong}")
 
 
 def _parsed(words: list[str]) -> TrainConfig:
@@ -250,70 +219,63 @@ def _check_names(plan: Plan, row: Row) -> None:
     names = {f.name for group, kind in GROUPS.items() if group != "model" for f in fields(kind)}
     if plan.base.preset not in PRESETS:
         raise UserError(f"no preset {plan.base.preset}; there are {', '.join(PRESETS)}")
-    for name in _plain(plan.base.set) | _plain(row.set):
+    for name in (name.replace("-", "_") for name in [*plan.base.set, *row.set]):
         if name not in known:
             raise UserError(f"set: GambaConfig has no field {name}")
-    for name in _plain(plan.base.options) | _plain(row.options):
+    for name in (name.replace("-", "_") for name in [*plan.base.options, *row.options]):
         if name in RESERVED:
             raise UserError(f"options: {name} is not for a plan to give")
         if name not in names:
             raise UserError(f"options: gamba train has no {option(name)}")
 
 
-def check(plan: Plan, settings: Settings, rows: Sequence[Row]) -> None:
-    """Checks every row's commands.
+def check(settings: Settings) -> None:
+    """Checks the commands of every row of the plan.
 
     Raises:
         UserError: names the first row that is wrong, and what of it.
     """
-    for row in rows:
-        stages(plan, row, plan.seeds_of(row)[0], settings)
-    for name in {row.series for row in rows} - {None}:
-        members = [row for row in plan.rows if row.series == name]
-        numbers = [gaussians_of(plan, row, settings) for row in members]
+    plan = settings.plan
+    for row in plan.rows:
+        stages(settings, row, plan.seeds_of(row)[0])
+    for name in {row.series for row in plan.rows} - {None}:
+        numbers = [gaussians_of(settings, row) for row in plan.rows if row.series == name]
         if len({*numbers}) != len(numbers):
             raise UserError(f"series {name}: two of its rows have the same number of Gaussians")
 
 
-def digest(kept: dict[str, list[str]]) -> str:
-    """The hash of a row's exact commands, 16 hexadecimal digits."""
-    return hashlib.sha256(json.dumps(kept).encode()).hexdigest()[:16]
-
-
 def difference(old: dict[str, list[str]], new: dict[str, list[str]]) -> str | None:
     """Names the first difference between the commands of a row; None where there is none."""
-    for name in [*new, *(name for name in old if name not in new)]:
+    for name in [*new, *old]:
         if old.get(name) == new.get(name):
             continue
-        if name not in old or name not in new:
-            return f"the command {(new.get(name) or old[name])[0]} {_came(name in new)}"
+        if name not in old:
+            return f"the command {new[name][0]} was not part of it then"
+        if name not in new:
+            return f"the command {old[name][0]} is no part of it now"
         there, here = (_by_option(words[name]) for words in (old, new))
         for word in [*here, *there]:
             if there.get(word) != here.get(word):
-                before, after = (_shown(values.get(word)) for values in (there, here))
+                before, after = (
+                    "not given" if word not in values else values[word] or "given"
+                    for values in (there, here)
+                )
                 return f"{word}: {before} then, {after} now"
+        return "the order of its options"
     return None
 
 
-def _came(is_new: bool) -> str:
-    return "was not part of it then" if is_new else "is no part of it now"
-
-
-def _shown(value: str | None) -> str:
-    return "not given" if value is None else value or "given"
-
-
-def _by_option(words: list[str]) -> dict[str, str]:
+def _by_option(words: Sequence[str]) -> dict[str, str]:
     """Values by option, of ``--set`` by field."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, str] = {}
     key = "DATA"
     for word in words[1:]:
         if word.startswith("--"):
             key = word
-            found.setdefault(key, [])
+            found.setdefault(key, "")
         elif key == "--set":
             field, _, value = word.partition("=")
-            found[f"--set {field}"] = [value]
+            found[f"--set {field}"] = value
         else:
-            found.setdefault(key, []).append(word)
-    return {name: " ".join(values) for name, values in found.items()}
+            found[key] = f"{found.get(key, '')} {word}".strip()
+    return found

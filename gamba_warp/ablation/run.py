@@ -2,62 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 import shutil
+import signal
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator
 from pathlib import Path
 
+from .. import processes
 from ..errors import UserError, one_line
 from ..files import atomic_folder, output_folder
 from .figures import read_facts, read_result
-from .jobs import ROW, Settings, Stage
-from .plan import Plan
-from .processes import Child, End, stop_requests, why
-from .record import Ended, Record, add_part, write_record
+from .jobs import ROW, Stage
+from .tasks import Ended, Task
 
-_WAIT = 0.1  # seconds between two looks at the processes
 _PATIENCE = 600.0  # seconds in which a command that is asked to stop has saved and ended
-ENOUGH = {0, 1}  # exit code 1: some objects failed, and the others have results
+_ENOUGH = {0, 1}  # exit code 1: some objects failed, and the others have results
+_TAIL = 1 << 14  # bytes of a log that are searched for what went wrong
 
 
-@dataclass
-class Task:
-    """A row with one seed.
-
-    Attributes:
-        name: for messages.
-        folder: its folder.
-        stages: its commands.
-        record: what of it is done.
-        geometry: number of objects whose shapes are evaluated, or None for all.
-        child: the command that runs now.
-    """
-
-    name: str
-    folder: Path
-    stages: list[Stage]
-    record: Record
-    geometry: int | None = None
-    child: Child | None = None
-    stage: Stage | None = field(default=None, repr=False)
-
-    def following(self) -> Stage | None:
-        """The next command; None where all have ended well."""
-        for stage in self.stages:
-            done = stage.name in self.record.ended and (self.folder / stage.makes).exists()
-            if not done:
-                return stage
-        return None
-
-
-def run_tasks(
-    tasks: list[Task],
-    jobs: int,
-    threads: int,
-    ended: Callable[[Task], None],
-) -> int:
+def run_tasks(tasks: list[Task], jobs: int, threads: int, ended: Callable[[Task], None]) -> int:
     """Runs tasks until all have ended, or a signal asks to stop.
 
     A row that fails stops no other. On a signal the commands are asked to stop, and a training
@@ -75,71 +41,72 @@ def run_tasks(
     Raises:
         UserError: a folder or a record cannot be written.
     """
-    waiting, running = list(tasks), []
-    told = 0
-    asked = 0.0
-    with stop_requests() as received:
-        try:
-            while running or (waiting and not received):
-                while waiting and len(running) < jobs and not received:
-                    running.append(waiting.pop(0))
-                    _advance(running[-1], jobs, threads)
-                if len(received) > told:
-                    late = told > 0
-                    told, asked = len(received), asked or time.monotonic()
-                    _ask(running, at_once=late)
-                if asked and time.monotonic() - asked > _PATIENCE:
-                    _ask(running, at_once=True)
-                for task in list(running):
-                    _look(task, jobs, threads, bool(received))
-                    if task.child is None:
-                        running.remove(task)
-                        if task.record.status != "begun":
-                            ended(task)
-                time.sleep(_WAIT)
-        finally:  # also where a record cannot be written
-            for task in running:
-                if task.child is not None:
-                    task.child.kill()
+    waiting, told, late = list(tasks), 0, math.inf
+    running: list[tuple[Task, Generator[processes.Child, None, None]]] = []
+    with processes.stop_requests() as received, contextlib.ExitStack() as ending:
+        while running or (waiting and not received):
+            while waiting and len(running) < jobs and not received:
+                commands = _commands(waiting[0], jobs, threads, received)
+                running.append((waiting.pop(0), ending.enter_context(contextlib.closing(commands))))
+            asked, told = len(received) > told, len(received)
+            at_once = told > 1 or time.monotonic() > late
+            late = min(late, time.monotonic() + _PATIENCE) if told else late
+            for task, commands in list(running):
+                child = next(commands, None)
+                if child is None:
+                    running.remove((task, commands))
+                    if task.record.status != "begun":
+                        ended(task)
+                elif at_once:
+                    child.kill()
+                elif asked:
+                    child.ask(signal.SIGTERM)
+            time.sleep(processes.LOOK)
     return 128 + received[0] if received else 0
 
 
-def _ask(running: list[Task], at_once: bool) -> None:
-    for task in running:
-        if task.child is not None:
-            task.child.ask(at_once)
-
-
-def _look(task: Task, jobs: int, threads: int, stopping: bool) -> None:
-    """Takes note of a command that has ended, and starts the next one."""
-    if task.child is None or task.stage is None:
-        return
-    end = task.child.poll()
-    if end is None:
-        return
-    task.child = None
-    _note_end(task, task.stage, end, jobs, threads)
-    if task.record.status == "begun" and end.code in ENOUGH and not stopping:
-        _advance(task, jobs, threads)
-
-
-def _note_end(task: Task, stage: Stage, end: End, jobs: int, threads: int) -> None:
-    record, log = task.record, _log(task, stage)
-    ended = Ended(end.seconds, end.peak_memory, threads, jobs)
-    ended = add_part(record.parts.get(stage.name), ended)
-    if end.code not in ENOUGH or not (task.folder / stage.makes).exists():
-        record.parts[stage.name] = ended
-        if not end.stopped:
-            record.status, record.reason = "failed", f"{stage.words[0]}: {why(end.code, log)}"
-    else:
-        ended.note = "" if end.code == 0 else why(end.code, log)
-        record.parts.pop(stage.name, None)
-        record.ended[stage.name] = ended
+def _commands(
+    task: Task, jobs: int, threads: int, stopping: list[int]
+) -> Generator[processes.Child, None, None]:
+    """Does the commands of a task that are not done, and yields at every look the one that runs."""
+    while not stopping and (stage := task.following()) is not None:
+        log = output_folder(task.folder) / f"{stage.name}.log"
+        task.write("begun")
+        words = stage.words_in(task.folder)
+        words += ["--threads", str(threads)] if stage.name == "train" else []
+        # A progress bar writes ten lines a second, and nobody looks.
+        own = {"TQDM_MININTERVAL": "30"}
+        own |= {f"{library}_NUM_THREADS": str(threads) for library in ("OMP", "MKL")}
+        try:
+            if stage.name == "shapes" and task.geometry is not None:
+                choose(task.folder, stage, task.geometry)
+            with open(log, "ab") as output:
+                output.write(f"$ gamba {' '.join(words)}\n".encode(errors="replace"))
+                output.flush()
+                child = processes.Child([*processes.GAMBA, *words], output, own)
+        except (OSError, UserError) as error:
+            reason = one_line(str(getattr(error, "strerror", None) or error), 300)
+            return task.write("failed", f"{stage.words[0]}: {reason}")
+        try:
+            while (end := child.poll()) is None:
+                yield child
+        finally:  # also where a record cannot be written
+            child.kill()
+        before = task.record.parts.pop(stage.name, Ended())  # a run that was stopped and went on
+        memory = max(before.peak_memory or 0, end.peak_memory or 0) or None
+        part = Ended(before.seconds + end.seconds, memory, threads, jobs)
+        reason = why(end.code, log)
+        if end.code not in _ENOUGH or not (task.folder / stage.makes).exists():
+            task.record.parts[stage.name] = part
+            stopped = end.stopped or stopping
+            return task.write(None if stopped else "failed", f"{stage.words[0]}: {reason}")
+        part.note = reason if end.code else ""
+        task.record.ended[stage.name] = part
         if stage.name == "train" and (reason := diverged(task.folder / "run")):
-            record.status, record.reason = "failed", f"train: {reason}"
-    if record.status == "begun" and task.following() is None:
-        record.status = "ok"
-    write_record(task.folder, record)
+            return task.write("failed", f"train: {reason}")
+        task.write()
+    if task.following() is None:
+        task.write("ok")
 
 
 def diverged(run: Path) -> str | None:
@@ -153,40 +120,13 @@ def diverged(run: Path) -> str | None:
     return None
 
 
-def _advance(task: Task, jobs: int, threads: int) -> None:
-    """Starts the next command of a task, if there is one and it can be started."""
-    stage = task.following()
-    if stage is None:
-        task.record.status = "ok"
-        write_record(task.folder, task.record)
-        return
-    output_folder(task.folder)
-    task.record.status, task.record.reason = "begun", ""
-    write_record(task.folder, task.record)
-    words = stage.words_in(task.folder)
-    if stage.name == "train":
-        words += ["--threads", str(threads)]
-    try:
-        if stage.name == "shapes" and task.geometry is not None:
-            choose(task.folder, stage, task.geometry)
-        task.stage, task.child = stage, Child(words, _log(task, stage), threads)
-    except (OSError, UserError) as error:
-        reason = one_line(str(getattr(error, "strerror", None) or error), 300)
-        task.record.status, task.record.reason = "failed", f"{stage.words[0]}: {reason}"
-        write_record(task.folder, task.record)
-
-
-def _log(task: Task, stage: Stage) -> Path:
-    return task.folder / f"{stage.name}.log"
-
-
-def row_line(plan: Plan, task: Task) -> str:
+def row_line(task: Task) -> str:
     """One line about a row that has ended, with one seed."""
     record = task.record
     if record.status == "failed":
         return f"{task.name}: failed: {record.reason}"
     try:
-        found = read_result(plan.row(record.row), task.folder, record)
+        found = read_result(task)
     except UserError as error:
         return f"{task.name}: {error}"
     values = [v["psnr"] for v in found.objects.values() if "psnr" in v]
@@ -211,14 +151,11 @@ def choose(folder: Path, stage: Stage, count: int) -> None:
         UserError: there are no Gaussians, or they cannot be copied.
     """
     target = folder / stage.words[1].removeprefix(f"{ROW}/")
-    source = next(
-        (f for f in (folder / "views", folder / "fit") if (f / "gaussians").is_dir()), None
-    )
-    found = sorted((source / "gaussians").glob("*.ply")) if source else []
+    found = sorted(p for of in ("views", "fit") for p in folder.glob(f"{of}/gaussians/*.ply"))
     if not found:
         raise UserError("it has no Gaussians whose shapes could be evaluated")
-    if count < len(found):
-        found = [found[k * len(found) // count] for k in range(count)]
+    count = min(count, len(found))
+    found = [found[k * len(found) // count] for k in range(count)]
     try:
         with atomic_folder(target, replace=True) as temporary:
             for path in found:
@@ -227,28 +164,29 @@ def choose(folder: Path, stage: Stage, count: int) -> None:
         raise UserError(f"cannot write {target}: {error.strerror}") from error
 
 
-def open_inputs(given: tuple[Settings, list[str]]) -> None:
-    """Opens what the commands of an ablation will read.
-
-    It is called in a process of its own. What a command's process held before it became that
-    command counts as its memory, so the process that starts commands must not load torch.
+def why(code: int, log: Path) -> str:
+    """Says in one line why a command failed, from its exit code and its outputs.
 
     Args:
-        given: what is the same for every row, and the names of the rows that need VGG16.
-
-    Raises:
-        UserError: something is not there.
+        code: as ``processes.End`` has it.
+        log: the file of its outputs.
     """
-    from ..data.dataset import open_dataset
-    from ..devices import pick_device
-    from ..vision.weights import FETCH, lpips_available
-
-    settings, weights = given
-    pick_device(settings.device)
-    for split in ("train", settings.evaluation.split):
-        if not open_dataset(settings.data, split).uids:
-            raise UserError(f"{settings.data}: its part {split} has no objects")
-    if settings.meshes is not None and not settings.meshes.is_dir():
-        raise UserError(f"--meshes {settings.meshes}: no such folder")
-    if weights and not lpips_available():
-        raise UserError(f"row {weights[0]}: needs the weights of VGG16; fetch them with: {FETCH}")
+    try:
+        with open(log, "rb") as file:
+            file.seek(max(0, log.stat().st_size - _TAIL))
+            text = file.read().decode(errors="replace")
+    except OSError:
+        text = ""
+    mark = "\n$ gamba "
+    if mark in f"\n{text}":  # of its own run alone
+        text = f"\n{text}".rpartition(mark)[2].partition("\n")[2]
+    lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]
+    told = [line for line in lines if line.startswith(("gamba: ", "failed: "))]
+    if code > 128:
+        number = code - 128
+        name = signal.Signals(number).name if number in {*signal.Signals} else "unknown"
+        memory = ", perhaps for want of memory" if name == "SIGKILL" else ""
+        return f"died of signal {number} ({name}){memory}"
+    if told:
+        return one_line(told[-1].removeprefix("gamba: "), 300)
+    return one_line(f"exit code {code}: {lines[-1] if lines else 'it said nothing'}", 300)

@@ -16,11 +16,11 @@ from ..data.preprocess import prepare
 from ..errors import UserError
 from ..formats.ply import load_ply
 from ..gaussians import Gaussians
-from ..images import load_rgba
 from .card import OF_GROUNDS, OF_PICTURES, about_model, read_card
 from .curves import curves_section
 from .page import Section, demo_page
 from .run_log import read_run_log
+from .sheet import tiles
 from .turntable import turntable_frames
 
 _BASELINES = {
@@ -183,7 +183,7 @@ def _trained_here(results: DemoResults, strips: list[Path]) -> list[Section]:
     for strip in strips:
         other = results.views_here / "strips" / strip.name
         if other.exists():
-            shipped, here = _tiles(strip), _tiles(other)
+            shipped, here = tiles(strip), tiles(other)
             rows = {"Shipped": shipped[1], "Trained here": here[1], "Truth": shipped[2]}
             sections.append(
                 Section(f"{_name(strip.stem)}: shipped, trained here, and true", views=rows)
@@ -199,26 +199,19 @@ def _compared(shipped: Path) -> str:
     return f"; the shipped one took {card.steps:,}" if card else ""
 
 
-def _tiles(strip: Path) -> np.ndarray:
-    """``[3, V, S, S, 3]``: input, prediction and truth of each view, which are a strip's rows."""
-    rgb = load_rgba(strip)[..., :3]
-    side = rgb.shape[1] // 3
-    return rgb.reshape(-1, side, 3, side, 3).transpose(2, 0, 1, 3, 4)
-
-
 def _held_out(strip: Path, views: Path, report: dict) -> Section:
     """One object with its predicted and its true views, by the shipped model."""
-    tiles = _tiles(strip)
+    shown = tiles(strip)
     gaussians = load_ply(views / "gaussians" / f"{strip.stem}.ply").drawn()
     record = next(o for o in report["objects"] if o["name"] == strip.stem)
     return Section(
         _name(strip.stem),
         f"Shipped model. New views: {record['psnr']:.1f} dB; "
         f"input view: {record['input']['psnr']:.1f} dB.",
-        picture=tiles[0][0],
+        picture=shown[0][0],
         gaussians=gaussians,
         turntable=_turntable(gaussians),
-        views={"Predicted": tiles[1], "Truth": tiles[2]},
+        views={"Predicted": shown[1], "Truth": shown[2]},
     )
 
 

@@ -13,7 +13,7 @@ from ..data.preprocess import resize_rgba
 from ..errors import UserError
 from ..files import atomic_path
 from ..gaussians import Gaussians
-from ..images import to_uint8
+from ..images import load_rgba, to_uint8
 from ..trajectories.paths import Viewpoint
 from .turntable import turntable_frames
 
@@ -76,3 +76,22 @@ class Sheet:
             draw.line((x + _TILE, y + _LABEL, x + _TILE, y + high - 1), "#cccccc")
         with atomic_path(self.path) as temporary:
             sheet.save(temporary, quality=88)  # PNG has no use for it
+
+
+def tiles(path: Path, columns: int = 3) -> np.ndarray:
+    """The views of a strip, as evaluations and fits write them: square ones in columns.
+
+    Args:
+        path: the picture.
+        columns: of views.
+
+    Returns:
+        ``[columns, V, S, S, 3]`` in [0, 1]; of ``gamba eval-views`` input, prediction and truth.
+
+    Raises:
+        UserError: the picture cannot be read.
+        ValueError: its views are not square.
+    """
+    rgb = load_rgba(path)[..., :3]
+    side = rgb.shape[1] // columns
+    return rgb.reshape(-1, side, columns, side, 3).transpose(2, 0, 1, 3, 4)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +13,7 @@ import msgspec
 from ..errors import UserError
 from ..files import sha256, write_json
 from ..kernels.runtime.system import end_signals
+from ..processes import GAMBA, Child, stop_requests
 from ..untrusted.documents import read_document
 
 _MADE = ("run", "icons", "views", "truth", "geometry", "views-here")  # folders of a demo
@@ -133,20 +132,14 @@ class Stages:
 
 
 def _call(words: list[str]) -> int:
-    """Runs a command and waits for it whatever comes; hands on what asks this process to stop.
+    """Runs a command and waits for it whatever comes; hands on what asks this process to stop."""
+    with stop_requests() as received:
+        child = Child([*GAMBA, *words])
 
-    A Ctrl-C reaches the command by the terminal itself, and it saves before it ends.
-    """
-    process = subprocess.Popen([sys.executable, "-m", "gamba_warp", *words])
+        def hand_on() -> None:
+            while received:
+                child.ask(received.pop(0))
 
-    def hand_on(number: int, frame: object) -> None:
-        process.send_signal(number)
-
-    old = {number: signal.signal(number, hand_on) for number in end_signals()}
-    old[signal.SIGINT] = signal.signal(signal.SIGINT, lambda number, frame: None)
-    try:
-        code = process.wait()
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
-    return code if code >= 0 else 128 - code
+        end = child.wait(hand_on)
+    assert end is not None, "there is no time limit"
+    return end.code

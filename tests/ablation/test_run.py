@@ -12,17 +12,16 @@ import pytest
 from ablation import fake
 from ablation.fake import write_plan
 
-from gamba_warp import cli
-from gamba_warp.ablation import processes
+from gamba_warp import cli, processes
 from gamba_warp.files import PART
 
 FAKE = [sys.executable, fake.__file__]
 # Runs ``gamba ablate`` with the fake commands, in a process that can be killed.
 DRIVER = """
 import sys
-from gamba_warp import cli
-from gamba_warp.ablation import command, processes
-processes.GAMBA[:] = sys.argv[1:3]
+from gamba_warp import cli, processes
+from gamba_warp.ablation import command
+processes.GAMBA = sys.argv[1:3]
 command._check_inputs = lambda *given: None
 cli.main(["ablate", *sys.argv[3:]])
 """
@@ -157,7 +156,7 @@ def test_a_changed_plan_is_refused_and_restart_does_what_changed(gamba, tmp_path
 def test_fits_shapes_and_a_series(gamba, tmp_path, monkeypatch):
     (tmp_path / "meshes").mkdir()
     empty = {"apple": 19.0, "bench": 22.0, "chair": 20.0}
-    monkeypatch.setattr("gamba_warp.ablation.write.empty_psnr", lambda data, result: empty)
+    monkeypatch.setattr("gamba_warp.ablation.page.empty_psnr", lambda *given: empty)
     fits = [
         {"name": f"f{n}", "kind": "fit", "options": {"gaussians": n}, "series": "fits"}
         for n in (400, 100)

@@ -6,8 +6,8 @@ import pytest
 from helpers import micro
 
 from gamba_warp import cli
-from gamba_warp.ablation.figures import SeedResult, empty_psnr
-from gamba_warp.ablation.processes import why
+from gamba_warp.ablation.figures import empty_psnr
+from gamba_warp.ablation.run import why
 from gamba_warp.data.dataset import open_dataset
 from gamba_warp.eval.views.baselines import background
 from gamba_warp.eval.views.compare import Truth, compare
@@ -69,8 +69,7 @@ def test_the_empty_picture_is_that_of_the_evaluation(tmp_path):
     cameras = relative_cameras(loaded.cameras, 1.5)
     truth = Truth("cloudb", loaded.images, cameras, views)
     values = compare({"": background(truth)}, truth)[""]
-    result = SeedResult(tmp_path, None, views={"cloudb": views[1:], "nobody": [1], "cloudc": []})
-    found = empty_psnr(data, result)
+    found = empty_psnr(data, {"cloudb": views[1:], "nobody": [1], "cloudc": []}, None)
     assert list(found) == ["cloudb"]
     assert found["cloudb"] == pytest.approx((values[1]["psnr"] + values[2]["psnr"]) / 2)
 

@@ -278,9 +278,9 @@ def _plan(path: Path, out: Path) -> Any:
     found = read_plan(path)
     with named(path):
         budget = jobs.budget_of(found, None, None)
-        settings = jobs.Settings(path.parent, out, found.evaluation, budget, None, "cpu")
-        jobs.check(found, settings, found.rows)
-    return found, [jobs.stages(found, row, 0, settings) for row in found.rows]
+        settings = jobs.Settings(found, path.parent, out, found.evaluation, budget, None, "cpu")
+        jobs.check(settings)
+    return found, [jobs.stages(settings, row, 0) for row in found.rows]
 
 
 def _compare(path: Path, out: Path) -> Any:

@@ -10,9 +10,9 @@ from helpers.disk import full_at
 from helpers.micro import run
 
 from gamba_warp import cli
-from gamba_warp.ablation.processes import stop_requests
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, only_process
+from gamba_warp.processes import stop_requests
 from gamba_warp.train import loop
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.log import Quiet, RunLog, say

@@ -1,0 +1,155 @@
+"""What of a row is done, with one seed: ``state.json`` while it runs, ``row.json`` after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from ..errors import UserError
+from ..files import remove_folder, write_json
+from ..untrusted.documents import read_document
+from ..versions import __version__
+from .jobs import FOLDERS, Settings, Stage, difference, stages
+from .plan import Row
+
+_MAX = 1 << 20  # bytes of a record; ours have a few kB
+
+
+class Ended(msgspec.Struct):
+    """A command that has ended well.
+
+    Attributes:
+        seconds: that it took, of all its parts where it was stopped on the way.
+        peak_memory: most bytes of memory that its process held, or None.
+        threads: that it had.
+        jobs: rows that ran at once.
+        note: what went wrong beside, in one line.
+    """
+
+    seconds: float = 0.0
+    peak_memory: int | None = None
+    threads: int = 1
+    jobs: int = 1
+    note: str = ""
+
+
+class Record(msgspec.Struct):
+    """What is known of a row with one seed.
+
+    Attributes:
+        row: its name.
+        seed: its seed.
+        commands: words by the command's name, ``ROW`` in place of the row's folder.
+        status: "begun", "ok" or "failed".
+        reason: why it failed, in one line.
+        ended: what has ended well, by the command's name.
+        parts: of the commands that have not.
+        gamba_warp: version of the package.
+    """
+
+    row: str
+    seed: int
+    commands: dict[str, list[str]]
+    version: Annotated[int, Meta(ge=1, le=1)] = 1
+    status: Literal["begun", "ok", "failed"] = "begun"
+    reason: str = ""
+    ended: dict[str, Ended] = {}
+    parts: dict[str, Ended] = {}
+    gamba_warp: str = __version__
+
+
+def read_record(folder: Path) -> Record | None:
+    """The record of a row's folder; None where there is none.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    for name in ("row.json", "state.json"):
+        if (folder / name).exists():
+            return read_document(folder / name, Record, _MAX)
+    return None
+
+
+@dataclass
+class Task:
+    """A row with one seed.
+
+    Attributes:
+        row: of the plan.
+        folder: its folder.
+        stages: its commands.
+        record: what of it is done.
+        changed: what of its commands was another one when it ran, or None.
+        geometry: number of objects whose shapes are evaluated, or None for all.
+    """
+
+    row: Row
+    folder: Path
+    stages: list[Stage]
+    record: Record
+    changed: str | None
+    geometry: int | None
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"{self.row.name}, seed {self.record.seed}"
+
+    def following(self) -> Stage | None:
+        """The next command; None where all have ended well."""
+        for stage in self.stages:
+            if stage.name not in self.record.ended or not (self.folder / stage.makes).exists():
+                return stage
+        return None
+
+    def begin_anew(self) -> None:
+        """Removes what commands made that are others now, and what came after them.
+
+        Raises:
+            UserError: something cannot be removed.
+        """
+        old = self.record
+        self.record, self.changed = _begun(self.row, old.seed, self.stages), None
+        for name, words in self.record.commands.items():
+            if old.commands.get(name) != words or name not in old.ended:
+                break
+            self.record.ended[name] = old.ended[name]
+        try:
+            for name in (name for name in old.commands if name not in self.record.ended):
+                chosen = self.folder.glob("chosen-*") if name == "shapes" else ()
+                for path in (*chosen, self.folder / FOLDERS[name]):
+                    if path.is_dir():
+                        remove_folder(path)
+        except OSError as error:
+            raise UserError(f"cannot remove {self.folder}: {error.strerror}") from error
+
+    def write(self, status: Literal["begun", "ok", "failed"] | None = None, why: str = "") -> None:
+        """Writes the record, atomically, with another status if one is given."""
+        if status is not None:
+            self.record.status, self.record.reason = status, why
+        names = ["state.json", "row.json"]
+        now, other = names if self.record.status == "begun" else names[::-1]
+        write_json(self.folder / now, msgspec.to_builtins(self.record))
+        (self.folder / other).unlink(missing_ok=True)
+
+
+def _begun(row: Row, seed: int, stages: list[Stage]) -> Record:
+    return Record(row.name, seed, {stage.name: stage.words for stage in stages})
+
+
+def task_of(settings: Settings, row: Row, seed: int) -> Task:
+    """A row with one seed, and what of it is done.
+
+    Raises:
+        UserError: an option of the row is wrong, or its record is damaged.
+    """
+    made = stages(settings, row, seed)
+    folder = settings.out / "rows" / row.name / f"seed-{seed}"
+    wanted = _begun(row, seed, made)
+    record = read_record(folder) or wanted
+    other = difference(record.commands, wanted.commands)
+    return Task(row, folder, made, record, other, settings.evaluation.geometry_objects)
