@@ -202,16 +202,16 @@ def _check(plan: Plan) -> None:
         if row.name in known:
             raise UserError(f"row {row.name}: there are two of this name")
         known.add(row.name)
-        if row.kind == "fit" and row.set:
-            raise UserError(f"row {row.name}: a fit has no model, so it has no set")
-        if row.kind == "fit" and row.background_margin is not None:
-            raise UserError(f"row {row.name}: a fit has no model, so it has no background_margin")
+        of_models = {"set": bool(row.set), "background_margin": row.background_margin is not None}
+        for name in (name for name, given in of_models.items() if given and row.kind == "fit"):
+            raise UserError(f"row {row.name}: a fit has no model, so it has no {name}")
         unknown = [name for name in row.paper if name not in METRICS]
         if unknown or not all(map(math.isfinite, row.paper.values())):
             what = f"no metric {unknown[0]}" if unknown else "not a number"
             raise UserError(f"row {row.name}: paper: {what}; there are {', '.join(METRICS)}")
         _check_values(f"row {row.name}", row.set, row.options)
-        _check_seeds(f"row {row.name}", plan.seeds_of(row))
+        if len({*plan.seeds_of(row)}) != len(plan.seeds_of(row)):
+            raise UserError(f"row {row.name}: a seed is there twice")
     _check_values("base", plan.base.set, plan.base.options, plan.base.fit)
     others = {plan.compare_with, *(row.compare_with for row in plan.rows)}
     for name in filter(None, others):
@@ -221,11 +221,6 @@ def _check(plan: Plan) -> None:
         kinds = {row.kind for row in plan.rows if row.series == name}
         if len(kinds) > 1:
             raise UserError(f"series {name}: it mixes models and fits")
-
-
-def _check_seeds(where: str, seeds: list[int]) -> None:
-    if len({*seeds}) != len(seeds):
-        raise UserError(f"{where}: a seed is there twice")
 
 
 def _check_values(where: str, *groups: Values) -> None:

@@ -197,7 +197,7 @@ class _Scale:
     def ticks(self) -> list[float]:
         """Round values within the bounds; where all figures are one, that one."""
         if self._only is not None and not self._logarithmic:
-            return [self._only]
+            return [float(f"{self._only:.4g}")]
         return round_values(self.low, self.high, self._logarithmic)
 
 

@@ -1,4 +1,4 @@
-"""All that ``gamba export`` writes of one file of Gaussians."""
+"""What is written of an object of Gaussians, and all that ``gamba export`` writes of a file."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..batch import STAGES
 from ..conventions import Axes
 from ..errors import UserError
 from ..formats.gaussians.files import (
@@ -30,52 +31,125 @@ from .page import Section, reconstruction_page
 from .turntable import save_turntable, turntable_frames
 
 
-@dataclass
-class ExportJob:
-    """What to write for each input.
+@dataclass(kw_only=True)
+class ObjectFiles:
+    """What to write of each object.
 
     Attributes:
         folder: folder of the results.
-        mesh: formats of the mesh.
         splats: formats of the Gaussians.
-        page: whether a page with a 3D viewer is written.
+        mesh: formats of a mesh of the surface.
+        page: whether a self-contained HTML page with a 3D viewer is written.
         turntable: ``gif``, ``mp4`` or ``none``.
-        surface: how the mesh is made.
-        texture: side of its texture, pixels; 0: none.
-        axes: axes of the meshes, but of .glb.
-        min_opacity: fainter Gaussians are left out; None: those that are never drawn.
         size: side of the turntable's frames, pixels.
         frames: views of one turn.
-        device: device that renders.
-        view: from where turntables and pages look, in units of the object's longest side.
+        axes: axes of the meshes, but of .glb.
+        min_opacity: fainter Gaussians are left out; None: those that are never drawn.
+        surface: how the mesh is made.
+        texture: side of its texture, pixels; 0: none.
     """
 
     folder: Path
-    mesh: tuple[MeshFormat, ...]
     splats: tuple[SplatFormat, ...]
+    mesh: tuple[MeshFormat, ...]
     page: bool
     turntable: str
-    surface: SurfaceOptions
-    texture: int
-    axes: Axes
-    min_opacity: float | None
     size: int
     frames: int
-    device: torch.device
-    view: Viewpoint = Viewpoint()
+    axes: Axes
+    min_opacity: float | None
+    surface: SurfaceOptions
+    texture: int = 0
 
-    def suffixes(self) -> list[str]:
-        """What follows the name of an input in each of its files."""
-        found = mesh_suffixes(self.mesh, self.texture)
-        found += [splat_suffix(kind) for kind in self.splats]
+    def suffixes(self, meshes: bool = True) -> list[str]:
+        """What follows the name of an object in each of its files, those of meshes the last."""
+        found = [splat_suffix(kind) for kind in self.splats]
         found += [f".{self.turntable}"] if self.turntable != "none" else []
-        return found + ([".html"] if self.page else [])
+        found += [".html"] if self.page else []
+        return found + (mesh_suffixes(self.mesh, self.texture) if meshes else [])
 
     def require(self) -> None:
         """Refuses what needs a library that is not installed (ModuleNotFoundError)."""
         require_movie(self.turntable)
         if self.mesh:
             self.surface.require(self.texture)
+
+    def write(
+        self,
+        gaussians: Gaussians,
+        shown: Gaussians | None,
+        view: Viewpoint,
+        section: Section,
+        device: torch.device,
+        comments: Sequence[str],
+    ) -> tuple[list[str], np.ndarray | None]:
+        """Writes the files of one object, ``NAME.*`` by the section's title.
+
+        Args:
+            gaussians: the object, of any size anywhere.
+            shown: the object as turntable and viewer have it, at the origin in units of its
+                longest side; None: as it is.
+            view: from where they look.
+            section: of the page, which gets what is made here.
+            device: that renders.
+            comments: lines for the header of a ``.ply``.
+
+        Returns:
+            Sentences about what formats cannot hold and about the mesh, and the turntable
+            ``[F, S, S, 3]`` uint8, if one was made.
+
+        Raises:
+            UserError: a file cannot be written, or the object has no surface.
+        """
+        base, turn = self.folder / section.title, None
+        STAGES.begin("Gaussians")
+        paths = {kind: base.with_name(base.name + splat_suffix(kind)) for kind in self.splats}
+        said = [write_gaussians(p, gaussians, k, comments=comments) for k, p in paths.items()]
+        if self.turntable != "none" or self.page:
+            STAGES.begin("turntable")
+            seen = gaussians if shown is None else shown
+            turn = turntable_frames(
+                seen.to(device), size=self.size, frames=self.frames, **asdict(view)
+            )
+            if self.turntable != "none":
+                STAGES.begin(f"{self.turntable} file")
+                save_turntable(base.with_name(f"{base.name}.{self.turntable}"), turn)
+            section.turntable, section.gaussians = turn, seen
+            self._write_page(section, meshes=False)
+        if self.mesh:  # what takes longest comes last: all else is there to look at
+            STAGES.begin("mesh")
+            start = time.perf_counter()
+            options = self.surface, self.axes, device, self.texture
+            mesh = write_meshes(base, gaussians, self.mesh, *options)
+            seconds = time.perf_counter() - start
+            closed = "closed" if mesh.is_watertight() else "open"
+            counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closed}"
+            said.append(f"Mesh: {counts}, {seconds:.1f} s.")
+            section.mesh = mesh if shown is None else None
+            self._write_page(section, meshes=True)
+        STAGES.begin("rest")
+        return [*filter(None, said)], turn
+
+    def _write_page(self, section: Section, meshes: bool) -> None:
+        """The page, if it is wanted; the second time it also leads to the meshes."""
+        if self.page:
+            STAGES.begin("page")
+            ends = [end for end in self.suffixes(meshes) if end != ".html"]
+            section.files = [section.title + end for end in ends]
+            reconstruction_page(self.folder / f"{section.title}.html", section)
+
+
+@dataclass(kw_only=True)
+class ExportJob(ObjectFiles):
+    """What to write for each input.
+
+    Attributes:
+        device: device that renders.
+        view: from where turntables and pages look, in units of the object's longest side.
+    """
+
+    device: torch.device
+    view: Viewpoint = Viewpoint()
 
 
 def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path, str]]]:
@@ -103,18 +177,19 @@ def find_gaussians(inputs: Sequence[Path]) -> tuple[list[Path], list[tuple[Path,
                 failures.append((path, "no such file"))
             continue
         inside = sorted(p for p in path.glob("[!.]*") if p.suffix.lower() in SPLAT_SUFFIXES)
-        inside = [p for p in inside if p.suffix.lower() != ".glb" or not _is_mesh(p)]
+        inside = [p for p in inside if p.suffix.lower() != ".glb" or holds_gaussians(p)]
         files.update(dict.fromkeys(inside))
         if not inside:
             failures.append((path, "the folder holds no .ply, .splat, .spz or .glb files"))
     return list(files), failures
 
 
-def _is_mesh(path: Path) -> bool:
+def holds_gaussians(path: Path) -> bool:
+    """Whether a .glb holds Gaussians, or what cannot be told; a mesh is neither."""
     try:
-        return splat_kind(path) is None
+        return splat_kind(path) is not None
     except UserError:  # it is refused with this reason when it is read
-        return False
+        return True
 
 
 def export(name: str, path: Path, job: ExportJob) -> str:
@@ -132,68 +207,8 @@ def export(name: str, path: Path, job: ExportJob) -> str:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
     """
     gaussians, count = to_be_written(read_gaussians(path), job.min_opacity)
-    said, comments = [f"{name}: {count}"], comments_of(path)
-    for kind in job.splats:
-        target = job.folder / (name + splat_suffix(kind))
-        said += filter(None, [write_gaussians(target, gaussians, kind, comments=comments)])
-    page = job.folder / f"{name}.html"
-    section = _write_pictures(page, gaussians, job)
-    if not job.mesh:
-        return " ".join(said)
-    start = time.perf_counter()
-    base, options = job.folder / name, job.surface
-    found = write_meshes(base, gaussians, job.mesh, options, job.axes, job.device, job.texture)
-    if section is not None:  # the page again, which leads to the meshes, too
-        section.files = [*section.files, *(name + s for s in mesh_suffixes(job.mesh, job.texture))]
-        reconstruction_page(page, section)
-    closed = "closed" if found.is_watertight() else "open"
-    counts = f"{len(found.vertices):,} vertices, {len(found.faces):,} faces, {closed}"
-    seconds = time.perf_counter() - start
-    return " ".join([*said, f"Mesh: {counts}, {seconds:.1f} s."])
-
-
-def _write_pictures(page: Path, gaussians: Gaussians, job: ExportJob) -> Section | None:
-    """The page and the turntables, of the object at the origin with longest side 1."""
-    if not job.page and job.turntable == "none":
-        return None
-    files = [page.stem + splat_suffix(kind) for kind in job.splats]
-    moved = gaussians.in_unit(*unit_frame(gaussians)).to(job.device)
-    turn = turntable_frames(moved, size=job.size, frames=job.frames, **asdict(job.view))
-    if job.turntable != "none":
-        files.append(f"{page.stem}.{job.turntable}")
-        save_turntable(page.with_name(files[-1]), turn)
-    return write_page(page, page.stem, gaussians, turn, job.view, files) if job.page else None
-
-
-def write_page(
-    path: Path,
-    title: str,
-    gaussians: Gaussians,
-    turntable: np.ndarray | None = None,
-    view: Viewpoint | None = None,
-    files: Sequence[str] = (),
-) -> Section:
-    """Writes a page with a 3D viewer, of an object of any size anywhere.
-
-    Args:
-        path: the .html file.
-        title: heading of the page.
-        gaussians: one object.
-        turntable: frames ``[T, S, S, 3]`` uint8 of one turn, or None.
-        view: where the viewer starts, in units of the object's longest side.
-        files: names of files beside the page, which it offers for download.
-
-    Returns:
-        What is on it.
-
-    Raises:
-        UserError: the object has no extent, or the file cannot be written.
-    """
-    moved = gaussians.in_unit(*unit_frame(gaussians))
-    table = [("Gaussians", f"{gaussians.num:,}")]
-    camera = asdict(view or Viewpoint())
-    section = Section(
-        title, turntable=turntable, gaussians=moved, table=table, files=files, **camera
-    )
-    reconstruction_page(path, section)
-    return section
+    drawn = job.page or job.turntable != "none"
+    shown = gaussians.in_unit(*unit_frame(gaussians)) if drawn else gaussians
+    section = Section(name, table=[("Gaussians", f"{gaussians.num:,}")], **asdict(job.view))
+    said, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
+    return " ".join([f"{name}: {count}", *said])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from ..errors import UserError
 from ..images import load_rgba
@@ -16,6 +18,29 @@ from .run_log import RunRecord, read_run_log
 
 PAGE = "index.html"
 _WARNINGS = 20  # the last ones, on the page
+
+
+class _Length(msgspec.Struct, frozen=True):
+    steps: int | None = None
+
+
+class _Config(msgspec.Struct, frozen=True):
+    data: str | None = None
+    preset: str | None = None
+    length: _Length = _Length()
+
+
+class _Start(msgspec.Struct):
+    """What is read of the log's first line; with something of another type in it, nothing is."""
+
+    objects: int | None = None
+    held_out: int | None = None
+    split_version: int | None = None
+    parameters: int | None = None
+    steps: int | None = None
+    device: str | None = None
+    command: str = ""
+    config: _Config = _Config()
 
 
 def write_run_page(run: Path, path: Path | None = None) -> Path:
@@ -32,70 +57,63 @@ def write_run_page(run: Path, path: Path | None = None) -> Path:
         UserError: the log cannot be read, or the page cannot be written.
     """
     path = path or run / PAGE
-    record = read_run_log(run / "log.jsonl")
+    record, start = read_run_log(run / "log.jsonl"), _Start()
+    with contextlib.suppress(msgspec.ValidationError):
+        start = msgspec.convert(record.start, _Start)
+    steps = start.steps or start.config.length.steps
+    total = f" of {steps:,}" if steps else ""
+    code = record.end.get("code")
+    state = "finished" if record.end else "in training, or cut off"
+    if type(code) is int and code > 128:
+        state = "stopped; the same command goes on from here"
+    hours = f"{record.minutes / 60:.1f} hours"
+    spent = hours if record.minutes >= 90 else f"{record.minutes:.1f} minutes"
     sections = [
-        Section("Run", table=_facts(record)),
-        curves_section("Curves", _about_curves(record), record),
+        Section("Run", table=_facts(record, start)),
+        curves_section("Curves", _about_curves(record, start), record),
         *_validation(record),
         *_samples(run),
-        *_warnings(record),
-        *_configuration(record),
     ]
+    if record.warnings:
+        shown = record.warnings[-_WARNINGS:]
+        text = "" if len(shown) == len(record.warnings) else f"The last {len(shown)}."
+        rows = [[f"step {step:,}", message[:500]] for step, message in shown]
+        sections.append(Section("Warnings", text, table=rows))
+    if options := record.start.get("config"):
+        details = {"All options": json.dumps(options, indent=2)[:30_000]}
+        sections.append(Section("Command", code=start.command[:10_000], details=details))
     name = "/".join(run.resolve().parts[-2:])  # many a run lies in a folder that is called run
-    demo_page(path, sections, title=f"Training of {name}", text=_state(record))
+    text = f"Step {record.step:,}{total}, {spent} of training: {state}."
+    demo_page(path, sections, title=f"Training of {name}", text=text)
     return path
 
 
-def _state(record: RunRecord) -> str:
-    length = record.start.get("config", {})
-    length = length.get("length", {}) if isinstance(length, dict) else {}
-    steps = record.start.get("steps") or (length.get("steps") if isinstance(length, dict) else None)
-    total = f" of {steps:,}" if type(steps) is int else ""
-    if record.end:
-        code = record.end.get("code")
-        stopped = type(code) is int and code > 128
-        state = "stopped; the same command goes on from here" if stopped else "finished"
-    else:
-        state = "in training, or cut off"
-    return f"Step {record.step:,}{total}, {_time(record.minutes)} of training: {state}."
-
-
-def _time(minutes: float) -> str:
-    return f"{minutes / 60:.1f} hours" if minutes >= 90 else f"{minutes:.1f} minutes"
-
-
-def _facts(record: RunRecord) -> list[tuple[str, str | int | float]]:
+def _facts(record: RunRecord, start: _Start) -> list[tuple[str, str]]:
     """What is trained on what, and how fast."""
-    start, config = record.start, record.start.get("config")
-    config = config if isinstance(config, dict) else {}
-    rows: list[tuple[str, Any]] = [
-        ("Data", config.get("data")),
-        ("Objects", start.get("objects")),
-        ("Held-out objects", start.get("held_out")),
-        ("Version of the split", start.get("split_version")),
-        ("Preset", config.get("preset")),
-        ("Parameters", start.get("parameters")),
-        ("Device", start.get("device")),
-    ]
+    rows = {
+        "Data": start.config.data,
+        "Objects": start.objects,
+        "Held-out objects": start.held_out,
+        "Version of the split": start.split_version,
+        "Preset": start.config.preset,
+        "Parameters": start.parameters,
+        "Device": start.device,
+    }
     if record.minutes and record.step:
-        rows.append(("Seconds a step", f"{60 * record.minutes / record.step:.3g}"))
+        rows["Seconds a step"] = f"{60 * record.minutes / record.step:.3g}"
     views = record.series.get("train.views_per_second")
     if views and views.values:
         last = list(views.values)[-50:]
-        rows.append(("Views a second, lately", f"{sum(last) / len(last):.3g}"))
-    rows.append(("Warnings", len(record.warnings)))
-    return [(name, _cell(value)) for name, value in rows if value is not None]
+        rows["Views a second, lately"] = f"{sum(last) / len(last):.3g}"
+    rows["Warnings"] = len(record.warnings)
+    texts = ((name, f"{v:,}" if isinstance(v, int) else v) for name, v in rows.items())
+    return [(name, text[:300]) for name, text in texts if text is not None]
 
 
-def _cell(value: object) -> str:
-    return f"{value:,}" if type(value) is int else str(value)[:300]
-
-
-def _about_curves(record: RunRecord) -> str:
-    held = record.start.get("held_out")
+def _about_curves(record: RunRecord, start: _Start) -> str:
     text = "Point at a chart for its values."
-    if type(held) is int:
-        text = f"Held out: {held} objects that are not trained on. {text}"
+    if start.held_out is not None:
+        text = f"Held out: {start.held_out} objects that are not trained on. {text}"
     loss = record.series.get("train.loss")
     if loss and len(loss.steps) > 60:
         text += (
@@ -110,48 +128,26 @@ def _about_curves(record: RunRecord) -> str:
 def _validation(record: RunRecord) -> list[Section]:
     """The last validation as a table."""
     rows = []
-    for view in ("input", "novel"):
+    for view, name in (("input", "input view"), ("novel", "novel views")):
         found = [record.series.get(f"val.{measure}_{view}") for measure in OF_PICTURES]
         if any(found):
-            cells = [f"{series.values[-1]:.4g}" if series else "absent" for series in found]
-            rows.append([f"{view} view" + ("s" if view == "novel" else ""), *cells])
+            rows.append([name, *(f"{s.values[-1]:.4g}" if s else "absent" for s in found)])
     if not rows:
         return []
-    step = int(max(s.steps[-1] for n, s in record.series.items() if n.startswith("val.")))
-    text = f"Means over the held-out objects at step {step:,}."
+    step = max(s.steps[-1] for n, s in record.series.items() if n.startswith("val."))
+    text = f"Means over the held-out objects at step {step:,.0f}."
     return [Section("Last validation", text, header=["", *OF_PICTURES.values()], table=rows)]
 
 
 def _samples(run: Path) -> list[Section]:
     """The newest sample pictures, which the training wrote."""
-    found = [(re.fullmatch(r"step_(\d{1,15})\.png", p.name), p) for p in run.glob("samples/step_*")]
-    numbered = sorted((int(match[1]), path) for match, path in found if match)
-    if not numbered:
-        return []
-    step, path = numbered[-1]
-    try:
-        picture = load_rgba(path)[..., :3]
-    except UserError:
-        return []
-    text = (
-        f"Held-out objects at step {step:,}: in each pair of rows the true views are above and "
-        "the predicted ones below; the first column is the input view."
-    )
-    return [Section("Pictures", text, strip=picture)]
-
-
-def _warnings(record: RunRecord) -> list[Section]:
-    if not record.warnings:
-        return []
-    shown = record.warnings[-_WARNINGS:]
-    text = "" if len(shown) == len(record.warnings) else f"The last {len(shown)}."
-    rows = [[f"step {step:,}", message[:500]] for step, message in shown]
-    return [Section("Warnings", text, table=rows)]
-
-
-def _configuration(record: RunRecord) -> list[Section]:
-    config, command = record.start.get("config"), record.start.get("command")
-    section = Section("Command", code=command[:10_000] if isinstance(command, str) else "")
-    if isinstance(config, dict):
-        section.details = {"All options": json.dumps(config, indent=2)[:30_000]}
-    return [section] if section.code or section.details else []
+    found = ((re.fullmatch(r"step_(\d{1,15})\.png", p.name), p) for p in run.glob("samples/step_*"))
+    step, path = max(((int(match[1]), path) for match, path in found if match), default=(0, None))
+    with contextlib.suppress(UserError):
+        if path is not None:
+            text = (
+                f"Held-out objects at step {step:,}: in each pair of rows the true views are above "
+                "and the predicted ones below; the first column is the input view."
+            )
+            return [Section("Pictures", text, strip=load_rgba(path)[..., :3])]
+    return []

@@ -91,7 +91,10 @@ def read_run_log(path: Path) -> RunRecord:
         step, clock = line["step"], _number(line.get("time"))
         event = line["event"]
         if event == "start":
-            _cut(record, step)
+            for series in record.series.values():  # the run has gone back to this step
+                series.cut(step)
+            last = [series.minutes[-1] for series in record.series.values() if series.minutes]
+            record.minutes = max(last, default=0.0)
             record.start, record.end = line, {}
             began, before = clock or 0.0, record.minutes
         elif event in ("train", "val"):
@@ -99,7 +102,13 @@ def read_run_log(path: Path) -> RunRecord:
             if minutes is None:
                 minutes = before + max(0.0, (clock or began) - began) / 60
             record.minutes = max(record.minutes, minutes)
-            _add(record, event, step, record.minutes, line)
+            for name, number in ((name, _number(value)) for name, value in line.items()):
+                wanted = event == "val" or name in _TRAIN or name.startswith("loss_")
+                if number is None or not wanted or name in _NO_FIGURES or not _NAME.fullmatch(name):
+                    continue
+                name = f"{event}.{name}"
+                if name in record.series or len(record.series) < _MOST_SERIES:
+                    record.series.setdefault(name, Series()).add(step, record.minutes, number)
         elif event == "end":
             record.end = line
         elif event == "warning" and isinstance(line.get("message"), str):
@@ -128,25 +137,6 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
                     yield line
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from error
-
-
-def _add(record: RunRecord, event: str, step: int, minutes: float, line: dict) -> None:
-    for name, value in line.items():
-        number = _number(value)
-        wanted = event == "val" or name in _TRAIN or name.startswith("loss_")
-        if number is None or not wanted or name in _NO_FIGURES or not _NAME.fullmatch(name):
-            continue
-        name = f"{event}.{name}"
-        if name in record.series or len(record.series) < _MOST_SERIES:
-            record.series.setdefault(name, Series()).add(step, minutes, number)
-
-
-def _cut(record: RunRecord, step: int) -> None:
-    """Takes away what was logged after a step, to which the run has gone back."""
-    for series in record.series.values():
-        series.cut(step)
-    last = [series.minutes[-1] for series in record.series.values() if series.minutes]
-    record.minutes = max(last, default=0.0)
 
 
 def _number(value: object) -> float | None:

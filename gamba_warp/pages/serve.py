@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.server
 import socket
 import threading
@@ -92,8 +93,12 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
         timeout = _READ_SECONDS  # of each single read and write
 
         def handle(self) -> None:
+            def end() -> None:
+                with contextlib.suppress(OSError):  # it is closed already
+                    self.connection.shutdown(socket.SHUT_RDWR)
+
             # A client that sends a letter now and then would pass every single read's limit.
-            timer = threading.Timer(_READ_SECONDS, _close, [self.connection])
+            timer = threading.Timer(_READ_SECONDS, end)
             timer.daemon = True
             self.reading = timer
             timer.start()
@@ -122,10 +127,3 @@ def page_handler(content: bytes) -> type[http.server.BaseHTTPRequestHandler]:
             """Says nothing."""
 
     return Handler
-
-
-def _close(connection: socket.socket) -> None:
-    try:
-        connection.shutdown(socket.SHUT_RDWR)
-    except OSError:  # it is closed already
-        pass
