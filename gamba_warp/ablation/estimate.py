@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 
-from .figures import read_facts
+from .figures import read_log, step_seconds
 from .jobs import Settings, fit_options, train_config
 from .plan import Row
 from .tasks import Task
@@ -60,7 +60,7 @@ def print_plan(settings: Settings, tasks: list[Task], jobs: int, threads: int) -
     total = 0.0
     for name in dict.fromkeys(task.row.name for task in tasks):
         seeds = [task for task in tasks if task.row.name == name]
-        steps = [read_facts(task.folder / "run" / "log.jsonl").step_seconds for task in seeds]
+        steps = [step_seconds(read_log(task.folder / "run" / "log.jsonl")) for task in seeds]
         known = next((step for step in steps if step is not None), None)
         minutes = row_minutes(settings, seeds[0].row, threads, known)
         print(f"{name}: {seeds[0].row.label}, about {minutes:.1f} minutes a seed")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from msgspec import Meta
 from ..conventions import WHITE, over_background
 from ..errors import UserError
 from ..image_metrics import all_figures
-from ..pages.run_log import read_lines
+from ..pages.run_log import RunRecord, read_run_log
 from ..untrusted.documents import read_document
 from .jobs import Settings, gaussians_of
 from .plan import Row
@@ -29,31 +28,6 @@ Objects = dict[str, dict[str, float]]  # metrics by object
 
 
 @dataclass
-class Facts:
-    """What the log of a run says.
-
-    Attributes:
-        steps: optimizer steps done.
-        skipped: those that were not finite.
-        step_seconds: median time of a step, seconds, or None.
-        parameters: that were trained, or None.
-        device: that trained, such as "cpu", or "".
-        device_memory: most bytes of a GPU's memory that the run held, or None.
-        last_loss: of the training; NaN where it was not finite, None where there is none.
-        last_val_loss: of the validation, as ``last_loss``.
-    """
-
-    steps: int = 0
-    skipped: int = 0
-    step_seconds: float | None = None
-    parameters: int | None = None
-    device: str = ""
-    device_memory: int | None = None
-    last_loss: float | None = None
-    last_val_loss: float | None = None
-
-
-@dataclass
 class SeedResult:
     """What a row has with one seed.
 
@@ -63,7 +37,8 @@ class SeedResult:
             object. What was not evaluated lacks.
         views: indices of these views, by object.
         size: height of the pictures compared, or None for the files' own.
-        facts: of the training.
+        log: of the training; of a fit there is none.
+        step_seconds: median time of a step, seconds, or None.
         missing: objects that could not be evaluated.
     """
 
@@ -71,7 +46,8 @@ class SeedResult:
     objects: Objects = field(default_factory=dict)
     views: dict[str, list[int]] = field(default_factory=dict)
     size: int | None = None
-    facts: Facts = field(default_factory=Facts)
+    log: RunRecord = field(default_factory=RunRecord)
+    step_seconds: float | None = None
     missing: list[str] = field(default_factory=list)
 
 
@@ -187,11 +163,12 @@ def read_result(task: Task) -> SeedResult:
         found.views = {record.name: record.views_held_out for record in report.objects}
         fits = [record for record in report.objects if isinstance(record.seconds, float)]
         times = [record.seconds / record.steps for record in fits]
-        found.facts.step_seconds = statistics.median(times) if times else None
+        found.step_seconds = statistics.median(times) if times else None
     else:
         found.objects = report.figures(VIEW_METRICS)
         found.views = {record.name: record.views[1:] for record in report.objects}
-        found.facts = read_facts(task.folder / "run" / "log.jsonl")
+        found.log = read_log(task.folder / "run" / "log.jsonl")
+        found.step_seconds = step_seconds(found.log)
     if "shapes" in task.record.ended:
         report = read_document(task.folder / "shapes" / "report.json", _Report)
         for name, values in report.figures(SHAPE_METRICS).items():
@@ -223,29 +200,14 @@ def empty_psnr(data: Path, views: dict[str, list[int]], size: int | None) -> dic
     return found
 
 
-def read_facts(path: Path) -> Facts:
-    """Reads a run's log; lines that are damaged are passed over, and so is a log that lacks."""
-    facts, seconds = Facts(), []
+def read_log(path: Path) -> RunRecord:
+    """What a run's log says; nothing where it lacks."""
     with contextlib.suppress(UserError):
-        for line in read_lines(path):
-            event, facts.steps = line["event"], line["step"]
-            memory, skipped = _whole(line.get("device_memory")), _whole(line.get("skipped"))
-            if memory is not None:
-                facts.device_memory = max(memory, facts.device_memory or 0)
-            facts.skipped = facts.skipped if skipped is None else skipped
-            if event == "start":
-                facts.parameters = _whole(line.get("parameters"))
-                facts.device = str(line.get("device", ""))[:100]
-            elif event in ("train", "val") and "loss" in line:
-                # The log has null for a loss that is not finite.
-                loss = line["loss"] if type(line["loss"]) in (int, float) else math.nan
-                setattr(facts, "last_loss" if event == "train" else "last_val_loss", loss)
-                taken = line.get("seconds")
-                if event == "train" and type(taken) in (int, float) and 0 < taken < 1e9:
-                    seconds.append(taken)
-    facts.step_seconds = statistics.median(seconds) if seconds else None
-    return facts
+        return read_run_log(path)
+    return RunRecord()
 
 
-def _whole(value: object) -> int | None:
-    return value if type(value) is int and 0 <= value < 10**18 else None
+def step_seconds(log: RunRecord) -> float | None:
+    """The median time of a step of a training, seconds, or None."""
+    seconds = log.values("train.seconds")
+    return statistics.median(seconds) if seconds else None

@@ -14,7 +14,7 @@ from pathlib import Path
 from .. import processes
 from ..errors import UserError, one_line
 from ..files import atomic_folder, output_folder
-from .figures import read_facts, read_result
+from .figures import read_log, read_result
 from .jobs import ROW, Stage
 from .tasks import Ended, Task
 
@@ -111,12 +111,13 @@ def _commands(
 
 def diverged(run: Path) -> str | None:
     """Says that a training that ended well has diverged all the same, from its log; or None."""
-    facts = read_facts(run / "log.jsonl")
-    for name, value in (("loss", facts.last_loss), ("validation's loss", facts.last_val_loss)):
-        if value is not None and not math.isfinite(value):
+    log = read_log(run / "log.jsonl")
+    for event, name in (("train", "loss"), ("val", "validation's loss")):
+        if not math.isfinite(log.losses.get(event, 0.0)):
             return f"diverged: its last {name} is not finite"
-    if facts.steps and facts.skipped > facts.steps / 2:
-        return f"diverged: {facts.skipped} of its {facts.steps} steps were not finite"
+    skipped = max(log.values("train.skipped"), default=0)
+    if log.step and skipped > log.step / 2:
+        return f"diverged: {skipped:.0f} of its {log.step} steps were not finite"
     return None
 
 
@@ -131,8 +132,8 @@ def row_line(task: Task) -> str:
         return f"{task.name}: {error}"
     values = [v["psnr"] for v in found.objects.values() if "psnr" in v]
     parts = [f"PSNR {sum(values) / len(values):.2f} dB" if values else "no view could be compared"]
-    if found.facts.step_seconds is not None:
-        parts.append(f"{found.facts.step_seconds:.3g} s a step")
+    if found.step_seconds is not None:
+        parts.append(f"{found.step_seconds:.3g} s a step")
     if found.missing:
         parts.append(f"{len(found.missing)} objects lack")
     spent = sum(part.seconds for part in record.ended.values())

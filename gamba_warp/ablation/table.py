@@ -51,11 +51,13 @@ def make_table(settings: Settings, results: list[RowResult], empty: Empty) -> di
 
 def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
     row, seeds = result.row, result.seeds
-    facts = [seed.facts for seed in seeds.values()]
+    logs = [seed.log for seed in seeds.values()]
     records = [seed.task.record.ended for seed in seeds.values()]
     ended = [part for of in records if (part := of.get("fit" if row.kind == "fit" else "train"))]
-    on_gpu = any(f.device.startswith("cuda") for f in facts)
-    memory = [f.device_memory for f in facts] if on_gpu else [part.peak_memory for part in ended]
+    on_gpu = any(str(log.start.get("device")).startswith("cuda") for log in logs)
+    memory = [part.peak_memory for part in ended]
+    if on_gpu:
+        memory = [round(value) for log in logs for value in log.values("train.device_memory")]
     status = "failed" if result.failed else "incomplete" if result.absent else "ok"
     return {
         "name": row.name,
@@ -68,12 +70,12 @@ def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
         "gaussians": result.gaussians,
         "figures": _figures(result),
         "difference": _difference(result, reference),
-        "step_seconds": _median([f.step_seconds for f in facts]),
-        "steps": _median([f.steps for f in facts]) if row.kind == "train" else None,
+        "step_seconds": _median([seed.step_seconds for seed in seeds.values()]),
+        "steps": _median([log.step for log in logs]) if row.kind == "train" else None,
         "seconds": _median([part.seconds for part in ended]),
         "peak_memory": max(filter(None, memory), default=None),
         "peak_memory_of": "GPU" if on_gpu else "process",
-        "parameters": next((f.parameters for f in facts if f.parameters is not None), None),
+        "parameters": next((log.start.get("parameters") for log in logs if log.start), None),
         "threads": sorted({part.threads for part in ended}),
         "jobs": sorted({part.jobs for part in ended}),
         "missing": {str(n): s.missing for n, s in seeds.items() if s.missing},

@@ -6,7 +6,7 @@ import math
 import re
 from array import array
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ _LONGEST = 1 << 20  # bytes of a line; ours have a few hundred
 _MOST_WARNINGS = 1000
 _MOST_STEPS = 10**12
 # Of a training line; a validation's figures are all wanted.
-_TRAIN = {"loss", "psnr", "lr", "grad_norm", "views_per_second"}
+_TRAIN = {"loss", "psnr", "lr", "grad_norm", "views_per_second", "seconds", "skipped"}
+_TRAIN |= {"device_memory"}
 _NAME = re.compile(r"[a-z][a-z_]{0,30}")
 _MOST_SERIES = 60
 _NO_FIGURES = {"step", "time", "minutes", "epoch"}
@@ -63,6 +64,7 @@ class RunRecord:
         start: the last line of the event ``start``, or empty.
         end: the line of the event ``end`` after it, or empty.
         warnings: steps and messages, the last thousand.
+        losses: the last one of "train" and of "val"; NaN where it was not finite.
     """
 
     series: dict[str, Series] = field(default_factory=dict)
@@ -71,6 +73,11 @@ class RunRecord:
     start: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
     warnings: list[tuple[int, str]] = field(default_factory=list)
+    losses: dict[str, float] = field(default_factory=dict)
+
+    def values(self, name: str) -> Sequence[float]:
+        """The values of a figure by its name in ``series``; none where it lacks."""
+        return self.series[name].values if name in self.series else ()
 
 
 def read_run_log(path: Path) -> RunRecord:
@@ -102,6 +109,9 @@ def read_run_log(path: Path) -> RunRecord:
             if minutes is None:
                 minutes = before + max(0.0, (clock or began) - began) / 60
             record.minutes = max(record.minutes, minutes)
+            if "loss" in line:  # null for one that is not finite
+                loss = _number(line["loss"])
+                record.losses[event] = math.nan if loss is None else loss
             for name, number in ((name, _number(value)) for name, value in line.items()):
                 wanted = event == "val" or name in _TRAIN or name.startswith("loss_")
                 if number is None or not wanted or name in _NO_FIGURES or not _NAME.fullmatch(name):
