@@ -115,7 +115,7 @@ def diverged(run: Path) -> str | None:
     for event, name in (("train", "loss"), ("val", "validation's loss")):
         if not math.isfinite(log.losses.get(event, 0.0)):
             return f"diverged: its last {name} is not finite"
-    skipped = max(log.values("train.skipped"), default=0)
+    skipped = log.most.get("skipped", 0)
     if log.step and skipped > log.step / 2:
         return f"diverged: {skipped:.0f} of its {log.step} steps were not finite"
     return None

@@ -57,7 +57,7 @@ def _row(result: RowResult, reference: RowResult | None) -> dict[str, Any]:
     on_gpu = any(str(log.start.get("device")).startswith("cuda") for log in logs)
     memory = [part.peak_memory for part in ended]
     if on_gpu:
-        memory = [round(value) for log in logs for value in log.values("train.device_memory")]
+        memory = [round(log.most["device_memory"]) for log in logs if "device_memory" in log.most]
     status = "failed" if result.failed else "incomplete" if result.absent else "ok"
     return {
         "name": row.name,

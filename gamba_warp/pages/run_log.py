@@ -18,8 +18,7 @@ _LONGEST = 1 << 20  # bytes of a line; ours have a few hundred
 _MOST_WARNINGS = 1000
 _MOST_STEPS = 10**12
 # Of a training line; a validation's figures are all wanted.
-_TRAIN = {"loss", "psnr", "lr", "grad_norm", "views_per_second", "seconds", "skipped"}
-_TRAIN |= {"device_memory"}
+_TRAIN = {"loss", "psnr", "lr", "grad_norm", "views_per_second", "seconds"}
 _NAME = re.compile(r"[a-z][a-z_]{0,30}")
 _MOST_SERIES = 60
 _NO_FIGURES = {"step", "time", "minutes", "epoch"}
@@ -65,6 +64,7 @@ class RunRecord:
         end: the line of the event ``end`` after it, or empty.
         warnings: steps and messages, the last thousand.
         losses: the last one of "train" and of "val"; NaN where it was not finite.
+        most: the largest of "skipped" (steps) and "device_memory" (bytes), of all lines.
     """
 
     series: dict[str, Series] = field(default_factory=dict)
@@ -74,6 +74,7 @@ class RunRecord:
     end: dict[str, Any] = field(default_factory=dict)
     warnings: list[tuple[int, str]] = field(default_factory=list)
     losses: dict[str, float] = field(default_factory=dict)
+    most: dict[str, float] = field(default_factory=dict)
 
     def values(self, name: str) -> Sequence[float]:
         """The values of a figure by its name in ``series``; none where it lacks."""
@@ -97,6 +98,9 @@ def read_run_log(path: Path) -> RunRecord:
     for line in read_lines(path):
         step, clock = line["step"], _number(line.get("time"))
         event = line["event"]
+        for name in ("skipped", "device_memory"):
+            if (number := _number(line.get(name))) is not None:
+                record.most[name] = max(number, record.most.get(name, 0.0))
         if event == "start":
             for series in record.series.values():  # the run has gone back to this step
                 series.cut(step)

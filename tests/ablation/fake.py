@@ -19,13 +19,19 @@ def plan(*rows, **more):
 
 
 def write_plan(folder, *rows, **more):
-    path = folder / "trial.json"
+    path = folder / f"{more.get('name', 'trial')}.json"
     path.write_text(json.dumps(plan(*rows, **more)))
     return path
 
 
 def option(words, name, default=None):
     return words[words.index(name) + 1] if name in words else default
+
+
+def write_report(out, figures, more):
+    objects = [{"name": name, **own, **more} for name, own in figures.items()]
+    report = {"protocol": {"size": None}, "objects": objects, "failures": []}
+    (out / "report.json").write_text(json.dumps(report))
 
 
 def train(words, out):
@@ -61,15 +67,9 @@ def train(words, out):
 def views(words, out):
     """PSNR is that of ``OBJECTS``, 100 dB more for each unit of the learning rate, 1 by seed."""
     rate, seed = json.loads(Path(option(words, "--checkpoint")).read_text())
-    objects = [
-        {
-            **{"name": name, "status": "ok", "views": [0, 1, 2], "psnr": psnr + 100 * rate + seed},
-            **{"ssim": 0.5, "lpips": None, "mask_iou": 0.25, "psnr_black": psnr - 3},
-        }
-        for name, psnr in OBJECTS.items()
-    ]
-    report = {"protocol": {"size": None}, "objects": objects, "failures": []}
-    (out / "report.json").write_text(json.dumps(report))
+    more = {"status": "ok", "views": [0, 1, 2], "ssim": 0.5, "lpips": None, "mask_iou": 0.25}
+    figures = {n: {"psnr": p + 100 * rate + seed, "psnr_black": p - 3} for n, p in OBJECTS.items()}
+    write_report(out, figures, more)
     if "--save-gaussians" in words:
         (out / "gaussians").mkdir()
         for name in OBJECTS:
@@ -79,23 +79,18 @@ def views(words, out):
 
 def shapes(words, out):
     found = sorted(path.stem for path in Path(words[1]).iterdir())
-    objects = [{"name": n, "status": "ok", "chamfer": 0.01 * len(n), "iou": 0.5} for n in found]
-    (out / "report.json").write_text(json.dumps({"objects": objects, "failures": []}))
+    write_report(out, {n: {"chamfer": 0.01 * len(n)} for n in found}, {"status": "ok", "iou": 0.5})
     return 1  # some of the true meshes have no prediction
 
 
 def fit(words, out):
     number = int(option(words, "--gaussians"))
-    objects = [
-        {
-            **{"name": name, "psnr_held_out": psnr + number / 100, "ssim_held_out": None},
-            "psnr_grey_held_out": psnr - 1,
-            **{"seconds": 10.0, "steps": 5, "views_held_out": [5]},
-        }
+    more = {"ssim_held_out": None, "seconds": 10.0, "steps": 5, "views_held_out": [5]}
+    figures = {
+        name: {"psnr_held_out": psnr + number / 100, "psnr_grey_held_out": psnr - 1}
         for name, psnr in OBJECTS.items()
-    ]
-    report = {"protocol": {"size": None}, "objects": objects, "failures": []}
-    (out / "report.json").write_text(json.dumps(report))
+    }
+    write_report(out, figures, more)
     return 0
 
 

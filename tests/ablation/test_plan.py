@@ -27,93 +27,76 @@ def told(path, tmp_path):
     return str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "b, reason",
+    [
+        ({"name": "a"}, "row a: there are two"),
+        ({"name": "../b"}, "$.rows[1].name"),
+        ({"sett": {}}, "unknown field `sett`"),
+        ({"background_margin": -1}, "background_margin"),
+        ({"kind": "fit", "background_margin": 0}, "row b: a fit has no model, so it has no back"),
+        ({"kind": "fit", "set": {"width": 8}}, "row b: a fit has no model, so it has no set"),
+        ({"kind": "fit", "options": {"gaussians": 1}}, "row b: gamba fit: Expected `int` >= 2"),
+        ({"kind": "fit", "options": {"views": 1}}, "row b: gamba fit: Object contains unknown"),
+        ({"set": {"widht": 4}}, "row b: set: GambaConfig has no field wid"),
+        ({"set": {"width": 0}}, "row b: --set: config: width is 0"),
+        ({"set": {"patch_size": 5}}, "row b: --set: config: image_size"),
+        ({"options": {"clap": 4}}, "row b: options: gamba train has no --c"),
+        ({"options": {"lr": -1}}, "row b: --lr -1"),
+        ({"options": {"lr": "fast"}}, "row b: gamba train does not take --l"),
+        ({"options": {"radial_mask": 3}}, "does not take --radial-mask 3"),
+        ({"options": {"seed": 3}}, "row b: options: seed is not for a plan"),
+        ({"options": {"out": "x"}}, "row b: options: out is not for a plan"),
+        ({"options": {"steps": 9}}, "row b: steps: the budget is the same"),
+        ({"options": {"lr": "--x"}}, "row b: lr: '--x' is no value"),
+        ({"options": {"lr": "a\0"}}, "row b: lr: 'a\\x00' is no value"),
+        ({"note": "a\nb"}, "a title or a note has a letter that"),
+        ({"seeds": [1, 1]}, "row b: a seed is there twice"),
+        ({"paper": {"speed": 1}}, "row b: paper: no metric speed"),
+    ],
+)
+def test_what_is_wrong_is_told_with_the_rows_name(b, reason, tmp_path):
+    text = told(write_plan(tmp_path, "a", {"name": "b", **b}), tmp_path)
+    assert reason in text and "\n" not in text and len(text) < 300
+
+
+IN_SERIES = {"name": "a", "series": "n"}
 FIT = {"name": "b", "kind": "fit"}
 
 
 @pytest.mark.parametrize(
     "rows, more, reason",
     [
-        (["a", "a"], {}, "row a: there are two"),
-        (
-            ["a", {**FIT, "background_margin": 0}],
-            {},
-            "row b: a fit has no model, so it has no back",
-        ),
-        (["a", {"name": "b", "background_margin": -1}], {}, "background_margin"),
-        (["a", {"name": "b", "sett": {}}], {}, "unknown field `sett`"),
-        (["a", {"name": "b", "set": {"widht": 4}}], {}, "row b: set: GambaConfig has no field wid"),
-        (["a", {"name": "b", "set": {"width": 0}}], {}, "row b: --set: config: width is 0"),
-        (["a", {"name": "b", "set": {"patch_size": 5}}], {}, "row b: --set: config: image_size"),
-        (
-            ["a", {"name": "b", "options": {"clap": 4}}],
-            {},
-            "row b: options: gamba train has no --c",
-        ),
-        (["a", {"name": "b", "options": {"lr": -1}}], {}, "row b: --lr -1"),
-        (
-            ["a", {"name": "b", "options": {"lr": "fast"}}],
-            {},
-            "row b: gamba train does not take --l",
-        ),
-        (["a", {"name": "b", "options": {"radial_mask": 3}}], {}, "does not take --radial-mask 3"),
-        (
-            ["a", {"name": "b", "options": {"seed": 3}}],
-            {},
-            "row b: options: seed is not for a plan",
-        ),
-        (
-            ["a", {"name": "b", "options": {"out": "x"}}],
-            {},
-            "row b: options: out is not for a plan",
-        ),
-        (["a", {"name": "b", "options": {"steps": 9}}], {}, "row b: steps: the budget is the same"),
-        (["a", {"name": "b", "options": {"lr": "--x"}}], {}, "row b: lr: '--x' is no value"),
-        (["a", {"name": "b", "options": {"lr": "a\0"}}], {}, "row b: lr: 'a\\x00' is no value"),
-        (["a", {"name": "b", "note": "a\nb"}], {}, "a title or a note has a letter that"),
-        (["a", {"name": "b", "seeds": [1, 1]}], {}, "row b: a seed is there twice"),
-        (["a", {"name": "b", "paper": {"speed": 1}}], {}, "row b: paper: no metric speed"),
-        (["a", {"name": "../b"}], {}, "$.rows[1].name"),
-        (["a"], {"compare_with": "c"}, "plan trial has no row c; it has a"),
+        ("a", {"compare_with": "c"}, "plan trial has no row c; it has a"),
         (["a", FIT], {"compare_with": "b"}, "compare_with b: rows can be compared with a model"),
-        (["a", {**FIT, "set": {"width": 8}}], {}, "row b: a fit has no model"),
-        (["a", {**FIT, "options": {"gaussians": 1}}], {}, "row b: gamba fit: Expected `int` >= 2"),
-        (["a", {**FIT, "options": {"views": 1}}], {}, "row b: gamba fit: Object contains unknown"),
-        (
-            [{"name": "a", "series": "n"}, {**FIT, "series": "n"}],
-            {},
-            "series n: it mixes models and fits",
-        ),
-        (
-            [{"name": "a", "series": "n"}, {"name": "b", "series": "n"}],
-            {},
-            "series n: two of its rows have the same number",
-        ),
-        (["a"], {"base": {"options": {}}}, "the budget of a row: expected steps or minutes"),
-        (["a"], {"base": {"options": {"steps": 1, "minutes": 1}}}, "expected steps or minutes"),
-        (["a"], {"base": {"preset": "huge"}}, "row a: no preset huge"),
+        ([IN_SERIES, {**FIT, "series": "n"}], {}, "series n: it mixes models and fits"),
+        ([IN_SERIES, {**IN_SERIES, "name": "b"}], {}, "series n: two of its rows have the same nu"),
+        ("a", {"base": {"options": {}}}, "the budget of a row: expected steps or minutes"),
+        ("a", {"base": {"options": {"steps": 1, "minutes": 1}}}, "expected steps or minutes"),
+        ("a", {"base": {"preset": "huge"}}, "row a: no preset huge"),
         ([], {}, "$.rows"),
     ],
 )
-def test_what_is_wrong_is_told_with_the_rows_name(rows, more, reason, tmp_path):
+def test_what_is_wrong_with_the_whole_plan_is_told(rows, more, reason, tmp_path):
     text = told(write_plan(tmp_path, *rows, **more), tmp_path)
     assert reason in text and "\n" not in text and len(text) < 300
 
 
 def test_what_is_wrong_ends_the_command_before_it_writes(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = write_plan(tmp_path, "a", {"name": "b", "options": {"clap": 1}})
-    assert cli.run("ablate", [str(path), str(tmp_path)]) == 2
-    assert cli.run("ablate", ["tabel2", str(tmp_path)]) == 2
-    path = write_plan(tmp_path, "a")
-    assert cli.run("ablate", [str(path), str(tmp_path), "--rows", "z"]) == 2
-    assert cli.run("ablate", [str(path), str(tmp_path), "--steps", "1", "--minutes", "1"]) == 2
-    assert cli.run("ablate", [str(path), str(tmp_path / "none"), "--dry-run"]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 5
-    assert "row b" in lines[0] and "no such plan; give ours, paper-table2, questions" in lines[1]
-    assert "has no row z; it has a" in lines[2] and "give one of them" in lines[3]
-    assert "none" in lines[4]
-    assert [path.name for path in tmp_path.iterdir()] == ["trial.json"]
+    path, data = str(write_plan(tmp_path, "a")), str(tmp_path)
+    bad = str(write_plan(tmp_path, "a", {"name": "b", "options": {"clap": 1}}, name="bad"))
+    for words, reason in (
+        ([bad, data], "row b"),
+        (["tabel2", data], "no such plan; give ours, paper-table2, questions"),
+        ([path, data, "--rows", "z"], "has no row z; it has a"),
+        ([path, data, "--steps", "1", "--minutes", "1"], "give one of them"),
+        ([path, f"{data}/none", "--dry-run"], "none"),
+    ):
+        assert cli.run("ablate", words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert reason in line
+    assert {path.name for path in tmp_path.iterdir()} == {"trial.json", "bad.json"}
 
 
 def test_a_row_is_evaluated_without_its_background(tmp_path):
@@ -147,9 +130,8 @@ def test_the_shipped_plans_are_sound(name, tmp_path):
     given = settings(tmp_path, chosen, jobs.budget_of(chosen, None, None), meshes=tmp_path)
     for row in chosen.rows:
         assert jobs.stages(given, row, 0)
-    rows = chosen.rows
     jobs.check(given)
-    numbers = {r.name: jobs.gaussians_of(given, r) for r in rows if r.series}
+    numbers = {r.name: jobs.gaussians_of(given, r) for r in chosen.rows if r.series}
     if name == "questions":
         want = {"1k": 1024, "2k": 2304, "4k": 4096, "9k": 9216, "16k": 16384}
         assert {n[10:]: v for n, v in numbers.items() if n.startswith("gau")} == want
@@ -180,11 +162,10 @@ def test_a_plan_is_kept_as_it_is(tmp_path):
 
 def test_the_difference_of_two_commands_is_named():
     old = {"train": ["train", "D", "--set", "a=1", "b=2", "--lr", "1"], "views": ["eval-views"]}
-    same = {name: list(words) for name, words in old.items()}
-    assert jobs.difference(old, same) is None
-    same["train"][3] = "a=3"
-    assert jobs.difference(old, same) == "--set a: 1 then, 3 now"
-    fewer = {"train": ["train", "D", "--set", "a=1", "b=2"], "views": ["eval-views"]}
+    assert jobs.difference(old, {name: [*words] for name, words in old.items()}) is None
+    other = {**old, "train": ["train", "D", "--set", "a=3", "b=2", "--lr", "1"]}
+    assert jobs.difference(old, other) == "--set a: 1 then, 3 now"
+    fewer = {**old, "train": old["train"][:-2]}
     assert jobs.difference(old, fewer) == "--lr: 1 then, not given now"
     more = {**old, "shapes": ["eval-geometry", "P"]}
     assert "eval-geometry was not part" in jobs.difference(old, more)

@@ -139,10 +139,12 @@ def test_steps_that_were_made_again_count_once(tmp_path):
     log += [line("train", step, 6 * step, loss=step) for step in (10, 20, 30)]
     log += [line("start", 10, 4000)]
     log += [line("train", step, 4000 + 6 * (step - 10), loss=100 + step) for step in (20, 30, 40)]
+    log.append(line("end", 40, skipped=3, device_memory=5))
     record = read_run_log(write(tmp_path / "log.jsonl", *log))
     loss = record.series["train.loss"]
     assert list(loss.steps) == [10, 20, 30, 40] and list(loss.values) == [10, 120, 130, 140]
     assert list(loss.minutes) == pytest.approx([1, 2, 3, 4]), "the hour between does not count"
+    assert record.losses == {"train": 140} and record.most == {"skipped": 3, "device_memory": 5}
 
 
 def long_log(path, every=25, total=40_000):
