@@ -1,5 +1,6 @@
 """Rows run, fail, stop and go on: with commands that write small reports at once."""
 
+import contextlib
 import json
 import os
 import signal
@@ -196,66 +197,51 @@ def test_a_dry_run_prints_the_commands_and_does_nothing(gamba, tmp_path, capsys)
     assert "4 runs, 2 at once" in said and not (tmp_path / "out").exists()
 
 
-def start(tmp_path, path, *words):
-    environment = os.environ | {"FAKE_CALLS": str(tmp_path / "calls")}
-    command = [sys.executable, "-c", DRIVER, *FAKE, str(path), str(tmp_path / "data")]
-    command += ["--out", str(tmp_path / "out"), "--device", "cpu", *words]
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+AFTER = ["train b/0", "eval-views b/0", "train c/0", "eval-views c/0"]
 
 
-def wait_for(path):
-    for _ in range(600):
-        if path.exists():
-            return
-        time.sleep(0.1)
-    raise AssertionError(f"{path} never came")
-
-
-def waiting_plan(tmp_path):
+@pytest.fixture
+def waiting(gamba, tmp_path):
+    """What starts an ablation as a process, its plan, and the run that waits for a signal."""
+    path = write_plan(tmp_path, "a", {"name": "b", "options": {"clip": 6}}, "c")
     (tmp_path / "calls").write_text("")
-    return write_plan(tmp_path, "a", {"name": "b", "options": {"clip": 6}}, "c")
+    command = [sys.executable, "-c", DRIVER, *FAKE, str(path), str(tmp_path / "data")]
+    command += ["--out", str(tmp_path / "out"), "--device", "cpu"]
+    said = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(command, **said)
+    run = tmp_path / "out" / "rows" / "b" / "seed-0" / "run"
+    for _ in range(600):
+        if (run / "waits").exists():
+            return path, process, run, lambda: subprocess.Popen(command, **said)
+        time.sleep(0.1)
+    raise AssertionError(f"{run} never came")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_lets_the_training_save_and_the_same_command_goes_on(gamba, tmp_path, number):
-    path = waiting_plan(tmp_path)
-    process = start(tmp_path, path)
-    run = tmp_path / "out" / "rows" / "b" / "seed-0" / "run"
-    wait_for(run / "waits")
+def test_a_signal_lets_the_training_save_and_the_same_command_goes_on(gamba, waiting, number):
+    path, process, run, _ = waiting
     process.send_signal(number)
     said, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
     assert "the same command goes on" in said and (run / "saved").exists()
     record = json.loads((run.parent / "state.json").read_text())
     assert record["status"] == "begun" and record["parts"]["train"]["seconds"] > 0
-    code, called = gamba(path)
-    assert code == 0
-    assert called == ["train b/0", "eval-views b/0", "train c/0", "eval-views c/0"]
+    assert gamba(path) == (0, AFTER)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a child outlives a killed parent")
-def test_a_killed_ablation_leaves_no_child_and_goes_on(gamba, tmp_path):
-    path = waiting_plan(tmp_path)
-    process = start(tmp_path, path)
-    run = tmp_path / "out" / "rows" / "b" / "seed-0" / "run"
-    wait_for(run / "waits")
-    again = start(tmp_path, path)
+def test_a_killed_ablation_leaves_no_child_and_goes_on(gamba, waiting):
+    path, process, run, start = waiting
+    again = start()
     said, _ = again.communicate(timeout=60)
     assert again.returncode == 2 and "another process runs an ablation here" in said
     process.kill()
     process.communicate(timeout=60)
     (run / "saved").write_text("x")  # the fake waits no more
-    code, called = gamba(path)
-    assert code == 0
-    assert called == ["train b/0", "eval-views b/0", "train c/0", "eval-views c/0"]
-    for line in (line for line in Path("/proc").glob("[0-9]*/cmdline")):
-        try:
-            words = line.read_bytes()
-        except OSError:
-            continue
-        assert bytes(run) not in words, "a child is alive"
+    assert gamba(path) == (0, AFTER)
+    for line in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            assert bytes(run) not in line.read_bytes(), "a child is alive"
 
 
 def test_what_is_damaged_is_told(gamba, tmp_path, capsys):

@@ -30,11 +30,14 @@ def starter(tmp_path):
     return folder
 
 
+def demo(starter, out, *options):
+    return run("demo", ["--no-lpips", "--starter", str(starter), "--out", str(out), *options])
+
+
 @pytest.mark.slow
 def test_demo(starter, tmp_path):
     out = tmp_path / "demo"
-    options = ["--minutes", "0.05", "--no-lpips", "--starter", str(starter), "--out", str(out)]
-    assert run("demo", options) == 0
+    assert demo(starter, out, "--minutes", "0.05") == 0
     page = (out / "index.html").read_text()
     for part in (
         "Objects that the model has never seen",
@@ -60,7 +63,7 @@ def test_demo(starter, tmp_path):
 
 
 def test_without_starter_set(tmp_path, capsys):
-    assert run("demo", ["--starter", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert demo(tmp_path, tmp_path / "out") == 2
     said = capsys.readouterr().err
     assert "no such folder" in said and said.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -72,7 +75,7 @@ def test_without_starter_set(tmp_path, capsys):
 
 def test_without_the_shipped_model(starter, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(checkpoint, "DEFAULT_CHECKPOINT", tmp_path / "none.safetensors")
-    assert run("demo", ["--starter", str(starter), "--out", str(tmp_path / "out")]) == 2
+    assert demo(starter, tmp_path / "out") == 2
     assert "none.safetensors: no such file" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -92,13 +95,7 @@ class Calls:
         stage = words[0] + (" here" if "--no-baselines" in words else "")
         self.stages.append(stage)
         code = self.codes.get(stage, 0)
-        folder = {
-            "train": "run",
-            "reconstruct": "icons",
-            "eval-views": "views",
-            "eval-views here": "views-here",
-            "eval-geometry": "geometry",
-        }[stage]
+        folder = dict(zip(ALL, ("icons", "views", "geometry", "run", "views-here")))[stage]
         if code == 0:
             (self.out / folder).mkdir(parents=True, exist_ok=True)
             made = "model.safetensors" if stage == "train" else "report.json"
@@ -111,25 +108,24 @@ ALL = ["reconstruct", "eval-views", "eval-geometry", "train", "eval-views here"]
 
 def test_an_interrupted_demo_goes_on(starter, tmp_path, monkeypatch, capsys):
     out = tmp_path / "demo"
-    options = ["--no-lpips", "--starter", str(starter), "--out", str(out)]
     calls = Calls(monkeypatch, out)
     calls.codes = {"eval-views": 143}
-    assert run("demo", options) == 143 and calls.stages == ALL[:2] and not calls.pages
+    assert demo(starter, out) == 143 and calls.stages == ALL[:2] and not calls.pages
     assert "the same command goes on" in capsys.readouterr().out
     calls.codes, calls.stages = {"train": 1}, []
-    assert run("demo", options) == 2 and calls.stages == ALL[1:4]
+    assert demo(starter, out) == 2 and calls.stages == ALL[1:4]
     calls.codes, calls.stages = {}, []
-    assert run("demo", options) == 0 and calls.stages == ALL[3:]
+    assert demo(starter, out) == 0 and calls.stages == ALL[3:]
     calls.stages = []
-    assert run("demo", options) == 0 and calls.stages == []
+    assert demo(starter, out) == 0 and calls.stages == []
     (out / "run" / "model.safetensors").unlink()  # what follows from it is made again, too
-    assert run("demo", options) == 0 and calls.stages == ALL[3:]
+    assert demo(starter, out) == 0 and calls.stages == ALL[3:]
 
 
 def test_the_page_is_there_before_the_training(starter, tmp_path, monkeypatch):
     out = tmp_path / "demo"
     calls = Calls(monkeypatch, out)
-    assert run("demo", ["--no-lpips", "--starter", str(starter), "--out", str(out)]) == 0
+    assert demo(starter, out) == 0
     (early, first), (late, second) = calls.pages
     assert (early, late) == (3, 5)
     assert "Training still runs" in first and "All of it took" in second
@@ -138,25 +134,17 @@ def test_the_page_is_there_before_the_training(starter, tmp_path, monkeypatch):
 
 
 def test_a_demo_of_other_options_is_refused_unless_fresh(starter, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "demo"
-    options = ["--no-lpips", "--starter", str(starter), "--out", str(out)]
-    calls = Calls(monkeypatch, out)
-    assert run("demo", options) == 0
-    (out / "mine.txt").write_text("not a demo's")
-    calls.stages = []
-    assert run("demo", [*options, "--minutes", "1"]) == 2 and calls.stages == []
-    assert "holds a demo of other options or of another model" in capsys.readouterr().err
-    assert run("demo", [*options, "--minutes", "1", "--fresh"]) == 0 and calls.stages == ALL
-    assert (out / "mine.txt").exists()
-
-
-def test_a_demo_of_another_shipped_model_is_refused(starter, tmp_path, monkeypatch, capsys):
     out, model = tmp_path / "demo", tmp_path / "new.safetensors"
     monkeypatch.setattr(checkpoint, "DEFAULT_CHECKPOINT", model)
-    options = ["--no-lpips", "--starter", str(starter), "--out", str(out)]
-    Calls(monkeypatch, out)
     model.write_bytes(b"one")
-    assert run("demo", options) == 0
+    calls = Calls(monkeypatch, out)
+    assert demo(starter, out) == 0
+    (out / "mine.txt").write_text("not a demo's")
+    calls.stages = []
+    assert demo(starter, out, "--minutes", "1") == 2 and calls.stages == []
+    assert "holds a demo of other options or of another model" in capsys.readouterr().err
     model.write_bytes(b"two")
-    assert run("demo", options) == 2
+    assert demo(starter, out) == 2 and calls.stages == []
     assert "of another model; give --fresh" in capsys.readouterr().err
+    assert demo(starter, out, "--minutes", "1", "--fresh") == 0 and calls.stages == ALL
+    assert (out / "mine.txt").exists()

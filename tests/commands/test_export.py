@@ -129,18 +129,14 @@ def test_what_cannot_start(ball, tmp_path, options, reason, capsys):
     assert reason in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_missing_inputs(tmp_path, capsys):
+def test_inputs_are_there_and_stay(ball, tmp_path, capsys):
     assert export(tmp_path / "gone.ply", "--out", tmp_path / "out") == 2
     (tmp_path / "empty").mkdir()
     assert export(tmp_path / "empty", "--out", tmp_path / "out") == 2
     assert "gone.ply: no such file" in capsys.readouterr().err
-
-
-def test_the_input_is_not_overwritten(ball, tmp_path, capsys):
     before = ball.read_bytes()
-    code = export(ball, "--out", tmp_path, "--mesh", "--splats", "ply")
-    assert code == 2 and ball.read_bytes() == before
-    assert "would be overwritten" in capsys.readouterr().err
+    assert export(ball, "--out", tmp_path, "--mesh", "--splats", "ply") == 2
+    assert ball.read_bytes() == before and "would be overwritten" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", MESH_FORMATS)

@@ -1,5 +1,7 @@
 """``gamba reconstruct --sheet``: every result in one picture."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -47,12 +49,16 @@ def test_a_row_is_the_input_and_views_around(tmp_path):
     assert picture[:18, 128:].min() == 1 and picture[:18, :128].min() < 0.6  # the name
 
 
+def sheet_of(path, count):
+    """A sheet of white rows whose names cannot be written as they are."""
+    sheet = Sheet(path)
+    sheet._rows += [(f"n{n}\udcff", np.zeros((128, 768, 3), np.uint8)) for n in range(count)]
+    sheet.write()
+
+
 @pytest.mark.parametrize(("count", "size"), [(12, (768, 12 * 146)), (13, (2 * 768 + 12, 7 * 146))])
 def test_many_rows_stand_in_two_columns(tmp_path, count, size):
-    sheet = Sheet(tmp_path / "s.webp")
-    for number in range(count):
-        sheet._rows.append((f"n{number}\udcff", np.zeros((128, 768, 3), np.uint8)))
-    sheet.write()
+    sheet_of(tmp_path / "s.webp", count)
     with Image.open(tmp_path / "s.webp") as picture:
         assert picture.size == size and picture.format == "WEBP"
 
@@ -79,6 +85,4 @@ def test_a_sheet_that_cannot_be_is_one_line(tmp_path, checkpoint, capsys):
         lines = capsys.readouterr().err.splitlines()
         assert len(lines) == 1 and str(sheet) in lines[0] and reason in lines[0]
     with pytest.raises(UserError, match="cannot write /dev/null/s.png"):
-        empty = Sheet(tmp_path.__class__("/dev/null/s.png"))
-        empty._rows.append(("a", np.zeros((128, 768, 3), np.uint8)))
-        empty.write()
+        sheet_of(Path("/dev/null/s.png"), 1)

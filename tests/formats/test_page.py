@@ -144,10 +144,9 @@ def test_text_is_escaped(tmp_path):
     assert "&lt;b&gt;" in page_text("", "", [Section("", charts=["<b>"])]), "a text is no SVG"
 
 
-def test_tables_show_numbers_to_four_digits(tmp_path):
+def test_tables_show_numbers_to_four_digits():
     rows = [("a", 24.34567, 12345), ("b", 1e-7, 7)]
-    demo_page(tmp_path / "a.html", [Section("t", table=rows, header=("", "x", "n"))])
-    source = Page(tmp_path / "a.html").source
+    source = page_text("", "", [Section("t", table=rows, header=("", "x", "n"))])
     for text in ("<td>a</td>", ">24.35<", ">1e-07<", ">12,345<"):
         assert text in source
     rows = [("-1.5", "2 to 3", "0.5 [0.4, 0.6]", "reached"), ("5 %", "n/a", "-", "b [c]")]
@@ -156,13 +155,6 @@ def test_tables_show_numbers_to_four_digits(tmp_path):
         assert f'<td class="number">{text}</td>' in written and f"<td>{text}</td>" in written
     assert "<td>0.5 <span>[0.4, 0.6]</span></td>" in written and "<td>b [c]</td>" in written
     assert '<td class="reached">reached</td>' in written
-
-
-def test_a_bare_section_and_no_sections(tmp_path):
-    demo_page(tmp_path / "a.html", [Section("only a title")])
-    assert "only a title" in Page(tmp_path / "a.html").text
-    demo_page(tmp_path / "a.html", [])
-    assert Page(tmp_path / "a.html").all("h1")
 
 
 def drawn(ends=None, logarithmic=False, **lines):
@@ -197,7 +189,9 @@ def test_degenerate_charts_stay_finite(values):
     assert "nan" not in svg and "inf" not in svg and len(line) == len(values)
 
 
-def test_a_page_that_cannot_be_written():
+def test_a_page_of_nothing_and_one_that_cannot_be_written():
+    assert "<h1>bare</h1>" in page_text("bare", "", [])
+    assert "<h2>only a title</h2>" in page_text("", "", [Section("only a title")])
     with pytest.raises(UserError, match=r"cannot write /dev/null/a\.html"):
         demo_page("/dev/null/a.html", [])
 

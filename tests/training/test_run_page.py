@@ -96,7 +96,7 @@ def test_a_log_without_figures_gives_a_sentence(tmp_path, content):
 
 
 def test_no_log_is_one_line(tmp_path):
-    refused(r"log\.jsonl: no such file", curves, tmp_path / "log.jsonl")
+    refused(r"log\.jsonl: no such file", read_run_log, tmp_path / "log.jsonl")
     (tmp_path / "log.jsonl").mkdir()
     refused("not a plain file", write_run_page, tmp_path)
     assert not (tmp_path / "index.html").exists()
@@ -111,15 +111,8 @@ def test_lines_that_are_no_lines_of_a_log_are_passed_over(tmp_path):
         b"\xff\xfe",
         b"3",
         b'{"event": "train", "step": 16, "loss": NaN}',
-        line("train", -1, loss=5.0),
-        line("train", 2.5, loss=5.0),
-        line("train", 10**400, loss=5.0),
-        line("train", True, loss=5.0),
-        line("train", 17, loss="5"),
-        line("train", 17, loss=True),
-        line("train", 17, loss=None),
-        line("train", 17, loss=[1.0]),
-        line("train", 17, loss=10**400),
+        *(line("train", step, loss=5.0) for step in (-1, 2.5, 10**400, True)),
+        *(line("train", 17, loss=loss) for loss in ("5", True, None, [1.0], 10**400)),
         {"step": 17, "loss": 5.0},
         line(["train"], 17, loss=5.0),
         line("train", 18, **{"loss_<b>": 5.0}),
