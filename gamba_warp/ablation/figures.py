@@ -134,7 +134,7 @@ class _Protocol(msgspec.Struct, frozen=True):
 class _Report(msgspec.Struct):
     """What is read of a report of ``gamba eval-views``, ``eval-geometry`` or ``fit``."""
 
-    objects: list[_Object]
+    objects: list[_Object]  # pyright: ignore[reportInvalidTypeForm] (made of the registry)
     failures: list[dict[str, Any]] = []
     protocol: _Protocol = _Protocol()
 

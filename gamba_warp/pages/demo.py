@@ -152,7 +152,10 @@ def _numbers(results: DemoResults, report: dict[str, Any], card: ModelCard | Non
     text = f"Means over {report['num_ok']} held-out objects; LPIPS is better the lower it is. "
     text += f"Shape, by the shipped model: {', '.join(found)}." if found else "No geometry."
     rows = [row for row in (card.figures if card else ()) if row.views == "novel"]
-    known = {row.name: row.psnr.mean for row in rows if row.psnr is not None}
+    of, known = "psnr", {}
+    for row in rows:
+        if figure := getattr(row, of):
+            known[row.name] = figure.mean
     empty = report["baselines"].get("background", {}).get("psnr", math.inf)
     if report["mean"]["psnr"] < known.get("model", 0) and empty < known.get("background", 0):
         text += (

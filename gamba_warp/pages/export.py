@@ -103,8 +103,10 @@ class ObjectFiles:
         """
         base, turn = self.folder / section.title, None
         STAGES.begin("Gaussians")
-        paths = {kind: base.with_name(base.name + splat_suffix(kind)) for kind in self.splats}
-        said = [write_gaussians(p, gaussians, k, comments=comments) for k, p in paths.items()]
+        said = []
+        for kind in self.splats:
+            path = base.with_name(base.name + splat_suffix(kind))
+            said.append(write_gaussians(path, gaussians, kind, comments=comments))
         if self.turntable != "none" or self.page:
             STAGES.begin("turntable")
             seen = gaussians if shown is None else shown

@@ -19,7 +19,9 @@ def _environment() -> Environment:
     found = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined,
-        **{"autoescape": True, "trim_blocks": True, "lstrip_blocks": True},
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     found.filters["px"] = "{:.1f}".format
     return found
