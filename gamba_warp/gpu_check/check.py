@@ -8,8 +8,11 @@ within its time; both files are written after every item, and say what was not d
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -22,7 +25,6 @@ from ..errors import UserError
 from ..files import CHECKOUT, atomic_path, output_folder, write_json
 from ..kernels.bench import Settings
 from ..kernels.bench.peers import PACKAGES, versions
-from ..processes import Child
 from . import MINUTES, STEPS, Step
 from .report import headline, machine_facts, page
 
@@ -216,17 +218,49 @@ def run_python(
         look: called every tenth of a second, and at the end.
 
     Returns:
-        The exit code (128 + n for signal n), None if it was ended, and its last printed line.
+        The exit code, None if it was ended, and the last line that it printed.
     """
     paths = [str(CHECKOUT), os.environ.get("PYTHONPATH", "")]
-    environment = {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    ends = time.time() + seconds
     with tempfile.TemporaryFile() as said:
-        child = Child([sys.executable, *arguments], said, environment)
-        end = child.wait(look, seconds)
+        process = subprocess.Popen(
+            [sys.executable, *arguments],
+            **{"stdout": said, "stderr": subprocess.STDOUT, "stdin": subprocess.DEVNULL},
+            **{"env": environment, "start_new_session": True},
+        )
+        try:
+            while process.poll() is None and time.time() < ends:
+                time.sleep(0.1)
+                look()
+            code = process.poll()
+        finally:
+            if process.poll() is None:
+                end_tree(process)
         look()
         said.seek(0)
         lines = said.read().decode(errors="replace").strip().splitlines()
-    return end and end.code, lines[-1] if lines else "nothing was printed"
+    return code, lines[-1] if lines else "nothing was printed"
+
+
+def end_tree(process: subprocess.Popen) -> None:
+    """Ends a process, and what it started itself; waits until the process is gone.
+
+    Args:
+        process: made with ``start_new_session``, which makes it a group where there are groups.
+    """
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)
+    elif sys.platform == "win32":
+        # By its whole path: Windows would look in the working directory before its own folders.
+        root = os.environ.get("SystemRoot", "C:\\Windows")
+        taskkill = os.path.join(root, "System32", "taskkill.exe")
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            subprocess.run(
+                [taskkill, "/F", "/T", "/PID", str(process.pid)], capture_output=True, timeout=30
+            )
+    process.kill()  # does nothing if it is gone; else at least the process itself ends
+    process.wait()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -34,11 +34,7 @@ class _Record(msgspec.Struct):
 
 
 class Stages:
-    """What of a demo is done, as ``OUT/stages.json`` keeps it.
-
-    Attributes:
-        seconds: that the stages took which earlier processes ran.
-    """
+    """What of a demo is done, as ``OUT/stages.json`` keeps it."""
 
     def __init__(self, out: Path) -> None:
         """Reads what is done in a folder.
@@ -46,11 +42,10 @@ class Stages:
         Raises:
             UserError: the record is damaged.
         """
-        self._path = out / "stages.json"
-        self._record = _Record()
+        self._path, self._record = out / "stages.json", _Record()
         if self._path.exists():
             self._record = read_document(self._path, _Record)
-        self.seconds = self._record.seconds
+        self.seconds = self._record.seconds  # that the stages took which earlier processes ran
         self._anew = False  # whether a stage has run, so that those after it must, too
 
     def forget(self) -> None:
@@ -59,17 +54,15 @@ class Stages:
         Raises:
             UserError: something cannot be removed.
         """
-        if not self._path.exists():
-            return
-        try:
-            for name in _MADE:
-                folder = self._path.with_name(name)
-                if folder.is_dir() and not folder.is_symlink():
-                    shutil.rmtree(folder)
-            self._path.unlink()
-        except OSError as error:
-            raise UserError(f"cannot remove {error.filename}: {error.strerror}") from error
-        self._record, self.seconds = _Record(), 0.0
+        if self._path.exists():
+            try:
+                for folder in map(self._path.with_name, _MADE):
+                    if folder.is_dir() and not folder.is_symlink():
+                        shutil.rmtree(folder)
+                self._path.unlink()
+            except OSError as error:
+                raise UserError(f"cannot remove {error.filename}: {error.strerror}") from error
+            self._record, self.seconds = _Record(), 0.0
 
     def gamba(
         self,
@@ -111,24 +104,18 @@ class Stages:
             print("done before", flush=True)
             return
         self._record.begun[stage] = kept  # what it leaves half-done is of these options
-        if stage in self._record.ended:
-            self._record.ended.remove(stage)
-        self._write()
+        self._record.ended = [name for name in self._record.ended if name != stage]
+        write_json(self._path, msgspec.to_builtins(self._record))
         started = time.perf_counter()
         code = _call(words)
         self._record.seconds += time.perf_counter() - started
-        if makes:
-            self._anew = True
-            if code == 0:
-                self._record.ended.append(stage)
-        self._write()
+        self._anew = self._anew or bool(makes)
+        self._record.ended += [stage] if makes and code == 0 else []
+        write_json(self._path, msgspec.to_builtins(self._record))
         if code - 128 in (signal.SIGINT, *end_signals()):
             raise Stopped(code)
         if code and not may_fail:
             raise UserError(f"the command above ended with exit code {code}")
-
-    def _write(self) -> None:
-        write_json(self._path, msgspec.to_builtins(self._record))
 
 
 def _call(words: list[str]) -> int:

@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,6 @@ from architecture.imports import modules
 import gamba_warp.measure.stress_run  # noqa: F401 (loaded before a test takes something away)
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, STARTER, atomic_folder, only_process, sweep, write_json
-from gamba_warp.gpu_check.check import run_python
 from gamba_warp.kernels.bench.core.measure import peak_bytes
 from gamba_warp.kernels.runtime import memory, system, team
 from gamba_warp.kernels.selective_scan import selective_scan
@@ -168,65 +166,6 @@ def test_training_stops_without_sighup(no_nohup, monkeypatch):
     with stop_signals() as received:
         signal.raise_signal(signal.SIGTERM)
     assert received == [signal.SIGTERM]
-
-
-# Stands in for Windows' taskkill: notes its words, and ends the process and what it started.
-TASKKILL = f"""#!{sys.executable}
-import os, pathlib, signal, sys
-number = int(sys.argv[-1])
-pathlib.Path(__file__).with_name("words").write_text(" ".join(sys.argv[1:]))
-found = pathlib.Path(f"/proc/{{number}}/task/{{number}}/children").read_text().split()
-for one in (number, *map(int, found)):
-    os.kill(one, signal.SIGKILL)
-"""
-# Starts a process that would live for a minute, writes its number, and waits.
-PARENT = """
-import pathlib, subprocess, sys, time
-child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-place = pathlib.Path(sys.argv[1])
-place.with_suffix(".new").write_text(str(child.pid))
-place.with_suffix(".new").rename(place)
-time.sleep(60)
-"""
-
-
-def ended_with_its_child(path):
-    """Runs ``PARENT`` until its child is there; whether that is gone a little later."""
-
-    def look():
-        if path.exists():
-            raise KeyboardInterrupt  # the time is up at once, and not before
-
-    with pytest.raises(KeyboardInterrupt):
-        run_python(["-c", PARENT, str(path)], 60.0, look)
-    stat = Path("/proc") / path.read_text() / "stat"
-    for _ in range(30):
-        try:
-            state = stat.read_text().rsplit(")", 1)[1].split()[0]
-        except OSError:
-            return True
-        if state == "Z":  # ended, and nobody has asked for it
-            return True
-        time.sleep(0.1)
-    os.kill(int(path.read_text()), signal.SIGKILL)
-    return False
-
-
-def test_what_takes_too_long_is_ended_with_what_it_started(tmp_path, monkeypatch):
-    """By the group of processes, by Windows' command; with neither, the process alone."""
-    assert ended_with_its_child(tmp_path / "by group")
-    monkeypatch.delattr(os, "killpg")
-    assert not ended_with_its_child(tmp_path / "alone")
-    monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.setenv("SystemRoot", str(tmp_path))
-    assert not ended_with_its_child(tmp_path / "no command")
-    (tmp_path / "System32").mkdir()
-    command = tmp_path / "System32" / "taskkill.exe"
-    command.write_text(TASKKILL)
-    command.chmod(0o755)
-    assert ended_with_its_child(tmp_path / "by command")
-    words = (tmp_path / "System32" / "words").read_text().split()
-    assert words[:3] == ["/F", "/T", "/PID"] and words[3].isdigit()
 
 
 def test_cores_without_affinity(monkeypatch):
