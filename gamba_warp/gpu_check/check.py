@@ -2,35 +2,115 @@
 
 Needs torch, numpy and warp-lang, nothing else, and no installation: in a bare checkout
 ``python -m gamba_warp.gpu_check`` is the same command. Each step runs in a process of its own,
-within its time; both files are written after every item, and say what was not done.
+within its time, and writes both files after every item. So whatever ends a step, a crash of another
+package or the clock, loses no more than the item under way; the files say what was not done.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
+import warp as wp
 
-from ..errors import UserError
-from ..files import CHECKOUT, atomic_path, output_folder, write_json
-from ..kernels.bench import Settings
+from ..errors import UserError, first_line
+from ..files import output_folder, write_json, write_text
+from ..kernels.bench import Case, Settings, Target, measure
+from ..kernels.bench.cases import conv, raster, scan
+from ..kernels.bench.core.measure import synchronize
+from ..kernels.bench.core.report import judge
 from ..kernels.bench.peers import PACKAGES, versions
+from ..kernels.bench.static.report import find_kernels
+from ..measure import blocks, inference
+from ..untrusted.children import Failed, end_idle, run_each
 from . import MINUTES, STEPS, Step
+from .checks import LeftOut, checks
 from .report import headline, machine_facts, page
 
 FORMAT = "gamba_warp.gpu_check.1"
 _GRACE = 15.0  # seconds that the last item of a step may take
 _LEAST = 5.0  # seconds below which no step begins
+_Item = TypeVar("_Item")
+# These cases are timed first, since the time may end before the list does; all others follow.
+_FIRST = [
+    *(("scan", "operator"), ("raster", "scene"), ("conv", "operator"), ("block", "one block")),
+    *(("block", "backbone"), ("raster", "32 views"), ("scan", "training batch")),
+    ("model", "one picture"),
+]
+_ON_A_CPU = [("conv", "operator")]  # a quick run on a CPU only tries the command
+# These cases run other people's packages, and a crash there must not end the timing of ours.
+_BESIDE = {
+    "peers-conv": [("conv", "operator")],
+    "peers-scan": [("scan", "reference loop")],
+    "peers-raster": [("raster", "scene"), ("raster", "32 views")],
+}
+
+
+class Report:
+    """The document of a run, and its two files, which are written whenever something is added.
+
+    Attributes:
+        folder: of gpu-check.json and gpu-check.md.
+        document: ``{format, verdict, machine, settings, steps, results, failures, not_done,
+            bench}``, ready for JSON; the last is one document as ``gamba bench`` writes it,
+            inference included.
+        until: time after which no item is begun, seconds since the epoch.
+        settings: of the benchmark's cases, by the options of the command.
+    """
+
+    def __init__(self, folder: Path, document: dict, until: float = float("inf")) -> None:
+        self.folder, self.document, self.until = folder, document, until
+        asked = document["settings"]
+        threads = torch.get_num_threads()
+        self.settings = Settings(torch.device(asked["device"]), asked["level"], threads=threads)
+
+    def write(self) -> None:
+        """Replaces both files."""
+        write_json(self.folder / "gpu-check.json", self.document)
+        write_text(self.folder / "gpu-check.md", page(self.document))
+
+    def read(self) -> None:
+        """Takes over what a step has written."""
+        self.document = json.loads((self.folder / "gpu-check.json").read_bytes())
+
+    def leave_out(self, what: str, reason: str) -> None:
+        """Records that something is not done, and why."""
+        self.document["not_done"].append({"what": what, "reason": reason})
+
+    def in_time(self, items: Iterable[_Item], name: Callable[[_Item], str]) -> Iterator[_Item]:
+        """Yields items while there is time, and writes after each."""
+        for item in items:
+            if time.time() > self.until:
+                self.leave_out(name(item), "time was up")
+            else:
+                yield item
+                self.write()
+
+
+def begin(device: str, quick: bool, folder: Path) -> Report:
+    """A report of a run of which nothing is done yet."""
+    settings = {"device": device, "level": "quick" if quick else "normal"}
+    empty = {"steps": [], "results": {}, "failures": [], "not_done": []}
+    bench = {"records": [], "targets": []}
+    document = {"format": FORMAT, "verdict": "not finished", "machine": {}, "settings": settings}
+    report = Report(folder, document | empty | {"bench": bench})
+    document = report.document
+    document["machine"] = machine_facts(report.settings)
+    for package in sorted(set(PACKAGES) - versions().keys()):
+        report.leave_out(f"comparison with {package}", "not installed")
+    return report
 
 
 def run_gpu_check(
@@ -59,212 +139,210 @@ def run_gpu_check(
         raise UserError("no CUDA device here; --device cpu --quick tries the command itself")
     if not 0 < minutes < float("inf"):
         raise UserError(f"--minutes is {minutes}, it must be positive")
-    run = Run(make_settings(device, quick), output_folder(out), 60 * minutes)
+    report, ends = begin(device, quick, output_folder(out)), time.time() + 60 * minutes
     try:
         for step in STEPS:
             if not steps or step.name in steps:
-                run.do(step, step.seconds * minutes / MINUTES)
+                do(report, step, min(step.seconds * minutes / MINUTES, ends - time.time() - 1))
+        failures = len(report.document["failures"])
+        verdict = f"{failures} failed" if failures else "all that could be run passed"
+        code = 1 if failures else 0
     except KeyboardInterrupt:
-        run.finish("interrupted; what was done is here")
-        return 130
-    failures = len(run.document()["failures"])
-    run.finish(f"{failures} failed" if failures else "all that could be run passed")
-    return 1 if failures else 0
+        report.read()
+        verdict, code = "interrupted; what was done is here", 130
+    report.document["verdict"] = verdict
+    report.write()
+    rows = headline(report.document)
+    width = min(60, max(len(name) for name, _ in rows))
+    lines = [f"{name:<{width}}  {value}" for name, value in rows]
+    lines += [f"failed: {text}" for text in report.document["failures"]]
+    lines += [f"not done: {r['what']}: {r['reason']}" for r in report.document["not_done"]]
+    print("\n".join(lines))
+    print(f"{verdict}; wrote {report.folder / 'gpu-check.json'} and gpu-check.md")
+    return code
 
 
-def make_settings(device: str, quick: bool) -> Settings:
-    """The settings of the benchmark's cases, by the options of the command."""
-    level = "quick" if quick else "normal"
-    return Settings(torch.device(device), level, False, torch.get_num_threads())
+def do(report: Report, step: Step, seconds: float) -> None:
+    """Runs a step in a process of its own, for so long at most."""
+    started, failures = time.time(), len(report.document["failures"])
+    row = {"name": step.name, "status": "not done", "reason": "", "seconds": 0.0}
+    report.document["steps"].append(row)
+    report.write()
+    if step.cuda and report.settings.device.type != "cuda":
+        row["reason"] = "needs CUDA"
+    elif step.packages and not versions().keys() & set(step.packages):
+        row["reason"] = f"not installed: {', '.join(step.packages)}"
+    elif seconds < _LEAST:
+        row["reason"] = "time was up"
+    else:
+        until = started + max(seconds - _GRACE, seconds / 2)
+        value = in_a_process(partial(run_step, report.folder, until), step.name, seconds)
+        report.read()
+        row = report.document["steps"][-1]
+        row["status"] = "passed"
+        if isinstance(value, Failed) and "took more than" in value.reason:
+            row.update(status="stopped", reason=f"its {seconds:.0f} s were up")
+        elif isinstance(value, Failed):
+            row["reason"] = value.reason
+            report.document["failures"].append(f"step {step.name}: {value.reason}")
+        if len(report.document["failures"]) > failures:
+            row["status"] = "failed"
+    row["seconds"] = time.time() - started
+    if row["status"] in ("not done", "stopped"):
+        rest = "the rest of " if row["status"] == "stopped" else ""
+        report.leave_out(f"{rest}step {step.name}", row["reason"])
+    report.write()
+    reason = f" ({row['reason']})" if row["reason"] else ""
+    print(f"{step.name:<10} {row['status']}{reason}, {row['seconds']:.0f} s", flush=True)
 
 
-class Run:
-    """A run under way; its files are written whenever something is added."""
-
-    def __init__(self, settings: Settings, folder: Path, seconds: float) -> None:
-        self.settings, self.folder = settings, folder
-        self.ends = time.time() + seconds
-        self.verdict = "not finished"
-        self.machine = machine_facts(settings)
-        self.steps: list[dict] = []
-        self.parts: dict[str, dict] = {"packages": new_part()}
-        for package in sorted(set(PACKAGES) - versions().keys()):
-            self._leave_out("packages", f"comparison with {package}", "not installed")
-        self.write()
-
-    def _leave_out(self, name: str, what: str, reason: str) -> None:
-        self.parts[name]["not_done"].append({"what": what, "reason": reason})
-
-    def document(self) -> dict:
-        """Everything that is known so far, ready for JSON.
-
-        It is ``{format, verdict, machine, settings, steps, results, failures, not_done, bench}``;
-        the last is one document as ``gamba bench`` writes it, inference included.
-        """
-        parts = self.parts.values()
-        results = {name: dict(part["result"]) for name, part in self.parts.items()}
-        benches = [found.pop("bench") for found in results.values() if "bench" in found]
-        return {
-            "format": FORMAT,
-            "verdict": self.verdict,
-            "machine": self.machine,
-            "settings": {"device": self.settings.device.type, "level": self.settings.level},
-            "steps": self.steps,
-            "results": {name: found for name, found in results.items() if found},
-            "failures": [failure for part in parts for failure in part["failures"]],
-            "not_done": [row for part in parts for row in part["not_done"]],
-            "bench": join_benches(benches),
-        }
-
-    def write(self) -> None:
-        """Replaces both files."""
-        document = self.document()
-        write_json(self.folder / "gpu-check.json", document)
-        with atomic_path(self.folder / "gpu-check.md") as temporary:
-            temporary.write_text(page(document), encoding="utf-8")
-
-    def finish(self, verdict: str) -> None:
-        """Writes the files for the last time, and prints the table."""
-        self.verdict = verdict
-        self.write()
-        document = self.document()
-        rows = headline(document)
-        width = min(60, max(len(name) for name, _ in rows))
-        lines = [f"{name:<{width}}  {value}" for name, value in rows]
-        lines += [f"failed: {text}" for text in document["failures"]]
-        lines += [f"not done: {row['what']}: {row['reason']}" for row in document["not_done"]]
-        print("\n".join(lines))
-        print(f"{verdict}; wrote {self.folder / 'gpu-check.json'} and gpu-check.md")
-
-    def do(self, step: Step, seconds: float) -> None:
-        """Runs a step in a process of its own, for ``seconds`` at most or the rest of the run."""
-        started = time.time()
-        seconds = min(seconds, self.ends - started - 1)
-        row = {"name": step.name, "status": "not done", "reason": "", "seconds": 0.0}
-        self.steps.append(row)
-        self.parts[step.name] = new_part()
-        if step.cuda and self.settings.device.type != "cuda":
-            row["reason"] = "needs CUDA"
-        elif step.packages and not versions().keys() & set(step.packages):
-            row["reason"] = f"not installed: {', '.join(step.packages)}"
-        elif seconds < _LEAST:
-            row["reason"] = "time was up"
-        else:
-            code, said = self._child(step.name, seconds)
-            part = self.parts[step.name]
-            row["status"] = "passed"
-            if code is None:
-                row.update(status="stopped", reason=f"its {seconds:.0f} s were up")
-            elif not part["whole"]:
-                row["reason"] = f"ended with code {code}: {said}"
-                part["failures"].append(f"step {step.name} {row['reason']}")
-            if part["failures"]:
-                row["status"] = "failed"
-        row["seconds"] = time.time() - started
-        if row["status"] in ("not done", "stopped"):
-            rest = "the rest of " if row["status"] == "stopped" else ""
-            self._leave_out(step.name, f"{rest}step {step.name}", row["reason"])
-        self.write()
-        reason = f" ({row['reason']})" if row["reason"] else ""
-        print(f"{step.name:<10} {row['status']}{reason}, {row['seconds']:.0f} s", flush=True)
-
-    def _child(self, name: str, seconds: float) -> tuple[int | None, str]:
-        """Runs a step of ``steps``; what it writes is taken over while it runs."""
-        until = time.time() + max(seconds - _GRACE, seconds / 2)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "part.json"
-
-            def look() -> None:
-                if path.exists():
-                    part = json.loads(path.read_bytes())
-                    if part != self.parts[name]:
-                        self.parts[name] = part
-                        self.write()
-
-            command = ["-m", "gamba_warp.gpu_check", "--child", name, "--out", str(path)]
-            command += ["--device", self.settings.device.type, "--until", str(until)]
-            command += ["--quick"] * (self.settings.level == "quick")
-            return run_python(command, seconds, look)
-
-
-def join_benches(documents: list[dict]) -> dict:
-    """Joins documents to one; a case or a measured target of a later one replaces an earlier."""
-    records: list[dict] = []
-    targets: dict[tuple, dict] = {}
-    for document in documents:
-        new = {(r["op"], r["case"]) for r in document["records"]}
-        records = [r for r in records if (r["op"], r["case"]) not in new] + document["records"]
-        for target in document.get("targets", []):
-            key = target["op"], target["text"]
-            if key not in targets or target["value"] is not None:
-                targets[key] = target
-    joined = documents[0] if documents else {}
-    return joined | {"records": records, "targets": list(targets.values())}
-
-
-def new_part() -> dict:
-    """What ``Part.write`` writes of a step that has done nothing."""
-    return {"result": {}, "not_done": [], "failures": [], "whole": False}
-
-
-def run_python(
-    arguments: list[str], seconds: float, look: Callable[[], None]
-) -> tuple[int | None, str]:
-    """Runs Python, and ends it with all that it started when its time is up.
-
-    Args:
-        arguments: of Python.
-        seconds: time limit.
-        look: called every tenth of a second, and at the end.
-
-    Returns:
-        The exit code, None if it was ended, and the last line that it printed.
-    """
-    paths = [str(CHECKOUT), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-    ends = time.time() + seconds
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(
-            [sys.executable, *arguments],
-            **{"stdout": said, "stderr": subprocess.STDOUT, "stdin": subprocess.DEVNULL},
-            **{"env": environment, "start_new_session": True},
-        )
+def in_a_process(function: Callable[[str], object], name: str, seconds: float) -> object:
+    """``function(name)`` in a process of its own, which is ended with all that it has started."""
+    with tempfile.TemporaryDirectory() as folder:
+        number = Path(folder) / "number"
         try:
-            while process.poll() is None and time.time() < ends:
-                time.sleep(0.1)
-                look()
-            code = process.poll()
+            [(_, value)] = run_each(partial(_leading, number, function), [name], seconds=seconds)
         finally:
-            if process.poll() is None:
-                end_tree(process)
-        look()
-        said.seek(0)
-        lines = said.read().decode(errors="replace").strip().splitlines()
-    return code, lines[-1] if lines else "nothing was printed"
+            end_idle()
+            if hasattr(os, "killpg") and number.exists():
+                with suppress(ProcessLookupError):
+                    os.killpg(int(number.read_bytes()), signal.SIGKILL)
+    return value
 
 
-def end_tree(process: subprocess.Popen) -> None:
-    """Ends a process, and what it started itself; waits until the process is gone.
+def _leading(number: Path, function: Callable[[str], object], name: str) -> object:
+    if hasattr(os, "setsid"):  # compilers that a package starts are then of this one's group
+        os.setsid()
+        number.write_text(str(os.getpid()), encoding="utf-8")
+    return function(name)
 
-    Args:
-        process: made with ``start_new_session``, which makes it a group where there are groups.
+
+def run_step(folder: Path, until: float, name: str) -> None:
+    """Runs the step of that name to its end, or until its time is up, into a folder's report."""
+    report = Report(folder, json.loads((folder / "gpu-check.json").read_bytes()), until)
+    settings, quick = report.settings, report.settings.level == "quick"
+    if name in _BESIDE:
+        _bench(report, replace(settings, peers=True), _BESIDE[name])
+    elif name == "bench":
+        cpu = settings.device.type == "cpu"
+        _bench(report, settings, _ON_A_CPU if quick and cpu else _FIRST, alone=quick)
+    else:
+        result = report.document["results"][name] = {}
+        {"compile": _compile, "checks": _checks, "inference": _inference}[name](report, result)
+    report.write()
+
+
+def _compile(report: Report, result: dict) -> None:
+    """Compiles every kernel of ``gamba bench --static`` for this device, into Warp's cache."""
+    device = wp.device_from_torch(report.settings.device)
+    entries = find_kernels()
+    result |= {"kernels": 0, "of": len(entries), "seconds": 0.0}
+    for entry in report.in_time(entries, lambda e: f"compile {e.name}, {e.case}"):
+        started = time.perf_counter()
+        if not entry.launch.kernel.module.load(device, entry.launch.block):
+            text = f"{entry.name}, {entry.case}: does not load on {device}"
+            report.document["failures"].append(text)
+        result["kernels"] += 1
+        result["seconds"] += time.perf_counter() - started
+
+
+def _checks(report: Report, result: dict) -> None:
+    found, device = result.setdefault("checks", []), report.settings.device
+    every = checks(report.settings.level == "quick")
+    for check in report.in_time(every, lambda check: check.name):
+        started = time.perf_counter()
+        row: dict[str, Any] = {"name": check.name, "status": "passed"}
+        try:
+            if check.cuda and device.type != "cuda":
+                raise LeftOut("needs CUDA")
+            row["found"] = check.run(device)
+        except LeftOut as reason:
+            report.leave_out(check.name, str(reason))
+            continue
+        except Exception as error:  # a broken kernel may raise anything, and that is a finding
+            row |= {"status": "failed", "found": f"{type(error).__name__}: {first_line(error)}"}
+            report.document["failures"].append(f"{check.name}: {row['found']}")
+        found.append(row | {"seconds": time.perf_counter() - started})
+
+
+def _inference(report: Report, result: dict) -> None:
+    settings = report.settings
+    result["ceilings"] = _ceilings(settings)
+    _measure(report, settings, inference.cases(settings), inference.targets(settings))
+    if settings.device.type != "cuda":
+        report.leave_out("inference from a CUDA graph", "needs CUDA")
+    else:
+        result["reserved_gib"] = torch.cuda.memory_reserved(settings.device) / 2**30
+
+
+def _ceilings(settings: Settings) -> dict[str, float]:
+    """Measures what the device does at best, to judge times by: a copy and a matrix product."""
+    count, side = (1 << 20, 256) if settings.level == "quick" else (1 << 30, 8192)
+    source = torch.ones(count // 4, device=settings.device)
+    a = torch.randn(side, side, device=settings.device).bfloat16()
+    target = torch.empty_like(source)
+
+    def seconds(run: Callable[[], object]) -> float:
+        spans = []
+        for _ in range(5):
+            started = time.perf_counter()
+            run()
+            synchronize(settings.device)
+            spans.append(time.perf_counter() - started)
+        return min(spans)
+
+    return {
+        "copy_gb_per_s": 2 * count / seconds(lambda: target.copy_(source)) / 1e9,
+        "bfloat16_tflop_per_s": 2 * side**3 / seconds(lambda: a @ a) / 1e12,
+    }
+
+
+def _bench(
+    report: Report, settings: Settings, first: list[tuple[str, str]], *, alone: bool = True
+) -> None:
+    """Measures the cases of ``gamba bench`` named in ``first``; unless ``alone``, then all others.
+
+    A name of ``first`` that has no case at this level is passed over.
     """
-    if hasattr(os, "killpg"):
-        os.killpg(process.pid, signal.SIGKILL)
-    elif sys.platform == "win32":
-        # By its whole path: Windows would look in the working directory before its own folders.
-        root = os.environ.get("SystemRoot", "C:\\Windows")
-        taskkill = os.path.join(root, "System32", "taskkill.exe")
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            subprocess.run(
-                [taskkill, "/F", "/T", "/PID", str(process.pid)], capture_output=True, timeout=30
-            )
-    process.kill()  # does nothing if it is gone; else at least the process itself ends
-    process.wait()
+    suites = raster, scan, conv, blocks
+    found = {(c.op, c.name): c for suite in suites for c in suite.cases(settings)}
+    keys = [*first, *([] if alone else found)]
+    cases = [found[key] for key in dict.fromkeys(keys) if key in found]
+    _measure(report, settings, cases, [t for suite in suites for t in suite.targets(settings)])
+
+
+def _measure(report: Report, settings: Settings, cases: list[Case], targets: list[Target]) -> None:
+    """Measures case after case; a fault of ours is a failure, a fault of a peer only a note."""
+    before, document = report.document["bench"], measure([], settings)
+    for case in report.in_time(cases, lambda case: f"{case.op}: {case.name}"):
+        records = measure([case], settings)["records"]
+        document["records"] += records
+        document["targets"] = judge(targets, document["records"])
+        report.document["bench"] = joined(before, document)
+        for r in records:
+            name = f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}"
+            if r["status"] == "ok":
+                continue
+            if r["is_peer"] or r["status"].startswith("not"):
+                report.leave_out(name, r["status"])
+            else:
+                report.document["failures"].append(f"{name}: {r['status']}")
+
+
+def joined(before: dict, later: dict) -> dict:
+    """One document of two; a case or a measured target of the later one replaces an earlier."""
+    new = {(r["op"], r["case"]) for r in later["records"]}
+    old = [r for r in before["records"] if (r["op"], r["case"]) not in new]
+    targets = {(t["op"], t["text"]): t for t in before["targets"]}
+    for t in later["targets"]:
+        if t["value"] is not None or (t["op"], t["text"]) not in targets:
+            targets[t["op"], t["text"]] = t
+    lists = {"records": old + later["records"], "targets": [*targets.values()]}
+    return later | before | lists
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """``python -m gamba_warp.gpu_check``: the command without tyro; with --child, one step."""
+    """``python -m gamba_warp.gpu_check``: the command without tyro."""
     parser = argparse.ArgumentParser(
         prog="gamba gpu-check", description=(run_gpu_check.__doc__ or "").split("\n\n")[0]
     )
@@ -274,15 +352,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=MINUTES, help="the run takes no longer")
     names = [step.name for step in STEPS]
     parser.add_argument("--steps", nargs="+", choices=names, default=(), help="only these")
-    parser.add_argument("--child", help=argparse.SUPPRESS)
-    parser.add_argument("--until", type=float, help=argparse.SUPPRESS)
     o = parser.parse_args(arguments)
-    if o.child:
-        # Imported here, because an import may be what breaks a step, and must end that step alone.
-        from .steps import Part, run_step
-
-        run_step(o.child, Part(o.out, o.until), make_settings(o.device, o.quick))
-        return 0
     try:
         return run_gpu_check(o.device, o.quick, o.out, o.minutes, o.steps)
     except UserError as error:

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..kernels.bench import Settings
 from ..kernels.bench.core.measure import machine
-from ..kernels.bench.core.report import groups, oracles, table
+from ..kernels.bench.core.report import TARGET_WORDS, groups, markdown_table, oracles, table
 from ..kernels.bench.peers import versions
 from ..versions import installed
 
@@ -38,26 +38,24 @@ def headline(document: dict) -> list[tuple[str, str]]:
     for step in document["steps"]:
         reason = f": {step['reason']}" if step["reason"] else ""
         rows.append((f"step {step['name']}", f"{step['status']}, {step['seconds']:.0f} s{reason}"))
-    results = {
-        name: document["results"].get(name, {}) for name in ("compile", "checks", "inference")
-    }
-    if found := results["compile"]:
+    results = document["results"]
+    if found := results.get("compile"):
         text = f"{found['kernels']} of {found['of']} in {found['seconds']:.1f} s"
         rows.append(("kernels compiled or loaded", text))
-    if words := [check["status"] for check in results["checks"].get("checks", [])]:
+    if words := [check["status"] for check in results.get("checks", {}).get("checks", [])]:
         counts = (f"{words.count(word)} {word}" for word in dict.fromkeys(words))
         rows.append(("checks of the kernels", ", ".join(counts)))
-    for name, value in results["inference"].get("ceilings", {}).items():
+    inference = results.get("inference", {})
+    for name, value in inference.get("ceilings", {}).items():
         rows.append((name.replace("_per_", "/").replace("_", " "), f"{value:.3g}"))
-    if "reserved_gib" in results["inference"]:
-        reserved = results["inference"]["reserved_gib"]
-        text = f"{reserved:.1f} GiB, graphs and both precisions together"
+    if "reserved_gib" in inference:
+        text = f"{inference['reserved_gib']:.1f} GiB, graphs and both precisions together"
         rows.append(("inference, memory taken", text))
     for record in document["bench"]["records"]:
         if record["op"] == "inference":
             rows.append((f"inference, {record['variant']}", _time(record)))
     for target in document["bench"]["targets"]:
-        words = {True: "reached", False: "missed", None: "not measured"}[target["reached"]]
+        words = TARGET_WORDS[target["reached"]]
         value = "" if target["value"] is None else f"{target['value']:.3g}, "
         rows.append((f"{target['op']}: {target['text']}", f"{value}{target['wanted']}: {words}"))
     return rows
@@ -78,7 +76,7 @@ def page(document: dict) -> str:
     """Returns the document as a Markdown page."""
     title = document["verdict"]
     lines = ["# gamba gpu-check", "", f"Written by `gamba gpu-check`, not by hand. **{title}**", ""]
-    lines += _table(("what", "found"), headline(document))
+    lines += markdown_table(("what", "found"), headline(document))
     not_done = [f"{row['what']}: {row['reason']}" for row in document["not_done"]]
     for name, rows in (("Failed", document["failures"]), ("Not done", not_done)):
         if rows:
@@ -86,11 +84,5 @@ def page(document: dict) -> str:
     for op, cases in groups({"records": document["bench"]["records"]}).items():
         for case, found in cases.items():
             lines += ["", f"## {op}: {case}", "", f"{found[0]['text']} {oracles(found)}", ""]
-            lines += _table(*table(found))
+            lines += markdown_table(*table(found))
     return "\n".join([*lines, ""])
-
-
-def _table(header, rows) -> list[str]:
-    cells = [[str(cell).replace("|", "\\|") for cell in row] for row in (header, *rows)]
-    lines = [f"| {' | '.join(row)} |" for row in cells]
-    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]

@@ -15,7 +15,7 @@ from ..files import output_folder, write_json, write_text
 from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.core.document import check_document
 from ..kernels.bench.core.page import page
-from ..kernels.bench.core.report import judge, markdown, ratio_table
+from ..kernels.bench.core.report import TARGET_WORDS, judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 from ..untrusted import documents
@@ -186,7 +186,7 @@ def summary(document: dict, old: dict | None) -> str:
     """Lines on targets, failures, and the ratios of the times to those of an older document."""
     lines = []
     for t in document["targets"]:
-        word = {True: "reached", False: "missed", None: "not measured"}[t["reached"]]
+        word = TARGET_WORDS[t["reached"]]
         value = "" if t["value"] is None else f"{t['value']:.3g}"
         lines.append(f"{word:<12} {value:>8}  ({t['wanted']})  {t['op']}: {t['text']}")
     stopped = (r for r in document["records"] if r["status"].startswith("stopped"))

@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,19 +16,23 @@ import torch
 from helpers.kernels import Watch
 
 from gamba_warp.cameras import Cameras
-from gamba_warp.files import write_json
 from gamba_warp.gpu_check import STEPS, StepName
 from gamba_warp.gpu_check import check as gpu_check
-from gamba_warp.gpu_check import kernels as gpu_kernels
-from gamba_warp.gpu_check import steps as gpu_steps
-from gamba_warp.gpu_check.check import main, make_settings, new_part, run_gpu_check
-from gamba_warp.gpu_check.steps import Part, run_step
+from gamba_warp.gpu_check import checks as gpu_kernels
+from gamba_warp.gpu_check.check import begin, in_a_process, main, run_gpu_check, run_step
+from gamba_warp.kernels.bench import Settings
 from gamba_warp.kernels.bench.static import dry_run
 from gamba_warp.measure import inference as bench_inference
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.untrusted.children import Failed
 
 ROOT = Path(__file__).resolve().parents[2]
+GRAPH = "scan and convolution in a CUDA graph"
+
+
+def settings(device, level):
+    return Settings(torch.device(device), level)
 
 
 @pytest.fixture
@@ -85,11 +91,11 @@ def test_the_watch_sees_what_waits(on_paper, wait):
 
 def test_inference_on_cuda_has_the_headline(monkeypatch, on_paper):
     monkeypatch.setattr(bench_inference, "_on", lambda model, settings: model.eval())
-    (case,) = bench_inference.cases(make_settings("cuda", quick=True))
+    (case,) = bench_inference.cases(settings("cuda", "quick"))
     with torch.device("cuda"):
         variants = {variant.name: variant for variant in case.build()}
     assert variants[bench_inference.HEADLINE].dtype == "bfloat16"
-    (target,) = bench_inference.targets(make_settings("cuda", quick=False))
+    (target,) = bench_inference.targets(settings("cuda", "normal"))
     assert target.times[0].variant in variants and target.at_most == 10
 
 
@@ -146,19 +152,19 @@ def test_nothing_to_start_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, 
     assert not (tmp_path / "new").exists()
 
 
-def part_of(tmp_path, name, until=float("inf")):
-    part = Part(tmp_path / "part.json", until)
-    run_step(name, part, make_settings("cpu", quick=True))
-    return json.loads(part.path.read_text())
+def part_of(folder, name, until=float("inf")):
+    begin("cpu", True, folder).write()
+    run_step(folder, until, name)
+    return json.loads((folder / "gpu-check.json").read_text())
 
 
 def test_the_checks_of_the_kernels(tmp_path):
-    part = part_of(tmp_path, "checks")
-    assert part["whole"] and part["failures"] == []
-    assert all(c["status"] == "passed" for c in part["result"]["checks"])
-    assert len(part["result"]["checks"]) == 10
-    needs = {row["what"] for row in part["not_done"] if row["reason"] == "needs CUDA"}
-    assert "scan and convolution in a CUDA graph" in needs and len(needs) == 10
+    document = part_of(tmp_path, "checks")
+    found = document["results"]["checks"]["checks"]
+    assert document["failures"] == [] and len(found) == 10
+    assert all(check["status"] == "passed" for check in found)
+    needs = {row["what"] for row in document["not_done"] if row["reason"] == "needs CUDA"}
+    assert GRAPH in needs and len(needs) == 10
 
 
 def test_a_wrong_kernel_fails_its_check(monkeypatch, tmp_path):
@@ -171,11 +177,11 @@ def test_a_wrong_kernel_fails_its_check(monkeypatch, tmp_path):
         "scan: two runs, the same bits",
     )
     found = [check for check in gpu_kernels.checks(quick=True) if check.name in names]
-    monkeypatch.setattr(gpu_steps, "checks", lambda quick: found)
-    part = part_of(tmp_path, "checks")
-    states = {c["name"]: c["status"] for c in part["result"]["checks"]}
+    monkeypatch.setattr(gpu_check, "checks", lambda quick: found)
+    document = part_of(tmp_path, "checks")
+    states = {c["name"]: c["status"] for c in document["results"]["checks"]["checks"]}
     assert states == dict(zip(names, ("failed", "failed", "passed")))
-    assert len(part["failures"]) == 2 and "relative rms error" in part["failures"][0]
+    assert len(document["failures"]) == 2 and "relative rms error" in document["failures"][0]
 
 
 def test_the_options_name_the_steps_of_the_plan():
@@ -184,100 +190,111 @@ def test_the_options_name_the_steps_of_the_plan():
 
 def test_no_item_begins_when_time_is_up(tmp_path):
     for name in ("checks", "bench"):
-        part = part_of(tmp_path, name, until=time.time() - 1)
-        reasons = {row["reason"] for row in part["not_done"]} - {"needs CUDA"}
-        assert part["whole"] and reasons == {"time was up"}
+        document = part_of(tmp_path, name, until=time.time() - 1)
+        rows = [r for r in document["not_done"] if not r["what"].startswith("comparison")]
+        assert {row["reason"] for row in rows} - {"needs CUDA"} == {"time was up"}
 
 
 def test_the_benchmark_step(tmp_path):
-    part = part_of(tmp_path, "bench")
-    records = part["result"]["bench"]["records"]
-    assert {record["op"] for record in records} == {"conv"} and part["failures"] == []
+    document = part_of(tmp_path, "bench")
+    records = document["bench"]["records"]
+    assert {record["op"] for record in records} == {"conv"} and document["failures"] == []
     assert all(record["ms_p50"] > 0 for record in records)
 
 
 def test_the_compile_step(monkeypatch, tmp_path):
     from helpers.kernels import plain_kernel
 
-    entry = gpu_steps.find_kernels.__globals__["Entry"]
+    entry = gpu_check.find_kernels.__globals__["Entry"]
     launch = dry_run.Launch(plain_kernel, 256)
-    monkeypatch.setattr(gpu_steps, "find_kernels", lambda: [entry("op", "c", "forward", launch)])
-    part = part_of(tmp_path, "compile")
-    assert part["result"]["kernels"] == part["result"]["of"] == 1 and part["failures"] == []
-    assert part["result"]["seconds"] > 0
+    monkeypatch.setattr(gpu_check, "find_kernels", lambda: [entry("op", "c", "forward", launch)])
+    document = part_of(tmp_path, "compile")
+    result = document["results"]["compile"]
+    assert result["kernels"] == result["of"] == 1 and document["failures"] == []
+    assert result["seconds"] > 0
 
 
-def child(part, code, said=""):
-    """Stands for a process that writes a part and ends with a code; None: its time was up."""
+@pytest.fixture
+def children(monkeypatch):
+    """Stands for the processes: ``child(name, seconds)`` gives what is added and how they end."""
 
-    def run(arguments, seconds, look):
-        write_json(arguments[arguments.index("--out") + 1], part)
-        look()
-        return code, said
+    def switch(child):
+        def run(function, name, seconds):
+            folder = function.args[0]
+            changes, end = child(name, seconds)
+            document = json.loads((folder / "gpu-check.json").read_text())
+            for key, value in changes.items():
+                old = document[key]
+                document[key] = old | value if isinstance(old, dict) else old + value
+            (folder / "gpu-check.json").write_text(json.dumps(document))
+            return end
 
-    return run
+        monkeypatch.setattr(gpu_check, "in_a_process", run)
+        monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+    return switch
 
 
-def result(failures=(), whole=True):
+def result(failures=()):
     row = {"name": "scan", "status": "passed", "found": "1e-7", "seconds": 1.0}
+    not_done = [{"what": "a", "reason": "b"}]
     return {
-        "result": {"checks": [row]},
-        "not_done": [{"what": "a", "reason": "b"}],
+        "results": {"checks": {"checks": [row]}},
+        "not_done": not_done,
         "failures": list(failures),
-        "whole": whole,
     }
 
 
+LATE, CORE = Failed("took more than 100 seconds"), Failed("its process died of signal 11")
+
+
 @pytest.mark.parametrize(
-    "part, code, status, exit_code, words",
+    "part, end, status, exit_code, words",
     [
-        (result(), 0, "passed", 0, ""),
-        (result(["scan: wrong"]), 0, "failed", 1, "scan: wrong"),
-        (result(whole=False), -11, "failed", 1, "step checks ended with code -11: a core"),
-        (result(whole=False), None, "stopped", 0, "the rest of step checks: its 100 s were up"),
-        (result(["scan: wrong"], whole=False), None, "failed", 1, "scan: wrong"),
+        (result(), None, "passed", 0, ""),
+        (result(["scan: wrong"]), None, "failed", 1, "scan: wrong"),
+        (result(), CORE, "failed", 1, "step checks: its process died of signal 11"),
+        (result(), LATE, "stopped", 0, "the rest of step checks: its 100 s were up"),
+        (result(["scan: wrong"]), LATE, "failed", 1, "scan: wrong"),
     ],
 )
-def test_what_a_step_left_is_kept(monkeypatch, tmp_path, part, code, status, exit_code, words):
-    monkeypatch.setattr(gpu_check, "run_python", child(part, code, "a core"))
+def test_what_a_step_left_is_kept(children, tmp_path, part, end, status, exit_code, words):
+    children(lambda name, seconds: (part, end))
     run = run_gpu_check(device="cpu", out=tmp_path, steps=("checks",))
     document = json.loads((tmp_path / "gpu-check.json").read_text())
     assert run == exit_code and document["steps"][0]["status"] == status
-    assert document["results"]["checks"] == part["result"]
+    assert document["results"] == part["results"]
     assert {"what": "a", "reason": "b"} in document["not_done"]
     page = (tmp_path / "gpu-check.md").read_text()
     assert words in page and "1 passed" in page
     assert document["verdict"] == ("1 failed" if exit_code else "all that could be run passed")
 
 
-def test_an_interrupt_keeps_what_was_done(monkeypatch, tmp_path):
-    done = child(result(), 0)
-
-    def run(arguments, *rest, **options):
-        if "inference" in arguments:
+def test_an_interrupt_keeps_what_was_done(children, tmp_path):
+    def child(name, seconds):
+        if name == "inference":
             raise KeyboardInterrupt
-        return done(arguments, *rest, **options)
+        return result(), None
 
-    monkeypatch.setattr(gpu_check, "run_python", run)
+    children(child)
     assert run_gpu_check(device="cpu", out=tmp_path) == 130
     document = json.loads((tmp_path / "gpu-check.json").read_text())
     assert document["verdict"].startswith("interrupted")
-    assert "checks" in document["results"] and "bench" not in document["results"]
+    assert "checks" in document["results"] and document["bench"]["records"] == []
 
 
-def test_the_whole_run_ends_in_its_time(monkeypatch, tmp_path):
+def test_the_whole_run_ends_in_its_time(monkeypatch, children, tmp_path):
     """Steps that take all they are given leave nothing for the last ones, which are told."""
     now, given = [0.0], []
 
-    def run(arguments, seconds, look):
+    def child(name, seconds):
         now[0] += seconds
         given.append(seconds)
-        return None, ""
+        return {}, LATE
 
+    children(child)
     monkeypatch.setattr(gpu_check.time, "time", lambda: now[0])
-    monkeypatch.setattr(gpu_check, "run_python", run)
-    monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(gpu_check, "versions", lambda: dict.fromkeys(gpu_check.PACKAGES, "1"))
     assert run_gpu_check(out=tmp_path) == 0
     assert given[:4] == [step.seconds for step in gpu_check.STEPS[:4]] and len(given) == 5
@@ -290,27 +307,17 @@ def test_the_whole_run_ends_in_its_time(monkeypatch, tmp_path):
     assert sum(given) == now[0] <= 12
 
 
-def test_peers_have_steps_of_their_own(monkeypatch, tmp_path):
+def test_peers_have_steps_of_their_own(monkeypatch, children, tmp_path):
     """What breaks there takes nothing along, and what is not installed is not begun."""
-    part = new_part() | {"whole": True}
-    part["result"] = {"bench": document_of(("conv", "operator", "default", 1.0), target=None)}
     runs = []
 
-    def run(arguments, seconds, look):
-        name = arguments[arguments.index("--child") + 1]
+    def child(name, seconds):
         runs.append(name)
-        if name == "peers-scan":
-            return -11, "a core"
-        if name == "peers-conv":
-            new = (("conv", "operator", "default", 2.0), ("conv", "operator", "theirs", 3.0))
-            part["result"] = {"bench": document_of(*new, target=1.5)}
-        return child(part, 0)(arguments, seconds, look)
+        return {}, CORE if name == "peers-scan" else None
 
+    children(child)
     found = {"causal-conv1d": "1", "mamba-ssm": "2"}
     monkeypatch.setattr(gpu_check, "versions", lambda: found)
-    monkeypatch.setattr(gpu_check, "run_python", run)
-    monkeypatch.setattr(gpu_check, "machine_facts", lambda settings: {"packages": {}})
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     steps = "bench", "peers-conv", "peers-scan", "peers-raster"
     assert run_gpu_check(out=tmp_path, steps=steps) == 1
     assert runs == ["bench", "peers-conv", "peers-scan"]
@@ -318,10 +325,18 @@ def test_peers_have_steps_of_their_own(monkeypatch, tmp_path):
     assert [step["status"] for step in document["steps"]] == [
         *("passed", "passed", "failed", "not done")
     ]
-    times = [(r["variant"], r["ms_p50"]) for r in document["bench"]["records"]]
-    assert times == [("default", 2.0), ("theirs", 3.0)]
-    assert [t["value"] for t in document["bench"]["targets"]] == [1.5]
     assert "not installed: gsplat, gswarp" in (tmp_path / "gpu-check.md").read_text()
+
+
+def test_a_later_measurement_replaces_an_earlier_one():
+    before = document_of(("conv", "operator", "default", 1.0), target=None)
+    new = (("conv", "operator", "default", 2.0), ("conv", "operator", "theirs", 3.0))
+    found = gpu_check.joined(before, document_of(*new, target=1.5))
+    times = [(r["variant"], r["ms_p50"]) for r in found["records"]]
+    assert times == [("default", 2.0), ("theirs", 3.0)]
+    assert [t["value"] for t in found["targets"]] == [1.5]
+    again = gpu_check.joined(found, document_of(target=None))
+    assert again == found
 
 
 def document_of(*records, target):
@@ -334,21 +349,42 @@ def document_of(*records, target):
     return {"records": [dict(zip(names, r)) | rest for r in records], "targets": [wanted]}
 
 
-def test_a_process_that_hangs_is_ended_with_its_children(tmp_path):
-    marker = tmp_path / "alive"
-    inner = f"import time, pathlib; time.sleep(2); pathlib.Path({str(marker)!r}).touch()"
-    outer = f"import subprocess, sys; print('began'); sys.stdout.flush(); \
-subprocess.run([sys.executable, '-c', {inner!r}])"
-    started, looks = time.time(), []
-    code, said = gpu_check.run_python(["-c", outer], 1.0, lambda: looks.append(1))
-    assert code is None and said == "began" and len(looks) > 2
-    assert time.time() - started < 2
-    time.sleep(max(0, started + 3.5 - time.time()))
-    assert not marker.exists()
+def start_another(place):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    Path(place).write_text(str(child.pid))
+    time.sleep(60)
+
+
+def test_an_interrupt_ends_a_process_with_what_it_started(tmp_path):
+    place = tmp_path / "number"
+
+    def interrupt():
+        while not (place.exists() and place.read_text()):
+            time.sleep(0.1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        in_a_process(start_another, str(place), 60)
+    time.sleep(0.5)
+    stat = Path("/proc") / place.read_text() / "stat"
+    assert not stat.exists() or stat.read_text().rsplit(")", 1)[1].split()[0] == "Z"
+
+
+def test_a_process_that_hangs_is_ended():
+    started = time.time()
+    assert "took more than 0.5 seconds" in in_a_process(time.sleep, 60, 0.5).reason
+    assert time.time() - started < 30
 
 
 def test_a_process_that_crashes():
-    crash = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
-    assert gpu_check.run_python(["-c", crash], 30, lambda: None) == (-11, "nothing was printed")
-    code, said = gpu_check.run_python(["-c", "1 / 0"], 30, lambda: None)
-    assert code == 1 and said == "ZeroDivisionError: division by zero"
+    assert "signal 11 (SIGSEGV)" in in_a_process(end_badly, "", 30).reason
+    assert in_a_process(divide, "", 30).reason == "ZeroDivisionError: division by zero"
+
+
+def end_badly(name):
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def divide(name):
+    return 1 / 0

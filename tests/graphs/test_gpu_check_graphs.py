@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gamba_warp.gpu_check import graphs
+from gamba_warp.gpu_check import checks as graphs
 
 CPU = torch.device("cpu")
 
@@ -32,7 +32,7 @@ def graph(monkeypatch):
     def switch(spoil=None):
         def captured(run, device):
             graph = Graph(run, spoil)
-            return graph, graph.made
+            return graph, graph.made, 0
 
         monkeypatch.setattr(graphs, "captured", captured)
         monkeypatch.setattr(graphs, "lists_outgrown", lambda: True)

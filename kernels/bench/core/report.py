@@ -168,13 +168,13 @@ def oracles(records: Sequence[dict]) -> str:
 
 def target_rows(document: dict) -> list[list[str]]:
     """Returns the targets' cells under ``TARGET_HEADER``."""
-    words = {True: "reached", False: "missed", None: "not measured"}
     return [
-        [t["op"], t["text"], t["wanted"], number(t["value"]), words[t["reached"]]]
+        [t["op"], t["text"], t["wanted"], number(t["value"]), TARGET_WORDS[t["reached"]]]
         for t in document.get("targets", [])
     ]
 
 
+TARGET_WORDS = {True: "reached", False: "missed", None: "not measured"}
 TARGET_HEADER = ("", "target", "wanted", "measured", "")
 EXPLANATION = (
     "Times are medians in milliseconds, with the 20 % and 80 % quantiles; variants of one table "
@@ -202,18 +202,19 @@ def markdown(documents: Sequence[dict], more: More = nothing_more) -> str:
         if document["interrupted"]:
             lines += ["The run was interrupted; what was measured is here.", ""]
         if targets := target_rows(document):
-            lines += [*_markdown_table(TARGET_HEADER, targets), ""]
+            lines += [*markdown_table(TARGET_HEADER, targets), ""]
         for op, cases in groups(document).items():
             for case, records in cases.items():
                 lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
                 said, tables = more(records)
                 lines += [line for text in said for line in (text, "")]
                 for rows in (table(records), *tables):
-                    lines += [*_markdown_table(*rows), ""]
+                    lines += [*markdown_table(*rows), ""]
     return "\n".join(lines)
 
 
-def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a Markdown table."""
     cells = [[cell.replace("|", "\\|") for cell in row] for row in (header, *rows)]
     lines = [f"| {' | '.join(row)} |" for row in cells]
     return [lines[0], "|" + " --- |" * len(header), *lines[1:]]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -16,18 +17,31 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from ..kernels.bench import compare
+from ..gaussians import Gaussians
+from ..kernels.bench import Error, Settings, compare
 from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
+<<<<<<< HEAD:gamba_warp/gpu_check/kernels.py
 from ..kernels.selective_scan.cuda import launch as cuda_scan
 from ..kernels.selective_scan.cuda.launch import Tuning
 from .graphs import captured, no_wait, raster_graph, same, step_graph, within
+=======
+from ..kernels.rasterize import lists_outgrown, rasterization
+from ..kernels.selective_scan.cuda.tuning import Tuning, use_tuning
+from ..measure.inference import build_model, captured
+from ..model.posing import reference_cameras
+from ..render import render
+>>>>>>> 6ced06b (gpu-check: one document that each step writes; run_each for processes):gamba_warp/gpu_check/checks.py
 
 # Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
 # rounds inputs and outputs, and a few pixels may cross the cut at the faintest alpha.
 LIMIT, HALF_LIMIT, PICTURE_LIMIT = 1e-5, 3e-2, 1e-3
+# Under capture torch may choose other kernels for a product; Adam's first steps go by the sign of
+# a gradient, so where that is a rounding, weights go apart.
+LOSS_LIMIT, CHANGE_LIMIT = 1e-4, 0.05
+_STEPS = 4  # of training
 # Each is batch, tokens, channels, states and groups.
 SCANS = [
     (2, 139, 37, 3, 1), (1, 65, 40, 3, 2), (1, 1, 1, 1, 1), (1, 577, 70, 16, 1),
@@ -207,7 +221,7 @@ def _graph(device: torch.device) -> str:
     """Checks that a replay gives the bits of a plain run, also with inputs changed meanwhile."""
     layer, inputs = _layer(_problem((1, 577, 70, 16, 1), device))
     with torch.no_grad():
-        graph, out = captured(lambda: layer(*inputs), device)
+        graph, out, _ = captured(lambda: layer(*inputs), device)
         for scale in (1.0, 0.5):
             inputs[0].mul_(scale)
             out.fill_(torch.nan)
@@ -215,3 +229,164 @@ def _graph(device: torch.device) -> str:
             torch.cuda.synchronize(device)
             same((out,), (layer(*inputs),))
     return "equal"
+
+
+def within(error: Error, limit: float) -> str:
+    """Returns an error in words.
+
+    Raises:
+        AssertionError: it is over the limit, or not a number.
+    """
+    if not error.rel_rms <= limit:
+        raise AssertionError(
+            f"{error.worst}: relative rms error {error.rel_rms:.2g}, allowed {limit:.2g}"
+        )
+    return f"{error.rel_rms:.1e}"
+
+
+def same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
+    """Compares results bit by bit.
+
+    Raises:
+        AssertionError: one differs.
+    """
+    for i, (a, b) in enumerate(zip(first, second)):
+        if not a.equal(b):
+            raise AssertionError(f"result {i} differs by up to {(a - b).abs().max().item():.2g}")
+
+
+class Splats:
+    """Gaussians and cameras that stay where they are in memory, rendered with all gradients."""
+
+    def __init__(self, device: torch.device, count: int = 700, views: int = 3, size: int = 75):
+        gaussians = {name: x.to(device) for name, x in shell(count, scale=3.0).items()}
+        self.leaves: dict[str, Any] = {k: x.requires_grad_() for k, x in gaussians.items()}
+        self.cameras = [x.to(device) for x in orbit_cameras(views, size)]
+        self.size = size
+
+    def run(self) -> dict[str, Tensor]:
+        """Renders, and returns picture, alphas, the number of pairs and the gradients."""
+        renders, alphas, meta = rasterization(
+            **self.leaves,
+            viewmats=self.cameras[0],
+            Ks=self.cameras[1],
+            width=self.size,
+            height=self.size,
+            render_mode="RGB+D",
+        )
+        grads = torch.autograd.grad(renders.square().sum() + alphas.sum(), [*self.leaves.values()])
+        made = {"renders": renders.detach(), "alphas": alphas.detach(), "pairs": meta.bins.count}
+        return made | dict(zip(self.leaves, grads))
+
+    @torch.no_grad()
+    def grow(self, factor: float) -> None:
+        """Multiplies the sizes of the Gaussians, and with these the number of pairs."""
+        self.leaves["scales"].mul_(factor)
+
+
+def no_wait(device: torch.device) -> str:
+    """Checks that torch waits for the device in no call but the first, neither graph nor not."""
+    splats, steps = Splats(device), TrainingStep(device)
+    for run in (splats.run, steps.run):
+        run()
+        before = torch.cuda.get_sync_debug_mode()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            run()
+        finally:
+            torch.cuda.set_sync_debug_mode(before)
+    return "rendering with gradients and a training step go on"
+
+
+def raster_graph(device: torch.device) -> str:
+    """Checks bits of replays, with sizes changed meanwhile, and with more pairs than have room."""
+    splats = Splats(device)
+    graph, made, _ = captured(splats.run, device)
+    found = []
+    for factor in (1.0, 0.8, 6.0, 0.25):
+        splats.grow(factor)
+        for value in made.values():
+            value.fill_(-1)
+        graph.replay()
+        torch.cuda.synchronize(device)
+        replayed = {name: value.clone() for name, value in made.items()}
+        found.append(int(replayed["pairs"]))
+        if factor == 6.0 and not lists_outgrown():
+            raise AssertionError(
+                f"{found[-1]} pairs after {found[0]} had room, which was not meant"
+            )
+        same(tuple(replayed.values()), tuple(splats.run().values()))
+    return "equal, with " + ", ".join(map(str, found)) + " pairs"
+
+
+class TrainingStep:
+    """A small model, its rendering, a loss of pictures and AdamW, all of fixed shapes.
+
+    The model is that of a quick run of ``gamba bench inference``, in training.
+    """
+
+    def __init__(self, device: torch.device):
+        torch.manual_seed(0)
+        self.model, _ = build_model(Settings(device, level="quick"))
+        self.model.train()
+        side = self.model.config.image_size
+        g = torch.Generator().manual_seed(1)
+        self.images = torch.rand(2, side, side, 3, generator=g).to(device)
+        self.cameras = reference_cameras(self.model.config, 2).to(device)
+        self.parameters = [p for p in self.model.parameters() if p.requires_grad]
+        rate = torch.tensor(1e-3, device=device) if device.type == "cuda" else 1e-3
+        self.optimizer = torch.optim.AdamW(
+            self.parameters, lr=rate, capturable=device.type == "cuda", fused=True
+        )
+
+    def run(self) -> Tensor:
+        """Makes a step and returns its loss."""
+        self.optimizer.zero_grad(set_to_none=True)
+        gaussians: Gaussians = self.model(self.images, self.cameras)
+        views = replace(
+            self.cameras, viewmats=self.cameras.viewmats[:, None], Ks=self.cameras.Ks[:, None]
+        )
+        picture = render(gaussians, views).rgb[:, 0]
+        loss = (picture - self.images).square().mean()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, 1.0)
+        self.optimizer.step()
+        return loss.detach()
+
+    @torch.no_grad()
+    def begin(self, weights: list[Tensor]) -> None:
+        """Sets weights and the optimizer's state to those of a beginning, in place."""
+        for parameter, weight in zip(self.parameters, weights):
+            parameter.copy_(weight)
+        for state in self.optimizer.state.values():
+            for value in state.values():
+                value.zero_()
+
+    def weights(self) -> list[Tensor]:
+        """Returns a copy of the weights."""
+        return [p.detach().clone() for p in self.parameters]
+
+    def train(self, step: Callable[[], Tensor], first: list[Tensor]) -> dict[str, Tensor]:
+        """Makes steps from a beginning; returns losses, and how far the weights went."""
+        self.begin(first)
+        losses = torch.stack([step().clone() for _ in range(_STEPS)])
+        change = [(now - old).flatten() for now, old in zip(self.weights(), first)]
+        return {"losses": losses, "change": torch.cat(change)}
+
+
+def step_graph(device: torch.device) -> str:
+    """Checks that replays of a captured training step train as plain steps do."""
+    steps = TrainingStep(device)
+    first = steps.weights()
+    graph, loss, _ = captured(steps.run, device)
+
+    def replay() -> Tensor:
+        graph.replay()
+        return loss
+
+    got, want = (steps.train(step, first) for step in (replay, steps.run))
+    if not want["losses"][-1] < want["losses"][0]:
+        raise AssertionError("the loss does not fall")
+    text = within(compare({"losses": got["losses"]}, {"losses": want["losses"]}), LOSS_LIMIT)
+    change = within(compare({"change": got["change"]}, {"change": want["change"]}), CHANGE_LIMIT)
+    return f"losses to {text}, the weights' change to {change}"
