@@ -18,22 +18,18 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians
-from ..kernels.bench import Error, Settings, compare
+from ..kernels.bench import BOTH, Error, Settings, compare
 from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from ..kernels.bench.cases.scan_problem import ScanProblem, make_inputs
+from ..kernels.bench.cases.scan_problem import make_inputs, scan_problem
+from ..kernels.bench.core.problem import Operator
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
-<<<<<<< HEAD:gamba_warp/gpu_check/kernels.py
+from ..kernels.rasterize import lists_outgrown, rasterization
 from ..kernels.selective_scan.cuda import launch as cuda_scan
 from ..kernels.selective_scan.cuda.launch import Tuning
-from .graphs import captured, no_wait, raster_graph, same, step_graph, within
-=======
-from ..kernels.rasterize import lists_outgrown, rasterization
-from ..kernels.selective_scan.cuda.tuning import Tuning, use_tuning
 from ..measure.inference import build_model, captured
 from ..model.posing import reference_cameras
 from ..render import render
->>>>>>> 6ced06b (gpu-check: one document that each step writes; run_each for processes):gamba_warp/gpu_check/checks.py
 
 # Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
 # rounds inputs and outputs, and a few pixels may cross the cut at the faintest alpha.
@@ -107,17 +103,17 @@ def checks(quick: bool) -> Iterator[Check]:
     yield Check("a whole training step in a CUDA graph", step_graph, cuda=True)
 
 
-def _problem(shape: tuple, device: torch.device) -> ScanProblem:
+def _problem(shape: tuple, device: torch.device) -> Operator:
     batch, length, channels, states, groups = shape
     inputs = make_inputs(batch, length, channels, states, groups)
     g = torch.Generator().manual_seed(2)
     state = torch.randn(batch, channels, states, generator=g)
-    return ScanProblem(inputs, device, length, channels, state)
+    return scan_problem(inputs, device, length, channels, state)
 
 
 def _scan(shape: tuple, dtype: torch.dtype, device: torch.device) -> str:
     """Checks the output and all gradients, from a given first state."""
-    error = _problem(shape, device).check_backward(dtype)
+    error = _problem(shape, device).check(BOTH, dtype)
     return within(error, LIMIT if dtype == torch.float32 else HALF_LIMIT)
 
 
@@ -165,7 +161,7 @@ def _raster(count: int, size: int, views: int, options: dict, device: torch.devi
     picture, alphas, _ = scene.forward()
     if not (picture.isfinite().all() and alphas.max() <= 1):
         raise AssertionError("the picture is not finite, or alpha is over 1")
-    return within(scene.check(backward=True), PICTURE_LIMIT)
+    return within(scene.check(BOTH), PICTURE_LIMIT)
 
 
 def _raster_twice(device: torch.device) -> str:
@@ -175,7 +171,7 @@ def _raster_twice(device: torch.device) -> str:
     return "equal"
 
 
-def _layer(problem: ScanProblem) -> tuple[Callable[..., Tensor], list[Tensor]]:
+def _layer(problem: Operator) -> tuple[Callable[..., Tensor], list[Tensor]]:
     """Makes a layer of convolution and scan, and its inputs on the device."""
     inputs = problem.at(torch.float32)
     weight = torch.linspace(-0.5, 0.5, 4 * inputs["u"].shape[2], device=problem.device)

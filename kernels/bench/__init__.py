@@ -1,6 +1,8 @@
 """Benchmarks of run time against error: cases, and how they are measured, for ``gamba bench``."""
 
 from .core.case import (
+    BOTH,
+    DIRECTIONS,
     LEVELS,
     Case,
     Error,
@@ -15,6 +17,8 @@ from .core.case import (
 from .core.measure import FORMAT, measure
 
 __all__ = [
+    "BOTH",
+    "DIRECTIONS",
     "FORMAT",
     "LEVELS",
     "Case",

@@ -14,17 +14,14 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.bench import Case, Error, Settings, Variant
+from gamba_warp.kernels.bench import BOTH, Case, Error, Settings, Variant
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from gamba_warp.kernels.bench.cases.raster_scene import make_pair as raster_pair
-from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs
-from gamba_warp.kernels.bench.cases.scan_problem import make_pair as scan_pair
+from gamba_warp.kernels.bench.cases.scan_problem import make_inputs, scan_problem
 from gamba_warp.kernels.bench.core.measure import peak_bytes
 
 from .slopes import GROWTH
 
 SCAN, RASTER = "growth-scan", "growth-raster"
-BOTH = "forward+backward"
 _TOKENS = 512  # first tokens that the scan's oracle sees
 _DENSE = 16384  # of more Gaussians the oracle sees those near its crop
 
@@ -108,8 +105,8 @@ def _scans(settings: Settings, size: str) -> list[Variant]:
         if size == "L" and level == "normal":
             sizes["D"] = _WIDTH_OF_LENGTHS
         inputs = make_inputs(sizes["B"], sizes["L"], sizes["D"], sizes["N"])
-        problem = ScanProblem(inputs, settings.device, _TOKENS)
-        for variant in scan_pair(problem, f"{size} {value:,}"):
+        problem = scan_problem(inputs, settings.device, _TOKENS)
+        for variant in problem.pair(f"{size} {value:,}"):
             variant.work = partial(_elements, sizes)
             made.append(_weighed(variant, size, value, "elements", settings.device))
     return made
@@ -131,7 +128,7 @@ def _scenes(settings: Settings, size: str) -> list[Variant]:
             scene, value = _scene(settings, shell(count, 2), value, 1), value * value
         else:
             scene = _scene(settings, shell(count), small, value)
-        for variant in raster_pair(scene, f"{value:,} {size}"):
+        for variant in scene.pair(f"{value:,} {size}"):
             backward = variant.direction == BOTH
             if scene.gaussians["opacities"].numel() > _DENSE:
                 variant.check = partial(check_near, scene, backward)
@@ -186,8 +183,8 @@ def check_near(scene: Scene, backward: bool) -> Error:
     near = near_crop(scene, backward)
     few = {k: x[near.to(x.device)] for k, x in scene.gaussians.items()}
     if backward:
-        return scene.changed(gaussians=few).check(True)
-    return scene.changed(truth=few).check(False)
+        return scene.changed(gaussians=few).check(BOTH)
+    return scene.changed(truth=few).check("forward")
 
 
 def targets(settings: Settings) -> list:

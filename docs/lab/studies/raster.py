@@ -10,16 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
+from gamba_warp.kernels.bench import DIRECTIONS, Case, Key, Settings, Target, Variant
 from gamba_warp.kernels.bench.cases.raster_parts import Parts
 from gamba_warp.kernels.bench.cases.raster_scene import (
-    BOTH,
     LEAVES,
     TRADE_LIMIT,
     Scene,
-    make_pair,
     make_scene,
-    make_variant,
     orbit_cameras,
     shell,
 )
@@ -57,7 +54,7 @@ def exponential(settings: Settings) -> list[Variant]:
     scene, default, made = make_scene(settings, 2), Tuning(), []
     for degree in (3, 5) if settings.level == "quick" else (2, 3, 4, 5):
         choice = Tuning(degree=degree)
-        pair = make_pair(scene, f"degree {degree}", limit=TRADE_LIMIT, default=choice == default)
+        pair = scene.pair(f"degree {degree}", limit=TRADE_LIMIT, default=choice == default)
         made += on_kernels(use_tuning, choice, pair)
     return made
 
@@ -71,7 +68,7 @@ def tiles(settings: Settings) -> list[Variant]:
     sizes = [(16, 4, 4), (16, 8, 4), (16, 8, 8), (16, 16, 16), (8, 4, 4), (8, 8, 8)]
     for tile, width, height in sizes[::4] if settings.level == "quick" else sizes:
         choice = Tuning(tile=tile, width=width, height=height)
-        pair = make_pair(scene, f"{tile}, {width} x {height}", default=choice == default)
+        pair = scene.pair(f"{tile}, {width} x {height}", default=choice == default)
         made += on_kernels(use_tuning, choice, pair)
     return made
 
@@ -85,10 +82,10 @@ def switches(settings: Settings) -> list[Variant]:
     part = torch.zeros_like(scene.upstream)
     part[:, :, : scene.size // 2] = scene.upstream[:, :, : scene.size // 2]
     scene = scene.changed(cotangent=part, wanted=("means",))
-    made = make_pair(scene, "all skips", default=True)
+    made = scene.pair("all skips", default=True)
     for field in fields(Skip):
         off = scene.changed(options={"skip": replace(Skip(), **{field.name: False})})
-        pair = make_pair(off, f"without {field.name}")
+        pair = off.pair(f"without {field.name}")
         for variant in pair[field.name in ("zero_upstream", "unused", "unasked") :]:
             variant.work = partial(_share, field.name, scene)
             made.append(variant)
@@ -183,7 +180,7 @@ def large_scenes(settings: Settings) -> list[Variant]:
             scene = _scene(settings, count, counts[0], high if wide else size, wide)
             name = f"{count} Gaussians" + f", {high * 16 // 9} x {high}" * wide
             front = Parts(scene)
-            forward, both = (make_variant(scene, name, d) for d in ("forward", BOTH))
+            forward, both = scene.pair(name)
             both.check, both.oracle = forward.check, forward.oracle
             variants = [forward, both, Variant(f"{_FRONT}, {name}", front.front, None)]
             for variant, backward in zip(variants, (False, True)):
@@ -201,7 +198,7 @@ def targets(settings: Settings) -> list[Target]:
     made = []
     for count in _LEVELS[settings.level][1:]:
         few, many = f"{_FEW} Gaussians", f"{count} Gaussians"
-        for direction in ("forward", BOTH):
+        for direction in DIRECTIONS:
             key = partial(Key, "raster", _CASE, direction=direction)
             text = f"{direction}, growth of time over that of pairs + Gaussians, {_FEW} to {count}"
             times = key(variant=many), key(variant=few, field=_SUM)

@@ -8,23 +8,21 @@ from unittest.mock import patch
 
 import torch
 
-from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
+from gamba_warp.kernels.bench import BOTH, Case, Key, Settings, Target, Variant
 from gamba_warp.kernels.bench.cases.scan_problem import (
-    BOTH,
-    TRADE_LIMIT,
-    ScanProblem,
+    bare,
     count_memory,
-    make_pair,
     make_problem,
-    make_variant,
 )
 from gamba_warp.kernels.bench.core.case import make_cases
+from gamba_warp.kernels.bench.core.problem import Operator
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
 
 from .probe import probe_rate, probe_scan
 
 on_cpu, on_cuda = partial(patch.object, cpu, "TUNING"), partial(patch.object, cuda, "FORCED")
+_TRADE_LIMIT = 1.0  # where accuracy is the knob
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -72,13 +70,13 @@ def bare_loop(settings: Settings) -> list[Variant]:
     given steps, without gate, skip or gradient, into a given output.
     """
     problem = make_problem(settings)
-    bare = problem.bare()
-    made = [make_variant(problem, "default", default=True)]
-    made.append(make_variant(bare, "given steps, no gate or skip"))
-    return [*made, *(_probe(bare, threads) for threads in sorted({1, settings.threads}))]
+    given = bare(problem)
+    made = [problem.variant("default", default=True)]
+    made.append(given.variant("given steps, no gate or skip"))
+    return [*made, *(_probe(given, threads) for threads in sorted({1, settings.threads}))]
 
 
-def _probe(bare: ScanProblem, threads: int) -> Variant:
+def _probe(bare: Operator, threads: int) -> Variant:
     x = bare.inputs
     out = torch.empty_like(x["u"][0])
     run = partial(
@@ -88,16 +86,16 @@ def _probe(bare: ScanProblem, threads: int) -> Variant:
     return Variant(
         f"probe, {threads} thread{'s' * (threads > 1)}",
         run,
-        lambda: bare.check_output(run()[None]),
+        lambda: bare.error(run()[None]),
         1e-5,
-        bare.oracle,
+        bare.text,
         peer=True,
         threads=threads,
         parameters={"B": 1, "L": length, "D": width, "N": 16},
     )
 
 
-def _shorter(settings: Settings) -> ScanProblem:
+def _shorter(settings: Settings) -> Operator:
     """Long enough for rates and errors: a quarter of the tokens."""
     return make_problem(settings, length=1024 if settings.level == "quick" else 4096)
 
@@ -110,11 +108,9 @@ def exponential(settings: Settings) -> list[Variant]:
     problem, default, made = _shorter(settings), cpu.Tuning(), []
     for degree in (3, 5) if settings.level == "quick" else (2, 3, 4, 5, 6):
         choice = default._replace(degree=degree, table=False)
-        pair = make_pair(problem, f"degree {degree}")
-        for variant in pair:
-            variant.limit = TRADE_LIMIT
+        pair = problem.pair(f"degree {degree}", limit=_TRADE_LIMIT)
         made += on_kernels(on_cpu, choice, pair)
-    return made + make_pair(problem, "default", default=True)
+    return made + problem.pair("default", default=True)
 
 
 def spacings(settings: Settings) -> list[Variant]:
@@ -124,7 +120,7 @@ def spacings(settings: Settings) -> list[Variant]:
     problem, default, made = _shorter(settings), cpu.Tuning(), []
     for chunk in (32, 64) if settings.level == "quick" else (16, 32, 64, 128, 256):
         choice = default._replace(chunk=chunk, strip=min(chunk, default.strip))
-        (both,) = [make_variant(problem, f"every {chunk}", BOTH, default=choice == default)]
+        (both,) = [problem.variant(f"every {chunk}", BOTH, default=choice == default)]
         both.work = partial(count_memory, problem, BOTH)
         both.parameters["spacing"] = chunk
         made += on_kernels(on_cpu, choice, [both])
@@ -138,7 +134,7 @@ def chunks(settings: Settings) -> list[Variant]:
     problem, default, made = _shorter(settings), cpu.Tuning(), []
     for strip in (32, 64) if settings.level == "quick" else (8, 16, 32, 64, 128, 256):
         choice = default._replace(strip=strip, chunk=max(strip, default.chunk))
-        pair = [make_variant(problem, f"{strip} tokens", default=choice == default)]
+        pair = [problem.variant(f"{strip} tokens", default=choice == default)]
         made += on_kernels(on_cpu, choice, pair)
     return made
 
@@ -150,7 +146,7 @@ def cuda_tunings(settings: Settings) -> list[Variant]:
     problem = make_problem(settings)
     (batch, length, width), states = problem.inputs["u"].shape, problem.inputs["A"].shape[1]
     chosen = cuda.scan_tuning((batch, length, width), states, 1, problem.device)
-    made = make_pair(problem, "chosen by itself", default=True)
+    made = problem.pair("chosen by itself", default=True)
     changes = [{"segments": n, "back_segments": n} for n in (1, 4, 16, 64)]
     changes += [
         {"channels": c, "states": s, "back_channels": c, "back_states": s}
@@ -158,5 +154,5 @@ def cuda_tunings(settings: Settings) -> list[Variant]:
     ]
     for change in changes:
         name = ", ".join(f"{k} {v}" for k, v in change.items() if not k.startswith("back_"))
-        made += on_kernels(on_cuda, chosen._replace(**change), make_pair(problem, name))
+        made += on_kernels(on_cuda, chosen._replace(**change), problem.pair(name))
     return made

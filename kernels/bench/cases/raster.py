@@ -9,6 +9,8 @@ import torch
 
 from .. import peers
 from ..core.case import (
+    BOTH,
+    DIRECTIONS,
     Case,
     Error,
     Key,
@@ -16,19 +18,17 @@ from ..core.case import (
     Target,
     Variant,
     compare,
+    dtype_name,
     make_cases,
     over_threads,
 )
 from . import harmonics
 from .raster_parts import gsplat_parts
 from .raster_scene import (
-    BOTH,
     LEAVES,
     TRADE_LIMIT,
     Scene,
-    make_pair,
     make_scene,
-    make_variant,
     orbit_cameras,
     shell,
 )
@@ -64,7 +64,7 @@ def scenes(settings: Settings) -> list[Variant]:
     made = []
     for scale in (1, 2, 4):
         scene = make_scene(settings, scale)
-        variants = make_pair(scene, f"scale {scale}", default=True)
+        variants = scene.pair(f"scale {scale}", default=True)
         if settings.peers:
             variants += _peers(scene, f"scale {scale}")
         for variant in variants:
@@ -105,7 +105,7 @@ def knobs(settings: Settings) -> list[Variant]:
     renderers assume.
     """
     scene = make_scene(settings, 2).changed(exact=_NO_THRESHOLDS)
-    made = make_pair(scene, "default: alpha 1/255, T 1e-4", limit=TRADE_LIMIT, default=True)
+    made = scene.pair("default: alpha 1/255, T 1e-4", limit=TRADE_LIMIT, default=True)
     quick = settings.level == "quick"
     for denominator in (64,) if quick else (4096, 1024, 64, 32, 16):
         made += _trade(scene, f"alpha 1/{denominator}", alpha_min=1 / denominator)
@@ -118,18 +118,17 @@ def knobs(settings: Settings) -> list[Variant]:
         kept = scene.gaussians["opacities"] >= opacity
         pruned = {k: x[kept] for k, x in scene.gaussians.items()}
         pruned = scene.changed(gaussians=pruned, truth=scene.gaussians)
-        made.append(make_variant(pruned, f"no opacities < {opacity}", limit=TRADE_LIMIT))
+        made.append(pruned.variant(f"no opacities < {opacity}", limit=TRADE_LIMIT))
     for dtype in (torch.bfloat16, torch.float16):
-        name = str(dtype).removeprefix("torch.")
+        name = dtype_name(dtype)
         rounded = {k: x.to(dtype) for k, x in scene.gaussians.items()}
         rounded = scene.changed(gaussians=rounded, truth=scene.gaussians)
-        made += make_pair(rounded, f"{name} inputs", limit=TRADE_LIMIT)
-        made[-1].dtype = made[-2].dtype = name
+        made += rounded.pair(f"{name} inputs", limit=TRADE_LIMIT, dtype=name)
     return made
 
 
 def _trade(scene: Scene, name: str, **options: float) -> list[Variant]:
-    return make_pair(scene.changed(options=options), name, limit=TRADE_LIMIT)
+    return scene.changed(options=options).pair(name, limit=TRADE_LIMIT)
 
 
 def skipping(settings: Settings) -> list[Variant]:
@@ -137,16 +136,16 @@ def skipping(settings: Settings) -> list[Variant]:
     all. Skipped: share of the pairs of Gaussians and tiles, or of the gradients.
     """
     scene = make_scene(settings, 2)
-    made = [make_variant(scene, "all gradients, whole picture", BOTH, default=True)]
+    made = [scene.variant("all gradients, whole picture", BOTH, default=True)]
     for name in ("colors", "means"):
-        made.append(make_variant(scene.changed(wanted=(name,)), f"gradient of {name} alone", BOTH))
+        made.append(scene.changed(wanted=(name,)).variant(f"gradient of {name} alone", BOTH))
         made[-1].work = lambda: scene.work(True) | {"skipped": 1 - 1 / len(LEAVES)}
     half = scene.size // 2
     for name, rows in (("half", scene.size), ("a quarter", half)):
         part = torch.zeros_like(scene.upstream)
         part[:, :rows, :half] = scene.upstream[:, :rows, :half]
         part = scene.changed(cotangent=part)
-        made.append(make_variant(part, f"upstream gradient on {name} of the picture", BOTH))
+        made.append(part.variant(f"upstream gradient on {name} of the picture", BOTH))
         made[-1].work = partial(_tiles_skipped, part)
     return made
 
@@ -174,9 +173,9 @@ def one_call(settings: Settings) -> list[Variant]:
         for b in range(objects)
         for v in range(views)
     ]
-    made = make_pair(together, "one call", default=True)
-    for direction in ("forward", BOTH):
-        variant = make_variant(single[0], f"{len(single)} calls", direction)
+    made = together.pair("one call", default=True)
+    for direction in DIRECTIONS:
+        variant = single[0].variant(f"{len(single)} calls", direction)
         runs = [s.forward if direction == "forward" else s.backward for s in single]
         variant.run, variant.work = partial(_call_all, runs), None
         variant.parameters["views"] = len(single)
@@ -199,7 +198,7 @@ def counts(settings: Settings) -> list[Variant]:
     made = []
     for count in counts:
         scene = make_scene(settings, math.sqrt(counts[0] / count), count)
-        made += make_pair(scene, f"{count} Gaussians")
+        made += scene.pair(f"{count} Gaussians")
     return made
 
 
@@ -208,7 +207,7 @@ def pixels(settings: Settings) -> list[Variant]:
     sides = (64, 128) if settings.level == "quick" else (128, 256, 512, 1024)
     made = []
     for side in sides:
-        made += make_pair(make_scene(settings, 2, size=side), f"{side} x {side}")
+        made += make_scene(settings, 2, size=side).pair(f"{side} x {side}")
     return made
 
 
@@ -218,7 +217,7 @@ def views(settings: Settings) -> list[Variant]:
     made = []
     for views in numbers:
         scene = make_scene(settings, size=size, views=views)
-        made += make_pair(scene, f"{views} view{'s' * (views > 1)}")
+        made += scene.pair(f"{views} view{'s' * (views > 1)}")
     return made
 
 
@@ -227,7 +226,7 @@ def batches(settings: Settings) -> list[Variant]:
     numbers, size = ((1, 2), 64) if settings.level == "quick" else ((1, 2, 4, 8, 16), 256)
     made = []
     for number in numbers:
-        made += make_pair(_objects(settings, number, 1, size), f"B {number}")
+        made += _objects(settings, number, 1, size).pair(f"B {number}")
         made[-1].parameters["B"] = made[-2].parameters["B"] = number
     return made
 
@@ -242,13 +241,13 @@ def _objects(settings: Settings, number: int, views: int, size: int) -> Scene:
 
 def by_threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, at scale 2."""
-    return over_threads(partial(make_pair, make_scene(settings, 2)))
+    return over_threads(make_scene(settings, 2).pair)
 
 
 def many_views(settings: Settings) -> list[Variant]:
     """32 views of 512² in one launch, beside gsplat."""
     scene = make_scene(settings, views=32)
-    return make_pair(scene, "ours", default=True) + (_peers(scene, "32 views") * settings.peers)
+    return scene.pair("ours", default=True) + (_peers(scene, "32 views") * settings.peers)
 
 
 def targets(settings: Settings) -> list[Target]:
@@ -257,17 +256,17 @@ def targets(settings: Settings) -> list[Target]:
         return []
     made, key = [], partial(Key, "raster")
     for scale, bound in ((1, 12), (2, 25), (4, 55)):
-        forward, both = (key("scene", f"scale {scale}", d) for d in ("forward", BOTH))
+        forward, both = (key("scene", f"scale {scale}", d) for d in DIRECTIONS)
         if settings.device.type == "cpu":
             made.append(Target(f"forward, scale {scale}, ms", (forward,), at_most=bound))
         text = f"forward + backward over forward, scale {scale}"
         made.append(Target(text, (both,), (forward,), at_most=3.5))
-    for direction in ("forward", BOTH):
+    for direction in DIRECTIONS:
         many, one = (key("one call", name, direction) for name in ("32 calls", "one call"))
         text = f"8 objects x 4 views, {direction}, 32 calls over one"
         made.append(Target(text, (many,), (one,), at_least=1.3))
     for count in (65536, 262144) if settings.level == "full" else (65536,):
-        for direction in ("forward", BOTH):
+        for direction in DIRECTIONS:
             few, many = (
                 partial(key, "Gaussians", f"{n} Gaussians", direction) for n in (16384, count)
             )
@@ -276,7 +275,7 @@ def targets(settings: Settings) -> list[Target]:
             made.append(Target(text, times, over, at_most=1.0))
     made += harmonics.targets(settings)
     if settings.device.type == "cuda":
-        ours, both = (key("32 views", "ours", d) for d in ("forward", BOTH))
+        ours, both = (key("32 views", "ours", d) for d in DIRECTIONS)
         peer = key("32 views", "gsplat, 32 views")
         made += [
             Target("forward, µs a view of 512²", (ours,), scale=1e3 / 32, at_most=60),

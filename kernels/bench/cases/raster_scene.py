@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,8 @@ from torch import Tensor
 
 from ...rasterize import rasterization
 from ...rasterize.reference import rasterization_reference
-from ..core.case import Error, Settings, Variant, compare
+from ..core.case import BOTH, Error, Settings, Variant, compare
+from ..core.problem import Problem
 
 LEAVES = ("means", "quats", "scales", "opacities", "colors")
 WORK = (
@@ -29,7 +30,6 @@ _FORWARD_CROP, _BACKWARD_CROP = (48, 40), (24, 20)  # width and height, pixels
 
 # Allowed relative rms error to float64; a knob that trades accuracy is allowed the more it trades.
 FORWARD_LIMIT, BACKWARD_LIMIT, TRADE_LIMIT = 1e-4, 1e-3, 10.0
-BOTH = "forward+backward"
 COUNT = 16384
 _SIZE = 512
 
@@ -62,7 +62,7 @@ def orbit_cameras(views: int, size: int) -> tuple[Tensor, Tensor]:
 
 
 @dataclass(eq=False)
-class Scene:
+class Scene(Problem):
     """Gaussians and cameras, run and checked in several ways.
 
     The dense oracle sees all Gaussians in a small crop of the first view, as a camera of its own
@@ -101,6 +101,8 @@ class Scene:
             g = torch.Generator().manual_seed(3)
             shape = (*self.viewmats.shape[:-2], self.size, self.size, 3)
             self.cotangent = torch.randn(shape, generator=g).to(self.device)
+        count, views = self.gaussians["opacities"].shape[-1], self.viewmats.shape[:-2].numel()
+        self.sizes = {"N": count, "side": self.size, "views": views}
 
     @property
     def upstream(self) -> Tensor:
@@ -108,15 +110,9 @@ class Scene:
         assert self.cotangent is not None  # ``__post_init__`` draws one
         return self.cotangent
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """For tables and charts."""
-        count, views = self.gaussians["opacities"].shape[-1], self.viewmats.shape[:-2].numel()
-        return {"N": count, "side": self.size, "views": views}
-
     def changed(self, **changes) -> Scene:
         """A copy with other attributes."""
-        return Scene(**(vars(self) | changes))
+        return replace(self, **changes)
 
     def arguments(self) -> dict:
         """What the operator is called with."""
@@ -153,9 +149,9 @@ class Scene:
         counts = {name: int(meta[name]) for name in (*WORK, *["tiles_skipped"] * backward)}
         return counts | {"gaussians": self.gaussians["opacities"].numel()}
 
-    def oracle(self, backward: bool) -> str:
+    def oracle(self, direction: str) -> str:
         """What the check compares with, in words."""
-        width, height = self.crop(backward)[2:]
+        width, height = self.crop(direction == BOTH)[2:]
         text = f"float64, all Gaussians dense, a crop of {width} x {height} pixels"
         return text + (" without thresholds" if "t_min" in self.exact else "")
 
@@ -165,8 +161,20 @@ class Scene:
         left, top = round(0.58 * self.size), round(0.39 * self.size)
         return left, top, min(width, self.size - left), min(height, self.size - top)
 
-    def check(self, backward: bool) -> Error:
+    def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
+        """The largest error that is allowed."""
+        return BACKWARD_LIMIT if direction == BOTH else FORWARD_LIMIT
+
+    def variant(
+        self, name: str, direction: str = "forward", options: dict | None = None, **changes
+    ) -> Variant:
+        """A variant that counts the operator's work, too."""
+        work = partial(self.work, direction == BOTH)
+        return super().variant(name, direction, options, **({"work": work} | changes))
+
+    def check(self, direction: str) -> Error:
         """Error of picture and alpha, and of the gradients asked for, on the crop."""
+        backward = direction == BOTH
         left, top, width, height = self.crop(backward)
         first = (0,) * (self.viewmats.dim() - 3)  # the first object
         Ks = self.Ks[first][:1].clone()
@@ -223,26 +231,3 @@ def make_scene(
     count = count or (COUNT // 8 if quick else COUNT)
     size = size or (_SIZE // 2 if quick else _SIZE)
     return Scene(shell(count, scale), *orbit_cameras(views, size), size, settings.device)
-
-
-def make_variant(
-    scene: Scene, name: str, direction: str = "forward", limit: float | None = None, **changes
-) -> Variant:
-    """A variant that calls the operator on a scene."""
-    backward = direction == BOTH
-    return Variant(
-        name=name,
-        run=scene.backward if backward else scene.forward,
-        check=partial(scene.check, backward),
-        limit=limit or (BACKWARD_LIMIT if backward else FORWARD_LIMIT),
-        oracle=scene.oracle(backward),
-        direction=direction,
-        parameters=scene.sizes,
-        work=partial(scene.work, backward),
-        **changes,
-    )
-
-
-def make_pair(scene: Scene, name: str, **changes) -> list[Variant]:
-    """Forward, and forward with all gradients."""
-    return [make_variant(scene, name, direction, **changes) for direction in ("forward", BOTH)]

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
 
 from .. import peers
-from ..core.case import Case, Error, Key, Settings, Target, Variant, make_cases, over_threads
-from .scan_problem import (
+from ..core.case import (
     BOTH,
-    HALF_LIMITS,
-    SIZES,
-    ScanProblem,
-    count_memory,
-    make_inputs,
-    make_pair,
-    make_problem,
-    make_variant,
+    DIRECTIONS,
+    Case,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    dtype_name,
+    make_cases,
+    over_threads,
 )
+from ..core.problem import Operator
+from .scan_problem import SIZES, count_memory, make_inputs, make_problem, scan_problem
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -39,7 +42,7 @@ def cases(settings: Settings) -> list[Case]:
 
 def operator(settings: Settings) -> list[Variant]:
     """The whole operator: softplus, bias, skip and gate."""
-    return make_pair(make_problem(settings), "default", default=True)
+    return make_problem(settings).pair("default", default=True)
 
 
 def reference_loop(settings: Settings) -> list[Variant]:
@@ -49,55 +52,25 @@ def reference_loop(settings: Settings) -> list[Variant]:
     length, width, tokens = SIZES[settings.level]
     if settings.level == "normal":
         length = 2048  # at 16961 tokens the loop takes seconds and its factors gigabytes
-    problem = ScanProblem(make_inputs(1, length, width), settings.device, tokens)
-    made = [
-        make_variant(problem, "default", default=True),
-        _peer(problem, "torch loop", peers.scan_loop, rounds=2),
-    ]
+    problem = scan_problem(make_inputs(1, length, width), settings.device, tokens)
+    loop = _peer(problem, peers.scan_loop).variant("torch loop", peer=True, rounds=2)
+    made = [problem.variant("default", default=True), loop]
     if settings.peers:
-        made.append(_peer(problem, "mambapy", peers.mambapy_scan, channels_first=False, rounds=3))
+        mambapy = _peer(problem, peers.mambapy_scan, channels_first=False)
+        made.append(mambapy.variant("mambapy", peer=True, rounds=3))
         if settings.device.type == "cuda":
-            made.append(_peer(problem, "mamba-ssm", peers.mamba_ssm_scan))
+            made.append(_peer(problem, peers.mamba_ssm_scan).variant("mamba-ssm", peer=True))
     return made
 
 
-def _peer(
-    problem: ScanProblem,
-    name: str,
-    function: Callable,
-    dtype: torch.dtype = torch.float32,
-    direction: str = "forward",
-    channels_first: bool = True,
-    **changes,
-) -> Variant:
-    """Another package's scan on the inputs of a problem, laid out as it wants them."""
-    inputs = dict(problem.at(dtype))
-    if channels_first:  # laid out as the peer wants it, before the clock
-        inputs |= {k: inputs[k].mT.contiguous() for k in ("u", "delta", "B", "C", "z")}
-
-    def forward() -> torch.Tensor:
-        with torch.no_grad():
-            return function(**inputs)
-
-    def backward() -> tuple[torch.Tensor, ...]:
-        leaves = {k: x.detach().requires_grad_() for k, x in inputs.items()}
-        return torch.autograd.grad(function(**leaves), list(leaves.values()), inputs["u"])
-
-    def check() -> Error:
-        out = forward()
-        return problem.check_output(out.mT if channels_first else out)
-
-    return Variant(
-        name,
-        forward if direction == "forward" else backward,
-        check,
-        HALF_LIMITS.get(dtype, 1e-4),
-        problem.oracle + ("" if direction == "forward" else ", output only"),
-        direction,
-        str(dtype).removeprefix("torch."),
-        peer=True,
-        parameters=problem.sizes,
-        **changes,
+def _peer(problem: Operator, function: Callable, channels_first: bool = True) -> Operator:
+    """Another package's scan on the same inputs, laid out for it; its output is checked."""
+    return replace(
+        problem,
+        function=function,
+        limits=dict.fromkeys(problem.limits, 1e-4),
+        turned=("u", "delta", "B", "C", "z", "out") if channels_first else (),
+        compared=False,
     )
 
 
@@ -107,18 +80,17 @@ def knobs(settings: Settings) -> list[Variant]:
     the one of Mamba's weights is the default at any cost.
     """
     problem = make_problem(settings)
-    made = make_pair(problem, "float32", default=True)
+    made = problem.pair("float32", default=True)
     for dtype in (torch.bfloat16, torch.float16):
-        name = str(dtype).removeprefix("torch.") + " inputs and output"
-        made += make_pair(problem, name, dtype=dtype)
+        made += problem.pair(f"{dtype_name(dtype)} inputs and output", {"dtype": dtype})
     for discretization in ("bilinear", "zoh"):
-        made += make_pair(problem, discretization, options={"discretization": discretization})
-    start = ScanProblem(problem.inputs, problem.device, problem.tokens)
+        made += problem.pair(discretization, {"discretization": discretization})
     batch, _, width = problem.inputs["u"].shape
-    start.initial_state = torch.randn(batch, width, 16, generator=torch.Generator().manual_seed(2))
-    made += make_pair(start, "with an initial state")
-    made += make_pair(make_problem(settings, groups=4), "4 groups of B and C")
-    return made
+    state = torch.randn(batch, width, 16, generator=torch.Generator().manual_seed(2))
+    tokens = SIZES[settings.level][2]
+    start = scan_problem(problem.inputs, problem.device, tokens, initial_state=state)
+    made += start.pair("with an initial state")
+    return made + make_problem(settings, groups=4).pair("4 groups of B and C")
 
 
 def lengths(settings: Settings) -> list[Variant]:
@@ -128,11 +100,10 @@ def lengths(settings: Settings) -> list[Variant]:
     lengths = {"quick": (256, 1024)}.get(settings.level, (4096, 16384, 65536))
     made = []
     for length in lengths:
-        problem = make_problem(settings, length=length)
-        problem.channels = 8 if length > 16961 else 32
-        for direction in ("forward", BOTH):
-            made.append(make_variant(problem, f"L {length}", direction, rounds=20))
-            made[-1].work = partial(count_memory, problem, direction)
+        problem = make_problem(settings, 8 if length > 16961 else 32, length=length)
+        for direction in DIRECTIONS:
+            work = partial(count_memory, problem, direction)
+            made.append(problem.variant(f"L {length}", direction, rounds=20, work=work))
     return made
 
 
@@ -142,9 +113,8 @@ def batches(settings: Settings) -> list[Variant]:
     length = 512 if quick else 4096
     made = []
     for batch in (1, 4) if quick else (1, 2, 4, 8):
-        made += make_pair(
-            make_problem(settings, batch=batch, length=length, channels=256), f"B {batch}"
-        )
+        problem = make_problem(settings, batch=batch, length=length, channels=256)
+        made += problem.pair(f"B {batch}")
     return made
 
 
@@ -154,26 +124,25 @@ def states(settings: Settings) -> list[Variant]:
     length = 512 if settings.level == "quick" else 4096
     made = []
     for states in counts:
-        made += make_pair(make_problem(settings, length=length, states=states), f"N {states}")
+        made += make_problem(settings, length=length, states=states).pair(f"N {states}")
     return made
 
 
 def by_threads(settings: Settings) -> list[Variant]:
     """Cost against torch's number of threads, from one to the machine's cores."""
-    return over_threads(partial(make_pair, make_problem(settings)))
+    return over_threads(make_problem(settings).pair)
 
 
 def training_batch(settings: Settings) -> list[Variant]:
     """A layer of the paper's training: 16 sequences in bfloat16, beside mamba-ssm."""
     batch = 2 if settings.level == "quick" else 16
-    problem = make_problem(settings, batch=batch)
-    problem.tokens = min(problem.tokens, 2048)
-    made = make_pair(problem, "default", dtype=torch.bfloat16, default=True)
-    single = make_problem(settings)
-    made.append(make_variant(single, "one sequence", dtype=torch.bfloat16))
+    length, width, tokens = SIZES[settings.level]
+    problem = scan_problem(make_inputs(batch, length, width), settings.device, min(tokens, 2048))
+    half = {"dtype": torch.bfloat16}
+    made = problem.pair("default", half, default=True)
+    made.append(make_problem(settings).variant("one sequence", options=half))
     if settings.peers:
-        peer = partial(_peer, problem, "mamba-ssm", peers.mamba_ssm_scan, torch.bfloat16)
-        made += [peer(direction) for direction in ("forward", BOTH)]
+        made += _peer(problem, peers.mamba_ssm_scan).pair("mamba-ssm", half, peer=True)
     return made
 
 
@@ -186,7 +155,7 @@ def targets(settings: Settings) -> list[Target]:
     made = [Target("forward + backward over forward", (both,), (ours,), at_most=5)]
     long, short = (partial(key, "length", f"L {length}") for length in (65536, 4096))
     for name, field in (("time", "ms_p50"), ("memory", "peak_bytes")):
-        for direction in ("forward", BOTH):
+        for direction in DIRECTIONS:
             text = f"{direction}, {name} per token at L 65536 over L 4096"
             times, over = (long(direction, field),), (short(direction, field),)
             most = 1.2 if (name, direction) == ("time", BOTH) else 1.1
@@ -195,7 +164,7 @@ def targets(settings: Settings) -> list[Target]:
     text = "saved for the backward over the state history"
     made.append(Target(text, (saved,), (history,), at_most=1 / 64))
     if settings.device.type == "cpu":
-        for direction in ("forward", BOTH):
+        for direction in DIRECTIONS:
             one, two = (key("threads", name, direction) for name in ("1 thread", "2 threads"))
             made.append(Target(f"{direction}, 1 thread over 2", (one,), (two,), at_least=1.8))
         return made

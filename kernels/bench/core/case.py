@@ -13,6 +13,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+BOTH = "forward+backward"
+DIRECTIONS = ("forward", BOTH)
+
+
+def dtype_name(dtype: torch.dtype) -> str:
+    """As "float32"."""
+    return str(dtype).removeprefix("torch.")
+
 
 class NotInstalled(Exception):
     """Raised for a peer that is not installed; ``str(error)`` names its package."""

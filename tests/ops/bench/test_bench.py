@@ -6,7 +6,6 @@ import mmap
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -20,6 +19,7 @@ from gamba_warp import cli
 from gamba_warp.commands import bench
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.bench import (
+    BOTH,
     Case,
     Error,
     Key,
@@ -34,7 +34,7 @@ from gamba_warp.kernels.bench.cases import conv as conv_suite
 from gamba_warp.kernels.bench.cases import raster as raster_suite
 from gamba_warp.kernels.bench.cases import scan as scan_suite
 from gamba_warp.kernels.bench.cases.raster_scene import make_scene
-from gamba_warp.kernels.bench.cases.scan_problem import ScanProblem, make_inputs, make_variant
+from gamba_warp.kernels.bench.cases.scan_problem import make_inputs, scan_problem
 from gamba_warp.kernels.bench.core.case import NotInstalled
 from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart, pareto
 from gamba_warp.kernels.bench.core.measure import peak_bytes, saved_bytes
@@ -116,9 +116,9 @@ def test_a_failed_check_prints_no_time(error):
 
 def test_a_wrong_kernel_is_caught(monkeypatch):
     """A thousandth too much in one channel of the scan's output."""
-    from gamba_warp.kernels.bench.cases import scan_problem
+    from gamba_warp.kernels.bench.cases import scan_problem as module
 
-    real = scan_problem.selective_scan
+    real = module.selective_scan
 
     def wrong(*arguments, **options):
         out = real(*arguments, **options)
@@ -126,10 +126,9 @@ def test_a_wrong_kernel_is_caught(monkeypatch):
 
     inputs = make_inputs(1, 40, 4)
     for function, status in ((real, "ok"), (wrong, "check failed")):
-        monkeypatch.setattr(scan_problem, "selective_scan", function)
-        problem = ScanProblem(inputs, torch.device("cpu"), 40)
-        made = [make_variant(problem, "x", d) for d in ("forward", "forward+backward")]
-        records = run(case(*made))["records"]
+        monkeypatch.setattr(module, "selective_scan", function)
+        problem = scan_problem(inputs, torch.device("cpu"), 40)
+        records = run(case(*problem.pair("x")))["records"]
         assert all(r["status"].startswith(status) for r in records)
 
 
@@ -392,17 +391,17 @@ def test_the_scans_corner_is_the_truth_of_the_whole(groups):
     """The oracle on some tokens and channels finds no error in the reference run on all."""
     inputs = make_inputs(2, 30, 12, states=3, groups=groups)
     state = torch.randn(2, 12, 3)
-    problem = ScanProblem(inputs, torch.device("cpu"), 20, 4, initial_state=state)
+    problem = scan_problem(inputs, torch.device("cpu"), 20, 4, initial_state=state)
 
-    def reference(self, inputs, **options):
+    def reference(**inputs):
         inputs = {k: x.double() for k, x in inputs.items()}
-        start = self.initial_state.double()
+        start = state.double()
         return selective_scan_reference(**inputs, delta_softplus=True, initial_state=start)[0]
 
-    problem.call = partial(reference, problem)
-    assert problem.check_forward().rel_rms < 1e-15
-    assert problem.check_backward().rel_rms < 1e-7  # gradients come back in float32
-    assert "4 of 12 channels, first 20 of 30 tokens" in problem.oracle
+    problem.function = reference
+    assert problem.check("forward").rel_rms < 1e-15
+    assert problem.check(BOTH).rel_rms < 1e-7  # gradients come back in float32
+    assert "4 of 12 channels, first 20 of 30 tokens" in problem.oracle(BOTH)
 
 
 def test_the_torch_loop_is_the_formula():
@@ -436,9 +435,9 @@ def test_the_bare_loop_is_right():
 def test_the_scene_and_its_crop():
     """The rasterizer is right on the oracle's crop; a wrong colour is seen."""
     scene = make_scene(QUICK, 2, count=300, size=64)
-    assert scene.check(True).rel_rms < 1e-4
+    assert scene.check(BOTH).rel_rms < 1e-4
     wrong = scene.changed(exact={"alpha_min": 0.2})
-    assert wrong.check(False).rel_rms > 1e-2
+    assert wrong.check("forward").rel_rms > 1e-2
     counts = scene.work(True)
     assert counts["pairs"] > 100 and counts["tiles"] == 16 and counts["gaussians"] == 300
 

@@ -1,0 +1,181 @@
+"""What is timed forward and with its gradients, and compared with a formula in float64 before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .case import BOTH, DIRECTIONS, Error, Variant, compare, dtype_name
+
+
+class Problem:
+    """Something that runs in both directions; a subclass gives what a variant is made of.
+
+    It has ``sizes`` for tables and charts; ``forward`` and ``backward``, which are timed; and
+    ``check``, ``oracle`` and ``limit`` of a direction (see ``Variant``).
+    """
+
+    sizes: Mapping[str, Any]
+    forward: Callable[..., object]
+    backward: Callable[..., object]
+    check: Callable[..., Error]
+    oracle: Callable[[str], str]
+
+    def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
+        """The largest error that is allowed."""
+        raise NotImplementedError
+
+    def variant(
+        self, name: str, direction: str = "forward", options: dict | None = None, **changes: Any
+    ) -> Variant:
+        """A variant that runs with ``options``; ``changes`` are of its attributes."""
+        options = options or {}
+        dtype = options.get("dtype", torch.float32)
+        run = self.forward if direction == "forward" else self.backward
+        given: dict[str, Any] = {
+            "run": partial(run, **options),
+            "check": partial(self.check, direction, **options),
+            "limit": self.limit(direction, dtype),
+            "oracle": self.oracle(direction),
+            "dtype": dtype_name(dtype),
+            "parameters": dict(self.sizes),
+        }
+        return Variant(name, direction=direction, **(given | changes))
+
+    def pair(self, name: str, options: dict | None = None, **changes: Any) -> list[Variant]:
+        """Forward, and forward with all gradients."""
+        return [self.variant(name, d, options, **changes) for d in DIRECTIONS]
+
+
+@dataclass(eq=False)
+class Operator(Problem):
+    """An operator of tensors by name, and its formula.
+
+    The oracle may see a corner of the problem, as the first tokens and a few channels, if the
+    operator's results there depend on nothing else. For gradients the cotangent is 0 outside the
+    corner, so that gradients of what all share are exact as well.
+
+    Attributes:
+        function: of the inputs by name and of options; the output.
+        reference: the formula, likewise, of the corner.
+        inputs: float32 on the CPU, the truth that every dtype is compared with.
+        cotangent: of the output, for the clock; the check draws its own.
+        device: where the operator runs.
+        text: the oracle in words.
+        sizes: for tables and charts.
+        limits: largest relative rms error to float64 by direction.
+        half_limits: those of half precision, explained by the rounding of inputs and output.
+        cast: names of the inputs that a dtype holds for.
+        corner: index of the corner by name of an input, or "out".
+        turned: inputs, and "out", of which ``function`` wants the last two dimensions exchanged.
+        fixed: inputs without a gradient.
+        compared: whether gradients are compared too, and not the output alone.
+    """
+
+    function: Callable[..., Tensor]
+    reference: Callable[..., Tensor]
+    inputs: dict[str, Tensor]
+    cotangent: Tensor
+    device: torch.device
+    text: str
+    sizes: Mapping[str, int]
+    limits: Mapping[str, float]
+    half_limits: Mapping[torch.dtype, float] = field(default_factory=dict)
+    cast: tuple[str, ...] = ()
+    corner: Mapping[str, Any] = field(default_factory=dict)
+    turned: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
+    compared: bool = True
+    truths: dict = field(default_factory=dict)
+    _laid: dict = field(default_factory=dict, init=False)
+
+    def oracle(self, direction: str) -> str:
+        """What the check compares with, in words."""
+        return self.text + (", output only" if direction == BOTH and not self.compared else "")
+
+    def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
+        """The largest error that is allowed."""
+        return self.half_limits.get(dtype, self.limits[direction])
+
+    def at(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+        """The inputs on the device, as ``function`` wants them, with ``cast`` in a dtype; kept."""
+        if dtype not in self._laid:
+            self._laid[dtype] = {
+                k: self._turn(k, x).to(self.device, dtype if k in self.cast else None)
+                for k, x in (self.inputs | {"out": self.cotangent}).items()
+            }
+        return {k: x for k, x in self._laid[dtype].items() if k != "out"}
+
+    def _turn(self, name: str, x: Tensor) -> Tensor:
+        return x.mT.contiguous() if name in self.turned else x
+
+    def call(self, inputs: dict[str, Tensor], **options: Any) -> Tensor:
+        """The operator as a caller calls it."""
+        return self.function(**inputs, **options)
+
+    @torch.no_grad()
+    def forward(self, dtype: torch.dtype = torch.float32, **options: Any) -> Tensor:
+        """The output, without a gradient."""
+        return self.call(self.at(dtype), **options)
+
+    def leaves(self, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+        """The inputs, asking for gradients."""
+        return {
+            k: x.detach().requires_grad_(k not in self.fixed) for k, x in self.at(dtype).items()
+        }
+
+    def backward(self, dtype: torch.dtype = torch.float32, **options: Any) -> tuple[Tensor, ...]:
+        """Forward and all gradients."""
+        leaves = self.leaves(dtype)
+        out = self.call(leaves, **options)
+        wanted = [x for x in leaves.values() if x.requires_grad]
+        return torch.autograd.grad(out, wanted, self._laid[dtype]["out"].to(out.dtype))
+
+    def check(self, direction: str, dtype: torch.dtype = torch.float32, **options: Any) -> Error:
+        """Error of the output, and of every gradient if the direction has them."""
+        gradients = direction == BOTH and self.compared
+        truth = self._truth(gradients, **options)
+        if not gradients:
+            return compare({"out": self._cut("out", self.forward(dtype, **options))}, truth)
+        leaves = self.leaves(dtype)
+        out = self.call(leaves, **options)
+        head = torch.zeros_like(self._turn("out", out.detach()), device="cpu")
+        head[self.corner.get("out", ...)] = self._drawn(truth["out"]).to(head.dtype)
+        wanted = {k: x for k, x in leaves.items() if x.requires_grad}
+        head = self._turn("out", head).to(out.device)
+        grads = torch.autograd.grad(out, list(wanted.values()), head)
+        got = {"out": out.detach()} | dict(zip(wanted, grads))
+        return compare({k: self._cut(k, x) for k, x in got.items()}, truth)
+
+    def error(self, out: Tensor, **options: Any) -> Error:
+        """Error of an output that something else gave."""
+        return compare({"out": self._cut("out", out)}, self._truth(False, **options))
+
+    def _cut(self, name: str, x: Tensor) -> Tensor:
+        """The corner of a result, laid out as the reference's."""
+        return self._turn(name, x).cpu()[self.corner.get(name, ...)]
+
+    def _drawn(self, like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=torch.Generator().manual_seed(1))
+
+    def _truth(self, gradients: bool, **options: Any) -> dict[str, Tensor]:
+        """Output, and if asked for the gradients, of the corner in float64; kept."""
+        key = gradients, *sorted(options.items())
+        if key not in self.truths:
+            leaves = {
+                k: x[self.corner.get(k, ...)].double().requires_grad_(k not in self.fixed)
+                for k, x in self.inputs.items()
+            }
+            with torch.set_grad_enabled(gradients):
+                out = self.reference(**leaves, **options)
+            self.truths[key] = {"out": out.detach()}
+            if gradients:
+                wanted = {k: x for k, x in leaves.items() if x.requires_grad}
+                grads = torch.autograd.grad(out, list(wanted.values()), self._drawn(out).double())
+                self.truths[key] |= dict(zip(wanted, grads))
+        return self.truths[key]
