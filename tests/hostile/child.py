@@ -228,15 +228,21 @@ def _attempt(case: Case, path: Path, files: Path, out: Path) -> tuple[str, str]:
     reader = READERS[case.reader]
     try:
         result = reader.read(path, out)
-        wrong = reader.sound(result, path, out)
+        try:
+            reader.sound(result, path, out)
+        except AssertionError as wrong:
+            return "unsound", str(wrong)
+        return "sound", ""
     except UserError as error:
         if _has_memory_error(error):
             return "memory", str(error)
-        wrong = sound.error(error, files, list(case.files))
-        return ("line", f"{wrong}: {str(error)[:200]!r}") if wrong else ("refused", str(error))
+        try:
+            sound.told(error, files, list(case.files))
+        except AssertionError as wrong:
+            return "line", f"{wrong}: {str(error)[:200]!r}"
+        return "refused", str(error)
     except BaseException as error:  # SystemExit and a reader's own KeyboardInterrupt too
         return ("memory" if _has_memory_error(error) else "exception"), _where(error)
-    return ("unsound", wrong) if wrong else ("sound", "")
 
 
 def _has_memory_error(error: BaseException | None) -> bool:

@@ -16,8 +16,44 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
+from gamba_warp.ablation import jobs
+from gamba_warp.ablation.plan import named, read_plan
+from gamba_warp.data import gso
+from gamba_warp.data.dataset import open_dataset
+from gamba_warp.data.preprocess import SamSegmenter, prepare
 from gamba_warp.errors import UserError
+from gamba_warp.eval.compare import html_page, join, markdown_page, read_reports
+from gamba_warp.eval.shapes.load import load_shape
+from gamba_warp.eval.shapes.pairs import evaluate_pairs, find_pairs
+from gamba_warp.eval.shapes.protocol import PRESETS, checked, read_protocol
+from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
+from gamba_warp.eval.views.pictures import PicturePredictions
+from gamba_warp.eval.views.predictions import open_predictions
+from gamba_warp.formats.catalogue import find_meshes
+from gamba_warp.formats.gaussians.files import read_gaussians
+from gamba_warp.formats.meshes import default_up, load_mesh
+from gamba_warp.images import find_pictures, load_rgba
+from gamba_warp.measure.stress_run import replay
+from gamba_warp.measure.suites import read_document, write_pages
+from gamba_warp.model.checkpoint import load_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.encoders import build_encoder, read_state
+from gamba_warp.model.released import convert_released
+from gamba_warp.photo.matte import Matte
+from gamba_warp.train.checkpoint import find_checkpoint, load_weights
+from gamba_warp.train.config import TrainConfig
+from gamba_warp.train.data.furniture import get_furniture
+from gamba_warp.train.data.render import Settings, render_object
+from gamba_warp.train.sources.gso import take_models
+from gamba_warp.train.sources.objaverse_lists import Lists
+from gamba_warp.train.sources.objaverse_views import find_rendered, take_views
+from gamba_warp.trajectories.files import load_path
+from gamba_warp.untrusted.documents import read_bytes
+from gamba_warp.viewer.page import write_viewer
+from gamba_warp.vision.fetch import load_numpy_pickle
+from gamba_warp.vision.weights import store_weights
 
 from . import seeds, sound
 
@@ -27,17 +63,22 @@ class Reader(NamedTuple):
 
     Attributes:
         read: reads what lies at a path; it may write into a folder, its second argument.
-        sound: says what is unsound in a result, from the result, the path and the folder; or None.
+        sound: asserts that a result is sound, from the result, the path and the folder.
         seeds: gives the sound files.
         share: how often it is tried; a quick reader has 8.
         whole: whether it is pointed at the folder of the files, and not at the first of them.
     """
 
     read: Callable[[Path, Path], Any]
-    sound: Callable[[Any, Path, Path], str | None]
+    sound: Callable[[Any, Path, Path], None]
     seeds: Callable[[], seeds.Kinds]
     share: int = 8
     whole: bool = False
+
+
+def alone(read: Callable[[Path], Any]) -> Callable[[Path, Path], Any]:
+    """A reader of a path, which writes nothing."""
+    return lambda path, out: read(path)
 
 
 def attempt(read: Callable, *arguments: Any) -> Any:
@@ -48,15 +89,7 @@ def attempt(read: Callable, *arguments: Any) -> Any:
         return error
 
 
-def _picture(path: Path, out: Path) -> Any:
-    from gamba_warp.images import load_rgba
-
-    return load_rgba(path)
-
-
 def _pictures(path: Path, out: Path) -> Any:
-    from gamba_warp.images import find_pictures, load_rgba
-
     found, failures = find_pictures([path])
     if not found:
         raise UserError("; ".join(f"{name}: {reason}" for name, reason in failures))
@@ -64,30 +97,17 @@ def _pictures(path: Path, out: Path) -> Any:
 
 
 def _prepare(path: Path, out: Path) -> Any:
-    from gamba_warp.data.preprocess import prepare
-
     mask = next((p for p in sorted(path.parent.iterdir()) if p.stem == "mask"), None)
     return prepare(path, mask=None if mask == path else mask)
 
 
-def _gaussians(path: Path, out: Path) -> Any:
-    from gamba_warp.formats.gaussians.files import read_gaussians
-
-    return read_gaussians(path)
-
-
 def _view(path: Path, out: Path) -> Any:
-    from gamba_warp.formats.gaussians.files import read_gaussians
-    from gamba_warp.viewer.page import write_viewer
-
     page = out / "page.html"
     write_viewer(page, path.name, read_gaussians(path), view=(1.5, 49.1, 0.0))
     return page.read_text(encoding="utf-8")
 
 
 def _predictions(path: Path, out: Path) -> Any:
-    from gamba_warp.eval.views.predictions import open_predictions
-
     opened: Any = open_predictions(path, 1.5, "cpu")
     names = [p.relative_to(path).with_suffix("").as_posix() for p in sorted(path.rglob("*.ply"))]
     return [attempt(opened.gaussians, None, name, 0) for name in names]
@@ -95,28 +115,15 @@ def _predictions(path: Path, out: Path) -> Any:
 
 def _cameras(path: Path, out: Path) -> Any:
     """The cameras as ``gamba render`` reads them, in the file's size and in another."""
-    from gamba_warp.trajectories.files import load_path
-
     load_path(path, (32, 24))
     return load_path(path)
 
 
 def _mesh(path: Path, out: Path) -> Any:
-    from gamba_warp.formats.meshes import default_up, load_mesh
-
     return load_mesh(path).normalized(default_up(path))[0]
 
 
-def _shape(path: Path, out: Path) -> Any:
-    from gamba_warp.eval.shapes.load import load_shape
-
-    return load_shape(path)
-
-
 def _evaluation(path: Path, out: Path) -> Any:
-    from gamba_warp.eval.shapes.pairs import evaluate_pairs, find_pairs
-    from gamba_warp.eval.shapes.protocol import PRESETS
-
     truth = out / "truth.off"
     truth.write_bytes(seeds.meshes()["off"]["ball.off"])
     pairs, failures = find_pairs(path, truth)
@@ -125,25 +132,17 @@ def _evaluation(path: Path, out: Path) -> Any:
 
 
 def _dataset(path: Path, out: Path) -> Any:
-    from gamba_warp.data.dataset import open_dataset
-
     dataset = open_dataset(path)
     bad = dataset.check()
     return [attempt(dataset.load, uid) for uid in dataset.uids], list(bad.values())
 
 
 def _split(path: Path, out: Path) -> Any:
-    from gamba_warp.data.dataset import open_dataset
-
     return open_dataset(path, "train").uids + open_dataset(path, "val").uids
 
 
 def _shown(path: Path, out: Path) -> Any:
     """Pictures that take the place of predictions, of each object of a dataset."""
-    from gamba_warp.data.dataset import open_dataset
-    from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
-    from gamba_warp.eval.views.pictures import PicturePredictions
-
     dataset, given = open_dataset(path / "data"), PicturePredictions(path / "seen", 1.5, "cpu")
     protocol = ViewsProtocol("all", 0, None, None, None, None, 1.5)
     truths = [attempt(load_truth, dataset, uid, protocol, "cpu") for uid in dataset.uids]
@@ -151,23 +150,12 @@ def _shown(path: Path, out: Path) -> Any:
     return [attempt(given.pictures, dataset, truth) for truth in good]
 
 
-def _catalogue(path: Path, out: Path) -> Any:
-    from gamba_warp.formats.catalogue import find_meshes
-
-    return find_meshes(path)
-
-
 def _render(path: Path, out: Path) -> Any:
-    from gamba_warp.formats.catalogue import find_meshes
-    from gamba_warp.train.data.render import Settings, render_object
-
     settings = Settings(1, 8, 49.1, 0, True, "png", "auto")
     return [attempt(render_object, mesh, out, settings) for mesh in find_meshes(path)[:2]]
 
 
 def _furniture(path: Path, out: Path) -> Any:
-    from gamba_warp.train.data.furniture import get_furniture
-
     target = out / "inner" / "furniture"
     (out / "inner").mkdir()
     (out / "inner" / "neighbour.txt").write_text("kept", encoding="utf-8")
@@ -176,10 +164,6 @@ def _furniture(path: Path, out: Path) -> Any:
 
 def _gobjaverse(path: Path, out: Path) -> Any:
     """Makes a dataset of a copy of G-Objaverse, as its lists choose; loads its objects."""
-    from gamba_warp.data.dataset import open_dataset
-    from gamba_warp.train.sources.objaverse_lists import Lists
-    from gamba_warp.train.sources.objaverse_views import find_rendered, take_views
-
     files = {name: path / name for name in ("index.json", "quality.json")}
     index, quality = (file if file.exists() else None for file in files.values())
     lists = Lists(index, tuple(sorted(path.glob("list*"))), (), quality)
@@ -193,11 +177,6 @@ def _gobjaverse(path: Path, out: Path) -> Any:
 
 def _gso(path: Path, out: Path) -> Any:
     """Takes models of a copy of GSO, and reads their meshes."""
-    from gamba_warp.data import gso
-    from gamba_warp.formats.catalogue import find_meshes
-    from gamba_warp.formats.meshes import load_mesh
-    from gamba_warp.train.sources.gso import take_models
-
     names = gso.NAMES[:2]
     failures = take_models(path, out / "gso", names)
     results: list[Any] = [UserError(reason) for reason in failures.values()]
@@ -210,20 +189,12 @@ def _gso(path: Path, out: Path) -> Any:
     return results
 
 
-def _model(path: Path, out: Path) -> Any:
-    from gamba_warp.model.checkpoint import load_model
-
-    return load_model(path)
-
-
 @functools.lru_cache(1)
 def _trainer() -> Any:
     return seeds.trainer(Path(tempfile.mkdtemp(prefix="trainer-")))
 
 
 def _training(path: Path, out: Path) -> Any:
-    from gamba_warp.train.checkpoint import find_checkpoint
-
     trainer = _trainer()
     before = sound.fingerprint(trainer)
     found = find_checkpoint(trainer.config.run.out, str(path))
@@ -238,43 +209,30 @@ def _training(path: Path, out: Path) -> Any:
 
 
 def _start_weights(path: Path, out: Path) -> Any:
-    from gamba_warp.train.checkpoint import load_weights
-
     model = _trainer().model
     load_weights(path, model)
     return model
 
 
 def _text(path: Path) -> str:
-    from gamba_warp.untrusted.documents import read_bytes
-
     return read_bytes(path).decode("utf-8", "replace")
 
 
 def _config(path: Path, out: Path) -> Any:
-    from gamba_warp.model.config import GambaConfig
-
     return GambaConfig.from_json(_text(path), str(path))
 
 
 def _set(path: Path, out: Path) -> Any:
-    from gamba_warp.train.config import TrainConfig
-
     lines = tuple(_text(path).splitlines())
     return TrainConfig(data=Path("data"), preset="tiny", set=lines).model_config()
 
 
 def _protocol(path: Path, out: Path) -> Any:
-    from gamba_warp.eval.shapes.protocol import checked, read_protocol
-
     return checked(read_protocol(str(path)), str(path))
 
 
 def _plan(path: Path, out: Path) -> Any:
     """The plan of an ablation, and the commands of its rows."""
-    from gamba_warp.ablation import jobs
-    from gamba_warp.ablation.plan import named, read_plan
-
     found = read_plan(path)
     with named(path):
         budget = jobs.budget_of(found, None, None)
@@ -285,56 +243,33 @@ def _plan(path: Path, out: Path) -> Any:
 
 def _compare(path: Path, out: Path) -> Any:
     """The table of a report beside itself, as ``gamba compare`` writes it."""
-    from gamba_warp.eval.compare import html_page, join, markdown_page, read_reports
-
     joined = join(read_reports((f"a={path}", f"b={path}"), ()), None)
     json.dumps(joined, allow_nan=False)
     return [markdown_page(joined, True), html_page(joined, True)]
 
 
 def _bench(path: Path, out: Path) -> Any:
-    from gamba_warp.measure.suites import read_document, write_pages
-
     return [page.read_text(encoding="utf-8") for page in write_pages([read_document(path)], out)]
 
 
 def _numeric(path: Path, out: Path) -> Any:
-    import torch
-
-    from gamba_warp.measure.stress_run import replay
-
     return list(replay([path], torch.device("cpu")))
 
 
 def _encoder(path: Path, out: Path) -> Any:
-    from gamba_warp.model.encoders import build_encoder
-
     vit = {"encoder": "vit_tiny_patch16_224", "encoder_size": 16}
     return build_encoder(replace(seeds.tiny_config(), **vit), path)
 
 
 def _released(path: Path, out: Path) -> Any:
-    from gamba_warp.model.encoders import read_state
-    from gamba_warp.model.released import convert_released
-
     return convert_released(read_state(path), str(path), 1)
 
 
-def _sam(path: Path, out: Path) -> Any:
-    from gamba_warp.data.preprocess import SamSegmenter
-
-    return SamSegmenter(path)
-
-
 def _matte(path: Path, out: Path) -> Any:
-    from gamba_warp.photo.matte import Matte
-
     return Matte(path)(seeds.rgba()[..., :3] / np.float32(255))
 
 
 def _pickle(path: Path, out: Path) -> Any:
-    from gamba_warp.vision.fetch import load_numpy_pickle
-
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     with path.open("rb") as file:
@@ -342,8 +277,6 @@ def _pickle(path: Path, out: Path) -> Any:
 
 
 def _archive(path: Path, out: Path) -> Any:
-    from gamba_warp.vision.weights import store_weights
-
     os.environ["GAMBA_CACHE"] = str(out)
     return store_weights(archive=path)
 
@@ -377,29 +310,29 @@ def _faulty(path: Path, out: Path) -> Any:
 
 
 READERS = {
-    "picture": Reader(_picture, sound.picture, seeds.pictures),
+    "picture": Reader(alone(load_rgba), sound.picture, seeds.pictures),
     "picture-folder": Reader(_pictures, sound.each(sound.picture), seeds.picture_folders, 3, True),
     "cut-out": Reader(_prepare, sound.cut_out, seeds.masked_pictures, 4),
-    "gaussians": Reader(_gaussians, sound.gaussians, seeds.splats),
+    "gaussians": Reader(alone(read_gaussians), sound.gaussians, seeds.splats),
     "gaussians-folder": Reader(
         _predictions, sound.each(sound.gaussians), seeds.splat_folders, 3, True
     ),
     "view": Reader(_view, sound.page, seeds.splats, 2),
     "cameras": Reader(_cameras, sound.cameras, seeds.cameras),
     "mesh": Reader(_mesh, sound.mesh, seeds.meshes),
-    "shape": Reader(_shape, sound.shape, seeds.shapes, 12),
+    "shape": Reader(alone(load_shape), sound.shape, seeds.shapes, 12),
     "evaluation": Reader(_evaluation, sound.report, seeds.compared, 1),
     "dataset": Reader(_dataset, sound.views, seeds.datasets, 8, True),
     "pack": Reader(_dataset, sound.views, seeds.packs, 6, True),
     "shown": Reader(_shown, sound.each(sound.shown), seeds.shown, 3, True),
     "split": Reader(_split, sound.nothing, seeds.split, 2, True),
-    "catalogue": Reader(_catalogue, sound.catalogue, seeds.catalogues, 4, True),
+    "catalogue": Reader(alone(find_meshes), sound.catalogue, seeds.catalogues, 4, True),
     "render": Reader(_render, sound.rendered, seeds.catalogues, 1, True),
     "furniture": Reader(_furniture, sound.furniture, seeds.libraries, 6, True),
     "package": Reader(_furniture, sound.furniture, seeds.packages, 6),
     "gobjaverse-copy": Reader(_gobjaverse, sound.views, seeds.gobjaverse, 3, True),
     "gso-copy": Reader(_gso, sound.scans, seeds.scans, 3, True),
-    "model": Reader(_model, sound.model, seeds.models, 6),
+    "model": Reader(alone(load_model), sound.model, seeds.models, 6),
     "training": Reader(_training, sound.training, seeds.checkpoints, 5, True),
     "start-weights": Reader(_start_weights, sound.model, seeds.models, 3),
     "config": Reader(_config, sound.config, seeds.configurations),
@@ -411,7 +344,7 @@ READERS = {
     "stress": Reader(_numeric, sound.nothing, seeds.numeric, 2),
     "released": Reader(_released, sound.released, seeds.released, 2),
     "encoder": Reader(_encoder, sound.nothing, seeds.weights, 1),
-    "sam": Reader(_sam, sound.nothing, seeds.weights, 1),
+    "sam": Reader(alone(SamSegmenter), sound.nothing, seeds.weights, 1),
     "matte": Reader(_matte, sound.alpha, seeds.networks, 3),
     "pickle": Reader(_pickle, sound.arrays, seeds.pickles, 4),
     "archive": Reader(_archive, sound.nothing, seeds.archives, 2),

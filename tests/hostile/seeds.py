@@ -10,7 +10,6 @@ import struct
 import tarfile
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from helpers.published import gobjaverse as published_views
 from helpers.published import gso as published_scans
 from helpers.released import theirs
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from gamba_warp.ablation.plan import PLANS
 from gamba_warp.data.gso import NAMES as SCANS
@@ -41,6 +41,8 @@ from gamba_warp.model.encoders import ImageEncoder
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.batches import open_data
 from gamba_warp.train.loop import Trainer
+from gamba_warp.train.sources.pack import PackSettings, write_pack
+from gamba_warp.versions import import_open3d
 
 Files = dict[str, bytes]
 Kinds = dict[str, Files]
@@ -147,14 +149,11 @@ def gaussians(count: int = 12, kind: Any = "ply", degree: int = 0) -> bytes:
 def splats() -> Kinds:
     """Gaussians in every format that is read, some with harmonics."""
     harmonics = gaussians(degree=1)
-    header, _, body = harmonics.partition(b"end_header\n")
-    rows = np.frombuffer(body, "<f4").reshape(-1, header.count(b"property float"))
-    text = io.BytesIO()
-    np.savetxt(text, rows, "%.9g")
-    header = header.replace(b"binary_little_endian", b"ascii")
+    text = PlyData.read(io.BytesIO(harmonics))
+    text.text = True
     seeds = {
         "gaussians": {"object.ply": gaussians()},
-        "gaussians-text": {"object.ply": header + b"end_header\n" + text.getvalue()},
+        "gaussians-text": {"object.ply": ply_bytes(text)},
         "gaussians-harmonics": {"object.ply": gaussians(degree=3)},
     }
     for kind in ("compressed-ply", "splat", "spz", "glb"):
@@ -191,22 +190,22 @@ def splat_folders() -> Kinds:
 def ply(points: np.ndarray, more: dict, faces: Sequence = (), form: str = "ascii") -> bytes:
     """A ``.ply`` of points ``[V, 3]``, further columns, and faces of any number of corners."""
     columns = {name: points[:, i].astype("<f4") for i, name in enumerate("xyz")} | more
-    types = {"<f4": "float", "u1": "uchar"}
-    lines = ["ply", f"format {form} 1.0", "comment made here", f"element vertex {len(points)}"]
-    lines += [f"property {types[c.dtype.str.lstrip('|')]} {n}" for n, c in columns.items()]
+    table = np.rec.fromarrays([*columns.values()], names=[*columns])
+    elements = [PlyElement.describe(np.asarray(table), "vertex")]
     if len(faces):
-        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    head = "\n".join([*lines, "end_header", ""]).encode()
-    if form == "ascii":
-        rows = [" ".join(f"{value:g}" for value in row) for row in zip(*columns.values())]
-        rows += [" ".join(map(str, [len(face), *face])) for face in faces]
-        return head + "\n".join([*rows, ""]).encode()
-    order = "<" if "little" in form else ">"
-    table = np.zeros(len(points), [(n, c.dtype.newbyteorder(order)) for n, c in columns.items()])
-    for name, column in columns.items():
-        table[name] = column
-    body = b"".join(struct.pack(f"{order}B{len(f)}i", len(f), *f) for f in faces)
-    return head + table.tobytes() + body
+        corners = np.empty(len(faces), [("vertex_indices", object)])
+        corners["vertex_indices"] = [np.array(face, "i4") for face in faces]
+        types = {"len_types": {"vertex_indices": "u1"}, "val_types": {"vertex_indices": "i4"}}
+        elements.append(PlyElement.describe(corners, "face", **types))
+    order = ">" if "big" in form else "<"
+    return ply_bytes(PlyData(elements, form == "ascii", order, comments=["made here"]))
+
+
+def ply_bytes(data: PlyData) -> bytes:
+    """What ``plyfile`` writes."""
+    content = io.BytesIO()
+    data.write(content)
+    return content.getvalue()
 
 
 @functools.cache
@@ -246,24 +245,15 @@ def meshes() -> Kinds:
     }
 
 
-def pcd(points: np.ndarray, form: str, normals: bool = False) -> bytes:
-    """A ``.pcd`` of points ``[N, 3]`` in the form "ascii", "binary" or "binary_compressed"."""
-    names = ["x", "y", "z"] + (["normal_x", "normal_y", "normal_z"] if normals else [])
-    rows = np.hstack([points] * (len(names) // 3)).astype("<f4")
-    head = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7"]
-    head += [f"FIELDS {' '.join(names)}"]
-    head += ["SIZE" + " 4" * len(names), "TYPE" + " F" * len(names), "COUNT" + " 1" * len(names)]
-    head += [f"WIDTH {len(points)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0"]
-    text = "\n".join([*head, f"POINTS {len(points)}", f"DATA {form}", ""]).encode()
-    if form == "ascii":
-        lines = [" ".join(f"{value:g}" for value in row) for row in rows]
-        return text + "\n".join([*lines, ""]).encode()
-    if form == "binary":
-        return text + rows.tobytes()
-    data = rows.T.tobytes()  # as LZF without any repetition: runs of up to 32 literal bytes
-    parts = [data[at : at + 32] for at in range(0, len(data), 32)]
-    packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
-    return text + struct.pack("<II", len(packed), len(data)) + packed
+def pcd(points: np.ndarray, normals: bool = False, **form: bool) -> bytes:
+    """A ``.pcd`` of points ``[N, 3]``, as Open3D writes it."""
+    o3d = import_open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(points if normals else [])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cloud.pcd"
+        o3d.io.write_point_cloud(str(path), cloud, **form)
+        return path.read_bytes()
 
 
 def clouds() -> Kinds:
@@ -277,10 +267,10 @@ def clouds() -> Kinds:
         "xyz": {"cloud.xyz": text},
         "pts": {"cloud.pts": b"24\n" + text},
         "pts-coloured": {"cloud.pts": coloured.encode()},
-        "pcd-ascii": {"cloud.pcd": pcd(points, "ascii")},
-        "pcd-binary": {"cloud.pcd": pcd(points, "binary")},
-        "pcd-compressed": {"cloud.pcd": pcd(points, "binary_compressed")},
-        "pcd-normals": {"cloud.pcd": pcd(points, "binary", True)},
+        "pcd-ascii": {"cloud.pcd": pcd(points, write_ascii=True)},
+        "pcd-binary": {"cloud.pcd": pcd(points)},
+        "pcd-compressed": {"cloud.pcd": pcd(points, compressed=True)},
+        "pcd-normals": {"cloud.pcd": pcd(points, normals=True)},
         "ply-cloud": {"cloud.ply": ply(points, normals)},
         "ply-cloud-binary": {"cloud.ply": ply(points, {}, form="binary_little_endian")},
     }
@@ -382,28 +372,24 @@ def datasets() -> Kinds:
 
 
 def packs() -> Kinds:
-    """A pack of two objects of two views, the first with depth; and one whose shard is a tar."""
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (2, _SIZE, _SIZE, 4), np.uint8)
-    depths = rng.integers(0, 9000, (2, _SIZE, _SIZE)).astype("<u2")
-    fixed = [*np.ravel(_POSE), 0, 0, 0, 1, 9.0, 0, 4, 0, 9, 4, 0, 0, 1]
-    sums = [[zlib.crc32(p.tobytes()) for p in pair] for pair in zip(images, depths)]
-    views = np.array([[*fixed, *pair, 0] for pair in sums], "<f8")
-    shard = views.tobytes() + images.tobytes() + depths.tobytes()
-    values = {"shard": "shard-00000.bin", "views": 2, "width": _SIZE, "height": _SIZE}
-    values |= {"crc": zlib.crc32(views.tobytes()), "cameras": 0, "images": views.nbytes}
-    values |= {"name": "A chair", "attribution": {"creator": "Jay"}, "depth_unit": 1e-4}
-    chair = values | {"uid": "chair", "split": "train", "depths": views.nbytes + images.nbytes}
-    stool = values | {"uid": "b/stool", "split": "val"}
-    index = {"format": "gamba-pack", "version": 1, "finished": True, "size": _SIZE}
-    tar = tarred({"00000000.cameras.npy": npy(views), "00000000.images.npy": npy(images)}, "")
-    starts = {"cameras": tar.index(views.tobytes()), "images": tar.index(images.tobytes())}
-    packed = index | {"objects": [stool | starts | {"shard": "shard-00000.tar"}]}
-    index |= {"objects": [chair, stool]}
-    return {
-        "arrays": {"pack.json": as_json(index), "shard-00000.bin": shard},
-        "webdataset": {"pack.json": as_json(packed), "shard-00000.tar": tar},
-    }
+    """Packs of two objects of two views, the first with depth, with either kind of shard."""
+    made = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        put(split()["transforms"], folder / "data")
+        for kind in ("arrays", "webdataset"):
+            write_pack(folder / "data", folder / kind, PackSettings(_SIZE, shards=kind), 1)
+            files = sorted((folder / kind).iterdir())
+            made[kind] = {path.name: path.read_bytes() for path in files if path.is_file()}
+    return made
+
+
+def put(files: Files, folder: Path) -> None:
+    """Writes files into a folder."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
 
 
 def catalogues() -> Kinds:
@@ -525,10 +511,7 @@ def released() -> Kinds:
 def trainer(folder: Path) -> Trainer:
     """A trainer on a dataset of one object, which is written into a folder."""
     parts = {"version": 1, "train": ["chair"], "val": [], "test": []}
-    for name, content in {**transforms("chair"), "split.json": as_json(parts)}.items():
-        path = folder / "data" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+    put({**transforms("chair"), "split.json": as_json(parts)}, folder / "data")
     views = {"batch_size": 1, "size": 8, "views_first": 1, "views_last": 1}
     config = micro.options(folder / "data", folder / "run", TINY_SET, views=views)
     torch.manual_seed(0)
