@@ -7,8 +7,9 @@ import warp as wp
 
 from ..kernels.bench import Settings
 from ..kernels.bench.core.measure import machine
-from ..kernels.bench.core.report import TARGET_WORDS, groups, markdown_table, oracles, table
+from ..kernels.bench.core.report import TARGET_WORDS, groups, oracles, table
 from ..kernels.bench.peers import versions
+from ..kernels.runtime.tables import markdown
 from ..versions import installed
 
 _OTHERS = ("timm", "pytest", "triton", "tyro", "safetensors")
@@ -76,7 +77,7 @@ def page(document: dict) -> str:
     """Returns the document as a Markdown page."""
     title = document["verdict"]
     lines = ["# gamba gpu-check", "", f"Written by `gamba gpu-check`, not by hand. **{title}**", ""]
-    lines += markdown_table(("what", "found"), headline(document))
+    lines.append(markdown(("what", "found"), headline(document)))
     not_done = [f"{row['what']}: {row['reason']}" for row in document["not_done"]]
     for name, rows in (("Failed", document["failures"]), ("Not done", not_done)):
         if rows:
@@ -84,5 +85,5 @@ def page(document: dict) -> str:
     for op, cases in groups({"records": document["bench"]["records"]}).items():
         for case, found in cases.items():
             lines += ["", f"## {op}: {case}", "", f"{found[0]['text']} {oracles(found)}", ""]
-            lines += markdown_table(*table(found))
+            lines.append(markdown(*table(found)))
     return "\n".join([*lines, ""])

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import torch
+from msgspec import Meta
 
 from ..batch import progress_bar
 from ..errors import UserError
 from ..files import output_folder, write_json, write_text
 from ..kernels.bench import Case, Settings, Target, measure
-from ..kernels.bench.core.document import check_document
+from ..kernels.bench.core.measure import FORMAT, TIMES
 from ..kernels.bench.core.page import page
 from ..kernels.bench.core.report import TARGET_WORDS, judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
@@ -107,15 +109,73 @@ def run_suites(
 
 
 def read_document(path: Path) -> dict:
-    """Reads a bench.json.
+    """Reads a bench.json, and checks that it holds all that reports need.
 
     Raises:
-        UserError: no such file, not JSON, or not of this format.
+        UserError: no such file, not JSON, of another format, or something in it is missing, of
+            another type or out of range; the message says where.
     """
+    document = documents.read_document(path, Any)
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise UserError(f"{path}: not a result of 'gamba bench' (format is not {FORMAT})")
     try:
-        return check_document(documents.read_document(path, Any))
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from error
+        msgspec.convert(document, _DOCUMENT)
+    except msgspec.ValidationError as error:
+        raise UserError(f"{path}: damaged: {error}") from error
+    for i, record in enumerate(document["records"]):
+        if record["status"] == "ok" and None in [record[name] for name in TIMES]:
+            raise UserError(f"{path}: damaged: records[{i}] has no times, but its status is ok")
+    return document
+
+
+_Text = Annotated[str, Meta(max_length=10_000)]  # the longest of ours is a compiler's message
+_Number = Annotated[float, Meta(gt=-1e300, lt=1e300)]
+_Time = Annotated[float, Meta(gt=0, lt=1e300)]
+
+
+def _fields(kind: Any, *names: str) -> list[tuple[str, Any]]:
+    return [(name, kind) for name in names]
+
+
+_RECORD = msgspec.defstruct(
+    "Record",
+    [
+        *_fields(_Text, "op", "case", "variant", "device", "dtype", "direction", "status"),
+        *_fields(_Text, "oracle", "text"),
+        *_fields(_Time | None, "ms_p20", "ms_p50", "ms_p80", "peer_ms"),
+        *_fields(_Number | None, "jit_ms", "rel_rms_error", "max_error"),
+        *_fields(_Text | None, "peer", "axis"),
+        *_fields(bool, "is_peer", "is_default"),
+        ("work", dict[str, _Number]),
+        ("parameters", dict[str, bool | _Number | _Text | None]),
+    ],
+)
+_TARGET = msgspec.defstruct(
+    "Target",
+    [
+        *_fields(_Text, "op", "text", "wanted"),
+        ("value", _Number | None),
+        ("reached", bool | None),
+    ],
+)
+_MACHINE = msgspec.defstruct(
+    "Machine",
+    [
+        *_fields(_Text, "cpu", "simd", "system", "python", "torch", "warp", "gamba_warp", "date"),
+        *_fields(_Text | None, "gpu", "cuda"),
+        *_fields(Annotated[int, Meta(ge=0, le=10**9)], "cores", "threads"),
+        ("peers", dict[str, str], {}),
+    ],
+)
+_DOCUMENT = msgspec.defstruct(
+    "Document",
+    [
+        ("machine", _MACHINE),
+        ("interrupted", bool),
+        ("records", list[_RECORD]),
+        ("targets", list[_TARGET], []),
+    ],
+)
 
 
 def write_document(

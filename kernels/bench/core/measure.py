@@ -24,7 +24,7 @@ from ...runtime import memory
 from .case import LEVELS, Case, NotInstalled, Settings, Stopped, Variant
 
 FORMAT = "gamba_warp.bench.1"
-_TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
+TIMES = ("ms_p20", "ms_p50", "ms_p80", "jit_ms")
 # Options of Linux's prctl, and its further arguments, which must be zeros.
 _SET_THP_DISABLE, _GET_THP_DISABLE = 41, 42
 _NO_MORE = (ctypes.c_ulong(0),) * 4
@@ -125,7 +125,7 @@ def _record(case: Case, variant: Variant, settings: Settings) -> dict:
         "device": settings.device.type,
         "dtype": variant.dtype,
         "direction": variant.direction,
-        **dict.fromkeys(_TIMES),
+        **dict.fromkeys(TIMES),
         "rel_rms_error": None,
         "max_error": None,
         "peer": None,
@@ -202,10 +202,10 @@ def _summarize(timed: list[_Timed]) -> None:
         if t.record["status"] == "ok" and not t.seconds:
             t.record["status"] = "not measured"
         if t.record["status"] != "ok":
-            t.record.update(dict.fromkeys(_TIMES))
+            t.record.update(dict.fromkeys(TIMES))
             continue
         quantiles = np.quantile(t.seconds, [0.2, 0.5, 0.8]) * 1e3
-        t.record.update(zip(_TIMES, map(float, quantiles)), rounds=len(t.seconds))
+        t.record.update(zip(TIMES, map(float, quantiles)), rounds=len(t.seconds))
     peers = [t.record for t in timed if t.record["is_peer"] and t.record["ms_p50"]]
     for record in (t.record for t in timed if not t.variant.peer):
         same = [r for r in peers if all(r[k] == record[k] for k in ("direction", "parameters"))]

@@ -6,6 +6,7 @@ import math
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 
+from ...runtime import tables
 from .case import Key, Target
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
@@ -202,19 +203,12 @@ def markdown(documents: Sequence[dict], more: More = nothing_more) -> str:
         if document["interrupted"]:
             lines += ["The run was interrupted; what was measured is here.", ""]
         if targets := target_rows(document):
-            lines += [*markdown_table(TARGET_HEADER, targets), ""]
+            lines += [tables.markdown(TARGET_HEADER, targets), ""]
         for op, cases in groups(document).items():
             for case, records in cases.items():
                 lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
-                said, tables = more(records)
+                said, more_tables = more(records)
                 lines += [line for text in said for line in (text, "")]
-                for rows in (table(records), *tables):
-                    lines += [*markdown_table(*rows), ""]
+                for rows in (table(records), *more_tables):
+                    lines += [tables.markdown(*rows), ""]
     return "\n".join(lines)
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a Markdown table."""
-    cells = [[cell.replace("|", "\\|") for cell in row] for row in (header, *rows)]
-    lines = [f"| {' | '.join(row)} |" for row in cells]
-    return [lines[0], "|" + " --- |" * len(header), *lines[1:]]

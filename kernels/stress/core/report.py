@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 
+from ...runtime.tables import markdown as markdown_table
 from .case import Case, Op, Outcome
 
 FORMAT = "gamba_warp.stress.1"
@@ -86,19 +87,18 @@ class Tally:
 
 def table(rows: list[Row]) -> str:
     """Returns a Markdown table with its columns aligned for a terminal."""
-    error = lambda value: f"{value:.1e}" if value else "0"  # noqa: E731
-    cells: list[list[str]] = [[*_HEAD]]
+
+    def error(value: float) -> str:
+        return f"{value:.1e}" if value else "0"
+
+    cells = []
     for r in rows:
-        cells.append([
-            r.op, r.kind, str(r.cases), error(r.forward[0]), r.forward[1], error(r.gradient[0]),
-            r.gradient[1].removeprefix("gradient of "), f"{r.ratio:.2f}",
-            f"{r.undecided / r.pixels:.2%}" if r.pixels else "", str(r.steep), str(r.nonfinite),
-            str(r.failures),
-        ])  # fmt: skip
-    widths = [max(map(len, column)) for column in zip(*cells)]
-    lines = ["| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in cells]
-    lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
-    return "\n".join(lines)
+        undecided = f"{r.undecided / r.pixels:.2%}" if r.pixels else ""
+        counts = str(r.steep), str(r.nonfinite), str(r.failures)
+        (forward, of), (gradient, of_gradient) = r.forward, r.gradient
+        errors = error(forward), of, error(gradient), of_gradient.removeprefix("gradient of ")
+        cells.append([r.op, r.kind, str(r.cases), *errors, f"{r.ratio:.2f}", undecided, *counts])
+    return markdown_table(_HEAD, cells, aligned=True)
 
 
 def plain_number(value: float | None) -> float | None:

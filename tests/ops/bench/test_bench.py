@@ -529,27 +529,46 @@ def test_gswarp_is_reported_where_it_is_not():
         scene.changed(options={"alpha_min": 0.1}).forward(peers.gswarp_rasterization)
 
 
+def first(**values):
+    return lambda document: document["records"][0].update(values)
+
+
 @pytest.mark.parametrize(
     "change, reason",
     [
-        (lambda d: d["records"][0].update(ms_p50=math.nan), "not valid JSON"),
-        (lambda d: d["records"][0].update(ms_p50=math.inf), "not valid JSON"),
-        (lambda d: d["records"][0].update(ms_p50="fast"), r"records\[0\].ms_p50 is 'fast'"),
-        (lambda d: d["records"][0].update(ms_p20=None), "no times, but its status is ok"),
-        (lambda d: d["records"][0].update(ms_p50=0.0), "a time that is not above 0"),
-        (lambda d: d["records"][0].update(max_error=1e308), r"records\[0\].max_error is '1e\+308'"),
-        (lambda d: d["records"][0].update(parameters={"L": []}), "a parameter that is no value"),
-        (lambda d: d["records"][0].update(axis="a," * 10**4), r"records\[0\].axis is 'a,a,"),
-        (lambda d: d["machine"].update(peers=["x"]), "machine.peers is no list of versions"),
-        (lambda d: d["machine"].update(cores=10**18 * 10**300), r"machine.cores is .1000"),
-        (lambda d: d["records"][0].update(work={"pairs": "many"}), "what is no number"),
-        (lambda d: d["records"][0].pop("text"), r"records\[0\] has no text"),
-        (lambda d: d["records"].append(7), r"records\[1\] is missing or is no object"),
-        (lambda d: d.update(records={}), "records is missing or is no list"),
-        (lambda d: d.pop("machine"), "machine is missing"),
-        (lambda d: d["machine"].pop("warp"), "machine has no warp"),
-        (lambda d: d.pop("interrupted"), "interrupted is missing"),
-        (lambda d: d.update(targets=[{"op": "scan"}]), r"targets\[0\] has no text"),
+        (first(ms_p50=math.nan), "not valid JSON"),
+        (first(ms_p50=math.inf), "not valid JSON"),
+        (
+            first(ms_p50="fast"),
+            r"got `str` - at `\$.records\[0\].ms_p50`",
+        ),
+        (first(ms_p20=None), "no times, but its status is ok"),
+        (first(ms_p50=0.0), r"> 0.0 - at `\$.records\[0\].ms_p50`"),
+        (first(max_error=1e308), r"- at `\$.records\[0\].max_error`"),
+        (
+            first(parameters={"L": []}),
+            r"`array` - at `\$.records\[0\].parameters",
+        ),
+        (
+            first(axis="a," * 10**4),
+            r"length <= 10000 - at `\$.records\[0\].axis`",
+        ),
+        (lambda d: d["machine"].update(peers=["x"]), r"got `array` - at `\$.machine.peers`"),
+        (lambda d: d["machine"].update(cores=10**18 * 10**300), r"not valid JSON|machine.cores"),
+        (
+            first(work={"pairs": "many"}),
+            r"`str` - at `\$.records\[0\].work",
+        ),
+        (lambda d: d["records"][0].pop("text"), r"required field `text` - at `\$.records\[0\]`"),
+        (lambda d: d["records"].append(7), r"got `int` - at `\$.records\[1\]`"),
+        (lambda d: d.update(records={}), r"got `object` - at `\$.records`"),
+        (lambda d: d.pop("machine"), "required field `machine`"),
+        (lambda d: d["machine"].pop("warp"), r"required field `warp` - at `\$.machine`"),
+        (lambda d: d.pop("interrupted"), "required field `interrupted`"),
+        (
+            lambda d: d.update(targets=[{"op": "scan"}]),
+            r"required field `text` - at `\$.targets\[0\]`",
+        ),
         (lambda d: d.update(format="gamba_warp.bench.0"), "not a result of"),
     ],
 )
