@@ -16,11 +16,11 @@ from ..errors import UserError
 from ..files import output_folder, write_json, write_text
 from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.core.measure import FORMAT, TIMES
-from ..kernels.bench.core.page import page
 from ..kernels.bench.core.report import TARGET_WORDS, judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 from ..untrusted import documents
+from .page import page
 
 Maker = Callable[[Sequence[dict]], str]  # of documents, a page
 
@@ -115,16 +115,27 @@ def read_document(path: Path) -> dict:
         UserError: no such file, not JSON, of another format, or something in it is missing, of
             another type or out of range; the message says where.
     """
-    document = documents.read_document(path, Any)
+    try:
+        return check_document(documents.read_document(path, Any))
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def check_document(document: Any) -> dict:
+    """Checks that the content of a bench.json holds all that reports need, and returns it.
+
+    Raises:
+        ValueError: as ``read_document`` says.
+    """
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise UserError(f"{path}: not a result of 'gamba bench' (format is not {FORMAT})")
+        raise ValueError(f"not a result of 'gamba bench' (format is not {FORMAT})")
     try:
         msgspec.convert(document, _DOCUMENT)
     except msgspec.ValidationError as error:
-        raise UserError(f"{path}: damaged: {error}") from error
+        raise ValueError(f"damaged: {error}") from error
     for i, record in enumerate(document["records"]):
         if record["status"] == "ok" and None in [record[name] for name in TIMES]:
-            raise UserError(f"{path}: damaged: records[{i}] has no times, but its status is ok")
+            raise ValueError(f"damaged: records[{i}] has no times, but its status is ok")
     return document
 
 

@@ -32,8 +32,9 @@ class Job(NamedTuple):
 
 
 def without_one_object(out: Path) -> None:
-    """Removes one rendered object."""
-    remove_folder(sorted(out.glob("*/transforms.json"))[-1].parent)
+    """Removes one rendered object; there may be none, as several in turn were not made again."""
+    for path in sorted(out.glob("*/transforms.json"))[-1:]:
+        remove_folder(path.parent)
 
 
 CPU = ("--device", "cpu")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from page_parts import table as table_of
-
 from gamba_warp.kernels.bench.static.report import full_name, static_markdown
+from gamba_warp.kernels.runtime import tables
 
 _NO_DISASSEMBLER = """
 No disassembler was found (nvdisasm on PATH, in CUDA_HOME or inside Triton): instructions are not
@@ -20,8 +19,8 @@ _KINDS = ("float", "special", "integer", "multiply", "convert", "global", "share
 _KINDS += ("shuffle", "barrier", "tensor")
 
 
-def _rows(header: list[str], rows: list[list[object]]) -> str:
-    return table_of(header, [[*map(str, row)] for row in rows])
+def _table(header: list[str], rows: list[list[object]]) -> str:
+    return tables.markdown(header, [[*map(str, row)] for row in rows])
 
 
 def loops(document: dict) -> list[str]:
@@ -37,7 +36,7 @@ def loops(document: dict) -> list[str]:
         kinds = [loop.get(kind, 0) for kind in _KINDS]
         table.append([full_name(row), row["case"], every, *kinds, loop.get("passes", 0)])
     header = ["kernel", "case", "all", *_KINDS, "memory"]
-    return ["## Instructions of the hottest loop", _LOOPS.format(arch), _rows(header, table), ""]
+    return ["## Instructions of the hottest loop", _LOOPS.format(arch), _table(header, table), ""]
 
 
 _ESTIMATES = """
@@ -78,12 +77,12 @@ def estimates(document: dict) -> list[str]:
     return [
         "## Least times of the scan, estimated",
         text,
-        table_of(header, [[*map(str, row)] for row in table]),
+        _table(header, table),
         "",
     ]
 
 
 def markdown(document: dict) -> str:
     """The page of the documents of ``report``."""
-    text = static_markdown(document).replace("gamba bench --static", "make instructions")
+    text = static_markdown(document, "make instructions")
     return "\n".join([text, *loops(document), *estimates(document)])

@@ -5,14 +5,17 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 
-from gamba_warp.kernels.bench.core.charts import HEIGHT, WIDTH
+from markupsafe import Markup
+
+from gamba_warp.pages.charts import HEIGHT, WIDTH
 
 from .slopes import error_charts, growth_charts
 
 _COLUMNS, _GAP, _TITLE = 2, 28, 30
 _STYLE = """
 svg { --text: #22252a; --soft: #686d76; --line: #dfe0dc; --card: #ffffff;
-  --s0: #1f6feb; --s1: #d1582b; --s2: #2c8a57; --s3: #8250c4; }
+  --s0: #1f6feb; --s1: #d1582b; --s2: #2c8a57; --s3: #8250c4; --s4: #b8860b; --s5: #c2397b; }
+.name { font-weight: 600; }
 text { fill: var(--text); font: 12px system-ui, sans-serif; }
 .title { font-size: 15px; font-weight: 600; }
 .axis { fill: var(--soft); font-weight: 600; }
@@ -49,7 +52,7 @@ def growth_picture(documents: Sequence[dict]) -> str:
         x, y = _GAP + i % _COLUMNS * step_x, _GAP + i // _COLUMNS * step_y
         parts.append(f'<text class="title" x="{x + 6}" y="{y + 16}">{html.escape(name)}</text>')
         place = f'<svg x="{x}" y="{y + _TITLE}" width="{WIDTH}" height="{HEIGHT}" '
-        parts.append(svg.replace("<svg ", place, 1))
+        parts.append(str(svg).replace("<svg ", place, 1))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}">'
         f"<style>{_STYLE}</style>{''.join(parts)}</svg>\n"
@@ -89,7 +92,7 @@ def bars(series: Mapping[str, Mapping[str, float]], label: str) -> str:
         )
         parts += _row(top, name, list(series.values()), largest)
     height = _TOP + len(names) * step
-    return f'<svg viewBox="0 0 {_WIDTH} {height}" role="img">{"".join(parts)}</svg>'
+    return Markup(f'<svg viewBox="0 0 {_WIDTH} {height}" role="img">{"".join(parts)}</svg>')
 
 
 def _row(top: float, name: str, series: Sequence[Mapping[str, float]], largest: float) -> list[str]:

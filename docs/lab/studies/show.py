@@ -7,11 +7,11 @@ from pathlib import Path
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
-from gamba_warp.kernels.bench.core import page as pages
 from gamba_warp.kernels.bench.core import report
-from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart
-from gamba_warp.kernels.bench.core.page import line_chart
+from gamba_warp.measure import page as pages
 from gamba_warp.measure import suites
+from gamba_warp.measure.page import line_chart
+from gamba_warp.pages.charts import Axis, Point, Series, chart
 
 from .crossing import FIGURES, crossings, series_of
 from .draw import bars, growth_picture
@@ -46,10 +46,8 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
 
 def markdown(documents: Sequence[dict]) -> str:
     """The tables of studies as Markdown."""
-    return report.markdown(documents, more).replace(
-        "Written by `gamba bench`, not by hand.",
-        "Written by `make study`, not by hand, of results of `gamba bench` and of the studies.",
-    )
+    by = "`make study`, not by hand, of results of `gamba bench` and of the studies"
+    return report.markdown(documents, more, by)
 
 
 def page(documents: Sequence[dict]) -> str:

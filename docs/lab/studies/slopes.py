@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart
+from gamba_warp.pages.charts import Axis, Point, Series, chart
 
 from .crossing import FIGURES
 

@@ -195,9 +195,11 @@ def nothing_more(records: Sequence[dict]) -> tuple[list[str], list[Table]]:
     return [], []
 
 
-def markdown(documents: Sequence[dict], more: More = nothing_more) -> str:
+def markdown(
+    documents: Sequence[dict], more: More = nothing_more, by: str = "`gamba bench`, not by hand"
+) -> str:
     """Returns a page of all tables; each document is of one machine."""
-    lines = ["# Benchmarks", "", "Written by `gamba bench`, not by hand.", "", EXPLANATION, ""]
+    lines = ["# Benchmarks", "", f"Written by {by}.", "", EXPLANATION, ""]
     for document in documents:
         lines += [f"## {machine_line(document)}", ""]
         if document["interrupted"]:

@@ -23,6 +23,7 @@ from gamba_warp.versions import __version__
 from ...causal_conv1d import causal_conv1d
 from ...rasterize import depth_quantile, rasterization
 from ...rasterize.harmonics import colors_seen_from
+from ...runtime import tables
 from ...selective_scan import selective_scan, selective_scan_state
 from .cubin import RESERVED, Resources, read_cubin
 from .dry_run import Launch, can_dry_run, launches_of
@@ -281,7 +282,7 @@ def static_report(say: Callable[[str], None] = lambda kernel: None) -> dict:
 
 
 _EXPLANATION = """
-Written by `gamba bench --static`, not by hand: the kernels were compiled ahead of time, and the
+Written by `{}`, not by hand: the kernels were compiled ahead of time, and the
 binaries say what they take. Nothing here was run. **Not measured on a GPU.**
 
 Two figures with a stroke are those of {}, in this order; one stands for both.
@@ -311,20 +312,20 @@ def full_name(row: dict) -> str:
     return f"`{row['kernel']}`" + (" (gradient)" if row["direction"] == "gradient" else "")
 
 
-def static_markdown(document: dict) -> str:
+def static_markdown(document: dict, by: str = "gamba bench --static") -> str:
     """The report as a page with one table per op."""
     versions = ", ".join(f"{name} {version}" for name, version in document["versions"].items())
-    text = _EXPLANATION.format(" and ".join(document["machines"]))
+    text = _EXPLANATION.format(by, " and ".join(document["machines"]))
     lines = ["# What the CUDA kernels take", text, f"{versions}.", ""]
     header, columns = ["kernel", "case", *_COLUMNS], _COLUMNS.values()
-    tables: dict[str, dict[tuple, list[dict]]] = {}
+    by_op: dict[str, dict[tuple, list[dict]]] = {}
     for row in document["kernels"]:
         names = full_name(row), row["case"]
-        tables.setdefault(row["op"], {}).setdefault(names, []).append(row)
-    for op, table in tables.items():
-        lines += [f"## {op}", "", f"| {' | '.join(header)} |", "|" + " --- |" * len(header)]
-        for names, rows in table.items():
-            cells = [" / ".join(dict.fromkeys(str(c(row)) for row in rows)) for c in columns]
-            lines.append(f"| {' | '.join([*names, *cells])} |")
-        lines.append("")
+        by_op.setdefault(row["op"], {}).setdefault(names, []).append(row)
+    for op, table in by_op.items():
+        cells = [
+            [*names, *(" / ".join(dict.fromkeys(str(c(row)) for row in rows)) for c in columns)]
+            for names, rows in table.items()
+        ]
+        lines += [f"## {op}", "", tables.markdown(header, cells), ""]
     return "\n".join(lines)

@@ -36,16 +36,16 @@ from gamba_warp.kernels.bench.cases import scan as scan_suite
 from gamba_warp.kernels.bench.cases.raster_scene import make_scene
 from gamba_warp.kernels.bench.cases.scan_problem import make_inputs, scan_problem
 from gamba_warp.kernels.bench.core.case import NotInstalled
-from gamba_warp.kernels.bench.core.charts import Axis, Point, Series, chart, pareto
 from gamba_warp.kernels.bench.core.measure import peak_bytes, saved_bytes
-from gamba_warp.kernels.bench.core.page import charts_of, page
 from gamba_warp.kernels.bench.core.report import judge, markdown, ratio_table, ratios
 from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import suites
 from gamba_warp.measure.blocks import without_encoder
+from gamba_warp.measure.page import charts_of, page
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.pages.charts import Axis, Point, Series, chart, pareto
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 # DESIGN's schema, and what it leaves to us.
@@ -342,7 +342,7 @@ def test_render_makes_the_same_files_again(monkeypatch, tmp_path, capsys):
         assert (again / name).read_text() == (tmp_path / name).read_text()
     assert bench.bench_command(render=source, out=tmp_path / "doc.md") == 0
     assert (tmp_path / "doc.md").read_text() == (tmp_path / "bench.md").read_text()
-    assert "http" not in (tmp_path / "bench.html").read_text()
+    assert "://" not in (tmp_path / "bench.html").read_text()
 
 
 def test_compare_of_tensors():

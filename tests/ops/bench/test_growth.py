@@ -19,8 +19,8 @@ from gamba_warp.commands.bench import SUITES
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.bench import Case, Settings, Variant
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
-from gamba_warp.kernels.bench.core.document import check_document
 from gamba_warp.measure import suites
+from gamba_warp.measure.suites import check_document
 
 DOCS = Path(__file__).parents[3] / "docs"
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
@@ -117,9 +117,8 @@ def test_strange_numbers_do_no_harm():
 
 
 def texts(svg):
-    return [
-        "".join(node.itertext()) for node in ET.fromstring(svg).iter() if node.tag[-4:] == "text"
-    ]
+    nodes = ET.fromstring(svg).iter()
+    return ["".join(node.itertext()) for node in nodes if node.tag.endswith(("text", "tspan"))]
 
 
 def test_charts_show_lines_slopes_and_the_work():

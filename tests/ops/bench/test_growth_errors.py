@@ -13,9 +13,9 @@ from lab.studies.show import charts_of
 from lab.studies.slopes import ERRORS, growth_table
 
 from gamba_warp.kernels.bench import Settings
-from gamba_warp.kernels.bench.core.document import check_document
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import suites
+from gamba_warp.measure.suites import check_document
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 CPU = torch.device("cpu")
@@ -102,7 +102,8 @@ def test_a_run_of_small_sizes():
     assert {r["axis"] for r in records} == {ERRORS}
     assert [r["direction"] for r in records] == ["forward+backward"] * 2 + ["forward"]
     (svg,) = charts_of(only[0], records)
-    labels = {"".join(x.itertext()) for x in ET.fromstring(svg).iter() if x.tag == "text"}
+    nodes = [x for x in ET.fromstring(svg).iter() if x.tag in ("text", "tspan")]
+    labels = {"".join(x.itertext()) for x in nodes}
     assert {"out", "last state", "worst gradient", "ε/2", "ε√T/2", "εT/2", "4,096"} <= labels
     header, rows = growth_table(records)
     assert header == ["L", *records[0]["work"], "of"]

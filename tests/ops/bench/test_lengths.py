@@ -13,8 +13,8 @@ from lab.studies.lengths import ATTENTION, BOTH, MAMBA, Bench, Line, Sizes
 from lab.studies.show import charts_of, markdown, page, summary, with_crossings
 
 from gamba_warp.kernels.bench import Case, Settings
-from gamba_warp.kernels.bench.core.document import check_document
 from gamba_warp.measure import suites
+from gamba_warp.measure.suites import check_document
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 SIZES = Sizes((40, 97), 64, 60.0)  # 97 is no whole number of chunks or segments
@@ -71,7 +71,7 @@ def test_the_page_draws_the_crossing():
     charts = charts_of("forward", records)
     assert len(charts) == 2
     time_, memory = (ET.fromstring(svg) for svg in charts)
-    texts = ["".join(node.itertext()) for node in time_.iter() if node.tag == "text"]
+    texts = ["".join(node.itertext()) for node in time_.iter() if node.tag in ("text", "tspan")]
     assert "L* = 3,000" in texts and {"a", "b", "crossing"} <= set(texts)
     assert not any("L*" in "".join(node.itertext()) for node in memory.iter())
 

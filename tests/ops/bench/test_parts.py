@@ -128,7 +128,7 @@ def test_dropped_patches_are_exact_and_counted():
     charts = charts_of("background", records)
     labels = ("milliseconds, forward", "memory, MiB, forward", "tokens of a batch")
     assert [sum(label in chart for chart in charts) for label in labels] == [2, 2, 1]
-    assert all("all patches" in chart and "object&#x27;s patches" in chart for chart in charts)
+    assert all("all patches" in chart and "object&#39;s patches" in chart for chart in charts)
 
 
 def test_a_step_on_a_folder_that_is_not_there_is_one_line(tmp_path):

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import html
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
-from .charts import Axis, Point, Series, chart, pareto
-from .report import (
+from ..kernels.bench.core.report import (
     EXPLANATION,
     TARGET_HEADER,
     More,
@@ -20,8 +16,9 @@ from .report import (
     table,
     target_rows,
 )
+from ..pages.charts import Axis, Point, Series, chart, pareto
+from ..pages.page import Section, page_text
 
-_NUMBER = re.compile(r"[0-9.,e-]+( to [0-9.,e-]+)?")
 _AXES = {
     "L": "tokens L",
     "B": "sequences B",
@@ -132,52 +129,27 @@ def _skip_chart(records: Sequence[dict], switched_off: bool) -> str:
     return chart(series, Axis("work skipped, %", False), Axis("time saved, %", False))
 
 
-_STYLE = Path(__file__).with_suffix(".css")
-
-
 def page(
     documents: Sequence[dict],
     more: More = nothing_more,
     charts: Callable[[str, Sequence[dict]], list[str]] = charts_of,
 ) -> str:
     """Returns a self-contained HTML page with the tables and the charts."""
-    style = _STYLE.read_text(encoding="utf-8")
-    body = [f"<header><h1>Benchmarks</h1><p>{EXPLANATION}</p>"]
-    body.append("<p>Circle: ours; ring: the default; square: a peer.</p></header>")
+    sections = []
     for document in documents:
-        head = f"<h2>{html.escape(machine_line(document))}</h2>"
-        if document["interrupted"]:
-            head += "<p>The run was interrupted; what was measured is here.</p>"
-        if targets := target_rows(document):
-            head += _html_table(TARGET_HEADER, targets)
-        body.append(f"<section>{head}</section>")
+        interrupted = "The run was interrupted; what was measured is here."
+        text = interrupted if document["interrupted"] else ""
+        targets = target_rows(document)
+        header = TARGET_HEADER if targets else ()
+        sections.append(Section(machine_line(document), text, header=header, table=targets))
         for op, cases in groups(document).items():
             for case, records in cases.items():
-                text = html.escape(f"{records[0]['text']} {oracles(records)}")
-                figures = "".join(charts(case, records))
-                figures = f'<div class="charts">{figures}</div>' if figures else ""
                 said, tables = more(records)
-                rows = "".join(_html_table(*rows) for rows in (table(records), *tables))
-                lines = "".join(f"<p>{html.escape(line)}</p>" for line in said)
-                name = html.escape(f"{op}: {case}")
-                body.append(
-                    f"<section><h2>{name}</h2><p>{text}</p>{lines}{figures}{rows}</section>"
-                )
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Benchmarks</title><style>\n{style}</style></head>\n<body>{''.join(body)}</body></html>\n"
-    )
-
-
-def _html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    def cell(text: str) -> str:
-        kind = text if text in ("reached", "missed") else ""
-        if _NUMBER.fullmatch(text):
-            kind = "number"
-        return f'<td class="{kind}">{html.escape(text)}</td>'
-
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
-    lines = [f"<tr>{head}</tr>"]
-    lines += [f"<tr>{''.join(cell(c) for c in row)}</tr>" for row in rows]
-    return f'<div class="scroll"><table>{"".join(lines)}</table></div>'
+                text = "\n\n".join([f"{records[0]['text']} {oracles(records)}", *said])
+                header, rows = table(records)
+                drawn = [svg for svg in charts(case, records) if svg]
+                title = f"{op}: {case}"
+                sections.append(Section(title, text, charts=drawn, header=header, table=rows))
+                sections += [Section("", header=head, table=rows) for head, rows in tables]
+    text = f"{EXPLANATION}\n\nCircle: ours; ring: the default; square: a peer."
+    return page_text("Benchmarks", text, sections)
