@@ -27,9 +27,9 @@ import warp as wp
 
 from ..errors import UserError, first_line
 from ..files import output_folder, write_json, write_text
-from ..kernels.bench import Case, Settings, Target, measure
 from ..kernels.bench.cases import conv, raster, scan
-from ..kernels.bench.core.measure import synchronize
+from ..kernels.bench.core.case import Case, Settings, Target
+from ..kernels.bench.core.measure import measure, synchronize
 from ..kernels.bench.core.report import judge
 from ..kernels.bench.peers import PACKAGES, versions
 from ..kernels.bench.static.report import find_kernels

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians
-from ..kernels.bench import BOTH, Error, Settings, compare
 from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from ..kernels.bench.cases.scan_problem import make_inputs, scan_problem
+from ..kernels.bench.core.case import BOTH, Error, Settings, compare
 from ..kernels.bench.core.problem import Operator
 from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from ..kernels.bench import Settings
+from ..kernels.bench.core.case import Settings
 from ..kernels.bench.core.measure import machine
 from ..kernels.bench.core.report import TARGET_WORDS, groups, oracles, table
 from ..kernels.bench.peers import versions

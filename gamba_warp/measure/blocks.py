@@ -12,8 +12,18 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ..devices import network_products
-from ..kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
-from ..kernels.bench.core.case import make_cases
+from ..kernels.bench.core.case import (
+    BOTH,
+    Case,
+    Error,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    compare,
+    make_cases,
+)
+from ..kernels.bench.core.problem import Problem
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
 from ..model.config import PRESETS, GambaConfig, Preset
@@ -21,7 +31,6 @@ from ..model.gamba import Gamba
 from ..model.parts.block import GambaBlock, prefix_states, run_blocks
 from ..model.posing import reference_cameras
 
-BOTH = "forward+backward"
 LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # allowed relative rms error to float64
 _IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # those of DINOv2 ViT-B/14 at 336 pixels
 TOKENS = 128  # number of first tokens that are compared with the oracle
@@ -96,7 +105,7 @@ class Products:
                 call()
 
 
-class Backbone:
+class Backbone(Problem):
     """Blocks of the paper's size with the condition of one image."""
 
     def __init__(self, settings: Settings, depth: int) -> None:
@@ -111,7 +120,7 @@ class Backbone:
         tokens = torch.randn(1, self.length, config.width)
         camera, image = torch.randn(1, 1, channels), torch.randn(1, _IMAGE_TOKENS, channels)
         self.tokens, self.camera, self.image = (x.to(self.device) for x in (tokens, camera, image))
-        self.parameters = {"L": self.length, "D": config.width, "depth": depth}
+        self.sizes = {"L": self.length, "D": config.width, "depth": depth}
 
     def run(self, tokens: Tensor) -> Tensor:
         """Runs the blocks as ``Gamba.forward`` does: first the prefix states, then the tokens."""
@@ -146,47 +155,39 @@ class Backbone:
         with network_products(self.device):
             return torch.autograd.grad(self.run(tokens), leaves, self.tokens)
 
-    @property
-    def oracle(self) -> str:
+    def oracle(self, direction: str) -> str:
         """What the check compares with, in words."""
-        tokens = f"first {TOKENS} of {self.length} tokens"
-        return f"float64 with the condition prepended, {tokens}"
+        text = f"float64 with the condition prepended, first {TOKENS} of {self.length} tokens"
+        return text + (", gradient of these tokens" if direction == BOTH else "")
 
-    def variant(self, name: str, run: Callable[[], Tensor], default: bool) -> Variant:
-        """A variant that runs the blocks forward in some way."""
-        return Variant(
-            name=name,
-            run=run,
-            check=partial(self.check, run),
-            limit=LIMIT,
-            oracle=self.oracle,
-            default=default,
-            parameters=self.parameters,
-        )
+    def limit(self, direction: str, dtype: torch.dtype = torch.float32) -> float:
+        """The largest error that is allowed."""
+        return BACKWARD_LIMIT if direction == BOTH else LIMIT
 
-    def check(self, forward: Callable[[], Tensor]) -> Error:
-        """Measures the error of what is added to the first tokens, which depend on no later one."""
-        with torch.no_grad():
-            got = forward()[:, :TOKENS].double().cpu()
-            first = tokens = self.tokens[:, :TOKENS].double().cpu()
+    def way(self, name: str, run: Callable[[], Tensor], **changes) -> Variant:
+        """A variant that runs the blocks forward in another way."""
+        return self.variant(name, run=run, check=partial(self.check, "forward", run), **changes)
+
+    def check(self, direction: str, run: Callable[[], Tensor] | None = None) -> Error:
+        """Measures the error of what is added to the first tokens, which depend on no later one.
+
+        Or of the first tokens' gradient, with a cotangent of 0 behind them.
+        """
+        first = self.tokens[:, :TOKENS].double().cpu().requires_grad_(direction == BOTH)
+        with torch.set_grad_enabled(direction == BOTH):
+            tokens = first
             for block in self.blocks:
                 tokens = reference_block(block, tokens, self.camera, self.image)
-        return compare({"update": got - first}, {"update": tokens - first})
-
-    def check_backward(self) -> Error:
-        """Measures the error of the first tokens' gradient, with a cotangent of 0 behind them."""
-        tokens = self.tokens.detach().requires_grad_()
+        if direction != BOTH:
+            got = (run or self.forward)()[:, :TOKENS].double().cpu()
+            return compare({"update": got - first}, {"update": tokens - first})
+        leaf = self.tokens.detach().requires_grad_()
         cotangent = self.tokens.clone()
         cotangent[:, TOKENS:] = 0
-        (got,) = torch.autograd.grad(self.run(tokens), [tokens], cotangent)
-        first = self.tokens[:, :TOKENS].double().cpu().requires_grad_()
-        out = first
-        for block in self.blocks:
-            out = reference_block(block, out, self.camera, self.image)
-        (want,) = torch.autograd.grad(out, [first], first.detach())
-        return compare(
-            {"gradient of the tokens": got[:, :TOKENS]}, {"gradient of the tokens": want}
-        )
+        (got,) = torch.autograd.grad(self.run(leaf), [leaf], cotangent)
+        (want,) = torch.autograd.grad(tokens, [first], first.detach())
+        name = "gradient of the tokens"
+        return compare({name: got[:, :TOKENS]}, {name: want})
 
 
 def reference_block(
@@ -242,17 +243,7 @@ def one_block(settings: Settings) -> list[Variant]:
     of all blocks are computed at once, which pays over the depth (backbone).
     """
     backbone = Backbone(settings, 1)
-    both = Variant(
-        name="default",
-        run=backbone.backward,
-        check=backbone.check_backward,
-        limit=BACKWARD_LIMIT,
-        oracle=f"{backbone.oracle}, gradient of these tokens",
-        direction=BOTH,
-        default=True,
-        parameters=backbone.parameters,
-    )
-    return [*_forwards(backbone, settings), both]
+    return [*_forwards(backbone, settings), backbone.variant("default", BOTH, default=True)]
 
 
 def whole_backbone(settings: Settings) -> list[Variant]:
@@ -261,25 +252,18 @@ def whole_backbone(settings: Settings) -> list[Variant]:
     """
     rounds = 3 if settings.level == "normal" else None  # one takes seconds
     backbone = Backbone(settings, 2 if settings.level == "quick" else 14)
-    made = _forwards(backbone, settings)
-    for variant in made:
-        variant.rounds = rounds
-    return made
+    return _forwards(backbone, settings, rounds=rounds)
 
 
-def _forwards(backbone: Backbone, settings: Settings) -> list[Variant]:
+def _forwards(backbone: Backbone, settings: Settings, **changes) -> list[Variant]:
     """Blocks with prefix states, with the condition prepended, and their products alone."""
     products = Products(backbone.forward, settings.device)
-    ways = {"default": backbone.forward, "prefix states off": backbone.prepended}
-    checked = [backbone.variant(name, run, name == "default") for name, run in ways.items()]
-    alone = Variant(
-        name="matrix products alone",
-        run=products.run,
-        check=None,
-        parameters=backbone.parameters,
-        work=products.work,
-    )
-    return [*checked, alone]
+    alone = {"run": products.run, "check": None, "work": products.work, "limit": 1e-5}
+    return [
+        backbone.variant("default", default=True, **changes),
+        backbone.way("prefix states off", backbone.prepended, **changes),
+        backbone.variant("matrix products alone", oracle="", **alone, **changes),
+    ]
 
 
 def without_encoder(config: GambaConfig) -> GambaConfig:

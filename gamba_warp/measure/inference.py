@@ -12,8 +12,16 @@ from torch import Tensor, nn
 
 from ..errors import UserError
 from ..gaussians import Gaussians
-from ..kernels.bench import Case, Error, Key, Settings, Target, Variant, compare
-from ..kernels.bench.core.case import make_cases
+from ..kernels.bench.core.case import (
+    Case,
+    Error,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    compare,
+    make_cases,
+)
 from ..kernels.bench.core.measure import peak_bytes
 from ..model.config import PRESETS
 from ..model.encoders import ImageEncoder

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..cameras import Cameras, intrinsics, orbit, plucker_rays
-from ..kernels.stress import Case, Op, Option, Outcome, Runs, generator
+from ..kernels.stress.core.case import Case, Op, Option, Outcome, Runs, generator
 from ..kernels.stress.core.rounding import SAMPLES, Rounding, samples_of
 from ..kernels.stress.oracles.scan import EXP_ULPS, conv, scan
 from ..model.config import GambaConfig

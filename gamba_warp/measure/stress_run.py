@@ -6,28 +6,22 @@ import importlib
 import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 
 from ..batch import progress_bar
 from ..errors import UserError
-from ..files import atomic_path, write_json
-from ..kernels.stress import (
-    Case,
-    Op,
-    Outcome,
-    draw_cases,
-    read_reproducer,
-    reproducer,
-    run_case,
-    shrink,
-)
-from ..kernels.stress.core.report import Tally, document, failure_text, markdown, table
+from ..files import write_json, write_text
+from ..kernels.runtime.tables import markdown
+from ..kernels.stress.core.case import Case, Op, Outcome, draw_cases, run_case, shrink
 from ..untrusted.documents import read_document
 from ..versions import __version__, installed
 
+FORMAT = "gamba_warp.stress.1"
 # What is stressed -> modules with an ``OP``. They are imported when they are asked for.
 SUITES = {
     "scan": ("gamba_warp.kernels.stress.cases.scan", "gamba_warp.kernels.stress.cases.conv"),
@@ -35,6 +29,10 @@ SUITES = {
     "model": ("gamba_warp.measure.stress",),
 }
 _SHRUNK = 5  # failures of a run that are made small; all are written
+_HEAD = (
+    *("op", "kind", "cases", "forward error", "of", "gradient error", "of", "error / limit"),
+    *("undecided pixels", "steep", "non-finite", "failures"),
+)
 
 
 def choose_ops(what: Sequence[str]) -> list[Op]:
@@ -53,17 +51,86 @@ def choose_ops(what: Sequence[str]) -> list[Op]:
     return [importlib.import_module(module).OP for name in wanted for module in SUITES[name]]
 
 
-def versions() -> dict[str, str]:
-    """Versions by name of what decides a result."""
-    return {"gamba_warp": __version__} | installed("torch", "warp-lang")
+@dataclass
+class Row:
+    """What the cases of one kind found so far.
+
+    Attributes:
+        op: name of the op.
+        kind: kind of values; "all" is the sum of an op.
+        cases: number of cases that were run.
+        forward: largest relative rms error of a forward result in float32, and its name.
+        gradient: largest relative rms error of a gradient, and its name.
+        ratio: largest error over its limit; infinite if something was not finite.
+        nonfinite: count of numbers that are not finite and should be.
+        failures: number of cases that failed in any way.
+        pixels: number of pixels compared (rasterizer).
+        undecided: number of those pixels in which rounding decides a cut or an order.
+        steep: number of cases that are judged by the widest limit of many trials.
+        seconds: time spent.
+    """
+
+    op: str
+    kind: str
+    cases: int = 0
+    forward: tuple[float, str] = (0.0, "")
+    gradient: tuple[float, str] = (0.0, "")
+    ratio: float = 0.0
+    nonfinite: int = 0
+    failures: int = 0
+    pixels: int = 0
+    undecided: int = 0
+    steep: int = 0
+    seconds: float = 0.0
+
+    def add(self, outcome: Outcome, seconds: float) -> None:
+        """Counts one case."""
+        self.cases += 1
+        self.seconds += seconds
+        self.nonfinite += outcome.nonfinite
+        self.failures += outcome.failure() is not None
+        self.pixels += outcome.pixels
+        self.undecided += outcome.undecided
+        self.steep += outcome.steep
+        for c in outcome.comparisons:
+            self.ratio = max(self.ratio, c.ratio)
+            which = "gradient" if c.name.startswith("gradient") else "forward"
+            if c.counts:
+                setattr(self, which, max(getattr(self, which), (c.error, c.name)))
+
+    def to_json(self) -> dict:
+        """The row as JSON values; what is not finite, which JSON cannot hold, is None."""
+        errors = {
+            name: {"error": _plain(error), "of": of}
+            for name, (error, of) in (("forward", self.forward), ("gradient", self.gradient))
+        }
+        rest = {"ratio": _plain(self.ratio), "seconds": round(self.seconds, 3)}
+        return asdict(self) | errors | rest
+
+
+def _plain(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def table(rows: Sequence[Row]) -> str:
+    """A Markdown table with its columns aligned for a terminal."""
+
+    def cells(r: Row) -> Iterator[str]:
+        yield from (r.op, r.kind, str(r.cases))
+        for error, of in (r.forward, r.gradient):
+            yield from (f"{error:.1e}" if error else "0", of.removeprefix("gradient of "))
+        yield f"{r.ratio:.2f}"
+        yield f"{r.undecided / r.pixels:.2%}" if r.pixels else ""
+        yield from map(str, (r.steep, r.nonfinite, r.failures))
+
+    return markdown(_HEAD, [[*cells(row)] for row in rows], aligned=True)
 
 
 class StressRun:
-    """One run: its tally, its failures, and the files that it leaves.
+    """One run: its rows, its failures, and the files that it leaves.
 
     Attributes:
         about: what is written of the run itself.
-        tally: the cases so far.
         failures: the file and a line of text of each failing case.
 
     Args:
@@ -80,7 +147,7 @@ class StressRun:
         self._ops, self._device, self._folder = ops, device, folder
         self._shrink_seconds = shrink_seconds
         self.about = {"seed": seed, "device": str(device), **versions()}
-        self.tally = Tally()
+        self._rows: dict[tuple[str, str], Row] = {}
         self.failures: list[dict[str, str]] = []
 
     def run(self, count: int | None, seconds: float) -> None:
@@ -99,7 +166,9 @@ class StressRun:
                     if index == count or started >= began + seconds:
                         break
                     outcome = run_case(op, case, self._device)
-                    self.tally.add(case, outcome, time.monotonic() - started)
+                    for key in ((case.op, "all"), (case.op, case.kind)):
+                        row = self._rows.setdefault(key, Row(*key))
+                        row.add(outcome, time.monotonic() - started)
                     if outcome.failure() is not None:
                         bar.set_postfix_str(f"{op.name}: a failure, made small")
                         self._keep_failure(op, case, outcome)
@@ -117,7 +186,7 @@ class StressRun:
         self.failures.append({"file": name})
 
         def keep(case: Case, outcome: Outcome) -> None:
-            write_json(self._folder / name, reproducer(case, outcome, versions()))
+            write_json(self._folder / name, reproducer(case, outcome))
             self.failures[-1]["text"] = failure_text(case, outcome)
 
         keep(case, outcome)  # as it is first, because making it small may be interrupted
@@ -126,19 +195,95 @@ class StressRun:
             if found.failure() is not None:
                 keep(small, found)
 
+    def _sorted(self) -> tuple[list[Row], list[Row]]:
+        """One row per op, and all others with those of an op together."""
+        totals = [row for row in self._rows.values() if row.kind == "all"]
+        ops = [row.op for row in totals]
+        rows = [row for row in self._rows.values() if row.kind != "all"]
+        return totals, sorted(rows, key=lambda row: ops.index(row.op))
+
     def write(self) -> None:
         """Writes stress.json and stress.md."""
-        content = self.tally, self.about, self.failures
-        write_json(self._folder / "stress.json", document(*content))
-        with atomic_path(self._folder / "stress.md") as temporary:
-            temporary.write_text(markdown(*content), encoding="utf-8")
+        totals, rows = self._sorted()
+        lists = {"totals": [r.to_json() for r in totals], "rows": [r.to_json() for r in rows]}
+        content = {"format": FORMAT, **self.about, **lists, "failures": self.failures}
+        write_json(self._folder / "stress.json", content)
+        about = ", ".join(f"{name} {value}" for name, value in self.about.items())
+        parts = ["# Numerical stress test", about, table(totals), table(rows)]
+        if self.failures:
+            lines = (f"- {f['file']}: {f['text']}" for f in self.failures)
+            parts += ["## Failures", "\n".join(lines)]
+        write_text(self._folder / "stress.md", "\n\n".join(parts) + "\n")
 
     def summary(self) -> str:
         """The table of the cases, and a line for each failure."""
-        lines = [table([*self.tally.sorted(), *self.tally.totals()])]
+        totals, rows = self._sorted()
+        lines = [table([*rows, *totals])]
         lines += [f"{self._folder / row['file']}: {row['text']}" for row in self.failures]
-        cases = sum(row.cases for row in self.tally.totals())
+        cases = sum(row.cases for row in totals)
         return "\n".join([*lines, f"{cases} cases, {len(self.failures)} failed"])
+
+
+def failure_text(case: Case, outcome: Outcome) -> str:
+    """Describes a failure in one line."""
+    failure = outcome.failure()
+    assert failure is not None
+    ratio = "" if failure["ratio"] is None else f"{failure['ratio']:.3g}"
+    words = {"limit": f" is {ratio} times its limit off", "not finite": " is not finite"}
+    return f"{case.op}, {case.kind}: {failure['name']}{words.get(failure['what'], '')}"
+
+
+def versions() -> dict[str, str]:
+    """Versions by name of what decides a result."""
+    return {"gamba_warp": __version__} | installed("torch", "warp-lang")
+
+
+def reproducer(case: Case, outcome: Outcome) -> dict:
+    """The content of a file from which ``replay`` runs a case again."""
+    failure = outcome.failure()
+    if failure is not None:
+        failure |= {name: _plain(failure[name]) for name in ("error", "ratio")}
+    return {"format": FORMAT, "case": asdict(case), "failure": failure, "versions": versions()}
+
+
+def read_reproducer(path: Path, ops: dict[str, Op]) -> Case:
+    """Reads the case of a ``reproducer``.
+
+    Raises:
+        UserError: no such file, not JSON, damaged, or from another version.
+    """
+    document = read_document(path, Any, limit=1 << 20)
+    try:
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise ValueError(f"not a case of 'gamba stress' (format is not {FORMAT})")
+        case = msgspec.convert(document.get("case"), Case)
+        op = ops.get(case.op)
+        if op is None or case.kind not in op.kinds:
+            raise ValueError(f"this version has no case {f'{case.op[:40]}, {case.kind[:40]}'!r}")
+        if not 0 <= case.seed < 2**31:
+            raise ValueError("damaged: seed is not in 0 to 2147483647")
+        _check_options(op, case.options)
+    except ValueError as error:  # msgspec's own is one
+        raise UserError(f"{path}: {error}") from error
+    return case
+
+
+def _check_options(op: Op, options: dict) -> None:
+    for name in sorted(options.keys() | op.plain.keys()):
+        if name not in op.plain or name not in options:
+            kind = "an unknown" if name in options else "no"
+            raise ValueError(f"{kind} option {name[:40]!r}; from another version, or damaged")
+        value, plain = options[name], op.plain[name]
+        allowed = op.choices.get(name)
+        wrong = type(value) is not type(plain) or (allowed and value not in allowed)
+        if wrong or (isinstance(value, (int, float)) and not 0 <= value <= 10**6):
+            shown = repr(value)[:40]
+            raise ValueError(f"option '{name}' is {shown}; from another version, or damaged")
+    fitting = op.valid(options)
+    for name, value in options.items():
+        if fitting[name] != value:
+            text = f"'{name}' is {value}, and {fitting[name]} is the nearest that fits"
+            raise ValueError(f"damaged: its options do not fit each other: {text}")
 
 
 def replay(paths: Sequence[Path], device: torch.device) -> Iterator[tuple[bool, str]]:
@@ -151,13 +296,7 @@ def replay(paths: Sequence[Path], device: torch.device) -> Iterator[tuple[bool, 
         UserError: no such file, not JSON, damaged, or from another version.
     """
     ops = {op.name: op for op in choose_ops(("all",))}
-    cases = []
-    for path in paths:
-        content = read_document(path, Any, limit=1 << 20)
-        try:
-            cases.append((path, read_reproducer(content, ops)))
-        except ValueError as error:
-            raise UserError(f"{path}: {error}") from error
+    cases = [(path, read_reproducer(path, ops)) for path in paths]
     for path, case in cases:
         outcome = run_case(ops[case.op], case, device)
         passes, worst = outcome.failure() is None, outcome.worst

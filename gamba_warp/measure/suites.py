@@ -14,8 +14,8 @@ from msgspec import Meta
 from ..batch import progress_bar
 from ..errors import UserError
 from ..files import output_folder, write_json, write_text
-from ..kernels.bench import Case, Settings, Target, measure
-from ..kernels.bench.core.measure import FORMAT, TIMES
+from ..kernels.bench.core.case import Case, Settings, Target
+from ..kernels.bench.core.measure import FORMAT, TIMES, measure
 from ..kernels.bench.core.report import TARGET_WORDS, judge, markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report

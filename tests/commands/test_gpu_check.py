@@ -20,7 +20,7 @@ from gamba_warp.gpu_check import STEPS, StepName
 from gamba_warp.gpu_check import check as gpu_check
 from gamba_warp.gpu_check import checks as gpu_kernels
 from gamba_warp.gpu_check.check import begin, in_a_process, main, run_gpu_check, run_step
-from gamba_warp.kernels.bench import Settings
+from gamba_warp.kernels.bench.core.case import Settings
 from gamba_warp.kernels.bench.static import dry_run
 from gamba_warp.measure import inference as bench_inference
 from gamba_warp.model.config import PRESETS

@@ -5,7 +5,8 @@ import torch
 from helpers import micro
 from lab.studies.training import loader
 
-from gamba_warp.kernels.bench import Settings, measure
+from gamba_warp.kernels.bench.core.case import Settings
+from gamba_warp.kernels.bench.core.measure import measure
 
 
 @pytest.mark.parametrize("given", [False, True])

@@ -14,9 +14,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.bench import BOTH, Case, Error, Settings, Variant
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from gamba_warp.kernels.bench.cases.scan_problem import make_inputs, scan_problem
+from gamba_warp.kernels.bench.core.case import BOTH, Case, Error, Settings, Variant
 from gamba_warp.kernels.bench.core.measure import peak_bytes
 
 from .slopes import GROWTH

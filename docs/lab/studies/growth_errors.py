@@ -18,8 +18,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gamba_warp.kernels import selective_scan
-from gamba_warp.kernels.bench import Case, Error, Settings, Variant, compare
 from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
+from gamba_warp.kernels.bench.core.case import Case, Error, Settings, Variant, compare
 
 from .slopes import ERRORS
 

@@ -19,9 +19,18 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from gamba_warp.kernels.bench import Case, Error, Settings, Stopped, Target, Variant, compare
+from gamba_warp.kernels.bench.core.case import (
+    BOTH,
+    Case,
+    Error,
+    Settings,
+    Stopped,
+    Target,
+    Variant,
+    compare,
+)
 from gamba_warp.kernels.bench.core.measure import peak_bytes, synchronize
-from gamba_warp.measure.blocks import BACKWARD_LIMIT, BOTH, LIMIT, reference_block
+from gamba_warp.measure.blocks import BACKWARD_LIMIT, LIMIT, reference_block
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.parts.attention import AttentionBlock
 from gamba_warp.model.parts.block import GambaBlock, run_blocks

@@ -12,8 +12,16 @@ from torch import Tensor
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
 from gamba_warp.data.preprocess import composite, prepare
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench import Case, Error, NotInstalled, Settings, Target, Variant, compare
-from gamba_warp.kernels.bench.core.case import make_cases
+from gamba_warp.kernels.bench.core.case import (
+    Case,
+    Error,
+    NotInstalled,
+    Settings,
+    Target,
+    Variant,
+    compare,
+    make_cases,
+)
 from gamba_warp.measure.blocks import Backbone
 from gamba_warp.measure.inference import captured
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
@@ -89,7 +97,7 @@ def compiled(settings: Settings) -> list[Variant]:
         runs["torch.compile"] = _Lazy(compiled_block)
     if settings.device.type == "cuda":
         runs["CUDA graph"] = _Lazy(graph)
-    return [backbone.variant(name, run, run is plain) for name, run in runs.items()]
+    return [backbone.way(name, run, default=run is plain) for name, run in runs.items()]
 
 
 class _Pictures:

@@ -12,7 +12,7 @@ from torch import Tensor
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.devices import float32_products, network_products
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench import Error, Key, Settings, Target, Variant, compare
+from gamba_warp.kernels.bench.core.case import Error, Key, Settings, Target, Variant, compare
 from gamba_warp.measure.blocks import Products, without_encoder
 from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, Preset

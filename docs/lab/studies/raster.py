@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.bench import DIRECTIONS, Case, Key, Settings, Target, Variant
 from gamba_warp.kernels.bench.cases.raster_parts import Parts
 from gamba_warp.kernels.bench.cases.raster_scene import (
     LEAVES,
@@ -20,7 +19,15 @@ from gamba_warp.kernels.bench.cases.raster_scene import (
     orbit_cameras,
     shell,
 )
-from gamba_warp.kernels.bench.core.case import make_cases
+from gamba_warp.kernels.bench.core.case import (
+    DIRECTIONS,
+    Case,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    make_cases,
+)
 from gamba_warp.kernels.rasterize import Skip, rasterization
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
 

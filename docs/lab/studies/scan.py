@@ -8,13 +8,20 @@ from unittest.mock import patch
 
 import torch
 
-from gamba_warp.kernels.bench import BOTH, Case, Key, Settings, Target, Variant
 from gamba_warp.kernels.bench.cases.scan_problem import (
     bare,
     count_memory,
     make_problem,
 )
-from gamba_warp.kernels.bench.core.case import make_cases
+from gamba_warp.kernels.bench.core.case import (
+    BOTH,
+    Case,
+    Key,
+    Settings,
+    Target,
+    Variant,
+    make_cases,
+)
 from gamba_warp.kernels.bench.core.problem import Operator
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda

@@ -8,8 +8,19 @@ import torch
 from torch import Tensor
 
 from ...causal_conv1d import causal_conv1d, causal_conv1d_fn
-from ..core.case import Case, Op, Option, Outcome, Runs, fitted, generator
-from ..core.ranges import COTANGENTS, DTYPES, RANGES, fill
+from ..core.case import (
+    COTANGENTS,
+    DTYPES,
+    RANGES,
+    Case,
+    Op,
+    Option,
+    Outcome,
+    Runs,
+    fill,
+    fitted,
+    generator,
+)
 from ..core.rounding import Rounding, samples_of
 from ..oracles import scan as scan_oracle
 from .scan import LAYOUTS, laid

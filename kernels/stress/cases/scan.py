@@ -9,8 +9,19 @@ import torch
 from torch import Tensor
 
 from ...selective_scan import selective_scan, selective_scan_fn, selective_scan_state
-from ..core.case import Case, Op, Option, Outcome, Runs, fitted, generator
-from ..core.ranges import COTANGENTS, DTYPES, RANGES, fill
+from ..core.case import (
+    COTANGENTS,
+    DTYPES,
+    RANGES,
+    Case,
+    Op,
+    Option,
+    Outcome,
+    Runs,
+    fill,
+    fitted,
+    generator,
+)
 from ..core.rounding import Rounding, samples_of
 from ..oracles import scan as scan_oracle
 

@@ -1,9 +1,10 @@
-"""A case as plain data, what running it found, and when that is a failure."""
+"""A case as plain data: drawn, run, judged, and made small if it fails."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from random import Random
@@ -12,7 +13,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .ranges import fill
 from .rounding import UNDERFLOW, UNIT
 
 FACTOR = 8.0  # largest error, as a multiple of what rounding does to the formula
@@ -25,6 +25,13 @@ _STORED = {
     torch.bfloat16: (2.0**-8, UNDERFLOW),
     torch.float16: (2.0**-11, 2.0**-25),
 }
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+RANGES = (
+    "normal", "uniform", "zeros", "ones", "alternating", "constant", "tiny", "denormal", "huge",
+    "spread", "spikes",
+)  # fmt: skip
+COTANGENTS = ("normal", "normal", "ones", "spikes", "zeros")
 
 
 @dataclass(frozen=True)
@@ -230,6 +237,61 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
         return Outcome(faults=[f"{type(error).__name__}: {text[0]}"])
 
 
+def draw_cases(ops: Sequence[Op], seed: int) -> Iterator[tuple[Op, Case]]:
+    """Draws cases endlessly, the same ones for the same ops and seed; ops and kinds take turns."""
+    count = 0
+    while True:
+        op = ops[count % len(ops)]
+        kind = op.kinds[count // len(ops) % len(op.kinds)]
+        rng = Random(f"{seed} {op.name} {count}")
+        options = op.draw(rng, kind)
+        yield op, Case(op.name, kind, rng.randrange(2**31), options)
+        count += 1
+
+
+def _size(op: Op, case: Case) -> float:
+    """Measures how far the options are from plain; shrinking only ever lowers it."""
+    pairs = [(case.options[name], plain) for name, plain in op.plain.items()]
+    far = (abs(a - b) if type(a) in (int, float) else float(a != b) for a, b in pairs)
+    return sum(far, float(case.kind != op.kinds[0]))
+
+
+def shrink(
+    op: Op, case: Case, device: torch.device, seconds: float = 30.0
+) -> tuple[Case, Outcome, int]:
+    """Looks greedily, for at most ``seconds``, for a smaller case that fails in the same way.
+
+    Returns:
+        The case, its outcome, and the number of cases tried.
+    """
+    outcome, tried, end = run_case(op, case, device), 0, time.monotonic() + seconds
+    failure = outcome.failure() or {}
+    improved = bool(failure)
+    while improved:
+        improved = False
+        for name in ("kind", *op.plain):
+            if name == "kind":
+                simpler = [replace(case, kind=op.kinds[0])]
+            else:  # the largest step towards the plain value first
+                value, plain = case.options[name], op.plain[name]
+                whole = type(value) is int
+                steps = [plain, (value + plain) // 2, value - 1] if whole else [plain]
+                options = [op.valid(case.options | {name: step}) for step in steps]
+                simpler = [replace(case, options=o) for o in options]
+            for candidate in simpler:
+                if time.monotonic() >= end:
+                    return case, outcome, tried
+                if _size(op, candidate) >= _size(op, case):
+                    continue
+                tried += 1
+                found = run_case(op, candidate, device)
+                other = found.failure()
+                if other is not None and other["what"] == failure["what"]:
+                    case, outcome, improved = candidate, found, True
+                    break
+    return case, outcome, tried
+
+
 def fitted(options: dict, sizes: tuple[str, ...], largest: int) -> dict:
     """Halves the largest of some sizes until their product is small enough; a 0 counts as 1.
 
@@ -248,6 +310,30 @@ def fitted(options: dict, sizes: tuple[str, ...], largest: int) -> dict:
 def generator(case: Case, name: str) -> torch.Generator:
     """Makes the source of chance for one tensor of a case, independent of its other tensors."""
     return torch.Generator().manual_seed(case.seed * 1009 + sum(name.encode()))
+
+
+def fill(shape: Sequence[int], kind: str, g: torch.Generator) -> Tensor:
+    """Draws float32 numbers of one of ``RANGES``.
+
+    "alternating" changes sign along dimension 1, "tiny" is around 1e-12, "denormal" around 1e-40
+    and "huge" around 1e4. "spread" is log-uniform in 1e-6..1e4 with either sign. "spikes" is 0,
+    except for one number in sixteen, which is around 1e3.
+    """
+    normal = torch.randn(shape, generator=g)
+    if kind == "uniform":
+        return torch.rand(shape, generator=g)
+    if kind == "spread":
+        return normal.sign() * 10 ** (10 * torch.rand(shape, generator=g) - 6)
+    if kind == "spikes":
+        return 1e3 * normal * (torch.rand(shape, generator=g) < 1 / 16)
+    if kind == "constant":
+        return torch.full(shape, torch.randn((), generator=g).item())
+    if kind in ("zeros", "ones", "alternating"):
+        values = torch.full(shape, float(kind != "zeros"))
+        if kind == "alternating" and len(shape) > 1:
+            values[:, 1::2] = -1
+        return values
+    return normal * {"tiny": 1e-12, "denormal": 1e-40, "huge": 1e4}.get(kind, 1.0)
 
 
 def fits(truth: Tensor, dtype: torch.dtype) -> Tensor:

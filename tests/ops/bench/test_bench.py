@@ -18,25 +18,24 @@ from lab.studies.training import step
 from gamba_warp import cli
 from gamba_warp.commands import bench
 from gamba_warp.errors import UserError
-from gamba_warp.kernels.bench import (
-    BOTH,
-    Case,
-    Error,
-    Key,
-    Settings,
-    Target,
-    Variant,
-    compare,
-    measure,
-    peers,
-)
+from gamba_warp.kernels.bench import peers
 from gamba_warp.kernels.bench.cases import conv as conv_suite
 from gamba_warp.kernels.bench.cases import raster as raster_suite
 from gamba_warp.kernels.bench.cases import scan as scan_suite
 from gamba_warp.kernels.bench.cases.raster_scene import make_scene
 from gamba_warp.kernels.bench.cases.scan_problem import make_inputs, scan_problem
-from gamba_warp.kernels.bench.core.case import NotInstalled
-from gamba_warp.kernels.bench.core.measure import peak_bytes, saved_bytes
+from gamba_warp.kernels.bench.core.case import (
+    BOTH,
+    Case,
+    Error,
+    Key,
+    NotInstalled,
+    Settings,
+    Target,
+    Variant,
+    compare,
+)
+from gamba_warp.kernels.bench.core.measure import measure, peak_bytes, saved_bytes
 from gamba_warp.kernels.bench.core.report import judge, markdown, ratio_table, ratios
 from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference

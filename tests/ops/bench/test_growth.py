@@ -17,8 +17,8 @@ from lab.studies.slopes import growth_lines, growth_table, growths, slope
 
 from gamba_warp.commands.bench import SUITES
 from gamba_warp.errors import UserError
-from gamba_warp.kernels.bench import Case, Settings, Variant
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
+from gamba_warp.kernels.bench.core.case import Case, Settings, Variant
 from gamba_warp.measure import suites
 from gamba_warp.measure.suites import check_document
 

@@ -12,7 +12,7 @@ from lab.studies.growth_errors import EPS, KINDS, Problem, Sizes
 from lab.studies.show import charts_of
 from lab.studies.slopes import ERRORS, growth_table
 
-from gamba_warp.kernels.bench import Settings
+from gamba_warp.kernels.bench.core.case import Settings
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import suites
 from gamba_warp.measure.suites import check_document

@@ -12,7 +12,7 @@ from lab.studies.crossing import crossings
 from lab.studies.lengths import ATTENTION, BOTH, MAMBA, Bench, Line, Sizes
 from lab.studies.show import charts_of, markdown, page, summary, with_crossings
 
-from gamba_warp.kernels.bench import Case, Settings
+from gamba_warp.kernels.bench.core.case import Case, Settings
 from gamba_warp.measure import suites
 from gamba_warp.measure.suites import check_document
 

@@ -12,8 +12,8 @@ from lab.studies.show import charts_of, markdown, page
 from torch.profiler import record_function
 
 from gamba_warp.errors import UserError
-from gamba_warp.kernels.bench import Case, Settings, Variant, measure
-from gamba_warp.kernels.bench.core.case import LEVELS, Level
+from gamba_warp.kernels.bench.core.case import LEVELS, Case, Level, Settings, Variant
+from gamba_warp.kernels.bench.core.measure import measure
 
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 

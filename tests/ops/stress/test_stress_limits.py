@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
-from gamba_warp.kernels.stress import Case, run_case
 from gamba_warp.kernels.stress.cases import raster
-from gamba_warp.kernels.stress.core.case import Comparison, Outcome, judge
+from gamba_warp.kernels.stress.core.case import Case, Comparison, Outcome, judge, run_case
 from gamba_warp.kernels.stress.core.rounding import SAMPLES, UNDERFLOW, Rounding, samples_of
 from gamba_warp.kernels.stress.oracles.scan import states
 from gamba_warp.measure import stress_run

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench import Error, Settings, Variant, compare
+from gamba_warp.kernels.bench.core.case import Error, Settings, Variant, compare
 from gamba_warp.kernels.bench.core.measure import peak_bytes
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.patches import foreground_patches

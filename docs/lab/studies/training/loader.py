@@ -15,7 +15,7 @@ import torch
 from gamba_warp.cameras import orbit
 from gamba_warp.data.dataset import ViewDataset, open_dataset
 from gamba_warp.images import save_image
-from gamba_warp.kernels.bench import Case, Key, Settings, Target, Variant
+from gamba_warp.kernels.bench.core.case import Case, Key, Settings, Target, Variant
 from gamba_warp.train.batches import Batches, TrainingData
 from gamba_warp.train.config import DataConfig, TrainConfig
 from gamba_warp.train.ddp import World

@@ -12,7 +12,15 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, cosine_similarity
 
 from gamba_warp.image_metrics import SSIM_WINDOW, ssim
-from gamba_warp.kernels.bench import Error, Key, NotInstalled, Settings, Target, Variant, compare
+from gamba_warp.kernels.bench.core.case import (
+    Error,
+    Key,
+    NotInstalled,
+    Settings,
+    Target,
+    Variant,
+    compare,
+)
 from gamba_warp.train.objective.losses import structure
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available, read_cached

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.data.dataset import ObjectViews, ViewDataset, open_dataset
-from gamba_warp.kernels.bench import Settings
+from gamba_warp.kernels.bench.core.case import Settings
 from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba

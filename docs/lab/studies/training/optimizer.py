@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from gamba_warp.kernels.bench import Error, Settings, Variant, compare
+from gamba_warp.kernels.bench.core.case import Error, Settings, Variant, compare
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.config import OptimConfig
 from gamba_warp.train.optim import Ema, build_optimizer
