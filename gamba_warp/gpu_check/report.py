@@ -33,8 +33,8 @@ def machine_facts(settings: Settings) -> dict:
 
 def headline(document: dict) -> list[tuple[str, str]]:
     """Returns what was found, in rows of a name and a value."""
-    joined = lambda values: ", ".join(f"{k} {v}" for k, v in values.items())  # noqa: E731
-    facts = document["machine"] | {"packages": joined(document["machine"]["packages"])}
+    packages = ", ".join(f"{k} {v}" for k, v in document["machine"]["packages"].items())
+    facts = document["machine"] | {"packages": packages}
     rows = [(name.replace("_", " "), str(value)) for name, value in facts.items() if value]
     for step in document["steps"]:
         reason = f": {step['reason']}" if step["reason"] else ""

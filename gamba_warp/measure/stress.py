@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -239,7 +241,7 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     oracle = _Oracle(case, model, trial)
     samples = {k: samples_of(x) for k, x in inputs.items()}
     truths = oracle.run(samples, cameras)
-    run = lambda: _run(model, case.options, inputs, cameras)  # noqa: E731
+    run = partial(_run, model, case.options, inputs, cameras)
     runs = Runs(case, run, leaves, truths, samples | oracle.weights)
     sizes = {k: x.dim() for k, x in (*leaves.items(), *runs.results.items())}
     return runs.outcome({k: tuple(range(n)) for k, n in sizes.items()})

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 import trimesh
 from helpers.released import make_released
 
@@ -21,14 +22,19 @@ class Job(NamedTuple):
     """One command that writes.
 
     Attributes:
-        words: the command and its arguments, by the folder of the small world and that of results.
+        line: the command and its arguments, with ``{world}`` for the folder of the small world and
+            ``{out}`` for that of results.
         other: further arguments that change what it writes, so that older results can be told.
         undo: removes a part of the results, where a command does not do again what is done.
     """
 
-    words: Callable[[Path, Path], list[object]]
-    other: tuple[object, ...] = ()
+    line: str
+    other: str = ""
     undo: Callable[[Path], None] | None = None
+
+    def words(self, world: Path, out: Path) -> list[str]:
+        """The command and its arguments."""
+        return [word.format(world=world, out=out) for word in self.line.split()]
 
 
 def without_one_object(out: Path) -> None:
@@ -37,100 +43,67 @@ def without_one_object(out: Path) -> None:
         remove_folder(path.parent)
 
 
-CPU = ("--device", "cpu")
-SMALL = ("--size", 16, "--frames", 2, *CPU)
-MODEL = ("image_size=16", "patch_size=4", "width=16", "depth=1", "state_size=4", "scale_init=0.06")
+SMALL = "--size 16 --frames 2 --device cpu"
+MODEL = "image_size=16 patch_size=4 width=16 depth=1 state_size=4 scale_init=0.06"
 JOBS = {
     "reconstruct": Job(
-        lambda world, out: [
-            *("reconstruct", world / "pictures", "--out", out, *SMALL),
-            *("--checkpoint", world / "run" / "model.safetensors"),
-            *("--splats", "ply", "splat", "glb"),
-        ],
-        ("--elevation", 20),
+        "reconstruct {world}/pictures --out {out} --checkpoint {world}/run/model.safetensors "
+        f"--splats ply splat glb {SMALL}",
+        "--elevation 20",
     ),
     "export": Job(
-        lambda world, out: [
-            *("export", world / "gaussians", "--out", out, "--voxels", 24, "--views", 8),
-            *("--pixels", 32, "--mesh", "glb", "ply", "--splats", "ply", "--page"),
-            *("--turntable", "gif", *SMALL),
-        ],
-        ("--frame", "opencv"),
+        "export {world}/gaussians --out {out} --voxels 24 --views 8 --pixels 32 --mesh glb ply "
+        f"--splats ply --page --turntable gif {SMALL}",
+        "--frame opencv",
     ),
     "render": Job(
-        lambda world, out: [
-            *("render", world / "gaussians", "--out", out, "--kind", "png", "--size", 32),
-            *("--frames", 3, "--depth", *CPU),
-        ],
-        ("--elevation", 20),
+        "render {world}/gaussians --out {out} --kind png --size 32 --frames 3 --depth --device cpu",
+        "--elevation 20",
     ),
     "fit": Job(
-        lambda world, out: [
-            *("fit", world / "data", "--out", out, "--steps", 4, "--gaussians", 60, *CPU)
-        ],
-        ("--seed", 1),
+        "fit {world}/data --out {out} --steps 4 --gaussians 60 --device cpu",
+        "--seed 1",
     ),
     "data render": Job(
-        lambda world, out: [
-            *("data", "render", world / "meshes", "--out", out, "--views", 2, "--size", 16),
-            *("--workers", 1),
-        ],
+        "data render {world}/meshes --out {out} --views 2 --size 16 --workers 1",
         undo=without_one_object,
     ),
     "eval-views": Job(
-        lambda world, out: [
-            *("eval-views", "--checkpoint", world / "run" / "model.safetensors"),
-            *("--data", world / "data", "--out", out, "--split", "all"),
-            *("--no-lpips", "--save-gaussians", *CPU),
-        ],
-        ("--views", 3),
+        "eval-views --checkpoint {world}/run/model.safetensors --data {world}/data --out {out} "
+        "--split all --no-lpips --save-gaussians --device cpu",
+        "--views 3",
     ),
     "eval-geometry": Job(
-        lambda world, out: [
-            *("eval-geometry", world / "meshes", world / "meshes", "--out", out, "--points", 500)
-        ],
-        ("--seed", 1),
+        "eval-geometry {world}/meshes {world}/meshes --out {out} --points 500",
+        "--seed 1",
     ),
     "import-released": Job(
-        lambda world, out: [
-            *("import-released", world / "released" / "theirs.pth", "--out", out),
-            *("--encoder-weights", world / "released" / "vit.safetensors", "--depth", 1),
-        ]
+        "import-released {world}/released/theirs.pth --out {out} "
+        "--encoder-weights {world}/released/vit.safetensors --depth 1"
     ),
     "data pack": Job(
-        lambda world, out: [*("data", "pack", world / "data", out, "--size", 16, "--workers", 1)],
+        "data pack {world}/data {out} --size 16 --workers 1",
         undo=remove_folder,
     ),
     "ablate": Job(
-        lambda world, out: [
-            *("ablate", world / "plan.json", world / "data", "--out", out, "--rows", "fit", *CPU)
-        ],
+        "ablate {world}/plan.json {world}/data --out {out} --rows fit --device cpu",
         undo=lambda out: remove_folder(out / "rows"),
     ),
-    "data furniture": Job(
-        lambda world, out: ["data", "furniture", "--tree", world / "libraries", "--out", out]
-    ),
-    "view": Job(
-        lambda world, out: [
-            *("view", world / "gaussians" / "ball.ply", "--out", out / "page.html"),
-            "--no-open-browser",
-        ]
-    ),
-    "stress": Job(
-        lambda world, out: ["stress", "scan", "--cases", 2, *CPU, "--out", out], ("--seed", 1)
-    ),
-    "bench": Job(
-        lambda world, out: ["bench", "--render", world / "bench" / "bench.json", "--out", out]
-    ),
+    "data furniture": Job("data furniture --tree {world}/libraries --out {out}"),
+    "view": Job("view {world}/gaussians/ball.ply --out {out}/page.html --no-open-browser"),
+    "stress": Job("stress scan --cases 2 --device cpu --out {out}", "--seed 1"),
+    "bench": Job("bench --render {world}/bench/bench.json --out {out}"),
 }
 
 
-def training(world: Path, out: Path, steps: int) -> list[object]:
+def training(world: Path, out: Path, steps: int) -> list[str]:
     """The command that trains a tiny model, or goes on."""
-    words: list[object] = ["train", world / "data", "--preset", "tiny", "--set", *MODEL]
-    words += ["--size", 16, "--lpips", "off", "--views-last", 2, "--val-every", 10, *CPU]
-    words += ["--workers", 1, "--no-tensorboard", "--batch-size", 2, "--save-every", 3]
-    return [*words, "--log-every", 1, "--out", out, "--steps", steps]
+    line = (
+        f"train {{world}}/data --preset tiny --set {MODEL} --size 16 --lpips off --views-last 2 "
+        "--val-every 10 --device cpu --workers 1 --no-tensorboard --batch-size 2 --save-every 3 "
+        f"--log-every 1 --out {{out}} --steps {steps}"
+    )
+    return Job(line).words(world, out)
 
 
 def undisturbed(*words: object):
@@ -143,60 +116,60 @@ def undisturbed(*words: object):
 def make_world(folder: Path, commands: list[str]) -> None:
     """Makes data, a model, pictures, meshes and what else the commands need."""
     rng = np.random.default_rng(0)
-    (folder / "meshes").mkdir()
+    for name in ("meshes", "pictures", "gaussians"):
+        (folder / name).mkdir()
     solids = {"ball": trimesh.creation.icosphere(1), "box": trimesh.creation.box()}
     for name, mesh in (solids | {"cone": trimesh.creation.cone(1, 2)}).items():
         mesh.export(folder / "meshes" / f"{name}.ply")
-    data = ("--views", 4, "--size", 16, "--workers", 1, "--out", folder / "data")
-    undisturbed("data", "render", folder / "meshes", *data)
+    data = "data render {world}/meshes --out {out} --views 4 --size 16 --workers 1"
+    undisturbed(*Job(data).words(folder, folder / "data"))
     parts = {"version": 1, "train": ["ball", "box"], "val": ["cone"], "test": []}
     write_json(folder / "data" / "split.json", parts)
     undisturbed(*training(folder, folder / "run", 2))
     rgba = np.zeros((20, 30, 4))
     rgba[4:16, 8:24] = (0.8, 0.3, 0.1, 1)
     for name in ("a", "b"):
-        (folder / "pictures").mkdir(exist_ok=True)
         save_image(folder / "pictures" / f"{name}.png", rgba)
     points = rng.normal(size=(200, 3))
     points *= 0.4 / np.linalg.norm(points, axis=1, keepdims=True)
-    (folder / "gaussians").mkdir()
     save_ply(folder / "gaussians" / "ball.ply", ball(points))
     if "ablate" in commands:
-        write_json(folder / "plan.json", plan())
+        write_json(folder / "plan.json", PLAN)
     if "data furniture" in commands:
         make_library(folder / "libraries", folder / "pictures" / "a.png")
     if "import-released" in commands:
         make_released(folder / "released")
     if "bench" in commands:
-        undisturbed("bench", "conv", "--quick", *CPU, "--out", folder / "bench")
+        quick = "bench conv --quick --device cpu --out {out}"
+        undisturbed(*Job(quick).words(folder, folder / "bench"))
 
 
 def ball(points: np.ndarray) -> Gaussians:
     """Opaque Gaussians at points ``[N, 3]``."""
-    import torch
-
-    size = len(points)
+    size, generator = len(points), torch.Generator().manual_seed(0)
     return Gaussians(
-        means=torch.from_numpy(points).float(),
-        quats=None,
-        scales=torch.full((size, 3), 0.08),
-        opacities=torch.full((size,), 0.95),
-        colors=torch.rand(size, 3, generator=torch.Generator().manual_seed(0)),
+        torch.from_numpy(points).float(),
+        None,
+        torch.full((size, 3), 0.08),
+        torch.full((size,), 0.95),
+        torch.rand(size, 3, generator=generator),
     )
 
 
-def plan() -> dict:
-    """An ablation of one fit of a few steps."""
-    fit = {"steps": 3, "limit": 1, "held_out": 3, "size": 16}
-    return {
-        "name": "small",
-        "title": "One fit",
-        "seeds": [0],
-        "base": {"preset": "tiny", "options": {"steps": 2, "batch_size": 2}, "fit": fit},
-        "evaluation": {"split": "val", "objects": 1, "views": 3, "size": 16},
-        "compare_with": "model",
-        "rows": [{"name": "model"}, {"name": "fit", "kind": "fit", "options": {"gaussians": 20}}],
-    }
+# An ablation of one fit of a few steps.
+PLAN = {
+    "name": "small",
+    "title": "One fit",
+    "seeds": [0],
+    "base": {
+        "preset": "tiny",
+        "options": {"steps": 2, "batch_size": 2},
+        "fit": {"steps": 3, "limit": 1, "held_out": 3, "size": 16},
+    },
+    "evaluation": {"split": "val", "objects": 1, "views": 3, "size": 16},
+    "compare_with": "model",
+    "rows": [{"name": "model"}, {"name": "fit", "kind": "fit", "options": {"gaussians": 20}}],
+}
 
 
 def make_library(folder: Path, icon: Path) -> None:

@@ -118,7 +118,7 @@ def test_a_disturbed_command_loses_nothing(world, tmp_path, name, fault):
         if job.undo is not None and out.exists():
             job.undo(out)
         before = contents(out)
-        changed = [*words, *(job.other if turn % 2 == 0 else ())]
+        changed = [*words, *(job.other.split() if turn % 2 == 0 else ())]
         if fault == "SIGKILL":
             after = rng.uniform(0.02, 1.1) * first.seconds
             end = run_child(gamba, *changed, kill_after=after)
@@ -209,6 +209,6 @@ def test_children_end_as_they_are_told(tmp_path):
 def test_a_made_up_released_file_is_imported(tmp_path):
     make_released(tmp_path / "released")
     name, *words = JOBS["import-released"].words(tmp_path, tmp_path / "out")
-    assert run(name, [*map(str, words)]) == 0
+    assert run(name, words) == 0
     config = json.loads((tmp_path / "out" / "config.json").read_text())
     assert {name: config[name] for name in SIZES} == SIZES

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from gamba_warp.kernels.bench.cases.raster_parts import Parts
 from gamba_warp.kernels.bench.cases.raster_scene import (
@@ -28,16 +26,16 @@ from gamba_warp.kernels.bench.core.case import (
     Variant,
     make_cases,
 )
-from gamba_warp.kernels.rasterize import Skip, rasterization
+from gamba_warp.kernels.rasterize import Skip
 from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
 
+from .growth import near_crop
 from .scan import on_kernels
 
 _FEW = 16384
 _CASE = "large scenes"
 _FRONT = "projection and lists"
 _SUM = "pairs_and_gaussians"
-_MARGIN = 16  # pixels around the crop of the check, within which the oracle sees all Gaussians
 _LEVELS = {"quick": (1024, 40000), "normal": (_FEW, 262144), "full": (_FEW, 262144, 1048576)}
 
 
@@ -143,18 +141,6 @@ class LargeScene(Scene):
         left, top, width, height = super().crop(True)
         return left + (self.width - self.size) // 2, top, width, height
 
-    def see_around_the_crop(self) -> None:
-        """Gives the oracle the Gaussians whose boxes meet the crop or a margin around it."""
-        left, top, width, height = self.crop(False)
-        Ks = self.Ks[:1].clone()
-        Ks[:, 0, 2] -= left - _MARGIN
-        Ks[:, 1, 2] -= top - _MARGIN
-        sizes: dict[str, Any] = dict(width=width + 2 * _MARGIN, height=height + 2 * _MARGIN)
-        with torch.no_grad():
-            meta = rasterization(**self.gaussians, viewmats=self.viewmats[:1], Ks=Ks, **sizes)[2]
-        near: Tensor = (meta["radii"][0] > 0).any(-1)
-        self.truth = {k: x[near] for k, x in self.gaussians.items()}
-
 
 def _scene(settings: Settings, count: int, few: int, size: int, wide: bool) -> LargeScene:
     viewmats, Ks = orbit_cameras(1, size)
@@ -166,7 +152,8 @@ def _scene(settings: Settings, count: int, few: int, size: int, wide: bool) -> L
     scene = LargeScene(gaussians, viewmats, Ks, size, settings.device, cotangent=cotangent)
     scene.wide = wide
     if count > few:
-        scene.see_around_the_crop()
+        near = near_crop(scene, False).to(settings.device)
+        scene.truth = {k: x[near] for k, x in scene.gaussians.items()}
     return scene
 
 

@@ -20,7 +20,7 @@ class Problem:
     ``check``, ``oracle`` and ``limit`` of a direction (see ``Variant``).
     """
 
-    sizes: Mapping[str, Any]
+    sizes: dict[str, Any]
     forward: Callable[..., object]
     backward: Callable[..., object]
     check: Callable[..., Error]
@@ -83,7 +83,7 @@ class Operator(Problem):
     cotangent: Tensor
     device: torch.device
     text: str
-    sizes: Mapping[str, int]
+    sizes: dict[str, int]
     limits: Mapping[str, float]
     half_limits: Mapping[torch.dtype, float] = field(default_factory=dict)
     cast: tuple[str, ...] = ()

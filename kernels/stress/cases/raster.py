@@ -334,8 +334,8 @@ def _poison_faults(case: Case, x: dict, run, runs: Runs) -> list[str]:
     bad, old = poisoned(case, x)
     again = run(bad)
     others = gradients_of(again, {k: bad[k] for k in runs.grads}, runs.cotangents)
-    faults = [f"{n} changed by Gaussians that are not finite" for n, x in runs.results.items()
-              if not torch.equal(x, again[n])]  # fmt: skip
+    moved = [name for name, x in runs.results.items() if not torch.equal(x, again[name])]
+    faults = [f"{name} changed by Gaussians that are not finite" for name in moved]
     for name, gradient in runs.grads.items():
         other, of_gaussian = others[name], name in GAUSSIAN
         axis = gaussians_axis(case.options, name)

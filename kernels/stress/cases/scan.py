@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import torch
@@ -159,7 +160,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     batch, length, channels, n = (o[k] for k in ("batch", "length", "channels", "states"))
     token, grouped = (batch, length, channels), (batch, length, o["groups"], n)
     g = {name: generator(case, name) for name in ("u", "delta", "A", "B", "C", "z", "rest")}
-    rest = lambda *shape: torch.randn(*shape, generator=g["rest"])  # noqa: E731
+    rest = partial(torch.randn, generator=g["rest"])
     steps, rates = _steps_and_rates(o, token, g)
     B_shape = (channels, n) if o["constant_B"] else grouped
     made = {
@@ -209,10 +210,8 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
         return {"last": state}
     u, delta, B, C = (x[name][:, k:] for name in ("u", "delta", "B", "C"))
     z = None if x["z"] is None else x["z"][:, k:]
-    result = selective_scan(
-        u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], initial_state=state,
-        return_last_state=o["last"], **common,
-    )  # fmt: skip
+    common |= dict(initial_state=state, return_last_state=o["last"])
+    result = selective_scan(u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], **common)
     return dict(zip(("out", "last"), result if isinstance(result, tuple) else (result,)))
 
 

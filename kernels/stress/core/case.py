@@ -401,10 +401,9 @@ def gradients_of(results: dict, leaves: dict, cotangents: dict) -> dict[str, Ten
     names = [n for n in results if results[n].requires_grad and results[n].numel()]
     if not names:
         return {k: torch.zeros_like(x) for k, x in leaves.items()}
-    grads = torch.autograd.grad(
-        [results[n] for n in names], list(leaves.values()),
-        [cotangents[n].to(results[n]).expand_as(results[n]) for n in names], allow_unused=True,
-    )  # fmt: skip
+    outputs = [results[n] for n in names]
+    upstream = [cotangents[n].to(x).expand_as(x) for n, x in zip(names, outputs)]
+    grads = torch.autograd.grad(outputs, list(leaves.values()), upstream, allow_unused=True)
     return {k: torch.zeros_like(x) if g is None else g for (k, x), g in zip(leaves.items(), grads)}
 
 

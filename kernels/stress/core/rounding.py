@@ -89,15 +89,19 @@ class Rounding:
     def sum(self, x: Tensor, dim: int) -> Tensor:
         """Adds up a dimension; rounds as ``added`` does, and not the total."""
         dim %= x.dim()
-        back = lambda v: v.unsqueeze(dim).expand(x.shape)  # noqa: E731
-        return _Step.apply(x, lambda x: self.added(x, (dim,)), back)
+        shape = x.shape
+        return _Step.apply(
+            x, lambda x: self.added(x, (dim,)), lambda v: v.unsqueeze(dim).expand(shape)
+        )
 
     def share(self, x: Tensor, *shape: int) -> Tensor:
         """Expands ``x`` to a shape (-1 keeps a size); its gradient is a sum as of ``added``."""
         sizes = tuple(a if b < 0 else b for a, b in zip(x.shape, shape, strict=True))
         dims = tuple(d for d, (a, b) in enumerate(zip(x.shape, sizes)) if a != b)
-        back = lambda v: self.added(v, dims).reshape(x.shape)  # noqa: E731
-        return _Step.apply(x, lambda x: x.expand(sizes), back)
+        shape = x.shape
+        return _Step.apply(
+            x, lambda x: x.expand(sizes), lambda v: self.added(v, dims).reshape(shape)
+        )
 
     def sigmoid(self, x: Tensor, ulps: float) -> Tensor:
         """Computes 1 / (1 + e^-x) to ``ulps``."""
@@ -107,8 +111,7 @@ class Rounding:
         with torch.no_grad():
             y = self.rounded(function(x), ulps)
             rate = self.rounded(slope(x, y), ulps)
-        back = lambda v: self.rounded(v * rate, 1.0, up=False)  # noqa: E731
-        return _Step.apply(x, lambda _: y, back)
+        return _Step.apply(x, lambda _: y, lambda v: self.rounded(v * rate, 1.0, up=False))
 
     def rounded(self, x: Tensor, ulps: float, up: bool = True) -> Tensor:
         """Rounds as the call does, without a gradient.

@@ -75,7 +75,10 @@ def _rotation(q: Tensor, r: Rounding) -> Tensor:
     size = q.norm(dim=-1, keepdim=True)
     identity = q.new_tensor([1.0, 0, 0, 0]).expand_as(q)
     w, x, y, z = r(torch.where(size > 0, q / size.clamp_min(1e-300), identity)).unbind(-1)
-    two = lambda a, b, c, d: r(2 * (r(a * b) + r(c * d)))  # noqa: E731
+
+    def two(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+        return r(2 * (r(a * b) + r(c * d)))
+
     rows = [
         [r(1 - two(y, y, z, z)), two(x, y, -w, z), two(x, z, w, y)],
         [two(x, y, w, z), r(1 - two(x, x, z, z)), two(y, z, -w, x)],

@@ -58,7 +58,10 @@ def _walk_rounded(f: Tensor, w: Tensor, first: Tensor, r: Rounding) -> tuple[Ten
     What a token rounds goes on to the next with the state, as another input does. So it is found
     for all tokens of the exact walk at once, and a second walk takes it along.
     """
-    before = lambda h: torch.cat([first[:, :, None], h[:, :, :-1]], 2)  # noqa: E731
+
+    def before(h: Tensor) -> Tensor:
+        return torch.cat([first[:, :, None], h[:, :, :-1]], 2)
+
     h = _walk(f, w, first)
     products = f * before(h)
     rounded = r.rounded(products, 1.0) - products + (r.rounded(h, 1.0) - h)
