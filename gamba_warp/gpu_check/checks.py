@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians
+from ..kernels.bench.cases.conv import conv_problem
 from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from ..kernels.bench.cases.scan_problem import make_inputs, scan_problem
 from ..kernels.bench.core.case import BOTH, Error, Settings, compare
 from ..kernels.bench.core.problem import Operator
 from ..kernels.causal_conv1d import causal_conv1d
-from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.rasterize import lists_outgrown, rasterization
 from ..kernels.selective_scan.cuda import launch as cuda_scan
 from ..kernels.selective_scan.cuda.launch import Tuning
@@ -129,22 +129,9 @@ def _scan_twice(device: torch.device) -> str:
     return "equal"
 
 
-def _conv(shape: tuple, device: torch.device) -> str:
+def _conv(shape: tuple[int, int, int, int], device: torch.device) -> str:
     """Checks the output and all gradients, from given first tokens."""
-    batch, length, channels, taps = shape
-    g = torch.Generator().manual_seed(0)
-    sizes = {"x": (batch, length, channels), "weight": (channels, taps), "bias": (channels,)}
-    sizes["initial_state"] = (batch, taps - 1, channels)
-    inputs = {name: torch.randn(*size, generator=g) for name, size in sizes.items()}
-    cotangent = torch.randn(*sizes["x"], generator=g)
-    mine: dict[str, Any] = {k: x.to(device).requires_grad_() for k, x in inputs.items()}
-    exact = {name: x.double().requires_grad_() for name, x in inputs.items()}
-    out = causal_conv1d(**mine, activation="silu")
-    want, _ = causal_conv1d_reference(**exact, activation="silu")
-    grads = torch.autograd.grad(out, list(mine.values()), cotangent.to(device))
-    wants = torch.autograd.grad(want, list(exact.values()), cotangent.double())
-    got = {"out": out} | dict(zip(mine, grads))
-    return within(compare(got, {"out": want} | dict(zip(exact, wants))), LIMIT)
+    return within(conv_problem(device, shape, state=True).check(BOTH), LIMIT)
 
 
 def _scene(count: int, size: int, views: int, options: dict, device: torch.device) -> Scene:

@@ -9,12 +9,11 @@ from pathlib import Path
 import torch
 import warp as wp
 
-from ..cameras import Cameras, intrinsics, orbit
 from ..errors import first_line
-from ..gaussians import Gaussians
-from ..kernels.selective_scan import selective_scan
+from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
+from ..kernels.bench.cases.scan_problem import make_inputs, scan_problem
+from ..kernels.bench.core.measure import synchronize
 from ..model.checkpoint import DEFAULT_CHECKPOINT
-from ..render import render
 from ..versions import EXTRA_OF, import_open3d, to_install
 from ..vision.fetch import cache_folder
 from ..vision.weights import FETCH, lpips_available
@@ -82,37 +81,12 @@ def warm_up_kernels() -> Iterator[tuple[str, float, float]]:
         The device's type, the seconds of the first run, which compiles or loads the kernels, and
         those of the second.
     """
-    for device in ["cpu", "cuda"][: 1 + torch.cuda.is_available()]:
-        first, again = (_seconds_of_a_run(device) for _ in range(2))
-        yield device, first, again
-
-
-def _seconds_of_a_run(device: str) -> float:
-    started = time.perf_counter()
-    _run_scan(device)
-    _run_rasterizer(device)
-    if device != "cpu":
-        torch.cuda.synchronize()
-    return time.perf_counter() - started
-
-
-def _run_scan(device: str) -> None:
-    u, delta, z = torch.rand(3, 1, 32, 32, device=device).requires_grad_()
-    a = -torch.rand(32, 16, device=device)
-    b, c = torch.rand(2, 1, 32, 16, device=device)
-    direct, bias = torch.rand(2, 32, device=device)
-    selective_scan(u, delta, a, b, c, direct, z, bias, delta_softplus=True).sum().backward()
-
-
-def _run_rasterizer(device: str) -> None:
-    n = 64
-    gaussians = Gaussians(
-        means=torch.rand(n, 3) - 0.5,
-        quats=torch.randn(n, 4),
-        scales=torch.full((n, 3), 0.05),
-        opacities=torch.full((n,), 0.5),
-        colors=torch.rand(n, 3),
-    ).to(device)
-    gaussians.means.requires_grad_()
-    cameras = Cameras(orbit(torch.tensor([0.0])), intrinsics(32, 32)[None], 32, 32).to(device)
-    render(gaussians, cameras).rgb.sum().backward()
+    for name in ["cpu", "cuda"][: 1 + torch.cuda.is_available()]:
+        device, spans = torch.device(name), []
+        for _ in range(2):
+            started = time.perf_counter()
+            scan_problem(make_inputs(1, 32, 32), device, 32).backward()
+            Scene(shell(64), *orbit_cameras(1, 32), 32, device).backward()
+            synchronize(device)
+            spans.append(time.perf_counter() - started)
+        yield name, spans[0], spans[1]

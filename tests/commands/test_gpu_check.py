@@ -168,8 +168,7 @@ def test_the_checks_of_the_kernels(tmp_path):
 
 
 def test_a_wrong_kernel_fails_its_check(monkeypatch, tmp_path):
-    right, call = gpu_kernels.causal_conv1d, gpu_kernels.Operator.call
-    monkeypatch.setattr(gpu_kernels, "causal_conv1d", lambda *a, **k: right(*a, **k) + 1e-4)
+    call = gpu_kernels.Operator.call
     monkeypatch.setattr(gpu_kernels.Operator, "call", lambda *a, **k: call(*a, **k) * 1.0001)
     names = (
         "scan (2, 139, 37, 3, 1)",

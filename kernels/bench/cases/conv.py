@@ -26,8 +26,8 @@ from ..core.problem import Operator
 
 LIMITS = {"forward": 1e-6, BOTH: 1e-5}
 HALF_LIMITS = {torch.bfloat16: 1e-2, torch.float16: 2e-3}
-_TAPS = 4
-_SIZES = {"quick": (1024, 256), "normal": (16961, 1024), "full": (16961, 1024)}
+_FULL = (1, 16961, 1024, 4)
+_SIZES = {"quick": (1, 1024, 256, 4), "normal": _FULL, "full": _FULL}  # of ``conv_problem``
 _TOKENS = 2048  # that the oracle looks at
 
 
@@ -44,24 +44,41 @@ def _reference(**inputs: Tensor) -> Tensor:
 _silu = partial(causal_conv1d, activation="silu")
 
 
-def _problem(settings: Settings, function: Callable = _silu, turned: bool = False) -> Operator:
-    """``function(x, weight, bias)``; the oracle sees all channels of the first tokens."""
-    length, width = _SIZES[settings.level]
+def conv_problem(
+    device: torch.device,
+    sizes: tuple[int, int, int, int],
+    function: Callable[..., Tensor] = _silu,
+    turned: bool = False,
+    state: bool = False,
+) -> Operator:
+    """``function(x, weight, bias)``; the oracle sees all channels of the first tokens.
+
+    Args:
+        device: where the operator runs.
+        sizes: batch, tokens, channels and taps.
+        function: the operator, or another package's.
+        turned: whether that wants ``x [B, D, L]``.
+        state: whether ``initial_state`` is an input too.
+    """
+    batch, length, width, taps = sizes
     tokens = min(length, _TOKENS)
     g = torch.Generator().manual_seed(0)
     inputs = {
-        "x": torch.randn(1, length, width, generator=g),
-        "weight": torch.rand(width, _TAPS, generator=g) - 0.5,
+        "x": torch.randn(batch, length, width, generator=g),
+        "weight": torch.rand(width, taps, generator=g) - 0.5,
         "bias": torch.rand(width, generator=g) - 0.5,
     }
+    cotangent = torch.randn(batch, length, width, generator=g)
+    if state:
+        inputs["initial_state"] = torch.randn(batch, taps - 1, width, generator=g)
     return Operator(
         function,
         _reference,
         inputs,
-        torch.randn(1, length, width, generator=g),
-        settings.device,
+        cotangent,
+        device,
         "float64 sum" + (f", first {tokens} tokens" if tokens < length else ""),
-        {"B": 1, "L": length, "D": width, "taps": _TAPS},
+        {"B": batch, "L": length, "D": width, "taps": taps},
         LIMITS,
         HALF_LIMITS,
         cast=("x", "out"),
@@ -72,16 +89,17 @@ def _problem(settings: Settings, function: Callable = _silu, turned: bool = Fals
 
 def operator(settings: Settings) -> list[Variant]:
     """Convolution and SiLU beside torch's grouped convolution in its own layout."""
-    made = _problem(settings).pair("default", default=True)
-    made += _problem(settings, peers.torch_conv, True).pair("torch conv1d", peer=True, rounds=10)
+    problem = partial(conv_problem, settings.device, _SIZES[settings.level])
+    made = problem().pair("default", default=True)
+    made += problem(peers.torch_conv, True).pair("torch conv1d", peer=True, rounds=10)
     if settings.peers and settings.device.type == "cuda":
-        made += _problem(settings, peers.causal_conv1d, True).pair("causal-conv1d", peer=True)
+        made += problem(peers.causal_conv1d, True).pair("causal-conv1d", peer=True)
     return made
 
 
 def knobs(settings: Settings) -> list[Variant]:
     """Half precision is compared with the truth of the float32 inputs."""
-    problem, made = _problem(settings), []
+    problem, made = conv_problem(settings.device, _SIZES[settings.level]), []
     for dtype in (torch.float32, torch.bfloat16, torch.float16):
         default = dtype == torch.float32
         made += problem.pair(dtype_name(dtype), {"dtype": dtype}, default=default)
