@@ -74,7 +74,7 @@ ROOMS = {
     "kernels.stress.cases": Room(
         "one file a subject", (*_KERNELS, "kernels.stress.core", "kernels.stress.oracles")
     ),
-    "kernels.stress": Room("its public names", ("kernels.stress.core",)),
+    "kernels.stress": Room("the folder of its three rooms"),
     "words": Room("Gaussians, cameras, images, rendering, files, errors", _KERNELS),
     "compat": Room("other packages' interfaces over our kernels", _WORDS),
     "untrusted": Room("what strangers' files go through first", _WORDS),
