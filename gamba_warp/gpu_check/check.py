@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import signal
 import sys
@@ -197,21 +198,34 @@ def do(report: Report, step: Step, seconds: float) -> None:
 
 
 def in_a_process(function: Callable[[str], object], name: str, seconds: float) -> object:
-    """``function(name)`` in a process of its own, which is ended with all that it has started."""
-    with tempfile.TemporaryDirectory() as folder:
-        number = Path(folder) / "number"
+    """``function(name)`` in a process of its own, which is ended with all that it has started.
+
+    Returns:
+        The value or ``Failed``; of a process that died, with the last line that it wrote.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        number, said = Path(place) / "number", Path(place) / "said"
         try:
-            [(_, value)] = run_each(partial(_leading, number, function), [name], seconds=seconds)
+            task = partial(_leading, number, said, function)
+            [(_, value)] = run_each(task, [name], seconds=seconds)
         finally:
             end_idle()
             if hasattr(os, "killpg") and number.exists():
                 with suppress(ProcessLookupError):
                     os.killpg(int(number.read_bytes()), signal.SIGKILL)
+        if isinstance(value, Failed) and "its process" in value.reason and said.exists():
+            lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            value = Failed(": ".join([value.reason, *lines[-1:]]))
     return value
 
 
-def _leading(number: Path, function: Callable[[str], object], name: str) -> object:
-    if hasattr(os, "setsid"):  # compilers that a package starts are then of this one's group
+def _leading(number: Path, said: Path, function: Callable[[str], object], name: str) -> object:
+    with said.open("wb") as file:  # kernels and compilers tell much that is no finding
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    # A daemon, as which this process began, must not start others, as torch.compile does.
+    multiprocessing.current_process()._config["daemon"] = False  # pyright: ignore[reportAttributeAccessIssue]
+    if hasattr(os, "setsid"):  # what it starts is then of this one's group
         os.setsid()
         number.write_text(str(os.getpid()), encoding="utf-8")
     return function(name)

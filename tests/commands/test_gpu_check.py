@@ -1,6 +1,7 @@
 """``gamba gpu-check`` on a CPU: its steps, its files, what it says when something is not there."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -377,11 +378,14 @@ def test_a_process_that_hangs_is_ended():
 
 
 def test_a_process_that_crashes():
-    assert "signal 11 (SIGSEGV)" in in_a_process(end_badly, "", 30).reason
+    reason = in_a_process(end_badly, "said last", 30).reason
+    assert "signal 11 (SIGSEGV)" in reason and reason.endswith(": said last")
     assert in_a_process(divide, "", 30).reason == "ZeroDivisionError: division by zero"
 
 
 def end_badly(name):
+    multiprocessing.Process(target=print, args=("other",)).start()  # as torch.compile may
+    os.write(1, f"first\n{name}\n".encode())
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
