@@ -384,7 +384,9 @@ def test_a_process_that_crashes():
 
 
 def end_badly(name):
-    multiprocessing.Process(target=print, args=("other",)).start()  # as torch.compile may
+    other = multiprocessing.Process(target=print, args=("other",))  # as torch.compile may
+    other.start()
+    other.join()
     os.write(1, f"first\n{name}\n".encode())
     os.kill(os.getpid(), signal.SIGSEGV)
 
