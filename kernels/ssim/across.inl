@@ -5,7 +5,7 @@ const int numbers = maps.hor.shape[2], height = maps.got.shape[1];
 const int picture = task / height, y = task % height;
 const float *g = at(maps.got, picture, y), *w = at(maps.want, picture, y);
 F s0 = F{}, s1 = F{}, s2 = F{}, s3 = F{};
-const F m = read(at(maps.shift, picture, 0)); // the same for each tap, which has the same channel
+const F m = read(at(maps.shift, picture, 0));  // the same for each tap, which has the same channel
 #pragma unroll
 for (int k = 0; k < 11; ++k) {
     F a = read(g + k * channels), c = read(w + k * channels);

@@ -20,8 +20,7 @@ auto read = [&](const float* p) -> F {
     return v;
 };
 auto write = [&](float* p, F v) {
-    if (width >= 16)
-        *(F*)p = v;
+    if (width >= 16) *(F*)p = v;
     else
         for (int i = 0; i < width; ++i) p[i] = v[i];
 };

@@ -2,7 +2,7 @@
 // (lanes = blocks), and those that its ellipse touches are evaluated (lanes = pixels).
 #include "tile.h"
 
-const F corner_x = COLUMN_STARTS, corner_y = ROW_STARTS; // of the part of the tile around a block
+const F corner_x = COLUMN_STARTS, corner_y = ROW_STARTS;  // of the part of the tile around a block
 const I bit = 1 << lane;
 // The blocks around which some pixel centre may have q <= limit: the least q on the rectangle of a
 // block's pixel centres (README.md §2, the last paragraph).
@@ -10,7 +10,7 @@ auto touched = [&](const Tile& tile, int g) -> int {
     const float* const mean = (const float*)(splats.means2d.data + g);
     const float* const conic = (const float*)(splats.conics.data + g);
     const float a = conic[0], k = conic[1], e = conic[2];
-    const float across = a * k * k; // products are rounded before they are added
+    const float across = a * k * k;  // products are rounded before they are added
     const float slope = -a * k / (across + e);
     const float widened = 2.0f * wp::log(splats.opacities.data[g] / picture.alpha_min) * SLACK;
     const float limit = widened + SLACK_ABS;
@@ -27,7 +27,7 @@ auto touched = [&](const Tile& tile, int g) -> int {
     return __builtin_reduce_or((I)(q <= limit) & bit);
 };
 
-F* const sums = (F*)workers.workspace.data + (size_t)worker * BLOCKS * channels; // of colours
+F* const sums = (F*)workers.workspace.data + (size_t)worker * BLOCKS * channels;  // of colours
 for (int index = next_tile(); index < tiles; index = next_tile()) {
     const int begin = lists.starts.data[index], end = lists.starts.data[index + 1];
     walk.walked.data[index] = 0;

@@ -5,7 +5,7 @@
 const int row_length = rows.sums.shape[1];
 F* const v_colors =
     (F*)workers.workspace.data + (size_t)worker * (channels + BLOCKS * (channels + 1));
-F* const v_pixels = v_colors + channels; // of each block: of its channels, and of alpha
+F* const v_pixels = v_colors + channels;  // of each block: of its channels, and of alpha
 // pairwise, in a fixed order
 auto total_ = [](F x) -> float {
     float s[16];
@@ -33,7 +33,7 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
     const bool wanted = any_(nonzero) || (every && !(picture.skip & ZERO_UPSTREAM));
     rows.skipped.data[index] = !wanted;
     if (!wanted) continue;
-    F Ts[BLOCKS], Rs[BLOCKS]; // transmittance, and what lies behind
+    F Ts[BLOCKS], Rs[BLOCKS];  // transmittance, and what lies behind
     const I* const stops = (const I*)walk.stops.data + tile.first;
     for (int b = 0; b < BLOCKS; ++b) {
         const F T = ((const F*)walk.transmittances.data)[tile.first + b];
@@ -42,7 +42,7 @@ for (int index = next_tile(); index < tiles; index = next_tile()) {
     }
     for (int k = end - 1; k >= begin; --k) {
         const int later = k - AHEAD > begin ? k - AHEAD : begin;
-        if (walk.blocks.data[later]) { // rows are in the order of the Gaussians
+        if (walk.blocks.data[later]) {  // rows are in the order of the Gaussians
             const int row = lists.rows.data[later];
             const char* const sums = (const char*)(rows.sums.data + (size_t)row * row_length);
             __builtin_prefetch(sums, 1);

@@ -19,12 +19,9 @@ for (int j = begin, g = image * groups + first_group; j < end; j += 16, ++g) {
         }
     };
     // loops of constant length over adjacent numbers become loads of lanes
-    if (order)
-        load(n, [&](int l) { return order[j + l]; });
-    else if (n == 16)
-        load(16, [&](int l) { return j + l; });
-    else
-        load(n, [&](int l) { return j + l; });
+    if (order) load(n, [&](int l) { return order[j + l]; });
+    else if (n == 16) load(16, [&](int l) { return j + l; });
+    else load(n, [&](int l) { return j + l; });
     auto get = [&](int k) -> F { return *(const F*)part[k]; };
     const F rx = get(6), ry = get(7);
     const I seen = rx > 0.0f;
@@ -37,7 +34,7 @@ for (int j = begin, g = image * groups + first_group; j < end; j += 16, ++g) {
     }
     const I top = top_(get(1), ry), count = bottom_(get(1), ry) - top + 1;
     const I box = count * (tile_(get(0) + rx, wide) - tile_(get(0) - rx, wide) + 1);
-    in_boxes += __builtin_reduce_add(seen ? box : I{}); // each is at most 2^24
+    in_boxes += __builtin_reduce_add(seen ? box : I{});  // each is at most 2^24
     const Ellipse E = ellipse_(get(0), get(1), get(2), get(3), get(4), get(5), rx);
     I few = seen & (count <= 4);
     const int most = __builtin_reduce_max(few ? count : I{});

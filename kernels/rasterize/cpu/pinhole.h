@@ -19,12 +19,9 @@ auto read_ = [](const void* from, int size, int n, F* v) {
         for (int l = 0; l < count; ++l)
             for (int k = 0; k < numbers; ++k) part[k][l] = p[numbers * l + k];
     };
-    if (n == 16 && size == 3)
-        fill(16, 3);
-    else if (n == 16 && size == 4)
-        fill(16, 4);
-    else
-        fill(n, size);
+    if (n == 16 && size == 3) fill(16, 3);
+    else if (n == 16 && size == 4) fill(16, 4);
+    else fill(n, size);
     for (int k = 0; k < size; ++k) v[k] = *(const F*)part[k];
 };
 auto write_ = [](void* to, int size, int n, const F* v) {
@@ -35,12 +32,9 @@ auto write_ = [](void* to, int size, int n, const F* v) {
         for (int l = 0; l < count; ++l)
             for (int k = 0; k < numbers; ++k) p[numbers * l + k] = part[k][l];
     };
-    if (n == 16 && size == 2)
-        spill(16, 2);
-    else if (n == 16 && size == 3)
-        spill(16, 3);
-    else
-        spill(n, size);
+    if (n == 16 && size == 2) spill(16, 2);
+    else if (n == 16 && size == 3) spill(16, 3);
+    else spill(n, size);
 };
 
 // the length of quaternions, in numbers that do not leave float32's range

@@ -31,7 +31,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     for (; c + 16 <= n * channels; c += 16) largest += *(const F*)(color + c) * 0.0f;
     float rest = any_(largest != 0.0f) ? 1.0f : 0.0f;
     for (; c < n * channels; ++c) rest += color[c] * 0.0f;
-    if (rest != 0.0f) // something is not finite: 0 times it is NaN
+    if (rest != 0.0f)  // something is not finite: 0 times it is NaN
         for (int l = 0; l < n; ++l)
             for (int k = 0; k < channels; ++k)
                 if (color[l * channels + k] * 0.0f != 0.0f) finite[l] = 0;
@@ -106,8 +106,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
     write_(splats.extents.data + i, 2, n, extent);
     write_(splats.depths.data + i, 1, n, &depth);
     write_(splats.opacities.data + i, 1, n, &shown);
-    if (n == 16)
-        *(I*)(splats.status.data + i) = status;
+    if (n == 16) *(I*)(splats.status.data + i) = status;
     else
         for (int l = 0; l < n; ++l) splats.status.data[i + l] = status[l];
 }

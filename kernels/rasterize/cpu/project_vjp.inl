@@ -47,8 +47,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
         to_camera_(camera, mean, t);
         jacobian_(camera, t, slopes, P);
         for (int r = 0; r < 2; ++r)
-            if (scene.quats.data)
-                turned_(P[r], R, N[r]);
+            if (scene.quats.data) turned_(P[r], R, N[r]);
             else
                 for (int k = 0; k < 3; ++k) N[r][k] = P[r][k];
         for (int k = 0; k < 3; ++k) {
@@ -87,7 +86,7 @@ for (int i0 = begin; i0 < end; i0 += 16) {
                 v_P[r][j] = scene.quats.data
                     ? fma_(v_N[r][2], R[j][2], fma_(v_N[r][1], R[j][1], mul_(v_N[r][0], R[j][0])))
                     : v_N[r][j];
-        auto v_J = [&](int r, int j) -> F { // times the transpose of W
+        auto v_J = [&](int r, int j) -> F {  // times the transpose of W
             return fma_(v_P[r][2], splat(V[4 * j + 2]),
                 fma_(v_P[r][1], splat(V[4 * j + 1]), mul_(v_P[r][0], splat(V[4 * j]))));
         };

@@ -14,8 +14,7 @@ auto emit = [&](int& cursor, int i) {
     if (order) {
         lists.pairs.data[place] = i;
         lists.rows.data[place] = p;
-    } else
-        items[place] = {keys[i], i, p};
+    } else items[place] = {keys[i], i, p};
     ++p;
 };
 for (int j = begin, g = image * groups + first_group; j < end; j += 16, ++g) {
@@ -23,7 +22,7 @@ for (int j = begin, g = image * groups + first_group; j < end; j += 16, ++g) {
     const int* const corner = corners_of(g);
     const Word* const words = words_of(g);
     auto bits_of = [&](int l) -> int { return words[l >> 2] >> 16 * (l & 3) & 0xffff; };
-    if (any_(*(const I*)corner < 0)) { // some are large
+    if (any_(*(const I*)corner < 0)) {  // some are large
         for (int l = 0; l < n; ++l) {
             const int i = gaussian(j + l);
             lists.offsets.data[j + l] = p;

@@ -7,7 +7,7 @@ struct Staged {
     int key, gaussian, number;
 };
 const bool views = !staged.data;
-const int size = splats.depths.shape[0] / count; // Gaussians of a view
+const int size = splats.depths.shape[0] / count;  // Gaussians of a view
 for (;;) {
     const int list = __atomic_fetch_add(counter.data, 1, __ATOMIC_RELAXED);
     if (list >= count) return;
@@ -56,8 +56,7 @@ for (;;) {
     }
     for (int j = 0; j < n; ++j) {
         const unsigned i = now[j];
-        if (views)
-            lists.order.data[begin + j] = begin + i;
+        if (views) lists.order.data[begin + j] = begin + i;
         else {
             lists.pairs.data[begin + j] = items[i].gaussian;
             lists.rows.data[begin + j] = items[i].number;

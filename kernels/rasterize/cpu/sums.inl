@@ -14,8 +14,7 @@ for (int j = begin; j < end; ++j) {
         for (int p = from; p < to; ++p) {
             if (!rows.written.data[p]) continue;
             const float* const row = rows.sums.data + (size_t)p * width;
-            if ((long long)p * width + 16 <= all)
-                sum += *(const F*)row;
+            if ((long long)p * width + 16 <= all) sum += *(const F*)row;
             else {
                 F part = F{};
                 for (int c = 0; c < width; ++c) part[c] = row[c];

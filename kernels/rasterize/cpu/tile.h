@@ -9,9 +9,9 @@ const int channels = splats.colors.shape[1], tiles = lists.starts.shape[0] - 1;
 auto next_tile = [&]() -> int { return __atomic_fetch_add(workers.counter.data, 1, 0); };
 
 struct Tile {
-    int image, x, y; // of its first pixel
-    int first;       // of its blocks
-    int inside;      // a bit for each block that has a pixel in the picture
+    int image, x, y;  // of its first pixel
+    int first;        // of its blocks
+    int inside;       // a bit for each block that has a pixel in the picture
 };
 auto tile_at = [&](int index) -> Tile {
     const int per_image = picture.tiles_x * picture.tiles_y;

@@ -20,10 +20,8 @@ auto store_rows_ = [&](float* row, int live, const F* from) {
         for (int i = 0; i < 16; ++i) r[i] = from[o + i];
         turn_(r);
         for (int j = 0; j < live; ++j)
-            if (o + 16 <= FLOATS)
-                *(F*)(row + j * K_D + o) = r[j];
-            else
-                __builtin_memcpy(row + j * K_D + o, r + j, FLOATS % 16 * 4);
+            if (o + 16 <= FLOATS) *(F*)(row + j * K_D + o) = r[j];
+            else __builtin_memcpy(row + j * K_D + o, r + j, FLOATS % 16 * 4);
     }
     for (int j = 0; j < live && K_D > FLOATS; ++j)
         __builtin_memset(row + j * K_D + FLOATS, 0, (K_D - FLOATS) * 4);
