@@ -67,7 +67,7 @@ def test_every_page_is_in_the_navigation(site):
 def test_docstrings_are_on_the_api_pages(site):
     text = (site / "api/kernels.html").read_text()
     for name in ("selective_scan", "rasterization", "causal_conv1d_fn"):
-        assert f"function.{name}" in text or f"dropin.{name}" in text
+        assert f"function.{name}" in text
     assert "delta_softplus" in text
     names = (site / "api/gaussians.html").read_text()
     assert 'id="gamba_warp.cameras.orbit"' in names and "azimuths" in names
