@@ -8,7 +8,7 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test hostile endurance bench study instructions docs lint format \
+.PHONY: setup demo test hostile endurance bench study instructions docs lint format figures \
         architecture constraints clean
 
 setup: $(STAMP)
@@ -60,7 +60,7 @@ bench: $(STAMP)
 study: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
 
-# docs/benchmarks/static.md: what the CUDA kernels take, and with nvdisasm (on PATH, in CUDA_HOME
+# docs/lab/benchmarks/static.md: what the CUDA kernels take, and with nvdisasm (on PATH, in CUDA_HOME
 # or inside Triton) their instructions, and the scan's least times.
 instructions: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m lab.instructions
@@ -85,6 +85,11 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	git ls-files -z '*.h' '*.inl' | xargs -0r $(BIN)/clang-format -i
+
+# Tables and pictures of the pages from results that are kept; REPORTS="--views out/eval/report.json"
+# puts an evaluation of the shipped model into its card first.
+figures: $(STAMP)
+	PYTHONPATH=docs $(BIN)/python -m lab.figures $(REPORTS)
 
 # docs/architecture.svg and the table of docs/architecture.md, from today's imports.
 architecture: $(STAMP)

@@ -64,8 +64,8 @@ def keep_memory() -> None:
     """Lets the process keep the memory that it frees, up to 1 GiB, where glibc gives it.
 
     It is for the tensors of torch's own operators. Their blocks of some MiB are otherwise given
-    back at once, and the system clears each page again at the next use (docs/step.md says what that
-    costs a picture). The results of our operators do not need it: the pool of
+    back at once, and the system clears each page again at the next use (docs/lab/step.md says what
+    that costs a picture). The results of our operators do not need it: the pool of
     ``kernels/runtime/memory.py`` keeps them in every program, also those over 256 MiB, which glibc
     gives back as before.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from page_parts import with_parts
+from lab.figures.parts import with_parts
 
 from .imports import Import, read_imports
 from .picture import arrows, draw

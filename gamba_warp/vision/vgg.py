@@ -103,7 +103,7 @@ class VGG16Trunk(nn.Module):
         """``forward`` of two batches with products in bfloat16 where little depends on them.
 
         These are all of the gradient, and those of block 5; the first four blocks are float32 in
-        the forward pass. (docs/step.md has what each choice gives.) The gradient reaches ``a``
+        the forward pass. (docs/lab/step.md has what each choice gives.) The gradient reaches ``a``
         alone.
 
         Args:

@@ -1,12 +1,12 @@
 """The model's card: what pages say of a model, and that docs/model-card.md says the same."""
 
-import importlib.util
 import json
 from pathlib import Path
 
 import msgspec
 import pytest
-from page_parts import marks
+from lab.figures import model_card
+from lab.figures.parts import marks
 
 from gamba_warp.errors import UserError
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT
@@ -17,10 +17,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 @pytest.fixture
 def tool():
-    spec = importlib.util.spec_from_file_location("model_card", DOCS / "model_card.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return model_card
 
 
 def row(views, name, psnr, **more):
@@ -88,21 +85,21 @@ def test_the_shipped_model_has_a_card_and_the_page_is_made_of_it(tool):
     assert card is not None and card.objects > 100 and card.limits
     assert any(row.name == "model" and row.views == "novel" for row in card.figures)
     page = (DOCS / "model-card.md").read_text(encoding="utf-8")
-    assert tool.page_of(page, card) == page, "run: python docs/model_card.py"
+    assert tool.page_of(page, card) == page, "run: make figures"
     readme = tool.README.read_text(encoding="utf-8")
-    assert tool.readme_of(readme, card) == readme, "run: python docs/model_card.py"
+    assert tool.readme_of(readme, card) == readme, "run: make figures"
 
 
 def test_reports_become_figures(tool, model, tmp_path, monkeypatch):
     page = tmp_path / "page.md"
     names = ("facts", "command", "figures", "limits")
-    lines = [line for name in names for line in marks("docs/model_card.py", name)]
+    lines = [line for name in names for line in marks("make figures", name)]
     page.write_text("# Top\n" + "\n".join(lines) + "\nlast\n")
     model.write_bytes(b"weights")
     monkeypatch.setattr(tool, "DEFAULT_CHECKPOINT", model)
     monkeypatch.setattr(tool, "PAGE", page)
     readme = tmp_path / "README.md"
-    readme.write_text("\n".join(marks("docs/model_card.py", "results")))
+    readme.write_text("\n".join(marks("make figures", "results")))
     monkeypatch.setattr(tool, "README", readme)
     metrics = {"psnr": {"mean": 21.0, "interval": [20.0, 22.0]}, "lpips": {"mean": None}}
     metrics["psnr_black"] = {"mean": 17.0, "interval": [16.0, 18.0]}

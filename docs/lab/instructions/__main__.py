@@ -1,4 +1,4 @@
-"""``make instructions``: writes docs/benchmarks/static.json and static.md."""
+"""``make instructions``: writes docs/lab/benchmarks/static.json and static.md."""
 
 from __future__ import annotations
 

@@ -1,14 +1,13 @@
 """``make study WHAT=growth``: slopes, what grows faster than its work, and what the words mean."""
 
-import importlib.util
 import json
 import math
 import xml.etree.ElementTree as ET
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from lab.figures import growth as writer
 from lab.studies import growth, show
 from lab.studies.__main__ import GROUPS, STUDIES
 from lab.studies.draw import growth_picture
@@ -22,7 +21,6 @@ from gamba_warp.kernels.bench.core.case import Case, Settings, Variant
 from gamba_warp.measure import suites
 from gamba_warp.measure.suites import check_document
 
-DOCS = Path(__file__).parents[3] / "docs"
 QUICK = Settings(torch.device("cpu"), "quick", threads=1)
 SIZES = (1024, 4096, 16384, 65536)
 
@@ -201,22 +199,14 @@ def test_the_oracle_of_many_gaussians_sees_all_that_reach_the_crop(monkeypatch):
     assert growth.check_near(scene, False).rel_rms > 1e-2
 
 
-@pytest.fixture(scope="module")
-def writer():
-    spec = importlib.util.spec_from_file_location("growth_page", DOCS / "growth_page.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_page_of_growth_shows_the_results(writer):
+def test_the_page_of_growth_shows_the_results():
     document = suites.read_document(writer.RESULTS)
     text = writer.PAGE.read_text(encoding="utf-8")
-    assert writer.page_of(text, document) == text, "run: python docs/growth_page.py"
+    assert writer.page_of(text, document) == text, "run: make figures"
     for name, path in writer.PICTURES.items():
         picture = growth_picture([writer.split(document)[name]])
         shown = path.read_text(encoding="utf-8") if path.exists() else ""
-        assert shown == picture, "run: python docs/growth_page.py"
+        assert shown == picture, "run: make figures"
     for r in document["records"]:
         assert r["status"] == "ok", (r["case"], r["variant"], r["status"])
     with pytest.raises(ValueError, match="no mark"):

@@ -3,7 +3,7 @@
 The pictures are those that other packages bring as samples; they are read from where the packages
 lie (or from a folder of unpacked archives), and none of them is kept here:
 
-    python docs/photo_ways.py --model isnet.onnx --folder unpacked --out ways.png
+    python docs/lab/figures/photo_ways.py --model isnet.onnx --folder unpacked --out ways.png
 
 prints the table of docs/photo.md, without the verdicts of eyes, and writes a sheet to look at: a
 row a picture; the picture, and what is left of it after a plain background, the matte of the

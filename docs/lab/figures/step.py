@@ -1,33 +1,32 @@
-"""Writes the tables of docs/step.md from docs/benchmarks/cpu-step.json and cpu-precision.json.
+"""Writes the tables of docs/lab/step.md from cpu-step.json and cpu-precision.json.
 
 After both measurements:
 
     make study WHAT="step --threads 1 --data starter/data --out out/step"
     make study WHAT="model --only precision --out out/model"
-    cp out/step/bench.json docs/benchmarks/cpu-step.json
-    cp out/model/bench.json docs/benchmarks/cpu-precision.json
-    python docs/step_page.py
+    cp out/step/bench.json docs/lab/benchmarks/cpu-step.json
+    cp out/model/bench.json docs/lab/benchmarks/cpu-precision.json
+    make figures
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from lab.studies.parts import WHOLE, parts_of
-from page_parts import with_parts
 
-from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
 from gamba_warp.kernels.bench.core.report import machine_line
 from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.measure.suites import read_document
 
-HERE = Path(__file__).parent
-PAGE = HERE / "step.md"
-STEP, PRECISION = (HERE / "benchmarks" / f"cpu-{name}.json" for name in ("step", "precision"))
+from .parts import with_parts
+
+LAB = Path(__file__).parents[1]
+PAGE = LAB / "step.md"
+STEP, PRECISION = (LAB / "benchmarks" / f"cpu-{name}.json" for name in ("step", "precision"))
 _PRECISIONS = ("float32", "bfloat16")
 _BOTH = " / ".join(_PRECISIONS)
 
@@ -60,7 +59,7 @@ def page_of(text: str, step: dict, precision: dict) -> str:
         "ssim": _ssim(_Case(step, "step", "SSIM")),
         "optimizer": _optimizer(_Case(step, "step", "optimizer")),
     }
-    return with_parts(text, "docs/step_page.py", parts)
+    return with_parts(text, "make figures", parts)
 
 
 class _Case:
@@ -150,10 +149,3 @@ def _optimizer(case: _Case) -> str:
         rows.append([text, "", *(case.ms(f"{name}, {way}") for way in ways[1:])])
     ends = " and ".join(f"{case.ms(f'gradients to {to}')} ms to {to}" for to in ("None", "zero"))
     return f"{markdown(['ms', *ways], rows)}\n\nTo set the gradients takes {ends}."
-
-
-if __name__ == "__main__":
-    try:
-        main()
-    except (UserError, ValueError) as error:
-        sys.exit(f"gamba: {error}")

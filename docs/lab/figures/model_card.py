@@ -2,8 +2,8 @@ r"""Puts figures into the card of the shipped model; writes docs/model-card.md a
 
 After ``gamba eval-views`` and ``gamba eval-geometry`` of the model that ships:
 
-    python docs/model_card.py --views out/eval/report.json --geometry out/shapes/report.json \
-        --retrieval out/shapes-retrieval/report.json
+    make figures REPORTS="--views out/eval/report.json --geometry out/shapes/report.json \
+        --retrieval out/shapes-retrieval/report.json"
 
 Without an option it only writes the tables again. Everything else in the card, ``NAME.json``
 beside the weights, is written by hand.
@@ -11,13 +11,10 @@ beside the weights, is written by hand.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import tyro
-from page_parts import with_parts
 
 from gamba_warp.errors import UserError
 from gamba_warp.files import write_json, write_text
@@ -34,8 +31,10 @@ from gamba_warp.pages.card import (
 )
 from gamba_warp.untrusted.documents import read_document
 
-PAGE = Path(__file__).with_name("model-card.md")
-README = Path(__file__).parents[1] / "README.md"
+from .parts import with_parts
+
+DOCS = Path(__file__).parents[2]
+PAGE, README = DOCS / "model-card.md", DOCS.parent / "README.md"
 TITLES = {"novel": "New views", "input": "The input view", "shape": "Shape"}
 
 
@@ -90,7 +89,7 @@ def page_of(text: str, card: ModelCard) -> str:
         "figures": "\n\n".join([card.measured, *_tables(card)]),
         "limits": "\n".join(f"- {limit}" for limit in card.limits),
     }
-    return with_parts(text, "docs/model_card.py", parts)
+    return with_parts(text, "make figures", parts)
 
 
 def readme_of(text: str, card: ModelCard) -> str:
@@ -118,7 +117,7 @@ def readme_of(text: str, card: ModelCard) -> str:
         name = "**shipped model**" if row.name == "model" else row.name.replace("_", " ")
         rows.append([name, *texts])
     results = markdown([f"{novel[0].objects} objects", *heads], rows)
-    return with_parts(text, "docs/model_card.py", {"results": results})
+    return with_parts(text, "make figures", {"results": results})
 
 
 def _tables(card: ModelCard) -> list[str]:
@@ -159,10 +158,3 @@ def _shape(name: str, report: dict[str, Any]) -> Row:
     return msgspec.convert(
         {"views": "shape", "name": name, "objects": report["num_ok"], **figures}, Row
     )
-
-
-if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except UserError as error:
-        sys.exit(f"gamba: {error}")

@@ -1,33 +1,35 @@
-"""Writes the tables and pictures of docs/growth.md from docs/benchmarks/cpu-growth.json.
+"""Writes the tables and pictures of docs/lab/growth.md from docs/lab/benchmarks/cpu-growth.json.
 
 After ``make study WHAT=growth`` in one run or in parts:
 
     make study WHAT="--render out/a/bench.json out/b/bench.json --out out/growth.json"
-    cp out/growth.json docs/benchmarks/cpu-growth.json
-    python docs/growth_page.py
+    cp out/growth.json docs/lab/benchmarks/cpu-growth.json
+    make figures
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import torch
 from lab.studies import growth, growth_errors
 from lab.studies.draw import growth_picture
 from lab.studies.slopes import ERRORS, growth_lines, growth_table
-from page_parts import with_parts
 
-from gamba_warp.errors import UserError
 from gamba_warp.files import write_text
 from gamba_warp.kernels.bench.core.report import groups, machine_line
 from gamba_warp.kernels.runtime.tables import markdown
 from gamba_warp.measure.suites import make_settings, read_document
 
-HERE = Path(__file__).parent
-PAGE = HERE / "growth.md"
-RESULTS = HERE / "benchmarks" / "cpu-growth.json"
-PICTURES = {"costs": HERE / "pictures" / "growth.svg", "errors": HERE / "pictures" / "errors.svg"}
+from .parts import with_parts
+
+LAB = Path(__file__).parents[1]
+PAGE = LAB / "growth.md"
+RESULTS = LAB / "benchmarks" / "cpu-growth.json"
+PICTURES = {
+    "costs": LAB.parent / "pictures" / "growth.svg",
+    "errors": LAB.parent / "pictures" / "errors.svg",
+}
 
 
 def main() -> None:
@@ -67,7 +69,7 @@ def page_of(text: str, document: dict) -> str:
         "costs": costs + _costs(parts["costs"]),
         "errors": errors + _errors(parts["errors"]),
     }
-    return with_parts(text, "docs/growth_page.py", written)
+    return with_parts(text, "make figures", written)
 
 
 def _missing(document: dict) -> list[str]:
@@ -111,10 +113,3 @@ def _errors(document: dict) -> str:
             header, rows = growth_table(records) or ([], [])
             blocks.append(f"**{case}**\n\n{markdown(header, rows)}")
     return "\n\n".join(blocks) or "Not measured yet."
-
-
-if __name__ == "__main__":
-    try:
-        main()
-    except (UserError, ValueError) as error:
-        sys.exit(f"gamba: {error}")

@@ -1,0 +1,34 @@
+"""``make figures``, or ``python -m lab.figures`` with docs/ on the path of modules."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import tyro
+
+from gamba_warp.errors import UserError
+
+from . import growth, model_card, step
+
+
+def figures(
+    views: Path | None = None, geometry: Path | None = None, retrieval: Path | None = None
+) -> None:
+    """Writes the tables and pictures of the pages again, from the results that are kept.
+
+    Args:
+        views: report of eval-views, whose figures go into the card of the shipped model first.
+        geometry: likewise, report of eval-geometry of the model.
+        retrieval: likewise, report of eval-geometry of what the retrieval finds.
+    """
+    model_card.main(views, geometry, retrieval)
+    growth.main()
+    step.main()
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(figures)
+    except (UserError, ValueError) as error:
+        sys.exit(f"gamba: {error}")
