@@ -240,7 +240,7 @@ CTRL_C = """
 import os, runpy, signal, sys
 from gamba_warp.train import run
 signal.signal(signal.SIGINT, signal.default_int_handler)
-run.open_data = lambda config: os.kill(os.getpid(), signal.SIGINT)
+run.open_data = lambda *_: os.kill(os.getpid(), signal.SIGINT)
 module, *sys.argv[1:] = sys.argv[1:]
 runpy.run_module(module, run_name="__main__", alter_sys=True)
 """

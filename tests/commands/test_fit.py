@@ -12,7 +12,6 @@ from gamba_warp.cli import run
 from gamba_warp.commands.fit import fit_command
 from gamba_warp.conventions import GROUNDS, over_background
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.eval.views import compare
 from gamba_warp.eval.views.compare import ViewsProtocol, load_truth, render_views
 from gamba_warp.eval.views.predictions import PlyPredictions
 from gamba_warp.fitting import objects
@@ -21,7 +20,7 @@ from gamba_warp.fitting.objects import choose_objects, split_views
 from gamba_warp.fitting.optimize import activate, fit
 from gamba_warp.fitting.relocate import relocate, shares
 from gamba_warp.fitting.start import random_start, sample_views, visual_hull
-from gamba_warp.image_metrics import psnr
+from gamba_warp.image_metrics import METRICS, psnr
 from gamba_warp.images import load_rgba, save_image
 from gamba_warp.render import render
 
@@ -226,7 +225,7 @@ def test_relocation_has_a_limit():
 
 
 def test_psnr_is_that_of_eval():
-    assert objects.psnr is compare.psnr is psnr
+    assert objects.psnr is METRICS["psnr"].compare is psnr
 
 
 def test_views_and_objects_are_chosen_by_rule():

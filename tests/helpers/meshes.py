@@ -6,7 +6,7 @@ import struct
 import numpy as np
 from PIL import Image
 
-from gamba_warp.train.data.poses import Settings
+from gamba_warp.train.data.settings import Settings
 from gamba_warp.train.sources.commands import Share, data_render_command
 
 QUAD = """mtllib quad.mtl

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
+import trimesh
 from helpers.gaussians import some
 from helpers.images import cut_out
 from helpers.model import run_reconstruct
@@ -17,7 +18,7 @@ from gamba_warp.formats.ply import load_ply, save_ply
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.pages import outputs
+from gamba_warp.pages import export
 from gamba_warp.pages.turntable import turntable_frames
 from gamba_warp.surfaces.extract import unit_frame
 from gamba_warp.trajectories.paths import upright
@@ -45,9 +46,12 @@ def model(tmp_path_factory):
 
 def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
     meshed = []
-    monkeypatch.setattr(
-        outputs, "write_meshes", lambda base, gaussians, *_: meshed.append(gaussians)
-    )
+
+    def written(base, gaussians, *_):
+        meshed.append(gaussians)
+        return trimesh.creation.box()
+
+    monkeypatch.setattr(export, "write_meshes", written)
     picture = cut_out(tmp_path / "thing.png")
     plain, turned = tmp_path / "plain", tmp_path / "turned"
     common = [picture, "--checkpoint", model, "--size", 48, "--frames", 4]

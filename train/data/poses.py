@@ -1,4 +1,4 @@
-"""How the views of an object are made: the settings, and the cameras.
+"""How the views of an object are made: the cameras.
 
 Those stand around it, and each has all of it in the picture.
 """
@@ -7,60 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal
 
 import numpy as np
-import tyro
-from msgspec import Meta
 
-from gamba_warp.conventions import DEFAULT_FOV
+from .settings import SPREAD
 
 MARGIN = 0.96  # share of the picture's half size that the object may reach
 NEAREST = 3.0  # least distance, in half sizes of the object along the camera's axes
-SPREAD = 0.2  # largest share by which a distance exceeds the least one, unless told
 FRONT = (35.0, 0.0, 20.0)  # degrees: largest azimuth, least and largest elevation of a front view
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides the pixels; every ``transforms.json`` keeps it.
-
-    Attributes:
-        views: number of views of an object.
-        size: pixels a side.
-        fov: vertical field of view, degrees.
-        seed: seed of cameras and lights; those of an object also depend on its uid.
-        depth: also write 16-bit depth pictures, of the first and of the last surface.
-        format: format of the pictures; both are lossless.
-        up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
-        fronts: number of views from the front, the first ones.
-        spread: largest share by which a camera stands further away than it must.
-        stretch: stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
-        fov_spread: draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
-        light: varied makes the lights of the objects differ more.
-        poses: "drawn", or "gso": those of that evaluation, the input view first.
-    """
-
-    views: Annotated[int, Meta(ge=1, le=10_000)] = 24
-    size: Annotated[int, Meta(ge=8, le=4096)] = 128
-    fov: Annotated[float, Meta(ge=5, le=120)] = DEFAULT_FOV
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-    depth: bool = False
-    format: Literal["webp-lossless", "png"] = "webp-lossless"
-    up: Literal["auto", "y", "z"] = "auto"
-    fronts: Annotated[int, Meta(ge=0, le=10_000)] = 1
-    spread: Annotated[float, Meta(ge=0, le=10)] = SPREAD
-    stretch: Annotated[float, Meta(ge=1, le=10)] = 1.0
-    fov_spread: Annotated[float, Meta(ge=1, le=4)] = 1.0
-    light: Literal["usual", "varied"] = "usual"
-    poses: tyro.conf.Suppress[Literal["drawn", "gso"]] = "drawn"
-
-    def drawn(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-        """Draws the stretch along the file's axes ``[3]`` and the field of view of an object."""
-        stretch = np.exp(rng.uniform(-1, 1, 3) * np.log(self.stretch))
-        fov = self.fov * float(np.exp(rng.uniform(-1, 1) * np.log(self.fov_spread)))
-        return stretch, fov
 
 
 def look_at_origin(azimuth: float, elevation: float, distance: float) -> np.ndarray:

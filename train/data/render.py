@@ -34,8 +34,9 @@ from gamba_warp.untrusted.children import Failed, run_each
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import plain_name
 
-from .poses import Settings, ring_poses, sample_poses
+from .poses import ring_poses, sample_poses
 from .raycast import Lights, RayCaster
+from .settings import Settings
 
 DEPTH_UNIT = 1e-4  # object units; 16 bits then reach 6.5
 

@@ -24,8 +24,8 @@ from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import load_rgba
 
-from .poses import Settings
 from .render import render_object
+from .settings import Settings
 
 SETTINGS = Settings()  # the command's own
 

@@ -21,7 +21,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.files import output_folder, write_json
 from gamba_warp.untrusted.ranges import Seed, ranged
 
-from ..data.poses import Settings
+from ..data.settings import Settings
 from .objaverse_lists import Lists
 
 Item = TypeVar("Item")

@@ -22,8 +22,8 @@ from gamba_warp.untrusted.archives import open_zip
 from gamba_warp.untrusted.documents import read_bytes
 from gamba_warp.untrusted.names import inside
 
-from ..data.poses import Settings
 from ..data.render import render_meshes, still_missing
+from ..data.settings import Settings
 
 MESH = "meshes/model.obj"
 METADATA = "metadata.pbtxt"

@@ -1,0 +1,59 @@
+"""The settings of rendered views, which the commands show without loading anything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from msgspec import Meta
+
+from gamba_warp.conventions import DEFAULT_FOV
+
+if TYPE_CHECKING:
+    import numpy as np
+
+SPREAD = 0.2  # largest share by which a distance exceeds the least one, unless told
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the pixels; every ``transforms.json`` keeps it.
+
+    Attributes:
+        views: number of views of an object.
+        size: pixels a side.
+        fov: vertical field of view, degrees.
+        seed: seed of cameras and lights; those of an object also depend on its uid.
+        depth: also write 16-bit depth pictures, of the first and of the last surface.
+        format: format of the pictures; both are lossless.
+        up: the axis that points up in the files; auto: y for .obj, .glb and .gltf, z for others.
+        fronts: number of views from the front, the first ones.
+        spread: largest share by which a camera stands further away than it must.
+        stretch: stretch each object along each axis by a factor between 1 / STRETCH and STRETCH.
+        fov_spread: draw each object's field of view between FOV / FOV_SPREAD and FOV * FOV_SPREAD.
+        light: varied makes the lights of the objects differ more.
+        poses: "drawn", or "gso": those of that evaluation, the input view first.
+    """
+
+    views: Annotated[int, Meta(ge=1, le=10_000)] = 24
+    size: Annotated[int, Meta(ge=8, le=4096)] = 128
+    fov: Annotated[float, Meta(ge=5, le=120)] = DEFAULT_FOV
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    depth: bool = False
+    format: Literal["webp-lossless", "png"] = "webp-lossless"
+    up: Literal["auto", "y", "z"] = "auto"
+    fronts: Annotated[int, Meta(ge=0, le=10_000)] = 1
+    spread: Annotated[float, Meta(ge=0, le=10)] = SPREAD
+    stretch: Annotated[float, Meta(ge=1, le=10)] = 1.0
+    fov_spread: Annotated[float, Meta(ge=1, le=4)] = 1.0
+    light: Literal["usual", "varied"] = "usual"
+    poses: tyro.conf.Suppress[Literal["drawn", "gso"]] = "drawn"
+
+    def drawn(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+        """Draws the stretch along the file's axes ``[3]`` and the field of view of an object."""
+        import numpy as np  # not at the top: `--help` of a command shows these fields
+
+        stretch = np.exp(rng.uniform(-1, 1, 3) * np.log(self.stretch))
+        fov = self.fov * float(np.exp(rng.uniform(-1, 1) * np.log(self.fov_spread)))
+        return stretch, fov
