@@ -10,7 +10,7 @@ from .page import markdown
 from .report import report
 
 if __name__ == "__main__":
-    folder = Path(__file__).resolve().parents[2] / "benchmarks"
+    folder = Path(__file__).resolve().parents[1] / "benchmarks"
     document = report(print)
     write_json(folder / "static.json", document)
     write_text(folder / "static.md", markdown(document))

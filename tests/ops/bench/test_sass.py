@@ -17,7 +17,7 @@ from lab.instructions.estimate import (
 )
 from lab.instructions.page import markdown
 
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "benchmarks"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "lab" / "benchmarks"
 
 # Two loops, one in the other; a cold part that comes after the end and jumps back; another kernel.
 TEXT = """

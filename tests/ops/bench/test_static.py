@@ -21,7 +21,7 @@ from gamba_warp.kernels.bench.static.report import MACHINES, occupancy, static_m
 from gamba_warp.kernels.runtime.views import view
 
 ROOT = Path(__file__).resolve().parents[3]
-DOCS = ROOT / "docs" / "benchmarks"
+DOCS = ROOT / "docs" / "lab" / "benchmarks"
 
 # op, kernel, case: registers of a thread, bytes of stack, bytes of shared memory of a block, warps
 # that fit on a multiprocessor; about a tenth from what the compiler used when this was written.
