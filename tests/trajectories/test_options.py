@@ -3,7 +3,6 @@
 import json
 import math
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.pages import export
 from gamba_warp.pages.turntable import turntable_frames
-from gamba_warp.surfaces.extract import unit_frame
+from gamba_warp.surfaces.extract import Surface, unit_frame
 from gamba_warp.trajectories.paths import upright
 
 
@@ -49,7 +48,7 @@ def test_a_picture_from_above_stands_upright(tmp_path, model, monkeypatch):
 
     def written(base, gaussians, *_):
         meshed.append(gaussians)
-        return SimpleNamespace(vertices=(), faces=(), is_watertight=lambda: True)
+        return Surface(np.eye(4, 3), np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))
 
     monkeypatch.setattr(export, "write_meshes", written)
     picture = cut_out(tmp_path / "thing.png")
