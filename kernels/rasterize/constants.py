@@ -4,7 +4,8 @@ ALPHA_MIN = 1.0 / 255.0  # a fainter contribution is skipped
 ALPHA_MAX = 0.99  # alpha is clamped here, so 1 / (1 - alpha) <= 100
 T_MIN = 1e-4  # a pixel stops before its transmittance would fall to this: (1 - ALPHA_MAX)^2
 EPS2D = 0.3  # added to the diagonal of the projected covariance, square pixels
-TILE = 16  # pixels, side of a square tile
+TILE = 16  # pixels, side of a square tile, a power of two
+BLOCKS = (TILE // 4) ** 2  # of 4 x 4 pixels in a tile
 FRUSTUM_MARGIN = (
     0.3  # share of tan(fov / 2): how far outside the picture the Jacobian still follows
 )

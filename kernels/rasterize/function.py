@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from .checks import check_inputs
-from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN
-from .cpu.tuning import tuning_for
+from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN, TILE
 from .harmonics import colors_from_harmonics
 from .meta import Drawn, Meta
 from .ops import bin_op, composite, project
@@ -101,7 +100,6 @@ def rasterization(
         rasterize_mode=rasterize_mode,
     )  # fmt: skip
     lead = check_inputs(tensors, options)
-    tuning = tuning_for(means.device.type)
     views, batch = viewmats.shape[-3], math.prod(lead)
     flat: dict[str, Any] = {k: _flat(x, batch, len(lead)) for k, x in tensors.items()}
     means, quats, scales, opacities, colors, viewmats, Ks, backgrounds = flat.values()
@@ -122,18 +120,17 @@ def rasterization(
     size = Size(width, height, views, int(colors_per_view), skip.bits())
     limits = Limits(alpha_min, alpha_max, t_min)
     *splats, status = (x.detach() for x in per_view)
-    bins = Bins(*bin_op(*splats, width, height, alpha_min, size.skip, tuning.numbers()))
+    bins = Bins(*bin_op(*splats, width, height, alpha_min, size.skip))
     skipped = None if torch.compiler.is_compiling() else bins.box_pairs.new_full((), -1)
     drawn = per_view.means2d, per_view.conics, per_view.view_opacities, channels
-    choices = list(size), list(limits), tuning.numbers()
-    renders, alphas, *walk = composite(*drawn, list(bins), *choices, skipped)
+    renders, alphas, *walk = composite(*drawn, list(bins), list(size), list(limits), skipped)
     renders = _finish(render_mode, renders, alphas, backgrounds)
     renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
-    meta = Meta(Drawn(splats, size, limits, tuning), bins, Walk(*walk), status, skipped)
+    meta = Meta(Drawn(splats, size, limits), bins, Walk(*walk), status, skipped)
     # under gsplat's names
     meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
     meta.update(opacities=projected.view_opacities, radii=projected.extents.ceil().int())
-    meta.update(width=width, height=height, tile_size=tuning.tile)
+    meta.update(width=width, height=height, tile_size=TILE)
     return renders, alphas, meta
 
 

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .cpu.tuning import Tuning
 from .ops import bin_op, composite
 from .project import STATUS_NAMES
 from .tiles import Bins, Limits, Size, Tiling, Walk
@@ -17,29 +16,27 @@ class Drawn(NamedTuple):
 
     Attributes:
         splats: means2d, conics, depths, opacities and extents of I views, without gradients.
-        size: what ``composite`` was given, like the next two.
+        size: what ``composite`` was given, like the limits.
         limits: what ``composite`` was given.
-        tuning: what ``composite`` was given.
     """
 
     splats: Sequence[Tensor]
     size: Size
     limits: Limits
-    tuning: Tuning
 
     def tiling(self) -> Tiling:
         """The cut into tiles."""
-        return Tiling(self.size.width, self.size.height, self.tuning.tile)
+        return Tiling(self.size.width, self.size.height)
 
     def listed(self) -> tuple[Bins, Walk]:
         """The lists with room for all pairs, whose number is read back, and what the walk left."""
         means2d, conics, depths, opacities, extents = self.splats
-        size, numbers = self.size._replace(colors_per_view=1), self.tuning.numbers()
+        size = self.size._replace(colors_per_view=1)
         picture = size.width, size.height, self.limits.alpha_min, size.skip
-        bins = bin_op(means2d, conics, depths, opacities, extents, *picture, numbers, True)
+        bins = bin_op(means2d, conics, depths, opacities, extents, *picture, True)
         color = torch.ones_like(depths).view(-1, 1)
         splats = means2d, conics, opacities, color
-        _, _, *walk = composite(*splats, list(bins), list(size), list(self.limits), numbers, None)
+        _, _, *walk = composite(*splats, list(bins), list(size), list(self.limits), None)
         return Bins(*bins), Walk(*walk)
 
 

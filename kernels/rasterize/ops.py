@@ -14,10 +14,10 @@ from torch import Tensor
 
 from ..runtime.start import without_compiler
 from ..runtime.views import vectors
+from .constants import BLOCKS
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
 from .cpu.project import project_on_lanes, vjp_on_lanes
-from .cpu.tuning import Tuning
 from .cuda import bin as bin_cuda
 from .cuda import composite as composite_cuda
 from .project import (
@@ -139,7 +139,6 @@ def bin_op(
     height: int,
     alpha_min: float,
     skip: int,
-    tuning: List[int],
     exact: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Makes the tile lists of all views, ``Bins``; on CUDA without waiting for the number of pairs.
@@ -157,7 +156,6 @@ def bin_op(
         height: pixels.
         alpha_min: what is fainter than this is not drawn.
         skip: from ``Skip.bits``.
-        tuning: numbers of a ``Tuning``, whose tile is taken.
         exact: lists as long as there are pairs; on CUDA the number is read back for that.
 
     Raises:
@@ -166,7 +164,7 @@ def bin_op(
         RuntimeError: a CUDA graph is captured, and these shapes were never rendered.
     """
     images, num = depths.shape
-    tiling = Tiling(width, height, Tuning(*tuning).tile)
+    tiling = Tiling(width, height)
     if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
         raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
     grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
@@ -181,8 +179,8 @@ def _(means2d, conics, depths, *rest):
     def ints(*shape, dtype=torch.int32):
         return depths.new_empty(shape, dtype=dtype)
 
-    width, height, tuning = rest[2], rest[3], rest[6]
-    tiles = depths.shape[0] * Tiling(width, height, Tuning(*tuning).tile).count
+    width, height = rest[2], rest[3]
+    tiles = depths.shape[0] * Tiling(width, height).count
     count, pairs = depths.numel(), torch.library.get_ctx().new_dynamic_size()
     return tuple(
         Bins(
@@ -207,35 +205,32 @@ def composite(
     bins: List[Tensor],
     size: List[int],
     limits: List[float],
-    tuning: List[int],
     skipped: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Blends the pairs: pictures, alphas and the fields of a ``Walk``.
 
     ``colors`` is ``[I * N, C]`` or, shared by the views, ``[B * N, C]``. The lists hold what
-    ``Bins``, ``Size``, ``Limits`` and ``Tuning`` hold, the lists of tiles are made with the same
-    tuning, and backward keeps it. Backward counts the tiles that it skips into ``skipped``, int64
-    without dimensions.
+    ``Bins``, ``Size`` and ``Limits`` hold. Backward counts the tiles that it skips into
+    ``skipped``, int64 without dimensions.
     """
     splats = means2d, conics, view_opacities, colors
-    given = Bins(*bins), _picture(means2d, size, limits, tuning), Tuning(*tuning)
+    given = Bins(*bins), _picture(means2d, size, limits)
     renders, alphas, w = _compositor(means2d.device).composite_forward(*splats, *given)
     return renders, alphas, w.transmittances, w.stops, w.blocks, w.walked, w.blocks_walked
 
 
-def _picture(means2d: Tensor, size: list[int], limits: list[float], tuning: list[int]) -> Picture:
-    num, tile = means2d.shape[1], Tuning(*tuning).tile
-    return make_picture(Size(*size), Limits(*limits), num=num, tile=tile)
+def _picture(means2d: Tensor, size: list[int], limits: list[float]) -> Picture:
+    return make_picture(Size(*size), Limits(*limits), num=means2d.shape[1])
 
 
 @composite.register_fake
 def _(means2d, conics, view_opacities, colors, bins, size, *rest):
     width, height = Size(*size).width, Size(*size).height
-    images, pairs, tuning = means2d.shape[0], Bins(*bins).pairs, Tuning(*rest[1])
-    tiles = images * Tiling(width, height, tuning.tile).count
+    images, pairs = means2d.shape[0], Bins(*bins).pairs
+    tiles = images * Tiling(width, height).count
     walk = Walk(
-        transmittances=colors.new_empty(tiles * tuning.blocks, 16),
-        stops=pairs.new_empty(tiles * tuning.blocks, 16),
+        transmittances=colors.new_empty(tiles * BLOCKS, 16),
+        stops=pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.empty_like(pairs),
         walked=pairs.new_empty(tiles),
         blocks_walked=pairs.new_empty(tiles, dtype=torch.int64),
@@ -251,7 +246,6 @@ def _composite_vjp(
     bins: List[Tensor],
     size: List[int],
     limits: List[float],
-    tuning: List[int],
     walk: List[Tensor],
     v_pixels: List[Tensor],
     geometry: bool,
@@ -264,8 +258,7 @@ def _composite_vjp(
         view_opacities,
         colors,
         Bins(*bins),
-        _picture(means2d, size, limits, tuning),
-        Tuning(*tuning),
+        _picture(means2d, size, limits),
         Walk(*walk),
         v_renders,
         v_alphas,
@@ -275,7 +268,7 @@ def _composite_vjp(
 
 
 @_composite_vjp.register_fake
-def _(splats, bins, size, limits, tuning, walk, v_pixels, geometry):
+def _(splats, bins, size, limits, walk, v_pixels, geometry):
     *geometries, colors = splats
     v_colors = colors.new_empty(*splats[2].shape, colors.shape[1])
     v_geometry = map(torch.empty_like, geometries) if geometry else ()
@@ -283,7 +276,7 @@ def _(splats, bins, size, limits, tuning, walk, v_pixels, geometry):
 
 
 def _composite_setup(ctx, inputs, output):
-    *splats, bins, ctx.size, ctx.limits, ctx.tuning, ctx.skipped = inputs
+    *splats, bins, ctx.size, ctx.limits, ctx.skipped = inputs
     renders, alphas, *walk = output
     ctx.mark_non_differentiable(*walk)
     ctx.set_materialize_grads(False)
@@ -300,8 +293,8 @@ def _composite_backward(ctx, *cotangents):
         for v, shape in zip(cotangents, ctx.shapes)
     ]
     geometry = any(needs[:3]) or not size.skip & UNASKED
-    options = ctx.size, ctx.limits, ctx.tuning
-    skipped, *grads, v_colors = _composite_vjp(splats, bins, *options, walk, v_pixels, geometry)
+    given = splats, bins, ctx.size, ctx.limits, walk, v_pixels, geometry
+    skipped, *grads, v_colors = _composite_vjp(*given)
     if ctx.skipped is not None:
         ctx.skipped.copy_(skipped.sum())
     if not size.colors_per_view and size.views:
@@ -311,7 +304,7 @@ def _composite_backward(ctx, *cotangents):
     v_colors = v_colors.reshape(colors.shape) if v_colors.numel() else torch.zeros_like(colors)
     grads = [*(grads or [None] * 3), v_colors]
     grads = (x if need else None for x, need in zip(grads, needs))
-    return *grads, [None] * len(bins), None, None, None, None
+    return *grads, [None] * len(bins), None, None, None
 
 
 composite.register_autograd(_composite_backward, setup_context=_composite_setup)

@@ -14,6 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from ..runtime.views import struct
+from .constants import TILE
 from .skip import TILE_TEST
 
 wp.set_module_options({"enable_backward": False})
@@ -23,37 +24,30 @@ SLACK, SLACK_ABS = 1.0 + 1e-4, 1e-4
 
 
 class Tiling(NamedTuple):
-    """How a picture is cut into square tiles; it belongs to the lists that were made with it.
+    """How a picture is cut into square tiles of ``TILE`` pixels a side.
 
     Attributes:
         width: of the picture, pixels.
         height: of the picture, pixels.
-        tile: side of a tile in pixels, a power of two.
     """
 
     width: int
     height: int
-    tile: int
 
     @property
     def tiles_x(self) -> int:
         """Tiles in a row; the last one may reach beyond the picture."""
-        return -(-self.width // self.tile)
+        return -(-self.width // TILE)
 
     @property
     def tiles_y(self) -> int:
         """Rows of tiles."""
-        return -(-self.height // self.tile)
+        return -(-self.height // TILE)
 
     @property
     def count(self) -> int:
         """Tiles of one picture."""
         return self.tiles_x * self.tiles_y
-
-    @property
-    def shift(self) -> int:
-        """A tile has 2^shift pixels in a row."""
-        return self.tile.bit_length() - 1
 
 
 class Bins(NamedTuple):
@@ -115,6 +109,25 @@ class Walk(NamedTuple):
     blocks_walked: Tensor
 
 
+@struct
+class Walked:
+    """``Walk`` as a launch takes it."""
+
+    transmittances: wp.array2d[wp.float32]
+    stops: wp.array2d[wp.int32]
+    blocks: wp.array[wp.int32]
+    walked: wp.array[wp.int32]
+    blocks_walked: wp.array[wp.int64]
+
+
+@struct
+class Pixels:
+    """The pictures, or the gradient that comes from them; by pixels of all of them."""
+
+    renders: wp.array2d[wp.float32]
+    alphas: wp.array2d[wp.float32]
+
+
 class PairGradients(NamedTuple):
     """Gradients of the compositor's inputs: of each (view, Gaussian), the sum over its pairs.
 
@@ -158,7 +171,7 @@ def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
     grid = Grid()
     grid.num, grid.alpha_min, grid.skip = num, alpha_min, skip
     grid.width, grid.height = tiling.width, tiling.height
-    grid.tiles_x, grid.tiles_y, grid.shift = tiling.tiles_x, tiling.tiles_y, tiling.shift
+    grid.tiles_x, grid.tiles_y, grid.shift = tiling.tiles_x, tiling.tiles_y, TILE.bit_length() - 1
     return grid
 
 
@@ -206,16 +219,15 @@ class Picture:
 
 
 @functools.lru_cache(maxsize=256)
-def make_picture(size: Size, limits: Limits, *, num: int, tile: int) -> Picture:
+def make_picture(size: Size, limits: Limits, *, num: int) -> Picture:
     """The scalars of a compositing launch as one kernel argument, not to be changed either.
 
     Args:
         size: the integers.
         limits: the thresholds.
         num: Gaussians of a view.
-        tile: side of a tile, pixels.
     """
-    tiling = Tiling(size.width, size.height, tile)
+    tiling = Tiling(size.width, size.height)
     picture = Picture()
     picture.width, picture.height = size.width, size.height
     picture.tiles_x, picture.tiles_y = tiling.tiles_x, tiling.tiles_y

@@ -1,1 +1,1 @@
-"""What every operator stands on: views of tensors, launches, threads, memory, SIMD, tuning."""
+"""What every operator stands on: views of tensors, launches, threads, memory, SIMD."""

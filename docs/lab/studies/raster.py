@@ -1,4 +1,4 @@
-"""Studies of the rasterizer: its inner choices, its switches one by one, and large scenes."""
+"""Studies of the rasterizer: its switches one by one, and large scenes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import torch
 from gamba_warp.kernels.bench.cases.raster_parts import Parts
 from gamba_warp.kernels.bench.cases.raster_scene import (
     LEAVES,
-    TRADE_LIMIT,
     Scene,
     make_scene,
     orbit_cameras,
@@ -27,10 +26,8 @@ from gamba_warp.kernels.bench.core.case import (
     make_cases,
 )
 from gamba_warp.kernels.rasterize import Skip
-from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
 
 from .growth import near_crop
-from .scan import on_kernels
 
 _FEW = 16384
 _CASE = "large scenes"
@@ -43,39 +40,8 @@ def cases(settings: Settings) -> list[Case]:
     """All studies of the rasterizer at the level's sizes."""
     builders = [("switches", switches, "switched off")]
     if settings.device.type == "cpu":
-        builders += [
-            ("exponential", exponential, "error"),
-            ("tiles", tiles, "error"),
-            ("large scenes", large_scenes, "N"),
-        ]
+        builders.append(("large scenes", large_scenes, "N"))
     return make_cases("raster", settings, builders)
-
-
-def exponential(settings: Settings) -> list[Variant]:
-    """Degree of the polynomial that makes exp in the CPU's kernels, at scale 2. The truth has the
-    same thresholds, so that the polynomial alone is seen: without them ("knobs") their error
-    hides it. Degree 5 errs by float32's own rounding at a price that is hardly to be measured.
-    """
-    scene, default, made = make_scene(settings, 2), Tuning(), []
-    for degree in (3, 5) if settings.level == "quick" else (2, 3, 4, 5):
-        choice = Tuning(degree=degree)
-        pair = scene.pair(f"degree {degree}", limit=TRADE_LIMIT, default=choice == default)
-        made += on_kernels(use_tuning, choice, pair)
-    return made
-
-
-def tiles(settings: Settings) -> list[Variant]:
-    """Side of the tiles that have a list, and size of the sub-tiles that an ellipse is tested
-    against in them, of the CPU's kernels, at scale 2. Same picture: a smaller tile makes more
-    pairs, a larger sub-tile more evaluations.
-    """
-    scene, default, made = make_scene(settings, 2), Tuning(), []
-    sizes = [(16, 4, 4), (16, 8, 4), (16, 8, 8), (16, 16, 16), (8, 4, 4), (8, 8, 8)]
-    for tile, width, height in sizes[::4] if settings.level == "quick" else sizes:
-        choice = Tuning(tile=tile, width=width, height=height)
-        pair = scene.pair(f"{tile}, {width} x {height}", default=choice == default)
-        made += on_kernels(use_tuning, choice, pair)
-    return made
 
 
 def switches(settings: Settings) -> list[Variant]:

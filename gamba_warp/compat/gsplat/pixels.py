@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gamba_warp.kernels.rasterize import Skip
-from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, T_MIN
-from gamba_warp.kernels.rasterize.cpu.tuning import tuning_for
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, T_MIN, TILE
 from gamba_warp.kernels.rasterize.ops import composite
 from gamba_warp.kernels.rasterize.tiles import Bins, Limits, Size, Tiling
 
@@ -151,13 +150,12 @@ def blend(
             of ``a (dx + k dy)² + e dy²``), opacities ``[I, R]``, and colors ``[I * R, C]``, or
             ``[I / views * R, C]`` if an object's views share them. The lists name rows of all.
         bins: the lists of tiles.
-        tiling: the cut into tiles, of the side that ``tuning_for`` says.
+        tiling: the cut into tiles.
         views: pictures of an object, which share the colours; 1 if none do.
         keep: given, in backward, the absolute gradients ``[I * R, 2]`` of the centres; or None.
     """
     size = Size(tiling.width, tiling.height, views, int(views == 1), SKIP)
-    tuning = tuning_for(layers[0].device.type).numbers()
-    renders, alphas, *_ = composite(*layers, list(bins), list(size), list(LIMITS), tuning, None)
+    renders, alphas, *_ = composite(*layers, list(bins), list(size), list(LIMITS), None)
     if keep is None or not renders.requires_grad:
         return renders, alphas
     both = torch.cat([renders, alphas], -1)
@@ -184,12 +182,12 @@ def _absolute_gradients(
     means2d, conics, opacities = means2d.flatten(0, 1), conics.flatten(0, 1), opacities.flatten()
     # a channel of ones stands for alpha, which is the sum of the weights
     colors = torch.cat([colors, torch.ones_like(opacities)[:, None]], -1)
-    right, below = (-size % tiling.tile for size in (tiling.width, tiling.height))
+    right, below = (-size % TILE for size in (tiling.width, tiling.height))
     padded = F.pad(upstream.permute(0, 3, 1, 2), (0, right, 0, below))  # 0 beyond the picture
-    by_tile = F.pixel_unshuffle(padded, tiling.tile).unflatten(1, (-1, tiling.tile**2))
+    by_tile = F.pixel_unshuffle(padded, TILE).unflatten(1, (-1, TILE**2))
     by_tile = by_tile.permute(0, 3, 4, 2, 1).flatten(0, 2)  # [tiles, pixels, C + 1]
-    inside = torch.arange(tiling.tile**2, device=means2d.device)
-    offsets = torch.stack([inside % tiling.tile, inside // tiling.tile], -1) + 0.5
+    inside = torch.arange(TILE**2, device=means2d.device)
+    offsets = torch.stack([inside % TILE, inside // TILE], -1) + 0.5
     total, counts = torch.zeros_like(means2d), bins.starts.diff()
     order = counts.argsort(descending=True)[: int((counts > 0).sum())]
     while len(order):  # those of like lengths together
@@ -200,7 +198,7 @@ def _absolute_gradients(
         real = place < counts[tiles, None]
         rows = bins.pairs[(bins.starts[tiles, None] + place).clamp_max(len(bins.pairs) - 1)]
         column, line = tiles % tiling.tiles_x, tiles // tiling.tiles_x % tiling.tiles_y
-        corners = torch.stack([column, line], -1) * tiling.tile
+        corners = torch.stack([column, line], -1) * TILE
         d = corners[:, None, None] + offsets - means2d[rows][:, :, None]
         a, k, e = conics[rows][:, :, None].unbind(-1)
         dy = d[..., 1]
@@ -304,14 +302,13 @@ def rasterize_to_pixels(
 
     # Each of gsplat's tiles begins at one of ours: where it needs a part of a tile, the next one is
     # moved, and so are its Gaussians.
-    tile, device = tuning_for(means2d.device.type).tile, means2d.device
-    parts = -(-tile_size // tile)
-    moved = tile_size % tile != 0
+    device, parts = means2d.device, -(-tile_size // TILE)
+    moved = tile_size % TILE != 0
     if moved:
         owner = torch.arange(len(counts), device=device).repeat_interleave(counts)
         corner = torch.stack([owner % grid_x, owner // grid_x % grid_y], -1)
         layers = [x[ids] for x in layers]
-        layers[0] = layers[0] + corner * (parts * tile - tile_size)
+        layers[0] = layers[0] + corner * (parts * TILE - tile_size)
     images = math.prod(lead)
     around = torch.arange(len(counts), device=device).view(images, grid_y, 1, grid_x, 1)
     around = around.expand(-1, -1, parts, -1, parts).flatten()
@@ -338,7 +335,7 @@ def rasterize_to_pixels(
         box_pairs=starts[-1],
         count=starts[-1],
     )
-    tiling = Tiling(grid_x * parts * tile, grid_y * parts * tile, tile)
+    tiling = Tiling(grid_x * parts * TILE, grid_y * parts * TILE)
     found = []
     for picture in blend(layers, bins, tiling, keep=keep if absgrad else None):
         apart = picture.unflatten(2, (grid_x, -1)).unflatten(1, (grid_y, -1))

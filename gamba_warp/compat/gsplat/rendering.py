@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
-from gamba_warp.kernels.rasterize.cpu.tuning import tuning_for
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, TILE
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.ops import bin_op
 from gamba_warp.kernels.rasterize.project import LensOptions
@@ -185,11 +184,10 @@ def rasterization(
             each = blended if blended.dim() == 4 else blended[:, None]
             parts.insert(0, each.expand(-1, views, -1, -1))
         blended = torch.cat(parts, -1)
-    tuning = tuning_for(means.device.type)
-    tiling = Tiling(width, height, tuning.tile)
+    tiling = Tiling(width, height)
     per_view = [x.flatten(0, 1).contiguous() for x in splats]
     # of exact length, because meta shows them
-    numbers = width, height, ALPHA_MIN, SKIP, tuning.numbers(), True
+    numbers = width, height, ALPHA_MIN, SKIP, True
     bins = Bins(*bin_op(*(x.detach() for x in per_view), *numbers))
     layers = *per_view[:2], per_view[3], blended.flatten(0, -2).contiguous()
 
@@ -219,7 +217,7 @@ def rasterization(
         tile_width=grid[1], tile_height=grid[0], tiles_per_gauss=shown(counts.view(seen.shape)),
         isect_ids=pair_ids(tile // tiling.count, tile % tiling.count, depths, tiling.count),
         flatten_ids=row.int(), isect_offsets=bins.starts[:-1].view(*lead, views, *grid),
-        width=width, height=height, tile_size=tiling.tile, n_batches=len(radii), n_cameras=views,
+        width=width, height=height, tile_size=TILE, n_batches=len(radii), n_cameras=views,
     )  # fmt: skip
     renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
     return renders, alphas, meta

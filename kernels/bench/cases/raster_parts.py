@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ...rasterize import Skip
 from ...rasterize.constants import ALPHA_MIN, EPS2D, TILE
-from ...rasterize.cpu.tuning import current
 from ...rasterize.ops import bin_op, project
 from ...rasterize.project import LensOptions, Projected
 from .. import peers
@@ -65,7 +64,7 @@ class Parts:
         """Our tile lists; of the scene's own projection if none is given."""
         x = projected or self.projected
         parts = x.means2d, x.conics, x.depths, x.view_opacities, x.extents
-        options = self.width, self.height, ALPHA_MIN, Skip().bits(), current().numbers()
+        options = self.width, self.height, ALPHA_MIN, Skip().bits()
         return bin_op(*(part.flatten(0, 1) for part in parts), *options)
 
     def gsplat_bin(self) -> object:

@@ -2,9 +2,9 @@
 // (lanes = blocks), and those that its ellipse touches are evaluated (lanes = pixels).
 #include "tile.h"
 
-const F corner_x = COLUMN_STARTS, corner_y = ROW_STARTS;  // of the part of the tile around a block
+const F corner_x = X * 4.0f, corner_y = Y * 4.0f;  // a block's first pixel, in the tile
 const I bit = 1 << lane;
-// The blocks around which some pixel centre may have q <= limit: the least q on the rectangle of a
+// The blocks in which some pixel centre may have q <= limit: the least q on the rectangle of a
 // block's pixel centres (README.md §2, the last paragraph).
 auto touched = [&](const Tile& tile, int g) -> int {
     const float* const mean = (const float*)(splats.means2d.data + g);
@@ -15,8 +15,8 @@ auto touched = [&](const Tile& tile, int g) -> int {
     const float widened = 2.0f * wp::log(splats.opacities.data[g] / picture.alpha_min) * SLACK;
     const float limit = widened + SLACK_ABS;
     const F zero = F{};
-    const F x0 = corner_x + ((float)tile.x + 0.5f) - mean[0], x1 = x0 + (WIDTH - 1.0f);
-    const F y0 = corner_y + ((float)tile.y + 0.5f) - mean[1], y1 = y0 + (HEIGHT - 1.0f);
+    const F x0 = corner_x + ((float)tile.x + 0.5f) - mean[0], x1 = x0 + 3.0f;
+    const F y0 = corner_y + ((float)tile.y + 0.5f) - mean[1], y1 = y0 + 3.0f;
     const F ny = max_(y0, min_(zero, y1)), nx = max_(x0, min_(zero, x1));
     const F kny = k * ny;
     F u = max_(x0, min_(-kny, x1)) + kny;

@@ -72,6 +72,10 @@ auto alpha_of = [&](const Splat& s, F U, F V) -> F {
     x = max_(x, F{} - 126.0f);
     const F n = x + shifter;
     const F f = x - (n - shifter);
-    POLYNOMIAL
+    const F high = fma_(splat(0.00132764715f), f, splat(0.00967554133f));
+    const F middle = fma_(splat(0.0555071327f), f, splat(0.240221197f));
+    const F low = fma_(splat(0.693146967f), f, splat(1.00000007f));
+    const F f2 = f * f;  // pairs of terms make a shorter chain than Horner's
+    const F p = fma_(fma_(high, f2, middle), f2, low);
     return p * (F)((I)n << 23) * s.opacity;
 };

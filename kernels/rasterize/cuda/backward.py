@@ -12,7 +12,7 @@ import warp as wp
 
 from ...runtime.views import struct
 from ..skip import UNUSED, ZERO_UPSTREAM
-from ..tiles import Lists, Picture
+from ..tiles import Lists, Picture, Pixels, Walked
 from . import leaves as L
 from .warp import (
     CHUNK,
@@ -24,9 +24,7 @@ from .warp import (
     WARP,
     WIDTH,
     Gaussians,
-    Pixels,
     Place,
-    Walked,
     first_block,
     kernel_options,
     placing,

@@ -16,11 +16,12 @@ from torch import Tensor
 from ...runtime.launch import cuda_launch
 from ...runtime.recording import multiprocessors_of
 from ...runtime.views import Packed
-from ..tiles import Bins, Lists, PairGradients, Picture, Walk
+from ..constants import BLOCKS
+from ..tiles import Bins, Lists, PairGradients, Picture, Pixels, Walk, Walked
 from .backward import Rows, backward_kernels, row_length
 from .forward import forward_kernels
 from .reduce import reduce_rows
-from .warp import CHUNK, WARP, Gaussians, Pixels, Walked
+from .warp import CHUNK, WARP, Gaussians
 
 
 def parts_of_tile(tiles: int, device: torch.device) -> int:
@@ -68,9 +69,8 @@ def composite_forward(
     colors: Tensor,
     bins: Bins,
     picture: Picture,
-    tuning: object,
 ) -> tuple[Tensor, Tensor, Walk]:
-    """As ``composite_forward`` of the CPU; ``tuning`` is the CPU's default, which is not read.
+    """As ``composite_forward`` of the CPU.
 
     A ``Walk``'s pixels are in the order of the lanes, its ``stops`` are set where a pixel stopped
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
@@ -81,8 +81,8 @@ def composite_forward(
     alphas = colors.new_empty(images, picture.height, picture.width, 1)
     parts = parts_of_tile(tiles, colors.device)
     walk = Walk(
-        transmittances=colors.new_empty(tiles * 16, 16),
-        stops=bins.pairs.new_empty(tiles * 16, 16),
+        transmittances=colors.new_empty(tiles * BLOCKS, 16),
+        stops=bins.pairs.new_empty(tiles * BLOCKS, 16),
         blocks=torch.zeros_like(bins.pairs),
         walked=bins.pairs.new_zeros(tiles),
         blocks_walked=bins.pairs.new_zeros(tiles, dtype=torch.int64),
@@ -105,13 +105,12 @@ def composite_backward(
     colors: Tensor,
     bins: Bins,
     picture: Picture,
-    tuning: object,
     walk: Walk,
     v_renders: Tensor,
     v_alphas: Tensor,
     geometry: bool,
 ) -> tuple[PairGradients, Tensor]:
-    """As ``composite_backward`` of the CPU; ``tuning`` is not read."""
+    """As ``composite_backward`` of the CPU."""
     tiles, channels = walk.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
     v_pairs = colors.new_zeros(bins.pairs.numel(), parts, row_length(channels))

@@ -10,7 +10,7 @@ from typing import no_type_check
 import warp as wp
 
 from ..skip import BLOCK_TEST, STOPPED
-from ..tiles import Lists, Picture
+from ..tiles import Lists, Picture, Pixels, Walked
 from . import leaves as L
 from .warp import (
     HEIGHT,
@@ -20,9 +20,7 @@ from .warp import (
     WARP,
     WIDTH,
     Gaussians,
-    Pixels,
     Place,
-    Walked,
     first_block,
     kernel_options,
     placing,

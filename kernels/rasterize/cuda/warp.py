@@ -247,25 +247,6 @@ class Gaussians:
     first: int  # the first channel of this launch
 
 
-@struct
-class Walked:
-    """``Walk``, in its order."""
-
-    transmittances: wp.array2d[wp.float32]
-    stops: wp.array2d[wp.int32]
-    blocks: wp.array[wp.int32]
-    walked: wp.array[wp.int32]
-    blocks_walked: wp.array[wp.int64]
-
-
-@struct
-class Pixels:
-    """The pictures, or the gradient that comes from them; by pixels of all of them."""
-
-    renders: wp.array2d[wp.float32]
-    alphas: wp.array2d[wp.float32]
-
-
 @functools.cache
 def staging(channels: int, size: int):
     """The function that puts a lane's Gaussian into its record.

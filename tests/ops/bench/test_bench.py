@@ -441,10 +441,16 @@ def test_the_scene_and_its_crop():
     assert counts["pairs"] > 100 and counts["tiles"] == 16 and counts["gaussians"] == 300
 
 
-@pytest.mark.parametrize("name", ["one call", "skipping", "batch", "exponential", "harmonics"])
-def test_raster_cases_run(name):
-    every = [*raster_suite.cases(QUICK), *raster_study.cases(QUICK)]
-    chosen = [c for c in every if c.name == name]
+@pytest.mark.parametrize(
+    "suite, name",
+    [
+        *((raster_suite, name) for name in ("one call", "skipping", "batch", "harmonics")),
+        (raster_study, "switches"),
+        (scan_study, "exponential"),
+    ],
+)
+def test_cases_run(suite, name):
+    chosen = [c for c in suite.cases(QUICK) if c.name == name]
     records = measure(chosen, QUICK)["records"]
     assert records and all(r["status"] == "ok" for r in records), records
     if name == "skipping":

@@ -10,7 +10,6 @@ from gamba_warp.kernels.rasterize import Skip, ops, project, rasterization
 from gamba_warp.kernels.rasterize.cpu import bin as bin_cpu
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
-from gamba_warp.kernels.rasterize.cpu.tuning import Tuning, use_tuning
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.project import LensOptions, make_lens
 from gamba_warp.kernels.rasterize.tiles import PairGradients
@@ -61,11 +60,6 @@ def test_same_lists_pictures_and_gradients(monkeypatch, size, shape):
 @pytest.mark.parametrize("options", [{"skip": Skip(tile_test=False)}, {"render_mode": "RGB+ED"}])
 def test_same_with_options(monkeypatch, options):
     assert_lists(monkeypatch, make(1, 2, 200, 50, 70), **options)
-
-
-def test_same_with_another_tile(monkeypatch):
-    with use_tuning(Tuning(tile=8)):
-        assert_lists(monkeypatch, make(1, 2, 200, 50, 70))
 
 
 def test_lists_are_in_order_of_depth_then_of_index(monkeypatch):

@@ -5,9 +5,10 @@ import torch
 from helpers import assert_rel_rms
 from helpers.raster import GRADIENT, NAMES, PICTURE, leaves, make, near_a_cut
 
-from gamba_warp.kernels.rasterize import rasterization
+from gamba_warp.kernels.rasterize import ops, rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_from_harmonics
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
+from gamba_warp.kernels.rasterize.tiles import Limits, Size
 
 # Σ w z / Σ w where pixels are so faint that 1 - T has lost the digits of Σ w
 DEPTH = 1e-6  # relative: rounding of the weights, of which a mean of depths sees a part
@@ -199,3 +200,38 @@ def test_one_gaussian_has_its_own_depth_wherever_it_is_seen():
     assert alphas[seen].min() < 2e-5 and seen.any() and not seen.all()
     assert (renders[seen] / meta["depths"] - 1).abs().max() < 2.5e-7
     assert (renders[~seen] == 0).all()
+
+
+def test_fake_results_have_the_real_shapes():
+    num, views, width, height = 40, 2, 37, 21
+    meta = rasterization(**make(1, views, num=num, width=width, height=height))[-1]
+    names = ("means2d", "conics", "depths", "opacities")
+    means2d, conics, depths, opacities = (meta[k].detach().flatten(0, 1) for k in names)
+    extents = torch.full_like(means2d, 5.0)
+    bins = (means2d, conics, depths, opacities, extents, width, height, 1 / 255, 127)
+    checks = ("test_schema", "test_faketensor")
+    torch.library.opcheck(ops.bin_op, bins, test_utils=checks)
+    size = Size(width=width, height=height, views=views, colors_per_view=0, skip=127)
+    limits = Limits(alpha_min=1 / 255, alpha_max=0.99, t_min=1e-4)
+    lists = list(meta.bins), list(size), list(limits)
+    arguments = (means2d, conics, opacities, torch.rand(num, 3), *lists, None)
+    torch.library.opcheck(ops.composite, arguments, test_utils=checks)
+
+
+def test_a_compiled_call_has_the_same_bits():
+    scene = make(1, 1, num=40, width=37, height=21)
+    names = ("means", "quats", "scales", "opacities", "colors")
+
+    def call(*gaussians):
+        rest = {k: scene[k] for k in ("viewmats", "Ks", "width", "height")}
+        return rasterization(**dict(zip(names, gaussians)), **rest, render_mode="RGB+ED")[:2]
+
+    # torch 2.6 cuts the graph at the lists, whose length is not known before, and at ``Meta``.
+    whole = torch.__version__ >= "2.10"
+    results = []
+    for function in (call, torch.compile(call, fullgraph=whole, backend="aot_eager")):
+        gaussians = [scene[name].clone().requires_grad_() for name in names]
+        renders, alphas = function(*gaussians)
+        grads = torch.autograd.grad((renders.square() + alphas).sum(), gaussians)
+        results.append([renders, alphas, *grads])
+    assert all(torch.equal(a, b) for a, b in zip(*results))

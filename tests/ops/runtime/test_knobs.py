@@ -1,6 +1,5 @@
 """Choices inside the kernels: each gives the default's result but for what it trades."""
 
-import dataclasses
 from unittest.mock import patch
 
 import pytest
@@ -11,7 +10,6 @@ from gamba_warp.cameras import Cameras, intrinsics, reference_viewmat
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
 from gamba_warp.kernels.rasterize import rasterization
-from gamba_warp.kernels.rasterize.cpu import tuning as raster_tuning
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
 from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.kernels.selective_scan.cpu import launch as cpu_scan
@@ -55,29 +53,6 @@ def results(of):
     return [renders, alphas, *of.backward()], meta
 
 
-@pytest.mark.parametrize("tile, width, height", [(16, 8, 4), (16, 16, 16), (8, 4, 4), (8, 8, 4)])
-def test_tiles_and_sub_tiles(tile, width, height):
-    want, default = results(scene())
-    choice = raster_tuning.Tuning(tile=tile, width=width, height=height)
-    with raster_tuning.use_tuning(choice):
-        got, meta = results(scene())
-        counts = {k: meta[k] for k in ("blocks_used", "tiles", "pairs", "blocks_walked")}
-    assert torch.equal(got[0], want[0]) and torch.equal(got[1], want[1])
-    assert all(rel_rms(a, b) < 1e-6 for a, b in zip(got, want))  # sums by tile
-    assert counts["blocks_used"] == default["blocks_used"]
-    assert meta["tile_size"] == tile and counts["tiles"] == 2 * (-(-75 // tile)) ** 2
-    assert (counts["pairs"] > default["pairs"]) == (tile == 8)
-    assert (counts["blocks_walked"] > default["blocks_walked"]) == (width > 4)
-
-
-@pytest.mark.parametrize("degree, low, high", [(2, 1e-4, 5e-3), (3, 1e-6, 5e-4), (4, 1e-8, 2e-5)])
-def test_degree_of_exp(degree, low, high):
-    want, _ = results(scene())
-    with raster_tuning.use_tuning(raster_tuning.Tuning(degree=degree)):
-        got, _ = results(scene())
-    assert low < rel_rms(got[0], want[0]) < high
-
-
 @pytest.mark.parametrize("t_min", [0.3, 1e-2, 1e-30])
 def test_the_limit_of_transmittance(t_min):
     """Against the oracle with the same limit; the default's picture is another one."""
@@ -97,28 +72,6 @@ def test_the_limit_of_transmittance(t_min):
 def test_limits_that_are_refused(t_min):
     with pytest.raises(ValueError, match="t_min is"):
         rasterization(**scene(t_min=t_min).arguments())
-
-
-@pytest.mark.parametrize(
-    "module, choice, reason",
-    [
-        (raster_tuning, {"tile": 32}, "tile is 32"),
-        (raster_tuning, {"tile": 8, "width": 16}, "width is 16"),
-        (raster_tuning, {"degree": 6}, "degree is 6"),
-    ],
-)
-def test_choices_that_are_refused(module, choice, reason):
-    with pytest.raises(ValueError, match=reason):
-        module.Tuning(**choice)
-
-
-@pytest.mark.parametrize("module", [raster_tuning])
-def test_a_choice_ends_with_its_block(module):
-    other = dataclasses.replace(module.Tuning(), degree=3)
-    with pytest.raises(RuntimeError), module.use_tuning(other):
-        assert module.current() == other
-        raise RuntimeError
-    assert module.current() == module.Tuning()
 
 
 @pytest.fixture(scope="module")
