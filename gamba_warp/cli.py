@@ -52,10 +52,12 @@ KEEPING = {"reconstruct", "app", "train", "ablate", "bench", "demo", "fit", "eva
 # Those that launch kernels.
 LAUNCHING = KEEPING | {"export", "render", "stress", "gpu-check", "doctor"}
 MODULES = {
-    "app": "gamba_warp.app.app_command",
+    "app": "gamba_warp.app.server",
     "train": "gamba_warp.train.command",
     **{name: "gamba_warp.train.sources.commands" for name in COMMANDS if name[:5] == "data "},
     "ablate": "gamba_warp.ablation.command",
+    **dict.fromkeys(("bench", "stress", "gpu-check", "doctor"), "gamba_warp.commands.machine"),
+    **dict.fromkeys(("import-released", "weights lpips"), "gamba_warp.commands.weights"),
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",
     "compare": "gamba_warp.eval.compare_command",

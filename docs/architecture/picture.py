@@ -86,7 +86,7 @@ BOXES = {
     "eval": Box(4.7, 7, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
     "gpu_check": Box(0.6, 9, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
     "ablation": Box(2.1, 9, "gamba_warp", "ablation", ("rows trained and", "evaluated alike")),
-    "commands": Box(2.2, 11, "gamba_warp", "commands", ("a file a command:", "parse, call, print")),
+    "commands": Box(2.2, 11, "gamba_warp", "commands", ("by subject:", "parse, call, print")),
     "cli": Box(2.8, 12, "gamba_warp", "cli", ("gamba COMMAND,", "python -m …")),
     "public": Box(0.2, 12, "gamba_warp", "gamba_warp", ("its public names,", "loaded when used")),
 }

@@ -117,7 +117,7 @@ ROOMS = {
         ("measure", *_TRAIN, *_EVAL),
     ),
     "commands": Room(
-        "a file a command",
+        "commands, by subject",
         (*_MEASURES, "measure", "ablation", "gpu_check"),
         (*_TRAIN, *_EVAL),
     ),

@@ -14,11 +14,18 @@ from ..errors import UserError, first_line
 from ..images import save_image
 from ..versions import advice
 from . import work
-from .cutting import Cut, cut_picture, editor_picture, mended, read_strokes, restarted
-from .examples import examples
+from .cutting import (
+    Cut,
+    cut_picture,
+    editor_picture,
+    examples,
+    mended,
+    read_strokes,
+    restarted,
+)
 from .guard import VISITOR
+from .server import MainThread
 from .shelf import Shelf
-from .turns import MainThread
 
 if TYPE_CHECKING:
     from ..model.gamba import Gamba

@@ -1,4 +1,4 @@
-"""The cut-out of a picture, as the page shows it, and the strokes that mend its mask."""
+"""Pictures to take for an example, the cut-out of one, and the strokes that mend its mask."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ import numpy as np
 
 from ..conventions import over_background
 from ..errors import UserError
+from ..files import STARTER
 
 if TYPE_CHECKING:
     from ..photo.cutout import Ways
+
 
 SIDE = 720  # longer side of the picture that is painted on, pixels
 KEEP, REMOVE = "#2f6fed", "#e8590c"  # colours of the brush: blue and orange, told apart by all eyes
@@ -24,6 +26,7 @@ _TILE = 12  # side of the checkerboard's squares, pixels
 _LIGHT, _DARK = 0.97, 0.86
 _GHOST = 0.22  # how much of what is cut away still shows, so that it can be painted back
 _NAME = re.compile(r"[^\w-]+")
+FOLDER = STARTER / "icons"  # the examples
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,3 +208,19 @@ def _resized(values: np.ndarray, height: int, width: int) -> np.ndarray:
         for plane in np.moveaxis(np.ascontiguousarray(planes, np.float32), -1, 0)
     ]
     return out[0] if values.ndim == 2 else np.stack(out, -1)
+
+
+def examples() -> list[tuple[Path, str]]:
+    """The pictures that come with the package, sorted by name, each with what it shows.
+
+    An installed package has two, a checkout more.
+    """
+    found = sorted(FOLDER.glob("*.png"))
+    return [(path, _title(path.stem)) for path in found]
+
+
+def _title(name: str) -> str:
+    """``scopia-dog-house`` is "dog house": what comes first is who made it."""
+    for maker in ("blendswap-cc-0-", "blendswap-cc-by-", "katorlegaz-", "scopia-"):
+        name = name.removeprefix(maker)
+    return name.rstrip("0123456789").replace("-", " ").replace("_", " ")

@@ -26,7 +26,7 @@ from ..errors import UserError, first_line
 from ..images import PICTURE_SUFFIXES
 from ..pages.serve import is_foreign
 from ..untrusted.documents import parse_document
-from .examples import examples
+from .cutting import examples
 from .shelf import KEPT, Shelf
 
 # Scripts stand in the page, and its brush compiles shaders' bindings; the viewer is a frame of the

@@ -1,25 +1,126 @@
-"""Serves the page on 127.0.0.1 until Ctrl-C, and leaves nothing behind."""
+"""``gamba app``: serves the page on 127.0.0.1 until Ctrl-C, and leaves nothing behind."""
 
 from __future__ import annotations
 
 import logging
 import os
+import queue
 import shutil
 import signal
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
+import tyro
+from msgspec import Meta
+
+from ..conventions import DeviceChoice
 from ..errors import UserError
 from ..files import only_process
+from ..untrusted.ranges import ranged
 from .shelf import Shelf
-from .turns import MainThread
 
 if TYPE_CHECKING:
     import gradio as gr
+
+
+@ranged
+def app_command(
+    *,
+    checkpoint: Path | None = None,
+    encoder_weights: Path | None = None,
+    matte_model: Annotated[str | None, tyro.conf.arg(metavar="FILE|URL")] = None,
+    port: Annotated[int, Meta(ge=0, le=65535)] = 7860,
+    open_browser: bool = True,
+    max_upload_mb: Annotated[int, Meta(ge=1, le=1024)] = 30,
+    device: DeviceChoice = "auto",
+) -> None:
+    """Serves a page that makes 3D objects of pictures, for this machine alone, until Ctrl-C.
+
+    Args:
+        checkpoint: Trained model (.safetensors); the shipped model if not given.
+        encoder_weights: The image encoder's weights, where the model has a pretrained one.
+        matte_model: ONNX file of an ISNet or U2-Net that cuts objects out, or the address of a copy
+            of one of rembg's; if not given, one that rembg keeps on this machine, or it is fetched
+            once (179 MB).
+        port: Port of 127.0.0.1; 0 picks a free one.
+        open_browser: Open the browser; the address is printed in any case.
+        max_upload_mb: Largest picture file, MB.
+        device: Device that computes; auto is the GPU if there is one.
+    """
+    from ..devices import pick_device
+    from ..model.checkpoint import load_model
+    from ..photo.cutout import Ways
+
+    chosen, port = pick_device(device), free_port(port)
+    ways = Ways(matte_model=matte_model, device=chosen).checked()
+    model = load_model(checkpoint, chosen, encoder_weights)
+    with work_folder() as folder:
+        quiet(folder)
+        from .actions import Actions
+        from .interface import build
+
+        turns, shelf = MainThread(), Shelf(folder)
+        page = build(Actions(model, ways, shelf, str(chosen), turns))
+        serve(page, shelf, port, max_upload_mb, open_browser, turns)
+
+
+Result = TypeVar("Result")
+
+
+class MainThread:
+    """Jobs of other threads, done in turn by the one that calls ``work``.
+
+    gradio calls from threads that come and go. Open3D ends the whole process at its exit if it was
+    used on a thread that had ended before, and OpenMP makes a new team of threads for every thread
+    that computes. So the main thread, which has nothing else to do, computes.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: queue.SimpleQueue[tuple[Future, Callable, tuple]] = queue.SimpleQueue()
+        self._over = False
+
+    def call(self, function: Callable[..., Result], *args: Any) -> Result:
+        """Has the main thread call the function, and waits; what it raises is raised here.
+
+        Raises:
+            UserError: the main thread has ended.
+        """
+        future: Future[Result] = Future()
+        self._jobs.put((future, function, args))
+        if self._over:
+            future.cancel()
+        try:
+            return future.result()
+        except CancelledError:
+            raise UserError("gamba app was ended; start it again") from None
+
+    def work(self) -> None:
+        """Does jobs until something that is no error of a job, such as Ctrl-C, ends it."""
+        try:
+            self._work()
+        finally:  # who waits for a job must not wait for ever
+            self._over = True
+            while not self._jobs.empty():
+                self._jobs.get()[0].cancel()
+
+    def _work(self) -> None:
+        while True:
+            future, function, args = self._jobs.get()
+            try:
+                result = function(*args)
+            except Exception as error:
+                future.set_exception(error)
+            except BaseException:
+                future.cancel()
+                raise
+            else:
+                future.set_result(result)
+
 
 HOST = "127.0.0.1"
 PREFIX = "gamba-app-"
@@ -107,8 +208,7 @@ def serve(
     from starlette.middleware import Middleware
 
     from .guard import Guard
-    from .interface import inputs
-    from .look import LOOK, theme
+    from .interface import LOOK, inputs, theme
 
     guard = Middleware(Guard, shelf=shelf, inputs=inputs(page), max_bytes=max_mb << 20)
     try:

@@ -23,9 +23,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from ..errors import UserError
-from .headers import compare_sizes, open_shape
+from .headers import MAX_VALUES, compare_sizes, lines_of, open_shape, read_table
 from .ply_data import read_ply
-from .tables import MAX_VALUES, lines_of, read_table
 
 SUFFIXES = (".xyz", ".pts", ".pcd", ".ply")
 MAX_POINTS = MAX_VALUES // 3

@@ -1,24 +1,35 @@
-"""Counts that a shape file states, against its size: a file that lies is refused unread."""
+"""What readers of shapes share: counts that a file states against its size, and rows of numbers.
+
+A file that lies is refused unread. In a text every row has the same columns, and
+every word is a number.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
+import numpy as np
 
 from ..errors import UserError
 from ..untrusted.documents import parse_document
-from .tables import lines_of
 
 MAX_FILE = 1 << 30  # bytes of a shape
 SLACK = 2  # bytes after the end: a line end
 GLB_JSON, GLB_START = 0x4E4F534A, 12
 MAX_ZEROS = 1 << 24  # bytes of all accessors that no bytes of the file stand behind
+MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
+MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
+_BOM = b"\xef\xbb\xbf"
+# str takes four control signs for blanks, which are none in a file: they become no ASCII.
+_STRICT = bytes(0xFF if 0x1C <= number <= 0x1F else number for number in range(256))
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=MAX_FILE)]
 
@@ -240,6 +251,61 @@ def _check_accessors(path: Path, tree: _Gltf) -> None:
         compare_sizes(path, says, wanted, there, exact=False)
     if total > MAX_FILE:
         raise UserError(f"{path}: its accessors take {total >> 20} MB, over {MAX_FILE >> 20}")
+
+
+def lines_of(file: BinaryIO, source: str, comments: str = "") -> Iterator[str]:
+    """Yields the lines of a text file that are not blank, of bounded length.
+
+    Args:
+        file: where the text begins.
+        source: named in errors.
+        comments: a line that begins with it is passed over; empty: there are no comments.
+
+    Raises:
+        UserError: a line is longer than ``MAX_LINE``.
+    """
+    first = True
+    while line := file.readline(MAX_LINE):
+        if len(line) == MAX_LINE:
+            raise UserError(f"{source}: a line of more than {MAX_LINE} letters")
+        # What is not ASCII becomes a sign that no number has.
+        line = (line.removeprefix(_BOM) if first else line).translate(_STRICT)
+        text = line.decode("ascii", "replace")
+        first = False
+        if not text.isspace() and text and not (comments and text.lstrip().startswith(comments)):
+            yield text
+
+
+def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ()) -> np.ndarray:
+    """Reads lines of numbers as ``[N, C]`` float64; NaN and infinity are numbers here.
+
+    Args:
+        lines: one row each.
+        source: named in errors.
+        columns: the numbers of columns that are allowed; empty: any.
+
+    Raises:
+        UserError: a word is no number, the rows differ in their number of columns, or there are
+            more than ``MAX_VALUES`` numbers.
+    """
+    lines = iter(lines)
+    first = next(lines, None)
+    if first is None:
+        return np.zeros((0, columns[0] if columns else 0))
+    count = len(first.split())
+    if columns and count not in columns:
+        wanted = " or ".join(map(str, columns))
+        raise UserError(f"{source}: {count} columns in the first row, expected {wanted}")
+    most = MAX_VALUES // count
+    try:
+        table = np.loadtxt(islice(chain([first], lines), most + 1), comments=None, ndmin=2)
+    except ValueError as error:
+        # "...; use `usecols` to select a subset" is advice for programmers.
+        reason = re.split(r"[;\n]", str(error))[0].rstrip(".")
+        raise UserError(f"{source}: {reason[:200]}") from error
+    if len(table) > most:
+        raise UserError(f"{source}: over {MAX_VALUES} numbers, the limit for one file")
+    return table
 
 
 _CHECKS = {".stl": _check_stl, ".off": _check_off, ".glb": check_glb, ".gltf": _check_gltf}

@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import UserError
-from .headers import compare_sizes, open_shape
+from .headers import MAX_VALUES, compare_sizes, lines_of, open_shape, read_table
 from .ply_header import ORDERS, PlyElement, PlyHeader, PlyProperty, read_ply_header
-from .tables import MAX_VALUES, lines_of, read_table
 
 _ROWS = 100_000  # rows of text with lists that are read at once
 

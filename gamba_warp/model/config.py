@@ -75,7 +75,8 @@ class GambaConfig:
             leaves the others E alone (paper, answer A4). It needs an even number of patches a side.
         prepend: False leaves out camera and image tokens (paper Table 2, "w/o Prepending").
         image_tokens: where these stand: "prefix" prepends them, "mixed" spreads them evenly among
-            the 3DGS tokens (``model.parts.mixed``). To attention, which knows no order, it is one.
+            the 3DGS tokens (``model.parts.block.mixed_places``). To attention, which knows no
+            order, it is one.
         camera_token: whether the camera is prepended; the image tokens may be prepended alone.
         encoder: "none", "vgg16" or the name of a timm ViT, e.g. "vit_base_patch14_reg4_dinov2".
         encoder_size: side of the picture that the encoder sees, pixels.

@@ -16,7 +16,7 @@ from ..errors import UserError, first_line
 from ..images import to_uint8
 from ..untrusted.children import Failed, run_each
 from ..versions import require, to_install
-from . import models, network
+from . import models
 
 MAX_MODEL = 2 << 30  # bytes of a model's file; the largest that rembg publishes has 1.1 GB
 _SECONDS = 300.0  # for one picture; it takes about six on two cores
@@ -74,7 +74,7 @@ class Matte:
     def _run(self, rgb: np.ndarray | None) -> np.ndarray | None:
         task = (str(self.path.absolute()), self._version, rgb, torch.get_num_threads())
         try:
-            ((_, value),) = run_each(network.alpha_of, [task], seconds=_SECONDS, memory=_MEMORY)
+            ((_, value),) = run_each(models.alpha_of, [task], seconds=_SECONDS, memory=_MEMORY)
         except RuntimeError as error:  # no child could be started
             value = Failed(first_line(error))
         if not isinstance(value, Failed):

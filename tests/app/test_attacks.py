@@ -9,7 +9,7 @@ import pytest
 from helpers.app import FORM, MEGABYTES, Program, form, serving
 from PIL import Image
 
-from gamba_warp.app.examples import examples
+from gamba_warp.app.cutting import examples
 
 TAKE, EXAMPLE, BRUSH, MEND, RESTART, MAKE = 0, 2, 3, 4, 5, 6  # numbers of functions
 ROUTES = ["", "theme.css", "gradio_api/file=/etc/passwd", "gradio_api/queue/data?session_hash=abc"]

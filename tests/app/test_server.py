@@ -13,8 +13,8 @@ from helpers.app import FORM, form
 
 from gamba_warp.app import guard, server
 from gamba_warp.app import shelf as shelves
+from gamba_warp.app.server import MainThread
 from gamba_warp.app.shelf import Shelf
-from gamba_warp.app.turns import MainThread
 from gamba_warp.errors import UserError
 
 

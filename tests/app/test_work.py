@@ -12,7 +12,7 @@ from helpers.model import quick, run_reconstruct
 from PIL import Image
 
 from gamba_warp.app import cutting, work
-from gamba_warp.app.examples import examples
+from gamba_warp.app.cutting import examples
 from gamba_warp.cameras import orbit
 from gamba_warp.errors import UserError
 from gamba_warp.files import STARTER

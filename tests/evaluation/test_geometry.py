@@ -23,8 +23,8 @@ from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Mesh, Similarity, sample
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.surfaces.cleaning import cleaned_mesh
 from gamba_warp.surfaces.density import opacity_volume
+from gamba_warp.surfaces.extract import cleaned_mesh
 from gamba_warp.surfaces.options import SurfaceOptions
 
 

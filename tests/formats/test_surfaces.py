@@ -14,9 +14,8 @@ from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench.static.cubin import read_cubin
 from gamba_warp.kernels.rasterize import depth_quantile, quantile
 from gamba_warp.render import render
-from gamba_warp.surfaces.cleaning import cleaned_mesh
 from gamba_warp.surfaces.density import MOST_POINTS, opacity_volume
-from gamba_warp.surfaces.extract import extract_surface, unit_frame, vertex_colors
+from gamba_warp.surfaces.extract import cleaned_mesh, extract_surface, unit_frame, vertex_colors
 from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.surfaces.tsdf import CLEAR, Views, fuse, look_around, sphere_cameras
 

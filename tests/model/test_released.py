@@ -17,7 +17,7 @@ from timm.models.vision_transformer import _create_vision_transformer
 from torch.nn import functional as F
 
 from gamba_warp import cli
-from gamba_warp.commands.import_released import import_released_command
+from gamba_warp.commands.weights import import_released_command
 from gamba_warp.errors import UserError
 from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
 from gamba_warp.model import released

@@ -95,7 +95,7 @@ def _die(task):
 
 
 def test_a_crash_of_the_runtime_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(matte.network, "alpha_of", _die)
+    monkeypatch.setattr(matte.models, "alpha_of", _die)
     with pytest.raises(UserError, match=r"--matte-model .*its process died of signal 9"):
         Matte(network(tmp_path))
 

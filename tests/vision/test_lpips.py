@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 
-from gamba_warp.commands.weights_lpips import weights_lpips_command
+from gamba_warp.commands.weights import weights_lpips_command
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
 from gamba_warp.vision import fetch

@@ -7,8 +7,7 @@ from helpers.model import assert_each_alone, assert_recomputed_alike, inputs, mi
 
 from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba, make_blocks
-from gamba_warp.model.parts.block import prefix_states, run_blocks
-from gamba_warp.model.parts.mixed import mixed_places
+from gamba_warp.model.parts.block import mixed_places, prefix_states, run_blocks
 
 
 def blocks_of(camera: int, image: int, **changes) -> torch.nn.ModuleList:

@@ -16,7 +16,7 @@ from lab.studies import scan as scan_study
 from lab.studies.training import step
 
 from gamba_warp import cli
-from gamba_warp.commands import bench
+from gamba_warp.commands import machine
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.bench import peers
 from gamba_warp.kernels.bench.cases import conv as conv_suite
@@ -70,7 +70,7 @@ def run(*cases):
 def stub(monkeypatch, *cases, targets=()):
     """Makes ``gamba bench scan`` run these cases."""
     module = type("M", (), {"cases": lambda _: list(cases), "targets": lambda _: list(targets)})
-    monkeypatch.setattr(bench, "load_suite", lambda op: module)
+    monkeypatch.setattr(machine, "load_suite", lambda op: module)
 
 
 def test_records_have_the_schema_and_are_json():
@@ -172,7 +172,7 @@ def test_interrupt_keeps_what_was_measured(monkeypatch, tmp_path, capsys):
         case(variant("d")),
     )
     stub(monkeypatch, *cases)
-    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 130
+    assert machine.bench_command(("scan",), quick=True, out=tmp_path) == 130
     assert "interrupted" in capsys.readouterr().out
     document = json.loads((tmp_path / "bench.json").read_text())
     assert document["interrupted"] and "interrupted" in (tmp_path / "bench.md").read_text()
@@ -231,14 +231,14 @@ def test_cuda_without_a_gpu(tmp_path, capsys):
 def test_compare_prints_ratios(monkeypatch, tmp_path, capsys):
     old = run(case(variant("a"), variant("gone")))
     stub(monkeypatch, case(variant("a"), variant("new")))
-    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 0
+    assert machine.bench_command(("scan",), quick=True, out=tmp_path) == 0
     new = suites.read_document(tmp_path / "bench.json")
     old["records"][0]["ms_p50"] = 2 * new["records"][0]["ms_p50"]
     (record, before, after), *more = ratios(old, new)
     assert record["variant"] == "a" and before == 2 * after and not more
     (tmp_path / "old.json").write_text(json.dumps(old))
     capsys.readouterr()
-    bench.bench_command(("scan",), quick=True, out=tmp_path, compare=tmp_path / "old.json")
+    machine.bench_command(("scan",), quick=True, out=tmp_path, compare=tmp_path / "old.json")
     assert re.search(r"[\d.]+ x .* ms  scan · one · a · forward · float32", capsys.readouterr().out)
     assert "0.50 x" in ratio_table(old, new)
     old["machine"]["torch"] = "1.0"
@@ -247,10 +247,10 @@ def test_compare_prints_ratios(monkeypatch, tmp_path, capsys):
 
 def test_failures_give_code_1(monkeypatch, tmp_path, capsys):
     stub(monkeypatch, case(variant("bad", error=1.0)))
-    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 1
+    assert machine.bench_command(("scan",), quick=True, out=tmp_path) == 1
     assert "bad, forward: check failed" in capsys.readouterr().out
     stub(monkeypatch, case(variant("absent", raises(NotInstalled("gsplat")), peer=True)))
-    assert bench.bench_command(("scan",), quick=True, out=tmp_path) == 0
+    assert machine.bench_command(("scan",), quick=True, out=tmp_path) == 0
 
 
 def test_targets_are_judged():
@@ -333,13 +333,13 @@ def test_a_case_has_the_charts_of_its_axis(axis, count):
 
 def test_render_makes_the_same_files_again(monkeypatch, tmp_path, capsys):
     stub(monkeypatch, case(variant("a", default=True), axis="error"))
-    bench.bench_command(("scan",), quick=True, out=tmp_path)
+    machine.bench_command(("scan",), quick=True, out=tmp_path)
     again = tmp_path / "again"
     source = (tmp_path / "bench.json",)
-    assert bench.bench_command(render=source, out=again) == 0
+    assert machine.bench_command(render=source, out=again) == 0
     for name in ("bench.md", "bench.html"):
         assert (again / name).read_text() == (tmp_path / name).read_text()
-    assert bench.bench_command(render=source, out=tmp_path / "doc.md") == 0
+    assert machine.bench_command(render=source, out=tmp_path / "doc.md") == 0
     assert (tmp_path / "doc.md").read_text() == (tmp_path / "bench.md").read_text()
     assert "://" not in (tmp_path / "bench.html").read_text()
 
@@ -461,7 +461,7 @@ def test_cases_run(suite, name):
         assert error["degree 3"] > 10 * error["degree 5"]
 
 
-@pytest.mark.parametrize("op, module", [("block", bench.load_suite("block")), ("step", step)])
+@pytest.mark.parametrize("op, module", [("block", machine.load_suite("block")), ("step", step)])
 def test_model_cases_run(op, module):
     cases = [c for c in module.cases(QUICK) if c.op == op][:1]
     records = measure(cases, QUICK)["records"]
@@ -496,7 +496,7 @@ def test_unwritable_result_is_one_line(monkeypatch, tmp_path):
     stub(monkeypatch, case(variant()))
     (tmp_path / "bench.md").mkdir()
     with pytest.raises(UserError, match="bench.md"):
-        bench.bench_command(("scan",), quick=True, out=tmp_path)
+        machine.bench_command(("scan",), quick=True, out=tmp_path)
     assert (tmp_path / "bench.json").is_file()
 
 

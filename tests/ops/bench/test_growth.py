@@ -14,7 +14,7 @@ from lab.studies.draw import growth_picture
 from lab.studies.show import charts_of, markdown, page
 from lab.studies.slopes import growth_lines, growth_table, growths, slope
 
-from gamba_warp.commands.bench import SUITES
+from gamba_warp.commands.machine import SUITES
 from gamba_warp.errors import UserError
 from gamba_warp.kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from gamba_warp.kernels.bench.core.case import Case, Settings, Variant

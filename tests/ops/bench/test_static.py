@@ -13,7 +13,7 @@ import warp as wp
 from helpers.kernels import plain_kernel
 from lab.instructions.page import markdown
 
-from gamba_warp.commands.bench import bench_command
+from gamba_warp.commands.machine import bench_command
 from gamba_warp.kernels.bench.static import report as static
 from gamba_warp.kernels.bench.static.cubin import read_cubin
 from gamba_warp.kernels.bench.static.dry_run import Launch, can_dry_run, dry_run

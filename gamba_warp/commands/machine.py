@@ -1,0 +1,206 @@
+"""What a machine has, how fast and how exact it is: ``gamba bench, stress, gpu-check, doctor``."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Literal
+
+import tyro
+from msgspec import Meta
+
+from ..conventions import DeviceChoice
+from ..devices import pick_device
+from ..files import output_folder
+from ..gpu_check import MINUTES, StepName
+from ..untrusted.ranges import Minutes, Seed, Threads, ranged
+from ..versions import used_versions
+
+# What is measured -> the module with ``cases(settings)`` and ``targets(settings)``. It is imported
+# when it is asked for.
+SUITES = {
+    "scan": "gamba_warp.kernels.bench.cases.scan",
+    "conv": "gamba_warp.kernels.bench.cases.conv",
+    "raster": "gamba_warp.kernels.bench.cases.raster",
+    "block": "gamba_warp.measure.blocks",
+    "model": "gamba_warp.measure.blocks",
+}
+
+
+@ranged
+def bench_command(
+    what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (
+        "all",
+    ),
+    *,
+    device: DeviceChoice = "auto",
+    quick: bool = False,
+    full: bool = False,
+    peers: bool = False,
+    out: Path = Path("out/bench"),
+    threads: Threads | None = None,
+    compare: Path | None = None,
+    render: tuple[Path, ...] = (),
+    static: bool = False,
+    only: tuple[str, ...] = (),
+) -> int:
+    """Measures run time against error, with what is installed beside us.
+
+    Every variant is compared with float64 before it is timed; what fails gets no time. Writes
+    bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
+
+    Args:
+        what: scan, conv, raster, block, model, or all.
+        device: Device to measure; auto is the GPU if there is one.
+        quick: Small sizes and a few rounds, which take seconds.
+        full: All sizes, many rounds, and the torch loop at full length.
+        peers: Also measure mambapy, mamba-ssm, causal-conv1d, gsplat and gswarp, where installed.
+        out: Folder for the results. With --render it may be a .md or .html file.
+        threads: Number of CPU threads; torch's own number if not given.
+        compare: An older bench.json; prints the ratios of the times.
+        render: Measure nothing; make the tables and the page of these JSON files.
+        static: Measure nothing; compile the CUDA kernels, no GPU needed, and write what they take
+            (registers, stack, shared memory, occupancy) to static.json and static.md.
+        only: Measure only these cases, by their full names, as "one call".
+    """
+    from ..measure import suites
+
+    if static:
+        folder = output_folder(out)
+        rows = suites.write_static(folder)
+        print(f"{rows} rows; wrote {folder / 'static.json'} and static.md")
+        return 0
+    if render:
+        first, *others = suites.write_pages([suites.read_document(path) for path in render], out)
+        print(" and ".join([f"wrote {first}", *(path.name for path in others)]))
+        return 0
+    chosen = suites.choose(what, SUITES, {"all": tuple(SUITES)})
+    settings = suites.make_settings(pick_device(device), quick, full, peers, threads)
+    old = suites.read_document(compare) if compare is not None else None
+    folder = output_folder(out)
+    document = suites.run_suites({op: load_suite(op) for op in chosen}, settings, only)
+    suites.write_document(document, folder)
+    written = f"wrote {folder / 'bench.json'}, bench.md and bench.html"
+    print(f"{suites.summary(document, old)}; {written}")
+    if document["interrupted"]:
+        print("interrupted; what was measured is kept")
+        return 130
+    return 1 if suites.failed_records(document) else 0
+
+
+def load_suite(op: str) -> ModuleType:
+    """The module with the cases and targets of one of ``SUITES``."""
+    return importlib.import_module(SUITES[op])
+
+
+@ranged
+def stress_command(
+    what: tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="WHAT ...")]] = (
+        "all",
+    ),
+    *,
+    seed: Seed = 0,
+    minutes: Minutes | None = None,
+    cases: Annotated[int, Meta(ge=1)] | None = None,
+    device: DeviceChoice = "auto",
+    threads: Threads | None = None,
+    out: Path = Path("out/stress"),
+    shrink_seconds: Annotated[float, Meta(ge=0, le=86_400)] = 30.0,
+    replay: tuple[Path, ...] = (),
+) -> int:
+    """Runs random and hostile cases of the kernels and the model, each against float64.
+
+    Forward results and all gradients; a failing case is made small and written to a file that
+    --replay runs again. Writes stress.json and stress.md. Ctrl-C keeps what was found.
+
+    Args:
+        what: scan (with the convolution), raster, model, or all (of these).
+        seed: The same seed gives the same cases in the same order.
+        minutes: Time limit; 1 if not given, or none with --cases.
+        cases: Number of cases; as many as fit in --minutes if not given.
+        device: Device of the kernels; auto is the GPU if there is one.
+        threads: Number of CPU threads; torch's own number if not given.
+        out: Folder for the summary and the failing cases.
+        shrink_seconds: Time limit for making one failing case small.
+        replay: Run only these files of failing cases.
+    """
+    import torch
+
+    from ..measure import stress_run
+
+    chosen = pick_device(device)
+    if threads is not None:
+        torch.set_num_threads(threads)
+    if replay:
+        code = 0
+        for passes, text in stress_run.replay(replay, chosen):
+            print(text)
+            code = code if passes else 1
+        return code
+    endless = minutes is None and cases is not None
+    ops = stress_run.choose_ops(what)
+    run = stress_run.StressRun(ops, chosen, output_folder(out), seed, shrink_seconds)
+    run.run(cases, math.inf if endless else 60 * (minutes or 1.0))
+    run.write()
+    print(f"{run.summary()}; wrote {out / 'stress.json'}")
+    if run.about["interrupted"]:
+        print("interrupted; what was found is kept")
+        return 130
+    return 1 if run.failures else 0
+
+
+@ranged
+def gpu_check_command(
+    *,
+    device: Literal["cuda", "cpu"] = "cuda",
+    quick: bool = False,
+    out: Path = Path("out/gpu-check"),
+    minutes: Minutes = MINUTES,
+    steps: tuple[StepName, ...] = (),
+) -> int:
+    """Runs kernel checks, full-size inference and the benchmark on this machine.
+
+    Writes gpu-check.json and gpu-check.md after every item, and says what it could not do. The
+    exit code is 0 if all that could be run passed, 1 if something failed, 2 without a CUDA device.
+
+    Args:
+        device: "cpu" tries the command itself, with --quick in seconds.
+        quick: Use tiny sizes.
+        out: Folder for the results.
+        minutes: Time limit of the whole run.
+        steps: Steps to take; all if not given.
+    """
+    from ..gpu_check.check import run_gpu_check
+
+    return run_gpu_check(device, quick, out, minutes, steps)
+
+
+def doctor_command(warm_up: bool = False) -> int:
+    """Says what this machine has and can run, and what is missing.
+
+    Args:
+        warm_up: Also compile the kernels for this machine's devices, and print the time.
+    """
+    from ..measure import health
+
+    _print("Versions", used_versions().items())
+    _print("Devices", health.devices())
+    _print("Folders", health.folders())
+    abilities = list(health.abilities())
+    _print("Can run", ((name, value) for name, value, _ in abilities))
+    if warm_up:
+        print("Kernels")
+        for device, first, again in health.warm_up_kernels():
+            print(f"  {device:<18} {first:.1f} s to compile or load, then {1000 * again:.0f} ms")
+    else:
+        print("Kernels compile on first use; 'gamba doctor --warm-up' does it now")
+    return 1 if any(fault for _, _, fault in abilities) else 0
+
+
+def _print(title: str, lines: Iterable[tuple[str, str]]) -> None:
+    print(title)
+    for name, value in lines:
+        print(f"  {name:<18} {value}")
