@@ -71,7 +71,8 @@ def cut_picture(path: Path, name: str, ways: Ways) -> Cut:
     try:
         rgba = shrink(load_rgba(path, longest=WORKING_SIZE), WORKING_SIZE)
     except UserError as error:
-        raise UserError(str(error).replace(str(path), _shown_name(name))) from error
+        shown = name if len(name) <= 60 else f"{name[:40]}...{name[-15:]}"
+        raise UserError(str(error).replace(str(path), shown)) from error
     try:
         cut = cut_out(path, ways)
     except UserError as error:  # the picture is sound, so the object can be painted by hand
@@ -102,10 +103,6 @@ def _clean_edge(rgb: np.ndarray, mask: np.ndarray, found: np.ndarray) -> np.ndar
 def stem(name: str) -> str:
     """The name of a stranger's file as a plain stem of ours: letters, digits, ``_`` and ``-``."""
     return _NAME.sub("-", Path(name).stem).strip("-_")[:60] or "object"
-
-
-def _shown_name(name: str) -> str:
-    return name if len(name) <= 60 else f"{name[:40]}...{name[-15:]}"
 
 
 def editor_picture(cut: Cut) -> np.ndarray:
@@ -215,12 +212,9 @@ def examples() -> list[tuple[Path, str]]:
 
     An installed package has two, a checkout more.
     """
-    found = sorted(FOLDER.glob("*.png"))
-    return [(path, _title(path.stem)) for path in found]
-
-
-def _title(name: str) -> str:
-    """``scopia-dog-house`` is "dog house": what comes first is who made it."""
-    for maker in ("blendswap-cc-0-", "blendswap-cc-by-", "katorlegaz-", "scopia-"):
-        name = name.removeprefix(maker)
-    return name.rstrip("0123456789").replace("-", " ").replace("_", " ")
+    found = []
+    for path in sorted(FOLDER.glob("*.png")):
+        # ``scopia-dog-house`` is "dog house": what comes first is who made it.
+        title = re.sub("^(blendswap-cc-(0|by)|katorlegaz|scopia)-", "", path.stem)
+        found.append((path, re.sub("[-_]", " ", title.rstrip("0123456789"))))
+    return found

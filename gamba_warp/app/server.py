@@ -8,6 +8,7 @@ import queue
 import shutil
 import signal
 import socket
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
@@ -26,6 +27,11 @@ from .shelf import Shelf
 
 if TYPE_CHECKING:
     import gradio as gr
+
+HOST = "127.0.0.1"
+PREFIX = "gamba-app-"
+_PAGES = 8  # whose pictures and results are kept at once
+Result = TypeVar("Result")
 
 
 @ranged
@@ -69,9 +75,6 @@ def app_command(
         serve(page, shelf, port, max_upload_mb, open_browser, turns)
 
 
-Result = TypeVar("Result")
-
-
 class MainThread:
     """Jobs of other threads, done in turn by the one that calls ``work``.
 
@@ -102,29 +105,21 @@ class MainThread:
     def work(self) -> None:
         """Does jobs until something that is no error of a job, such as Ctrl-C, ends it."""
         try:
-            self._work()
+            while True:
+                future, function, args = self._jobs.get()
+                try:
+                    result = function(*args)
+                except Exception as error:
+                    future.set_exception(error)
+                except BaseException:
+                    future.cancel()
+                    raise
+                else:
+                    future.set_result(result)
         finally:  # who waits for a job must not wait for ever
             self._over = True
             while not self._jobs.empty():
                 self._jobs.get()[0].cancel()
-
-    def _work(self) -> None:
-        while True:
-            future, function, args = self._jobs.get()
-            try:
-                result = function(*args)
-            except Exception as error:
-                future.set_exception(error)
-            except BaseException:
-                future.cancel()
-                raise
-            else:
-                future.set_result(result)
-
-
-HOST = "127.0.0.1"
-PREFIX = "gamba-app-"
-_PAGES = 8  # whose pictures and results are kept at once
 
 
 @contextmanager
@@ -240,7 +235,7 @@ def serve(
     logging.getLogger("python_multipart").setLevel(logging.ERROR)  # it warns of damaged uploads
     address = f"http://{HOST}:{port}/"
     print(f"{address} (Ctrl-C ends it)", flush=True)
-    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         if open_browser:
             webbrowser.open(address)
@@ -253,7 +248,3 @@ def _is_ours(record: logging.LogRecord) -> bool:
     """Whether a logged error may be our defect: a browser that leaves in the middle is none."""
     error = record.exc_info[1] if record.exc_info else None
     return type(error).__name__ not in ("ClientDisconnect", "LocalProtocolError")
-
-
-def _end(number: int, _frame: object) -> None:
-    raise SystemExit(128 + number)

@@ -99,7 +99,14 @@ def write(made: Made, kind: str, folder: Path, device: str = "cpu") -> tuple[Pat
         lost = write_gaussians(path, gaussians, kind)  # type: ignore[arg-type]
         note = f"{lost} {count}" if lost else count
     elif kind in MESHES:
-        _write_mesh(path, made, device)
+        import torch
+
+        from ..surfaces.extract import surface_of
+        from ..surfaces.files import save_mesh
+        from ..surfaces.options import SurfaceOptions
+
+        options, chosen = SurfaceOptions(colors=True), torch.device(device)
+        save_mesh(path, surface_of(made.gaussians.to(chosen), options, chosen))
     elif kind == "gif":
         from ..pages.turntable import save_turntable, turntable_frames
 
@@ -112,14 +119,3 @@ def write(made: Made, kind: str, folder: Path, device: str = "cpu") -> tuple[Pat
 
         write_viewer(path, made.name, made.gaussians, camera=made.camera)
     return path, note
-
-
-def _write_mesh(path: Path, made: Made, device: str) -> None:
-    import torch
-
-    from ..surfaces.extract import surface_of
-    from ..surfaces.files import save_mesh
-    from ..surfaces.options import SurfaceOptions
-
-    options, chosen = SurfaceOptions(colors=True), torch.device(device)
-    save_mesh(path, surface_of(made.gaussians.to(chosen), options, chosen))

@@ -93,8 +93,12 @@ def _shipped(stages, results, starter: Path, truth: Path) -> None:
         makes=[views / "report.json"],
         reads=[model],
     )
+    # The true meshes of the predicted objects, so that the folders pair by name.
+    output_folder(truth)
+    for ply in (views / "gaussians").glob("*.ply"):
+        shutil.copyfile(starter / "meshes" / ply.name, truth / ply.name)
     stages.gamba(
-        *("eval-geometry", views / "gaussians", _true_meshes(views, starter, truth)),
+        *("eval-geometry", views / "gaussians", truth),
         *("--frame", "reference", "--data", data, "--out", results.shapes),
         makes=[results.shapes / "report.json"],
         may_fail=True,
@@ -130,11 +134,3 @@ def _write(results, out: Path, minutes: float, state: str) -> None:
         f"model that was trained here, from nothing, for {minutes:g} minutes. {state}"
     )
     write_demo(out / "index.html", results, text)
-
-
-def _true_meshes(views: Path, starter: Path, folder: Path) -> Path:
-    """Gathers the true meshes of the predicted objects, so that the folders pair by name."""
-    output_folder(folder)
-    for ply in (views / "gaussians").glob("*.ply"):
-        shutil.copyfile(starter / "meshes" / ply.name, folder / ply.name)
-    return folder

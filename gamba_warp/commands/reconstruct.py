@@ -19,10 +19,8 @@ from ..formats.names import MeshChoice, SplatFormat, mesh_formats
 from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, ranged
 
 if TYPE_CHECKING:
-    import numpy as np
     import torch
 
-    from ..gaussians import Gaussians
     from ..model.gamba import Gamba
     from ..pages.outputs import Outputs
     from ..pages.sheet import Sheet
@@ -130,7 +128,11 @@ def reconstruct_command(
     output_folder(out)
     one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision)
     for_each(names, one, "reconstruct", "picture", failures)
-    _end(outputs, times)
+    if outputs.sheet is not None:
+        outputs.sheet.write()
+    outputs.write_index()
+    if times:
+        print(STAGES.table())
     return report(len(pictures), "picture", failures, out)
 
 
@@ -145,33 +147,18 @@ def _one(
     precision: Precision,
 ) -> None:
     """Reconstructs one picture, and writes what was asked for."""
+    from ..model.predict import reconstruct
     from ..pages.outputs import write_outputs
     from ..photo.cutout import cut_out
 
     STAGES.begin("cutting out")
     cut = cut_out(path, ways)
     say(f"{path}: {cut.how}")
-    gaussians, seconds = _forward(model, cut.rgba, precision)
-    write_outputs(name, cut, gaussians.to(device), outputs, model.config, seconds)
-
-
-def _forward(model: Gamba, rgba: np.ndarray, precision: Precision) -> tuple[Gaussians, float]:
-    """The Gaussians of one picture, on the CPU, and the seconds of the forward pass."""
-    from ..model.predict import reconstruct
-
     STAGES.begin("network")
     started = time.perf_counter()
-    gaussians = reconstruct(model, rgba, precision).to("cpu")  # waits for the device
-    return gaussians, time.perf_counter() - started
-
-
-def _end(outputs: Outputs, times: bool) -> None:
-    """Writes the sheet and the page of all results, and prints what the stages took."""
-    if outputs.sheet is not None:
-        outputs.sheet.write()
-    outputs.write_index()
-    if times:
-        print(STAGES.table())
+    gaussians = reconstruct(model, cut.rgba, precision).to("cpu")  # waits for the device
+    seconds = time.perf_counter() - started
+    write_outputs(name, cut, gaussians.to(device), outputs, model.config, seconds)
 
 
 def _found(

@@ -73,7 +73,9 @@ def render_command(
     plan = plan_path(trajectory, None if size is None else parse_size(size), frames, view)
     film = Film(*plan, parse_background(background), depth)
     film.rate = film.rate if fps is None else fps
-    _check_kind(kind, film.background is None, depth)
+    if kind != "png" and (film.background is None or depth):
+        given = "--depth" if depth else "--background none"
+        raise UserError(f"{given} needs pictures: give --kind png")
     files, failures = find_gaussians(inputs)
     if not files:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
@@ -106,12 +108,6 @@ def _kind(
     if kind is not None and kind != suffix:
         raise UserError(f"--out {out}: its name says {suffix}, but --kind {kind}")
     return "gif" if suffix == "gif" else "mp4" if suffix == "mp4" else "png"
-
-
-def _check_kind(kind: str, transparent: bool, depth: bool) -> None:
-    if kind != "png" and (transparent or depth):
-        given = "--depth" if depth else "--background none"
-        raise UserError(f"{given} needs pictures: give --kind png")
 
 
 def _single(

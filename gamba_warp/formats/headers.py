@@ -143,22 +143,18 @@ def _check_stl(path: Path, file: BinaryIO, size: int) -> None:
     head = file.read(84)
     head += file.read(1 << 12)
     if head.lstrip().startswith(b"solid") and b"facet" in head:
-        _check_stl_text(path, head + file.read())
+        # Every facet is closed and has three vertices, and the solid has an end.
+        text = (head + file.read()).lower()
+        ends, vertices = text.count(b"endfacet"), text.count(b"vertex")
+        begun = text.count(b"facet") - ends
+        if not begun == ends == vertices / 3 or b"endsolid" not in text:
+            says = f"{begun} facets, {ends} of them with an end, and {vertices} vertices"
+            raise UserError(f"{path}: truncated or false, {says}")
         return
     if len(head) < 84:
         raise UserError(f"{path}: {size} bytes are too few for an .stl file")
     count = struct.unpack("<I", head[80:84])[0]
     compare_sizes(path, f"{count} faces", 50 * count, size - 84)
-
-
-def _check_stl_text(path: Path, text: bytes) -> None:
-    """Every facet is closed and has three vertices, and the solid has an end."""
-    text = text.lower()
-    ends, vertices = text.count(b"endfacet"), text.count(b"vertex")
-    begun = text.count(b"facet") - ends
-    if not begun == ends == vertices / 3 or b"endsolid" not in text:
-        says = f"{begun} facets, {ends} of them with an end, and {vertices} vertices"
-        raise UserError(f"{path}: truncated or false, {says}")
 
 
 def _check_off(path: Path, file: BinaryIO, size: int) -> None:

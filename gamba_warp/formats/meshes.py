@@ -156,7 +156,10 @@ def _read_parts(path: Path, warnings: list[str]) -> list[tuple]:
     suffix = path.suffix.lower()
     if suffix == ".ply":
         data = read_ply(path)
-        if _has_mixed_polygons(data):
+        # trimesh does not read a binary file whose faces differ in length.
+        lists = [x for x in data.elements.get("face", {}).values() if isinstance(x, PlyList)]
+        uneven = any(len(x.lengths) and np.ptp(x.lengths) > 0 for x in lists)
+        if uneven and data.header.format != "ascii":
             return [(_mixed_mesh(path, data), np.eye(4))]
     with open_shape(path) as (file, _):
         text = file.read()
@@ -178,13 +181,6 @@ def _read_parts(path: Path, warnings: list[str]) -> list[tuple]:
         return parts
     except Exception as error:  # trimesh raises whatever its parsers run into
         raise UserError(f"{path}: cannot be read as a mesh ({first_line(error)})") from error
-
-
-def _has_mixed_polygons(data: PlyData) -> bool:
-    """Whether it is a binary file whose faces differ in length, which trimesh does not read."""
-    lists = [x for x in data.elements.get("face", {}).values() if isinstance(x, PlyList)]
-    uneven = any(len(x.lengths) and np.ptp(x.lengths) > 0 for x in lists)
-    return uneven and data.header.format != "ascii"
 
 
 def _mixed_mesh(path: Path, data: PlyData):

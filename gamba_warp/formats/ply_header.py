@@ -93,21 +93,17 @@ def read_ply_header(path: Path, file: BinaryIO) -> PlyHeader:
             case ["comment"]:
                 comments.append(line.partition(" ")[2].strip())
             case ["element"]:
-                elements.append(_element(path, words))
+                if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MAX_DIGITS:
+                    raise UserError(
+                        f"{path}: the .ply header says '{' '.join(words)[:80]}', "
+                        f"expected 'element {words[1] if len(words) > 1 else 'NAME'} COUNT'"
+                    )
+                elements.append(PlyElement(words[1], int(words[2]), []))
             case ["property"]:
                 if not elements:
                     raise UserError(f"{path}: the .ply header has a property before any element")
                 elements[-1].properties.append(_property(path, words))
     return PlyHeader(layout, comments, elements, start)
-
-
-def _element(path: Path, words: list[str]) -> PlyElement:
-    if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MAX_DIGITS:
-        raise UserError(
-            f"{path}: the .ply header says '{' '.join(words)[:80]}', "
-            f"expected 'element {words[1] if len(words) > 1 else 'NAME'} COUNT'"
-        )
-    return PlyElement(words[1], int(words[2]), [])
 
 
 def _property(path: Path, words: list[str]) -> PlyProperty:

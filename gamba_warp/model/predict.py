@@ -40,7 +40,11 @@ def reconstruct(
         UserError: the file cannot be read, or its object cannot be told from the background.
         ValueError: the array has another shape.
     """
-    rgba = picture if isinstance(picture, np.ndarray) else _cut_out(picture)
+    rgba = picture
+    if not isinstance(rgba, np.ndarray):
+        from ..photo.cutout import Ways, cut_out
+
+        rgba = cut_out(rgba, Ways(fetch=False)).rgba
     if rgba.ndim != 3 or rgba.shape[0] != rgba.shape[1] or rgba.shape[2] != 4:
         raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config
@@ -49,12 +53,6 @@ def reconstruct(
     dtype = pick_precision(precision, device, config.width)
     with network_products(device, dtype):
         return model(images, reference_cameras(config, 1).to(device))[0]
-
-
-def _cut_out(picture: str | Path) -> np.ndarray:
-    from ..photo.cutout import Ways, cut_out
-
-    return cut_out(picture, Ways(fetch=False)).rgba
 
 
 def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
 
 from ..cameras import Cameras
 from ..errors import UserError
@@ -63,13 +62,11 @@ def render_path(
         rgb = seen.rgb
         if background is None:
             rgb = torch.cat([rgb / seen.alpha.clamp_min(1e-6), seen.alpha], -1)
-        depths = None if seen.depth is None else _known_depth(seen.depth, seen.alpha)
+        depths = None
+        if seen.depth is not None:
+            depths = torch.where(seen.alpha > 0.5, seen.depth, 0.0)[..., 0].cpu().numpy()
         for number, picture in enumerate(rgb.cpu().numpy()):
             yield to_uint8(picture), None if depths is None else depths[number]
-
-
-def _known_depth(depth: Tensor, alpha: Tensor) -> np.ndarray:
-    return torch.where(alpha > 0.5, depth, 0.0)[..., 0].cpu().numpy()
 
 
 def require_movie(kind: str) -> None:

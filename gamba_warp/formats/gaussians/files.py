@@ -153,15 +153,11 @@ def write_gaussians(
         save_ply(path, gaussians, comments=comments)
         return None
     if kind == "compressed-ply":
-        return _save_compressed(path, gaussians, comments)
+        lines, body, clipped = packed(export_arrays(path, gaussians))
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(ended_header([*header_lines(comments), *lines]) + body)
+        return f"{path}: the format clips harmonics to ±4." if clipped else None
     if kind == "glb":
         save_glb(path, gaussians)
         return None
     return {"splat": save_splat, "spz": save_spz}[kind](path, gaussians)
-
-
-def _save_compressed(path: str | Path, gaussians: Gaussians, comments: Iterable[str]) -> str | None:
-    lines, body, clipped = packed(export_arrays(path, gaussians))
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(ended_header([*header_lines(comments), *lines]) + body)
-    return f"{path}: the format clips harmonics to ±4." if clipped else None

@@ -96,14 +96,10 @@ def save_glb(path: str | Path, gaussians: Gaussians) -> None:
         "bufferViews": views,
         "accessors": accessors,
     }
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(_container(document, b"".join(parts)))
-
-
-def _container(document: dict, binary: bytes) -> bytes:
-    """The GLB container: a header, a JSON chunk padded with spaces, and a BIN chunk of float32."""
+    # The container: a header, a JSON chunk padded with spaces, and a BIN chunk of float32.
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    chunks += struct.pack("<I4s", offset, b"BIN\0") + b"".join(parts)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)

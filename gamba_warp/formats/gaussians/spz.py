@@ -106,7 +106,11 @@ def load_spz(path: str | Path) -> Gaussians:
     opacities = take("u1") / 255
     colors = (take("u1", 3) / 255 - 0.5) / _COLOR * SH_C0 + 0.5
     scales = np.exp(take("u1", 3) / 16 - 10)
-    quats = _smallest(take("<u4")) if found.version > 2 else _first_three(take("u1", 3))
+    if found.version > 2:
+        quats = _smallest(take("<u4"))
+    else:
+        xyz = take("u1", 3) / 127.5 - 1
+        quats = np.column_stack([np.sqrt(np.maximum(0.0, 1 - (xyz**2).sum(1))), xyz])
     harmonics = (take("u1", K, 3).astype(np.float64) - 128) / 128
     arrays = {
         "means": means,
@@ -142,9 +146,3 @@ def _smallest(words: np.ndarray) -> np.ndarray:
         columns.append(np.where(part >> 9, -size, size))
     quats = from_smallest_three((words >> 30).astype(np.int64), np.stack(columns, 1))
     return np.roll(quats, 1, axis=1)
-
-
-def _first_three(xyz: np.ndarray) -> np.ndarray:
-    values = xyz / 127.5 - 1
-    w = np.sqrt(np.maximum(0.0, 1 - (values**2).sum(1)))
-    return np.column_stack([w, values])
