@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from ..model.gamba import Gamba
     from ..pages.outputs import Outputs
-    from ..pages.sheet import Sheet
     from ..photo.cutout import Ways
 
 
@@ -98,6 +97,7 @@ def reconstruct_command(
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
     from ..pages.card import about_model
     from ..pages.outputs import Outputs
+    from ..pages.sheet import Sheet
     from ..photo.cutout import Ways
 
     pictures, failures = _found(images, mask)
@@ -121,7 +121,10 @@ def reconstruct_command(
     outputs.require()
     reads = (mask, Path(matte_model) if matte_model else None, sam, file, encoder_weights)
     names = plan_outputs(pictures, outputs.suffixes(), out, reads, outputs.own(len(pictures)))
-    outputs.sheet = _sheet(sheet, [*pictures, *reads])
+    if sheet is not None:
+        check_not_read([sheet], [*pictures, *reads])
+        outputs.sheet = Sheet(sheet)
+        output_folder(sheet.parent)
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
@@ -188,15 +191,3 @@ def _file_of(checkpoint: Path) -> Path:
             "--checkpoint FILE"
         )
     return checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
-
-
-def _sheet(path: Path | None, reads: list[Path | None]) -> Sheet | None:
-    """The sheet, if one is asked for, in a folder that is there. Raises UserError."""
-    from ..pages.sheet import Sheet
-
-    if path is None:
-        return None
-    check_not_read([path], reads)
-    sheet = Sheet(path)
-    output_folder(path.parent)
-    return sheet

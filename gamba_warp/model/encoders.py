@@ -121,7 +121,13 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
     if config.encoder == "none":
         return None
     if config.encoder == "vgg16":
-        return _build_vgg(config, weights)
+        from ..vision.vgg import vgg16_features
+
+        if isinstance(weights, Mapping) or str(weights) in ("hub", "random"):
+            got = "tensors" if isinstance(weights, Mapping) else f"'{weights}'"
+            raise UserError(f"encoder vgg16: takes the cached weights or a file, not {got}")
+        network = vgg16_features(weights)
+        return ImageEncoder(network, network.dim, config)
     return _build_vit(config, weights)
 
 
@@ -146,16 +152,6 @@ def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
         if count > MAX_PARAMETERS:
             raise UserError(f"encoder {config.encoder}: has {count:,} parameters, too many")
         return ImageEncoder(_ViT(vit, config), vit.num_features, config)
-
-
-def _build_vgg(config: GambaConfig, weights: Weights | None) -> ImageEncoder:
-    from ..vision.vgg import vgg16_features
-
-    if isinstance(weights, Mapping) or str(weights) in ("hub", "random"):
-        got = "tensors" if isinstance(weights, Mapping) else f"'{weights}'"
-        raise UserError(f"encoder vgg16: takes the cached weights or a file, not {got}")
-    network = vgg16_features(weights)
-    return ImageEncoder(network, network.dim, config)
 
 
 def _build_vit(config: GambaConfig, weights: Weights | None) -> ImageEncoder:

@@ -23,6 +23,10 @@ from ..errors import UserError, first_line
 
 _FROM = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
 _SECONDS = 20  # without an answer, after which the network counts as not there
+_OPEN = 1024  # side of the input where the file leaves it open, pixels
+_SIDES = (32, 2048)  # smallest and largest side of an input, pixels
+_U2NET = 320  # up to this side: U2-Net and its like, which are trained on ImageNet's colours
+_MEAN, _SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Published(NamedTuple):
@@ -130,12 +134,6 @@ def fetch(model: Published, address: str) -> Path:
             reason = f"{urlsplit(address).hostname} cannot be reached"
         raise NotFetched(reason) from error
     return Path(found)
-
-
-_OPEN = 1024  # side of the input where the file leaves it open, pixels
-_SIDES = (32, 2048)  # smallest and largest side of an input, pixels
-_U2NET = 320  # up to this side: U2-Net and its like, which are trained on ImageNet's colours
-_MEAN, _SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 def alpha_of(task: tuple[str, tuple[int, int], np.ndarray | None, int]) -> np.ndarray | None:

@@ -200,7 +200,9 @@ def cleaned_mesh(
     if meshes.current_mesh().face_number() == 0:
         raise UserError("no part of the surface is large enough")
     if close_holes:
-        _make_manifold(meshes)
+        # Closing holes needs a manifold; of the faces at an edge of more than two, the smallest go.
+        meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
+        meshes.meshing_repair_non_manifold_vertices()
         meshes.meshing_close_holes(maxholesize=close_holes, newfaceselected=False)
     if smooth:
         meshes.apply_coord_taubin_smoothing(stepsmoothnum=smooth)
@@ -239,12 +241,3 @@ def _part_sizes(faces: np.ndarray) -> np.ndarray:
     pairs = np.asarray(trimesh.graph.face_adjacency(faces))
     links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(faces),) * 2)
     return np.bincount(connected_components(links, directed=False)[1])
-
-
-def _make_manifold(meshes) -> None:
-    """Makes the mesh manifold, as closing holes needs it.
-
-    Of the faces at an edge of more than two, the smallest are removed first.
-    """
-    meshes.meshing_repair_non_manifold_edges(method="Remove Faces")
-    meshes.meshing_repair_non_manifold_vertices()

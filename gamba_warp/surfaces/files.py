@@ -67,7 +67,11 @@ def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    vertices, uvs, faces = _split_at_seams(surface, texture)
+    # A vertex at a seam of the texture is there twice.
+    corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
+    found, faces = np.unique(corners, axis=0, return_inverse=True)
+    vertices, uvs = surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:]
+    faces = faces.reshape(-1, 3)
     image = Image.fromarray(to_uint8(texture.image))
     if path.suffix.lower() == ".glb":
         material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
@@ -84,15 +88,6 @@ def _save_textured(path: Path, surface: Surface, texture: Texture) -> None:
     lines += [f"vt {u:.7f} {v:.7f}" for u, v in uvs]
     lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in faces + 1]
     _write(path, "\n".join([*lines, ""]))
-
-
-def _split_at_seams(
-    surface: Surface, texture: Texture
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices ``[W, 3]``, their UVs ``[W, 2]`` and faces; a vertex at a seam is there twice."""
-    corners = np.column_stack([surface.faces.reshape(-1), texture.uvs.reshape(-1, 2)])
-    found, faces = np.unique(corners, axis=0, return_inverse=True)
-    return surface.vertices[found[:, 0].astype(np.int64)], found[:, 1:], faces.reshape(-1, 3)
 
 
 def _write(path: Path, content: bytes | str) -> None:

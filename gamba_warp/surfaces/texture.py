@@ -12,6 +12,8 @@ from torch import Tensor
 from ..errors import UserError
 from .tsdf import CLEAR, Views
 
+_PADDING = 4  # texels between the pieces of the atlas
+
 
 def vertex_colors(vertices: np.ndarray, faces: np.ndarray, views: Views, voxels: int) -> np.ndarray:
     """The mean colour of each vertex in the views that see it; those in front count most.
@@ -106,9 +108,6 @@ def _seen(
     return torch.where(visible, facing.clamp_min(0), 0)[:, None], color
 
 
-_PADDING = 4  # texels between the pieces of the atlas
-
-
 @dataclass
 class Texture:
     """The colours of a surface as a picture.
@@ -139,6 +138,8 @@ def bake_texture(
     Raises:
         UserError: the picture is too small for the faces, or no view sees the surface.
     """
+    from scipy.ndimage import distance_transform_edt
+
     uvs = unwrapped(vertices, faces, side)
     texels, owner, weights = covered_texels(uvs, side)
     if len(texels) == 0:
@@ -151,7 +152,11 @@ def bake_texture(
     image[texels] = point_colors(positions, directions, views, voxels)
     known = np.zeros(side * side, bool)
     known[texels] = True
-    return Texture(uvs, _spread(image.reshape(side, side, 3), known.reshape(side, side)))
+    # Every texel has the nearest known colour, so that seams do not show.
+    missing = ~known.reshape(side, side)
+    found = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    rows, columns = cast("tuple[np.ndarray, np.ndarray]", found)
+    return Texture(uvs, image.reshape(side, side, 3)[rows, columns])
 
 
 def unwrapped(vertices: np.ndarray, faces: np.ndarray, side: int) -> np.ndarray:
@@ -203,12 +208,3 @@ def covered_texels(uvs: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, 
     weights = np.stack([1 - second - third, second, third], 1)
     inside = (weights >= -1e-9).all(1)  # NaN is not
     return (y * side + x)[inside], owner[inside], weights[inside]
-
-
-def _spread(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The picture with the nearest known colour at every texel, so that seams do not show."""
-    from scipy.ndimage import distance_transform_edt
-
-    found = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    rows, columns = cast("tuple[np.ndarray, np.ndarray]", found)
-    return image[rows, columns]

@@ -183,10 +183,11 @@ def _of_nerfstudio(path: _Nerfstudio, source: str) -> CameraPath:
     width, height = round(path.render_width), round(path.render_height)
     poses = _tensor([posed.camera_to_world for posed in path.camera_path]).view(-1, 4, 4)
     Ks = torch.stack([_centred(width, height, posed.fov) for posed in path.camera_path])
+    _check_rotations(poses, source)
     rate = path.fps
     if path.seconds is not None:  # as nerfstudio itself: the length counts, not the rate
         rate = min(1000.0, len(poses) / path.seconds)
-    return CameraPath(Cameras(_to_views(poses, source), Ks, width, height), rate)
+    return CameraPath(Cameras(from_opengl(poses), Ks, width, height), rate)
 
 
 def _of_transforms(file: Path, source: str) -> CameraPath:
@@ -226,11 +227,6 @@ def _tensor(values: Any) -> Tensor:
 def _centred(width: int, height: int, fov: float) -> Tensor:
     focal = 0.5 * height / torch.tan(torch.deg2rad(_tensor(fov)) / 2)
     return _tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-
-
-def _to_views(poses: Tensor, source: str) -> Tensor:
-    _check_rotations(poses, source)
-    return from_opengl(poses)
 
 
 def _check(cameras: Cameras, source: str) -> None:
