@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from .gaussians.arrays import MIN_SCALE, export_arrays, flip_axes, sound_gaussia
 from .gaussians.compressed import is_compressed, unpacked
 from .headers import open_shape
 from .ply_data import read_ply
-from .ply_header import ORDERS, PlyElement, PlyHeader, read_ply_header
+from .ply_header import ORDERS, PlyHeader, read_ply_header
 
 TURNED = "frame opengl"  # the comment of files with y up, which earlier versions could write
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
@@ -108,11 +109,8 @@ def load_ply(path: str | Path) -> Gaussians:
         header = read_ply_header(path, file)
         if is_compressed(header):
             arrays = unpacked(path, read_ply(path))
-        elif header.format == "ascii":
-            arrays = _activated(path, _from_text(path, header))
         else:
-            file.seek(header.start)
-            arrays = _activated(path, _from_bytes(path, header, file.read()))
+            arrays = _activated(path, _vertices(path, header, file))
     gaussians = sound_gaussians(path, arrays)
     return flip_axes(gaussians) if TURNED in header.comments else gaussians
 
@@ -143,42 +141,13 @@ def _activated(path: Path, vertices: Columns) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _from_text(path: Path, header: PlyHeader) -> Columns:
-    """The vertices' properties of a text file. Raises UserError."""
-    vertex = _first_vertex(path, header)
-    _vertex_dtype(path, vertex, "=")
-    found = read_ply(path).elements["vertex"]
-    if vertex.count == 0:
-        raise UserError(f"{path}: holds no Gaussians")
-    return {name: np.asarray(column) for name, column in found.items()}
-
-
-def _from_bytes(path: Path, header: PlyHeader, data: bytes) -> Columns:
-    """The vertices' properties of a binary file. Raises UserError."""
-    if header.format not in ORDERS:
+def _vertices(path: Path, header: PlyHeader, file: BinaryIO) -> Columns:
+    """The vertices' properties of a text or binary file. Raises UserError."""
+    if header.format not in ("ascii", *ORDERS):
         raise UserError(f"{path}: .ply format is {header.format}, neither binary nor ascii")
-    vertex = _first_vertex(path, header)
-    dtype = _vertex_dtype(path, vertex, ORDERS[header.format])
-    size, there = vertex.count * dtype.itemsize, len(data)
-    if there < size or (len(header.elements) == 1 and there > size):
-        kind = "truncated or false header" if there < size else "false header"
-        raise UserError(
-            f"{path}: {kind}, {vertex.count} vertices take {size} bytes but {there} follow"
-        )
-    if vertex.count == 0:
-        raise UserError(f"{path}: holds no Gaussians")
-    table = np.frombuffer(data, dtype, vertex.count)
-    return {name: table[name] for name in dtype.names or ()}
-
-
-def _first_vertex(path: Path, header: PlyHeader) -> PlyElement:
     if not header.elements or header.elements[0].name != "vertex":
         raise UserError(f"{path}: the .ply header does not begin with 'element vertex COUNT'")
-    return header.elements[0]
-
-
-def _vertex_dtype(path: Path, vertex: PlyElement, order: str) -> np.dtype:
-    """The type of a vertex for numpy. Raises UserError where it is not made of named numbers."""
+    vertex, order = header.elements[0], ORDERS.get(header.format, "=")
     if not vertex.properties:
         raise UserError(f"{path}: vertices have no properties")
     fields: dict[str, str] = {}
@@ -188,4 +157,20 @@ def _vertex_dtype(path: Path, vertex: PlyElement, order: str) -> np.dtype:
         if name in fields:
             raise UserError(f"{path}: vertex property {name} is given twice")
         fields[name] = order + kind
-    return np.dtype(list(fields.items()))
+    if header.format == "ascii":
+        found = read_ply(path).elements["vertex"]
+    else:
+        dtype = np.dtype(list(fields.items()))
+        file.seek(header.start)
+        data = file.read()
+        size, there = vertex.count * dtype.itemsize, len(data)
+        if there < size or (len(header.elements) == 1 and there > size):
+            kind = "truncated or false header" if there < size else "false header"
+            raise UserError(
+                f"{path}: {kind}, {vertex.count} vertices take {size} bytes but {there} follow"
+            )
+        table = np.ndarray(vertex.count, dtype, data)
+        found = {name: table[name] for name in fields}
+    if vertex.count == 0:
+        raise UserError(f"{path}: holds no Gaussians")
+    return {name: np.asarray(column) for name, column in found.items()}
