@@ -103,11 +103,12 @@ def test_open_sheets_hold_nothing(monkeypatch):
     assert empty["iou"] is None and empty["iou_reason"] == "neither shape fills a voxel"
 
 
+@pytest.mark.parametrize("voxels", [8, 32, 64])
 @pytest.mark.parametrize("shift", [(0.25, 0, 0), (0.5, 0.25, 0), (0.3, 0.2, 0.1), (1.5, 0, 0)])
-def test_cubes_shifted(shift):
+def test_cubes_shifted(shift, voxels):
     overlap = np.prod(1 - np.minimum(1, np.abs(shift)))
-    got = shape_iou(cube(shift), cube(), PRESETS["default"])
-    on_voxels = all(value * 64 % 1 == 0 for value in shift)
+    got = shape_iou(cube(shift), cube(), replace(PRESETS["default"], iou_voxels=voxels))
+    on_voxels = all(value * voxels % 1 == 0 for value in shift)
     # off the voxels' faces a layer of half a voxel may count or not on each side
     assert abs(got["iou"] - overlap / (2 - overlap)) <= (1e-12 if on_voxels else 0.03)
 
@@ -154,6 +155,10 @@ def test_alignment_recovers_scale_and_rotation():
     assert np.abs(np.array(alignment["rotation"]) @ turn - np.eye(3)).max() < 0.02
     assert alignment["fitness"] > 0.99 and alignment["inlier_rmse"] < 0.03
     assert abs(values["scale"]["alignment"]["scale"] * 0.7 - 1) < 0.02
+    straight = Similarity(np.eye(3), np.array([0.2, -0.1, 0.05]), 0.5).apply(truth)
+    options = {"num_points": 20_000, "align": "scale"}
+    got = compare(straight, truth, replace(PRESETS["default"], **options))
+    assert abs(got["alignment"]["scale"] - 2) < 0.02 and got["iou"] > 0.95
 
 
 MANY = """
