@@ -372,8 +372,6 @@ def test_names_that_are_not_utf_8_can_be_printed(tmp_path):
     ("arguments", "reason"),
     [
         (["--replay", "none.json"], "No such file"),
-        (["--minutes", "inf"], "--minutes"),
-        (["--cases", "0"], "--cases"),
         (["files"], "unknown 'files'; there are scan, raster, model and all"),
     ],
 )

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.refusals import refused_command
+from helpers.views import cloud_of
 from PIL import Image
 
 from gamba_warp.cameras import fibonacci_sphere
@@ -16,7 +18,6 @@ from gamba_warp.formats.gaussians.files import write_gaussians
 from gamba_warp.formats.meshes import load_mesh, to_linear
 from gamba_warp.formats.names import MESH_FORMATS
 from gamba_warp.formats.ply import load_ply, save_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.pages.serve import page_handler
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
@@ -30,15 +31,9 @@ def ball(tmp_path):
     axes, center = np.array([2.0, 3.0, 2.0]), [10.0, 20.0, 30.0]
     points = fibonacci_sphere(2500) * axes
     red = torch.from_numpy(points[:, 1:2] > 0)
-    gaussians = Gaussians(
-        means=torch.from_numpy(points + center).float(),
-        quats=None,
-        scales=torch.full((2500, 3), 0.1),
-        opacities=torch.full((2500,), 0.95),
-        colors=torch.where(red, torch.tensor([0.8, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.8])),
-    )
+    colors = torch.where(red, torch.tensor([0.8, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.8]))
     path = tmp_path / "egg.ply"
-    save_ply(path, gaussians)
+    save_ply(path, cloud_of(points + center, 0.1, 0.95, colors))
     return path
 
 
@@ -125,8 +120,8 @@ def test_a_folder_and_failures(ball, tmp_path, capsys):
     ],
 )
 def test_what_cannot_start(ball, tmp_path, options, reason, capsys):
-    assert run("export", [str(ball), "--out", str(tmp_path / "out"), *options]) == 2
-    assert reason in capsys.readouterr().err and not (tmp_path / "out").exists()
+    refused_command(capsys, "export", [ball, "--out", tmp_path / "out", *options], reason)
+    assert not (tmp_path / "out").exists()
 
 
 def test_inputs_are_there_and_stay(ball, tmp_path, capsys):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.micro import cloud, photograph, views_around, write_object
+from helpers.refusals import refused_command
 
 from gamba_warp.cli import run
 from gamba_warp.conventions import over_background
@@ -27,15 +28,7 @@ NEEDS_GSPLAT = pytest.mark.skipif(
 BOTH = pytest.mark.parametrize("name", ["mcmc", "default"])
 QUICK = FitConfig(gaussians=301, steps=70, views=4)
 NAMES = ("means", "quats", "scales", "opacities", "colors")
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small operations: on a busy machine threads would only wait."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def counted(monkeypatch):
@@ -180,9 +173,8 @@ def test_interrupt(name, tmp_path, monkeypatch, capsys):
 )
 def test_bad_input_in_one_line(arguments, message, tmp_path, capsys):
     write_object(tmp_path / "ball", cloud(0))
-    assert run("fit", [str(tmp_path / "ball"), "--out", str(tmp_path / "out"), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
+    words = [tmp_path / "ball", "--out", tmp_path / "out", *arguments]
+    refused_command(capsys, "fit", words, message)
     assert not (tmp_path / "out").exists()
 
 

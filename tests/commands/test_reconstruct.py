@@ -10,6 +10,8 @@ import torch
 from helpers.gaussians import some
 from helpers.images import bad_files, cut_out
 from helpers.model import quick, run_reconstruct
+from helpers.refusals import refused_command
+from helpers.views import cloud_of
 from PIL import Image
 
 from gamba_warp.batch import plan_outputs
@@ -18,28 +20,14 @@ from gamba_warp.data.preprocess import composite, prepare
 from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.ply import load_ply
-from gamba_warp.gaussians import Gaussians
 from gamba_warp.images import find_pictures, save_image
 from gamba_warp.model import checkpoint as checkpoints
 from gamba_warp.model import predict
-from gamba_warp.model.checkpoint import load_model, save_model
-from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.predict import reconstruct
 from gamba_warp.pages.turntable import save_turntable, turntable_frames
 from gamba_warp.photo import cutout
 from gamba_warp.render import render
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    torch.manual_seed(0)
-    config = GambaConfig(
-        image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
-    )
-    path = tmp_path_factory.mktemp("model") / "model.safetensors"
-    save_model(path, Gamba(config))
-    return path
 
 
 @pytest.fixture
@@ -178,13 +166,7 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
 @pytest.mark.parametrize("frame", ["opencv", "opengl", None])
 def test_a_mesh_of_what_was_reconstructed(tmp_path, picture, checkpoint, monkeypatch, frame):
     ends = torch.tensor([0.35, -0.1, 0.0])
-    stick = Gaussians(
-        means=(torch.arange(64.0)[:, None] / 63) * ends,
-        quats=None,
-        scales=torch.full((64, 3), 0.04),
-        opacities=torch.full((64,), 0.9),
-        colors=torch.tensor([0.9, 0.1, 0.1]).expand(64, 3),
-    )
+    stick = cloud_of((torch.arange(64.0)[:, None] / 63) * ends, 0.04, 0.9, [0.9, 0.1, 0.1])
     monkeypatch.setattr(predict, "reconstruct", lambda *_: stick)
     options = [*quick(checkpoint, tmp_path), "--mesh", "ply"]
     options += ["--frame", frame] if frame else []
@@ -307,48 +289,35 @@ def test_nothing_that_is_read_is_replaced(tmp_path, checkpoint, capsys, which):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def refused(arguments, *reasons):
-    """Runs, and expects exit code 2 and one line that holds the reasons."""
-
-    def check(capsys):
-        capsys.readouterr()
-        assert run_reconstruct(*arguments) == 2
-        captured = capsys.readouterr()
-        lines = [line for line in captured.err.splitlines() if not line.startswith("Warp")]
-        assert len(lines) == 1 and lines[0].startswith("gamba: "), captured.err
-        assert all(str(reason) in lines[0] for reason in reasons), lines[0]
-
-    return check
-
-
 def test_what_cannot_start_is_refused(tmp_path, picture, checkpoint, capsys):
     other, file = cut_out(tmp_path / "other.png"), tmp_path / "file"
     file.touch()
     (tmp_path / "empty").mkdir()
     ready = quick(checkpoint, tmp_path / "out")
     missing = tmp_path / "none.safetensors"
-    for check in (
-        refused([picture, *quick(missing, tmp_path / "out")], missing, "gamba train"),
-        refused([picture, *quick(file, tmp_path / "out")], file, "safetensors"),
-        refused([picture, *quick(checkpoint, file)], "cannot write into", file),
-        refused([picture, *quick(checkpoint, "/dev/null/x")], "cannot write into /dev/null/x"),
-        refused(ready, "give at least one picture or folder"),
-        refused([tmp_path / "empty", *ready], "empty: the folder holds no pictures"),
-        refused([picture, other, *ready, "--mask", picture], "--mask goes with one picture"),
-        refused([picture, *ready, "--size", 8], "--size"),
-        refused([picture, *ready, "--frames", 1], "--frames"),
-        refused([picture, *ready, "--sam", missing], "--sam", missing),
-    ):
-        check(capsys)
+    cases = [
+        ([picture, *quick(missing, tmp_path / "out")], missing, "gamba train"),
+        ([picture, *quick(file, tmp_path / "out")], file, "safetensors"),
+        ([picture, *quick(checkpoint, file)], "cannot write into", file),
+        ([picture, *quick(checkpoint, "/dev/null/x")], "cannot write into /dev/null/x"),
+        (ready, "give at least one picture or folder"),
+        ([tmp_path / "empty", *ready], "empty: the folder holds no pictures"),
+        ([picture, other, *ready, "--mask", picture], "--mask goes with one picture"),
+        ([picture, *ready, "--size", 8], "--size"),
+        ([picture, *ready, "--frames", 1], "--frames"),
+        ([picture, *ready, "--sam", missing], "--sam", missing),
+    ]
     if not torch.cuda.is_available():
-        refused([picture, *ready, "--device", "cuda"], "no CUDA device")(capsys)
+        cases.append(([picture, *ready, "--device", "cuda"], "no CUDA device"))
+    for words, *reasons in cases:
+        refused_command(capsys, "reconstruct", words, *reasons)
     assert not (tmp_path / "out" / "thing.ply").exists()
 
 
 def test_the_starter_model_is_the_default(tmp_path, picture, checkpoint, monkeypatch, capsys):
     monkeypatch.setattr(checkpoints, "DEFAULT_CHECKPOINT", tmp_path / "tiny.safetensors")
     arguments = [picture, "--out", tmp_path / "out", "--turntable", "none", "--no-page"]
-    refused(arguments, "tiny.safetensors", "--checkpoint FILE")(capsys)
+    refused_command(capsys, "reconstruct", arguments, "tiny.safetensors", "--checkpoint FILE")
     (tmp_path / "tiny.safetensors").write_bytes(checkpoint.read_bytes())
     assert run_reconstruct(*arguments) == 0
 

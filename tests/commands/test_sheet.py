@@ -4,45 +4,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from helpers.gaussians import some
 from helpers.images import cut_out
-from helpers.model import quick, run_reconstruct
+from helpers.model import SMALLEST, quick, run_reconstruct
+from helpers.refusals import refused, refused_command
 from PIL import Image
 
-from gamba_warp.errors import UserError
 from gamba_warp.images import load_rgba, save_image
-from gamba_warp.model.checkpoint import save_model
-from gamba_warp.model.config import GambaConfig
-from gamba_warp.model.gamba import Gamba
 from gamba_warp.pages.sheet import VIEWS, Sheet
 from gamba_warp.pages.turntable import turntable_frames
 from gamba_warp.trajectories.paths import Viewpoint
-
-CONFIG = GambaConfig(
-    image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
-)
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("model") / "model.safetensors"
-    save_model(path, Gamba(CONFIG))
-    return path
 
 
 def test_a_row_is_the_input_and_views_around(tmp_path):
     sheet, gaussians = Sheet(tmp_path / "s.png"), some(40)
     rgba = np.zeros((64, 64, 4), np.float32)
     rgba[16:48, 16:48] = (1, 0, 0, 1)
-    sheet.add("first", rgba, gaussians, Viewpoint(20.0, CONFIG.distance, CONFIG.fov))
+    sheet.add("first", rgba, gaussians, Viewpoint(20.0, SMALLEST.distance, SMALLEST.fov))
     sheet.write()
     picture = load_rgba(tmp_path / "s.png")[..., :3]
     assert picture.shape == (18 + 128, 6 * 128, 3)
     tiles = picture[18:].reshape(128, 1 + VIEWS, 128, 3).transpose(1, 0, 2, 3)
     assert np.abs(tiles[0][64, 64] - (1, 0, 0)).max() < 0.01 and tiles[0][4, 4].min() == 1
-    camera = {"elevation": 20.0, "distance": CONFIG.distance, "fov": CONFIG.fov}
+    camera = {"elevation": 20.0, "distance": SMALLEST.distance, "fov": SMALLEST.fov}
     want = turntable_frames(gaussians, size=128, frames=VIEWS, **camera) / 255
     np.testing.assert_array_equal(tiles[1][:, 1:], want[0].astype(np.float32)[:, 1:])  # and a line
     np.testing.assert_array_equal(tiles[2:], want[1:].astype(np.float32))
@@ -81,8 +65,6 @@ def test_a_sheet_that_cannot_be_is_one_line(tmp_path, checkpoint, capsys):
         tmp_path / "sheet.txt": "a sheet is one of .png, .webp, .jpg",
         path: "would be overwritten by an output",
     }.items():
-        assert run_reconstruct(path, *quick(checkpoint, tmp_path / "out"), "--sheet", sheet) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1 and str(sheet) in lines[0] and reason in lines[0]
-    with pytest.raises(UserError, match="cannot write /dev/null/s.png"):
-        sheet_of(Path("/dev/null/s.png"), 1)
+        words = [path, *quick(checkpoint, tmp_path / "out"), "--sheet", sheet]
+        refused_command(capsys, "reconstruct", words, sheet, reason)
+    refused("cannot write /dev/null/s.png", sheet_of, Path("/dev/null/s.png"), 1)

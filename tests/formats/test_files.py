@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.disk import full_at
+from helpers.refusals import refused
 from safetensors.torch import save_file
 
 from gamba_warp.data.dataset import open_dataset
@@ -46,14 +47,11 @@ def test_sha256_of_a_large_file_takes_little_memory(tmp_path):
 
 
 def test_sha256_names_the_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(UserError, match="absent: No such file"):
-        sha256(tmp_path / "absent")
-    with pytest.raises(UserError, match="not a plain file"):
-        sha256(tmp_path)
+    refused("absent: No such file", sha256, tmp_path / "absent")
+    refused("not a plain file", sha256, tmp_path)
     (tmp_path / "a").write_bytes(b"a")
     check_sha256(tmp_path / "a", "ca978112")
-    with pytest.raises(UserError, match="SHA-256 is ca978112, expected ca978113"):
-        check_sha256(tmp_path / "a", "ca978113")
+    refused("SHA-256 is ca978112, expected ca978113", check_sha256, tmp_path / "a", "ca978113")
 
 
 def test_leftovers_are_swept_by_age_and_nothing_else_is(tmp_path):
@@ -134,8 +132,7 @@ def test_what_has_its_name_is_on_the_disk(tmp_path, monkeypatch):
     refuse(errno.EINVAL)  # of a drive that cannot sync
     write_text(path, "b")
     refuse(errno.EIO)
-    with pytest.raises(UserError, match="a.txt: Input/output error"):
-        write_text(path, "c")
+    refused("a.txt: Input/output error", write_text, path, "c")
     assert path.read_text() == "b"
 
 
@@ -187,8 +184,7 @@ def test_what_begins_with_a_dot_is_no_input(tmp_path):
     assert list(visible(tmp_path, "*.ply")) == [tmp_path / "a.ply"]
     pairs, failures = find_pairs(tmp_path, tmp_path)
     assert [pair.name for pair in pairs] == ["a"] and not failures
-    with pytest.raises(UserError):
-        open_dataset(part)
+    refused(None, open_dataset, part)
 
 
 def test_who_reads_the_older_file_reads_it_to_its_end(tmp_path):

@@ -9,9 +9,9 @@ import urllib.parse
 import numpy as np
 import pytest
 from helpers.gaussians import some
+from helpers.refusals import refused
 from PIL import Image, features
 
-from gamba_warp.errors import UserError
 from gamba_warp.pages.charts import Axis, Point, Series, chart
 from gamba_warp.pages.page import Section, demo_page, page_text, reconstruction_page
 
@@ -192,8 +192,7 @@ def test_degenerate_charts_stay_finite(values):
 def test_a_page_of_nothing_and_one_that_cannot_be_written():
     assert "<h1>bare</h1>" in page_text("bare", "", [])
     assert "<h2>only a title</h2>" in page_text("", "", [Section("only a title")])
-    with pytest.raises(UserError, match=r"cannot write /dev/null/a\.html"):
-        demo_page("/dev/null/a.html", [])
+    refused(r"cannot write /dev/null/a\.html", demo_page, "/dev/null/a.html", [])
 
 
 def test_a_result_has_its_files_beside_a_large_viewer(tmp_path, browser_page):

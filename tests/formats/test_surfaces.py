@@ -7,6 +7,8 @@ import pytest
 import torch
 import trimesh
 import warp as wp
+from helpers.refusals import refused
+from helpers.views import cloud_of
 
 from gamba_warp.cameras import fibonacci_sphere
 from gamba_warp.errors import UserError
@@ -22,17 +24,9 @@ from gamba_warp.surfaces.tsdf import CLEAR, Views, fuse, look_around, sphere_cam
 QUICK = dict(voxels=64, views=24, pixels=128)
 
 
-def at(points, sigma=0.010, opacity=0.9, colors=None):
+def at(points, sigma=0.010, opacity=0.9, colors=0.5):
     """Round Gaussians at ``points [N, 3]``."""
-    means = torch.as_tensor(np.asarray(points), dtype=torch.float32)
-    count = len(means)
-    return Gaussians(
-        means=means,
-        quats=None,
-        scales=torch.full((count, 3), sigma),
-        opacities=torch.full((count,), opacity),
-        colors=torch.full((count, 3), 0.5) if colors is None else colors,
-    )
+    return cloud_of(points, sigma, opacity, colors)
 
 
 def on(mesh, count=4000, **options):
@@ -174,8 +168,7 @@ def test_smoothing_flattens_and_keeps_the_size():
 
 
 def test_a_clean_mesh_of_nothing():
-    with pytest.raises(UserError, match="no part"):
-        cleaned_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    refused("no part", cleaned_mesh, np.zeros((3, 3)), np.array([[0, 1, 2]]))
 
 
 @pytest.mark.parametrize("method", ["tsdf", "density"])
@@ -201,8 +194,7 @@ def test_what_has_no_surface(method, case, reason):
         some.scales[3, 1] = math.nan
     if case == "infinite":
         some.means[3, 1] = math.inf
-    with pytest.raises(UserError, match=reason):
-        extract_surface(some, SurfaceOptions(method=method, **QUICK))
+    refused(reason, extract_surface, some, SurfaceOptions(method=method, **QUICK))
 
 
 @pytest.mark.parametrize("method", ["tsdf", "density"])
@@ -230,15 +222,13 @@ def test_unit_frame_passes_over_floaters():
 
 @pytest.mark.parametrize("options", [{"voxels": 4}, {"voxels": 4096}, {"views": 1}, {"pixels": 3}])
 def test_options_out_of_range(options):
-    with pytest.raises(UserError, match="--" + next(iter(options))):
-        SurfaceOptions(**options).check()
+    refused("--" + next(iter(options)), SurfaceOptions(**options).check)
 
 
 def test_a_grid_that_is_too_large():
     corners = np.array([[x, y, z] for x in (-0.9, 0.9) for y in (-0.9, 0.9) for z in (-0.9, 0.9)])
     assert (1.8 * 1024) ** 3 > MOST_POINTS
-    with pytest.raises(UserError, match="1024 voxels a unit: a grid of"):
-        opacity_volume(at(corners), 1024)
+    refused("1024 voxels a unit: a grid of", opacity_volume, at(corners), 1024)
 
 
 def test_depth_quantile_against_its_definition():

@@ -68,9 +68,7 @@ def write_object(folder: Path, gaussians: Gaussians, views: int = VIEWS) -> None
     azimuths = torch.arange(views) * (360.0 / views)
     viewmats = orbit(azimuths, elevation=15.0, distance=1.8)
     cameras = Cameras(viewmats, intrinsics(SIZE, SIZE).expand(views, 3, 3), SIZE, SIZE)
-    pictures = render(gaussians, cameras)
-    # Pictures on black have premultiplied colour, but files hold straight alpha.
-    rgba = torch.cat([pictures.rgb / pictures.alpha.clamp_min(1e-3), pictures.alpha], -1)
+    rgba = photograph(gaussians, cameras)
     folder.mkdir(parents=True)
     K = cameras.Ks[0]
     frames = []

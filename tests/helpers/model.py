@@ -11,6 +11,9 @@ from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 
 FIELDS = ("means", "scales", "opacities", "colors")
+SMALLEST = GambaConfig(
+    image_size=16, patch_size=4, width=16, depth=1, encoder="none", encoder_size=16
+)
 
 
 @timm.models.register_model

@@ -4,29 +4,12 @@ import math
 
 import pytest
 import torch
-from helpers.gaussians import some
+from helpers.gaussians import covariances, rotations, some
 from torch.testing import assert_close
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.gaussians import Gaussians, matrix_to_quat, quat_multiply
 from gamba_warp.render import render
-
-
-def to_matrix(quat):
-    w, x, y, z = (quat / quat.norm()).tolist()
-    return torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=quat.dtype,
-    )
-
-
-def covariances(gaussians):
-    halves = [to_matrix(q) * s for q, s in zip(gaussians.quats, gaussians.scales)]
-    return torch.stack([h @ h.T for h in halves])
 
 
 def batch(*lead, n=5, rotated=True):
@@ -67,8 +50,8 @@ def test_detach_cuts_the_graph():
 
 def test_quaternion_product_is_the_matrix_product():
     p, q = torch.randn(2, 4, dtype=torch.float64)
-    got = to_matrix(quat_multiply(p, q))
-    assert_close(got, to_matrix(p) @ to_matrix(q))
+    got = rotations(quat_multiply(p, q))
+    assert_close(got, rotations(p) @ rotations(q))
 
 
 ANGLES = [0, 1e-4, 1, math.pi / 2, math.pi - 1e-4, math.pi]
@@ -79,19 +62,19 @@ ANGLES = [0, 1e-4, 1, math.pi / 2, math.pi - 1e-4, math.pi]
 def test_quaternion_of_a_matrix(axis, angle):
     axis = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
     quat = torch.cat([torch.tensor([math.cos(angle / 2)]).double(), math.sin(angle / 2) * axis])
-    matrix = to_matrix(quat)
+    matrix = rotations(quat)
     got = matrix_to_quat(matrix)
     assert got[0] >= 0
     assert_close(got.norm(), torch.tensor(1.0).double())
-    assert_close(to_matrix(got), matrix, atol=1e-9, rtol=0)
+    assert_close(rotations(got), matrix, atol=1e-9, rtol=0)
     # float32 entries: their rounding and no more
-    assert_close(to_matrix(matrix_to_quat(matrix.float())), matrix.float(), atol=3e-7, rtol=0)
+    assert_close(rotations(matrix_to_quat(matrix.float())), matrix.float(), atol=3e-7, rtol=0)
 
 
 @pytest.mark.parametrize("rotated", [True, False])
 def test_rigid_motion_moves_means_and_covariances(rotated):
     gaussians = some(6, rotated).to(torch.float64)
-    rotation = to_matrix(torch.randn(4, dtype=torch.float64))
+    rotation = rotations(torch.randn(4, dtype=torch.float64))
     shift = torch.randn(3, dtype=torch.float64)
     moved = gaussians.transformed(rotation, shift, 1.7)
     assert_close(moved.means, torch.stack([1.7 * rotation @ m + shift for m in gaussians.means]))
@@ -99,8 +82,8 @@ def test_rigid_motion_moves_means_and_covariances(rotated):
     if not rotated:
         quats = torch.eye(4, dtype=torch.float64)[:1].expand(6, 4)
         before = Gaussians(**{**vars(gaussians), "quats": quats})
-    want = 1.7**2 * rotation @ covariances(before) @ rotation.T
-    assert_close(covariances(moved), want)
+    want, got = (torch.tensor(covariances(g.quats, g.scales)) for g in (before, moved))
+    assert_close(got, 1.7**2 * rotation @ want @ rotation.T)
     assert_close(moved.opacities, gaussians.opacities)
     assert_close(moved.colors, gaussians.colors)
 
@@ -108,7 +91,7 @@ def test_rigid_motion_moves_means_and_covariances(rotated):
 def test_rigid_motion_of_a_batch_with_gradients():
     gaussians = batch(2, 3)
     gaussians.means.requires_grad_()
-    rotation = to_matrix(torch.randn(4))
+    rotation = rotations(torch.randn(4))
     moved = gaussians.transformed(rotation, torch.zeros(3))
     cotangent = torch.randn(2, 3, 5, 3)
     (gradient,) = torch.autograd.grad((moved.means * cotangent).sum(), gaussians.means)
@@ -122,7 +105,7 @@ def test_an_object_that_turns_with_the_camera_keeps_its_picture(count):
     torch.manual_seed(3)
     gaussians = some(7)
     gaussians.harmonics = 0.3 * torch.randn(7, count, 3)
-    turn = to_matrix(torch.tensor([0.7, -0.2, 0.5, 0.4], dtype=torch.float64)).float()
+    turn = rotations(torch.tensor([0.7, -0.2, 0.5, 0.4], dtype=torch.float64)).float()
     shift = torch.tensor([0.1, -0.2, 0.05])
     motion = torch.eye(4)
     motion[:3, :3], motion[:3, 3] = turn, shift

@@ -4,9 +4,9 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.model import inputs, micro
+from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, orbit
-from gamba_warp.errors import UserError
 from gamba_warp.model.config import PRESETS, GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.vision.vgg import VGG16Features, VGG16Trunk
@@ -227,8 +227,7 @@ def test_config_json_round_trip():
 )
 def test_config_json_errors(change, words):
     text = micro().to_json().replace('"width": 16', change or '"depth": 2')
-    with pytest.raises(UserError, match=words):
-        GambaConfig.from_json(text, "file.x")
+    refused(words, GambaConfig.from_json, text, "file.x")
 
 
 @pytest.mark.parametrize(
@@ -245,5 +244,4 @@ def test_config_json_errors(change, words):
     ],
 )
 def test_config_refuses(changes, words):
-    with pytest.raises(UserError, match=words):
-        micro(**changes)
+    refused(words, micro, **changes)

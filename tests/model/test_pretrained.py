@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 from helpers.model import inputs, micro
+from helpers.refusals import refused
 
 from gamba_warp import Gamba, load_model
 from gamba_warp.errors import UserError
@@ -49,11 +50,9 @@ def test_config_json_of_another_model(tmp_path):
     _model().save_pretrained(tmp_path)
     fields = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(fields | {"state_size": 5}))
-    with pytest.raises(UserError, match="is not the configuration in"):
-        Gamba.from_pretrained(tmp_path)
+    refused("is not the configuration in", Gamba.from_pretrained, tmp_path)
     (tmp_path / "config.json").write_bytes(b"\xff\xfe")
-    with pytest.raises(UserError, match="config.json: cannot be read"):
-        Gamba.from_pretrained(tmp_path)
+    refused("config.json: cannot be read", Gamba.from_pretrained, tmp_path)
 
 
 def test_needs_no_hub_for_a_folder(tmp_path, monkeypatch):
@@ -61,8 +60,7 @@ def test_needs_no_hub_for_a_folder(tmp_path, monkeypatch):
     model = _model()
     model.save_pretrained(tmp_path)
     assert _same(model, Gamba.from_pretrained(tmp_path))
-    with pytest.raises(UserError, match=r"pip install '\.\[hub\]' in the checkout"):
-        Gamba.from_pretrained("nobody/nothing")
+    refused(r"pip install '\.\[hub\]' in the checkout", Gamba.from_pretrained, "nobody/nothing")
 
 
 def _cached(tmp_path, model):
@@ -79,11 +77,8 @@ def test_a_cached_repository_needs_no_network(tmp_path, monkeypatch):
     _cached(tmp_path, model)
     monkeypatch.setattr("socket.socket.connect", _no_network)
     assert _same(model, Gamba.from_pretrained("owner/name", cache_dir=tmp_path))
-    with pytest.raises(
-        UserError, match="owner/other: neither a folder here nor to be had"
-    ) as error:
+    with pytest.raises(UserError, match="owner/other: neither a folder here nor to be had"):
         Gamba.from_pretrained("owner/other", cache_dir=tmp_path)
-    assert "\n" not in str(error.value)
 
 
 def _no_network(*arguments):
@@ -94,9 +89,7 @@ def _no_network(*arguments):
 def test_names_that_are_none(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("socket.socket.connect", _no_network)
-    with pytest.raises(UserError) as error:
-        Gamba.from_pretrained(name, cache_dir=tmp_path)
-    assert "\n" not in str(error.value)
+    refused(None, Gamba.from_pretrained, name, cache_dir=tmp_path)
 
 
 def test_a_repository_without_a_model(tmp_path, monkeypatch):
@@ -128,5 +121,4 @@ def test_push(tmp_path, monkeypatch):
     assert sent["repository"] == ("owner/name", True, "t") and _same(model, sent["model"])
     assert sent["files"] == {"README.md", "config.json", "model.safetensors"}
     monkeypatch.setattr(Api, "create_repo", _no_network)
-    with pytest.raises(UserError, match="owner/name: cannot be written to the Hub"):
-        model.push_to_hub("owner/name")
+    refused("owner/name: cannot be written to the Hub", model.push_to_hub, "owner/name")

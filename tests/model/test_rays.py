@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from helpers.model import inputs, micro
+from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
-from gamba_warp.errors import UserError
 from gamba_warp.eval.views.baselines import billboard
 from gamba_warp.eval.views.compare import Truth
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
@@ -336,10 +336,8 @@ def test_configurations_of_older_files_mean_the_paper():
         part for part in old[1:-1].split(", ") if "ray_" not in part and 'decoder"' not in part
     ]
     assert GambaConfig.from_json("{" + ", ".join(values) + "}").decoder == "bins"
-    with pytest.raises(UserError, match="patch_size 4 is not a multiple of ray_cells 3"):
-        rays(ray_cells=3)
-    with pytest.raises(UserError, match="ray_cells 4 is not a multiple of ray_coarse 3"):
-        rays(ray_cells=4, ray_coarse=3)
+    refused("patch_size 4 is not a multiple of ray_cells 3", rays, ray_cells=3)
+    refused("ray_cells 4 is not a multiple of ray_coarse 3", rays, ray_cells=4, ray_coarse=3)
     with pytest.raises(ValueError, match=r"images is \(1, 12, 12, 3\), expected"):
         Gamba(rays())(torch.rand(1, 12, 12, 3), one(cut_outs()[1], 0))
 

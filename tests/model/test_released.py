@@ -11,6 +11,7 @@ import pytest
 import timm
 import torch
 from helpers.model import inputs, micro
+from helpers.refusals import refused
 from plyfile import PlyData
 from safetensors.torch import save_file
 from timm.models.vision_transformer import _create_vision_transformer
@@ -18,7 +19,6 @@ from torch.nn import functional as F
 
 from gamba_warp import cli
 from gamba_warp.commands.weights import import_released_command
-from gamba_warp.errors import UserError
 from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
 from gamba_warp.model import released
 from gamba_warp.model.checkpoint import load_model
@@ -173,8 +173,7 @@ def test_encoder_from_a_file_of_its_own(golden, tmp_path, wide):
     path = _file(golden, tmp_path, encoder=False)
     model = load_released(path, tmp_path / "vit.safetensors", 2)
     assert model.encoder.fingerprint == whole.encoder.fingerprint
-    with pytest.raises(UserError, match=r"theirs.pth: has no image encoder"):
-        load_released(path, depth=2)
+    refused(r"theirs.pth: has no image encoder", load_released, path, depth=2)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
@@ -195,8 +194,7 @@ def test_any_float_dtype(golden, tmp_path, wide, dtype):
         assert torch.equal(a, b), name
     for wrong in (points.square(), points + 0.02, points * torch.tensor([[1], [1], [1.02]])):
         state = rounded | {"model.decoder.coords": wrong.to(dtype)}
-        with pytest.raises(UserError, match="not the same even points"):
-            convert_released(state, "wrong", 2)
+        refused("not the same even points", convert_released, state, "wrong", 2)
 
 
 @pytest.mark.parametrize("depth, found", [(2, 1), (14, 2), (1, 2)])
@@ -206,8 +204,7 @@ def test_a_file_without_its_last_blocks_is_refused(golden, tmp_path, depth, foun
         k: v for k, v in state.items() if "layers.1.mamba" not in k and "layers.1.cond" not in k
     }
     words = f"a: holds {found} blocks?, not {depth}: a part .* --depth {found} takes"
-    with pytest.raises(UserError, match=words):
-        convert_released(part if found == 1 else state, "a", depth)
+    refused(words, convert_released, part if found == 1 else state, "a", depth)
     assert DEPTH == PRESETS["released"].depth == 14
     assert inspect.signature(import_released_command).parameters["depth"].default == DEPTH
 
@@ -231,8 +228,7 @@ def test_wrappers_names_are_left_out(golden, tmp_path, wide, change):
     assert got.config == want.config and got.encoder.fingerprint == want.encoder.fingerprint
     assert torch.equal(got.decoder.position.weight, want.decoder.position.weight)
     torch.save(content | {"module." + name: value for name, value in content.items()}, path)
-    with pytest.raises(UserError, match="has a tensor twice, with 'module.'"):
-        load_released(path, depth=2)
+    refused("has a tensor twice, with 'module.'", load_released, path, depth=2)
 
 
 @pytest.mark.parametrize(
@@ -241,9 +237,7 @@ def test_wrappers_names_are_left_out(golden, tmp_path, wide, change):
 def test_an_object_in_the_file_is_named(golden, tmp_path, thing, name):
     path = tmp_path / "theirs.pth"
     torch.save({"model": _state(golden), "args": thing}, path)
-    with pytest.raises(UserError, match=rf"it holds '{name}', of which torch reads none") as caught:
-        load_released(path, depth=2)
-    assert "\n" not in str(caught.value)
+    refused(rf"it holds '{name}', of which torch reads none", load_released, path, depth=2)
 
 
 @pytest.mark.parametrize(
@@ -266,9 +260,8 @@ def test_an_object_in_the_file_is_named(golden, tmp_path, thing, name):
 )
 def test_other_networks_are_one_line(golden, tmp_path, name, value, words):
     path = _file(golden, tmp_path, encoder=False, **{name: value})
-    with pytest.raises(UserError, match=words) as caught:
-        load_released(path, "random" if "embedding" in words else None, 2)
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    said = refused(words, load_released, path, "random" if "embedding" in words else None, 2)
+    assert str(path) in said
 
 
 def test_the_file_itself_is_never_replaced(golden, tmp_path, wide, capsys):

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 from architecture.imports import modules
+from helpers.refusals import refused
 
 import gamba_warp.measure.stress_run  # noqa: F401 (loaded before a test takes something away)
 from gamba_warp.errors import UserError
@@ -197,24 +198,20 @@ def test_without_a_home_weights_need_a_folder(tmp_path, monkeypatch):
 
     monkeypatch.delenv("GAMBA_CACHE", raising=False)
     monkeypatch.setattr(Path, "home", nowhere)
-    with pytest.raises(UserError, match="no home folder; let GAMBA_CACHE name one"):
-        cache_folder()
+    refused("no home folder; let GAMBA_CACHE name one", cache_folder)
     (tmp_path / "file").touch()
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "file"))
-    with pytest.raises(UserError, match="file: .*; GAMBA_CACHE names another folder"):
-        store_weights()
+    refused("file: .*; GAMBA_CACHE names another folder", store_weights)
 
 
 @pytest.mark.parametrize("name", ["ab:c.obj", "Con", "nul.png", "a/lpt1.t", "a?", "b.", "b ", "<"])
 def test_names_that_windows_takes_for_something_else(name, monkeypatch, tmp_path):
     assert parts_of(name, "file")
     monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(UserError, match="^file: Windows has no files of the name"):
-        inside(tmp_path, name, "file")
+    refused("^file: Windows has no files of the name", inside, tmp_path, name, "file")
     for fine in ("console.obj", "a.b/c d.png", "com.txt", "äö/nulls"):
         assert inside(tmp_path, fine, "file") == tmp_path / fine
-    with pytest.raises(UserError, match="leaves its folder"):
-        inside(tmp_path, "../a", "file")
+    refused("leaves its folder", inside, tmp_path, "../a", "file")
 
 
 def test_a_link_to_another_drive_leaves_the_folder(monkeypatch, tmp_path):
@@ -222,8 +219,7 @@ def test_a_link_to_another_drive_leaves_the_folder(monkeypatch, tmp_path):
         raise ValueError("Paths don't have the same drive")
 
     monkeypatch.setattr(os.path, "commonpath", other_drives)
-    with pytest.raises(UserError, match="cannot be followed"):
-        inside(tmp_path, "a", "file")
+    refused("cannot be followed", inside, tmp_path, "a", "file")
 
 
 def test_a_lock_that_nobody_else_may_read(monkeypatch, tmp_path):

@@ -13,6 +13,7 @@ import zipfile
 import zlib
 
 import pytest
+from helpers.refusals import refused_at
 
 from gamba_warp.errors import UserError
 from gamba_warp.untrusted import archives
@@ -33,15 +34,6 @@ def linked(name):
     return info
 
 
-def one_line(source, reason, function, *arguments):
-    """Calls it, and expects a UserError of one line that begins with the source."""
-    with pytest.raises(UserError) as caught:
-        function(*arguments)
-    message = str(caught.value)
-    assert message.startswith(f"{source}: ") and reason in message, message
-    assert len(message.splitlines()) == 1 and len(message) < 400
-
-
 def unpack(path, out):
     with open_zip(path) as archive:
         for name in archive.names:
@@ -55,8 +47,8 @@ def test_a_zip_is_unpacked_inside_its_folder(tmp_path):
     assert (tmp_path / "out/b/c/d.txt").read_text() == "two"
     with open_zip(path) as archive:
         assert archive.read("a.txt", 10) == b"one"
-        one_line(path, "is over", archive.read, "a.txt", 2)
-        one_line(path, "holds no 'x'", archive.read, "x", 2)
+        refused_at(path, "is over", archive.read, "a.txt", 2)
+        refused_at(path, "holds no 'x'", archive.read, "x", 2)
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
@@ -80,26 +72,26 @@ def test_a_zip_is_unpacked_inside_its_folder(tmp_path):
 def test_bad_members_are_refused_before_any_is_unpacked(tmp_path, monkeypatch, members, reason):
     monkeypatch.setattr(archives, "MAX_MEMBERS", 5)
     path = make_zip(tmp_path / "a.zip", [("good", "1"), *members][-6:])
-    one_line(path, reason, unpack, path, tmp_path / "out")
+    refused_at(path, reason, unpack, path, tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
 
 
 def test_bombs_and_odd_zips(tmp_path, monkeypatch):
     monkeypatch.setattr(archives, "_SMALL", 1000)
     path = make_zip(tmp_path / "bomb.zip", [("a", b"0" * 1_000_000)])
-    one_line(path, "100 times its size", unpack, path, tmp_path / "out")
+    refused_at(path, "100 times its size", unpack, path, tmp_path / "out")
     path = make_zip(tmp_path / "b.zip", [("a", b"0" * 99)], zipfile.ZIP_LZMA)
-    one_line(path, "in a way", unpack, path, tmp_path / "out")
+    refused_at(path, "in a way", unpack, path, tmp_path / "out")
     path = make_zip(tmp_path / "c.zip", [("a", b"0" * 99)])
     data = bytearray(path.read_bytes())
     data[data.rindex(b"PK\1\2") + 8] |= 1  # the flag of a password
     path.write_bytes(data)
-    one_line(path, "encrypted", unpack, path, tmp_path / "out")
+    refused_at(path, "encrypted", unpack, path, tmp_path / "out")
     monkeypatch.setattr(archives, "_DIRECTORY", 10)
-    one_line(path, "too many members", unpack, path, tmp_path / "out")
+    refused_at(path, "too many members", unpack, path, tmp_path / "out")
     path = make_zip(tmp_path / "d.zip", [("a/b", "1"), ("a", "1")])
     monkeypatch.undo()
-    one_line(path, "", unpack, path, tmp_path / "out")  # a file where a folder is
+    refused_at(path, "", unpack, path, tmp_path / "out")  # a file where a folder is
 
 
 def test_a_zip_that_lies_about_a_size_fills_no_memory(tmp_path):
@@ -111,8 +103,8 @@ def test_a_zip_that_lies_about_a_size_fills_no_memory(tmp_path):
     tracemalloc.start()
     try:
         with open_zip(path) as archive:
-            one_line(path, "CRC", archive.read, "a", 100)
-        one_line(path, "CRC", unpack, path, tmp_path / "out")
+            refused_at(path, "CRC", archive.read, "a", 100)
+        refused_at(path, "CRC", unpack, path, tmp_path / "out")
         assert tracemalloc.get_traced_memory()[1] < 10_000_000
     finally:
         tracemalloc.stop()
@@ -157,16 +149,16 @@ def test_ar_sizes(tmp_path):
     assert read_data(path) == ("data.tar.xz", b"12345")
     for size in ("-60", "-1", "1e3", "", "0x10", "9999999999"):
         make_ar(path, [("data.tar.xz", b"12345", size)])
-        one_line(path, "no sound size", read_data, path)
+        refused_at(path, "no sound size", read_data, path)
         make_ar(path, [("first", b"2.0", size), ("data.tar.xz", b"12345", 5)])
         started = time.monotonic()
-        one_line(path, "", read_data, path)
+        refused_at(path, "", read_data, path)
         assert time.monotonic() - started < 1  # -60 went round for ever
     whole = make_ar(path, [("data.tar.xz", b"12345" * 9, 45)]).read_bytes()
     for length in (0, 7, 8, 30, 67, 68, 90):
         path.write_bytes(whole[:length])
-        one_line(path, "", read_data, path)
-    one_line(tmp_path, "no such file", read_data, tmp_path)
+        refused_at(path, "", read_data, path)
+    refused_at(tmp_path, "no such file", read_data, tmp_path)
 
 
 def make_tar(members, form=tarfile.PAX_FORMAT):
@@ -193,35 +185,35 @@ def test_tars_packed_in_any_way(tmp_path):
     plain = make_tar([("./", b"", tarfile.DIRTYPE), *odd, *PLAIN])
     for pack in (bytes, gzip.compress, bz2.compress, lzma.compress):
         assert read_tar(pack(plain), tmp_path) == {"./a": b"one", "b/c": b"two"}
-    one_line("a.tar", "zstd", read_tar, b"\x28\xb5\x2f\xfd" + plain, tmp_path)
+    refused_at("a.tar", "zstd", read_tar, b"\x28\xb5\x2f\xfd" + plain, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_bad_tars(tmp_path, monkeypatch):
     for name in ("../x", "/x", "a/../../x"):
         data = make_tar([(name, b"", tarfile.REGTYPE)])
-        one_line("a.tar", "", read_tar, data, tmp_path)
+        refused_at("a.tar", "", read_tar, data, tmp_path)
     negative = bytearray(make_tar(PLAIN, tarfile.GNU_FORMAT))
     negative[124:136] = b"\xff" * 10 + b"\xfc\x00"  # the size as a number of 12 bytes: -1024
     negative[148:156] = b" " * 8
     negative[148:156] = b"%06o\0 " % sum(negative[:512])
-    one_line("a.tar", "size", read_tar, bytes(negative), tmp_path)
+    refused_at("a.tar", "size", read_tar, bytes(negative), tmp_path)
     long_name = bytearray(make_tar([("a" * 150, b"", tarfile.REGTYPE)], tarfile.GNU_FORMAT))
     long_name[124:136] = b"77777777777\0"
     long_name[148:156] = b" " * 8
     long_name[148:156] = b"%06o\0 " % sum(long_name[:512])
-    one_line("a.tar", "a header of", read_tar, bytes(long_name), tmp_path)
+    refused_at("a.tar", "a header of", read_tar, bytes(long_name), tmp_path)
     whole = make_tar([("a", b"0" * 3_000, tarfile.REGTYPE)])
     for length in range(512, 512 + 3_000, 300):  # the end is missing when the member is read
-        one_line("a.tar", "", read_tar, whole[:length], tmp_path)
+        refused_at("a.tar", "", read_tar, whole[:length], tmp_path)
     bomb = make_tar([("a", b"0" * 3_000_000, tarfile.REGTYPE)])
     monkeypatch.setattr(archives, "_SMALL", 1000)
     for pack in (gzip.compress, bz2.compress, lzma.compress):
-        one_line("a.tar", "100 times its size", read_tar, pack(bomb), tmp_path)
+        refused_at("a.tar", "100 times its size", read_tar, pack(bomb), tmp_path)
     monkeypatch.setattr(archives, "MAX_MEMBERS", 1)
-    one_line("a.tar", "over 1 members", read_tar, make_tar(PLAIN), tmp_path)
+    refused_at("a.tar", "over 1 members", read_tar, make_tar(PLAIN), tmp_path)
     monkeypatch.setattr(archives, "_MEMORY", 1000)
-    one_line("a.tar", "Memory", read_tar, lzma.compress(make_tar(PLAIN)), tmp_path)
+    refused_at("a.tar", "Memory", read_tar, lzma.compress(make_tar(PLAIN)), tmp_path)
     assert not list(tmp_path.iterdir())
 
 

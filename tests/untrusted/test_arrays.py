@@ -5,8 +5,8 @@ import zipfile
 
 import numpy as np
 import pytest
+from helpers.refusals import refused, refused_at
 
-from gamba_warp.errors import UserError
 from gamba_warp.untrusted.arrays import MAX_BYTES, read_array
 
 WANTED = np.arange(6.0).reshape(3, 2) + 0.5
@@ -71,13 +71,9 @@ def test_every_kind_of_number_is_read(tmp_path, dtype, order):
 def test_lies_are_one_line(tmp_path, content, reason):
     path = tmp_path / "a.npy"
     path.write_bytes(content)
-    with pytest.raises(UserError) as caught:
-        read_array(path, (3, 2))
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ") and reason in message and "\n" not in message
+    refused_at(path, reason, read_array, path, (3, 2))
 
 
 def test_what_is_no_file(tmp_path):
     for path in (tmp_path, tmp_path / "none.npy", tmp_path / ("n" * 300), tmp_path / "a\0b"):
-        with pytest.raises(UserError, match="cannot be read"):
-            read_array(path, (3, 2))
+        refused("cannot be read", read_array, path, (3, 2))

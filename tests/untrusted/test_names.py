@@ -1,8 +1,8 @@
 """Names from archives, catalogues and datasets: they stay inside their folder, or are refused."""
 
 import pytest
+from helpers.refusals import refused
 
-from gamba_warp.errors import UserError
 from gamba_warp.untrusted.names import MAX_NAME, inside, plain_name
 
 BAD = [
@@ -29,10 +29,7 @@ BAD = [
 @pytest.mark.parametrize("name", BAD, ids=ascii)
 def test_bad_names_are_one_line(tmp_path, name):
     for function in (lambda: inside(tmp_path, name, "x.json"), lambda: plain_name(name, "x.json")):
-        with pytest.raises(UserError) as caught:
-            function()
-        assert str(caught.value).startswith("x.json: ")
-        assert len(str(caught.value).splitlines()) == 1 and len(str(caught.value)) < 200
+        assert len(refused(r"^x\.json: ", function)) < 200
 
 
 def test_good_names(tmp_path):
@@ -49,8 +46,7 @@ def test_good_names(tmp_path):
         assert inside(tmp_path, name, "x") == tmp_path / name
     assert plain_name("chair-1.obj", "x") == "chair-1.obj"
     for name in ("a/b", "./a", "a/", ".hidden"):
-        with pytest.raises(UserError):
-            plain_name(name, "x")
+        refused(None, plain_name, name, "x")
 
 
 def test_links_may_not_leave_the_folder(tmp_path):
@@ -61,8 +57,7 @@ def test_links_may_not_leave_the_folder(tmp_path):
     (folder / "in").symlink_to(folder / "images")
     (folder / "round").symlink_to(folder / "round")
     for name in ("out/secret.png", "out/none.png", "out"):
-        with pytest.raises(UserError, match="leaves"):
-            inside(folder, name, "x")
+        refused("leaves", inside, folder, name, "x")
     assert inside(folder, "in/a.png", "x") == folder / "in" / "a.png"
     inside(folder, "round/a.png", "x")  # opening it fails, and says so
     (tmp_path / "link").symlink_to(folder)

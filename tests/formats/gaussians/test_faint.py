@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.gaussians import some
+from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.cli import run
-from gamba_warp.errors import UserError
 from gamba_warp.formats.gaussians.files import read_gaussians, to_be_written, write_gaussians
 from gamba_warp.formats.names import SPLAT_FORMATS, splat_suffix
 from gamba_warp.formats.ply import load_ply, save_ply
@@ -68,11 +68,9 @@ def test_limits_of_ones_own():
     kept, said = to_be_written(gaussians, 0.5)
     assert 0 < kept.num < 200 and bool((kept.opacities >= 0.5).all())
     assert said == f"{kept.num} Gaussians, {300 - kept.num} left out (opacity under 0.5)."
-    with pytest.raises(UserError, match=r"no Gaussian has an opacity of 1\.5 or more"):
-        to_be_written(gaussians, 1.5)
+    refused(r"no Gaussian has an opacity of 1\.5 or more", to_be_written, gaussians, 1.5)
     gaussians.opacities[:] = float(LIMIT) / 2
-    with pytest.raises(UserError, match="no Gaussian has an opacity of 1/255 or more"):
-        to_be_written(gaussians)
+    refused("no Gaussian has an opacity of 1/255 or more", to_be_written, gaussians)
     gaussians.opacities[5] = float("nan")  # which is refused where it is written
     assert to_be_written(gaussians)[0].num == 1
 

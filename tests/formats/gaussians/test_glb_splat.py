@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from helpers.gaussians import some
+from helpers.gaussians import covariances, some
 from helpers.judges.npm import npm_package, run_node
-from helpers.judges.splats import attributes, covariances, read_glb
+from helpers.judges.splats import attributes, read_glb
 from helpers.meshes import glb
 
 from gamba_warp.formats.gaussians.glb import save_glb

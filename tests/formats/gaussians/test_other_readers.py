@@ -3,9 +3,9 @@
 import gaussforge
 import numpy as np
 import pytest
-from helpers.gaussians import some
+from helpers.gaussians import covariances, some
 from helpers.judges.npm import npm_package, run_node
-from helpers.judges.splats import ALLOWED, check, covariances, differences, published
+from helpers.judges.splats import ALLOWED, check, differences, published
 
 from gamba_warp.cli import run
 from gamba_warp.formats.gaussians.files import read_gaussians, write_gaussians

@@ -8,8 +8,7 @@ import tracemalloc
 
 import pytest
 import torch
-from helpers.gaussians import some
-from helpers.judges.splats import rotations
+from helpers.gaussians import rotations, some
 
 from gamba_warp.errors import UserError
 from gamba_warp.formats.gaussians.files import read_gaussians, splat_kind, write_gaussians
@@ -80,8 +79,8 @@ def test_the_numbers_of_a_file_by_the_layout(tmp_path, degree, extensions):
     s = 0.5**0.5
     turn = flip @ torch.tensor([[s, -s, 0], [s, s, 0], [0, 0, 1]]).double()
     # 1/511 is a step of the quaternion's numbers, half of it is what they are off, twice as angle
-    torch.testing.assert_close(rotations(got.quats)[0], turn, atol=2e-3, rtol=0)
-    torch.testing.assert_close(rotations(got.quats)[1], flip @ flip, atol=1e-6, rtol=0)
+    torch.testing.assert_close(rotations(got.quats.double())[0], turn, atol=2e-3, rtol=0)
+    torch.testing.assert_close(rotations(got.quats.double())[1], flip @ flip, atol=1e-6, rtol=0)
     if degree:
         sh = torch.tensor([[64.0, 0, -64], [2, 0, -2], [0, 127, -128]]) / 128
         # Of degree 1 the order is y, z, x, and the first two are turned.

@@ -11,16 +11,7 @@ import numpy as np
 import torch
 from plyfile import PlyData
 
-
-def rotations(quats):
-    """``[N, 3, 3]`` float64 of wxyz quaternions of any length."""
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).double().unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+from helpers.gaussians import covariances, rotations
 
 
 def differences(want, got):
@@ -33,7 +24,9 @@ def differences(want, got):
     order = distance.argmin(1)
     assert got.num == want.num and len(set(order.tolist())) == want.num
     got = got.select(order)
-    cosines = (rotations(want.quats) * rotations(got.quats)).sum(1).abs().clamp(max=1)
+    cosines = (
+        (rotations(want.quats.double()) * rotations(got.quats.double())).sum(1).abs().clamp(max=1)
+    )
     found = {
         "means": distance.min(1).values.max(),
         "angle": cosines.arccos().max(),
@@ -114,21 +107,6 @@ def attributes(document, binary):
     return primitive, out
 
 
-def covariances(quats_wxyz, scales):
-    """``[N, 3, 3]`` float64; the quaternions are unit."""
-    w, x, y, z = np.moveaxis(np.asarray(quats_wxyz, np.float64), -1, 0)
-    rotation = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
-    half = rotation * np.asarray(scales, np.float64)[:, None, :]
-    return half @ half.swapaxes(1, 2)
-
-
 def published(path, kind):
     """The centres ``[N, 3]`` and covariances of a file, turned from its format's axes to OpenCV's.
 
@@ -153,5 +131,4 @@ def published(path, kind):
         quats = np.stack([vertex[f"rot_{i}"] for i in range(4)], 1)
         scales = np.exp(np.stack([vertex[f"scale_{i}"] for i in range(3)], 1))
     turn = np.array([1, -1, -1] if kind in ("spz", "glb") else [1, 1, 1])
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     return centres * turn, covariances(quats, scales) * np.outer(turn, turn)

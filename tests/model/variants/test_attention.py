@@ -4,6 +4,7 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.model import FIELDS, assert_each_alone, assert_recomputed_alike, inputs, micro
+from helpers.refusals import refused
 
 from gamba_warp.cameras import Cameras
 from gamba_warp.errors import UserError
@@ -184,8 +185,9 @@ def test_sizes():
 
 
 def test_refused():
-    with pytest.raises(UserError, match="width 16 is not a multiple of num_heads 3"):
-        micro(mixer="attention", attention_heads=3)
+    refused(
+        "width 16 is not a multiple of num_heads 3", micro, mixer="attention", attention_heads=3
+    )
     assert micro(attention_heads=3).mixer == "mamba"
     with pytest.raises(UserError, match="mlp_width is 65,536, over 32,768"):
         GambaConfig(mixer="attention", width=4096, attention_mlp=16, depth=1)

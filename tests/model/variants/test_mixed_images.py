@@ -4,8 +4,8 @@ import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers.model import assert_each_alone, assert_recomputed_alike, inputs, micro
+from helpers.refusals import refused
 
-from gamba_warp.errors import UserError
 from gamba_warp.model.gamba import Gamba, make_blocks
 from gamba_warp.model.parts.block import mixed_places, prefix_states, run_blocks
 
@@ -114,5 +114,4 @@ def test_attention_knows_no_order():
 
 
 def test_refused():
-    with pytest.raises(UserError, match="image_tokens mixed needs prepend"):
-        micro(image_tokens="mixed", prepend=False)
+    refused("image_tokens mixed needs prepend", micro, image_tokens="mixed", prepend=False)

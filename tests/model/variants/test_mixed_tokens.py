@@ -3,9 +3,9 @@
 import pytest
 import torch
 from helpers.model import inputs, micro
+from helpers.refusals import refused
 
 from gamba_warp.cameras import plucker_rays
-from gamba_warp.errors import UserError
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.tokens import SplatTokens, normalize_imagenet, scan_orders
@@ -60,5 +60,4 @@ def test_paper_sizes():
     ],
 )
 def test_refused(changes, words):
-    with pytest.raises(UserError, match=words):
-        micro(**(CONFIG | changes))
+    refused(words, micro, **CONFIG | changes)
