@@ -86,56 +86,45 @@ def _damage(path, kind):
     save_model(path, model)
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
-    state = model.stored_state()
-    if kind == "truncated":
-        path.write_bytes(path.read_bytes()[:-100])
-    elif kind == "empty":
-        path.write_bytes(b"")
-    elif kind == "text":
-        path.write_text("this is not a model " * 20)
-    elif kind == "missing":
+    config, state = metadata["config"], model.stored_state()
+
+    def stored(tensors=state, **changes):
+        save_file(tensors, path, metadata=metadata | changes)
+
+    def configured(old, new):
+        stored(config=config.replace(old, new))
+
+    if kind == "pipe":
         path.unlink()
-    elif kind == "no metadata":
-        save_file(state, path)
-    elif kind == "other format":
-        save_file(state, path, metadata=metadata | {"format": "gamba_warp.model.0"})
-    elif kind == "other preset":
-        other = micro(encoder="none", width=24).to_json()
-        save_file(state, path, metadata=metadata | {"config": other})
-    elif kind == "tensor gone":
-        state.pop("norm.weight")
-        save_file(state, path, metadata=metadata)
-    elif kind == "tensor more":
-        save_file(state | {"stranger": torch.ones(1)}, path, metadata=metadata)
-    elif kind == "config key":
-        config = metadata["config"].replace('"fov"', '"view"')
-        save_file(state, path, metadata=metadata | {"config": config})
-    elif kind == "huge":
-        config = json.dumps(json.loads(metadata["config"]) | {"width": 2048, "depth": 200})
-        save_file({"x": torch.ones(1)}, path, metadata=metadata | {"config": config})
-    elif kind == "nobody's":
-        config = metadata["config"].replace('"encoder": "none"', '"encoder": "vit_of_nobody"')
-        save_file(state, path, metadata=metadata | {"config": config})
-    elif kind == "endless depth":
-        config = metadata["config"].replace('"depth": 2', '"depth": 1000000000')
-        save_file(state, path, metadata=metadata | {"config": config})
-    elif kind == "nested":
-        config = metadata["config"].replace('"depth": 2', f'"depth": {"[" * 60 + "]" * 60}')
-        save_file(state, path, metadata=metadata | {"config": config})
-    elif kind == "integers":
-        whole = {name: value.int() for name, value in state.items()}
-        save_file(whole, path, metadata=metadata)
+        os.mkfifo(path)
     elif kind == "not finite":
         state["norm.weight"][3:5] = torch.tensor([float("nan"), float("inf")])
-        save_file(state, path, metadata=metadata)
+        stored()
+    elif kind == "huge":
+        huge = json.dumps(json.loads(config) | {"width": 2048, "depth": 200})
+        stored({"x": torch.ones(1)}, config=huge)
     elif kind == "no text":
         header = json.dumps({"__metadata__": {"config": 7, "format": "x"}}).encode()
         path.write_bytes(struct.pack("<Q", len(header)) + header)
-    elif kind == "header":
-        path.write_bytes(struct.pack("<Q", 1 << 40) + path.read_bytes()[8:])
-    elif kind == "pipe":
-        path.unlink()
-        os.mkfifo(path)
+    else:
+        nested = f'"depth": {"[" * 60 + "]" * 60}'
+        {
+            "truncated": lambda: path.write_bytes(path.read_bytes()[:-100]),
+            "empty": lambda: path.write_bytes(b""),
+            "text": lambda: path.write_text("this is not a model " * 20),
+            "missing": path.unlink,
+            "no metadata": lambda: save_file(state, path),
+            "other format": lambda: stored(format="gamba_warp.model.0"),
+            "other preset": lambda: stored(config=micro(encoder="none", width=24).to_json()),
+            "tensor gone": lambda: stored({k: v for k, v in state.items() if k != "norm.weight"}),
+            "tensor more": lambda: stored(state | {"stranger": torch.ones(1)}),
+            "config key": lambda: configured('"fov"', '"view"'),
+            "nobody's": lambda: configured('"encoder": "none"', '"encoder": "vit_of_nobody"'),
+            "endless depth": lambda: configured('"depth": 2', '"depth": 1000000000'),
+            "nested": lambda: configured('"depth": 2', nested),
+            "integers": lambda: stored({name: value.int() for name, value in state.items()}),
+            "header": lambda: path.write_bytes(struct.pack("<Q", 1 << 40) + path.read_bytes()[8:]),
+        }[kind]()
 
 
 @pytest.mark.parametrize(

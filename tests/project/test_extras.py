@@ -26,6 +26,10 @@ ALL_OF_IT = {
 BY_NAME = re.compile(
     r"(install|run|add)\s[^\n]*?\s*['\"\s]gamba[-_]warp[\[=\s'\"]|pypi\.org/\S*gamba"
 )
+# Libraries whose distribution has another name than the module.
+DISTRIBUTIONS = {"PIL": "pillow", "skimage": "scikit-image", "warp": "warp-lang"}
+# Its weights are taken from the package where somebody has it.
+OPTIONAL = {"lpips"}
 # Refuses each library of the extras as if it were not installed, and runs a command.
 WITHOUT = """
 import importlib.util, sys
@@ -54,6 +58,7 @@ def declared():
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
     section = config["options.extras_require"]
+    section["core"] = config["options"]["install_requires"]
 
     def names(extra):
         found = set()
@@ -167,13 +172,32 @@ def test_what_only_an_option_needs(tmp_path):
     picture = cut_out(tmp_path / "thing.png")
     save_image(tmp_path / "busy.png", disc_on_noise((60, 80))[0])
     quick = ("--turntable", "none", "--no-page", "--out", tmp_path / "out")
-    for options, library, extra in (
-        ((picture, "--matte-model", "model.onnx"), "onnxruntime", "photo"),
-    ):
-        done = in_the_core("reconstruct", *options, *quick)
-        assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].endswith(
-            f"needs {library}, which is not installed: {versions.to_install(extra)}"
-        ), done.stderr
+    done = in_the_core("reconstruct", picture, "--matte-model", "model.onnx", *quick)
+    assert done.returncode == 2 and done.stderr.strip().splitlines()[-1].endswith(
+        f"needs onnxruntime, which is not installed: {versions.to_install('photo')}"
+    ), done.stderr
     done = in_the_core("reconstruct", tmp_path / "busy.png", *quick)
     assert done.returncode == 0 and "Colours alone (GrabCut)" in done.stdout, done.stderr
     assert versions.to_install("photo") in done.stderr
+
+
+def imported() -> dict[str, Path]:
+    """Libraries imported anywhere in the package, inside functions too, each with a file."""
+    found = {}
+    for folder in ("gamba_warp", "kernels", "train", "eval"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                if isinstance(node, ast.ImportFrom) and node.level == 0:
+                    names = [node.module or ""]
+                found.update({name.split(".")[0]: path for name in names})
+    return {n: p for n, p in found.items() if n not in {*sys.stdlib_module_names, "gamba_warp"}}
+
+
+def test_every_import_is_required():
+    required = set().union(*(names for extra, names in declared().items() if extra != "test"))
+    libraries = imported()
+    assert {"torch", "scipy", "PIL"} <= set(libraries), "the reader sees imports"
+    for name, path in libraries.items():
+        wanted = DISTRIBUTIONS.get(name, name.replace("_", "-"))
+        assert name in OPTIONAL or wanted in required, f"{path}: {name} is not in setup.cfg"
