@@ -85,8 +85,8 @@ def _missing(document: dict) -> list[str]:
 
 def _picture(name: str, parts: dict[str, dict]) -> str:
     """The link to a picture, where there is anything to draw."""
-    file = PICTURES[name]
-    return f"![Growth of {name}](pictures/{file.name})\n\n" if growth_picture([parts[name]]) else ""
+    drawn = growth_picture([parts[name]])
+    return f"![Growth of {name}](../pictures/{PICTURES[name].name})\n\n" if drawn else ""
 
 
 def _costs(document: dict) -> str:
