@@ -322,3 +322,22 @@ def test_json_refuses_nan(tmp_path):
     with pytest.raises(ValueError):
         write_json(tmp_path / "a.json", {"x": float("nan")})
     assert not list(tmp_path.iterdir())
+
+
+def test_exif_rotation_is_applied(tmp_path):
+    image = colours()
+    exif = image.getexif()
+    exif[0x0112] = 6  # turn a quarter clockwise to view
+    image.save(tmp_path / "a.png", exif=exif)
+    want = np.asarray(image.rotate(-90, expand=True)) / 255
+    np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
+
+
+def test_a_full_disk_is_a_user_error(tmp_path):
+    def full():
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(UserError, match=r"cannot write .*a\.bin: No space left"):
+        with atomic_path(tmp_path / "a.bin"):
+            full()
+    assert not list(tmp_path.iterdir())

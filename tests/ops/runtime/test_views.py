@@ -50,7 +50,7 @@ def test_a_struct_of_arrays_for_a_launch():
     assert torch.equal(out, (places[..., 2] + rows[..., 1] + 7).flatten())
     with pytest.raises(TypeError, match="int64"):
         Packed(_Points, places.long(), rows, None, 7)
-    with pytest.raises(ValueError, match="shorter|longer"):
+    with pytest.raises(ValueError, match="longer"):
         Packed(_Points, places, rows)
 
 
