@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from .gaussians.arrays import MIN_SCALE, export_arrays, flip_axes, sound_gaussia
 from .gaussians.compressed import is_compressed, unpacked
 from .headers import open_shape
 from .ply_data import read_ply
-from .ply_header import ORDERS, PlyHeader, read_ply_header
+from .ply_header import PlyHeader, read_ply_header
 
 TURNED = "frame opengl"  # the comment of files with y up, which earlier versions could write
 _OPACITY_MARGIN = 1e-6  # keeps the logit finite (|logit| < 14)
@@ -36,8 +35,6 @@ _GROUPS = {
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
 _REST = re.compile(r"f_rest_\d+")
-
-Columns = dict[str, np.ndarray]
 
 
 def save_ply(
@@ -110,12 +107,12 @@ def load_ply(path: str | Path) -> Gaussians:
         if is_compressed(header):
             arrays = unpacked(path, read_ply(path))
         else:
-            arrays = _activated(path, _vertices(path, header, file))
+            arrays = _activated(path, _vertices(path, header))
     gaussians = sound_gaussians(path, arrays)
     return flip_axes(gaussians) if TURNED in header.comments else gaussians
 
 
-def _activated(path: Path, vertices: Columns) -> dict[str, np.ndarray]:
+def _activated(path: Path, vertices: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The values of the vertices' properties. Raises UserError where one is missing."""
     arrays = {}
     with np.errstate(over="ignore"):
@@ -141,36 +138,14 @@ def _activated(path: Path, vertices: Columns) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _vertices(path: Path, header: PlyHeader, file: BinaryIO) -> Columns:
+def _vertices(path: Path, header: PlyHeader) -> dict[str, np.ndarray]:
     """The vertices' properties of a text or binary file. Raises UserError."""
-    if header.format not in ("ascii", *ORDERS):
-        raise UserError(f"{path}: .ply format is {header.format}, neither binary nor ascii")
     if not header.elements or header.elements[0].name != "vertex":
         raise UserError(f"{path}: the .ply header does not begin with 'element vertex COUNT'")
-    vertex, order = header.elements[0], ORDERS.get(header.format, "=")
-    if not vertex.properties:
+    if not header.elements[0].properties:
         raise UserError(f"{path}: vertices have no properties")
-    fields: dict[str, str] = {}
-    for name, kind, length in vertex.properties:
+    for name, _, length in header.elements[0].properties:
         if length:
             raise UserError(f"{path}: vertex property {name} is a list, not a plain number")
-        if name in fields:
-            raise UserError(f"{path}: vertex property {name} is given twice")
-        fields[name] = order + kind
-    if header.format == "ascii":
-        found = read_ply(path).elements["vertex"]
-    else:
-        dtype = np.dtype(list(fields.items()))
-        file.seek(header.start)
-        data = file.read()
-        size, there = vertex.count * dtype.itemsize, len(data)
-        if there < size or (len(header.elements) == 1 and there > size):
-            kind = "truncated or false header" if there < size else "false header"
-            raise UserError(
-                f"{path}: {kind}, {vertex.count} vertices take {size} bytes but {there} follow"
-            )
-        table = np.ndarray(vertex.count, dtype, data)
-        found = {name: table[name] for name in fields}
-    if vertex.count == 0:
-        raise UserError(f"{path}: holds no Gaussians")
+    found = read_ply(path, MAX_FILE).elements["vertex"]
     return {name: np.asarray(column) for name, column in found.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -10,10 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import UserError
-from .headers import MAX_VALUES, compare_sizes, lines_of, open_shape, read_table
+from .headers import MAX_FILE, MAX_VALUES, compare_sizes, lines_of, open_shape, read_table
 from .ply_header import ORDERS, PlyElement, PlyHeader, PlyProperty, read_ply_header
-
-_ROWS = 100_000  # rows of text with lists that are read at once
 
 
 class PlyList(NamedTuple):
@@ -28,6 +26,9 @@ class PlyList(NamedTuple):
     lengths: np.ndarray
 
 
+Columns = dict[str, np.ndarray | PlyList]  # an element's, by the names of its properties
+
+
 class PlyData(NamedTuple):
     """What a file holds.
 
@@ -37,7 +38,7 @@ class PlyData(NamedTuple):
     """
 
     header: PlyHeader
-    elements: dict[str, dict[str, np.ndarray | PlyList]]
+    elements: dict[str, Columns]
 
     def numbers(self, element: str, names: tuple[str, ...]) -> np.ndarray | None:
         """``[N, C]`` float64, properties of an element; None where one of them is not there."""
@@ -47,40 +48,44 @@ class PlyData(NamedTuple):
         return np.stack([np.asarray(column, np.float64) for column in found], 1)
 
 
-def read_ply(path: Path) -> PlyData:
+def read_ply(path: Path, limit: int = MAX_FILE) -> PlyData:
     """Reads every element of a ``.ply`` file, text or binary.
 
     Nothing is allocated by what the header says before the file's size is known to fit it.
+
+    Args:
+        path: the file.
+        limit: largest size, bytes.
 
     Raises:
         UserError: it is no ``.ply`` file, holds less or more than its header states, a word is no
             number, or a name is given twice.
     """
-    with open_shape(path) as (file, size):
+    with open_shape(path, limit) as (file, size):
         header = read_ply_header(path, file)
-        _check_names(path, header)
+        _check_header(path, header)
         file.seek(header.start)
         says = ", ".join(f"{element.count} {element.name}" for element in header.elements)
-        elements: dict[str, dict[str, np.ndarray | PlyList]] = {}
         if header.format == "ascii":
             lines = lines_of(file, str(path))
-            for element in header.elements:
-                elements[element.name] = _from_text(path, lines, element)
+            found = {element.name: _from_text(path, lines, element) for element in header.elements}
             if next(lines, None) is not None:
                 raise UserError(f"{path}: false header, more lines follow than {says}")
-            return PlyData(header, elements)
-        if header.format not in ORDERS:
-            raise UserError(f"{path}: the .ply header states no format")
+            return PlyData(header, found)
         least = sum(element.count * element.least_bytes() for element in header.elements)
         compare_sizes(path, says, least, size - header.start, exact=False)
         data, at = file.read(), 0
+    elements: dict[str, Columns] = {}
     for element in header.elements:
         elements[element.name], at = _from_bytes(path, data, at, element, ORDERS[header.format])
-    compare_sizes(path, says, at, len(data))
+    if data[at:].strip(b"\r\n"):
+        raise UserError(f"{path}: false header, {says} take {at} bytes but {len(data)} follow")
     return PlyData(header, elements)
 
 
-def _check_names(path: Path, header: PlyHeader) -> None:
+def _check_header(path: Path, header: PlyHeader) -> None:
+    if header.format not in ("ascii", *ORDERS):
+        raise UserError(f"{path}: .ply format is {header.format}, neither binary nor ascii")
     for element in header.elements:
         names = [item.name for item in element.properties]
         if len(set(names)) < len(names):
@@ -93,81 +98,53 @@ def _check_names(path: Path, header: PlyHeader) -> None:
         raise UserError(f"{path}: the .ply header has an element twice")
 
 
-def _from_text(
-    path: Path, lines: Iterator[str], element: PlyElement
-) -> dict[str, np.ndarray | PlyList]:
+def _from_text(path: Path, lines: Iterator[str], element: PlyElement) -> Columns:
     """The element's columns, from as many lines as it has rows."""
-    items, count = element.properties, element.count
-    if not items or not count:
-        return {item.name: _empty(item) for item in items}
-    lists = [item for item in items if item.length]
-    parts, left = [], count
-    while left:
-        step = left if not lists else min(left, _ROWS)
-        rows = islice(lines, step)
-        table = _text_rows(path, list(rows), element) if lists else _text_table(path, rows, element)
-        there = table[1]
-        if there < step:
-            raise UserError(
-                f"{path}: truncated or false header, {count} {element.name}, "
-                f"but {count - left + there} lines follow"
-            )
-        parts.append(table[0])
-        left -= step
-    return {item.name: _joined([part[item.name] for part in parts]) for item in items}
+    items, count, source = element.properties, element.count, f"{path}: {element.name}"
+    ends = [0]  # of the rows, among all numbers
+
+    def words() -> Iterator[str]:
+        for line in islice(lines, count if items else 0):
+            row = line.split()
+            ends.append(ends[-1] + len(row))
+            yield from row
+
+    with_lists = any(item.length for item in items)
+    if with_lists:  # whose rows may differ in length
+        table = read_table(words(), source, (1,))
+    else:
+        table = read_table(islice(lines, count if items else 0), source, (len(items),))
+    there = len(ends) - 1 if with_lists else len(table)
+    if items and there < count:
+        raise UserError(
+            f"{path}: truncated or false header, {count} {element.name}, but {there} lines follow"
+        )
+    if not with_lists:
+        return {item.name: _typed(path, table[:, i], item) for i, item in enumerate(items)}
+    flat = table[:, 0]
+    numbers = memoryview(flat)
+
+    def length_at(at: int, item: PlyProperty) -> int:
+        length = numbers[at] if at < len(flat) else -1.0
+        if length < 0 or not length.is_integer():
+            raise UserError(f"{source} has a list of length {length:g}")
+        return int(length)
+
+    def check(row: int, at: int) -> None:
+        if at != ends[row + 1]:
+            got, wanted = ends[row + 1] - ends[row], at - ends[row]
+            raise UserError(f"{source} has a row of {got} numbers, not {wanted}")
+
+    steps = [(1 if item.length else 0, 1) for item in items]
+    starts, lengths, _ = _walk(element, count, 0, steps, length_at, check)
+    return {
+        item.name: _column(item, _typed(path, flat[_each(*found, 1)], item), found[1])
+        for item, *found in zip(items, starts, lengths)
+    }
 
 
-def _empty(item: PlyProperty) -> np.ndarray | PlyList:
-    none = np.zeros(0, item.kind)
-    return PlyList(none, np.zeros(0, np.int64)) if item.length else none
-
-
-def _joined(columns: list) -> np.ndarray | PlyList:
-    if len(columns) == 1:
-        return columns[0]
-    if isinstance(columns[0], PlyList):
-        return PlyList(*(np.concatenate(parts) for parts in zip(*columns)))
-    return np.concatenate(columns)
-
-
-def _text_table(path: Path, rows: Iterator[str], element: PlyElement) -> tuple[dict, int]:
-    items = element.properties
-    table = read_table(rows, f"{path}: {element.name}", (len(items),))
-    columns = {item.name: _typed(path, table[:, i], item) for i, item in enumerate(items)}
-    return columns, len(table)
-
-
-def _text_rows(path: Path, rows: list[str], element: PlyElement) -> tuple[dict, int]:
-    """Columns of lines with lists, whose rows may differ in length; and how many there were."""
-    words: list[str] = []
-    spans: dict[str, list[tuple[int, int]]] = {item.name: [] for item in element.properties}
-    for row in rows:
-        if "_" in row:  # which Python allows within a number
-            raise UserError(f"{path}: {element.name}: {row.strip()[:40]!r} is no number")
-        split = row.split()
-        at, base = 0, len(words)
-        for item in element.properties:
-            length = 1
-            if item.length:
-                word = split[at] if at < len(split) else ""
-                if not word.isdecimal() or len(word) > 9:
-                    raise UserError(f"{path}: {element.name} has a list of length '{word[:20]}'")
-                length, at = int(word), at + 1
-            spans[item.name].append((base + at, length))
-            at += length
-        if at != len(split):
-            raise UserError(f"{path}: {element.name} has a row of {len(split)} numbers, not {at}")
-        words += split
-    try:
-        flat = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise UserError(f"{path}: {element.name}: {str(error)[:100]}") from error
-    columns: dict[str, np.ndarray | PlyList] = {}
-    for item in element.properties:
-        starts, lengths = np.array(spans[item.name], np.int64).reshape(-1, 2).T
-        values = _typed(path, flat[_each(starts, lengths, 1)], item)
-        columns[item.name] = PlyList(values, lengths) if item.length else values
-    return columns, len(rows)
+def _column(item: PlyProperty, values: np.ndarray, lengths: np.ndarray) -> np.ndarray | PlyList:
+    return PlyList(values, lengths) if item.length else values
 
 
 def _typed(path: Path, values: np.ndarray, item: PlyProperty) -> np.ndarray:
@@ -185,6 +162,41 @@ def _typed(path: Path, values: np.ndarray, item: PlyProperty) -> np.ndarray:
     return values.astype(kind)
 
 
+def _walk(
+    element: PlyElement,
+    rows: int,
+    at: int,
+    steps: list[tuple[int, int]],
+    length_at: Callable[[int, PlyProperty], int],
+    check: Callable[[int, int], None],
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Goes through rows with lists one by one: only a row says where the next one begins.
+
+    Args:
+        element: whose rows they are.
+        rows: how many.
+        at: where the first begins.
+        steps: of each property, what the length of its list takes (0: it is no list), and what a
+            number takes.
+        length_at: the length that stands at a place.
+        check: given each row and where it ends.
+
+    Returns:
+        ``[properties, rows]`` where the numbers begin and how many there are, and the end.
+    """
+    starts = np.empty((len(steps), rows), np.int64)
+    lengths = np.ones_like(starts)
+    for row in range(rows):
+        for i, (head, step) in enumerate(steps):
+            length = 1
+            if head:
+                length = lengths[i, row] = length_at(at, element.properties[i])
+            starts[i, row] = at + head
+            at += head + length * step
+        check(row, at)
+    return starts, lengths, at
+
+
 def _each(starts: np.ndarray, lengths: np.ndarray, step: int) -> np.ndarray:
     """``[M]`` the places of all items of lists that start at ``starts``, ``step`` apart."""
     ends = np.cumsum(lengths)
@@ -194,83 +206,54 @@ def _each(starts: np.ndarray, lengths: np.ndarray, step: int) -> np.ndarray:
 
 def _from_bytes(
     path: Path, data: bytes, at: int, element: PlyElement, order: str
-) -> tuple[dict[str, np.ndarray | PlyList], int]:
+) -> tuple[Columns, int]:
     """The element's columns and where the next element begins."""
     items, count = element.properties, element.count
+    says, kinds = f"{count} {element.name}", [np.dtype(order + item.kind) for item in items]
     if not items or not count:
-        return {item.name: _empty(item) for item in items}, at
-    says = f"{count} {element.name} with lists"
+        none = np.zeros(0, np.int64)
+        return {item.name: _column(item, np.zeros(0, item.kind), none) for item in items}, at
     compare_sizes(path, says, count * element.least_bytes(), len(data) - at, exact=False)
-    lengths: dict[str, int] = {}
-    place = at  # as a rule all lists of a property are as long as the first
-    for item in items:
-        place += item.least_bytes()
-        if item.length:
-            compare_sizes(path, says, place, len(data), exact=False)
-            kind = np.dtype(order + item.length)
-            lengths[item.name] = int(np.frombuffer(data, kind, 1, place - kind.itemsize)[0])
-            if lengths[item.name] < 0:
-                raise UserError(f"{path}: false header, a list of {lengths[item.name]}")
-            place += lengths[item.name] * np.dtype(item.kind).itemsize
-    if count * (place - at) <= len(data) - at:
-        fields = []
-        for i, item in enumerate(items):
-            if item.length:
-                fields += [(f"n{i}", order + item.length)]
-            fields += [(f"v{i}", order + item.kind, (lengths.get(item.name, 1),))]
-        rows = np.frombuffer(data, np.dtype(fields), count, at)
-        if all((rows[f"n{i}"] == lengths[x.name]).all() for i, x in enumerate(items) if x.length):
-            return {
-                item.name: _uniform(rows[f"v{i}"], item) for i, item in enumerate(items)
-            }, at + count * (place - at)
-    return _walked(path, data, at, element, order)
 
-
-def _uniform(values: np.ndarray, item: PlyProperty) -> np.ndarray | PlyList:
-    if not item.length:
-        return values[:, 0]
-    return PlyList(values.reshape(-1), np.full(len(values), values.shape[1], np.int64))
-
-
-def _walked(
-    path: Path, data: bytes, at: int, element: PlyElement, order: str
-) -> tuple[dict[str, np.ndarray | PlyList], int]:
-    """As ``_from_bytes``, row by row, for lists that differ in length."""
-    says = f"{element.count} {element.name} with lists"
     byteorder = "little" if order == "<" else "big"
-    starts = np.empty((len(element.properties), element.count), np.int64)
-    lengths = np.ones_like(starts)
-    steps = [
-        (i, np.dtype(item.length or "u1").itemsize if item.length else 0,
-         item.length.startswith("i"), np.dtype(item.kind).itemsize)
-        for i, item in enumerate(element.properties)
-    ]  # fmt: skip
-    for row in range(element.count):
-        for i, head, signed, step in steps:
-            length = 1
-            if head:
-                length = int.from_bytes(data[at : at + head], byteorder, signed=signed)
-                if length < 0:
-                    raise UserError(f"{path}: false header, a list of {length} in {element.name}")
-                at += head
-                lengths[i, row] = length
-            starts[i, row] = at
-            at += length * step
+
+    def length_at(at: int, item: PlyProperty) -> int:
+        part = data[at : at + int(item.length[1])]
+        length = int.from_bytes(part, byteorder, signed=item.length.startswith("i"))
+        if length < 0:
+            raise UserError(f"{path}: false header, a list of {length} in {element.name}")
+        return length
+
+    def check(row: int, at: int) -> None:
         if at > len(data):
             compare_sizes(path, says, at, len(data), exact=False)
+
+    steps = [(np.dtype(x.length).itemsize if x.length else 0, np.dtype(x.kind).itemsize)
+             for x in items]  # fmt: skip
+    # As a rule all lists of a property are as long as the first.
+    _, lengths, end = _walk(element, 1, at, steps, length_at, check)
+    if count * (end - at) <= len(data) - at:
+        fields = []
+        for i, item in enumerate(items):
+            fields += [(f"n{i}", order + item.length)] if item.length else []
+            fields += [(f"v{i}", kinds[i], (int(lengths[i, 0]),))]
+        rows = np.frombuffer(data, np.dtype(fields), count, at)
+        if all((rows[f"n{i}"] == lengths[i]).all() for i, x in enumerate(items) if x.length):
+            columns: Columns = {}
+            for i, item in enumerate(items):
+                values, each = rows[f"v{i}"], np.repeat(lengths[i], count)
+                values = values.reshape(-1) if item.length else values[:, 0]
+                columns[item.name] = _column(item, values, each)
+            return columns, at + count * (end - at)
+    starts, lengths, end = _walk(element, count, at, steps, length_at, check)
     if lengths.sum() > MAX_VALUES:
         raise UserError(f"{path}: over {MAX_VALUES} numbers, the limit for one file")
-    raw = np.frombuffer(data, np.uint8)
-    columns: dict[str, np.ndarray | PlyList] = {}
-    for i, item in enumerate(element.properties):
-        kind = np.dtype(order + item.kind)
-        places = _each(starts[i], lengths[i], kind.itemsize)
-        taken = np.empty((len(places), kind.itemsize), np.uint8)
-        for byte in range(kind.itemsize):
-            taken[:, byte] = raw[places + byte]
-        values = taken.view(kind)[:, 0]
-        columns[item.name] = PlyList(values, lengths[i]) if item.length else values
-    return columns, at
+    raw, columns = np.frombuffer(data, np.uint8), {}
+    for i, item in enumerate(items):
+        places, size = _each(starts[i], lengths[i], steps[i][1]), steps[i][1]
+        values = np.stack([raw[places + byte] for byte in range(size)], 1).view(kinds[i])[:, 0]
+        columns[item.name] = _column(item, values, lengths[i])
+    return columns, end
 
 
 def triangles(path: Path, faces: PlyList, count: int) -> np.ndarray:

@@ -147,7 +147,7 @@ BAD_FILES = {
     "faces first": ([header(2)[0], "element face 2", *header(2)[1:]], "element vertex COUNT"),
     "negative": (header(-1), "element vertex COUNT"),
     "huge": (header("9" * 5000), "element vertex COUNT"),
-    "lies": (header(10**15), "truncated or false header, 1000000000000000 vertices take"),
+    "lies": (header(10**15), "truncated or false header, 1000000000000000 vertex take"),
     "no properties": (header(2, properties=[]), "no properties"),
     "list": (header(2, "list uchar float"), "not a plain number"),
     "odd type": (header(2, "half"), "'half x' is not a plain number"),
