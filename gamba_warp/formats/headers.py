@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -23,7 +23,6 @@ from ..untrusted.documents import parse_document
 
 MAX_FILE = 1 << 30  # bytes of a shape
 SLACK = 2  # bytes after the end: a line end
-GLB_JSON, GLB_START = 0x4E4F534A, 12
 MAX_ZEROS = 1 << 24  # bytes of all accessors that no bytes of the file stand behind
 MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
@@ -66,12 +65,15 @@ class Accessor(msgspec.Struct):
         return one * parts[self.type]
 
 
-class _Gltf(msgspec.Struct):
+class Gltf(msgspec.Struct):
     """The parts of a glTF document that say how many bytes are where."""
 
     buffers: list[_Buffer] = []
     bufferViews: list[View] = []
     accessors: list[Accessor] = []
+
+
+Tree = TypeVar("Tree", bound=Gltf)
 
 
 @contextmanager
@@ -179,49 +181,57 @@ def _check_off(path: Path, file: BinaryIO, size: int) -> None:
         raise UserError(f"{path}: truncated or false header, {says}, but {found} lines follow")
 
 
-def check_glb(path: Path, file: BinaryIO, size: int) -> None:
-    """Compares what a .glb file says it holds with its size.
+def read_glb(path: Path, file: BinaryIO, size: int, kind: type[Tree]) -> tuple[Tree, bytes]:
+    """Reads a .glb file, and compares what it says it holds with its size.
 
     Args:
         path: named in errors.
         file: at its start.
         size: of the file, bytes.
+        kind: of the document.
+
+    Returns:
+        The document, and the bytes of the first chunk that is another.
 
     Raises:
         UserError: the file holds less or more than it says, or its header is broken.
         struct.error, IndexError: likewise.
     """
-    magic, version, length = struct.unpack("<4sII", file.read(GLB_START))
+    magic, version, length = struct.unpack("<4sII", file.read(12))
     if magic != b"glTF":
         raise UserError(f"{path}: not a .glb file")
     if version != 2:
         raise UserError(f"{path}: cannot be read as a mesh (version {version} of .glb, not 2)")
     compare_sizes(path, "its header and chunks", length, size)
-    at, text, binary = GLB_START, None, 0
-    while at + 8 <= size:
-        file.seek(at)
-        chunk, kind = struct.unpack("<II", file.read(8))
+    text, binary = None, b""
+    while (at := file.tell()) + 8 <= size:
+        chunk, is_text = struct.unpack("<I4s", file.read(8))
         compare_sizes(path, f"a chunk at byte {at}", chunk, size - at - 8, exact=False)
-        if kind == GLB_JSON and text is None:
-            text = file.read(chunk)
+        data = file.read(chunk)
+        if is_text == b"JSON" and text is None:
+            text = data
         else:
-            binary += chunk
-        at += 8 + chunk
+            binary = binary or data
     if text is None:
         raise UserError(f"{path}: no JSON chunk")
     # Padded with blanks; some writers pad with zeros.
-    tree = parse_document(text.rstrip(b"\0 "), _Gltf, str(path))
+    tree = parse_document(text.rstrip(b"\0 "), kind, str(path))
     for number, buffer in enumerate(tree.buffers):
         if buffer.uri is None:
-            compare_sizes(path, f"buffer {number}", buffer.byteLength, binary, exact=False)
+            compare_sizes(path, f"buffer {number}", buffer.byteLength, len(binary), exact=False)
     _check_accessors(path, tree)
+    return tree, binary
+
+
+def _check_glb(path: Path, file: BinaryIO, size: int) -> None:
+    read_glb(path, file, size, Gltf)
 
 
 def _check_gltf(path: Path, file: BinaryIO, size: int) -> None:
-    _check_accessors(path, parse_document(file.read(), _Gltf, str(path)))
+    _check_accessors(path, parse_document(file.read(), Gltf, str(path)))
 
 
-def _check_accessors(path: Path, tree: _Gltf) -> None:
+def _check_accessors(path: Path, tree: Gltf) -> None:
     """Each view against its buffer, each accessor against its view.
 
     trimesh compares the buffers' stated lengths with their real ones where a view is taken.
@@ -304,4 +314,4 @@ def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ())
     return table
 
 
-_CHECKS = {".stl": _check_stl, ".off": _check_off, ".glb": check_glb, ".gltf": _check_gltf}
+_CHECKS = {".stl": _check_stl, ".off": _check_off, ".glb": _check_glb, ".gltf": _check_gltf}

@@ -13,8 +13,7 @@ from msgspec import Meta
 
 from ...errors import UserError
 from ...gaussians import SH_C0, Gaussians
-from ...untrusted.documents import parse_document
-from ..headers import GLB_JSON, GLB_START, Accessor, View, check_glb, open_shape
+from ..headers import Accessor, Gltf, open_shape, read_glb
 from .arrays import flip_axes, sound_gaussians
 from .glb import COLOR_SPACE, EXTENSION, POINTS, harmonic_names
 
@@ -49,9 +48,7 @@ class _Scene(msgspec.Struct):
     nodes: list[_Index] = []
 
 
-class _Document(msgspec.Struct):
-    accessors: list[Accessor] = []
-    bufferViews: list[View] = []
+class _Document(Gltf):
     meshes: list[_Mesh] = []
     nodes: list[_Node] = []
     scenes: list[_Scene] = []
@@ -62,8 +59,8 @@ class _Document(msgspec.Struct):
 def holds_gaussians(path: Path, file: BinaryIO, size: int) -> bool:
     """Whether a .glb file has a primitive with the extension; False for whatever is damaged."""
     try:
-        document, _ = _parse(path, file, size)
-    except (UserError, struct.error):
+        document, _ = read_glb(path, file, size, _Document)
+    except (UserError, struct.error, IndexError):
         return False
     return any(EXTENSION in p.extensions for mesh in document.meshes for p in mesh.primitives)
 
@@ -79,9 +76,7 @@ def load_glb(path: str | Path) -> Gaussians:
     path = Path(path)
     with open_shape(path) as (file, size):
         try:
-            check_glb(path, file, size)
-            file.seek(0)
-            document, binary = _parse(path, file, size)
+            document, binary = read_glb(path, file, size, _Document)
             parts = [
                 _moved(path, _primitive(path, document, binary, primitive), matrix)
                 for primitive, matrix in _placed(path, document)
@@ -91,23 +86,6 @@ def load_glb(path: str | Path) -> Gaussians:
     if not parts:
         raise UserError(f"{path}: no Gaussians in it (no primitive has {EXTENSION})")
     return flip_axes(_joined(parts))
-
-
-def _parse(path: Path, file: BinaryIO, size: int) -> tuple[_Document, bytes]:
-    """The document, and the bytes of the first binary chunk."""
-    if struct.unpack("<4sII", file.read(GLB_START))[:2] != (b"glTF", 2):
-        raise UserError(f"{path}: not a .glb file of version 2")
-    text, binary = None, b""
-    while (at := file.tell()) + 8 <= size:
-        chunk, kind = struct.unpack("<II", file.read(8))
-        if chunk > size - at - 8:
-            raise UserError(f"{path}: truncated, a chunk of {chunk} bytes at byte {at}")
-        data = file.read(chunk)
-        if kind == GLB_JSON and text is None:
-            text = data
-        elif not binary:
-            binary = data
-    return parse_document((text or b"").rstrip(b"\0 "), _Document, str(path)), binary
 
 
 def _placed(path: Path, document: _Document) -> list[tuple[_Primitive, np.ndarray]]:
