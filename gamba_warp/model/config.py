@@ -324,7 +324,7 @@ class GambaConfig:
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
-    def from_json(cls, text: str, source: str = "config") -> GambaConfig:
+    def from_json(cls, text: str | bytes, source: str = "config") -> GambaConfig:
         """Reads what ``to_json`` wrote.
 
         Args:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..errors import UserError, first_line
 from ..files import atomic_path, output_folder, write_text
+from ..untrusted.documents import read_bytes
 from ..versions import __version__, advice
 from .config import GambaConfig
 from .encoders import Weights, outline_encoder
@@ -114,7 +115,11 @@ class Pretrained:
                 local_files_only=local_files_only,
                 token=token,
             )
-        _check_config(path / CONFIG_NAME, path / FILE_NAME)
+        said, model = path / CONFIG_NAME, path / FILE_NAME  # the model's own file decides
+        if said.is_file() and model.is_file():
+            text = read_bytes(said, _MAX_CONFIG)
+            if GambaConfig.from_json(text, str(said)) != read_config(model)[0]:
+                raise UserError(f"{said}: is not the configuration in {model}")
         return read_model(cls, path, device, encoder_weights)
 
     def push_to_hub(self: Gamba, repo_id: str, card: str = "", **options: Any) -> str:  # type: ignore[misc]
@@ -335,20 +340,6 @@ def model_card(model: Gamba, name: str, card: str = "") -> str:
         "",
     ]
     return "\n".join(lines + ([card.strip(), ""] if card else []))
-
-
-def _check_config(config: Path, model: Path) -> None:
-    """Compares config.json with what the model's own file says, which decides."""
-    if not (config.is_file() and model.is_file()):
-        return
-    if config.stat().st_size > _MAX_CONFIG:
-        raise UserError(f"{config}: has more than {_MAX_CONFIG:,} bytes")
-    try:
-        text = config.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{config}: cannot be read ({first_line(error)})") from error
-    if GambaConfig.from_json(text, str(config)) != read_config(model)[0]:
-        raise UserError(f"{config}: is not the configuration in {model}")
 
 
 def _hub(what: str) -> Any:

@@ -12,7 +12,6 @@ import struct
 import tarfile
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,31 +31,15 @@ _MEMORY = 256 << 20  # bytes that xz may ask for; xz -9 asks for 65 MB
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those whose memory is bounded
 _AR = struct.Struct("16s12s6s6s8s10s2s")  # name, time, user, group, mode, size, end
 
-# What the standard library raises on damaged archives.
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zipfile.LargeZipFile,
-    tarfile.TarError,
-    lzma.LZMAError,
-    zlib.error,
-    struct.error,
-    EOFError,
-    OSError,
-    NotImplementedError,  # of an unknown compression
-    RuntimeError,  # of a password; RecursionError, of headers of headers
-    ValueError,
-    OverflowError,
-    IndexError,
-    KeyError,
-)
-
 
 @contextmanager
 def _one_line(source: object) -> Iterator[None]:
     """Makes every error of damage, or of the disk, a UserError that begins with ``source``."""
     try:
         yield
-    except _DAMAGE as error:
+    except UserError:
+        raise
+    except Exception as error:  # the standard library's are of a dozen kinds
         if isinstance(error, OSError) and error.strerror:  # gzip's own error has none
             raise UserError(f"{source}: {error.strerror}") from error
         reason = first_line(error)
@@ -233,15 +216,15 @@ def _unpacked(file: BinaryIO, source: object) -> BinaryIO:
     """A reader of what a tar is packed in: gzip, bzip2, xz, or nothing."""
     start = file.read(6)
     file.seek(0)
-    if start.startswith(b"\x1f\x8b"):
-        return cast(BinaryIO, gzip.GzipFile(fileobj=file))
-    if start.startswith(b"BZh"):
-        return cast(BinaryIO, bz2.BZ2File(file))
-    if start == b"\xfd7zXZ\0":
-        return io.BufferedReader(_Xz(file))
     if start.startswith(b"\x28\xb5\x2f\xfd"):
         raise UserError(f"{source}: packed with zstd, which is not read; unpack it yourself")
-    return file
+    readers = {
+        b"\x1f\x8b": lambda: gzip.GzipFile(fileobj=file),
+        b"BZh": lambda: bz2.BZ2File(file),
+        b"\xfd7zXZ\0": lambda: io.BufferedReader(_Xz(file)),
+    }
+    made = [read() for magic, read in readers.items() if start.startswith(magic)]
+    return cast(BinaryIO, made[0]) if made else file
 
 
 class _ShortReads:

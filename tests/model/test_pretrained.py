@@ -52,7 +52,7 @@ def test_config_json_of_another_model(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(fields | {"state_size": 5}))
     refused("is not the configuration in", Gamba.from_pretrained, tmp_path)
     (tmp_path / "config.json").write_bytes(b"\xff\xfe")
-    refused("config.json: cannot be read", Gamba.from_pretrained, tmp_path)
+    refused("config.json: .* not valid JSON", Gamba.from_pretrained, tmp_path)
 
 
 def test_needs_no_hub_for_a_folder(tmp_path, monkeypatch):

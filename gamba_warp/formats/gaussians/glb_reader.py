@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import torch
 from msgspec import Meta
+from torch.nn import functional as F
 
 from ...errors import UserError
 from ...gaussians import SH_C0, Gaussians
@@ -206,33 +207,17 @@ def _moved(path: Path, gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
     moved = gaussians.transformed(
         torch.from_numpy(turn).float(), torch.from_numpy(matrix[:3, 3].copy()).float(), scale
     )
-    return sound_gaussians(
-        path,
-        {
-            name: getattr(moved, name).numpy()
-            for name in ("means", "quats", "scales", "opacities", "colors", "harmonics")
-            if getattr(moved, name) is not None
-        },
-    )
+    arrays = {name: value.numpy() for name, value in vars(moved).items() if value is not None}
+    return sound_gaussians(path, arrays)
 
 
 def _joined(parts: list[Gaussians]) -> Gaussians:
     """All parts as one object; those of a lower degree get harmonics of zero."""
     if len(parts) == 1:
         return parts[0]
-    most = max((p.harmonics.shape[1] for p in parts if p.harmonics is not None), default=0)
-    harmonics = None
-    if most:
-        full = [torch.zeros(part.num, most, 3) for part in parts]
-        for part, room in zip(parts, full):
-            if part.harmonics is not None:
-                room[:, : part.harmonics.shape[1]] = part.harmonics
-        harmonics = torch.cat(full)
-    return Gaussians(
-        means=torch.cat([p.means for p in parts]),
-        quats=torch.cat([p.quats for p in parts if p.quats is not None]),
-        scales=torch.cat([p.scales for p in parts]),
-        opacities=torch.cat([p.opacities for p in parts]),
-        colors=torch.cat([p.colors for p in parts]),
-        harmonics=harmonics,
-    )
+    most = max(0 if part.harmonics is None else part.harmonics.shape[1] for part in parts)
+    for part in parts if most else ():
+        own = torch.zeros(part.num, 0, 3) if part.harmonics is None else part.harmonics
+        part.harmonics = F.pad(own, (0, 0, 0, most - own.shape[1]))
+    names = [name for name, value in vars(parts[0]).items() if value is not None]
+    return Gaussians(**{name: torch.cat([getattr(p, name) for p in parts]) for name in names})
