@@ -1,18 +1,17 @@
 """A hostile case as plain data: the files that a reader is given, and how they came about."""
 
-import base64
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+
+import msgspec
 
 from gamba_warp.untrusted.names import inside
 
 FORMAT = "gamba_warp.stress_files.1"
 
 
-class Entry(NamedTuple):
+class Entry(msgspec.Struct, frozen=True):
     """What lies at one name of a case.
 
     Attributes:
@@ -25,7 +24,7 @@ class Entry(NamedTuple):
     kind: str = "file"
 
 
-class Case(NamedTuple):
+class Case(msgspec.Struct, frozen=True):
     """All that is needed to run a case again.
 
     Attributes:
@@ -39,7 +38,7 @@ class Case(NamedTuple):
     reader: str
     seed: str
     main: str
-    files: Mapping[str, Entry]
+    files: dict[str, Entry]
     mutations: tuple[str, ...] = ()
 
 
@@ -71,23 +70,12 @@ def place_case(case: Case, folder: Path) -> Path:
 
 def write_case(case: Case, path: Path, outcome: str = "", text: str = "") -> None:
     """Writes a case as JSON, with how it ended: what ``corpus/`` keeps."""
-    files = {
-        name: {"kind": entry.kind, "data": base64.b64encode(entry.data).decode()}
-        for name, entry in case.files.items()
-    }
     ended = {"outcome": outcome, "text": text.encode("utf-8", "replace").decode()}
-    content = {"format": FORMAT, **case._asdict(), "files": files, **ended}
+    content = {"format": FORMAT, **msgspec.to_builtins(case), **ended}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(content)) + b"\n")
 
 
 def read_case(path: Path) -> Case:
     """Reads what ``write_case`` wrote."""
-    stored = json.loads(path.read_bytes())
-    assert stored["format"] == FORMAT, f"{path}: not a case"
-    files = {
-        name: Entry(base64.b64decode(entry["data"]), entry["kind"])
-        for name, entry in stored["files"].items()
-    }
-    mutations = tuple(stored.get("mutations", ()))
-    return Case(stored["reader"], stored["seed"], stored["main"], files, mutations)
+    return msgspec.json.decode(path.read_bytes(), type=Case)

@@ -5,11 +5,13 @@ import struct
 import tarfile
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import PurePosixPath
 
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from .case import Case, Entry, sound_case
+from .case import Case, Entry
 from .containers import BY_SUFFIX
 from .mutations import BYTES, JSON, NAMES, TEXT, Draw, choice, encode, position
 
@@ -63,7 +65,7 @@ def _changed(draw: Draw, case: Case, others: list[bytes]) -> Case:
 def _with(case: Case, name: str, entry: Entry | None, what: str) -> Case:
     files = {other: item for other, item in case.files.items() if other != name or entry}
     files |= {name: entry} if entry else {}
-    return case._replace(files=files, mutations=(*case.mutations, f"{name}: {what}"))
+    return replace(case, files=files, mutations=(*case.mutations, f"{name}: {what}"))
 
 
 def _other_kind(draw: Draw, case: Case, name: str) -> Case:
@@ -92,22 +94,14 @@ def _renamed(draw: Draw, case: Case, name: str) -> Case:
         return case
     files = {new if other == name else other: entry for other, entry in case.files.items()}
     main, done = new if case.main == name else case.main, f"{name}: named {new}"
-    return case._replace(main=main, files=files, mutations=(*case.mutations, done))
+    return replace(case, main=main, files=files, mutations=(*case.mutations, done))
 
 
 @st.composite
-def cases(draw: Draw, reader: str, seeds: dict[str, dict[str, bytes]], folder: bool) -> Case:
-    """Sound files of a reader, and one to four mutations of them.
-
-    Args:
-        draw: hypothesis's.
-        reader: its name.
-        seeds: its sound files by name of the kind; the first of each is the most important one.
-        folder: whether it is pointed at the folder of the files, and not at the first of them.
-    """
-    seed = choice(draw, *seeds)
-    case = sound_case(reader, seed, "" if folder else next(iter(seeds[seed])), seeds[seed])
-    others = [data for files in seeds.values() for data in files.values()]
+def cases(draw: Draw, sound: Sequence[Case]) -> Case:
+    """A sound case of a reader, preferably the first, and one to four mutations of its files."""
+    case = sound[choice(draw, *range(len(sound)))]
+    others = [entry.data for made in sound for entry in made.files.values()]
     for _ in range(choice(draw, 1, 1, 1, 2, 2, 3, 4)):
         case = _changed(draw, case, others) if case.files else case
     return case

@@ -16,6 +16,7 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
+from msgspec.structs import replace
 
 from gamba_warp.errors import MOST_LETTERS, UserError, one_line
 from gamba_warp.untrusted.children import end_idle
@@ -53,15 +54,11 @@ def base():
 
 
 @functools.cache
-def seeds_of(reader):
-    return READERS[reader].seeds()
-
-
 def sound_cases(reader):
     """A case of each of a reader's sound files."""
-    for seed, files in seeds_of(reader).items():
-        main = "" if READERS[reader].whole else next(iter(files))
-        yield sound_case(reader, seed, main, files)
+    made = READERS[reader].seeds().items()
+    mains = ("" if READERS[reader].whole else next(iter(files)) for _, files in made)
+    return [sound_case(reader, seed, main, files) for (seed, files), main in zip(made, mains)]
 
 
 @functools.cache
@@ -82,7 +79,7 @@ def fuzz(reader, base, seed, examples, out, counts):
         report_multiple_bugs=False,
         suppress_health_check=list(HealthCheck),
     )
-    @given(cases(reader, seeds_of(reader), READERS[reader].whole))
+    @given(cases(sound_cases(reader)))
     def holds(case):
         verdict = run_case(case, base)
         counts[verdict.outcome] += 1
@@ -152,11 +149,11 @@ def test_what_is_no_file_is_refused(base, kind):
     """In each file's place, of every reader: a pipe has no end, nor has /dev/zero."""
     told = {}
     for reader in TRIED:
-        case = next(sound_cases(reader))
+        case = sound_cases(reader)[0]
         for name in list(case.files)[:3]:
             changed = {name: Entry(b"/dev/zero", kind)} if kind != "missing" else {}
             files = {other: entry for other, entry in case.files.items() if other != name}
-            verdict = run_case(case._replace(files=files | changed), base)
+            verdict = run_case(replace(case, files=files | changed), base)
             if verdict.bad:
                 told[reader, name] = verdict
     assert not told
@@ -175,7 +172,7 @@ def test_the_same_seed_gives_the_same_cases():
 
         @hypothesis.seed(seed)
         @settings(max_examples=40, phases=(Phase.generate,), database=None, deadline=None)
-        @given(cases("shape", seeds_of("shape"), False))
+        @given(cases(sound_cases("shape")))
         def collect(case):
             found.append(case)
 
