@@ -2,7 +2,6 @@
 
 import io
 import os
-import random
 import struct
 import zlib
 
@@ -117,24 +116,6 @@ def test_huge_pictures_are_refused_before_they_are_decoded(tmp_path, monkeypatch
     monkeypatch.setattr("gamba_warp.images.MAX_PIXELS", 34)
     colours().save(tmp_path / "a.png")
     refused("7x5 is over", load_rgba, tmp_path / "a.png")
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")  # of the TIFF decoder
-@pytest.mark.parametrize("form", ["PNG", "JPEG", "GIF", "TIFF", "WEBP", "BMP"])
-def test_damaged_files_give_a_picture_or_a_user_error(tmp_path, form):
-    rng, whole = random.Random(form), encoded(form)
-    path = tmp_path / "a"
-    failed = 0
-    for _ in range(150):
-        content = bytearray(whole)
-        for _ in range(rng.randint(1, 8)):
-            content[rng.randrange(min(len(content), rng.choice([64, 10**9])))] = rng.randrange(256)
-        path.write_bytes(content[: rng.choice([len(content), rng.randrange(1, len(content))])])
-        try:
-            assert load_rgba(path).shape[2] == 4
-        except UserError:
-            failed += 1
-    assert failed > 10
 
 
 def test_saved_pictures_come_back(tmp_path):
@@ -321,23 +302,4 @@ def test_places_that_cannot_be_written(tmp_path):
 def test_json_refuses_nan(tmp_path):
     with pytest.raises(ValueError):
         write_json(tmp_path / "a.json", {"x": float("nan")})
-    assert not list(tmp_path.iterdir())
-
-
-def test_exif_rotation_is_applied(tmp_path):
-    image = colours()
-    exif = image.getexif()
-    exif[0x0112] = 6  # turn a quarter clockwise to view
-    image.save(tmp_path / "a.png", exif=exif)
-    want = np.asarray(image.rotate(-90, expand=True)) / 255
-    np.testing.assert_allclose(load_rgba(tmp_path / "a.png")[..., :3], want, atol=1e-6)
-
-
-def test_a_full_disk_is_a_user_error(tmp_path):
-    def full():
-        raise OSError(28, "No space left on device")
-
-    with pytest.raises(UserError, match=r"cannot write .*a\.bin: No space left"):
-        with atomic_path(tmp_path / "a.bin"):
-            full()
     assert not list(tmp_path.iterdir())

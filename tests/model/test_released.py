@@ -22,7 +22,7 @@ from gamba_warp.commands.weights import import_released_command
 from gamba_warp.formats.ply import flip_axes, load_ply, save_ply
 from gamba_warp.model import released
 from gamba_warp.model.checkpoint import load_model
-from gamba_warp.model.config import PRESETS, GambaConfig
+from gamba_warp.model.config import PRESETS
 from gamba_warp.model.encoders import build_encoder
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts.decoder import GaussianDecoder
@@ -318,12 +318,3 @@ def test_bilinear_resize():
     assert torch.allclose(encoder(images), want, atol=1e-6)
     other = build_encoder(micro(encoder_normalize=False), "random")(images)
     assert not torch.allclose(other, want, atol=1e-3)
-
-
-def test_older_files_lack_the_fields():
-    import json
-
-    fields = json.loads(micro().to_json())
-    for name in ("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"):
-        fields.pop(name)
-    assert GambaConfig.from_json(json.dumps(fields)) == micro()

@@ -4,18 +4,15 @@ import bz2
 import gzip
 import io
 import lzma
-import random
 import stat
 import tarfile
 import time
 import tracemalloc
 import zipfile
-import zlib
 
 import pytest
 from helpers.refusals import refused_at
 
-from gamba_warp.errors import UserError
 from gamba_warp.untrusted import archives
 from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
 
@@ -110,25 +107,6 @@ def test_a_zip_that_lies_about_a_size_fills_no_memory(tmp_path):
         tracemalloc.stop()
 
 
-def test_damaged_zips_are_one_line(tmp_path):
-    rng = random.Random(0)
-    members = [(f"{i}.txt", rng.randbytes(300) * 3) for i in range(4)]
-    whole = make_zip(tmp_path / "a.zip", members).read_bytes()
-    failed, path = 0, tmp_path / "a.zip"
-    for number in range(300):
-        content = bytearray(whole)
-        for _ in range(rng.randint(1, 4)):
-            content[rng.randrange(len(content))] = rng.randrange(256)
-        path.write_bytes(content[: rng.choice([len(content), rng.randrange(len(content))])])
-        try:
-            unpack(path, tmp_path / f"out{number}")
-        except UserError as error:
-            assert len(str(error).splitlines()) == 1
-            failed += 1
-    assert failed > 200
-    assert {p.name for p in tmp_path.iterdir()} <= {"a.zip", *(f"out{n}" for n in range(300))}
-
-
 def make_ar(path, members):
     with path.open("wb") as file:
         file.write(b"!<arch>\n")
@@ -215,17 +193,3 @@ def test_bad_tars(tmp_path, monkeypatch):
     monkeypatch.setattr(archives, "_MEMORY", 1000)
     refused_at("a.tar", "Memory", read_tar, lzma.compress(make_tar(PLAIN)), tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-def test_damaged_tars_are_one_line(tmp_path):
-    rng, plain = random.Random(1), make_tar(PLAIN * 3)
-    for pack in (bytes, zlib.compress, gzip.compress, bz2.compress, lzma.compress):
-        for _ in range(60):
-            content = bytearray(pack(plain))
-            for _ in range(rng.randint(1, 4)):
-                content[rng.randrange(min(len(content), 600))] = rng.randrange(256)
-            content = content[: rng.choice([len(content), rng.randrange(len(content))])]
-            try:
-                read_tar(bytes(content), tmp_path)
-            except UserError as error:
-                assert len(str(error).splitlines()) == 1

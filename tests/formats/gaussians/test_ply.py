@@ -198,11 +198,6 @@ def test_rotations_of_length_zero_are_refused(tmp_path):
         load_ply(write(tmp_path / "a.ply", header(3), values.tobytes()))
 
 
-def test_missing_file_and_folder(tmp_path):
-    refused("No such file", load_ply, tmp_path / "none.ply")
-    refused("Is a directory", load_ply, tmp_path)
-
-
 def test_values_whose_squares_overflow(tmp_path):
     """A long or short rotation is one; a place or a size beyond all bounds is none."""
     rows = np.ones((3, 14), "<f4")

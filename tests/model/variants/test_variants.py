@@ -9,9 +9,9 @@ from helpers.model import inputs, micro
 
 from gamba_warp.model.checkpoint import load_model, save_model
 from gamba_warp.model.config import PRESETS, GambaConfig
-from gamba_warp.model.encoders import outline_encoder
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.predict import reconstruct
+from gamba_warp.vision.vgg import VGG16Features, VGG16Trunk
 
 # Names and shapes of the tensors that files of the presets hold; older files have the same.
 STORED = {
@@ -23,6 +23,7 @@ STORED = {
 }
 NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
 NEW += ("triplane_size", "triplane_features", "image_tokens", "num_orders")
+NEW += ("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor")
 VARIANTS = [
     {"mixer": "attention", "attention_heads": 2},
     {"mixer": "attention", "attention_mlp": 1, "norm": "rms", "prepend": False},
@@ -40,13 +41,47 @@ VARIANTS = [
 ]
 
 
+LENGTHS = {"tiny": (4096, 0), "rays": (49152, 0), "small": (9216, 144), "paper": (16384, 576)}
+LENGTHS["released"] = (16384, 577)
+# The paper's ablations, and what else a configuration may say of the plain network.
+ABLATIONS = [
+    {},
+    {"encoder": "none"},
+    {"additive_image_tokens": False},
+    {"prepend": False},
+    {"camera_token": False},
+    {"predict_rotation": True, "norm": "rms"},
+    {"encoder_frozen": False},
+    {"discretization": "zoh"},
+    {"discretization": "bilinear"},
+    {"dt_rank": 3, "expand": 3, "conv_size": 2, "decoder_width": 20},
+]
+
+
 @pytest.mark.parametrize("preset", PRESETS)
-def test_presets_store_what_they_stored(preset):
+def test_presets_store_what_they_stored(preset, monkeypatch):
+    """And have its sizes; the number of parameters is known before a model is built."""
+    trunk = VGG16Trunk
+    monkeypatch.setattr(
+        "gamba_warp.vision.vgg.vgg16_features", lambda path: VGG16Features(trunk().state_dict())
+    )
     config = PRESETS[preset]
     with torch.device("meta"):
-        state = Gamba(config, encoder=outline_encoder(config)).stored_state()
+        model = Gamba(config, None if config.encoder == "vgg16" else "random")
+        images = torch.rand(1, config.encoder_size, config.encoder_size, 3)
+        image_tokens = model.encoder(images).shape[1] if model.encoder else 0
+    state = model.stored_state()
     text = json.dumps([[name, list(value.shape)] for name, value in state.items()])
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == STORED[preset]
+    assert (config.num_gaussians, image_tokens) == LENGTHS[preset]
+    assert model.tokens.orders.shape == (config.num_tokens,)
+    own = [p for name, p in model.named_parameters() if not name.startswith("encoder.")]
+    count = sum(p.numel() for p in own)
+    assert count <= config.num_parameters < 2.5 * count
+    assert config.encoder != "none" or count == config.num_parameters
+    if preset == "paper":  # whose own figure is "about 10 %" of 500 M parameters of an LRM
+        assert 40e6 < sum(value.numel() for value in state.values()) < 55e6
+        assert config.step_rank == 32 and model.encoder.channels == 768
 
 
 def test_older_files_mean_the_defaults():
@@ -73,10 +108,13 @@ def test_files_hold_a_variant(tmp_path, changes):
         assert getattr(got, name).isfinite().all()
 
 
-@pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])
-@pytest.mark.parametrize("changes", VARIANTS, ids=str)
-def test_every_parameter_of_a_variant_is_counted_and_learns(changes, encoder):
-    model = Gamba(micro(**({"encoder": encoder} | changes)), "random")
+@pytest.mark.parametrize(
+    "changes",
+    [{"encoder": name} | x for x in VARIANTS for name in ("none", "gamba_test_vit")] + ABLATIONS,
+    ids=str,
+)
+def test_every_parameter_of_a_variant_is_counted_and_learns(changes):
+    model = Gamba(micro(**changes), "random")
     own = {n: p for n, p in model.named_parameters() if not n.startswith("encoder.")}
     count = sum(p.numel() for p in own.values())
     assert count <= model.config.num_parameters
@@ -88,6 +126,8 @@ def test_every_parameter_of_a_variant_is_counted_and_learns(changes, encoder):
     parts = [made.means, made.scales, made.opacities, made.colors]
     parts += [] if made.quats is None else [made.quats]
     sum((part * torch.randn_like(part)).sum() for part in parts).backward()
-    for name, parameter in own.items():
-        assert parameter.grad is not None, name
-        assert parameter.grad.isfinite().all() and parameter.grad.abs().max() > 0, name
+    for name, parameter in model.named_parameters():
+        assert parameter.requires_grad == (name in own or not model.config.encoder_frozen), name
+        if parameter.requires_grad:
+            assert parameter.grad is not None, name
+            assert parameter.grad.isfinite().all() and parameter.grad.abs().max() > 0, name
