@@ -79,7 +79,7 @@ def _read_xyz(path: Path) -> Cloud:
         table = read_table(lines_of(file, str(path), comments="#"), str(path))
     if len(table) and table.shape[1] < 3:
         raise UserError(f"{path}: {table.shape[1]} columns, expected x y z")
-    return Cloud(_columns(table, 0))
+    return Cloud(np.ascontiguousarray(table[:, :3]))
 
 
 def _read_pts(path: Path) -> Cloud:
@@ -96,7 +96,7 @@ def _read_pts(path: Path) -> Cloud:
         raise UserError(
             f"{path}: truncated or false header, {count} points but {len(table)} lines follow"
         )
-    return Cloud(_columns(table, 0))
+    return Cloud(np.ascontiguousarray(table[:, :3]))
 
 
 def _read_ply(path: Path) -> Cloud:
@@ -209,12 +209,6 @@ def _pcd_cloud(field, kind: np.dtype) -> Cloud:
 
     has_normals = set(_PCD_NORMALS) <= set(kind.names or ())
     return Cloud(stacked(_AXES), stacked(_PCD_NORMALS) if has_normals else None)
-
-
-def _columns(table: np.ndarray, first: int) -> np.ndarray:
-    """``[N, 3]``: three columns, without a hold on the others' memory."""
-    three = table[:, first : first + 3]
-    return three if table.shape[1] == 3 else three.copy()
 
 
 def _whole(path: Path, what: str, word: str) -> int:

@@ -223,14 +223,6 @@ def read_glb(path: Path, file: BinaryIO, size: int, kind: type[Tree]) -> tuple[T
     return tree, binary
 
 
-def _check_glb(path: Path, file: BinaryIO, size: int) -> None:
-    read_glb(path, file, size, Gltf)
-
-
-def _check_gltf(path: Path, file: BinaryIO, size: int) -> None:
-    _check_accessors(path, parse_document(file.read(), Gltf, str(path)))
-
-
 def _check_accessors(path: Path, tree: Gltf) -> None:
     """Each view against its buffer, each accessor against its view.
 
@@ -314,4 +306,11 @@ def read_table(lines: Iterable[str], source: str, columns: tuple[int, ...] = ())
     return table
 
 
-_CHECKS = {".stl": _check_stl, ".off": _check_off, ".glb": _check_glb, ".gltf": _check_gltf}
+_CHECKS = {
+    ".stl": _check_stl,
+    ".off": _check_off,
+    ".glb": lambda path, file, size: read_glb(path, file, size, Gltf),
+    ".gltf": lambda path, file, size: _check_accessors(
+        path, parse_document(file.read(), Gltf, str(path))
+    ),
+}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -126,17 +126,16 @@ def _from_text(path: Path, lines: Iterator[str], element: PlyElement) -> Columns
 
     def length_at(at: int, item: PlyProperty) -> int:
         length = numbers[at] if at < len(flat) else -1.0
-        if length < 0 or not length.is_integer():
+        if not 0 <= length <= len(flat) or not length.is_integer():
             raise UserError(f"{source} has a list of length {length:g}")
         return int(length)
 
-    def check(row: int, at: int) -> None:
-        if at != ends[row + 1]:
-            got, wanted = ends[row + 1] - ends[row], at - ends[row]
-            raise UserError(f"{source} has a row of {got} numbers, not {wanted}")
-
     steps = [(1 if item.length else 0, 1) for item in items]
-    starts, lengths, _ = _walk(element, count, 0, steps, length_at, check)
+    starts, lengths, _ = _walk(element, ends[:-1], 0, steps, length_at)
+    wanted, got = starts[-1] + lengths[-1] - ends[:-1], np.diff(ends)
+    if (wanted != got).any():
+        row = (wanted != got).argmax()
+        raise UserError(f"{source} has a row of {got[row]} numbers, not {wanted[row]}")
     return {
         item.name: _column(item, _typed(path, flat[_each(*found, 1)], item), found[1])
         for item, *found in zip(items, starts, lengths)
@@ -164,36 +163,35 @@ def _typed(path: Path, values: np.ndarray, item: PlyProperty) -> np.ndarray:
 
 def _walk(
     element: PlyElement,
-    rows: int,
+    rows: Sequence[int | None],
     at: int,
     steps: list[tuple[int, int]],
     length_at: Callable[[int, PlyProperty], int],
-    check: Callable[[int, int], None],
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Goes through rows with lists one by one: only a row says where the next one begins.
 
     Args:
         element: whose rows they are.
-        rows: how many.
+        rows: where each begins, or None: where the one before it ends.
         at: where the first begins.
         steps: of each property, what the length of its list takes (0: it is no list), and what a
             number takes.
         length_at: the length that stands at a place.
-        check: given each row and where it ends.
 
     Returns:
         ``[properties, rows]`` where the numbers begin and how many there are, and the end.
     """
-    starts = np.empty((len(steps), rows), np.int64)
+    starts = np.empty((len(steps), len(rows)), np.int64)
     lengths = np.ones_like(starts)
-    for row in range(rows):
-        for i, (head, step) in enumerate(steps):
+    parts = [(i, item, *step) for i, (item, step) in enumerate(zip(element.properties, steps))]
+    for row, begin in enumerate(rows):
+        at = at if begin is None else begin
+        for i, item, head, step in parts:
             length = 1
             if head:
-                length = lengths[i, row] = length_at(at, element.properties[i])
+                length = lengths[i, row] = length_at(at, item)
             starts[i, row] = at + head
             at += head + length * step
-        check(row, at)
     return starts, lengths, at
 
 
@@ -224,14 +222,11 @@ def _from_bytes(
             raise UserError(f"{path}: false header, a list of {length} in {element.name}")
         return length
 
-    def check(row: int, at: int) -> None:
-        if at > len(data):
-            compare_sizes(path, says, at, len(data), exact=False)
-
     steps = [(np.dtype(x.length).itemsize if x.length else 0, np.dtype(x.kind).itemsize)
              for x in items]  # fmt: skip
     # As a rule all lists of a property are as long as the first.
-    _, lengths, end = _walk(element, 1, at, steps, length_at, check)
+    _, lengths, end = _walk(element, [None], at, steps, length_at)
+    compare_sizes(path, says, end, len(data), exact=False)
     if count * (end - at) <= len(data) - at:
         fields = []
         for i, item in enumerate(items):
@@ -245,7 +240,8 @@ def _from_bytes(
                 values = values.reshape(-1) if item.length else values[:, 0]
                 columns[item.name] = _column(item, values, each)
             return columns, at + count * (end - at)
-    starts, lengths, end = _walk(element, count, at, steps, length_at, check)
+    starts, lengths, end = _walk(element, [None] * count, at, steps, length_at)
+    compare_sizes(path, says, end, len(data), exact=False)
     if lengths.sum() > MAX_VALUES:
         raise UserError(f"{path}: over {MAX_VALUES} numbers, the limit for one file")
     raw, columns = np.frombuffer(data, np.uint8), {}

@@ -128,7 +128,24 @@ def build_encoder(config: GambaConfig, weights: Weights | None) -> ImageEncoder 
             raise UserError(f"encoder vgg16: takes the cached weights or a file, not {got}")
         network = vgg16_features(weights)
         return ImageEncoder(network, network.dim, config)
-    return _build_vit(config, weights)
+    if weights is None:
+        raise UserError(
+            f"encoder {config.encoder}: its weights must be named: a file, 'hub' to fetch them, "
+            "or 'random' for an untrained one"
+        )
+    if isinstance(weights, Mapping):
+        vit = _create_vit(config, pretrained=False)
+        _load_vit(vit, dict(weights), f"encoder {config.encoder}")
+    elif str(weights) == "random":
+        # Checkpoints do not store this network, so no global seed may decide its weights.
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            vit = _create_vit(config, pretrained=False)
+    else:
+        vit = _create_vit(config, pretrained=str(weights) == "hub")
+        if str(weights) != "hub":
+            _load_vit(vit, read_state(Path(weights)), str(weights))
+    return ImageEncoder(_ViT(vit, config), vit.num_features, config)
 
 
 def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
@@ -152,28 +169,6 @@ def outline_encoder(config: GambaConfig) -> ImageEncoder | None:
         if count > MAX_PARAMETERS:
             raise UserError(f"encoder {config.encoder}: has {count:,} parameters, too many")
         return ImageEncoder(_ViT(vit, config), vit.num_features, config)
-
-
-def _build_vit(config: GambaConfig, weights: Weights | None) -> ImageEncoder:
-    name = config.encoder
-    if weights is None:
-        raise UserError(
-            f"encoder {name}: its weights must be named: a file, 'hub' to fetch them, "
-            "or 'random' for an untrained one"
-        )
-    if isinstance(weights, Mapping):
-        vit = _create_vit(config, pretrained=False)
-        _load_vit(vit, dict(weights), f"encoder {name}")
-    elif str(weights) == "random":
-        # Checkpoints do not store this network, so no global seed may decide its weights.
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            vit = _create_vit(config, pretrained=False)
-    else:
-        vit = _create_vit(config, pretrained=str(weights) == "hub")
-        if str(weights) != "hub":
-            _load_vit(vit, read_state(Path(weights)), str(weights))
-    return ImageEncoder(_ViT(vit, config), vit.num_features, config)
 
 
 def _create_vit(config: GambaConfig, pretrained: bool) -> VisionTransformer:

@@ -131,21 +131,15 @@ class Gamba(Pretrained, nn.Module):
                 condition = self.condition(images, cameras)
             if isinstance(self.decoder, RayDecoder):
                 return self._on_rays(images, cameras, condition, background_margin or 0)
-            return self._on_all(images, cameras, condition, background_margin)
-
-    def _on_all(
-        self, images: Tensor, cameras: Cameras, condition: list[Any], background_margin: int | None
-    ) -> Gaussians:
-        """What ``forward`` does for the other decoders."""
-        tokens = self.tokens(images, cameras)
-        if background_margin is not None:
-            background = self.config.background_color
-            tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
-        ours, theirs = condition[: len(self.blocks)], condition[len(self.blocks) :]
-        tokens = self.norm(run_blocks(self.blocks, tokens, ours, self.recompute))
-        if self.planes is None:
-            return self.decoder(tokens)
-        return self.decoder(tokens, self.planes(len(images), theirs, self.recompute))
+            tokens = self.tokens(images, cameras)
+            if background_margin is not None:
+                background = self.config.background_color
+                tokens = tokens[:, self.tokens.foreground(images, background, background_margin)]
+            ours, theirs = condition[: len(self.blocks)], condition[len(self.blocks) :]
+            tokens = self.norm(run_blocks(self.blocks, tokens, ours, self.recompute))
+            if self.planes is None:
+                return self.decoder(tokens)
+            return self.decoder(tokens, self.planes(len(images), theirs, self.recompute))
 
     def _on_rays(
         self, rgba: Tensor, cameras: Cameras, condition: list[Any], margin: int

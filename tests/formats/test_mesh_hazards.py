@@ -57,6 +57,8 @@ BAD = {
     "without_a_vertex.stl": (STL.replace("vertex 1 0 0\n", "", 1), "8 vertices"),
     "word.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 x"]), "could not convert"),
     "short_row.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1"]), "a row of 3 numbers, not 4"),
+    "huge_list.ply": (ascii_ply(CORNERS, ["3 0 1 2", "1e300 0"]), "a list of length 1e+300"),
+    "short_first.ply": (ascii_ply(CORNERS, ["3 0 1", "3 0 1 2"]), "a row of 3 numbers, not 4"),
     "half.ply": (ascii_ply(CORNERS, ["3 0 1 2", "3 0 1 1.5"]), "vertex_indices is 1.5"),
     "vertex_word.ply": (ascii_ply([*CORNERS, "0 0 x"], ["3 0 1 2"]), "could not convert"),
 }

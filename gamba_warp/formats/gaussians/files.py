@@ -73,17 +73,13 @@ def read_gaussians(path: str | Path) -> Gaussians:
     path = Path(path)
     with open_shape(path, MAX_FILE) as (file, _):
         start = file.read(4)
-    if start.startswith(b"ply"):
-        return load_ply(path)
-    if start == b"glTF":
-        return load_glb(path)
-    if start.startswith(GZIP) or start == MAGIC:
-        return load_spz(path)
-    suffix = path.suffix.lower()
-    if suffix in SPLAT_SUFFIXES:  # the reader of that name says what is wrong
-        readers = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz, ".glb": load_glb}
-        return readers[suffix](path)
-    raise UserError(f"{path}: not Gaussians ({', '.join(SPLAT_SUFFIXES)})")
+    magics = {b"ply": load_ply, b"glTF": load_glb, GZIP: load_spz, MAGIC: load_spz}
+    by_name = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz, ".glb": load_glb}
+    readers = [reader for magic, reader in magics.items() if start.startswith(magic)]
+    reader = readers[0] if readers else by_name.get(path.suffix.lower())  # says what is wrong
+    if reader is None:
+        raise UserError(f"{path}: not Gaussians ({', '.join(SPLAT_SUFFIXES)})")
+    return reader(path)
 
 
 def comments_of(path: str | Path) -> list[str]:
