@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -124,14 +125,14 @@ def _from_text(path: Path, lines: Iterator[str], element: PlyElement) -> Columns
     flat = table[:, 0]
     numbers = memoryview(flat)
 
-    def length_at(at: int, item: PlyProperty) -> int:
+    def length_at(at: int) -> int:
         length = numbers[at] if at < len(flat) else -1.0
         if not 0 <= length <= len(flat) or not length.is_integer():
             raise UserError(f"{source} has a list of length {length:g}")
         return int(length)
 
-    steps = [(1 if item.length else 0, 1) for item in items]
-    starts, lengths, _ = _walk(element, ends[:-1], 0, steps, length_at)
+    steps = [(1, 1, length_at) if item.length else (0, 1, None) for item in items]
+    starts, lengths, _ = _walk(ends[:-1], 0, steps)
     wanted, got = starts[-1] + lengths[-1] - ends[:-1], np.diff(ends)
     if (wanted != got).any():
         row = (wanted != got).argmax()
@@ -162,37 +163,34 @@ def _typed(path: Path, values: np.ndarray, item: PlyProperty) -> np.ndarray:
 
 
 def _walk(
-    element: PlyElement,
     rows: Sequence[int | None],
     at: int,
-    steps: list[tuple[int, int]],
-    length_at: Callable[[int, PlyProperty], int],
+    steps: list[tuple[int, int, Callable[[int], int] | None]],
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Goes through rows with lists one by one: only a row says where the next one begins.
 
     Args:
-        element: whose rows they are.
         rows: where each begins, or None: where the one before it ends.
         at: where the first begins.
-        steps: of each property, what the length of its list takes (0: it is no list), and what a
-            number takes.
-        length_at: the length that stands at a place.
+        steps: of each property, what the length of its list takes (0: it is no list), what a
+            number takes, and what reads the length that stands at a place.
 
     Returns:
         ``[properties, rows]`` where the numbers begin and how many there are, and the end.
     """
-    starts = np.empty((len(steps), len(rows)), np.int64)
-    lengths = np.ones_like(starts)
-    parts = [(i, item, *step) for i, (item, step) in enumerate(zip(element.properties, steps))]
-    for row, begin in enumerate(rows):
+    starts, lengths = [array("q") for _ in steps], [array("q") for _ in steps]
+    parts = [
+        (*step, start.append, length.append) for step, start, length in zip(steps, starts, lengths)
+    ]
+    for begin in rows:
         at = at if begin is None else begin
-        for i, item, head, step in parts:
-            length = 1
-            if head:
-                length = lengths[i, row] = length_at(at, item)
-            starts[i, row] = at + head
-            at += head + length * step
-    return starts, lengths, at
+        for head, step, length_at, add_start, add_length in parts:
+            length = length_at(at) if length_at else 1
+            at += head
+            add_start(at)
+            add_length(length)
+            at += length * step
+    return np.array(starts), np.array(lengths), at
 
 
 def _each(starts: np.ndarray, lengths: np.ndarray, step: int) -> np.ndarray:
@@ -215,17 +213,21 @@ def _from_bytes(
 
     byteorder = "little" if order == "<" else "big"
 
-    def length_at(at: int, item: PlyProperty) -> int:
-        part = data[at : at + int(item.length[1])]
-        length = int.from_bytes(part, byteorder, signed=item.length.startswith("i"))
-        if length < 0:
-            raise UserError(f"{path}: false header, a list of {length} in {element.name}")
-        return length
+    def step(item: PlyProperty) -> tuple[int, int, Callable[[int], int] | None]:
+        head, size = int(item.length[1:] or 0), np.dtype(item.kind).itemsize
+        signed = item.length.startswith("i")
 
-    steps = [(np.dtype(x.length).itemsize if x.length else 0, np.dtype(x.kind).itemsize)
-             for x in items]  # fmt: skip
+        def length_at(at: int) -> int:
+            length = int.from_bytes(data[at : at + head], byteorder, signed=signed)
+            if length < 0:
+                raise UserError(f"{path}: false header, a list of {length} in {element.name}")
+            return length
+
+        return head, size, length_at if head else None
+
+    steps = [step(item) for item in items]
     # As a rule all lists of a property are as long as the first.
-    _, lengths, end = _walk(element, [None], at, steps, length_at)
+    _, lengths, end = _walk([None], at, steps)
     compare_sizes(path, says, end, len(data), exact=False)
     if count * (end - at) <= len(data) - at:
         fields = []
@@ -240,7 +242,7 @@ def _from_bytes(
                 values = values.reshape(-1) if item.length else values[:, 0]
                 columns[item.name] = _column(item, values, each)
             return columns, at + count * (end - at)
-    starts, lengths, end = _walk(element, [None] * count, at, steps, length_at)
+    starts, lengths, end = _walk([None] * count, at, steps)
     compare_sizes(path, says, end, len(data), exact=False)
     if lengths.sum() > MAX_VALUES:
         raise UserError(f"{path}: over {MAX_VALUES} numbers, the limit for one file")
