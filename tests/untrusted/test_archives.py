@@ -4,15 +4,18 @@ import bz2
 import gzip
 import io
 import lzma
+import random
 import stat
 import tarfile
 import time
 import tracemalloc
 import zipfile
+import zlib
 
 import pytest
 from helpers.refusals import refused_at
 
+from gamba_warp.errors import UserError
 from gamba_warp.untrusted import archives
 from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
 
@@ -193,3 +196,17 @@ def test_bad_tars(tmp_path, monkeypatch):
     monkeypatch.setattr(archives, "_MEMORY", 1000)
     refused_at("a.tar", "Memory", read_tar, lzma.compress(make_tar(PLAIN)), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_damaged_tars_are_one_line(tmp_path):
+    rng, plain = random.Random(1), make_tar(PLAIN * 3)
+    for pack in (bytes, zlib.compress, gzip.compress, bz2.compress, lzma.compress):
+        for _ in range(60):
+            content = bytearray(pack(plain))
+            for _ in range(rng.randint(1, 4)):
+                content[rng.randrange(min(len(content), 600))] = rng.randrange(256)
+            content = content[: rng.choice([len(content), rng.randrange(len(content))])]
+            try:
+                read_tar(bytes(content), tmp_path)
+            except UserError as error:
+                assert len(str(error).splitlines()) == 1
