@@ -4,7 +4,6 @@ Forward has a thread for each (view, Gaussian). The gradient has one for each Ga
 over its views: sums over views are then in a fixed order. README.md §1 and §4 hold the maths.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, no_type_check
 
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from ..runtime.launch import launch
 from ..runtime.memory import empty
-from ..runtime.views import Packed, struct, vectors
+from ..runtime.views import Packed, filled, struct, vectors
 from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 
 wp.set_module_options({"enable_backward": False})
@@ -467,17 +466,9 @@ def _project_vjp(
             v_scene_out.quats[g] = _rotation_vjp(q, v_R) / size
 
 
-@functools.lru_cache(maxsize=256)
 def make_lens(options: LensOptions) -> Lens:
     """The scalars of a projection as one kernel argument, which is shared: not to be changed."""
-    lens = Lens()
-    lens.width, lens.height = options.width, options.height
-    lens.near_plane, lens.far_plane = options.near_plane, options.far_plane
-    lens.radius_clip, lens.eps2d = options.radius_clip, options.eps2d
-    lens.alpha_min = options.alpha_min
-    lens.antialiased, lens.skip_unused = int(options.antialiased), int(options.skip_unused)
-    lens.rounded = int(options.rounded)
-    return lens
+    return filled(Lens, *options[:7], *map(int, options[7:]))
 
 
 def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> Tensor:

@@ -7,13 +7,12 @@ by exact intervals of columns. README.md §2 proves the test. Counting and writi
 functions.
 """
 
-import functools
 from typing import NamedTuple, no_type_check
 
 import warp as wp
 from torch import Tensor
 
-from ..runtime.views import struct
+from ..runtime.views import filled, struct
 from .constants import TILE
 from .skip import TILE_TEST
 
@@ -158,7 +157,6 @@ class Grid:
     skip: int
 
 
-@functools.lru_cache(maxsize=256)
 def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
     """The scalars of a binning launch as one kernel argument, which is shared: not to be changed.
 
@@ -168,11 +166,8 @@ def make_grid(tiling: Tiling, *, num: int, alpha_min: float, skip: int) -> Grid:
         alpha_min: what is fainter is not drawn.
         skip: from ``Skip.bits``.
     """
-    grid = Grid()
-    grid.num, grid.alpha_min, grid.skip = num, alpha_min, skip
-    grid.width, grid.height = tiling.width, tiling.height
-    grid.tiles_x, grid.tiles_y, grid.shift = tiling.tiles_x, tiling.tiles_y, TILE.bit_length() - 1
-    return grid
+    sizes = tiling.width, tiling.height, tiling.tiles_x, tiling.tiles_y, TILE.bit_length() - 1
+    return filled(Grid, num, *sizes, alpha_min, skip)
 
 
 class Size(NamedTuple):
@@ -218,7 +213,6 @@ class Picture:
     skip: int
 
 
-@functools.lru_cache(maxsize=256)
 def make_picture(size: Size, limits: Limits, *, num: int) -> Picture:
     """The scalars of a compositing launch as one kernel argument, not to be changed either.
 
@@ -228,14 +222,8 @@ def make_picture(size: Size, limits: Limits, *, num: int) -> Picture:
         num: Gaussians of a view.
     """
     tiling = Tiling(size.width, size.height)
-    picture = Picture()
-    picture.width, picture.height = size.width, size.height
-    picture.tiles_x, picture.tiles_y = tiling.tiles_x, tiling.tiles_y
-    picture.views, picture.num = size.views, num
-    picture.colors_per_view, picture.skip = size.colors_per_view, size.skip
-    picture.alpha_min, picture.alpha_max = limits.alpha_min, limits.alpha_max
-    picture.t_min = limits.t_min
-    return picture
+    sizes = *tiling, tiling.tiles_x, tiling.tiles_y, size.views, num, size.colors_per_view
+    return filled(Picture, *sizes, *limits, size.skip)
 
 
 @wp.func

@@ -49,24 +49,3 @@ def times(a: lanes, b: lanes) -> lanes: ...
     PRELUDE + f"{LANES} r; *(F*)&r = fma_(*(const F*)&a, *(const F*)&b, *(const F*)&c); return r;"
 )
 def fma(a: lanes, b: lanes, c: lanes) -> lanes: ...
-
-
-# A state that decays towards zero passes through denormals, which slow x86 down a hundredfold.
-@wp.func_native("""
-#if defined(__x86_64__)
-int before = (int)__builtin_ia32_stmxcsr();
-__builtin_ia32_ldmxcsr(before | 0x8040);
-return before;
-#else
-return 0;
-#endif
-""")
-def flush_denormals() -> int: ...
-
-
-@wp.func_native("""
-#if defined(__x86_64__)
-__builtin_ia32_ldmxcsr(before);
-#endif
-""")
-def restore_denormals(before: int): ...

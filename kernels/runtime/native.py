@@ -1,9 +1,14 @@
-"""C++ of the kernels: whole ``.inl`` files beside an operator, as text for ``wp.func_native``."""
+"""C++ of the kernels: whole files beside an operator, as text of functions and CPU kernels."""
 
 from __future__ import annotations
 
+import linecache
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import warp as wp
 
 _INCLUDE = re.compile(r'^[ \t]*#include "(.+)"[ \t]*\n', re.MULTILINE)
 
@@ -35,3 +40,39 @@ def native(path: Path, **defines: object) -> str:
 def _read(path: Path) -> str:
     text = path.read_text(encoding="utf-8")
     return _INCLUDE.sub(lambda found: _read(path.parent / found[1]), text)
+
+
+def native_kernel(
+    name: str,
+    text: str,
+    inputs: Mapping[str, Any],
+    outputs: Mapping[str, Any],
+    indices: str = "task",
+) -> Any:
+    """A CPU kernel for ``parallel_launch`` that is C++: the body of one task.
+
+    Args:
+        name: of the kernel.
+        text: from ``native``; the task's number and the arguments are known in it by their names.
+        inputs: Warp types by names, first those that are read.
+        outputs: of those that are written.
+        indices: names of the launch's dimensions, the first of which is the task's number.
+    """
+    arguments = {**inputs, **outputs}
+    names = ", ".join(arguments)
+    source = (
+        f"def {name}_task({indices}, {names}): ...\n"
+        f"def {name}(offset, {names}):\n"
+        f"    {indices} = wp.tid()\n"
+        f"    {name}_task(offset + {indices}, {names})\n"
+    )
+    # Warp reads the source of what it compiles, and finds it there, as debuggers do.
+    file = f"<{name}({names})>"
+    linecache.cache[file] = len(source), None, source.splitlines(True), file
+    made: dict[str, Any] = {"__name__": __name__, "wp": wp}
+    exec(compile(source, file, "exec"), made)
+    task, kernel = made[f"{name}_task"], made[name]
+    task.__annotations__ = {**dict.fromkeys(map(str.strip, indices.split(",")), int), **arguments}
+    kernel.__annotations__ = {"offset": int, **arguments}
+    made[f"{name}_task"] = wp.func_native(text)(task)
+    return wp.kernel(kernel, enable_backward=False, module="unique")

@@ -13,11 +13,9 @@ from .native import native
 __all__ = [
     "ACCESSORS",
     "ROWS",
-    "SETTLE",
     "VALUE",
     "WIDTH",
     "fma",
-    "settle",
     "sigmoid",
     "streams",
     "times",
@@ -44,18 +42,6 @@ def streams(results: Sequence[Tensor]) -> bool:
         and 4 * x.numel() >= _STREAMED
         for x in written
     )
-
-
-# What was written past the caches is seen by other threads from here on.
-SETTLE = """
-#if defined(__x86_64__)
-__builtin_ia32_sfence();
-#endif
-"""
-
-
-@wp.func_native(SETTLE)
-def settle(): ...
 
 
 def _accessors(dtype: torch.dtype):

@@ -117,6 +117,18 @@ def _fields(cls: Any) -> list[tuple[Any, int, Any]]:
     return fields
 
 
+@functools.lru_cache(1024)
+def filled(cls: type[_Class], *values: float) -> _Class:
+    """An instance of a struct of numbers, in the order of its fields; shared: not to be changed.
+
+    It is kept, because to fill one takes as long as a short launch.
+    """
+    made = cls()
+    for name, value in zip(cast(Any, cls).vars, values, strict=True):
+        setattr(made, name, value)
+    return made
+
+
 def struct(cls: type[_Class]) -> type[_Class]:
     """``wp.struct``, which to a type checker leaves the class what it is."""
     return cast(type[_Class], wp.struct(cls))

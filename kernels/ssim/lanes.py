@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from ..runtime.launch import parallel_launch
-from ..runtime.native import native
+from ..runtime.native import native, native_kernel
 from ..runtime.views import Packed, struct
 from .constants import C1, C2, EDGE, SIGMA, WINDOW
 from .products import box_of_windows, groups
@@ -54,17 +54,8 @@ _DEFINES = {"WEIGHTS": _weights(), "STRIP": _STRIP, "TWO_C1": 2 * C1, "TWO_C2": 
 
 def _kernel(name: str) -> Any:
     """The kernel of a file: a task for each row, or strip of rows, and sixteen numbers of it."""
-
-    @wp.func_native(native(Path(__file__).with_name(f"{name}.inl"), **_DEFINES))
-    def run(task: int, group: int, maps: Maps): ...
-
-    @wp.kernel(module="unique", enable_backward=False)
-    @no_type_check
-    def kernel(offset: int, maps_out: Maps):
-        task, group = wp.tid()
-        run(offset + task, group, maps_out)
-
-    return kernel
+    text = native(Path(__file__).with_name(f"{name}.inl"), **_DEFINES)
+    return native_kernel(f"ssim_{name}", text, {}, {"maps": Maps}, indices="task, group")
 
 
 _across, _down, _up, _back = map(_kernel, ("across", "down", "up", "back"))

@@ -10,7 +10,7 @@ README.md §2 holds the maths.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import Any
 
 import torch
 import warp as wp
@@ -18,13 +18,11 @@ from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from ...runtime.native import native
+from ...runtime.native import native, native_kernel
 from ...runtime.views import Packed, struct
 from ..project import Splats
 from ..skip import TILE_TEST
 from ..tiles import SLACK, SLACK_ABS, Bins, Grid, Lists
-
-wp.set_module_options({"enable_backward": False})
 
 MANY = 1 << 15  # Gaussians of a view from which sorting each list is quicker
 _PARTS_PER_THREAD = 4  # more than 1, since Gaussians differ in size, and so do parts
@@ -45,78 +43,35 @@ class Work:
     numbers: wp.array[wp.int32]  # [parts] the number of the first intersection
 
 
-@wp.func_native(native(_HERE / "sort.inl"))
-def _sort_worker(
-    worker: int,
-    count: int,
-    splats: Splats,
-    staged: wp.array2d[wp.int32],
-    counter: wp.array[wp.int32],
-    workspace: wp.array2d[wp.int64],
-    lists: Lists,
-): ...
-
-
-@wp.func_native(native(_HERE / "count.inl", **_DEFINES))
-def _count_part(task: int, parts: int, grid: Grid, splats: Splats, lists: Lists, work: Work): ...
-
-
-@wp.func_native(native(_HERE / "offsets.inl"))
-def _running_sums(parts: int, work: Work, lists: Lists): ...
-
-
-@wp.func_native(native(_HERE / "scatter.inl", **_DEFINES))
-def _scatter_part(
-    task: int,
-    parts: int,
-    grid: Grid,
-    splats: Splats,
-    work: Work,
-    lists: Lists,
-    staged: wp.array2d[wp.int32],
-): ...
-
-
-@wp.kernel
-@no_type_check
-def _sort(
-    offset: int,
-    count: int,
-    splats_in: Splats,
-    staged_in: wp.array2d[wp.int32],
-    counter_out: wp.array[wp.int32],
-    workspace_out: wp.array2d[wp.int64],
-    lists_out: Lists,
-):
-    """A task is a worker; ``counter`` is the next list, ``workspace`` holds two of a worker."""
-    worker = offset + wp.tid()
-    _sort_worker(worker, count, splats_in, staged_in, counter_out, workspace_out, lists_out)
-
-
-@wp.kernel
-@no_type_check
-def _count(offset: int, parts: int, grid: Grid, splats_in: Splats, lists_in: Lists, work_out: Work):
-    _count_part(offset + wp.tid(), parts, grid, splats_in, lists_in, work_out)
-
-
-@wp.kernel
-@no_type_check
-def _offsets(offset: int, parts: int, work_out: Work, lists_out: Lists):
-    _running_sums(parts, work_out, lists_out)
-
-
-@wp.kernel
-@no_type_check
-def _scatter(
-    offset: int,
-    parts: int,
-    grid: Grid,
-    splats_in: Splats,
-    work_out: Work,
-    lists_out: Lists,
-    staged_out: wp.array2d[wp.int32],
-):
-    _scatter_part(offset + wp.tid(), parts, grid, splats_in, work_out, lists_out, staged_out)
+# a task is a worker; ``counter`` is the next list, ``workspace`` holds two of a worker
+_sort = native_kernel(
+    "sort",
+    native(_HERE / "sort.inl"),
+    inputs={"count": int, "splats": Splats, "staged": wp.array2d[wp.int32]},
+    outputs={
+        "counter": wp.array[wp.int32],
+        "workspace": wp.array2d[wp.int64],
+        "lists": Lists,
+    },
+)
+_count = native_kernel(
+    "count",
+    native(_HERE / "count.inl", **_DEFINES),
+    inputs={"parts": int, "grid": Grid, "splats": Splats, "lists": Lists},
+    outputs={"work": Work},
+)
+_offsets = native_kernel(
+    "offsets",
+    native(_HERE / "offsets.inl"),
+    inputs={"parts": int},
+    outputs={"work": Work, "lists": Lists},
+)
+_scatter = native_kernel(
+    "scatter",
+    native(_HERE / "scatter.inl", **_DEFINES),
+    inputs={"parts": int, "grid": Grid, "splats": Splats},
+    outputs={"work": Work, "lists": Lists, "staged": wp.array2d[wp.int32]},
+)
 
 
 def _sort_lists(count: int, longest: int, splats: Packed, staged: Any, lists: Packed) -> None:

@@ -27,7 +27,7 @@ auto touched = [&](const Tile& tile, int g) -> int {
     return __builtin_reduce_or((I)(q <= limit) & bit);
 };
 
-F* const sums = (F*)workers.workspace.data + (size_t)worker * BLOCKS * channels;  // of colours
+F* const sums = (F*)workers.workspace.data + (size_t)task * BLOCKS * channels;  // of colours
 for (int index = next_tile(); index < tiles; index = next_tile()) {
     const int begin = lists.starts.data[index], end = lists.starts.data[index + 1];
     walk.walked.data[index] = 0;

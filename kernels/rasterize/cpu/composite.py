@@ -6,7 +6,7 @@ atomics: the same bits every time. README.md §3 and §5 hold the maths.
 """
 
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import Any
 
 import torch
 import warp as wp
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from ...runtime.native import native
+from ...runtime.native import native, native_kernel
 from ...runtime.views import Packed, struct
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
@@ -58,70 +58,27 @@ class Rows:
     geometry: int  # whether anything but colours is asked for
 
 
-@wp.func_native(native(_HERE / "composite.inl", **_DEFINES))
-def _blend(
-    worker: int,
-    picture: Picture,
-    splats: Gaussians,
-    lists: Lists,
-    walk: Walked,
-    pixels: Pixels,
-    workers: Workers,
-): ...
+_SPLATS = {"picture": Picture, "splats": Gaussians, "lists": Lists}
+_WALK = {"walk": Walked, "pixels": Pixels}
 
-
-@wp.func_native(native(_HERE / "composite_vjp.inl", **_DEFINES))
-def _unblend(
-    worker: int,
-    picture: Picture,
-    splats: Gaussians,
-    lists: Lists,
-    walk: Walked,
-    pixels: Pixels,
-    workers: Workers,
-    rows: Rows,
-): ...
-
-
-@wp.kernel(enable_backward=False, module="unique")
-@no_type_check
-def _composite(
-    offset: int,
-    picture: Picture,
-    splats_in: Gaussians,
-    lists_in: Lists,
-    walk_out: Walked,
-    pixels_out: Pixels,
-    workers_out: Workers,
-):
-    worker = offset + wp.tid()
-    _blend(worker, picture, splats_in, lists_in, walk_out, pixels_out, workers_out)
-
-
-@wp.kernel(enable_backward=False, module="unique")
-@no_type_check
-def _composite_vjp(
-    offset: int,
-    picture: Picture,
-    splats_in: Gaussians,
-    lists_in: Lists,
-    walk_in: Walked,
-    v_pixels_in: Pixels,
-    workers_out: Workers,
-    rows_out: Rows,
-):
-    worker = offset + wp.tid()
-    _unblend(worker, picture, splats_in, lists_in, walk_in, v_pixels_in, workers_out, rows_out)
-
-
-@wp.func_native(native(_HERE / "sums.inl", RUN=_RUN))
-def _sum_run(begin: int, splats: Gaussians, lists: Lists, rows: Rows, v: Gaussians): ...
-
-
-@wp.kernel(enable_backward=False)
-@no_type_check
-def _sum_rows(offset: int, splats_in: Gaussians, lists_in: Lists, rows_in: Rows, v_out: Gaussians):
-    _sum_run((offset + wp.tid()) * wp.static(_RUN), splats_in, lists_in, rows_in, v_out)
+_composite = native_kernel(
+    "composite",
+    native(_HERE / "composite.inl", **_DEFINES),
+    inputs=_SPLATS,
+    outputs={**_WALK, "workers": Workers},
+)
+_composite_vjp = native_kernel(
+    "composite_vjp",
+    native(_HERE / "composite_vjp.inl", **_DEFINES),
+    inputs={**_SPLATS, **_WALK},
+    outputs={"workers": Workers, "rows": Rows},
+)
+_sum_rows = native_kernel(
+    "sum_rows",
+    native(_HERE / "sums.inl", RUN=_RUN),
+    inputs={"splats": Gaussians, "lists": Lists, "rows": Rows},
+    outputs={"v": Gaussians},
+)
 
 
 def _workers(size: int) -> Packed:

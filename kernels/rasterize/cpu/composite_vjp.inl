@@ -4,7 +4,7 @@
 
 const int row_length = rows.sums.shape[1];
 F* const v_colors =
-    (F*)workers.workspace.data + (size_t)worker * (channels + BLOCKS * (channels + 1));
+    (F*)workers.workspace.data + (size_t)task * (channels + BLOCKS * (channels + 1));
 F* const v_pixels = v_colors + channels;  // of each block: of its channels, and of alpha
 // pairwise, in a fixed order
 auto total_ = [](F x) -> float {

@@ -3,18 +3,16 @@ the maths; the bits are those of the kernels of ``../project.py``.
 """
 
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import Any
 
 import torch
 import warp as wp
 
 from ...runtime.launch import parallel_launch
-from ...runtime.native import native
+from ...runtime.native import native, native_kernel
 from ...runtime.views import Packed
 from ..constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 from ..project import STATUS_NAMES, Lens, Scene, Splats
-
-wp.set_module_options({"enable_backward": False})
 
 _RUN = 512  # Gaussians of a task, a multiple of 16
 _PIECES_PER_THREAD = 8  # those that are culled cost less
@@ -26,62 +24,20 @@ _DEFINES = {
 }
 
 
-@wp.func_native(native(_HERE / "project.inl", **_DEFINES))
-def _project_run(
-    task: int,
-    views: int,
-    num: int,
-    colors_per_view: int,
-    lens: Lens,
-    scene: Scene,
-    colors: wp.array2d[wp.float32],
-    splats: Splats,
-): ...
+_SCENE = {"views": int, "num": int, "lens": Lens, "scene": Scene}
 
-
-@wp.kernel
-@no_type_check
-def _project(
-    offset: int,
-    views: int,
-    num: int,
-    colors_per_view: int,
-    lens: Lens,
-    scene_in: Scene,
-    colors_in: wp.array2d[wp.float32],
-    splats_out: Splats,
-):
-    task = offset + wp.tid()
-    _project_run(task, views, num, colors_per_view, lens, scene_in, colors_in, splats_out)
-
-
-@wp.func_native(native(_HERE / "project_vjp.inl", **_DEFINES))
-def _vjp_run(
-    task: int,
-    views: int,
-    num: int,
-    lens: Lens,
-    scene: Scene,
-    splats: Splats,
-    v_splats: Splats,
-    v_scene: Scene,
-): ...
-
-
-@wp.kernel
-@no_type_check
-def _project_vjp(
-    offset: int,
-    views: int,
-    num: int,
-    lens: Lens,
-    scene_in: Scene,
-    splats_in: Splats,
-    v_splats_in: Splats,
-    v_scene_out: Scene,
-):
-    task = offset + wp.tid()
-    _vjp_run(task, views, num, lens, scene_in, splats_in, v_splats_in, v_scene_out)
+_project = native_kernel(
+    "project",
+    native(_HERE / "project.inl", **_DEFINES),
+    inputs={**_SCENE, "colors_per_view": int, "colors": wp.array2d[wp.float32]},
+    outputs={"splats": Splats},
+)
+_project_vjp = native_kernel(
+    "project_vjp",
+    native(_HERE / "project_vjp.inl", **_DEFINES),
+    inputs={**_SCENE, "splats": Splats, "v_splats": Splats},
+    outputs={"v_scene": Scene},
+)
 
 
 def _launch(kernel: Any, rows: int, num: int, arguments: list) -> None:
@@ -97,7 +53,7 @@ def project_on_lanes(
     """Does what ``project_on_threads`` does, with the same arguments, on the lanes of a CPU."""
     *gaussians, colors, viewmats, Ks = inputs
     scene, splats = Packed(Scene, *gaussians, viewmats, Ks), Packed(Splats, *outputs)
-    arguments = [views, num, colors_per_view, lens, scene, colors, splats]
+    arguments = [views, num, lens, scene, colors_per_view, colors, splats]
     _launch(_project, images, num, arguments)
 
 

@@ -15,7 +15,7 @@ for (;;) {
     const int n = views ? size : lists.starts.data[list + 1] - begin;
     const unsigned* const depths = (const unsigned*)splats.depths.data + begin;
     const Staged* const items = (const Staged*)staged.data + begin;
-    Word* now = (Word*)workspace.data + (size_t)worker * workspace.shape[1];
+    Word* now = (Word*)workspace.data + (size_t)task * workspace.shape[1];
     Word* then = now + workspace.shape[1] / 2;
     auto key = [&](int j) -> unsigned { return views ? depths[j] : items[j].key; };
     unsigned least = ~0u, most = 0;

@@ -3,7 +3,7 @@
 #include "lanes.h"
 
 const int width = rows.sums.shape[1], channels = width - 6, count = lists.order.shape[0];
-const int end = begin + RUN < count ? begin + RUN : count;
+const int begin = task * RUN, end = begin + RUN < count ? begin + RUN : count;
 const long long all = (long long)rows.sums.shape[0] * width;
 for (int j = begin; j < end; ++j) {
     const int i = lists.order.data[j], from = lists.offsets.data[j], to = lists.offsets.data[j + 1];

@@ -90,7 +90,7 @@ for (int first = begin; first < end; first += 16) {
             v_mean[i] += v_t[i];
         }
         if (v_centers) {
-            float* const out = v_centers + (image * chunks + piece % chunks) * 3;
+            float* const out = v_centers + (image * chunks + task % chunks) * 3;
             for (int i = 0; i < 3; ++i) out[i] = (first == begin ? 0.0f : out[i]) - total_(v_t[i]);
         }
     }

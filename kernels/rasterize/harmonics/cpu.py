@@ -6,17 +6,13 @@ README.md §6 of the rasterizer holds the maths.
 
 import functools
 from pathlib import Path
-from typing import no_type_check
 
-import warp as wp
-
-from ...runtime.native import native
+from ...runtime.native import native, native_kernel
 from .shared import SHORTEST, Seen, Size
 
 CHUNK = 256  # Gaussians of a task; their gradient by a centre is one partial sum
 _UNROLLED = 96  # floats of a row up to which its loops are written out
 _HERE = Path(__file__).parent
-_OPTIONS = {"enable_backward": False}
 
 
 def _text(name: str, degree: int, channels: int, clamped: bool) -> str:
@@ -35,28 +31,12 @@ def _text(name: str, degree: int, channels: int, clamped: bool) -> str:
 @functools.cache
 def forward_kernel(degree: int, channels: int, clamped: bool):
     """Fills the colours, or the bare sums unless ``clamped``."""
-
-    @wp.func_native(_text("forward.inl", degree, channels, clamped))
-    def forward(piece: wp.int32, size: Size, seen: Seen): ...
-
-    @wp.kernel(module="unique", module_options=_OPTIONS)
-    @no_type_check
-    def harmonics(offset: wp.int32, size: Size, seen: Seen):
-        forward(offset + wp.tid(), size, seen)
-
-    return harmonics
+    text = _text("forward.inl", degree, channels, clamped)
+    return native_kernel("harmonics", text, {"size": Size}, {"seen": Seen})
 
 
 @functools.cache
 def backward_kernel(degree: int, channels: int, clamped: bool):
     """The gradient of ``forward_kernel``: from ``v_seen``'s colours to its other arrays."""
-
-    @wp.func_native(_text("backward.inl", degree, channels, clamped))
-    def backward(piece: wp.int32, size: Size, seen: Seen, v_seen: Seen): ...
-
-    @wp.kernel(module="unique", module_options=_OPTIONS)
-    @no_type_check
-    def harmonics_vjp(offset: wp.int32, size: Size, seen: Seen, v_seen: Seen):
-        backward(offset + wp.tid(), size, seen, v_seen)
-
-    return harmonics_vjp
+    text = _text("backward.inl", degree, channels, clamped)
+    return native_kernel("harmonics_vjp", text, {"size": Size, "seen": Seen}, {"v_seen": Seen})

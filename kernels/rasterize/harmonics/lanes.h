@@ -77,7 +77,7 @@ auto shown_ = [](F sum) -> F {
 };
 auto passes_ = [](F shown) -> I { return shown > (CLAMPED ? 0.0f : -3.4e38f); };
 const int chunks = (num + CHUNK - 1) / CHUNK;
-const int b = piece / chunks, begin = piece % chunks * CHUNK;
+const int b = task / chunks, begin = task % chunks * CHUNK;
 const int end = begin + CHUNK < num ? begin + CHUNK : num;
 // the means of the lanes from ``first`` on, of which ``live`` are Gaussians
 auto means_ = [&](int first, int live, F* mean) {

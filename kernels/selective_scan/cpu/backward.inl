@@ -1,122 +1,135 @@
 // Equation 1 again, keeping decay and state of every token, and the sums of equation 8; then
 // backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums begin anew in the first of the
 // BLOCKS lane groups that share them. What is not in ``needs`` is not computed.
+#include "task.h"
+each_(true, [&](const Place p) __attribute__((always_inline)) {
 #include "prepare.h"
 #include "states.h"
-write_soon_(du_out), write_soon_(ddelta_out), write_soon_(dz_out);
-F* const sums = (F*)sums_out.data;  // [2, states, TOKENS]
-const bool first = p.j % BLOCKS == 0;
-auto reverse = [&](auto kind, auto range, const auto& at,
-                   int needs) __attribute__((always_inline)) {
-    using State = decltype(kind);
-    constexpr int K = sizeof(at.a) / sizeof(F);
-    const int n = at.n;
-    const Column b = column_(b_in, n), c = column_(c_in, n);
-    F *const db = sums + n * TOKENS, *const dc = sums + (states + n) * TOKENS;
-    if (first)
-        for (int t = 0; t < K * TOKENS; ++t) {
-            if (needs & NEED_DB) db[t] = F{};
-            if (needs & NEED_DC) dc[t] = F{};
-        }
-    State hs[K], dhs[K];
-    F das[K];
+    F *const dh_of = row_(dh_out, p.state, p.k), *const da_of = row_(da_out, p.state, p.k);
+    const int chunk = p.t0 / TOKENS;
+    const F* const start = row_(starts_in, p.b, chunk, p.k);
+    write_soon_(du_out), write_soon_(ddelta_out), write_soon_(dz_out);
+    F* const sums = row_(sums_out, task);  // [2, states, TOKENS]
+    const bool first = p.j % BLOCKS == 0;
+    auto reverse = [&](auto kind, auto range, const auto& at,
+                       int needs) __attribute__((always_inline)) {
+        using State = decltype(kind);
+        constexpr int K = sizeof(at.a) / sizeof(F);
+        const int n = at.n;
+        const Column b = column_(b_in, n), c = column_(c_in, n);
+        F *const db = sums + n * TOKENS, *const dc = sums + (states + n) * TOKENS;
+        if (first)
+            for (int t = 0; t < K * TOKENS; ++t) {
+                if (needs & NEED_DB) db[t] = F{};
+                if (needs & NEED_DC) dc[t] = F{};
+            }
+        State hs[K], dhs[K];
+        F das[K];
 #pragma unroll
-    for (int k = 0; k < K; ++k) hs[k] = State(state_(starts_in, n + k), F{}, at.quiet[k]);
-    Fetch fetch = fetch_();
-    for (int t = 0; t < count; ++t) {
-        fetch.next();
-        const float *const bt = b.row(t), *const ct = c.row(t);
-        const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
-        F y = token[t].y;
+        for (int k = 0; k < K; ++k) hs[k] = State(start[n + k], F{}, at.quiet[k]);
+        Fetch fetch = fetch_();
+        for (int t = 0; t < count; ++t) {
+            fetch.next();
+            const float *const bt = b.row(t), *const ct = c.row(t);
+            const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
+            F y = token[t].y;
 #pragma unroll
-        for (int k = 0; k < K; ++k) {
-            State& h = hs[k];
-            Kept& own = kept[t * K + k];
-            F rise, g;
-            const F f = factors_(rate * at.a[k], range, rise, g);
-            own.m = State::one_of(f, rise, at.quiet[k]), own.h = h.value();
+            for (int k = 0; k < K; ++k) {
+                State& h = hs[k];
+                Kept& own = kept[t * K + k];
+                F rise, g;
+                const F f = factors_(rate * at.a[k], range, rise, g);
+                own.m = State::one_of(f, rise, at.quiet[k]), own.h = h.value();
 #if WEIGHTED
-            own.g = g;
+                own.g = g;
 #endif
-            h.step(f, rise, g * (du * bt[k]));
-            if (needs & NEED_DZ) y = fma_(h.value(), splat(ct[k]), y);
-            if (needs & NEED_DC) dc[k * TOKENS + t] = fma_(dy, h.value(), dc[k * TOKENS + t]);
+                h.step(f, rise, g * (du * bt[k]));
+                if (needs & NEED_DZ) y = fma_(h.value(), splat(ct[k]), y);
+                if (needs & NEED_DC) dc[k * TOKENS + t] = fma_(dy, h.value(), dc[k * TOKENS + t]);
+            }
+            token[t].y = y;
         }
-        token[t].y = y;
-    }
-    if (!(needs & NEED_DH)) return;
-#pragma unroll
-    for (int k = 0; k < K; ++k) {
-        dhs[k] = State(state_(dh_out, n + k), state_(dh_out, states + n + k), at.quiet[k]);
-        das[k] = F{};
-    }
-    fetch = fetch_();
-    for (int t = count - 1; t >= 0; --t) {
-        fetch.next();
-        const float *const bt = b.row(t), *const ct = c.row(t);
-        const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
-        F s = token[t].s, p = token[t].p;
+        if (!(needs & NEED_DH)) return;
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            State& dh = dhs[k];
-            const Kept& own = kept[t * K + k];
-            const float b_t = bt[k];
-            dh.add(dy, splat(ct[k]));
-            const F v = dh.value();
+            dhs[k] = State(dh_of[n + k], dh_of[states + n + k], at.quiet[k]);
+            das[k] = F{};
+        }
+        fetch = fetch_();
+        for (int t = count - 1; t >= 0; --t) {
+            fetch.next();
+            const float *const bt = b.row(t), *const ct = c.row(t);
+            const F rate = token[t].rate, du = token[t].du, dy = token[t].dy;
+            F s = token[t].s, p = token[t].p;
+#pragma unroll
+            for (int k = 0; k < K; ++k) {
+                State& dh = dhs[k];
+                const Kept& own = kept[t * K + k];
+                const float b_t = bt[k];
+                dh.add(dy, splat(ct[k]));
+                const F v = dh.value();
 #if WEIGHTED
-            const F g = own.g, gv = g * v;
+                const F g = own.g, gv = g * v;
 #else
             const F gv = v;
 #endif
-            if (needs & NEED_DB) db[k * TOKENS + t] = fma_(gv, du, db[k * TOKENS + t]);
-            s = fma_(gv, splat(b_t), s);
+                if (needs & NEED_DB) db[k * TOKENS + t] = fma_(gv, du, db[k * TOKENS + t]);
+                s = fma_(gv, splat(b_t), s);
 #if WEIGHTED
-            F df, dg;
-            slopes_(rate * at.a[k], State::decay_of(own.m, at.quiet[k]), g, df, dg);
-            const F q = v * (own.h * df + du * b_t * dg);
-            dh.decay(own.m);
+                F df, dg;
+                slopes_(rate * at.a[k], State::decay_of(own.m, at.quiet[k]), g, df, dg);
+                const F q = v * (own.h * df + du * b_t * dg);
+                dh.decay(own.m);
 #else
             dh.decay(own.m);
             const F q = dh.value() * own.h;
 #endif
-            p = fma_(q, at.a[k], p);
-            das[k] = fma_(q, rate, das[k]);
+                p = fma_(q, at.a[k], p);
+                das[k] = fma_(q, rate, das[k]);
+            }
+            token[t].s = s, token[t].p = p;
         }
-        token[t].s = s, token[t].p = p;
-    }
 #pragma unroll
-    for (int k = 0; k < K; ++k) {
-        dhs[k].keep(state_(dh_out, n + k), state_(dh_out, states + n + k));
-        state_(da_out, n + k) += das[k];
-    }
-};
-const int needs = p.sizes.needs, all = NEED_DZ | NEED_DC | NEED_DB | NEED_DH;
-visit_(needs == all, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
-    if constexpr (sizeof(at.a) / sizeof(F) == 1) reverse(kind, range, at, needs);
-    else reverse(kind, range, at, all);
-});
+        for (int k = 0; k < K; ++k) {
+            dhs[k].keep(dh_of[n + k], dh_of[states + n + k]);
+            da_of[n + k] += das[k];
+        }
+    };
+    const int needs = sizes.needs, all = NEED_DZ | NEED_DC | NEED_DB | NEED_DH;
+    visit_(needs == all, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
+        if constexpr (sizeof(at.a) / sizeof(F) == 1) reverse(kind, range, at, needs);
+        else reverse(kind, range, at, all);
+    });
 
-// Equations 9 and 11, dz, and the chunk's sums for dD and ddelta_bias. They are added by runs of
-// eight tokens, because equal terms would round to the same side at every token.
-const auto du = here_(du_out, p.width);
-const auto ddelta = here_(ddelta_out, p.width);
-const auto dz = here_(dz_out, p.width);
-const bool need_u = du_out.shape[1] > 0, need_delta = ddelta_out.shape[1] > 0;
-const bool need_z = dz_out.shape[1] > 0;
-F dskip = F{}, dbias = F{}, skips = F{}, biases = F{};
-for (int t = 0; t < count; ++t) {
-    const Token& own = token[t];
-    const F u = late[t].u;
-    skips = fma_(own.dy, u, skips);
-    const F d = fma_(u, own.s, own.p) * late[t].slope;
-    biases += d;
-    if ((t & 7) == 7 || t == count - 1) {
-        dskip += skips, dbias += biases;
-        skips = biases = F{};
+    // Equations 9 and 11, dz, and the chunk's sums for dD and ddelta_bias. They are added by runs
+    // of eight tokens, because equal terms would round to the same side at every token.
+    const auto du = here_(du_out, p.width);
+    const auto ddelta = here_(ddelta_out, p.width);
+    const auto dz = here_(dz_out, p.width);
+    const bool need_u = du_out.shape[1] > 0, need_delta = ddelta_out.shape[1] > 0;
+    const bool need_z = dz_out.shape[1] > 0;
+    F dskip = F{}, dbias = F{}, skips = F{}, biases = F{};
+    for (int t = 0; t < count; ++t) {
+        const Token& own = token[t];
+        const F u = late[t].u;
+        skips = fma_(own.dy, u, skips);
+        const F d = fma_(u, own.s, own.p) * late[t].slope;
+        biases += d;
+        if ((t & 7) == 7 || t == count - 1) {
+            dskip += skips, dbias += biases;
+            skips = biases = F{};
+        }
+        if (need_u) put_(du, t, fma_(own.rate * (1.0f / SCALE), own.s, skip * own.dy), stream);
+        if (need_delta) put_(ddelta, t, d, stream);
+        if (need_z) put_(dz, t, own.y * late[t].gate, stream);
     }
-    if (need_u) put_(du, t, fma_(own.rate * (1.0f / SCALE), own.s, skip * own.dy), stream);
-    if (need_delta) put_(ddelta, t, d, stream);
-    if (need_z) put_(dz, t, own.y * late[t].gate, stream);
-}
-F* const dchannel = (F*)dchannel_out.data;  // [2, blocks]
-dchannel[p.k] = dskip, dchannel[dchannel_out.shape[1] + p.k] = dbias;
+    *row_(dchannel_out, p.b, chunk, 0, p.k) = dskip;
+    *row_(dchannel_out, p.b, chunk, 1, p.k) = dbias;
+#include "sum_lanes.h"
+    if (p.j % BLOCKS == BLOCKS - 1 || p.j == p.blocks - 1) {
+        const size_t part = p.part + p.j / BLOCKS, size = (size_t)states * sizes.length;
+        if (sizes.needs & NEED_DB) sum_lanes_((const E*)sums, db_out.data + part * size);
+        if (sizes.needs & NEED_DC)
+            sum_lanes_((const E*)(sums + states * TOKENS), dc_out.data + part * size);
+    }
+});

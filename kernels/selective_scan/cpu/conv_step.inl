@@ -1,4 +1,5 @@
 // Sixteen channels of one token: each is convolved with the tokens seen, which are then shifted.
+const int b = task / blocks, d = task % blocks * 16, channels = blocks * 16;
 const float* x = (const float*)((const char*)x_in.data + (size_t)b * x_in.strides[0]) + d;
 const float* w = weight_in.data + (size_t)d * taps;
 float* seen = state_out.data + ((size_t)b * channels + d) * taps;
@@ -12,4 +13,4 @@ for (int c = 0; c < 16; ++c, seen += taps, w += taps) {
     seen[taps - 1] = x[c];
     sum[c] += old + x[c] * w[taps - 1];
 }
-*(F*)(x_out.data + (size_t)b * channels + d) = use_silu ? sum * sigmoid_(sum) : sum;
+*(F*)(y_out.data + (size_t)b * channels + d) = use_silu ? sum * sigmoid_(sum) : sum;

@@ -1,70 +1,78 @@
 // A strip of a lane group: equation 1 over its tokens, with equation 5 and the gate, or without
 // OUTPUT with the product of the decays.
+#include "task.h"
+each_(false, [&](const Place p) __attribute__((always_inline)) {
 #include "tokens.h"
 #include "states.h"
+    F* const h_of = row_(h_out, p.state, p.k);
+    F* const product_of = OUTPUT ? nullptr : row_(product_out, p.state, p.k);
+    if (starts_out.shape[1] > 0 && p.t0 % CHUNK == 0) {
+        F* const start = row_(starts_out, p.b, p.t0 / CHUNK, p.k);
+        for (int n = 0; n < states; ++n) start[n] = h_of[n];
+    }
 
-// what does not depend on the state n: step, input, D u and gate
-const bool use_z = OUTPUT && p.sizes.use_z;
-read_soon_(delta_in), read_soon_(u_in);
-if (use_z) read_soon_(z_in);
-if (OUTPUT) write_soon_(y_out);
-auto prepare = [&](int width, bool use_softplus, bool use_z) __attribute__((always_inline)) {
-    const auto us = here_(u_in, width);
-    const auto deltas = here_(delta_in, width);
-    const auto zs = here_(z_in, width);
-    for (int t = 0; t < count; ++t) {
-        F step = read_(deltas, t) + bias, gate = splat(1.0f);
-        if (use_softplus) step = softplus_(step);
-        if (use_z) {
-            const F z = read_(zs, t);
-            gate = z * sigmoid_(z);
+    // what does not depend on the state n: step, input, D u and gate
+    const bool use_z = OUTPUT && sizes.use_z;
+    read_soon_(delta_in), read_soon_(u_in);
+    if (use_z) read_soon_(z_in);
+    if (OUTPUT) write_soon_(y_out);
+    auto prepare = [&](int width, bool use_softplus, bool use_z) __attribute__((always_inline)) {
+        const auto us = here_(u_in, width);
+        const auto deltas = here_(delta_in, width);
+        const auto zs = here_(z_in, width);
+        for (int t = 0; t < count; ++t) {
+            F step = read_(deltas, t) + bias, gate = splat(1.0f);
+            if (use_softplus) step = softplus_(step);
+            if (use_z) {
+                const F z = read_(zs, t);
+                gate = z * sigmoid_(z);
+            }
+            const F u = read_(us, t), rate = step * SCALE;
+            top = wider_(top, rate);
+            token[t] = {rate, step * u, skip * u, gate};
         }
-        const F u = read_(us, t), rate = step * SCALE;
-        top = wider_(top, rate);
-        token[t] = {rate, step * u, skip * u, gate};
-    }
-};
-if (p.width >= 16 && use_softplus && use_z) prepare(16, true, true);  // usual: compiled by itself
-else prepare(p.width, use_softplus, use_z);
-tame = tame_(top * widest);
+    };
+    if (p.width >= 16 && use_softplus && use_z)
+        prepare(16, true, true);  // usual: compiled by itself
+    else prepare(p.width, use_softplus, use_z);
+    tame = tame_(top * widest);
 
-visit_(true, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
-    using State = decltype(kind);
-    constexpr int K = sizeof(at.a) / sizeof(F);
-    const int n = at.n;
-    const Column b = column_(b_in, n), c = column_(c_in, n);
-    State hs[K], products[K];
-#pragma unroll
-    for (int k = 0; k < K; ++k) {
-        hs[k] = State(state_(h_out, n + k), state_(h_out, states + n + k), at.quiet[k]);
-        if constexpr (!OUTPUT)
-            products[k] =
-                State(state_(product_out, n + k), state_(product_out, states + n + k), at.quiet[k]);
-    }
-    Fetch fetch = fetch_();
-    for (int t = 0; t < count; ++t) {
-        fetch.next();
-        const float *const bt = b.row(t), *const ct = c.row(t);
-        const F rate = token[t].rate, du = token[t].du;
-        F y = token[t].y;
+    visit_(true, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
+        using State = decltype(kind);
+        constexpr int K = sizeof(at.a) / sizeof(F);
+        const int n = at.n;
+        const Column b = column_(b_in, n), c = column_(c_in, n);
+        State hs[K], products[K];
 #pragma unroll
         for (int k = 0; k < K; ++k) {
-            F rise, g;
-            const F f = factors_(rate * at.a[k], range, rise, g);
-            hs[k].step(f, rise, g * (du * bt[k]));
-            if constexpr (OUTPUT) y = fma_(hs[k].value(), splat(ct[k]), y);
-            else products[k].decay(State::one_of(f, rise, at.quiet[k]));
+            hs[k] = State(h_of[n + k], h_of[states + n + k], at.quiet[k]);
+            if constexpr (!OUTPUT)
+                products[k] = State(product_of[n + k], product_of[states + n + k], at.quiet[k]);
         }
-        if constexpr (OUTPUT) token[t].y = y;
-    }
+        Fetch fetch = fetch_();
+        for (int t = 0; t < count; ++t) {
+            fetch.next();
+            const float *const bt = b.row(t), *const ct = c.row(t);
+            const F rate = token[t].rate, du = token[t].du;
+            F y = token[t].y;
 #pragma unroll
-    for (int k = 0; k < K; ++k) {
-        hs[k].keep(state_(h_out, n + k), state_(h_out, states + n + k));
-        if constexpr (!OUTPUT)
-            products[k].keep(state_(product_out, n + k), state_(product_out, states + n + k));
+            for (int k = 0; k < K; ++k) {
+                F rise, g;
+                const F f = factors_(rate * at.a[k], range, rise, g);
+                hs[k].step(f, rise, g * (du * bt[k]));
+                if constexpr (OUTPUT) y = fma_(hs[k].value(), splat(ct[k]), y);
+                else products[k].decay(State::one_of(f, rise, at.quiet[k]));
+            }
+            if constexpr (OUTPUT) token[t].y = y;
+        }
+#pragma unroll
+        for (int k = 0; k < K; ++k) {
+            hs[k].keep(h_of[n + k], h_of[states + n + k]);
+            if constexpr (!OUTPUT) products[k].keep(product_of[n + k], product_of[states + n + k]);
+        }
+    });
+    if constexpr (OUTPUT) {
+        const auto y = here_(y_out, p.width);
+        for (int t = 0; t < count; ++t) put_(y, t, token[t].y * token[t].gate, stream);
     }
 });
-if constexpr (OUTPUT) {
-    const auto y = here_(y_out, p.width);
-    for (int t = 0; t < count; ++t) put_(y, t, token[t].y * token[t].gate, stream);
-}

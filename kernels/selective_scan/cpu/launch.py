@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,14 +13,13 @@ from ...runtime.lanes import W, lanes
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.rows import streams
-from ...runtime.views import lane_contiguous, view
+from ...runtime.views import filled, lane_contiguous, view
 from ..problem import DISCRETIZATIONS, Scan
 from . import kernels
 from .kernels import BLOCKS, FEW, NEEDS, SPAN, Kind, Sizes, Tuning
 
 TUNING = Tuning()
 SEGMENT = 4  # chunks of a segment at least
-_FIELDS = tuple(Sizes.__annotations__)
 
 
 class Layout:
@@ -97,14 +95,6 @@ class Layout:
         return x.permute(0, 3, 1, 2)
 
 
-@functools.lru_cache(256)  # to fill one takes as long as a short scan
-def _struct(*values: int) -> Sizes:
-    sizes = Sizes()
-    for name, value in zip(_FIELDS, values, strict=True):
-        setattr(sizes, name, value)
-    return sizes
-
-
 def _pairs(states: Tensor) -> Tensor:
     """States as the kernels hold them, each with what it has rounded away, which is 0 at first."""
     return torch.constant_pad_nd(states, (0, 0, 0, states.shape[-2]))
@@ -156,7 +146,8 @@ class _Operands:
         """Launches a kernel of ``kernels.py``; ``results`` may go past the caches."""
         y = self.layout
         stream = int(y.group_width % W == 0 and streams(results))
-        sizes = _struct(
+        sizes = filled(
+            Sizes,
             *(y.length, y.segment, y.segments, y.batch, y.states, y.groups, y.group_width),
             *(y.group_blocks, y.span, *self.options, needs, stream),
         )

@@ -1,7 +1,7 @@
 // What does not depend on the state n in the gradient: as in forward.inl, with dy = dout silu(z),
 // and for later the slopes of the step and of the gate.
 #include "tokens.h"
-const bool use_z = p.sizes.use_z;
+const bool use_z = sizes.use_z;
 read_soon_(delta_in), read_soon_(u_in), read_soon_(dout_in);
 if (use_z) read_soon_(z_in);
 auto prepare = [&](int width, bool use_softplus, bool use_z) __attribute__((always_inline)) {

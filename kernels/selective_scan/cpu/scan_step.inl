@@ -1,4 +1,6 @@
 // Sixteen channels of one token; a state of sixteen numbers is one value.
+const int b = task / blocks, d = task % blocks * 16, channels = blocks * 16;
+#include "../../runtime/denormals.h"
 typedef float Eight __attribute__((vector_size(32)));
 typedef float Four __attribute__((vector_size(16)));
 auto sum_lanes_ = [](F v) -> float {

@@ -48,7 +48,6 @@ auto worth_ = [&](F x) -> int {
 };
 auto quiet_ = [&](F x) -> I { return within_(x, MODERATE) & -worth_(x); };  // the slow lanes
 
-auto state_ = [&](auto& array, int n) -> F& { return ((F*)array.data)[n]; };
 // B or C from entry n on, token by token
 struct Column {
     const char* at;

@@ -13,99 +13,37 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ...runtime.lanes import PRELUDE, W, flush_denormals, restore_denormals
+from ...runtime.lanes import PRELUDE, W
 from ...runtime.launch import parallel_launch
-from ...runtime.native import native
+from ...runtime.native import native, native_kernel
 
 _PLAIN = (Tensor, torch.nn.Parameter)  # no fake tensor, which has no memory
 _FEW = 64  # tasks of sixteen channels below which one thread is as fast as several
 
-_HERE, _HEAD = Path(__file__).parent, PRELUDE
+_HERE = Path(__file__).parent
 _MATRIX, _VECTOR = wp.array2d[wp.float32], wp.array[wp.float32]
-_STATES = wp.array3d[wp.float32]
+_RESULTS = {"state_out": wp.array3d[wp.float32], "y_out": _MATRIX}
 
-
-@wp.func_native(_HEAD + native(_HERE / "conv_step.inl"))
-def conv_leaf(
-    x_in: _MATRIX,
-    weight_in: _MATRIX,
-    bias_in: _VECTOR,
-    b: int,
-    d: int,
-    channels: int,
-    taps: int,
-    use_silu: int,
-    state_out: _STATES,
-    x_out: _MATRIX,
-): ...
-
-
-@wp.func_native(_HEAD + native(_HERE / "scan_step.inl"))
-def scan_leaf(
-    x_in: _MATRIX,
-    dt_in: _MATRIX,
-    a_in: _MATRIX,
-    b_in: _MATRIX,
-    c_in: _MATRIX,
-    skip_in: _VECTOR,
-    z_in: _MATRIX,
-    bias_in: _VECTOR,
-    b: int,
-    d: int,
-    channels: int,
-    states: int,
-    use_softplus: int,
-    logs: int,
-    state_out: _STATES,
-    y_out: _MATRIX,
-): ...
-
-
-@wp.kernel(enable_backward=False)
-def conv_kernel(
-    offset: wp.int32,
-    blocks: int,
-    taps: int,
-    use_silu: int,
-    x_in: _MATRIX,
-    weight_in: _MATRIX,
-    bias_in: _VECTOR,
-    state_out: _STATES,
-    x_out: _MATRIX,
-):
-    i = offset + wp.tid()
-    b = i // blocks
-    d = (i - b * blocks) * 16
-    conv_leaf(x_in, weight_in, bias_in, b, d, blocks * 16, taps, use_silu, state_out, x_out)
-
-
-@wp.kernel(enable_backward=False)
-def scan_kernel(
-    offset: wp.int32,
-    blocks: int,
-    states: int,
-    use_softplus: int,
-    logs: int,
-    x_in: _MATRIX,
-    dt_in: _MATRIX,
-    b_in: _MATRIX,
-    c_in: _MATRIX,
-    z_in: _MATRIX,
-    a_in: _MATRIX,
-    skip_in: _VECTOR,
-    bias_in: _VECTOR,
-    state_out: _STATES,
-    y_out: _MATRIX,
-):
-    i = offset + wp.tid()
-    b = i // blocks
-    d = (i - b * blocks) * 16
-    before = flush_denormals()
-    scan_leaf(
-        x_in, dt_in, a_in, b_in, c_in, skip_in, z_in, bias_in,
-        b, d, blocks * 16, states, use_softplus, logs, state_out, y_out,
-    )  # fmt: skip
-    restore_denormals(before)
+conv_kernel = native_kernel(
+    "conv_step",
+    PRELUDE + native(_HERE / "conv_step.inl"),
+    inputs={
+        **dict.fromkeys(("blocks", "taps", "use_silu"), int),
+        **dict.fromkeys(("x_in", "weight_in"), _MATRIX),
+        "bias_in": _VECTOR,
+    },
+    outputs=_RESULTS,
+)
+scan_kernel = native_kernel(
+    "scan_step",
+    PRELUDE + native(_HERE / "scan_step.inl"),
+    inputs={
+        **dict.fromkeys(("blocks", "states", "use_softplus", "logs"), int),
+        **dict.fromkeys(("x_in", "dt_in", "b_in", "c_in", "z_in", "a_in"), _MATRIX),
+        **dict.fromkeys(("skip_in", "bias_in"), _VECTOR),
+    },
+    outputs=_RESULTS,
+)
 
 
 def conv_step(

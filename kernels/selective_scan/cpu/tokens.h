@@ -26,10 +26,10 @@ alignas(64) Token token[TOKENS];
 F top = F{};  // the largest |rate| of each lane
 bool tame;    // whether all |rate A| are <= 125
 
-const int count = p.count, states = p.sizes.states;
-const bool use_softplus = p.sizes.use_softplus, stream = p.sizes.stream;
+const int count = p.count, states = sizes.states;
+const bool use_softplus = sizes.use_softplus, stream = sizes.stream;
 // Of the lane group: N rates A, then the largest |A|, D and the bias.
-const F* const channel = (const F*)channel_in.data;
+const F* const channel = row_(channel_in, p.k);
 const F widest = channel[states], skip = channel[states + 1], bias = channel[states + 2];
 auto here_ = [&](auto& array, int width) { return rows_(array, p.b, p.t0, p.d, width); };
 
