@@ -5,14 +5,12 @@ from typing import List
 import torch
 from torch import Tensor
 
-from ..runtime import rows as cpu_values
-from ..runtime import scalars as cuda_values
+from ..runtime.lanes import streams
 from ..runtime.launch import cuda_launch, parallel_launch
 from ..runtime.memory import empty
-from ..runtime.rows import streams
 from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
-from .kernels import CHUNK, STRIP, TAPS, backward_kernel, forward_kernel
+from .kernels import CHUNK, STRIP, TAPS, VALUES, backward_kernel, forward_kernel
 
 _FEW = 1 << 15  # elements that one thread has done before it could wake another
 
@@ -36,15 +34,15 @@ def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
 
 def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None):
     """Channels padded to whole values, views of the parameters, and the state's three rows."""
-    m = cpu_values if x.device.type == "cpu" else cuda_values
-    blocks = -(-x.shape[2] // m.WIDTH)
-    shape = (m.WIDTH,) if m.WIDTH > 1 else ()
-    w = _pack(weight, TAPS, blocks * m.WIDTH, x).view(TAPS, blocks, *shape)
-    v = _pack(bias, 1, blocks * m.WIDTH, x).view(blocks, *shape)
+    value, width = VALUES[x.device.type]
+    blocks = -(-x.shape[2] // width)
+    shape = (width,) if width > 1 else ()
+    w = _pack(weight, TAPS, blocks * width, x).view(TAPS, blocks, *shape)
+    v = _pack(bias, 1, blocks * width, x).view(blocks, *shape)
     rows = x.narrow(1, 0, 0) if state is None else lane_contiguous(state)
     if state is not None and (short := TAPS - 1 - state.shape[1]):
         rows = torch.constant_pad_nd(state, (0, 0, short, 0))
-    return blocks, view(w, m.VALUE), view(v, m.VALUE), rows
+    return blocks, view(w, value), view(v, value), rows
 
 
 def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list) -> None:
@@ -67,7 +65,7 @@ def conv(
     out = _empty(x, tuple(x.shape))
     kernel = forward_kernel(x.device.type, x.dtype)
     stream = int(x.device.type == "cpu" and streams([out]))
-    inputs = [strips, int(silu), stream, x, w, v, rows]
+    inputs = [int(silu), x, w, v, rows, stream]
     _launch(x, kernel, (x.shape[0] * strips, blocks), inputs, [out])
     return out
 
@@ -92,20 +90,20 @@ def _conv_backward(
     batch, length, channels = x.shape
     chunks = -(-length // CHUNK)
     x = lane_contiguous(x)
-    m = cpu_values if x.device.type == "cpu" else cuda_values
+    value, width = VALUES[x.device.type]
     blocks, w, v, rows = _operands(x, weight, bias, state)
     dx = _empty(x, (batch, length if need_x else 0, channels))
     dstate = x.new_zeros(batch, TAPS - 1 if need_state else 0, channels)
     dweight = torch.empty(
-        batch * chunks, 5 if need_weight or need_bias else 0, blocks * m.WIDTH, device=x.device
+        batch * chunks, 5 if need_weight or need_bias else 0, blocks * width, device=x.device
     )
-    shaped = dweight.view(*dweight.shape[:2], blocks, m.WIDTH) if m.WIDTH > 1 else dweight
+    shaped = dweight.view(*dweight.shape[:2], blocks, width) if width > 1 else dweight
     _launch(
         x,
         backward_kernel(x.device.type, x.dtype),
         (batch * chunks, blocks),
-        [chunks, int(silu), x, w, v, rows, lane_contiguous(dout)],
-        [dx, dstate, view(shaped, m.VALUE)],
+        [int(silu), x, w, v, rows, lane_contiguous(dout)],
+        [dx, dstate, view(shaped, value)],
     )
     grads = [dx] if need_x else []
     total = dweight.sum(0)[:, :channels]  # without rows if neither gradient is needed

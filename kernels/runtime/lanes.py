@@ -1,19 +1,19 @@
-"""Native leaves of the CPU kernels: sixteen adjacent channels as one SIMD value.
+"""Sixteen adjacent channels as one SIMD value: the C++ of the CPU kernels of ``[B, L, D]``.
 
-A leaf is a little C++ with the compiler's vector types, which become AVX-512, AVX2 or NEON
-instructions. The loops around them, and all that is not arithmetic on lanes, are Warp kernels.
+It has the compiler's vector types, which become AVX-512, AVX2 or NEON instructions.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 import warp as wp
+from torch import Tensor
 
 from .native import native
 
 W = 16  # channels of a lane group: one cache line of float32
 lanes = wp.types.vector(W, wp.float32)
-LANES = "wp::vec_t<16, float>"
 WARP_DTYPES = {
     torch.float32: wp.float32,
     torch.float16: wp.float16,
@@ -21,7 +21,6 @@ WARP_DTYPES = {
 }
 
 _HERE = Path(__file__).parent
-VECTORS = native(_HERE / "vectors.h")
 
 
 def prelude(degree: int, table: bool = False) -> str:
@@ -35,17 +34,22 @@ def prelude(degree: int, table: bool = False) -> str:
 
 
 PRELUDE = prelude(5)
+# C++ text of ``rows_``, ``read_``, ``write_`` and ``put_`` of a tensor, which follows that.
+ROWS = native(_HERE / "rows.h")
+
+_STREAMED = 32 << 20  # bytes: no cache of a few cores holds a result of this size
 
 
-@wp.func_native(PRELUDE + f"{LANES} r; *(F*)&r = sigmoid_(*(const F*)&x); return r;")
-def sigmoid(x: lanes) -> lanes: ...
+def streams(results: Sequence[Tensor]) -> bool:
+    """Whether results ``[B, L, D]`` may go past the caches: they are too large to be kept there.
 
-
-@wp.func_native(VECTORS + f"{LANES} r; *(F*)&r = *(const F*)&a * *(const F*)&b; return r;")
-def times(a: lanes, b: lanes) -> lanes: ...
-
-
-@wp.func_native(
-    PRELUDE + f"{LANES} r; *(F*)&r = fma_(*(const F*)&a, *(const F*)&b, *(const F*)&c); return r;"
-)
-def fma(a: lanes, b: lanes, c: lanes) -> lanes: ...
+    Of float32 each, dense, with whole cache lines; results without elements do not count.
+    """
+    written = [x for x in results if x.numel()]
+    return bool(written) and all(
+        x.dtype == torch.float32
+        and x.shape[-1] % W == 0
+        and x.data_ptr() % 64 == 0
+        and 4 * x.numel() >= _STREAMED
+        for x in written
+    )

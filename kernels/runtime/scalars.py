@@ -6,11 +6,26 @@ Each is plain Warp, or a line of C++ that also compiles for a CPU, where the tes
 import torch
 import warp as wp
 
-from .lanes import WARP_DTYPES
-
-VALUE = wp.float32
-WIDTH = 1
 LOG2E = 1.4426950408889634
+
+# A type, an integer of its bits, and the float that such an integer means.
+BITS = {
+    torch.float32: {
+        "ELEMENT": "float",
+        "WORD": "unsigned",
+        "WIDEN": "float f; memcpy(&f, &bits, 4); return f;",
+    },
+    torch.float16: {
+        "ELEMENT": "wp::float16",
+        "WORD": "unsigned short",
+        "WIDEN": "wp::half h; h.u = (unsigned short)bits; return wp::half_to_float(h);",
+    },
+    torch.bfloat16: {
+        "ELEMENT": "wp::bfloat16",
+        "WORD": "unsigned short",
+        "WIDEN": "unsigned v = bits << 16; float f; memcpy(&f, &v, 4); return f;",
+    },
+}
 
 # Each of the two is one instruction on the special function unit, with a relative error of about
 # 2^-22. Denormals count as 0.
@@ -80,30 +95,3 @@ def softplus(x: float) -> float:
 def softplus_slope(x: float) -> float:
     e = exp2(-wp.static(LOG2E) * wp.abs(x))
     return wp.where(x < 0.0, e, 1.0) * reciprocal(1.0 + e)
-
-
-@wp.func
-def times(a: float, b: float) -> float:
-    return a * b
-
-
-@wp.func
-def fma(a: float, b: float, c: float) -> float:
-    return a * b + c
-
-
-def _accessors(dtype: torch.dtype):
-    scalar = WARP_DTYPES[dtype]
-
-    @wp.func
-    def load(x_in: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int) -> float:
-        return float(x_in[b, t, d])
-
-    @wp.func
-    def store(x_out: wp.array3d(dtype=scalar), b: int, t: int, d: int, width: int, v: float):
-        x_out[b, t, d] = scalar(v)
-
-    return load, store
-
-
-ACCESSORS = {dtype: _accessors(dtype) for dtype in WARP_DTYPES}

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from ...runtime.lanes import WARP_DTYPES, lanes, prelude
+from ...runtime.lanes import ROWS, WARP_DTYPES, lanes, prelude
 from ...runtime.native import native, native_kernel
-from ...runtime.rows import ROWS
 from ...runtime.views import struct
 from ..problem import DISCRETIZATIONS, macros
 

@@ -9,10 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...runtime.lanes import W, lanes
+from ...runtime.lanes import W, lanes, streams
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
-from ...runtime.rows import streams
 from ...runtime.views import filled, lane_contiguous, view
 from ..problem import DISCRETIZATIONS, Scan
 from . import kernels

@@ -17,7 +17,7 @@ import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
 from ...runtime.native import native
-from ...runtime.scalars import EXP2, RECIPROCAL, WIDE, softplus
+from ...runtime.scalars import BITS, EXP2, RECIPROCAL, WIDE, softplus
 from ...runtime.views import struct
 from ..problem import macros
 
@@ -87,26 +87,6 @@ def block_shape(block: int, channels: int, states: int, total: int) -> BlockShap
     states = min(states, width)
     lanes = width // states
     return BlockShape(block, min(channels, lanes), states, lanes, -(-total // width))
-
-
-# A type, an integer of its bits, and the float that such an integer means.
-BITS = {
-    torch.float32: {
-        "ELEMENT": "float",
-        "WORD": "unsigned",
-        "WIDEN": "float f; memcpy(&f, &bits, 4); return f;",
-    },
-    torch.float16: {
-        "ELEMENT": "wp::float16",
-        "WORD": "unsigned short",
-        "WIDEN": "wp::half h; h.u = (unsigned short)bits; return wp::half_to_float(h);",
-    },
-    torch.bfloat16: {
-        "ELEMENT": "wp::bfloat16",
-        "WORD": "unsigned short",
-        "WIDEN": "unsigned v = bits << 16; float f; memcpy(&f, &v, 4); return f;",
-    },
-}
 
 
 @functools.cache

@@ -11,7 +11,8 @@ import torch
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from .blocks import BITS, BlockShape, Place, arena_io
+from ...runtime.scalars import BITS
+from .blocks import BlockShape, Place, arena_io
 
 FOUR = 4  # tokens of a vector
 

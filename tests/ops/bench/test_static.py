@@ -111,6 +111,9 @@ def kernels_of_the_sources():
                 decorators = " ".join(map(ast.unparse, node.decorator_list))
                 if "wp.kernel" in decorators:
                     names.add(node.name.lstrip("_"))
+            elif isinstance(node, ast.Call) and ast.unparse(node.func) == "native_kernel":
+                if isinstance(name := node.args[0], ast.Constant):
+                    names.add(name.value)
     return names
 
 

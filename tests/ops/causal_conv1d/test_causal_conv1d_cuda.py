@@ -17,17 +17,11 @@ def test_convolution_kernels(monkeypatch, use_silu):
     exact = leaves(inputs, torch.float64)
     activation = "silu" if use_silu else None
     out, _ = causal_conv1d_reference(**exact, activation=activation)
-    as_cuda = kernels._values
-    monkeypatch.setattr(kernels, "_values", lambda _, io: as_cuda("cuda", io))
-    monkeypatch.setattr(ops, "cpu_values", ops.cuda_values)
-    caches = (kernels.forward_kernel, kernels.backward_kernel)
-    for cached in caches:
-        cached.cache_clear()
-    try:
-        mine = leaves(inputs)
-        got = causal_conv1d(**mine, activation=activation)
-        assert_gradients((mine, [got]), (exact, [out]), 2e-6)
-    finally:
-        for cached in caches:
-            cached.cache_clear()
+    monkeypatch.setattr(ops, "VALUES", {"cpu": kernels.VALUES["cuda"]})
+    for name in ("forward_kernel", "backward_kernel"):
+        made = getattr(kernels, name)
+        monkeypatch.setattr(ops, name, lambda _, io, made=made: made("cuda", io))
+    mine = leaves(inputs)
+    got = causal_conv1d(**mine, activation=activation)
+    assert_gradients((mine, [got]), (exact, [out]), 2e-6)
     assert_rel_rms(got, out, 2e-7, "out")

@@ -1,0 +1,37 @@
+// Equation 2 for a chunk of tokens. dx of token t needs the gradients g of t to t + 3: the loop
+// runs three tokens behind.
+#include "window.h"
+const auto douts = rows_(dout_in, b, 0, d, width), dxs = rows_(dx_out, b, 0, d, width);
+const auto dstates = rows_(dstate_out, b, 0, d, width);
+const F one = F{} + 1.0f;
+F g0 = F{}, g1 = F{}, g2 = F{}, sums[5] = {}, run[5] = {};
+auto complete = [&] {
+    for (int i = 0; i < 5; ++i) sums[i] = sums[i] + run[i], run[i] = F{};
+};
+for (int t = t0; t < end + 3; ++t) {
+    F x3 = x2, g3 = F{};
+    if (t < length) {
+        x3 = read_(xs, t), g3 = read_(douts, t);
+        if (use_silu) {
+            const F y = fma_(w0, x0, fma_(w1, x1, fma_(w2, x2, fma_(w3, x3, bias))));
+            const F s = sigmoid_(y);
+            g3 = g3 * fma_(y * s, one - s, s);
+        }
+        if (t < end) {
+            run[0] = fma_(g3, x0, run[0]), run[1] = fma_(g3, x1, run[1]);
+            run[2] = fma_(g3, x2, run[2]), run[3] = fma_(g3, x3, run[3]);
+            run[4] = run[4] + g3;
+        }
+    }
+    const F dx = fma_(w3, g0, fma_(w2, g1, fma_(w1, g2, w0 * g3)));
+    if (t - 3 >= t0) {
+        if (dx_out.shape[1] > 0) write_(dxs, t - 3, dx);
+    } else if (t < 3 && dstate_out.shape[1] > 0) write_(dstates, t, dx);
+    x0 = x1, x1 = x2, x2 = x3;
+    g0 = g1, g1 = g2, g2 = g3;
+    if (RUN > 0 && (t - t0) % RUN == RUN - 1) complete();
+}
+complete();
+F* const dweight = (F*)dweight_out.data + (size_t)task * 5 * taps + k;
+if (dweight_out.shape[1] > 0)
+    for (int i = 0; i < 5; ++i) dweight[i * taps] = sums[i];

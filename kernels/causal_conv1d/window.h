@@ -1,0 +1,35 @@
+// What both kernels begin with. A value F is WIDTH channels, from the head of kernels.py: sixteen
+// lanes on a CPU, one number on CUDA.
+#if WIDTH == 1
+typedef float F;
+auto fma_ = [](F a, F b, F c) -> F { return a * b + c; };
+auto sigmoid_ = [&](F x) -> F { return reciprocal_(1.0f + exp2_(-1.4426950408889634f * x)); };
+auto rows_ = [](auto& array, int b, int t0, int d, int) {
+    typedef decltype(array.data + 0) Row;
+    struct Rows {
+        Row first;
+        size_t step;  // bytes
+        Row row(int t) const { return (Row)((char*)first + t * step); }
+    };
+    char* const at = (char*)array.data + (size_t)b * array.strides[0] + t0 * array.strides[1];
+    return Rows{(Row)at + d, (size_t)array.strides[1]};
+};
+auto read_ = [](const auto& rows, int t) -> F { return (F)*rows.row(t); };
+auto write_ = [](const auto& rows, int t, F v) { *rows.row(t) = (ELEMENT)v; };
+auto put_ = [&](const auto& rows, int t, F v, bool) { write_(rows, t, v); };
+#endif
+const int pieces = (x_in.shape[1] + PIECE - 1) / PIECE, b = task / pieces;
+const int t0 = task % pieces * PIECE, length = x_in.shape[1];
+const int end = t0 + PIECE < length ? t0 + PIECE : length;
+const int d = k * WIDTH, width = x_in.shape[2] - d < WIDTH ? x_in.shape[2] - d : WIDTH;
+const auto xs = rows_(x_in, b, 0, d, width), before = rows_(state_in, b, 0, d, width);
+const F* const w = (const F*)weight_in.data + k;
+const size_t taps = weight_in.shape[1];
+const F w0 = w[0], w1 = w[taps], w2 = w[2 * taps], w3 = w[3 * taps];
+const F bias = ((const F*)bias_in.data)[k];
+F x0 = F{}, x1 = F{}, x2 = F{};  // the three tokens before
+for (int t = t0 - 3; t < t0; ++t) {
+    x0 = x1, x1 = x2;
+    if (t >= 0) x2 = read_(xs, t);
+    else if (state_in.shape[1] > 0) x2 = read_(before, t + 3);
+}
