@@ -9,11 +9,9 @@ from functools import partial
 from typing import List
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from ..runtime.start import without_compiler
-from ..runtime.views import vectors
 from .constants import BLOCKS
 from .cpu import bin as bin_cpu
 from .cpu import composite as composite_cpu
@@ -168,9 +166,8 @@ def bin_op(
     if max(images * tiling.count, depths.numel()) >= MAX_PAIRS:
         raise ValueError(f"{images} views of {tiling.count} tiles, {num} Gaussians: over 2^31")
     grid = make_grid(tiling, num=num, alpha_min=alpha_min, skip=skip)
-    tensors, kinds = (means2d, conics, view_opacities, extents), (wp.vec2, wp.vec3, None, wp.vec2)
-    inputs = list(map(vectors, tensors, kinds))
-    b = _bin_views(depths.device, exact)(grid, depths, inputs, _refuse_too_many)
+    splats = means2d, conics, depths, view_opacities, extents
+    b = _bin_views(depths.device, exact)(grid, splats, _refuse_too_many)
     return b.order, b.offsets, b.pairs, b.rows, b.starts, b.box_pairs, b.count
 
 

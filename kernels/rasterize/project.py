@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..runtime.launch import launch
 from ..runtime.memory import empty
-from ..runtime.views import Packed, filled, struct, vectors
+from ..runtime.views import Packed, filled, struct
 from .constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 
 wp.set_module_options({"enable_backward": False})
@@ -97,11 +97,6 @@ class Lens:
     antialiased: int
     skip_unused: int
     rounded: int
-
-
-_GAUSSIANS = wp.vec3, wp.vec4, wp.vec3, wp.float32  # means, quats, scales, opacities
-_CAMERAS = wp.mat44, wp.mat33
-_SPLATS = wp.vec2, wp.vec3, wp.float32, wp.float32, wp.vec2, wp.int32  # as ``Projected``
 
 
 @struct
@@ -219,9 +214,9 @@ def _project(
     offset: wp.int32,
     views: wp.int32,
     num: wp.int32,
-    colors_per_view: wp.int32,
     lens: Lens,
     scene_in: Scene,
+    colors_per_view: wp.int32,
     colors_in: wp.array2d[wp.float32],
     splats_out: Splats,
 ):
@@ -478,24 +473,9 @@ def empty_on(device: torch.device, shape: Sequence[int], dtype: torch.dtype) -> 
     return torch.empty(*shape, dtype=dtype, device=device)
 
 
-def project_on_threads(
-    images: int, views: int, num: int, colors_per_view: int, lens: Lens, inputs: list, outputs: list
-) -> None:
-    """Runs the projection of B objects into V views each, a thread for each (view, Gaussian).
-
-    Args:
-        images: I = B * V.
-        views: of an object, V.
-        num: Gaussians of an object, at least 1.
-        colors_per_view: 1 if each view has colours of its own, otherwise 0.
-        lens: from ``make_lens``.
-        inputs: flat views of the inputs of ``project_forward``, in their order.
-        outputs: flat views of what it returns.
-    """
-    *gaussians, colors, viewmats, Ks = inputs
-    scene = Packed(Scene, *gaussians, viewmats, Ks)
-    inputs = [views, num, colors_per_view, lens, scene, colors]
-    launch(_project, images * num, inputs, [Packed(Splats, *outputs)], colors.device)
+def project_on_threads(images: int, num: int, arguments: list, device: torch.device) -> None:
+    """Runs the projection of ``num`` Gaussians into so many views, a thread for each of a view."""
+    launch(_project, images * num, arguments, [], device)
 
 
 def project_forward(
@@ -517,10 +497,9 @@ def project_forward(
         status=empty_on(device, [batch, views, num], torch.int32),
     )
     if projected.status.numel():
-        cameras = map(vectors, (viewmats, Ks), _CAMERAS)
-        flat = [*map(vectors, gaussians, _GAUSSIANS), colors.view(-1, colors.shape[-1]), *cameras]
-        outputs = list(map(vectors, projected, _SPLATS))
-        run(batch * views, views, num, int(colors.dim() == 4), lens, flat, outputs)
+        scene = Packed(Scene, *gaussians, viewmats, Ks)
+        arguments = [views, num, lens, scene, int(colors.dim() == 4), colors.flatten(0, -2)]
+        run(batch * views, num, [*arguments, Packed(Splats, *projected)], device)
     return projected
 
 
@@ -558,21 +537,17 @@ def project_backward(
     ]
     v_viewmats = means.new_zeros(batch * views, num, 12) if wanted[4] else None
     if status.numel():
-        flat = list(map(vectors, gaussians, _GAUSSIANS))
-        cameras = list(map(vectors, (viewmats, Ks), _CAMERAS))
-        kept = vectors(conics, wp.vec3), status.view(-1)
-        v_splats, outputs = map(vectors, cotangents, _SPLATS), map(vectors, grads, _GAUSSIANS)
+        given = [
+            Packed(Scene, *gaussians, viewmats, Ks),
+            Packed(Splats, None, conics, None, None, None, status),
+            Packed(Splats, *cotangents, None, None),
+            Packed(Scene, *grads, None, None),
+        ]
         if on_lanes and v_viewmats is None and not lens.antialiased:
-            given = [*flat[:3], *cameras, *kept, *v_splats]
-            on_lanes(batch, views, num, lens, given, list(outputs))
+            on_lanes(batch, num, [views, num, lens, *given])
         else:
-            given = [
-                Packed(Scene, *flat, *cameras),
-                Packed(Splats, None, kept[0], None, None, None, kept[1]),
-                Packed(Splats, *v_splats, None, None),
-            ]
-            results = [Packed(Scene, *outputs, None, None), v_viewmats]
-            launch(_project_vjp, batch * num, [views, num, lens, *given], results, means.device)
+            arguments = [views, num, lens, *given, v_viewmats]
+            launch(_project_vjp, batch * num, arguments, [], means.device)
     if v_viewmats is not None:
         v_viewmats = v_viewmats.sum(1).view(batch, views, 3, 4)
         v_viewmats = torch.nn.functional.pad(v_viewmats, (0, 0, 0, 1))

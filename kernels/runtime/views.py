@@ -139,13 +139,6 @@ def lane_contiguous(tensor: Tensor) -> Tensor:
     return tensor if tensor.stride(-1) == 1 or tensor.shape[-1] == 1 else tensor.contiguous()
 
 
-def vectors(tensor: Tensor | None, dtype):
-    """A contiguous tensor as a flat Warp array of numbers, vectors or matrices; None stays None."""
-    if tensor is None:
-        return None
-    return view(tensor.view(-1, *getattr(dtype, "_shape_", ())), dtype)
-
-
 @overload
 def tokens_first(x: Tensor, name: str) -> Tensor: ...
 @overload

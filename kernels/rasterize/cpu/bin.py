@@ -8,7 +8,7 @@ for memory: those go as they lie, and each list, which fits the nearest cache, i
 README.md §2 holds the maths.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,24 +81,22 @@ def _sort_lists(count: int, longest: int, splats: Packed, staged: Any, lists: Pa
     parallel_launch(_sort, workers, [count, splats, staged, counter, workspace, lists])
 
 
-def bin_views(grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None]) -> Bins:
+def bin_views(grid: Grid, tensors: Sequence[Tensor], check: Callable[[int], None]) -> Bins:
     """Makes the lists; ``check`` is given the number of intersections before they are made.
 
     Args:
         grid: from ``make_grid``.
-        depths: ``[I, N]``, not negative.
-        inputs: flat views of means2d, conics, opacities and extents.
+        tensors: means2d, conics, depths (not negative), opacities and extents, ``[I, N, ..]``.
         check: raises if there are too many.
     """
-    images, num = depths.shape
-    means2d, conics, opacities, extents = inputs
+    images, num = tensors[2].shape
     tiles, most = grid.tiles_x * grid.tiles_y, _PARTS_PER_THREAD * torch.get_num_threads()
     parts = 1 if images >= most else most
     tasks, groups, by_depth = images * parts, images * -(-num // 16), num < MANY
     order, offsets = (empty([images * num + i], torch.int32) for i in range(2))
     starts = order.new_empty(images * tiles + 1)
     count, box_count = (torch.empty((), dtype=torch.int64) for _ in range(2))
-    splats = Packed(Splats, means2d, conics, depths, opacities, extents, None)
+    splats = Packed(Splats, *tensors, None)
     work = Packed(
         Work,
         empty([groups * 16], torch.int32),

@@ -10,7 +10,6 @@ import warp as wp
 
 from ...runtime.launch import parallel_launch
 from ...runtime.native import native, native_kernel
-from ...runtime.views import Packed
 from ..constants import COMPENSATION_MIN, FRUSTUM_MARGIN
 from ..project import STATUS_NAMES, Lens, Scene, Splats
 
@@ -47,33 +46,11 @@ def _launch(kernel: Any, rows: int, num: int, arguments: list) -> None:
     parallel_launch(kernel, tasks, arguments, pieces=pieces)
 
 
-def project_on_lanes(
-    images: int, views: int, num: int, colors_per_view: int, lens: Lens, inputs: list, outputs: list
-) -> None:
+def project_on_lanes(images: int, num: int, arguments: list, device: torch.device) -> None:
     """Does what ``project_on_threads`` does, with the same arguments, on the lanes of a CPU."""
-    *gaussians, colors, viewmats, Ks = inputs
-    scene, splats = Packed(Scene, *gaussians, viewmats, Ks), Packed(Splats, *outputs)
-    arguments = [views, num, lens, scene, colors_per_view, colors, splats]
     _launch(_project, images, num, arguments)
 
 
-def vjp_on_lanes(batch: int, views: int, num: int, lens: Lens, inputs: list, outputs: list) -> None:
-    """Runs the gradient for B objects.
-
-    Args:
-        batch: objects, B.
-        views: of an object, at least 1.
-        num: Gaussians of an object, at least 1.
-        lens: from ``make_lens``; not of antialiasing.
-        inputs: flat views of means, quats, scales, viewmats, Ks, conics, status, and of the
-            gradients of means2d, conics, depths and opacities.
-        outputs: of the gradients of means, quats, scales and opacities.
-    """
-    means, quats, scales, viewmats, Ks, conics, status, *v_splats = inputs
-    arguments = [
-        Packed(Scene, means, quats, scales, None, viewmats, Ks),
-        Packed(Splats, None, conics, None, None, None, status),
-        Packed(Splats, *v_splats, None, None),
-        Packed(Scene, *outputs, None, None),
-    ]
-    _launch(_project_vjp, batch, num, [views, num, lens, *arguments])
+def vjp_on_lanes(batch: int, num: int, arguments: list) -> None:
+    """Runs the gradient for B objects; not by viewmats, and not of antialiasing."""
+    _launch(_project_vjp, batch, num, arguments)

@@ -5,7 +5,7 @@ over sorts behind the last tile. Where the pairs have no room, none is written a
 empty: then ``composite_unlisted`` makes the pictures.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import no_type_check
 
 import torch
@@ -79,17 +79,17 @@ def _emit(
 
 
 def bin_views(
-    grid: Grid, depths: Tensor, inputs: list, check: Callable[[int], None], exact: bool = False
+    grid: Grid, tensors: Sequence[Tensor], check: Callable[[int], None], exact: bool = False
 ) -> Bins:
     """As ``bin_views`` of the CPU, but the lists may have room for more pairs than there are.
 
     Args:
         grid: from ``make_grid``.
-        depths: ``[I, N]``, not negative.
-        inputs: flat views of means2d, conics, opacities and extents.
+        tensors: means2d, conics, depths (not negative), opacities and extents, ``[I, N, ..]``.
         check: raises if there are too many; it is called only where the number is read back.
         exact: whether to read the number of pairs back and to make the lists as long.
     """
+    depths = tensors[2]
     device, (images, num) = depths.device, depths.shape
     # stable: equal depths stay in the order of the Gaussians
     order = torch.argsort(depths, dim=1, stable=True)
@@ -97,8 +97,7 @@ def bin_views(
     order = order.view(-1).int()
     counts = torch.empty_like(order)
     box_counts = torch.empty_like(order, dtype=torch.int64)
-    means2d, conics, opacities, extents = inputs
-    splats = Packed(Splats, means2d, conics, None, opacities, extents, None)
+    splats = Packed(Splats, *tensors, None)
     launch(_count, order.numel(), [grid, splats, order], [counts, box_counts], device)
     offsets = torch.nn.functional.pad(counts.cumsum(0, dtype=torch.int64), (1, 0))
     count, offsets = offsets[-1].clone(), offsets.int()
