@@ -11,7 +11,7 @@ from torch import Tensor
 from .checks import check_inputs
 from .constants import ALPHA_MAX, ALPHA_MIN, EPS2D, T_MIN, TILE
 from .harmonics import colors_from_harmonics
-from .meta import Drawn, Meta
+from .meta import Call, Meta
 from .ops import bin_op, composite, project
 from .project import LensOptions, Projected
 from .skip import Skip
@@ -126,7 +126,7 @@ def rasterization(
     renders, alphas, *walk = composite(*drawn, list(bins), list(size), list(limits), skipped)
     renders = _finish(render_mode, renders, alphas, backgrounds)
     renders, alphas = (x.view(*lead, views, *x.shape[1:]) for x in (renders, alphas))
-    meta = Meta(Drawn(splats, size, limits), bins, Walk(*walk), status, skipped)
+    meta = Meta(Call(splats, size, limits), bins, Walk(*walk), status, skipped)
     # under gsplat's names
     meta.update(means2d=projected.means2d, conics=projected.conics, depths=projected.depths)
     meta.update(opacities=projected.view_opacities, radii=projected.extents.ceil().int())

@@ -11,7 +11,7 @@ from .project import STATUS_NAMES
 from .tiles import Bins, Limits, Size, Tiling, Walk
 
 
-class Drawn(NamedTuple):
+class Call(NamedTuple):
     """What was drawn, and how: enough to make the lists anew.
 
     Attributes:
@@ -59,9 +59,7 @@ class Meta(dict):
         bins: the lists themselves.
     """
 
-    def __init__(
-        self, drawn: Drawn, bins: Bins, walk: Walk, status: Tensor, skipped: Tensor | None
-    ):
+    def __init__(self, drawn: Call, bins: Bins, walk: Walk, status: Tensor, skipped: Tensor | None):
         super().__init__()
         self.tiling, self.bins, self._drawn = drawn.tiling(), bins, drawn
         self._walk, self._status, self._skipped = walk, status, skipped

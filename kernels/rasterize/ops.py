@@ -28,7 +28,7 @@ from .project import (
     project_on_threads,
 )
 from .skip import UNASKED
-from .tiles import Bins, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
+from .tiles import Bins, Drawn, Limits, Picture, Size, Tiling, Walk, make_grid, make_picture
 
 _OP = "gamba_warp::rasterize_"
 MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
@@ -210,9 +210,9 @@ def composite(
     ``Bins``, ``Size`` and ``Limits`` hold. Backward counts the tiles that it skips into
     ``skipped``, int64 without dimensions.
     """
-    splats = means2d, conics, view_opacities, colors
-    given = Bins(*bins), _picture(means2d, size, limits)
-    renders, alphas, w = _compositor(means2d.device).composite_forward(*splats, *given)
+    splats = Drawn(means2d, conics, view_opacities, colors)
+    given = splats, Bins(*bins), _picture(means2d, size, limits)
+    renders, alphas, w = _compositor(means2d.device).composite_forward(*given)
     return renders, alphas, w.transmittances, w.stops, w.blocks, w.walked, w.blocks_walked
 
 
@@ -247,20 +247,9 @@ def _composite_vjp(
     v_pixels: List[Tensor],
     geometry: bool,
 ) -> List[Tensor]:
-    means2d, conics, view_opacities, colors = splats
-    v_renders, v_alphas = v_pixels
-    grads, skipped = _compositor(means2d.device).composite_backward(
-        means2d,
-        conics,
-        view_opacities,
-        colors,
-        Bins(*bins),
-        _picture(means2d, size, limits),
-        Walk(*walk),
-        v_renders,
-        v_alphas,
-        geometry,
-    )
+    given = Drawn(*splats), Bins(*bins), _picture(splats[0], size, limits), Walk(*walk)
+    backward = _compositor(splats[0].device).composite_backward
+    grads, skipped = backward(*given, v_pixels, geometry)
     return [skipped, *(g for g in grads if g is not None)]
 
 

@@ -1,13 +1,13 @@
 """Tiles: how a picture is cut into them, their lists, and which of them an ellipse touches.
 
 In this order: ``Tiling``, the cut; ``Bins`` and ``Walk``, what binning and compositing leave to the
-steps after them; ``PairGradients``, what the compositor's gradient gives; ``Grid`` and ``Picture``,
+steps after them; ``Drawn``, what is composited; ``Grid`` and ``Picture``,
 the scalars that the launches of these two steps take; the test of an ellipse, row by row of tiles,
 by exact intervals of columns. README.md §2 proves the test. Counting and writing call the same
 functions.
 """
 
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import warp as wp
 from torch import Tensor
@@ -127,19 +127,20 @@ class Pixels:
     alphas: wp.array2d[wp.float32]
 
 
-class PairGradients(NamedTuple):
-    """Gradients of the compositor's inputs: of each (view, Gaussian), the sum over its pairs.
+class Drawn(NamedTuple):
+    """What is composited, or its gradients: of each (view, Gaussian), the sum over its pairs.
 
     Attributes:
-        means2d: ``[I, N, 2]``, or None if colours alone are asked for, like the next two.
-        conics: ``[I, N, 3]`` or None.
-        view_opacities: ``[I, N]`` or None.
-        colors: ``[I, N, C]``.
+        means2d: ``[I, N, 2]``; a gradient is None if colours alone are asked for, so are the next.
+        conics: ``[I, N, 3]``.
+        view_opacities: ``[I, N]``.
+        colors: ``[rows, C]``, rows = B * N, or I * N if each view has its own; their gradient is
+            ``[I, N, C]``.
     """
 
-    means2d: Tensor | None
-    conics: Tensor | None
-    view_opacities: Tensor | None
+    means2d: Any
+    conics: Any
+    view_opacities: Any
     colors: Tensor
 
 

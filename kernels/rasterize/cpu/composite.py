@@ -18,7 +18,7 @@ from ...runtime.native import native, native_kernel
 from ...runtime.views import Packed, struct
 from ..constants import BLOCKS, TILE
 from ..skip import BLOCK_TEST, EMPTY_TILES, STOPPED, UNUSED, ZERO_UPSTREAM
-from ..tiles import SLACK, SLACK_ABS, Bins, Lists, PairGradients, Picture, Pixels, Walk, Walked
+from ..tiles import SLACK, SLACK_ABS, Bins, Drawn, Lists, Picture, Pixels, Walk, Walked
 
 _HERE = Path(__file__).parent
 _RUN = 1024  # Gaussians of a task of the sums
@@ -87,28 +87,19 @@ def _workers(size: int) -> Packed:
     return Packed(Workers, torch.zeros(1, dtype=torch.int32), workspace)
 
 
-def composite_forward(
-    means2d: Tensor,
-    conics: Tensor,
-    view_opacities: Tensor,
-    colors: Tensor,
-    bins: Bins,
-    picture: Picture,
-) -> tuple[Tensor, Tensor, Walk]:
+def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tensor, Tensor, Walk]:
     """Blends I views; float32, contiguous tensors on the CPU.
 
     Args:
-        means2d: ``[I, N, 2]``.
-        conics: ``[I, N, 3]``.
-        view_opacities: ``[I, N]``.
-        colors: ``[rows, C]``, rows = B * N, or I * N if ``picture.colors_per_view``.
-        bins: from ``bin_gaussians``.
+        splats: what is drawn.
+        bins: from ``bin_views``.
         picture: from ``make_picture``.
 
     Returns:
         ``renders [I, H, W, C]``, ``alphas [I, H, W, 1]`` and a ``Walk``.
     """
-    images, channels = means2d.shape[0], colors.shape[1]
+    colors = splats.colors
+    images, channels = splats.means2d.shape[0], colors.shape[1]
     tiles = images * picture.tiles_x * picture.tiles_y
     renders = colors.new_zeros(images, picture.height, picture.width, channels)
     alphas = colors.new_zeros(images, picture.height, picture.width, 1)
@@ -121,7 +112,7 @@ def composite_forward(
     )
     arguments = [
         picture,
-        Packed(Gaussians, means2d, conics, view_opacities, colors),
+        Packed(Gaussians, *splats),
         Packed(Lists, *bins),
         Packed(Walked, *walk),
         Packed(Pixels, renders, alphas),
@@ -132,74 +123,54 @@ def composite_forward(
 
 
 def composite_backward(
-    means2d: Tensor,
-    conics: Tensor,
-    view_opacities: Tensor,
-    colors: Tensor,
-    bins: Bins,
-    picture: Picture,
-    walk: Walk,
-    v_renders: Tensor,
-    v_alphas: Tensor,
-    geometry: bool,
-) -> tuple[PairGradients, Tensor]:
+    splats: Drawn, bins: Bins, picture: Picture, walk: Walk, v_pixels: list[Tensor], geometry: bool
+) -> tuple[Drawn, Tensor]:
     """Gradients of ``composite_forward`` by (view, Gaussian), from a row of sums for each pair.
 
     Args:
-        means2d: as forward.
-        conics: as forward.
-        view_opacities: as forward.
-        colors: as forward.
+        splats: as forward.
         bins: as forward.
         picture: as forward.
         walk: as returned forward.
-        v_renders: ``[I, H, W, C]``.
-        v_alphas: ``[I, H, W, 1]``.
+        v_pixels: gradients of the renders ``[I, H, W, C]`` and the alphas ``[I, H, W, 1]``.
         geometry: whether anything but colours is asked for.
 
     Returns:
         The gradients and ``skipped [tiles]`` int32, 1 where a tile was not walked.
     """
-    channels = colors.shape[1]
+    channels = splats.colors.shape[1]
     sums = empty([bins.pairs.numel(), 6 + channels], torch.float32)
     written = bins.pairs.new_zeros(bins.pairs.numel(), dtype=torch.uint8)
     skipped = torch.empty_like(walk.walked)
     arguments = [
         picture,
-        Packed(Gaussians, means2d, conics, view_opacities, colors),
+        Packed(Gaussians, *splats),
         Packed(Lists, *bins),
         Packed(Walked, *walk),
-        Packed(Pixels, v_renders, v_alphas),
+        Packed(Pixels, *v_pixels),
         _workers(channels + BLOCKS * (channels + 1)),
         Packed(Rows, sums, written, skipped, int(geometry)),
     ]
     parallel_launch(_composite_vjp, torch.get_num_threads(), arguments)
-    return reduce_rows(sums, written, bins, conics, view_opacities, geometry), skipped
+    return reduce_rows(sums, written, splats, bins, geometry), skipped
 
 
-def reduce_rows(
-    sums: Tensor,
-    written: Tensor,
-    bins: Bins,
-    conics: Tensor,
-    view_opacities: Tensor,
-    geometry: bool,
-) -> PairGradients:
+def reduce_rows(sums: Tensor, written: Tensor, splats: Drawn, bins: Bins, geometry: bool) -> Drawn:
     """Sums rows by (view, Gaussian), in the order in which intersections are numbered.
 
     Args:
         sums: ``[P, 6 + C]``: six moments of h (README eq. 11), then the colours.
         written: ``[P]`` uint8, 0 where a row was not written and is not read.
-        bins: as forward.
-        conics: ``[I, N, 3]``.
-        view_opacities: ``[I, N]``.
+        splats: as forward, like the lists.
+        bins: of the intersections.
         geometry: whether anything but colours is asked for.
     """
+    _, conics, view_opacities, _ = splats
     lead, channels = view_opacities.shape, sums.shape[1] - 6
     v_means2d, v_conics, v_opacities = (
         empty([*lead, *size], torch.float32) if geometry else None for size in ((2,), (3,), ())
     )
-    v = PairGradients(v_means2d, v_conics, v_opacities, empty([*lead, channels], torch.float32))
+    v = Drawn(v_means2d, v_conics, v_opacities, empty([*lead, channels], torch.float32))
     arguments = [
         Packed(Gaussians, None, conics, view_opacities, None),
         Packed(Lists, *bins),

@@ -17,7 +17,7 @@ from ...runtime.launch import cuda_launch
 from ...runtime.recording import multiprocessors_of
 from ...runtime.views import Packed
 from ..constants import BLOCKS
-from ..tiles import Bins, Lists, PairGradients, Picture, Pixels, Walk, Walked
+from ..tiles import Bins, Drawn, Lists, Picture, Pixels, Walk, Walked
 from .backward import Rows, backward_kernels, row_length
 from .forward import forward_kernels
 from .reduce import reduce_rows
@@ -41,15 +41,12 @@ def _launch(
     kernels: Callable[[int], tuple[Any, Any]],
     warps: tuple[int, int],
     picture: Picture,
-    splats: list[Tensor],
+    splats: Drawn,
     inputs: list,
     outputs: list,
 ) -> None:
-    """Launches both ``kernels`` of each chunk of channels, with so many warps.
-
-    ``splats`` are means2d, conics, opacities and colors.
-    """
-    colors = splats[-1]
+    """Launches both ``kernels`` of each chunk of channels, with so many warps."""
+    colors = splats.colors
     if colors.device.type == "cpu" and not wp.config.enable_cpu_blocks:
         raise ValueError("device is cpu: these kernels run there with enable_cpu_blocks only")
     channels = colors.shape[1]
@@ -62,20 +59,14 @@ def _launch(
             )
 
 
-def composite_forward(
-    means2d: Tensor,
-    conics: Tensor,
-    view_opacities: Tensor,
-    colors: Tensor,
-    bins: Bins,
-    picture: Picture,
-) -> tuple[Tensor, Tensor, Walk]:
+def composite_forward(splats: Drawn, bins: Bins, picture: Picture) -> tuple[Tensor, Tensor, Walk]:
     """As ``composite_forward`` of the CPU.
 
     A ``Walk``'s pixels are in the order of the lanes, its ``stops`` are set where a pixel stopped
     only, and bit 16 + j of its ``blocks`` says that a pixel of sub-tile j stopped at the pair.
     """
-    images, channels = means2d.shape[0], colors.shape[1]
+    colors = splats.colors
+    images, channels = splats.means2d.shape[0], colors.shape[1]
     tiles = images * picture.tiles_x * picture.tiles_y
     renders = colors.new_empty(images, picture.height, picture.width, channels)
     alphas = colors.new_empty(images, picture.height, picture.width, 1)
@@ -91,7 +82,7 @@ def composite_forward(
         lambda count: forward_kernels(count, parts),
         (tiles * parts, tiles * parts),
         picture,
-        [means2d, conics, view_opacities, colors],
+        splats,
         [Packed(Lists, *bins)],
         [Packed(Walked, *walk), Packed(Pixels, renders, alphas)],
     )
@@ -99,28 +90,20 @@ def composite_forward(
 
 
 def composite_backward(
-    means2d: Tensor,
-    conics: Tensor,
-    view_opacities: Tensor,
-    colors: Tensor,
-    bins: Bins,
-    picture: Picture,
-    walk: Walk,
-    v_renders: Tensor,
-    v_alphas: Tensor,
-    geometry: bool,
-) -> tuple[PairGradients, Tensor]:
+    splats: Drawn, bins: Bins, picture: Picture, walk: Walk, v_pixels: list[Tensor], geometry: bool
+) -> tuple[Drawn, Tensor]:
     """As ``composite_backward`` of the CPU."""
+    colors = splats.colors
     tiles, channels = walk.walked.numel(), colors.shape[1]
     parts = parts_of_tile(tiles, colors.device)
     v_pairs = colors.new_zeros(bins.pairs.numel(), parts, row_length(channels))
     skipped = torch.ones_like(walk.walked)
     _launch(
         lambda count: backward_kernels(count, geometry, parts),
-        (tiles * parts, means2d.shape[0] * parts),
+        (tiles * parts, splats.means2d.shape[0] * parts),
         picture,
-        [means2d, conics, view_opacities, colors],
-        [Packed(Lists, *bins), Packed(Walked, *walk), Packed(Pixels, v_renders, v_alphas)],
+        splats,
+        [Packed(Lists, *bins), Packed(Walked, *walk), Packed(Pixels, *v_pixels)],
         [Packed(Rows, v_pairs, skipped)],
     )
-    return reduce_rows(v_pairs, bins, conics, view_opacities, geometry), skipped
+    return reduce_rows(v_pairs, splats, bins, geometry), skipped

@@ -12,7 +12,7 @@ from torch import Tensor
 from ...runtime.launch import launch
 from ...runtime.views import Packed
 from ..project import Splats
-from ..tiles import Bins, PairGradients
+from ..tiles import Bins, Drawn
 from .backward import columns_of_moments, row_length
 
 wp.set_module_options({"enable_backward": False})
@@ -92,23 +92,17 @@ def _finish(
         v_splats_out.opacities[i] = v_opacity
 
 
-def reduce_rows(
-    v_pairs: Tensor,
-    bins: Bins,
-    conics: Tensor,
-    view_opacities: Tensor,
-    geometry: bool,
-) -> PairGradients:
+def reduce_rows(v_pairs: Tensor, splats: Drawn, bins: Bins, geometry: bool) -> Drawn:
     """Sums rows by (view, Gaussian), as the CPU's; all rows are written.
 
     Args:
         v_pairs: ``[P, parts, 6 · chunks + C]``, or where the lists had no room, rows of Gaussians
             in the order of ``bins.order``.
-        bins: as forward.
-        conics: ``[I, N, 3]``.
-        view_opacities: ``[I, N]``.
+        splats: as forward, like the lists.
+        bins: of the pairs.
         geometry: whether anything but colours is asked for.
     """
+    _, conics, view_opacities, _ = splats
     v_means2d = v_conics = v_opacities = None
     if geometry:
         v_means2d = conics.new_empty(*conics.shape[:-1], 2)
@@ -138,4 +132,4 @@ def reduce_rows(
         ],
         conics.device,
     )
-    return PairGradients(v_means2d, v_conics, v_opacities, v_colors)
+    return Drawn(v_means2d, v_conics, v_opacities, v_colors)

@@ -12,7 +12,7 @@ from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cpu.project import project_on_lanes
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.project import LensOptions, make_lens
-from gamba_warp.kernels.rasterize.tiles import PairGradients
+from gamba_warp.kernels.rasterize.tiles import Drawn
 
 LISTS = ("pairs", "starts", "box_pairs")
 
@@ -154,8 +154,9 @@ def test_projection_on_lanes(num, rotated, antialiased, rounded, channels):
     assert len(got.status.unique()) >= (5 if num > 500 else 3)
 
 
-def sums_one_by_one(v_pairs, written, bins, conics, view_opacities, geometry):
+def sums_one_by_one(v_pairs, written, splats, bins, geometry):
     """Row after row in float32, and README eq. 11 with every product rounded."""
+    _, conics, view_opacities, _ = splats
     sums = torch.zeros(bins.order.numel(), v_pairs.shape[1])
     firsts = bins.offsets.tolist()
     for i, begin, end in zip(bins.order.tolist(), firsts, firsts[1:]):
@@ -169,7 +170,7 @@ def sums_one_by_one(v_pairs, written, bins, conics, view_opacities, geometry):
     v_conics = torch.stack([-0.5 * huu, -a * huy, -0.5 * hyy], -1)
     v_opacities = torch.where(h != 0, h / view_opacities, 0.0)
     assert geometry
-    return PairGradients(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
+    return Drawn(v_means2d, v_conics, v_opacities, sums[..., 6:].contiguous())
 
 
 @pytest.mark.parametrize("channels", [1, 3, 10, 11, 20])
