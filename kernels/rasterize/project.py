@@ -172,18 +172,10 @@ def unit(q: wp.vec4) -> wp.vec4:
 
 @wp.func
 @no_type_check
-def slope_bounds(center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.vec2:
-    # README eq. 2: the picture and a margin around it
-    margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    return wp.vec2(-(center / focal + margin), (size - center) / focal + margin)
-
-
-@wp.func
-@no_type_check
 def slope(p: wp.float32, center: wp.float32, size: wp.float32, focal: wp.float32) -> wp.float32:
-    # x/z kept within these bounds
-    bounds = slope_bounds(center, size, focal)
-    return wp.clamp(p, bounds[0], bounds[1])
+    # x/z kept within README eq. 2's bounds: the picture and a margin around it
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    return wp.clamp(p, -(center / focal + margin), (size - center) / focal + margin)
 
 
 @wp.func

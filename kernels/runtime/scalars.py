@@ -75,6 +75,17 @@ def exp2(x: float) -> float: ...
 def reciprocal(x: float) -> float: ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(x));
+#endif
+    return x;
+""")
+def anew(x: int) -> int:
+    """Returns x; what was computed from x before is not kept in registers for its sake."""
+    ...
+
+
 @wp.func
 def sigmoid(x: float) -> float:
     return reciprocal(1.0 + exp2(-wp.static(LOG2E) * x))  # 0 where the power is infinite

@@ -1,6 +1,29 @@
-"""What several test files share; here are the comparisons that name what differs."""
+"""What several test files share; here are threads and comparisons."""
+
+import contextlib
 
 import torch
+
+
+@contextlib.contextmanager
+def on_threads(count):
+    """So many threads of torch inside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def assert_same_on_threads(function, *counts) -> None:
+    """Fails unless the tensors that ``function`` gives have the same bits on so many threads."""
+    first = None
+    for count in counts:
+        with on_threads(count):
+            made = list(function())
+        first = first or made
+        assert all(map(torch.equal, made, first)), f"{count} threads"
 
 
 def rel_rms(got: torch.Tensor, want: torch.Tensor) -> float:

@@ -76,15 +76,6 @@ class Cuts:
 
 
 @pytest.fixture
-def one_thread():
-    """The oracles' operations are too small to share: on a busy machine threads only wait."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture
 def cuts(monkeypatch, one_thread):
     """The oracle blends by blocks and notes the cuts."""
     recorder = Cuts()

@@ -1,29 +1,17 @@
 """Shared by the tests of the scan: inputs, the oracle, and a comparison that names what differs."""
 
-import contextlib
-
 import pytest
 import torch
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.problem import DISCRETIZATIONS
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
-from helpers import assert_rel_rms
+from helpers import assert_rel_rms, on_threads
 
 FORWARD = 1e-6  # float32 rounding of a few hundred dependent steps; measured 1e-7 to 5e-7
 GRADIENT = 1e-5  # the same, for sums over up to 2 * 577 tokens; measured below 1e-6
 STATE = ("u", "delta", "A", "B", "delta_bias", "initial_state")  # of selective_scan_state
 every_discretization = pytest.mark.parametrize("discretization", DISCRETIZATIONS)
-
-
-@contextlib.contextmanager
-def on_threads(count):
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def make(batch, length, channels, states, groups=1, dtype=torch.float32):

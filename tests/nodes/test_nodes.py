@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from helpers import micro
+from helpers import micro, on_threads
 from helpers.micro import lines, run
 from helpers.nodes.processes import train_all, words
 from safetensors.torch import load_file
@@ -29,14 +29,10 @@ def runs(data, tmp_path_factory):
     """1 x 4 objects, 2 x 2 one after the other, and 2 x 2 in two processes."""
     folder = tmp_path_factory.mktemp("runs")
     alone = {"length": {"steps": STEPS}, "run": {"save_every": 1, "keep": 9, "threads": 1}}
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # as in the processes: sums are split by threads
-    try:
+    with on_threads(1):  # as in the processes: sums are split by threads
         assert run(data, folder / "whole", views={**VIEWS, "batch_size": 4}, **alone) == 0
         halves = {**VIEWS, "batch_size": 2, "accumulate": 2}
         assert run(data, folder / "halves", views=halves, **alone) == 0
-    finally:
-        torch.set_num_threads(threads)
     ends = train_all([words(data, folder / name, *OPTIONS) for name in ("two", "not-there")])
     assert [end.code for end in ends] == [0, 0], ends
     assert not (folder / "not-there").exists()  # only the first process writes

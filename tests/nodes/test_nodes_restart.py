@@ -5,7 +5,7 @@ import random
 
 import pytest
 import torch
-from helpers import micro
+from helpers import micro, on_threads
 from helpers.micro import lines, run
 from helpers.nodes.killing import kill_one_of_two, steps_for
 from helpers.nodes.processes import words
@@ -28,12 +28,8 @@ def test_killed_processes_start_anew_and_end_as_if_nothing_was(tmp_path):
     assert found.steps == steps and "Traceback" not in found.said, found
     assert {line["step"] for line in lines(tmp_path / "two", "train")} == {*range(1, steps + 1)}
     assert [line["code"] for line in lines(tmp_path / "two", "end")] == [0]
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:  # two halves of each batch in turn are the same sums, see test_nodes.py
+    with on_threads(1):  # two halves of each batch in turn are the same sums, see test_nodes.py
         options = {"length": {"steps": steps}, "views": {"batch_size": 2, "accumulate": 2}}
         assert run(data, tmp_path / "one", **options) == 0
-    finally:
-        torch.set_num_threads(threads)
     one, two = (load_file(tmp_path / name / "model.safetensors") for name in ("one", "two"))
     assert one.keys() == two.keys() and all(torch.equal(one[n], two[n]) for n in one)

@@ -2,35 +2,11 @@
 
 import warp as wp
 
+from ...runtime.scalars import anew as anew
+from ...runtime.scalars import exp2 as exp2
+from ...runtime.scalars import reciprocal as reciprocal
+
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    float y;
-    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
-    return y;
-#else
-    return exp2f(x);
-#endif
-""")
-def exp2(x: wp.float32) -> wp.float32:
-    """2^x, to 2 units in the last place."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    float y;
-    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
-    return y;
-#else
-    return 1.0f / x;
-#endif
-""")
-def reciprocal(x: wp.float32) -> wp.float32:
-    """1/x of a normal number, to 1 unit in the last place; 1/1 is exactly 1."""
-    ...
 
 
 @wp.func_native("""
@@ -83,17 +59,6 @@ def load_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32) -> wp.i
 
 @wp.func_native("values.data[i + step] = v;")
 def store_stop(values: wp.array2d[wp.int32], i: wp.int64, step: wp.int32, v: wp.int32): ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("" : "+r"(x));
-#endif
-    return x;
-""")
-def anew(x: wp.int32) -> wp.int32:
-    """Returns x; what was computed from x before is not kept in registers for its sake."""
-    ...
 
 
 # fmaf is named, since forward and backward must see the same alpha: the compiler has no choice.

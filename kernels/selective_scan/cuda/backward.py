@@ -13,7 +13,7 @@ from typing import no_type_check
 import warp as wp
 
 from ...runtime.lanes import WARP_DTYPES
-from ...runtime.scalars import sigmoid, softplus, softplus_slope
+from ...runtime.scalars import anew, sigmoid, softplus, softplus_slope
 from ...runtime.views import struct
 from ..problem import DISCRETIZATIONS, macros
 from .blocks import (
@@ -49,16 +49,6 @@ class Tile:
     mark: int  # of the chunk, that before the first token
     subs: int  # marks of the tile
     product: wp.int64  # where the block's products for dB and dC begin
-
-
-# The number, unknown to the compiler: what is computed from it is not kept in registers.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("" : "+r"(x));
-#endif
-    return x;
-""")
-def _anew(x: int) -> int: ...
 
 
 @functools.cache
@@ -352,7 +342,7 @@ def backward_kernel(
                 sums += wp.vec2(dskip, dbias)
             sync()
             # the chunk's sums join those of its run, which begin at 0 in memory
-            e = place(sizes, _anew(index), _anew(lane))
+            e = place(sizes, anew(index), anew(lane))
             run = e.at * ((sizes.segment / MARK + RUN - 1) / RUN) + back / RUN
             write_states(da_out, run, e, second_half(state) + read_states(da_out, run, e))
             state = join(first_half(state), vec())

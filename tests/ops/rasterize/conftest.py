@@ -5,14 +5,14 @@ from functools import partial
 import pytest
 import torch
 import warp as wp
-from helpers.raster_accuracy import cuts, one_thread
+from helpers.raster_accuracy import cuts
 
 from gamba_warp.kernels.rasterize import ops
 from gamba_warp.kernels.rasterize.cuda import bin as bin_cuda
 from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 
-__all__ = ["cuts", "on_blocks", "one_thread"]
+__all__ = ["cuts", "on_blocks"]
 
 
 @pytest.fixture

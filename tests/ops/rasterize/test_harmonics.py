@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import assert_rel_rms
+from helpers import assert_rel_rms, assert_same_on_threads
 
 from gamba_warp.kernels.rasterize.harmonics import (
     colors_from_harmonics,
@@ -262,16 +262,12 @@ def test_any_number_of_threads(per_view):
     """The same bits, twice and from one thread to four: 9 chunks of Gaussians."""
     inputs = make(1, 3, num=2100, per_view=per_view)
     v = torch.randn(1, 3, 2100, 3)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 2, 4):
-            torch.set_num_threads(threads)
-            colors, grads = run(colors_seen_from, 3, inputs, v)
-            results.append([colors, *grads.values()])
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        assert all(map(torch.equal, results[0], other))
+
+    def made():
+        colors, grads = run(colors_seen_from, 3, inputs, v)
+        return colors, *grads.values()
+
+    assert_same_on_threads(made, 1, 2, 2, 4)
 
 
 def test_strides_and_dtypes():

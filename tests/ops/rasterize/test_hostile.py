@@ -283,20 +283,22 @@ def test_principal_point_outside(cuts, center):
     assert_gradients(got, want, flipped)
 
 
-def test_permutation_at_size():
-    """Thousands of Gaussians, some culled, some hidden, colours per view: the same bits."""
+@pytest.mark.parametrize("views", [(), (2,)])
+def test_permutation_at_size(views):
+    """Thousands of Gaussians, some culled, some hidden, also colours per view: the same bits."""
     num = 3000
     scene = make(2, 2, num, width=70, height=50, size=0.05)
-    scene["colors"] = torch.rand(2, 2, num, 3)
+    scene["colors"] = torch.rand(2, *views, num, 3)
     scene["means"] = scene["means"] * 2
     order = torch.randperm(num)
-    other = {k: v[:, order] if k in GAUSSIAN[:4] else v for k, v in scene.items()}
-    other["colors"] = scene["colors"][:, :, order]
-    a, b = render(scene), render(other)
+
+    def turned(name, x):
+        return x[..., order, :] if name == "colors" else x[:, order] if name in GAUSSIAN else x
+
+    a, b = render(scene), render({k: turned(k, v) for k, v in scene.items()})
     assert a[1].mean() > 0.5 and torch.equal(a[0], b[0]) and torch.equal(a[1], b[1])
-    for name in GAUSSIAN[:4]:
-        assert torch.equal(a[2][name][:, order], b[2][name]), name
-    assert torch.equal(a[2]["colors"][:, :, order], b[2]["colors"])
+    for name in GAUSSIAN:
+        assert torch.equal(turned(name, a[2][name]), b[2][name]), name
 
 
 def test_nothing_in_sight():

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from helpers import on_threads
 from helpers.raster import NAMES, leaves, make
 
 from gamba_warp.kernels.rasterize import Skip, ops, project, rasterization
@@ -96,14 +97,11 @@ def test_pairs_are_numbered_by_gaussian(monkeypatch):
 
 def test_repeatable_with_any_number_of_threads(monkeypatch):
     monkeypatch.setattr(bin_cpu, "MANY", 0)
-    scene, before = make(1, 2, 400, 90, 61), torch.get_num_threads()
+    scene = make(1, 2, 400, 90, 61)
     want = call(scene)
-    try:
-        for threads in (1, 3, 5):
-            torch.set_num_threads(threads)
+    for threads in (1, 3, 5):
+        with on_threads(threads):
             assert_same(want, call(scene))
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("num, views", [(1, 1), (17, 2), (0, 1), (5, 0)])

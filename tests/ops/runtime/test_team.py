@@ -6,6 +6,7 @@ import warnings
 import pytest
 import torch
 import warp as wp
+from helpers import on_threads
 
 from gamba_warp.kernels.runtime import team
 from gamba_warp.kernels.runtime.launch import parallel_launch
@@ -51,16 +52,11 @@ def test_every_place_once(monkeypatch, with_team, threads):
         pytest.skip("torch has no OpenMP runtime with GNU's interface here")
     if not with_team:
         monkeypatch.setattr(team, "_parallel", 0)
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(threads)
+    with on_threads(threads):
         for size, pieces in ((1, None), (2, 7), (1001, 13)):
             a, b = torch.randn(2, size)
             for second in (b, None):  # an array that is missing after one that was there
-                got, want = mix(a, second, pieces)
-                assert torch.equal(got, want)
-    finally:
-        torch.set_num_threads(before)
+                assert torch.equal(*mix(a, second, pieces))
 
 
 def test_team_is_found_on_linux():

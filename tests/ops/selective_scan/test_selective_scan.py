@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import assert_rel_rms, rel_rms
+from helpers import assert_rel_rms, assert_same_on_threads, on_threads, rel_rms
 from helpers.scan import (
     FORWARD,
     assert_gradient_alone,
@@ -10,7 +10,6 @@ from helpers.scan import (
     every_discretization,
     leaves,
     make,
-    on_threads,
     oracle,
 )
 
@@ -129,15 +128,12 @@ def test_split_consistency(cut):
 def test_repeatable_and_independent_of_threads():
     inputs = make(2, 200, 150, 5)
 
-    def run(threads):
-        with on_threads(threads):
-            mine = leaves(inputs)
-            out = selective_scan(**mine, delta_softplus=True)
-            return [out, *torch.autograd.grad(out.square().sum(), [*mine.values()])]
+    def made():
+        mine = leaves(inputs)
+        out = selective_scan(**mine, delta_softplus=True)
+        return out, *torch.autograd.grad(out.square().sum(), [*mine.values()])
 
-    first = run(1)
-    for again in (run(1), run(2)):
-        assert all(torch.equal(a, b) for a, b in zip(first, again))
+    assert_same_on_threads(made, 1, 1, 2)
 
 
 def test_strided_inputs_are_not_copied():

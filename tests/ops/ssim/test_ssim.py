@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers import assert_same_on_threads
 
 from gamba_warp.kernels.ssim import dissimilarity, lanes
 from gamba_warp.kernels.ssim.reference import dissimilarity_reference
@@ -77,15 +78,7 @@ def test_one_differing_pixel_is_found_anywhere(place):
 
 def test_threads_and_runs_change_no_bit():
     got, want = pictures((6, 40, 50, 3))
-    threads, made = torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 3, 1):
-            torch.set_num_threads(count)
-            made.append(dissimilarity(got, want, True))
-    finally:
-        torch.set_num_threads(threads)
-    for value, slope in made[1:]:
-        assert torch.equal(value, made[0][0]) and torch.equal(slope, made[0][1])
+    assert_same_on_threads(lambda: dissimilarity(got, want, True), 1, 2, 3, 1)
 
 
 def test_nan_stays_in_its_picture():
