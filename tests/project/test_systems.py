@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import warp as wp
 from architecture.imports import modules
 from helpers.refusals import refused
 
@@ -134,6 +135,9 @@ def test_what_killed_commands_left_is_swept_without_users(no_users, tmp_path):
     part.mkdir()
     sweep(tmp_path, age=0)
     assert not part.exists()
+
+
+wp.init()  # its libraries are found before ctypes is patched
 
 
 def test_launches_without_openmp_and_huge_pages(windows, monkeypatch):
