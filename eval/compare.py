@@ -6,7 +6,6 @@ objects that all methods have; it is Markdown, JSON, and a page that loads nothi
 
 from __future__ import annotations
 
-import html
 import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -424,40 +423,17 @@ def markdown_page(joined: dict[str, Any], paper: bool) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-_STYLE = """
-:root { color-scheme: light dark; }
-body { margin: 0 auto; padding: 2rem 1.25rem; max-width: 70rem;
-  font: 15px/1.5 system-ui, sans-serif; }
-.scroll { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .3rem 1.2rem .3rem 0; text-align: left; border-bottom: 1px solid #8884; }
-th { font-weight: 600; } td span { opacity: .65; font-size: .85em; white-space: nowrap; }
-p { max-width: 52rem; }
-"""
-
-
 def html_page(joined: dict[str, Any], paper: bool) -> str:
     """The text of ``compare.html``; arguments as for ``markdown_page``."""
-    body = "".join(
-        f"<p>{html.escape(part)}</p>" if isinstance(part, str) else _html_table(part)
-        for part in _parts(joined, paper)
-    )
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Methods compared</title><style>{_STYLE}</style></head>\n"
-        f"<body><h1>Methods compared</h1>{body}</body></html>\n"
-    )
+    from gamba_warp.pages.page import Section, page_text  # with torch, which the table does without
 
-
-def _html_table(lines: Lines) -> str:
-    def figure(text: str) -> str:
-        value, bracket, ends = html.escape(text).partition(" [")
-        return f"{value}<br><span>[{ends}</span>" if bracket else value
-
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in lines[0])
-    rows = "".join(
-        f"<tr><td>{html.escape(name)}</td>{''.join(f'<td>{figure(c)}</td>' for c in cells)}</tr>"
-        for name, *cells in lines[1:]
-    )
-    return f'<div class="scroll"><table><tr>{head}</tr>{rows}</table></div>'
+    sections, texts = [], []
+    for part in _parts(joined, paper):
+        if isinstance(part, str):
+            texts.append(part)
+        else:
+            head, *rows = part
+            sections.append(Section("", "\n\n".join(texts), header=head, table=rows))
+            texts = []
+    sections += [Section("", "\n\n".join(texts))] if texts else []
+    return page_text("Methods compared", "", sections)

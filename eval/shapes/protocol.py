@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, get_origin, get_type_hints
+from typing import Annotated, Any
 
+import msgspec
 from msgspec import Meta
 
 from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.errors import UserError
 from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.untrusted.documents import read_document
-from gamba_warp.untrusted.ranges import Seed, check_kind, check_options, check_values
+from gamba_warp.untrusted.ranges import Seed, check_options
 
 from .command import (
     Align,
@@ -28,6 +29,9 @@ from .command import (
 )
 from .occupancy import RULES
 
+Thresholds = Annotated[
+    tuple[Annotated[float, Meta(gt=0, le=100)], ...], Meta(min_length=1, max_length=100)
+]
 VERSION = 3  # goes up whenever the same protocol would give other numbers
 
 POINTS: dict[PointRule, str] = {
@@ -84,11 +88,11 @@ class GeometryProtocol:
         surface: how Gaussians become a surface.
     """
 
-    name: str = "default"
+    name: Annotated[str, Meta(max_length=200)] = "default"
     points: PointRule = "area"
     num_points: Annotated[int, Meta(ge=1, le=10_000_000)] = 100_000
     seed: Seed = 0
-    thresholds: tuple[Annotated[float, Meta(gt=0, le=100)], ...] = (0.01, 0.02, 0.05)
+    thresholds: Thresholds = (0.01, 0.02, 0.05)
     occupancy: OccupancyRule = "solid"
     grid: GridRule = "around"
     iou_voxels: Annotated[int, Meta(ge=8, le=512)] = 64
@@ -134,26 +138,6 @@ PRESETS = {
 }
 
 
-def checked(protocol: GeometryProtocol, where: str) -> GeometryProtocol:
-    """Returns the protocol as it is, if its numbers are in their ranges.
-
-    Args:
-        protocol: any protocol.
-        where: the file or the options that it comes from, named in errors.
-
-    Raises:
-        UserError: a number is out of its range.
-    """
-    for part, prefix in ((protocol, ""), (protocol.surface, "surface.")):
-        hints = get_type_hints(type(part), include_extras=True)
-        check_values(vars(part), hints, lambda name, at=prefix: f"{where}: {at}{name} is")
-    if not 1 <= len(protocol.thresholds) <= 100:
-        raise UserError(f"{where}: thresholds must be 1 to 100 numbers")
-    if len(protocol.name) > 200:
-        raise UserError(f"{where}: name is over 200 letters long")
-    return protocol
-
-
 def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
     """The protocol that the options name, with the values that they give themselves.
 
@@ -168,7 +152,7 @@ def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
     surface = {name: getattr(options, name) for name in ("voxels", "views", "pixels")}
     surface["method"] = options.surface
     given, surface = ({k: v for k, v in part.items() if v is not None} for part in (given, surface))
-    return checked(replace(base, surface=replace(base.surface, **surface), **given), "options")
+    return replace(base, surface=replace(base.surface, **surface), **given)
 
 
 def read_protocol(choice: str) -> GeometryProtocol:
@@ -185,44 +169,24 @@ def read_protocol(choice: str) -> GeometryProtocol:
     path = Path(choice)
     if not path.is_file():
         raise UserError(f"--protocol {choice}: neither {', '.join(PRESETS)} nor a file")
-    value = read_document(path, Any)
-    if isinstance(value, dict) and isinstance(value.get("protocol"), dict):
-        value = value["protocol"]
-    if not isinstance(value, dict):
-        raise UserError(f"{path}: not a protocol, which is a JSON object")
-    value = dict(value)
+    value = read_document(path, dict[str, Any])
+    value = dict(inner if isinstance(inner := value.get("protocol"), dict) else value)
     version, words = value.pop("version", VERSION), value.pop("definitions", None)
     if version != VERSION:
         shown = str(version)[:40]
         raise UserError(f"{path}: protocol version {shown}, this program has version {VERSION}")
-    name = value.get("name")
-    base = PRESETS.get(name if isinstance(name, str) else "", PRESETS["default"])
-    protocol = checked(_filled(base, value, f"{path}: "), str(path))
+    base = asdict(PRESETS.get(str(value.get("name")), PRESETS["default"]))
+    surface = value.get("surface", {})
+    if isinstance(surface, dict):
+        value["surface"] = base["surface"] | surface
+        for at, part, known in (("", value, base), ("surface.", surface, base["surface"])):
+            if unknown := part.keys() - known.keys():
+                names = ", ".join(sorted(known))
+                raise UserError(f"{path}: {at}{min(unknown)} is unknown; known: {names}")
+    try:
+        protocol = msgspec.convert(base | value, GeometryProtocol)
+    except msgspec.ValidationError as error:
+        raise UserError(f"{path}: {error}") from error
     if words is not None and words != protocol.definitions():
         raise UserError(f"{path}: its definitions are not those of this program's version")
     return protocol
-
-
-def _filled(base: Any, values: dict[str, Any], where: str) -> Any:
-    """The dataclass ``base`` with the fields of ``values``, if of the right types, for its own."""
-    kinds, result = get_type_hints(type(base)), {}
-    for name, value in values.items():
-        if name not in kinds:
-            raise UserError(f"{where}{name} is unknown; known: {', '.join(sorted(kinds))}")
-        label, kind = f"{where}{name} is", kinds[name]
-        if kind is SurfaceOptions and isinstance(value, dict):
-            value = _filled(base.surface, value, f"{where}{name}.")
-        elif get_origin(kind) is tuple:  # of floats
-            value = tuple(_typed(label, item, float) for item in _typed(label, value, list))
-        else:
-            value = _typed(label, value, kind)
-        result[name] = value
-    return replace(base, **result)
-
-
-def _typed(label: str, value: Any, kind: Any) -> Any:
-    """The value where it is of the kind. Raises UserError."""
-    check_kind(label, value, kind)
-    if kind is float and abs(value) > 1e300:  # an integer of JSON may have any length
-        raise UserError(f"{label} too large")
-    return float(value) if kind is float else value

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from gamba_warp.batch import progress_bar
-from gamba_warp.cameras import relative_to_reference
 from gamba_warp.conventions import DEFAULT_DISTANCE
 from gamba_warp.data.dataset import ViewDataset
 from gamba_warp.errors import UserError
-from gamba_warp.files import output_folder, write_json
 from gamba_warp.fitting.config import FitConfig
-from gamba_warp.fitting.objects import FitJob, choose_objects, load_views
-from gamba_warp.fitting.optimize import fit
-from gamba_warp.formats.ply import load_ply, save_ply
-from gamba_warp.gaussians import Gaussians
+from gamba_warp.fitting.objects import FitJob, choose_objects, fit_object
+from gamba_warp.formats.ply import load_ply
 
 from .compare import Shown, Truth, ViewsProtocol, render_views
 
@@ -28,90 +22,44 @@ from .compare import Shown, Truth, ViewsProtocol, render_views
 class Ceiling:
     """The result of ``gamba fit`` on all views of an object, made now or read from its file.
 
-    Files are ``<uid>.ply`` in the world of view 0, as ``gamba fit`` writes them.
-
     Attributes:
         dataset: whose objects are fitted.
-        protocol: size of the pictures, input view and distance.
+        protocol: input view and distance.
         device: torch device.
-        folder: folder of the files; None: nothing is kept.
-        uids: objects to fit where the folder does not have them with these settings; None: nothing
-            is fitted, and only the files that are there count.
-        config: of the fit.
+        folder: of files ``<uid>.ply`` in the world of view 0, as ``gamba fit`` writes them.
+        job: how objects are fitted; None: only the files that are there count.
+        uids: the objects to fit.
     """
 
     dataset: ViewDataset
     protocol: ViewsProtocol
     device: str
-    folder: Path | None
-    uids: list[str] | None = None
-    config: FitConfig = FitConfig()  # noqa: RUF009 (frozen)
+    folder: Path
+    job: FitJob | None = None
+    uids: Sequence[str] = ()
 
     def __call__(self, truth: Truth) -> Shown | None:
-        """Returns the pictures, or None for an object that is not to be fitted.
+        """Returns the pictures, or None for an object that has no file and is not to be fitted.
 
         Raises:
             UserError: its views cannot be used, or a file is bad.
             ValueError: see ``fit``.
             FloatingPointError: see ``fit``.
         """
-        uid = truth.uid
-        path = self.folder / f"{uid}.ply" if self.folder else None
-        if self.uids is not None:
-            fitted = self._fitted(uid, path) if uid in self.uids else None
-        else:
-            fitted = load_ply(path).to(self.device) if path and path.exists() else None
-        if fitted is None:
+        path = self.folder / f"{truth.uid}.ply"
+        if self.job is not None and truth.uid in self.uids:
+            fit_object(self.job, truth.uid)
+        elif self.job is not None or not path.exists():
             return None
         # from the world of view 0, its camera at DEFAULT_DISTANCE, to that of the truth
-        views = self.dataset.load(uid, views=[0, self.protocol.reference])
+        views = self.dataset.load(truth.uid, views=[0, self.protocol.reference])
         first, reference = views.cameras.viewmats
         scale = self.protocol.distance / reference[:3, 3].norm()
         scale = scale / (DEFAULT_DISTANCE / first[:3, 3].norm())
         turn = (reference[:3, :3] @ first[:3, :3].T).to(self.device)
+        fitted = load_ply(path).to(self.device)
         moved = fitted.transformed(turn, turn.new_zeros(3), scale.item())
         return render_views(moved, truth.cameras)
-
-    def _fitted(self, uid: str, path: Path | None) -> Gaussians:
-        """Fits, or reads what the same settings gave for the same views before."""
-        job = FitJob(
-            dataset=self.dataset,
-            folder=self.folder or Path(),
-            config=self.config,
-            held_out=0,
-            size=self.protocol.size,
-            device=torch.device(self.device),
-        )
-        views = load_views(job, uid, list(range(self.dataset.num_views(uid))))
-        digest = hashlib.sha256(json.dumps(asdict(self.config)).encode())
-        for tensor in (views.images, views.cameras.viewmats, views.cameras.Ks):
-            digest.update(tensor.numpy().tobytes())
-        key, told = digest.hexdigest(), path.with_suffix(".json") if path else None
-        if path and told and path.exists() and _key_in(told) == key:
-            return load_ply(path).to(self.device)
-        images, cameras = views.images.to(self.device), views.cameras.to(self.device)
-        with progress_bar(total=100, desc=f"ceiling {uid}", unit="%", leave=False) as bar:
-
-            def show(done: float, _: float) -> None:
-                bar.update(int(100 * done) - bar.n)
-
-            result = fit(images, cameras, self.config, show)
-        first = cameras.viewmats[0]
-        _, scale = relative_to_reference(first[None], first)
-        moved = result.gaussians.transformed(first[:3, :3], first.new_zeros(3), scale.item())
-        if path and told:
-            output_folder(path.parent)
-            told.unlink(missing_ok=True)  # it vouches for the .ply
-            save_ply(path, moved, comments=[f"fitted to all views of {uid}"])
-            write_json(told, {"key": key, "fit": asdict(self.config)})
-        return moved
-
-
-def _key_in(path: Path) -> str | None:
-    try:
-        return json.loads(path.read_bytes())["key"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def open_ceiling(
@@ -132,15 +80,20 @@ def open_ceiling(
         uids: the objects under evaluation.
         protocol: as for ``Ceiling``.
         device: torch device.
-        out: the report's folder, where fitted objects are kept; or None.
+        out: the report's folder, where fitted objects are kept.
         steps: number of steps of a fit.
 
     Raises:
-        UserError: neither a number above 0 nor a folder with a file for any of ``uids``.
+        UserError: neither a number above 0 nor a folder with a file for any of ``uids``; or a
+            number without ``out``.
     """
     if wanted.isdecimal() and int(wanted) > 0:
-        folder, chosen = out / "ceiling" if out else None, choose_objects(uids, (), int(wanted))
-        return Ceiling(dataset, protocol, device, folder, chosen, FitConfig(steps=steps))
+        if out is None:
+            raise UserError(f"--ceiling {wanted}: needs --out")
+        config, size = FitConfig(steps=steps), protocol.size
+        job = FitJob(dataset, out / "ceiling", config, 0, size, torch.device(device))
+        chosen = choose_objects(uids, (), int(wanted))
+        return Ceiling(dataset, protocol, device, job.folder / "gaussians", job, chosen)
     folder = Path(wanted)
     if not folder.is_dir():
         raise UserError(f"--ceiling {wanted}: neither a number above 0 nor a folder")

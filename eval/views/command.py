@@ -42,7 +42,7 @@ class ViewsOptions:
         baselines: Also score an empty picture, a copy of the input, the input as a billboard, and
             the nearest training object.
         ceiling: Also score Gaussians fitted to all views: of so many objects (18 s each on two
-            cores, kept in OUT/ceiling), or those in a folder that gamba fit wrote.
+            cores, written into OUT/ceiling), or those in a folder that gamba fit wrote.
         ceiling_steps: Steps of each fit.
         lpips: LPIPS where its weights are there (gamba weights lpips).
         strips: Comparison pictures for the first so many objects.

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,12 +11,11 @@ from gamba_warp.data.dataset import open_dataset
 from gamba_warp.errors import UserError
 from gamba_warp.eval.views import baselines
 from gamba_warp.eval.views.baselines import Retrieval, background, billboard, input_copy
-from gamba_warp.eval.views.ceiling import Ceiling, open_ceiling
+from gamba_warp.eval.views.ceiling import open_ceiling
 from gamba_warp.eval.views.compare import Truth, ViewsProtocol, compare, load_truth, summary
 from gamba_warp.eval.views.contact_sheet import Row, choose_ranks, contact_sheet
 from gamba_warp.eval.views.table import differences_of, means, table_of
-from gamba_warp.fitting.config import FitConfig
-from gamba_warp.formats.ply import load_ply, save_ply
+from gamba_warp.formats.ply import save_ply
 from gamba_warp.image_metrics import on_grounds
 from gamba_warp.images import load_rgba
 
@@ -259,60 +259,40 @@ def test_interrupted(data, tmp_path, monkeypatch, capsys):
     assert "interrupted" in capsys.readouterr().err
 
 
-def test_ceiling_is_fitted_once(data, tmp_path, monkeypatch):
-    from gamba_warp.eval.views import ceiling as module
+def test_ceiling_is_fitted_and_kept(data, tmp_path):
+    dataset, objects = open_dataset(data), ["flat", "other"]
 
-    fitted, calls = module.fit, []
+    def make(wanted, protocol=PROTOCOL):
+        return open_ceiling(
+            *(wanted, dataset, objects, protocol), device="cpu", out=tmp_path, steps=25
+        )
 
-    def counted(*args):
-        calls.append(1)
-        return fitted(*args)
-
-    monkeypatch.setattr(module, "fit", counted)
-    dataset = open_dataset(data)
-
-    def make(steps=25, protocol=PROTOCOL):
-        config = FitConfig(steps=steps, gaussians=150)
-        folder = tmp_path / "ceiling"
-        return Ceiling(dataset, protocol, device="cpu", folder=folder, uids=["flat"], config=config)
-
+    ceiling = make("1")
+    assert ceiling.job.config.steps == 25 and list(ceiling.uids) == ["flat"]  # the first of two
+    ceiling.job.config = replace(ceiling.job.config, gaussians=150)
     truth = load_truth(dataset, "flat", PROTOCOL, "cpu")
-    first = make()(truth)
+    first = ceiling(truth)
     # 25 steps are enough to be better than an empty picture by far
     shown = {"fitted": first, "empty": background(truth)}
     means = {n: summary(v, truth.coverage)["psnr"] for n, v in compare(shown, truth).items()}
     assert means["fitted"] > 3 + means["empty"]
-    assert torch.allclose(make()(truth)[0], first[0], atol=1e-5) and len(calls) == 1  # .ply logits
-    make(26)(truth)
-    assert len(calls) == 2  # other settings
-    path = tmp_path / "ceiling" / "flat.ply"
-    assert load_ply(path).num > 0
-    assert make(26)(load_truth(dataset, "other", PROTOCOL, "cpu")) is None
-    path.with_suffix(".json").write_text("{")
-    make(26)(truth)
-    assert len(calls) == 3  # a file that nothing vouches for
+    assert ceiling(load_truth(dataset, "other", PROTOCOL, "cpu")) is None
+    kept = make(str(tmp_path / "ceiling"))  # the same by the folder's name
+    assert kept.job is None and torch.equal(kept(truth).rgb, first.rgb)
+    assert kept(load_truth(dataset, "other", PROTOCOL, "cpu")) is None
     # another input view and distance: the same Gaussians, in another world
     moved = ViewsProtocol("test", 2, None, None, None, None, 2.5)
-    again = make(26, moved)(load_truth(dataset, "flat", moved, "cpu"))
-    same = make(26)(truth)
-    assert (again[0][0] - same[0][2]).abs().max() < 1e-3 and len(calls) == 3
+    again = make(str(tmp_path / "ceiling"), moved)(load_truth(dataset, "flat", moved, "cpu"))
+    assert (again[0][0] - first[0][2]).abs().max() < 1e-3
 
 
-def test_ceiling_of_so_many_objects(data, tmp_path):
-    dataset = open_dataset(data)
-    options = {"device": "cpu", "out": tmp_path, "steps": 7}
-    ceiling = open_ceiling("2", dataset, dataset.uids, PROTOCOL, **options)
-    assert ceiling.uids == ["flat", "seen"] and ceiling.config.steps == 7  # of 4, evenly spaced
-    assert ceiling.folder == tmp_path / "ceiling"
-
-
-@pytest.mark.parametrize("wanted", ["0", "absent", "-3"])
-def test_ceiling_of_nothing(data, wanted, tmp_path):
+@pytest.mark.parametrize("wanted", ["0", "absent", "-3", "empty", "2"])
+def test_ceiling_of_nothing(data, wanted, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     dataset = open_dataset(data)
-    for value in (wanted, str(tmp_path / "empty")):
-        with pytest.raises(UserError, match="--ceiling"):
-            open_ceiling(value, dataset, dataset.uids, PROTOCOL, device="cpu", out=None, steps=5)
+    with pytest.raises(UserError, match=f"--ceiling {wanted}: "):
+        open_ceiling(wanted, dataset, dataset.uids, PROTOCOL, device="cpu", out=None, steps=5)
 
 
 def record(psnr, novel=True, lpips=None):
