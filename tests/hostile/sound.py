@@ -322,13 +322,6 @@ def pages(result, path, out):
     page(result[-1], path, out)
 
 
-def arrays(result, path, out):
-    """Nested containers of arrays of plain numbers."""
-    for value in _flat(result).values():
-        assert not (isinstance(value, np.ndarray) and value.dtype.hasobject), "an array of objects"
-        assert not callable(value), f"a pickle made {value!r}"
-
-
 def cameras(result, path, out):
     """Finite cameras that turn rigidly, with focal lengths above 0 and pictures of bounded size."""
     cameras, rate = result.cameras, result.fps
