@@ -161,19 +161,9 @@ def matrix_to_quat(rotation: Tensor) -> Tensor:
     near 180°.
     """
     m = rotation.double()
-    k = torch.stack(
-        [
-            torch.stack([m.trace(), m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
-            torch.stack(
-                [m[2, 1] - m[1, 2], 2 * m[0, 0] - m.trace(), m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]]
-            ),
-            torch.stack(
-                [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 2 * m[1, 1] - m.trace(), m[1, 2] + m[2, 1]]
-            ),
-            torch.stack(
-                [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 2 * m[2, 2] - m.trace()]
-            ),
-        ]
-    )
+    k = m.new_zeros(4, 4)
+    k[0, 0] = m.trace()
+    k[0, 1:] = k[1:, 0] = torch.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    k[1:, 1:] = m + m.mT - m.trace() * torch.eye(3).to(m)
     quat = torch.linalg.eigh(k).eigenvectors[:, -1]
     return (quat if quat[0] >= 0 else -quat).to(rotation.dtype)

@@ -15,12 +15,15 @@ import re
 import secrets
 import shutil
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping, Sequence
-from http.cookies import CookieError, SimpleCookie
 from pathlib import PurePath
 from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
+from starlette.exceptions import HTTPException
+from starlette.formparsers import MultiPartException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
 
 from ..errors import UserError, first_line
 from ..images import PICTURE_SUFFIXES
@@ -90,10 +93,6 @@ class _Call(msgspec.Struct):
     event_data: Any = None
 
 
-class _Refused(Exception):
-    """A status and one line."""
-
-
 class Guard:
     """An ASGI layer that lets in what the page itself asks for.
 
@@ -134,8 +133,7 @@ class Guard:
             await asyncio.to_thread(self._shelf.sweep)
 
     async def _answer(self, scope: Message, receive: Receive, send: Send) -> None:
-        headers = {name.decode("latin-1"): v.decode("latin-1") for name, v in scope["headers"]}
-        token, more = _token(headers.get("cookie", "")), list(_HEADERS)
+        more = list(_HEADERS)
 
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -144,34 +142,43 @@ class Guard:
 
         # What a proxy would say of itself; gradio would make addresses of it.
         kept = [h for h in scope["headers"] if b"forwarded" not in h[0] and b"gradio" not in h[0]]
+        scope.update({"headers": kept, "scheme": "http"})
+        request, path = Request(scope, receive), scope["path"]
         # The token is the browser's secret, and the folder's name is in what the page says.
-        visitor = token and hashlib.sha256(token.encode()).hexdigest()[:32]
-        scope.update({"headers": kept, "scheme": "http", VISITOR: visitor})
+        token = request.cookies.get(_COOKIE, "")
+        known = _TOKEN.fullmatch(token) is not None
+        visitor = hashlib.sha256(token.encode()).hexdigest()[:32] if known else None
+        scope[VISITOR], answer, read = visitor, self._app, receive
         try:
-            if is_foreign(headers):
-                raise _Refused(421, "this page is that of 127.0.0.1, for its own pages alone")
-            if scope["method"] in ("GET", "HEAD") and _READ.fullmatch(scope["path"]):
-                if scope["path"] == "/" and token is None:
+            if is_foreign(request.headers):
+                raise HTTPException(421, "this page is that of 127.0.0.1, for its own pages alone")
+            if request.method in ("GET", "HEAD") and _READ.fullmatch(path):
+                if path == "/" and visitor is None:
                     cookie = f"{_COOKIE}={secrets.token_hex(16)}; HttpOnly; SameSite=Lax; Path=/"
                     more.append((b"set-cookie", cookie.encode()))
                 self._check_read(scope, visitor or "-")
-                if scope["path"] == _PROGRESS:
-                    await _say(guarded, 200, 'data: {"msg": "done"}\n', "text/event-stream")
-                else:
-                    await self._app(scope, receive, guarded)
-            elif scope["method"] == "POST" and scope["path"] in (_UPLOAD, _JOIN):
-                if visitor is None:
-                    raise _Refused(403, "open the page first; it needs its cookie")
-                await self._take(scope, headers, receive, guarded, visitor)
+                if path == _PROGRESS:
+                    answer = Response('data: {"msg": "done"}\n\n', media_type="text/event-stream")
+            elif request.method != "POST" or path not in (_UPLOAD, _JOIN):
+                raise HTTPException(404, "there is nothing here")
+            elif visitor is None:
+                raise HTTPException(403, "open the page first; it needs its cookie")
+            elif path == _UPLOAD:
+                answer = JSONResponse(await self._taken(request, visitor))
             else:
-                raise _Refused(404, "there is nothing here")
-        except _Refused as error:
-            status, line = error.args
-            if scope["path"] == _JOIN:  # the page shows what a call's answer holds
-                detail = msgspec.json.encode({"detail": line}).decode()
-                await _say(guarded, status, detail, "application/json")
-            else:
-                await _say(guarded, status, line)
+                _check_size(request, _MAX_CALL)
+                body = self._checked(await request.body(), visitor)
+                pieces = iter([{"type": "http.request", "body": body}])
+
+                async def read() -> Message:
+                    return next(pieces, None) or await receive()
+
+        except HTTPException as error:
+            line, kind = error.detail, "text/plain"
+            if path == _JOIN:  # the page shows what a call's answer holds
+                line, kind = msgspec.json.encode({"detail": line}).decode(), "application/json"
+            answer = Response(f"{line}\n", error.status_code, media_type=kind)
+        await answer(scope, read, guarded)
 
     def _check_read(self, scope: Message, visitor: str) -> None:
         """Only what is the visitor's own; sessions are told apart by the visitor as well."""
@@ -180,60 +187,41 @@ class Guard:
             try:
                 self._shelf.file(path.removeprefix(_FILE), visitor)
             except UserError as error:
-                raise _Refused(403, str(error)) from None
+                raise HTTPException(403, str(error)) from None
         elif path.startswith(_ALIVE):
             scope["path"] += visitor
         scope["query_string"] = asked + visitor.encode() if _SESSION.fullmatch(asked) else b""
 
-    async def _take(
-        self, scope: Message, headers: dict[str, str], receive: Receive, send: Send, visitor: str
-    ) -> None:
-        """What comes in: never more than it states, nor more than all files together may take."""
-        stated, limit = headers.get("content-length", ""), _MAX_CALL
-        if scope["path"] == _UPLOAD:
-            limit = self._max_bytes + _HEAD
-        if not re.fullmatch("[0-9]{1,15}", stated):
-            raise _Refused(411, "what is sent must state its length")
-        if int(stated) > limit:
-            raise _Refused(413, f"more than {limit >> 20} MB, the maximum allowed size")
-        if scope["path"] == _JOIN:
-            body = self._checked(await _whole(receive), visitor)
-            pieces = iter([{"type": "http.request", "body": body}])
-
-            async def again() -> Message:
-                return next(pieces, None) or await receive()
-
-            await self._app(scope, again, send)
-            return
-        if self._coming + int(stated) > self._shelf.limit:
-            raise _Refused(503, "too much comes in at once; try again")
-        self._coming += int(stated)
+    async def _taken(self, request: Request, visitor: str) -> list[str]:
+        """The files of an upload: never more than it states, nor more than all may take."""
+        stated = _check_size(request, self._max_bytes + _HEAD)
+        if self._coming + stated > self._shelf.limit:
+            raise HTTPException(503, "too much comes in at once; try again")
+        self._coming += stated
         try:
             await asyncio.to_thread(self._shelf.sweep, self._coming)
-            taken = await asyncio.wait_for(self._upload(scope, receive, visitor), _UPLOAD_SECONDS)
+            return await asyncio.wait_for(self._upload(request, visitor), _UPLOAD_SECONDS)
         except asyncio.TimeoutError:
-            raise _Refused(408, "the upload took too long") from None
+            raise HTTPException(408, "the upload took too long") from None
         finally:
-            self._coming -= int(stated)
-        await _say(send, 200, msgspec.json.encode(taken).decode(), "application/json")
+            self._coming -= stated
 
-    async def _upload(self, scope: Message, receive: Receive, visitor: str) -> list[str]:
+    async def _upload(self, request: Request, visitor: str) -> list[str]:
         """Puts the files of a form on the shelf as they are; nobody looks into them yet."""
-        from starlette.exceptions import HTTPException
-        from starlette.formparsers import MultiPartException
-        from starlette.requests import Request
-
         try:
-            async with Request(scope, receive).form(max_files=4, max_fields=0) as form:
-                if not form:
-                    raise _Refused(400, "no upload of files")
-                return [await asyncio.to_thread(self._keep, f, visitor) for f in form.values()]
+            form = await request.form(max_files=4, max_fields=0)
         except (HTTPException, MultiPartException) as error:
-            raise _Refused(400, f"no upload of files ({first_line(error)})") from None
+            raise HTTPException(400, f"no upload of files ({first_line(error)})") from None
+        if not form:
+            raise HTTPException(400, "no upload of files")
+        try:
+            return [await asyncio.to_thread(self._keep, f, visitor) for f in form.values()]
+        finally:
+            await form.close()
 
     def _keep(self, file: Any, visitor: str) -> str:
         if file.size > self._max_bytes:
-            raise _Refused(413, "the file is over the maximum allowed size")
+            raise HTTPException(413, "the file is over the maximum allowed size")
         suffix = PurePath(file.filename or "").suffix.lower()
         name = f"picture{suffix if suffix in PICTURE_SUFFIXES else ''}"
         path = self._shelf.place(visitor) / name
@@ -258,32 +246,18 @@ class Guard:
                         file.meta = {"_type": "gradio.FileData"}  # gradio looks at such alone
             index = call.event_data.get("index") if isinstance(call.event_data, dict) else None
         except UserError as error:
-            raise _Refused(400, str(error)) from None
+            raise HTTPException(400, str(error)) from None
         call.session_hash += visitor
         call.data = [msgspec.Raw(msgspec.json.encode(item)) for item in given]
         call.event_data = {"index": index}
         return msgspec.json.encode(call)
 
 
-def _token(cookies: str) -> str | None:
-    """The visitor's token, which the browser brings back; None for a new one."""
-    try:
-        cookie = SimpleCookie(cookies).get(_COOKIE)
-    except CookieError:
-        return None
-    return cookie.value if cookie and _TOKEN.fullmatch(cookie.value) else None
-
-
-async def _whole(receive: Receive) -> bytes:
-    parts, more = [], True
-    while more:
-        message = await receive()
-        parts.append(message.get("body", b""))
-        more = message.get("more_body", False)
-    return b"".join(parts)
-
-
-async def _say(send: Send, status: int, line: str, kind: str = "text/plain") -> None:
-    headers = [(b"content-type", f"{kind}; charset=utf-8".encode())]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": f"{line}\n".encode()})
+def _check_size(request: Request, limit: int) -> int:
+    """The bytes that a request states; it must, and may not be over the limit."""
+    stated = request.headers.get("content-length", "")
+    if not re.fullmatch("[0-9]{1,15}", stated):
+        raise HTTPException(411, "what is sent must state its length")
+    if int(stated) > limit:
+        raise HTTPException(413, f"more than {limit >> 20} MB, the maximum allowed size")
+    return int(stated)

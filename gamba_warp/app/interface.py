@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +21,7 @@ _TITLE = """<h1>Gamba</h1>
 out.</p>"""
 _EMPTY = """<div class="stage empty"><p>The object will stand here.<br>Give a picture, look at its
 cut-out, and make it 3D.</p></div>"""
+_FILES = {"Gaussians": work.GAUSSIANS, "Mesh": work.MESHES, "To show": work.SHOWS}
 _BRUSHES = {"Paint what to keep": KEEP, "Paint what to remove": REMOVE}
 # On a phone the object stands below the window.
 _SHOW = """() => {
@@ -40,22 +40,141 @@ _FETCH = """(files) => {
 
 
 def build(actions: Actions) -> gr.Blocks:
-    """Makes the page; ``server.serve`` serves it."""
+    """Makes the page; ``server.serve`` serves it.
+
+    One action at a time over all pages, for they share the device. gradio preprocesses nothing: it
+    would decode pictures itself, and differently, without limits.
+    """
     gr.set_static_paths([FOLDER])
     page = gr.Blocks(title="Gamba", analytics_enabled=False, fill_width=True)
     with page:
         gr.HTML(_TITLE, elem_id="title")
-        states = gr.State(None, time_to_live=KEPT), gr.State(None, time_to_live=KEPT)
+        cut, made = gr.State(None, time_to_live=KEPT), gr.State(None, time_to_live=KEPT)
         with gr.Row(elem_id="bench"):
             with gr.Column(scale=5, min_width=300):
-                picture, gallery = _picture_part()
-                parts = _cut_part()
+                picture = gr.Image(
+                    label="Picture",
+                    sources=["upload", "clipboard"],
+                    type="filepath",
+                    image_mode=None,
+                    height=170,
+                    buttons=[],
+                    placeholder="Drop a picture here\nor click to choose one",
+                    elem_id="picture",
+                )
+                gallery = gr.Gallery(
+                    [(str(path), title) for path, title in examples()],
+                    label="Or take an example",
+                    columns=6,
+                    height="auto",
+                    allow_preview=False,
+                    object_fit="contain",
+                    buttons=[],
+                    interactive=False,
+                    elem_id="examples",
+                )
+                with gr.Column(visible=False, elem_id="cut") as cut_part:
+                    editor = gr.ImageEditor(
+                        label="Cut-out",
+                        type="numpy",
+                        image_mode="RGBA",
+                        format="png",
+                        sources=(),
+                        transforms=(),
+                        layers=False,
+                        brush=_brush(KEEP),
+                        eraser=gr.Eraser(default_size=SIDE // 24),
+                        canvas_size=(SIDE, SIDE),
+                        height=380,
+                        buttons=[],
+                        elem_id="editor",
+                    )
+                    note = gr.HTML(elem_id="note")
+                    choices, first = list(_BRUSHES), next(iter(_BRUSHES))
+                    plain: dict[str, Any] = {"show_label": False, "container": False}
+                    brush = gr.Radio(choices, value=first, elem_id="brush", **plain)
+                    with gr.Row():
+                        mend = gr.Button("Apply strokes", size="md", min_width=120)
+                        restart = gr.Button("Start over", size="md", min_width=120)
+                    elevation = gr.Slider(
+                        -30,
+                        90,
+                        value=0,
+                        step=1,
+                        label="Camera above the object, degrees",
+                        info="Where it looked down, this makes the object stand upright.",
+                        elem_id="elevation",
+                    )
+                    make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
             with gr.Column(scale=8, min_width=300, elem_id="right"):
                 stage = gr.HTML(_EMPTY, elem_id="stage")
-                files_part = _files_part()
-        _connect(actions, states, picture, gallery, parts, stage, files_part)
+                buttons: dict[str, gr.Button] = {}
+                with gr.Column(visible=False, elem_id="files") as files_part:
+                    for title, kinds in _FILES.items():
+                        with gr.Row(elem_classes="kinds"):
+                            gr.HTML(f"<span>{title}</span>", elem_classes="kinds-title")
+                            for kind, (label, _) in kinds.items():
+                                buttons[kind] = gr.Button(
+                                    label, size="sm", min_width=70, elem_id=f"file-{kind}"
+                                )
+                    made_files = gr.File(
+                        label="Files",
+                        file_count="multiple",
+                        interactive=False,
+                        visible=False,
+                        elem_id="made",
+                    )
+        one: dict[str, Any] = {
+            "concurrency_id": "gamba",
+            "concurrency_limit": 1,
+            "preprocess": False,
+            "api_visibility": "private",
+        }
+        # On the editor the sign that something is going on would stay: gradio shows it once more
+        # when the editor has taken its new picture.
+        quick = {**one, "show_progress": "hidden"}
+        taking = {**one, "show_progress_on": picture}
+        shown, mask = [cut, cut_part, editor, note, picture], [cut, editor]
+        # (The event ``input`` comes with the old picture when that is taken away.)
+        picture.upload(actions.take, picture, shown, **taking)
+        picture.clear(actions.leave, None, shown, **quick)
+        gallery.select(actions.example, None, shown, **taking)
+        # Waits for no other: it has a turn of its own.
+        brush.change(_painting, brush, editor, **{**quick, "concurrency_id": "brush"})
+        mend.click(actions.mend, mask, mask, **quick)
+        restart.click(actions.restart, cut, mask, **quick)
+        make.click(
+            actions.make,
+            [cut, editor, elevation],
+            [cut, editor, made, stage, files_part, made_files],
+            show_progress_on=stage,
+            **one,
+        )
+        make.click(None, js=_SHOW, api_visibility="private")
+        for kind, button in buttons.items():
+            written = button.click(
+                actions.writer(kind),
+                made,
+                [made, made_files],
+                show_progress_on=made_files,
+                **one,
+            )
+            written.success(None, made_files, None, js=_FETCH, api_visibility="private")
     page.queue(api_open=False, max_size=WAITING, default_concurrency_limit=1)
     return page
+
+
+def _brush(color: str) -> gr.Brush:
+    return gr.Brush(
+        colors=[(KEEP, STROKE), (REMOVE, STROKE)],
+        default_color=(color, STROKE),
+        default_size=SIDE // 20,
+        color_mode="fixed",
+    )
+
+
+def _painting(choice: str) -> Any:
+    return gr.update(brush=_brush(_BRUSHES[choice]))
 
 
 def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
@@ -69,173 +188,6 @@ def inputs(page: gr.Blocks) -> dict[int, list[Any]]:
     }
     ours = {number: fn.inputs for number, fn in page.fns.items() if fn.fn is not None}
     return {number: [kinds[type(block)] for block in given] for number, given in ours.items()}
-
-
-def _picture_part() -> tuple[gr.Image, gr.Gallery]:
-    picture = gr.Image(
-        label="Picture",
-        sources=["upload", "clipboard"],
-        type="filepath",
-        image_mode=None,
-        height=170,
-        buttons=[],
-        placeholder="Drop a picture here\nor click to choose one",
-        elem_id="picture",
-    )
-    gallery = gr.Gallery(
-        [(str(path), title) for path, title in examples()],
-        label="Or take an example",
-        columns=6,
-        height="auto",
-        allow_preview=False,
-        object_fit="contain",
-        buttons=[],
-        interactive=False,
-        elem_id="examples",
-    )
-    return picture, gallery
-
-
-@dataclass
-class _CutPart:
-    group: gr.Column
-    editor: gr.ImageEditor
-    note: gr.HTML
-    brush: gr.Radio
-    mend: gr.Button
-    restart: gr.Button
-    elevation: gr.Slider
-    make: gr.Button
-
-
-def _brush(color: str) -> gr.Brush:
-    size = SIDE // 20
-    return gr.Brush(
-        colors=[(KEEP, STROKE), (REMOVE, STROKE)],
-        default_color=(color, STROKE),
-        default_size=size,
-        color_mode="fixed",
-    )
-
-
-def _painting(choice: str) -> Any:
-    return gr.update(brush=_brush(_BRUSHES[choice]))
-
-
-def _cut_part() -> _CutPart:
-    with gr.Column(visible=False, elem_id="cut") as group:
-        editor = gr.ImageEditor(
-            label="Cut-out",
-            type="numpy",
-            image_mode="RGBA",
-            format="png",
-            sources=(),
-            transforms=(),
-            layers=False,
-            brush=_brush(KEEP),
-            eraser=gr.Eraser(default_size=SIDE // 24),
-            canvas_size=(SIDE, SIDE),
-            height=380,
-            buttons=[],
-            elem_id="editor",
-        )
-        note = gr.HTML(elem_id="note")
-        brush = gr.Radio(
-            list(_BRUSHES),
-            value=next(iter(_BRUSHES)),
-            show_label=False,
-            container=False,
-            elem_id="brush",
-        )
-        with gr.Row():
-            mend = gr.Button("Apply strokes", size="md", min_width=120)
-            restart = gr.Button("Start over", size="md", min_width=120)
-        elevation = gr.Slider(
-            -30,
-            90,
-            value=0,
-            step=1,
-            label="Camera above the object, degrees",
-            info="Where it looked down, this makes the object stand upright.",
-            elem_id="elevation",
-        )
-        make = gr.Button("Make it 3D", variant="primary", size="lg", elem_id="make")
-    return _CutPart(group, editor, note, brush, mend, restart, elevation, make)
-
-
-@dataclass
-class _FilesPart:
-    group: gr.Column
-    buttons: dict[str, gr.Button]
-    files: gr.File
-
-
-def _files_part() -> _FilesPart:
-    titles = {"Gaussians": work.GAUSSIANS, "Mesh": work.MESHES, "To show": work.SHOWS}
-    buttons: dict[str, gr.Button] = {}
-    with gr.Column(visible=False, elem_id="files") as group:
-        for title, kinds in titles.items():
-            with gr.Row(elem_classes="kinds"):
-                gr.HTML(f"<span>{title}</span>", elem_classes="kinds-title")
-                for kind, (label, _) in kinds.items():
-                    options = {"size": "sm", "min_width": 70, "elem_id": f"file-{kind}"}
-                    buttons[kind] = gr.Button(label, **options)
-        files = gr.File(
-            label="Files", file_count="multiple", interactive=False, visible=False, elem_id="made"
-        )
-    return _FilesPart(group, buttons, files)
-
-
-def _connect(
-    actions: Actions,
-    states: tuple[gr.State, gr.State],
-    picture: gr.Image,
-    gallery: gr.Gallery,
-    parts: _CutPart,
-    stage: gr.HTML,
-    files_part: _FilesPart,
-) -> None:
-    """Which action each event calls; one at a time over all pages, for they share the device.
-
-    gradio preprocesses nothing: it would decode pictures itself, and differently, without limits.
-    """
-    cut, made = states
-    one: dict[str, Any] = {
-        "concurrency_id": "gamba",
-        "concurrency_limit": 1,
-        "preprocess": False,
-        "api_visibility": "private",
-    }
-    # On the editor the sign that something is going on would stay: gradio shows it once more when
-    # the editor has taken its new picture.
-    quick = {**one, "show_progress": "hidden"}
-    taking = {**one, "show_progress_on": picture}
-    shown = [cut, parts.group, parts.editor, parts.note, picture]
-    # (The event ``input`` comes with the old picture when that is taken away.)
-    picture.upload(actions.take, picture, shown, **taking)
-    picture.clear(actions.leave, None, shown, **quick)
-    gallery.select(actions.example, None, shown, **taking)
-    mask = [cut, parts.editor]
-    # Waits for no other: it has a turn of its own.
-    parts.brush.change(_painting, parts.brush, parts.editor, **{**quick, "concurrency_id": "brush"})
-    parts.mend.click(actions.mend, mask, mask, **quick)
-    parts.restart.click(actions.restart, cut, mask, **quick)
-    parts.make.click(
-        actions.make,
-        [cut, parts.editor, parts.elevation],
-        [cut, parts.editor, made, stage, files_part.group, files_part.files],
-        show_progress_on=stage,
-        **one,
-    )
-    parts.make.click(None, js=_SHOW, api_visibility="private")
-    for kind, button in files_part.buttons.items():
-        button.click(
-            actions.writer(kind),
-            made,
-            [made, files_part.files],
-            show_progress_on=files_part.files,
-            **one,
-        ).success(None, files_part.files, None, js=_FETCH, api_visibility="private")
 
 
 LOOK = Path(__file__).parent / "look.css"
