@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from ..batch import for_each, plan_outputs, report
-from ..conventions import Axes, DeviceChoice
+from ..conventions import DeviceChoice
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import output_folder
-from ..formats.names import MeshChoice, SplatFormat, mesh_formats
+from ..pages.options import EXPORTED, FileOptions
 from ..surfaces.options import (
     BROWSER_FACES,
     TEXTURED_FACES,
@@ -26,21 +26,14 @@ from ..surfaces.options import (
     Views,
     Voxels,
 )
-from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, ranged
-
-if TYPE_CHECKING:
-    from ..pages.export import ExportJob
+from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 
 
 @ranged
 def export_command(
     inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
     /,
-    out: Path = Path("out"),
-    mesh: tuple[MeshChoice, ...] = ("glb",),
-    splats: tuple[SplatFormat, ...] = (),
-    page: bool = False,
-    turntable: Literal["gif", "mp4", "none"] = "none",
+    files: Annotated[FileOptions, tyro.conf.OmitArgPrefixes] = EXPORTED,
     surface: Literal["tsdf", "density"] = "tsdf",
     voxels: Voxels = 128,
     views: Views = 64,
@@ -52,10 +45,6 @@ def export_command(
     min_component: PartShare = 0.01,
     largest: bool = False,
     smooth: Smoothing = 0,
-    frame: Axes = "opengl",
-    min_opacity: Opacity | None = None,
-    size: Side = 256,
-    frames: Frames = 48,
     elevation: Elevation = 0.0,
     fov: Fov | None = None,
     distance: Distance | None = None,
@@ -68,11 +57,7 @@ def export_command(
 
     Args:
         inputs: Gaussians (.ply, .splat, .spz, .glb), or folders of them.
-        out: Folder for the results.
-        mesh: Files of the surface.
-        splats: Files of the Gaussians.
-        page: Write an HTML page with a 3D viewer.
-        turntable: Moving picture of one turn.
+        files: What is written.
         surface: Method: tsdf (fused depth of many views) or density (level set; fattens thin
             parts).
         voxels: Number of voxels along the object's longest side.
@@ -86,11 +71,6 @@ def export_command(
         min_component: Remove parts with a smaller share of the faces.
         largest: Keep the largest part only.
         smooth: Number of smoothing steps.
-        frame: Axes of meshes but .glb; opengl is y up, opencv y down as files of Gaussians are.
-        min_opacity: Leave out Gaussians fainter than this; 1/255 if not given, below which they
-            are never drawn. 0 keeps all.
-        size: Side of the turntable's frames in pixels.
-        frames: Number of views in the turntable.
         elevation: Degrees by which the camera of turntable and 3D viewer stands above the object.
         fov: Its field of view, degrees; 49.1 if not given. Without --distance the object stays as
             large.
@@ -98,7 +78,9 @@ def export_command(
             given.
         device: Device that renders; auto is the GPU if there is one.
     """
-    from ..pages.export import ExportJob
+    from tqdm import tqdm
+
+    from ..pages.export import ExportJob, export, find_gaussians
     from ..trajectories.paths import Viewpoint
 
     options = SurfaceOptions(
@@ -107,47 +89,30 @@ def export_command(
         views=views,
         pixels=pixels,
         faces=(TEXTURED_FACES if texture else BROWSER_FACES) if faces is None else faces,
-        colors=colors and set(mesh) != {"stl"},
+        colors=colors and set(files.mesh) != {"stl"},
         close_holes=close_holes,
         min_component=min_component,
         largest=largest,
         smooth=smooth,
     )
     job = ExportJob(
-        folder=out,
-        mesh=mesh_formats(mesh),
-        splats=splats,
-        page=page,
-        turntable=turntable,
+        options=files,
         surface=options,
         texture=texture,
-        axes=frame,
-        min_opacity=min_opacity,
-        size=size,
-        frames=frames,
         device=pick_device(device),
         view=Viewpoint().changed(elevation, distance, fov),
     )
-    return _run(inputs, job)
-
-
-def _run(inputs: tuple[Path, ...], job: ExportJob) -> int:
-    """Writes what the job says for each file, and returns the exit code."""
-    from tqdm import tqdm
-
-    from ..pages.export import export, find_gaussians
-
     if not job.suffixes():
         raise UserError("nothing to write: give --mesh, --splats, --page or --turntable")
     job.require()
-    files, failures = find_gaussians(inputs)
-    if not files:
+    found, failures = find_gaussians(inputs)
+    if not found:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
-    names = plan_outputs(files, job.suffixes(), job.folder)
-    output_folder(job.folder)
+    names = plan_outputs(found, job.suffixes(), files.out)
+    output_folder(files.out)
 
     def one(name: str, path: Path) -> None:
         tqdm.write(export(name, path, job))
 
     for_each(names, one, "export", "file", failures)
-    return report(len(files), "file", failures, job.folder)
+    return report(len(found), "file", failures, files.out)

@@ -6,23 +6,23 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ..batch import STAGES, check_not_read, for_each, plan_outputs, report, say
-from ..conventions import Axes, DeviceChoice, Precision
+from ..conventions import DeviceChoice, Precision
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
-from ..formats.names import MeshChoice, SplatFormat, mesh_formats
-from ..untrusted.ranges import Distance, Elevation, Fov, Frames, Opacity, Side, ranged
+from ..pages.options import RECONSTRUCTED, FileOptions
+from ..untrusted.ranges import Distance, Elevation, Fov, ranged
 
 if TYPE_CHECKING:
     import torch
 
     from ..model.gamba import Gamba
-    from ..pages.outputs import Outputs
+    from ..pages.export import Outputs
     from ..photo.cutout import Ways
 
 
@@ -46,22 +46,14 @@ def reconstruct_command(
     /,
     checkpoint: Path | None = None,
     encoder_weights: Path | None = None,
-    out: Path = Path("out"),
-    splats: tuple[SplatFormat, ...] = ("ply",),
-    mesh: tuple[MeshChoice, ...] = (),
-    turntable: Literal["gif", "mp4", "none"] = "gif",
-    size: Side = 256,
-    frames: Frames = 48,
+    files: Annotated[FileOptions, tyro.conf.OmitArgPrefixes] = RECONSTRUCTED,
     camera: Annotated[CameraOptions, tyro.conf.OmitArgPrefixes] = CameraOptions(),
-    page: bool = True,
     sheet: Path | None = None,
     mask: Path | None = None,
     matte_model: Annotated[str | None, tyro.conf.arg(metavar="FILE|URL")] = None,
     sam: Path | None = None,
     recenter: bool = True,
     save_inputs: bool = False,
-    frame: Axes = "opengl",
-    min_opacity: Opacity | None = None,
     device: DeviceChoice = "auto",
     precision: Precision = "float32",
     times: bool = False,
@@ -72,14 +64,8 @@ def reconstruct_command(
         images: Picture files, or folders of them.
         checkpoint: Trained model (.safetensors); the shipped model if not given.
         encoder_weights: The image encoder's weights, where the model has a pretrained one.
-        out: Folder for the results.
-        splats: Files of Gaussians to write.
-        mesh: Also files of a coloured mesh (gamba export has its options).
-        turntable: Moving picture of one turn.
-        size: Side of the turntable's frames in pixels.
-        frames: Number of views in the turntable.
+        files: What is written.
         camera: From where the picture was taken, and its results are shown.
-        page: Write an HTML page with the input, the turntable and a 3D viewer.
         sheet: Also one picture of all inputs and five views around each (.png, .webp, .jpg).
         mask: Picture that is white where the object is (for a single image).
         matte_model: ISNet or U2-Net (.onnx) that cuts objects out, or an address of rembg's.
@@ -87,16 +73,13 @@ def reconstruct_command(
         recenter: Bring the object into the middle of the picture, at the size of training; else it
             stays where and as large as it is in a square picture.
         save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
-        frame: Axes of meshes but .glb; opengl is y up, opencv y down as files of Gaussians are.
-        min_opacity: Leave out Gaussians fainter than this; 1/255 if not given, below which they
-            are never drawn. 0 keeps all.
         device: Device that computes; auto is the GPU if there is one.
         precision: That of the network's products; auto is bfloat16 where that is faster.
         times: Print what each stage took.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
     from ..pages.card import about_model
-    from ..pages.outputs import Outputs
+    from ..pages.export import Outputs
     from ..pages.sheet import Sheet
     from ..photo.cutout import Ways
 
@@ -104,15 +87,7 @@ def reconstruct_command(
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
     file = _file_of(checkpoint)
     outputs = Outputs(
-        folder=out,
-        splats=splats,
-        mesh=mesh_formats(mesh),
-        turntable=turntable,
-        size=size,
-        frames=frames,
-        page=page,
-        axes=frame,
-        min_opacity=min_opacity,
+        options=files,
         checkpoint=checkpoint,
         about=about_model(file),
         camera=(camera.elevation, camera.distance, camera.fov),
@@ -120,7 +95,7 @@ def reconstruct_command(
     )
     outputs.require()
     reads = (mask, Path(matte_model) if matte_model else None, sam, file, encoder_weights)
-    names = plan_outputs(pictures, outputs.suffixes(), out, reads, outputs.own(len(pictures)))
+    names = plan_outputs(pictures, outputs.suffixes(), files.out, reads, outputs.own(len(pictures)))
     if sheet is not None:
         check_not_read([sheet], [*pictures, *reads])
         outputs.sheet = Sheet(sheet)
@@ -128,7 +103,7 @@ def reconstruct_command(
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
     ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
-    output_folder(out)
+    output_folder(files.out)
     one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision)
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:
@@ -136,7 +111,7 @@ def reconstruct_command(
     outputs.write_index()
     if times:
         print(STAGES.table())
-    return report(len(pictures), "picture", failures, out)
+    return report(len(pictures), "picture", failures, files.out)
 
 
 def _one(
@@ -151,7 +126,7 @@ def _one(
 ) -> None:
     """Reconstructs one picture, and writes what was asked for."""
     from ..model.predict import reconstruct
-    from ..pages.outputs import write_outputs
+    from ..pages.export import write_outputs
     from ..photo.cutout import cut_out
 
     STAGES.begin("cutting out")

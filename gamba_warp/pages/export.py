@@ -1,17 +1,19 @@
-"""What is written of an object of Gaussians, and all that ``gamba export`` writes of a file."""
+"""What is written of an object: of a file by ``gamba export``, of a picture by ``reconstruct``."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
+from tqdm import tqdm
 
-from ..batch import STAGES
-from ..conventions import Axes
+from ..batch import STAGES, say
+from ..data.preprocess import composite
 from ..errors import UserError
 from ..formats.gaussians.files import (
     comments_of,
@@ -20,15 +22,24 @@ from ..formats.gaussians.files import (
     to_be_written,
     write_gaussians,
 )
-from ..formats.names import SPLAT_SUFFIXES, MeshFormat, SplatFormat, splat_suffix
+from ..formats.names import SPLAT_SUFFIXES, mesh_formats, splat_suffix
 from ..gaussians import Gaussians
+from ..images import save_image, to_uint8
+from ..model.config import GambaConfig
+from ..photo.cutout import CutOut
 from ..surfaces.extract import unit_frame
 from ..surfaces.files import mesh_suffixes, write_meshes
-from ..surfaces.options import SurfaceOptions
+from ..surfaces.options import BROWSER_FACES, SurfaceOptions
 from ..trajectories.movies import require_movie
-from ..trajectories.paths import Viewpoint
-from .page import Section, reconstruction_page
+from ..trajectories.paths import Viewpoint, set_up
+from .options import FileOptions
+from .page import Section, index_page, reconstruction_page
+from .sheet import Sheet
 from .turntable import save_turntable, turntable_frames
+
+INDEX = "index.html"  # leads to the pages of several results
+_SMALL = (320, 160)  # size there of an input and its result together, pixels
+_SURFACE = SurfaceOptions(colors=True, faces=BROWSER_FACES)
 
 
 @dataclass(kw_only=True)
@@ -36,41 +47,30 @@ class ObjectFiles:
     """What to write of each object.
 
     Attributes:
-        folder: folder of the results.
-        splats: formats of the Gaussians.
-        mesh: formats of a mesh of the surface.
-        page: whether a self-contained HTML page with a 3D viewer is written.
-        turntable: ``gif``, ``mp4`` or ``none``.
-        size: side of the turntable's frames, pixels.
-        frames: views of one turn.
-        axes: axes of the meshes, but of .glb.
-        min_opacity: fainter Gaussians are left out; None: those that are never drawn.
-        surface: how the mesh is made.
+        options: the files.
+        surface: how a mesh is made.
         texture: side of its texture, pixels; 0: none.
+        mesh: formats of the mesh.
     """
 
-    folder: Path
-    splats: tuple[SplatFormat, ...]
-    mesh: tuple[MeshFormat, ...]
-    page: bool
-    turntable: str
-    size: int
-    frames: int
-    axes: Axes
-    min_opacity: float | None
+    options: FileOptions
     surface: SurfaceOptions
     texture: int = 0
 
+    def __post_init__(self) -> None:
+        self.mesh = mesh_formats(self.options.mesh)
+
     def suffixes(self, meshes: bool = True) -> list[str]:
         """What follows the name of an object in each of its files, those of meshes the last."""
-        found = [splat_suffix(kind) for kind in self.splats]
-        found += [f".{self.turntable}"] if self.turntable != "none" else []
-        found += [".html"] if self.page else []
+        options = self.options
+        found = [splat_suffix(kind) for kind in options.splats]
+        found += [f".{options.turntable}"] if options.turntable != "none" else []
+        found += [".html"] if options.page else []
         return found + (mesh_suffixes(self.mesh, self.texture) if meshes else [])
 
     def require(self) -> None:
         """Refuses what needs a library that is not installed (ModuleNotFoundError)."""
-        require_movie(self.turntable)
+        require_movie(self.options.turntable)
         if self.mesh:
             self.surface.require(self.texture)
 
@@ -101,28 +101,29 @@ class ObjectFiles:
         Raises:
             UserError: a file cannot be written, or the object has no surface.
         """
-        base, turn = self.folder / section.title, None
+        options = self.options
+        base, turn = options.out / section.title, None
         STAGES.begin("Gaussians")
         said = []
-        for kind in self.splats:
+        for kind in options.splats:
             path = base.with_name(base.name + splat_suffix(kind))
             said.append(write_gaussians(path, gaussians, kind, comments=comments))
-        if self.turntable != "none" or self.page:
+        if options.turntable != "none" or options.page:
             STAGES.begin("turntable")
             seen = gaussians if shown is None else shown
             turn = turntable_frames(
-                seen.to(device), size=self.size, frames=self.frames, **asdict(view)
+                seen.to(device), size=options.size, frames=options.frames, **asdict(view)
             )
-            if self.turntable != "none":
-                STAGES.begin(f"{self.turntable} file")
-                save_turntable(base.with_name(f"{base.name}.{self.turntable}"), turn)
+            if options.turntable != "none":
+                STAGES.begin(f"{options.turntable} file")
+                save_turntable(base.with_name(f"{base.name}.{options.turntable}"), turn)
             section.turntable, section.gaussians = turn, seen
             self._write_page(section, meshes=False)
         if self.mesh:  # what takes longest comes last: all else is there to look at
             STAGES.begin("mesh")
             start = time.perf_counter()
-            options = self.surface, self.axes, device, self.texture
-            mesh = write_meshes(base, gaussians, self.mesh, *options)
+            how = self.surface, options.frame, device, self.texture
+            mesh = write_meshes(base, gaussians, self.mesh, *how)
             seconds = time.perf_counter() - start
             closed = "closed" if mesh.is_watertight() else "open"
             counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closed}"
@@ -134,11 +135,11 @@ class ObjectFiles:
 
     def _write_page(self, section: Section, meshes: bool) -> None:
         """The page, if it is wanted; the second time it also leads to the meshes."""
-        if self.page:
+        if self.options.page:
             STAGES.begin("page")
             ends = [end for end in self.suffixes(meshes) if end != ".html"]
             section.files = [section.title + end for end in ends]
-            reconstruction_page(self.folder / f"{section.title}.html", section)
+            reconstruction_page(self.options.out / f"{section.title}.html", section)
 
 
 @dataclass(kw_only=True)
@@ -208,9 +209,95 @@ def export(name: str, path: Path, job: ExportJob) -> str:
     Raises:
         UserError: the input cannot be read, has no surface, or a file cannot be written.
     """
-    gaussians, count = to_be_written(read_gaussians(path), job.min_opacity)
-    drawn = job.page or job.turntable != "none"
+    gaussians, count = to_be_written(read_gaussians(path), job.options.min_opacity)
+    drawn = job.options.page or job.options.turntable != "none"
     shown = gaussians.in_unit(*unit_frame(gaussians)) if drawn else gaussians
     section = Section(name, table=[("Gaussians", f"{gaussians.num:,}")], **asdict(job.view))
     said, _ = job.write(gaussians, shown, job.view, section, job.device, comments_of(path))
     return " ".join([f"{name}: {count}", *said])
+
+
+@dataclass(kw_only=True)
+class Outputs(ObjectFiles):
+    """What to write for each picture.
+
+    Attributes:
+        checkpoint: the model's file, named in the ``.ply``.
+        about: labels and texts for the page, of the model.
+        sheet: gets a row of each picture, or None.
+        camera: elevation of the input's camera above the object, degrees (what is written stands
+            upright); distance and field of view, degrees, of the camera of turntable, sheet and
+            viewer, of which None is the model's.
+        inputs: whether each cut-out is written, too, as ``NAME-input.png``.
+        made: by name a small picture of each result that has a page.
+    """
+
+    surface: SurfaceOptions = _SURFACE
+    checkpoint: Path
+    about: Sequence[tuple[str, str]] = ()
+    sheet: Sheet | None = None
+    camera: tuple[float, float | None, float | None] = (0.0, None, None)
+    inputs: bool = False
+    made: dict[str, np.ndarray] = field(default_factory=dict, init=False)
+
+    def suffixes(self, meshes: bool = True) -> list[str]:
+        """What follows the name of a picture in each of its files."""
+        return super().suffixes(meshes) + (["-input.png"] if self.inputs else [])
+
+    def own(self, count: int) -> list[str]:
+        """Names of files that are of no one of so many pictures."""
+        return [INDEX] if self.options.page and count > 1 else []
+
+    def write_index(self) -> None:
+        """Writes the page that leads to the results, where there are several."""
+        if len(self.made) > 1:
+            title = f"{len(self.made):,} reconstructions"
+            index_page(self.options.out / INDEX, title, self.made)
+
+    def view(self, config: GambaConfig) -> Viewpoint:
+        """From where turntable, sheet and viewer look; that of the input, but for the options."""
+        return Viewpoint(0.0, config.distance, config.fov).changed(*self.camera)
+
+
+def write_outputs(
+    name: str,
+    cut: CutOut,
+    gaussians: Gaussians,
+    outputs: Outputs,
+    config: GambaConfig,
+    seconds: float,
+) -> None:
+    """Writes everything that was asked for of one reconstruction, as ``NAME.*`` in the folder.
+
+    Args:
+        name: stem of the files.
+        cut: what was reconstructed, and how it was cut out.
+        gaussians: ``[N]``, on the device that is to render the turntable.
+        outputs: what to write.
+        config: of the model, for the camera.
+        seconds: how long the model took.
+
+    Raises:
+        UserError: a file cannot be written, or no Gaussian can be.
+    """
+    view = outputs.view(config)
+    gaussians, count = to_be_written(gaussians, outputs.options.min_opacity)
+    say(f"{name}: {count}")
+    gaussians = set_up(gaussians, view.elevation)
+    if outputs.inputs:
+        save_image(outputs.options.out / f"{name}-input.png", cut.editable)
+    device = gaussians.means.device
+    took = ("Forward pass", f"{seconds:.2f} s on {device.type}")
+    table = [("Gaussians", f"{gaussians.num:,}"), took, *outputs.about]
+    section = Section(name, cut.note, cut.rgba, table=table, **asdict(view))
+    comments = [f"from {name} by {outputs.checkpoint.name}"]
+    lost, turn = outputs.write(gaussians, None, view, section, device, comments)
+    for line in lost:
+        tqdm.write(line)
+    if outputs.sheet is not None:
+        outputs.sheet.add(name, cut.rgba, gaussians, view)
+    if outputs.options.page and turn is not None:
+        flat = to_uint8(composite(cut.rgba, turn.shape[1]).numpy())
+        small = Image.fromarray(np.hstack([flat, turn[len(turn) // 8]]))  # turned a little
+        small.thumbnail(_SMALL)
+        outputs.made[name] = np.asarray(small)

@@ -18,7 +18,7 @@ _FORKS.set_forkserver_preload(
     [
         *("timm", "trimesh", "gamba_warp.measure.suites", "gamba_warp.fitting.objects"),
         *("gamba_warp.eval.shapes.pairs", "gamba_warp.eval.views.evaluate"),
-        *("gamba_warp.model.predict", "gamba_warp.model.released", "gamba_warp.pages.outputs"),
+        *("gamba_warp.model.predict", "gamba_warp.model.released"),
         *("gamba_warp.pages.export", "gamba_warp.train.run", "gamba_warp.train.data.render"),
     ]
 )
