@@ -8,7 +8,6 @@ import os
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     import torch
 
 _TRIAL_SECONDS, _TRIAL_ROWS = 0.05, 2048
-_DOUBT = 4  # a trial that finds no gain takes this many times as long: the cores may be taken
 _FASTER = 1.2  # how much faster bfloat16 must be: a choice on the edge would change from run to run
 _ALL_DIGITS = 1e-6  # relative rms error of a product of float32; rounded factors make it 2e-3
 # Options of glibc's mallopt, and their values: what is kept free, and the size from which a block
@@ -117,7 +115,7 @@ def pick_precision(name: Precision, device: torch.device, width: int) -> torch.d
     Args:
         name: ``auto`` is bfloat16 where a product of the model's size is at least 1.2 times as
             fast in it as in float32 (``network_products``), else float32. The trial takes about
-            50 ms once a process; a processor without bfloat16 products fails it by far.
+            0.1 s once a process; a processor without bfloat16 products fails it by far.
         device: where the model computes.
         width: channels of the model's tokens.
 
@@ -136,26 +134,18 @@ def pick_precision(name: Precision, device: torch.device, width: int) -> torch.d
 def _gain_of_bfloat16(name: str, width: int, threads: int) -> float:
     """How many times as fast a product is in bfloat16 as in float32, by the fastest of each."""
     import torch
+    from torch.utils.benchmark import Timer
 
     device = torch.device(name)
     g = torch.Generator().manual_seed(0)  # the state of torch's own chance belongs to the caller
     full = torch.randn(_TRIAL_ROWS, width, generator=g).to(device)
     matrix = torch.randn(width, 4 * width, generator=g).to(device)
     pairs = [(full, matrix), (full.bfloat16(), matrix.bfloat16())]
-    best, rounds = [float("inf")] * 2, 0
-    began = time.perf_counter()
+    best = []
     with torch.no_grad(), network_products(device):
-        while rounds < 3 or time.perf_counter() - began < _TRIAL_SECONDS * (
-            1 if best[0] >= _FASTER * best[1] else _DOUBT
-        ):
-            for i, (a, b) in enumerate(pairs):
-                before = time.perf_counter()
-                torch.matmul(a, b)
-                if device.type == "cuda":
-                    torch.cuda.synchronize(device)
-                if rounds:  # the first is slow for other reasons
-                    best[i] = min(best[i], time.perf_counter() - before)
-            rounds += 1
+        for a, b in pairs:
+            timer = Timer("a @ b", globals={"a": a, "b": b}, num_threads=threads)
+            best.append(min(timer.blocked_autorange(min_run_time=_TRIAL_SECONDS).times))
     return best[0] / best[1]
 
 

@@ -61,15 +61,7 @@ def extract_surface(gaussians: Gaussians, options: SurfaceOptions, texture: int 
     gaussians = near_and_visible(gaussians.detach())
     views = None
     if options.method == "tsdf" or options.colors or texture:
-        views = look_around(
-            gaussians,
-            options.views,
-            options.pixels,
-            options.transmittance,
-            options.min_alpha,
-            options.clear_alpha,
-            options.max_slope,
-        )
+        views = look_around(gaussians, options)
     if options.method == "tsdf":
         assert views is not None
         support = max(1.0, options.min_support * options.views)
@@ -189,14 +181,26 @@ def cleaned_mesh(
     Raises:
         UserError: nothing is left.
     """
-    from pymeshlab import Mesh, MeshSet  # pyright: ignore[reportAttributeAccessIssue] (no stubs)
+    # which has no stubs
+    from pymeshlab import Mesh, MeshSet, PureValue  # pyright: ignore[reportAttributeAccessIssue]
 
     meshes = MeshSet()
     meshes.add_mesh(Mesh(vertices, faces.astype(np.int32)))
     meshes.meshing_remove_duplicate_vertices()
     meshes.meshing_remove_duplicate_faces()
     meshes.meshing_remove_null_faces()
-    _drop_parts(meshes, min_component, min_diameter, largest)
+    least = int(min_component * meshes.current_mesh().face_number())
+    if largest:
+        parts = _part_sizes(meshes.current_mesh().face_matrix())
+        least = max(least, int(parts.max(initial=0)))
+    meshes.meshing_remove_connected_component_by_face_number(
+        mincomponentsize=least, removeunref=True
+    )
+    if min_diameter > 0:
+        shortest = min_diameter * meshes.current_mesh().bounding_box().diagonal()
+        meshes.meshing_remove_connected_component_by_diameter(
+            mincomponentdiag=PureValue(shortest), removeunref=True
+        )
     if meshes.current_mesh().face_number() == 0:
         raise UserError("no part of the surface is large enough")
     if close_holes:
@@ -213,23 +217,6 @@ def cleaned_mesh(
         meshes.meshing_remove_unreferenced_vertices()
     kept = meshes.current_mesh()
     return kept.vertex_matrix(), kept.face_matrix().astype(np.int64)
-
-
-def _drop_parts(meshes, min_component: float, min_diameter: float, largest: bool) -> None:
-    from pymeshlab import PureValue  # pyright: ignore[reportAttributeAccessIssue] (no stubs)
-
-    least = int(min_component * meshes.current_mesh().face_number())
-    if largest:
-        parts = _part_sizes(meshes.current_mesh().face_matrix())
-        least = max(least, int(parts.max(initial=0)))
-    meshes.meshing_remove_connected_component_by_face_number(
-        mincomponentsize=least, removeunref=True
-    )
-    if min_diameter > 0:
-        shortest = min_diameter * meshes.current_mesh().bounding_box().diagonal()
-        meshes.meshing_remove_connected_component_by_diameter(
-            mincomponentdiag=PureValue(shortest), removeunref=True
-        )
 
 
 def _part_sizes(faces: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from ..gaussians import Gaussians
 from ..kernels.rasterize import depth_quantile
 from ..render import render
 from ..versions import import_open3d
+from .options import SurfaceOptions
 
 CLEAR = 1e5  # depth of a ray that meets nothing
 _CHUNK_PIXELS = 1 << 20  # pixels rendered in one launch
@@ -55,27 +56,15 @@ def sphere_cameras(count: int, radius: float, pixels: int) -> Cameras:
 
 
 @torch.no_grad()
-def look_around(
-    gaussians: Gaussians,
-    count: int,
-    pixels: int,
-    transmittance: float,
-    min_alpha: float,
-    clear_alpha: float,
-    max_slope: float,
-) -> Views:
-    """Renders an object from all around.
+def look_around(gaussians: Gaussians, options: SurfaceOptions) -> Views:
+    """Renders an object from all around, on a Fibonacci sphere.
+
+    On a slanted surface the near edge of a Gaussian is taken for its centre, and all views together
+    would make the object larger: pixels of a steeper surface than ``max_slope`` have no depth.
 
     Args:
         gaussians: one object, about the origin, on the device that renders.
-        count: number of views, on a Fibonacci sphere.
-        pixels: side of a picture.
-        transmittance: depth is where a ray's transmittance has fallen to this.
-        min_alpha: pixels with less have no depth.
-        clear_alpha: pixels with less meet nothing.
-        max_slope: pixels of a steeper surface, depth over width, have no depth: on a slanted
-            surface the near edge of a Gaussian is taken for its centre, and all views together
-            would make the object larger.
+        options: number and side of the pictures, and what has a depth in them.
 
     Raises:
         UserError: no pixel of any view is covered.
@@ -83,21 +72,22 @@ def look_around(
     reach = gaussians.means.norm(dim=-1) + 2 * gaussians.scales.amax(-1)
     # One far Gaussian must not make all others small in the pictures.
     radius = float(torch.quantile(reach.cpu()[:: 1 + gaussians.num // 2**20], 0.999)) * 1.05
-    cameras = sphere_cameras(count, radius, pixels)
-    chunk = max(1, _CHUNK_PIXELS // pixels**2)
+    count = options.views
+    cameras = sphere_cameras(count, radius, options.pixels)
+    chunk = max(1, _CHUNK_PIXELS // options.pixels**2)
     depth, rgb = [], []
     for start in range(0, count, chunk):
         seen = render(gaussians, cameras[start : start + chunk].to(gaussians.means.device))
-        part = depth_quantile(seen.meta, transmittance)
-        covered = (seen.alpha > min_alpha) & (part > 0)
+        part = depth_quantile(seen.meta, options.transmittance)
+        covered = (seen.alpha > options.min_alpha) & (part > 0)
         part = torch.where(covered, part, 0.0)
-        depth.append(torch.where(seen.alpha < clear_alpha, CLEAR, part)[..., 0].cpu())
+        depth.append(torch.where(seen.alpha < options.clear_alpha, CLEAR, part)[..., 0].cpu())
         rgb.append(torch.where(covered, seen.rgb / seen.alpha, 0.0).cpu())
     views = Views(cameras, torch.cat(depth), torch.cat(rgb))
     for k in range(count):
-        views.depth[k][_slope(views, k) > max_slope] = 0.0
+        views.depth[k][_slope(views, k) > options.max_slope] = 0.0
     if not views.hit().any():
-        raise UserError(f"no pixel of {count} views has alpha above {min_alpha}")
+        raise UserError(f"no pixel of {count} views has alpha above {options.min_alpha}")
     return views
 
 

@@ -43,34 +43,12 @@ class ViewerParts(NamedTuple):
     mesh: str
 
 
-def viewer_page(
-    title: str,
-    gaussians: Gaussians,
-    *,
-    mesh: Any = None,
-    camera: tuple[float, float, float] | None = None,
-    view: tuple[float, float, float] | None = None,
-    note: str = "",
-) -> str:
+def viewer_page(title: str, gaussians: Gaussians, **options: Any) -> str:
     """The viewer of one object as a whole document, for a file or for the ``srcdoc`` of a frame.
 
-    Args:
-        title: name of the object.
-        gaussians: ``[N]`` in the world of ``cameras.orbit``: y down, the input seen from azimuth 0.
-        mesh: the object's surface in the same world, with ``vertices [V, 3]``, ``faces [F, 3]`` and
-            ``colors [V, 3]`` in [0, 1] or None; or no mesh.
-        camera: distance from the origin in object units, field of view of the shorter side and
-            elevation, both in degrees, of the input's camera: it is the first view, and shown as
-            lines. None: there was no input, and the object may have any size and be anywhere.
-        view: the first view if there is no camera; its distance is that from the object's centre in
-            units of the object's longest side.
-        note: a few words below the title.
-
-    Raises:
-        UserError: a value is not finite, nothing can be seen, or the object has no extent.
-        ValueError: there is a batch dimension.
+    Arguments and errors are those of ``viewer_parts``.
     """
-    parts = viewer_parts(title, gaussians, mesh=mesh, camera=camera, view=view, note=note)
+    parts = viewer_parts(title, gaussians, **options)
     return _filled(program_page(title), parts._asdict())
 
 
@@ -107,7 +85,24 @@ def viewer_parts(
     view: tuple[float, float, float] | None = None,
     note: str = "",
 ) -> ViewerParts:
-    """What fills the slots of ``program_page``; arguments and errors as for ``viewer_page``."""
+    """What fills the slots of ``program_page``.
+
+    Args:
+        title: name of the object.
+        gaussians: ``[N]`` in the world of ``cameras.orbit``: y down, the input seen from azimuth 0.
+        mesh: the object's surface in the same world, with ``vertices [V, 3]``, ``faces [F, 3]`` and
+            ``colors [V, 3]`` in [0, 1] or None; or no mesh.
+        camera: distance from the origin in object units, field of view of the shorter side and
+            elevation, both in degrees, of the input's camera: it is the first view, and shown as
+            lines. None: there was no input, and the object may have any size and be anywhere.
+        view: the first view if there is no camera; its distance is that from the object's centre in
+            units of the object's longest side.
+        note: a few words below the title.
+
+    Raises:
+        UserError: a value is not finite, nothing can be seen, or the object has no extent.
+        ValueError: there is a batch dimension.
+    """
     seen = visible(gaussians, title)
     frame = own_frame(seen, title) if camera is None else Frame(np.zeros(3), 1.0)
     distance, fov, elevation = camera or view or (DEFAULT_DISTANCE, DEFAULT_FOV, 0.0)
@@ -146,10 +141,10 @@ def frame_element(
 
     Args:
         name: of the place, unlike those of the page's other places: letters and digits.
-        title: as for ``viewer_page``, like ``gaussians``.
+        title: as for ``viewer_parts``, like ``gaussians``.
         poster: HTML that stands there until the viewer is started.
         auto: whether it starts by itself.
-        options: as for ``viewer_page``; errors as there.
+        options: as for ``viewer_parts``; errors as there.
     """
     parts = viewer_parts(title, gaussians, **options)
     kinds = {"object": "application/json"}

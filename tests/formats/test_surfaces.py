@@ -99,8 +99,13 @@ def test_colors_of_a_sphere_of_two():
             assert error.mean() < 0.05 and error.max() < 0.2
 
 
+SEEN = SurfaceOptions(views=24, pixels=96, transmittance=0.9)
+
+
 def test_an_unseen_vertex_takes_the_nearest_color():
-    views = look_around(at(0.4 * fibonacci_sphere(2000)), 24, 96, 0.9, 0.3, 0.1, 1.5)
+    views = look_around(
+        at(0.4 * fibonacci_sphere(2000)), SurfaceOptions(views=24, pixels=96, transmittance=0.9)
+    )
     ball = trimesh.creation.icosphere(3, 0.4)
     inside = np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
     vertices = np.concatenate([ball.vertices, inside])
@@ -110,7 +115,9 @@ def test_an_unseen_vertex_takes_the_nearest_color():
 
 def test_space_that_is_seen_through_is_cleared():
     """Depth of one view makes a wall out of a speck; the others see past it."""
-    views = look_around(at(0.3 * fibonacci_sphere(2000)), 24, 96, 0.9, 0.3, 0.1, 1.5)
+    views = look_around(
+        at(0.3 * fibonacci_sphere(2000)), SurfaceOptions(views=24, pixels=96, transmittance=0.9)
+    )
     cameras = views.cameras
     depth = views.depth.clone()
     depth[0, :24] = float(cameras.viewmats[0, 2, 3])  # a wall through the centre, beside the ball

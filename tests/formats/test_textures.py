@@ -14,6 +14,7 @@ from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.extract import Surface
 from gamba_warp.surfaces.files import save_mesh
+from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.surfaces.texture import Texture, bake_texture, covered_texels, unwrapped
 from gamba_warp.surfaces.tsdf import look_around
 
@@ -41,7 +42,7 @@ def ball():
 @pytest.fixture(scope="module")
 def baked(ball):
     mesh = trimesh.creation.icosphere(2, RADIUS)
-    views = look_around(ball, 24, 128, 0.92, 0.3, 0.1, 1.5)
+    views = look_around(ball, SurfaceOptions(views=24, pixels=128))
     return mesh, bake_texture(mesh.vertices, mesh.faces, views, 64, 256)
 
 
@@ -94,7 +95,7 @@ def test_texels_of_one_triangle():
 
 def test_a_picture_that_is_too_small(ball, monkeypatch):
     """xatlas leaves each face some room; where no centre of a texel falls into it, that is said."""
-    views = look_around(ball, 8, 32, 0.92, 0.3, 0.1, 1.5)
+    views = look_around(ball, SurfaceOptions(views=8, pixels=32))
     mesh = trimesh.creation.icosphere(1, RADIUS)
     nowhere = np.zeros((len(mesh.faces), 3, 2))
     monkeypatch.setattr("gamba_warp.surfaces.texture.unwrapped", lambda *_: nowhere)
