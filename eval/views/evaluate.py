@@ -227,9 +227,26 @@ def evaluate_views(options: ViewsOptions) -> dict[str, Any]:
 
     Raises:
         UserError: something cannot be opened or written.
+        KeyboardInterrupt: Ctrl-C, and there is no record yet.
     """
     job, folder = open_job(options), options.out
-    objects, interrupted = evaluate(job, options)
+    objects: list[dict[str, Any]] = []
+    folders: dict[str, Path] = {}
+    for name in ("gaussians", "retrieval", "pictures"):
+        if folder and getattr(options, f"save_{name}"):
+            folders[name] = output_folder(folder / name)
+    interrupted = False
+    try:
+        for number, uid in enumerate(progress_bar(job.uids, unit="object")):
+            strips = {"strips": folder / "strips"} if folder and number < options.strips else {}
+            try:
+                objects.append(evaluate_object(job, uid, folders | strips))
+            except ERRORS as error:
+                objects.append(failure(uid, error))
+    except KeyboardInterrupt:
+        if not objects:
+            raise
+        interrupted = True
     report = report_of(job, options.data, objects) | {"interrupted": interrupted}
     if folder:
         save_report(report, folder)
@@ -317,41 +334,6 @@ def evaluate_object(job: Job, uid: str, folders: Mapping[str, Path] = {}) -> dic
         "truth_sha256": truth.digest,
         "seconds": stages.seconds,
     }
-
-
-def evaluate(job: Job, options: ViewsOptions) -> tuple[list[dict[str, Any]], bool]:
-    """Evaluates the job's objects.
-
-    Args:
-        job: what to do.
-        options: say which files are written for each object.
-
-    Returns:
-        The records, and whether Ctrl-C ended it after the first object and before the last.
-
-    Raises:
-        KeyboardInterrupt: there is no record yet.
-    """
-    objects: list[dict[str, Any]] = []
-    folders: dict[str, Path] = {}
-    if options.out:
-        for name in ("gaussians", "retrieval", "pictures"):
-            if getattr(options, f"save_{name}"):
-                folders[name] = output_folder(options.out / name)
-    try:
-        for number, uid in enumerate(progress_bar(job.uids, unit="object")):
-            more = {}
-            if options.out and number < options.strips:
-                more["strips"] = options.out / "strips"
-            try:
-                objects.append(evaluate_object(job, uid, folders | more))
-            except ERRORS as error:
-                objects.append(failure(uid, error))
-    except KeyboardInterrupt:
-        if not objects:
-            raise
-        return objects, True
-    return objects, False
 
 
 def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:

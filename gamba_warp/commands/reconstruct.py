@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
@@ -17,13 +16,6 @@ from ..errors import UserError
 from ..files import STARTER, output_folder
 from ..pages.options import RECONSTRUCTED, FileOptions
 from ..untrusted.ranges import Distance, Elevation, Fov, ranged
-
-if TYPE_CHECKING:
-    import torch
-
-    from ..model.gamba import Gamba
-    from ..pages.export import Outputs
-    from ..photo.cutout import Ways
 
 
 @dataclass(frozen=True)
@@ -77,15 +69,21 @@ def reconstruct_command(
         precision: That of the network's products; auto is bfloat16 where that is faster.
         times: Print what each stage took.
     """
-    from ..model.checkpoint import DEFAULT_CHECKPOINT, load_model
+    from ..model.checkpoint import DEFAULT_CHECKPOINT, FILE_NAME, load_model
+    from ..model.predict import reconstruct
     from ..pages.card import about_model
-    from ..pages.export import Outputs
+    from ..pages.export import Outputs, write_outputs
     from ..pages.sheet import Sheet
-    from ..photo.cutout import Ways
+    from ..photo.cutout import Ways, cut_out
 
     pictures, failures = _found(images, mask)
     checkpoint, chosen = checkpoint or DEFAULT_CHECKPOINT, pick_device(device)
-    file = _file_of(checkpoint)
+    if not checkpoint.exists():
+        raise UserError(
+            f"{checkpoint}: no such checkpoint; train one with 'gamba train', or give "
+            "--checkpoint FILE"
+        )
+    file = checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
     outputs = Outputs(
         options=files,
         checkpoint=checkpoint,
@@ -104,7 +102,17 @@ def reconstruct_command(
     model = load_model(checkpoint, chosen, encoder_weights)
     ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
     output_folder(files.out)
-    one = partial(_one, model=model, ways=ways, outputs=outputs, device=chosen, precision=precision)
+
+    def one(name: str, path: Path) -> None:
+        STAGES.begin("cutting out")
+        cut = cut_out(path, ways)
+        say(f"{path}: {cut.how}")
+        STAGES.begin("network")
+        started = time.perf_counter()
+        gaussians = reconstruct(model, cut.rgba, precision).to("cpu")  # waits for the device
+        seconds = time.perf_counter() - started
+        write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
+
     for_each(names, one, "reconstruct", "picture", failures)
     if outputs.sheet is not None:
         outputs.sheet.write()
@@ -112,31 +120,6 @@ def reconstruct_command(
     if times:
         print(STAGES.table())
     return report(len(pictures), "picture", failures, files.out)
-
-
-def _one(
-    name: str,
-    path: Path,
-    *,
-    model: Gamba,
-    ways: Ways,
-    outputs: Outputs,
-    device: torch.device,
-    precision: Precision,
-) -> None:
-    """Reconstructs one picture, and writes what was asked for."""
-    from ..model.predict import reconstruct
-    from ..pages.export import write_outputs
-    from ..photo.cutout import cut_out
-
-    STAGES.begin("cutting out")
-    cut = cut_out(path, ways)
-    say(f"{path}: {cut.how}")
-    STAGES.begin("network")
-    started = time.perf_counter()
-    gaussians = reconstruct(model, cut.rgba, precision).to("cpu")  # waits for the device
-    seconds = time.perf_counter() - started
-    write_outputs(name, cut, gaussians.to(device), outputs, model.config, seconds)
 
 
 def _found(
@@ -154,15 +137,3 @@ def _found(
     if not pictures:
         raise UserError("; ".join(f"{path}: {reason}" for path, reason in failures))
     return pictures, failures
-
-
-def _file_of(checkpoint: Path) -> Path:
-    """The model's file, also of a folder. Raises UserError, with a remedy, if it is not there."""
-    from ..model.checkpoint import FILE_NAME
-
-    if not checkpoint.exists():
-        raise UserError(
-            f"{checkpoint}: no such checkpoint; train one with 'gamba train', or give "
-            "--checkpoint FILE"
-        )
-    return checkpoint / FILE_NAME if checkpoint.is_dir() else checkpoint
