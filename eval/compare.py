@@ -14,17 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import tyro
 
 from gamba_warp.errors import UserError, one_line
-from gamba_warp.files import output_folder, write_json, write_text
 from gamba_warp.image_metrics import METRICS, all_figures, on_grounds
 from gamba_warp.untrusted.documents import parse_document, read_bytes
-from gamba_warp.untrusted.ranges import ranged
 from gamba_warp.versions import __version__
 
 from .averages import BOOTSTRAP, LEVEL, summary_of
-from .report import OK, flat, json_of
+from .report import OK, flat
 from .tables import Column, Lines, Row, figures, markdown
 
 FORMAT = "gamba_warp.compare.1"
@@ -440,43 +437,3 @@ def html_page(joined: dict[str, Any], paper: bool) -> str:
             texts = []
     sections += [Section("", "\n\n".join(texts))] if texts else []
     return page_text("Methods compared", "", sections)
-
-
-@ranged
-def compare_command(
-    reports: tyro.conf.Positional[
-        Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=REPORT ...")]
-    ],
-    *,
-    against: str | None = None,
-    seconds: tuple[str, ...] = (),
-    paper: bool = False,
-    out: Path | None = None,
-    json: bool = False,
-) -> int:
-    """PSNR, SSIM, LPIPS, Chamfer, Volume IoU and time of several methods, as the paper's Table 1.
-
-    Each method is evaluated before, by eval-views, eval-geometry or both; a name given twice has
-    both reports. Means are over the objects that all methods have. Reports of different protocols,
-    or of different true pictures or shapes, are refused.
-
-    Args:
-        reports: NAME=FILE: a report.json, or the folder that it is in.
-        against: The method that the others are subtracted from, object by object; the first one.
-        seconds: NAME=SECONDS that a method takes for an object, where no report has measured it.
-        paper: Also print the figures of the paper's Table 1, of other objects and protocol.
-        out: Folder for compare.json, compare.md and compare.html.
-        json: Print compare.json in place of the table.
-    """
-    if not reports:
-        raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
-    joined = join(read_reports(reports, seconds), against)
-    if paper:
-        joined["paper"] = {"caveat": CAVEAT, "table_1": TABLE_1}
-    if out is not None:
-        folder = output_folder(out)
-        write_json(folder / "compare.json", joined)
-        write_text(folder / "compare.md", markdown_page(joined, paper))
-        write_text(folder / "compare.html", html_page(joined, paper))
-    print(json_of(joined) if json else markdown_page(joined, paper), end="")
-    return 0

@@ -60,7 +60,7 @@ MODULES = {
     **dict.fromkeys(("import-released", "weights lpips"), "gamba_warp.commands.weights"),
     "eval-views": "gamba_warp.eval.views.command",
     "eval-geometry": "gamba_warp.eval.shapes.command",
-    "compare": "gamba_warp.eval.compare",
+    "compare": "gamba_warp.eval.compare_command",
 }
 
 

@@ -77,6 +77,7 @@ def test_no_two_inputs_share_an_output(tmp_path, capsys):
         f"{tmp_path / 'A.jpg'}: its results are named A-2\n"
         f"{tmp_path / 'x' / 'a.png'}: its results are named a-3\n"
     )
+    assert plan(["a.png", "a.jpg", "x/a.png", "a-2.png"]) == ["a", "a-2", "a-3", "a-2-2"]
     assert plan(["\u00e9.png", "e\u0301.png"], ".ply") == ["\u00e9", "e\u0301-2"]
 
 

@@ -79,31 +79,6 @@ def test_a_commands_result_is_the_exit_code(command, result, code):
     assert seen == [(5, False), (3, True)]
 
 
-@pytest.mark.parametrize(
-    "error, code, text",
-    [
-        (UserError("a.png: no such file"), 2, "gamba: a.png: no such file\n"),
-        (KeyboardInterrupt(), 130, "gamba: interrupted\n"),
-    ],
-)
-def test_expected_errors_have_a_code_and_no_traceback(command, error, code, text, capsys):
-    def current() -> None:
-        raise error
-
-    command(current)
-    assert exit_code(["try"]) == code
-    assert capsys.readouterr().err == text
-
-
-def test_defects_keep_their_traceback(command):
-    def current() -> None:
-        raise ZeroDivisionError
-
-    command(current)
-    with pytest.raises(ZeroDivisionError):
-        cli.main(["try"])
-
-
 def test_wrong_options_exit_with_2(command, capsys):
     def current(number: int = 3) -> None:
         raise AssertionError("must not run")
@@ -330,27 +305,26 @@ def test_a_value_out_of_its_range_is_one_line_before_anything_starts(
         (FileNotFoundError(2, "No such file or directory", "a.txt"), "a.txt: No such file"),
         (OSError(28, "No space left on device"), "No space left on device"),
         (UnicodeEncodeError("utf-8", "caf\udce9", 3, 4, "surrogates not allowed"), "not UTF-8"),
-        (UserError("two\nlines"), "two lines"),
+        (UserError("two\nlines"), "two lines\n"),
+        (KeyboardInterrupt(), "interrupted\n"),
+        *[(error, None) for error in (ZeroDivisionError(), RecursionError())],
+        *[(error("a defect"), None) for error in (OSError, UnicodeError)],
     ],
 )
-def test_what_is_wrong_outside_is_one_line(command, error, text, capsys):
+def test_what_is_wrong_outside_is_one_line_and_defects_keep_their_traceback(
+    command, error, text, capsys
+):
     def current() -> None:
         raise error
 
     command(current)
-    assert exit_code(["try"]) == 2
+    if text is None:
+        with pytest.raises(type(error)):
+            cli.main(["try"])
+        return
+    assert exit_code(["try"]) == (130 if isinstance(error, KeyboardInterrupt) else 2)
     said = capsys.readouterr().err
     assert said.startswith("gamba: ") and text in said and said.count("\n") == 1
-
-
-@pytest.mark.parametrize("error", [RecursionError(), OSError("a defect"), UnicodeError("a defect")])
-def test_other_defects_keep_their_traceback_too(command, error):
-    def current() -> None:
-        raise error
-
-    command(current)
-    with pytest.raises(type(error)):
-        cli.main(["try"])
 
 
 def test_a_full_disk_under_the_output_is_one_line(tmp_path):

@@ -14,7 +14,6 @@ from helpers.refusals import refused_command
 from helpers.views import cloud_of
 from PIL import Image
 
-from gamba_warp.batch import plan_outputs
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
 from gamba_warp.data.preprocess import composite, prepare
 from gamba_warp.errors import UserError
@@ -266,12 +265,6 @@ def test_folders_are_searched(tmp_path, checkpoint, capsys):
     assert f"{empty}: the folder holds no pictures" in capsys.readouterr().err
 
 
-def test_equal_stems_get_names_of_their_own(tmp_path):
-    paths = [tmp_path / p for p in ("a.png", "a.jpg", "x/a.png", "a-2.png")]
-    names = plan_outputs(paths, [])
-    assert list(names) == ["a", "a-2", "a-3", "a-2-2"] and list(names.values()) == paths
-
-
 @pytest.mark.parametrize("which", ["picture", "mask", "checkpoint"])
 def test_nothing_that_is_read_is_replaced(tmp_path, checkpoint, capsys, which):
     photo, mask = cut_out(tmp_path / "photo.png"), cut_out(tmp_path / "mask.png")
@@ -340,28 +333,12 @@ def test_a_mask_cuts_a_busy_picture(tmp_path, checkpoint):
     assert run_reconstruct(*ready, "--mask", tmp_path / "mask.png") == 0
 
 
-def test_outputs_that_cannot_be_written_are_failures(tmp_path, picture, checkpoint, capsys):
-    (tmp_path / "out" / "thing.ply").mkdir(parents=True)
-    assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
-    assert f"cannot write {tmp_path}/out/thing.ply" in capsys.readouterr().err
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["thing.ply"]
-
-
 def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):
     gaussians = some(9)
     gaussians.means[3] = float("nan")
     monkeypatch.setattr(predict, "reconstruct", lambda model, rgba, precision: gaussians)
     assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
     assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err
-
-
-def test_the_help_names_every_option(capsys):
-    with pytest.raises(SystemExit) as caught:
-        run_reconstruct("--help")
-    assert caught.value.code == 0
-    out = capsys.readouterr().out
-    for option in ("--checkpoint", "--splats", "--turntable", "--mask", "--sam", "--no-page"):
-        assert option in out
 
 
 def test_pictures_of_many_kinds_go_through(tmp_path, checkpoint):

@@ -1,0 +1,59 @@
+"""``gamba compare``: reports of several methods in one table.
+
+``--help`` answers at once, so what is slow to import is imported by the command itself.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from gamba_warp.errors import UserError
+from gamba_warp.untrusted.ranges import ranged
+
+
+@ranged
+def compare_command(
+    reports: tyro.conf.Positional[
+        Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=REPORT ...")]
+    ],
+    *,
+    against: str | None = None,
+    seconds: tuple[str, ...] = (),
+    paper: bool = False,
+    out: Path | None = None,
+    json: bool = False,
+) -> int:
+    """PSNR, SSIM, LPIPS, Chamfer, Volume IoU and time of several methods, as the paper's Table 1.
+
+    Each method is evaluated before, by eval-views, eval-geometry or both; a name given twice has
+    both reports. Means are over the objects that all methods have. Reports of different protocols,
+    or of different true pictures or shapes, are refused.
+
+    Args:
+        reports: NAME=FILE: a report.json, or the folder that it is in.
+        against: The method that the others are subtracted from, object by object; the first one.
+        seconds: NAME=SECONDS that a method takes for an object, where no report has measured it.
+        paper: Also print the figures of the paper's Table 1, of other objects and protocol.
+        out: Folder for compare.json, compare.md and compare.html.
+        json: Print compare.json in place of the table.
+    """
+    if not reports:
+        raise UserError("give NAME=REPORT, a report.json of eval-views or eval-geometry, each")
+    from gamba_warp.files import output_folder, write_json, write_text
+
+    from .compare import CAVEAT, TABLE_1, html_page, join, markdown_page, read_reports
+    from .report import json_of
+
+    joined = join(read_reports(reports, seconds), against)
+    if paper:
+        joined["paper"] = {"caveat": CAVEAT, "table_1": TABLE_1}
+    if out is not None:
+        folder = output_folder(out)
+        write_json(folder / "compare.json", joined)
+        write_text(folder / "compare.md", markdown_page(joined, paper))
+        write_text(folder / "compare.html", html_page(joined, paper))
+    print(json_of(joined) if json else markdown_page(joined, paper), end="")
+    return 0
