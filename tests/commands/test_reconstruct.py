@@ -221,9 +221,13 @@ def test_one_bad_picture_does_not_stop_the_others(tmp_path, checkpoint, capsys):
     save_image(folder / "noise.bmp", np.random.default_rng(0).random((9, 9, 3)))
     first, last = cut_out(folder / "aa.png"), cut_out(folder / "zz.png")
     cases += [(folder / "clear.png", "no object"), (folder / "noise.bmp", "cannot tell object")]
-    code = run_reconstruct(*quick(checkpoint, out), first, *(path for path, _ in cases), last)
+    code = run_reconstruct(
+        *(*quick(checkpoint, out), first, *(path for path, _ in cases), last, "--save-inputs")
+    )
     assert code == 1
-    assert sorted(path.name for path in out.iterdir()) == ["aa.ply", "zz.ply"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        *("aa-input.png", "aa.ply", "zz-input.png", "zz.ply")
+    ]
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gamba: ")]
     errors = [line for line in said if "no matting model is here" not in line]
     assert len(errors) == len(cases) == len(said) - 1

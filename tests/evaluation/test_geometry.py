@@ -24,7 +24,6 @@ from gamba_warp.eval.shapes.shape import Mesh, Similarity, sample
 from gamba_warp.formats.ply import save_ply
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.surfaces.density import opacity_volume
-from gamba_warp.surfaces.extract import cleaned_mesh
 from gamba_warp.surfaces.options import SurfaceOptions
 
 
@@ -197,13 +196,6 @@ def test_nothing_visible(method):
     faint.opacities = torch.zeros(50)
     with pytest.raises(UserError, match="Gaussian"):
         to_surface(faint, SurfaceOptions(method=method), 0, 10)
-
-
-def test_cleaning_drops_specks():
-    speck = as_mesh(trimesh.creation.icosphere(0, 0.02), (0.8, 0, 0))
-    whole = join(ball(0.4), speck)
-    kept = Mesh(*cleaned_mesh(whole.vertices, whole.faces, min_component=0.01))
-    assert len(kept.faces) == len(ball(0.4).faces)
 
 
 def test_points_are_repeatable_and_area_uniform():

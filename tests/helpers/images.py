@@ -1,6 +1,8 @@
 """Pictures for tests: random ones, their files in memory, and files that are not pictures."""
 
 import io
+import struct
+import zlib
 
 import numpy as np
 from PIL import Image
@@ -23,6 +25,18 @@ def encoded(form):
     return content.getvalue()
 
 
+def png_of_size(width, height):
+    """A PNG whose header states a size, with hardly any data."""
+
+    def chunk(kind, data):
+        crc = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + crc
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 999)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
 def bad_files(folder):
     """Writes files that cannot be read as a picture; yields name, path and the expected reason."""
     first, second = colours("P"), colours("P", (7, 5)).transpose(Image.Transpose.ROTATE_180)
@@ -35,11 +49,15 @@ def bad_files(folder):
         ("cut.png", encoded("PNG")[:1500], "cannot be decoded"),
         ("cut.jpg", encoded("JPEG")[:800], "cannot be decoded"),
         ("head.png", encoded("PNG")[:20], ""),
+        ("huge.png", png_of_size(20_000, 20_000), "is over 64 megapixels"),
+        ("long.png", png_of_size(40_000, 2), "is over 32768 pixels long"),
+        ("film.heic", b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + b"\0" * 99, ""),
     ]:
         (folder / name).write_bytes(content)
         yield name, folder / name, reason
-    first.save(folder / "moving.gif", save_all=True, append_images=[second])
-    yield "moving.gif", folder / "moving.gif", "animated picture (2 frames)"
+    for name in ("moving.gif", "moving.webp"):
+        first.convert("RGB").save(folder / name, save_all=True, append_images=[second])
+        yield name, folder / name, "animated picture (2 frames)"
 
 
 def cut_out(path, colour=(0.8, 0.3, 0.1)):

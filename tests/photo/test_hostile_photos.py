@@ -1,8 +1,6 @@
 """What people and their telephones give: a result, or one line and nothing half-written."""
 
 import os
-import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from PIL import Image
 from gamba_warp import cli
 from gamba_warp import images as pictures
 from gamba_warp.errors import UserError
-from gamba_warp.images import load_rgba, picture_size, save_image, to_uint8
+from gamba_warp.images import load_rgba, picture_size, to_uint8
 from gamba_warp.photo.cutout import cut_out
 
 
@@ -23,61 +21,6 @@ def photo(size=(96, 128)):
 def reconstruct(*words):
     quick = ("--turntable", "none", "--no-page")
     return cli.run("reconstruct", [str(word) for word in (*words, *quick)])
-
-
-def png_of_size(width, height):
-    """A PNG whose header states a size, with hardly any data."""
-
-    def chunk(kind, data):
-        return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        )
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 999)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + body
-
-
-def bad(folder):
-    """Files by name, each with what its line says."""
-    frames = [photo(), photo().transpose(Image.Transpose.ROTATE_180)]
-    frames[0].save(folder / "animated.gif", save_all=True, append_images=frames[1:])
-    frames[0].save(folder / "animated.webp", save_all=True, append_images=frames[1:])
-    (folder / "huge.png").write_bytes(png_of_size(20_000, 20_000))
-    (folder / "long.png").write_bytes(png_of_size(40_000, 2))
-    (folder / "page.jpg").write_bytes(b"<html><body>404 not found</body></html>")
-    (folder / "empty.jpg").touch()
-    (folder / "half.jpg").write_bytes(b"")
-    photo().save(folder / "half.jpg")
-    (folder / "half.jpg").write_bytes((folder / "half.jpg").read_bytes()[:1500])
-    (folder / "film.heic").write_bytes(b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + b"\0" * 99)
-    save_image(folder / "nothing.png", np.full((50, 60, 3), 0.7))
-    save_image(folder / "everywhere.png", np.random.default_rng(0).random((60, 60, 3)))
-    return {
-        "animated.gif": "animated picture (2 frames)",
-        "animated.webp": "animated picture (2 frames)",
-        "huge.png": "is over 64 megapixels",
-        "long.png": "is over 32768 pixels long",
-        "page.jpg": "not a picture that can be read",
-        "empty.jpg": "the file is empty",
-        "half.jpg": "cannot be decoded",
-        "film.heic": "",
-        "nothing.png": "no object found",
-        "everywhere.png": "cannot tell object from background",
-        "missing.jpg": "no such file",
-    }
-
-
-def test_what_cannot_be_reconstructed_is_one_line(tmp_path, capsys):
-    reasons, out = bad(tmp_path), tmp_path / "out"
-    files = [tmp_path / name for name in reasons]
-    assert reconstruct(*files, "--out", out, "--save-inputs") == 1
-    lines = [s for s in capsys.readouterr().err.splitlines() if s.startswith("gamba: failed: ")]
-    assert len(lines) == len(files)
-    for name, reason in reasons.items():
-        (line,) = (line for line in lines if f"/{name}: " in line)
-        assert f"{tmp_path / name}: " in line and reason in line
-    assert not any(out.iterdir())
 
 
 def test_outputs_that_cannot_be_written(tmp_path, capsys):
