@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import tyro
 from msgspec import Meta
@@ -15,6 +15,7 @@ from ..errors import UserError
 from ..files import output_folder
 from ..untrusted.ranges import Distance, Elevation, Fov, Rate, ranged
 
+Kind = Literal["gif", "mp4", "png"]
 _SUFFIXES = (".gif", ".mp4", ".png")
 
 
@@ -24,7 +25,7 @@ def render_command(
     /,
     trajectory: Annotated[str, tyro.conf.arg(metavar="turntable|spiral|FILE")] = "turntable",
     out: Path = Path("out"),
-    kind: Literal["gif", "mp4", "png"] | None = None,
+    kind: Kind | None = None,
     size: Annotated[str | None, tyro.conf.arg(metavar="W|WxH")] = None,
     frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None,
     fps: Rate | None = None,
@@ -65,9 +66,12 @@ def render_command(
     from ..trajectories.movies import require_movie
 
     single = out.suffix.lower() in _SUFFIXES and not out.is_dir()
-    kind = _kind(out, kind, single)
+    suffix = out.suffix.lower()[1:]
+    if single and kind not in (None, suffix):
+        raise UserError(f"--out {out}: its name says {suffix}, but --kind {kind}")
+    kind = cast(Kind, suffix) if single else kind or "gif"
     require_movie(kind)
-    if out.suffix.lower() == ".png" and single:
+    if single and kind == "png":
         frames = 1 if frames is None and trajectory in ("turntable", "spiral") else frames
     view = {"elevation": elevation, "distance": distance, "fov": fov}
     plan = plan_path(trajectory, None if size is None else parse_size(size), frames, view)
@@ -82,7 +86,15 @@ def render_command(
     chosen = pick_device(device)
     reads = [Path(trajectory)] if film.own else []
     if single:
-        targets = _single(out, files, reads, len(film.cameras.viewmats), depth)
+        count, png = len(film.cameras.viewmats), kind == "png"
+        if len(files) != 1:
+            raise UserError(f"--out {out}: {len(files)} files are given; give a folder")
+        if png and depth:
+            raise UserError(f"--out {out}: --depth makes two pictures of a view; give a folder")
+        if png and count != 1:
+            raise UserError(f"--out {out}: one picture, but there are {count} views; give a folder")
+        check_not_read([out], [*files, *reads])
+        targets = {str(out): files[0]}
     else:
         suffix = "" if kind == "png" else f".{kind}"
         names = plan_outputs(files, [suffix], out, reads)
@@ -97,27 +109,3 @@ def render_command(
 
     for_each(targets, one, "render", "file", failures)
     return report(len(files), "file", failures, out)
-
-
-def _kind(
-    out: Path, kind: Literal["gif", "mp4", "png"] | None, single: bool
-) -> Literal["gif", "mp4", "png"]:
-    suffix = out.suffix.lower()[1:]
-    if not single:
-        return kind or "gif"
-    if kind is not None and kind != suffix:
-        raise UserError(f"--out {out}: its name says {suffix}, but --kind {kind}")
-    return "gif" if suffix == "gif" else "mp4" if suffix == "mp4" else "png"
-
-
-def _single(
-    out: Path, files: list[Path], reads: list[Path], count: int, depth: bool
-) -> dict[str, Path]:
-    if len(files) != 1:
-        raise UserError(f"--out {out}: {len(files)} files are given; give a folder")
-    if out.suffix.lower() == ".png" and depth:
-        raise UserError(f"--out {out}: --depth makes two pictures of a view; give a folder")
-    if out.suffix.lower() == ".png" and count != 1:
-        raise UserError(f"--out {out}: one picture, but there are {count} views; give a folder")
-    check_not_read([out], [*files, *reads])
-    return {str(out): files[0]}

@@ -50,10 +50,10 @@ class Matte:
                 require("onnxruntime")
             raise NoMatte(f"onnxruntime is not installed: {to_install('photo')}")
         self._given = file is not None
-        if file is None:
-            self.path = _published(fetch, say)
+        if file is None or models.is_address(file):
+            self.path = _fetched(None if file is None else str(file), fetch or self._given, say)
         else:
-            self.path = _from_web(str(file), say) if models.is_address(file) else Path(file)
+            self.path = Path(file)
         self._version = _version_of(self.path) if self._given else (0, 0)
         if self._given:
             self._run(None)
@@ -96,40 +96,36 @@ def _version_of(path: Path) -> tuple[int, int]:
     return found.st_size, found.st_mtime_ns
 
 
-def _published(fetch: bool, say: Callable[[str], None]) -> Path:
-    path = models.kept()
-    if path is not None:
+def _fetched(address: str | None, fetch: bool, say: Callable[[str], None]) -> Path:
+    """The file at an address; where none is given, rembg's that is kept, or else is fetched.
+
+    Raises:
+        UserError: the file at the address cannot be had.
+        ModuleNotFoundError: pooch, which fetches it, is not installed.
+        NoMatte: no address is given, and there is no file.
+    """
+    if address is None and (path := models.kept()) is not None:
         return path
-    model = models.PUBLISHED[0]
-    how = f"no matting model is here; give --matte-model a copy or its address, of {model.address}"
-    if not fetch or not models.may_fetch():
-        raise NoMatte(how)
-    if find_spec("pooch") is None:
-        raise NoMatte(f"pooch, which fetches it, is not installed: {to_install('photo')}")
-    try:
-        return _fetched(model, model.address, say)
-    except models.NotFetched as error:
-        raise NoMatte(f"{how} ({error})") from error
-
-
-def _from_web(address: str, say: Callable[[str], None]) -> Path:
-    """The file at an address that was given. Raises UserError."""
-    model = models.published(address)
+    model = models.PUBLISHED[0] if address is None else models.published(address)
     if model is None:
         names = ", ".join(f"{known.name}.onnx" for known in models.PUBLISHED)
         raise UserError(f"--matte-model {address}: an address must end in one of {names}")
-    if not models.may_fetch():
-        raise UserError(f"--matte-model {address}: GAMBA_OFFLINE forbids to fetch it")
-    require("pooch")
-    try:
-        return _fetched(model, address, say)
-    except models.NotFetched as error:
-        raise UserError(f"--matte-model {address}: {error}") from error
-
-
-def _fetched(model: models.Published, address: str, say: Callable[[str], None]) -> Path:
-    say(f"fetching a matting model once, {model.megabytes} MB, from {address}")
-    return models.fetch(model, address)
+    if not models.may_fetch() or not fetch:
+        reason = "GAMBA_OFFLINE forbids to fetch it" if fetch else "it may not be fetched"
+    elif address is None and find_spec("pooch") is None:
+        raise NoMatte(f"pooch, which fetches it, is not installed: {to_install('photo')}")
+    else:
+        require("pooch")
+        found = address or model.address
+        say(f"fetching a matting model once, {model.megabytes} MB, from {found}")
+        try:
+            return models.fetch(model, found)
+        except models.NotFetched as error:
+            reason = str(error)
+    if address is not None:
+        raise UserError(f"--matte-model {address}: {reason}")
+    how = f"no matting model is here; give --matte-model a copy or its address, of {model.address}"
+    raise NoMatte(f"{how} ({reason})")
 
 
 def to_stderr(line: str) -> None:
