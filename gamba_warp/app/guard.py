@@ -148,7 +148,8 @@ class Guard:
         token = request.cookies.get(_COOKIE, "")
         known = _TOKEN.fullmatch(token) is not None
         visitor = hashlib.sha256(token.encode()).hexdigest()[:32] if known else None
-        scope[VISITOR], answer, read = visitor, self._app, receive
+        scope[VISITOR], answer = visitor, self._app
+        read: Receive = receive
         try:
             if is_foreign(request.headers):
                 raise HTTPException(421, "this page is that of 127.0.0.1, for its own pages alone")
@@ -170,8 +171,10 @@ class Guard:
                 body = self._checked(await request.body(), visitor)
                 pieces = iter([{"type": "http.request", "body": body}])
 
-                async def read() -> Message:
+                async def again() -> Message:
                     return next(pieces, None) or await receive()
+
+                read = again
 
         except HTTPException as error:
             line, kind = error.detail, "text/plain"
