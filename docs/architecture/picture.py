@@ -83,7 +83,7 @@ BOXES = {
     "pages": Box(2.2, 7, "gamba_warp", "pages", ("pages, turntables", "")),
     "measure": Box(0.6, 8, "gamba_warp", "measure", ("bench and stress cases", "with the model")),
     "train": Box(3.6, 8, "train", "train", ("batches, losses, loop;", "data/: rendering")),
-    "eval": Box(4.7, 7, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
+    "eval": Box(4.8, 8, "eval", "eval", ("views/: PSNR, LPIPS", "shapes/: Chamfer, IoU")),
     "gpu_check": Box(0.6, 9, "gamba_warp", "gpu_check", ("checks on", "a CUDA machine")),
     "ablation": Box(2.1, 9, "gamba_warp", "ablation", ("rows trained and", "evaluated alike")),
     "commands": Box(2.2, 11, "gamba_warp", "commands", ("by subject:", "parse, call, print")),
