@@ -19,8 +19,7 @@ from ..gpu_check import MINUTES, StepName
 from ..untrusted.ranges import Minutes, Seed, Threads, ranged
 from ..versions import used_versions
 
-# What is measured -> the module with ``cases(settings)`` and ``targets(settings)``. It is imported
-# when it is asked for.
+# What is measured -> the module with ``cases(settings)``, imported when it is asked for.
 SUITES = {
     "scan": "gamba_warp.kernels.bench.cases.scan",
     "conv": "gamba_warp.kernels.bench.cases.conv",
@@ -92,7 +91,7 @@ def bench_command(
 
 
 def load_suite(op: str) -> ModuleType:
-    """The module with the cases and targets of one of ``SUITES``."""
+    """The module with the cases of one of ``SUITES``."""
     return importlib.import_module(SUITES[op])
 
 

@@ -29,9 +29,8 @@ import warp as wp
 from ..errors import UserError, first_line
 from ..files import output_folder, write_json, write_text
 from ..kernels.bench.cases import conv, raster, scan
-from ..kernels.bench.core.case import Case, Settings, Target
+from ..kernels.bench.core.case import Case, Settings
 from ..kernels.bench.core.measure import measure, synchronize
-from ..kernels.bench.core.report import judge
 from ..kernels.bench.peers import PACKAGES, versions
 from ..kernels.bench.static.report import find_kernels
 from ..measure import blocks, inference
@@ -104,7 +103,7 @@ def begin(device: str, quick: bool, folder: Path) -> Report:
     """A report of a run of which nothing is done yet."""
     settings = {"device": device, "level": "quick" if quick else "normal"}
     empty = {"steps": [], "results": {}, "failures": [], "not_done": []}
-    bench = {"records": [], "targets": []}
+    bench = {"records": []}
     document = {"format": FORMAT, "verdict": "not finished", "machine": {}, "settings": settings}
     report = Report(folder, document | empty | {"bench": bench})
     document = report.document
@@ -282,7 +281,7 @@ def _checks(report: Report, result: dict) -> None:
 def _inference(report: Report, result: dict) -> None:
     settings = report.settings
     result["ceilings"] = _ceilings(settings)
-    _measure(report, settings, inference.cases(settings), inference.targets(settings))
+    _measure(report, settings, inference.cases(settings))
     if settings.device.type != "cuda":
         report.leave_out("inference from a CUDA graph", "needs CUDA")
     else:
@@ -322,16 +321,15 @@ def _bench(
     found = {(c.op, c.name): c for suite in suites for c in suite.cases(settings)}
     keys = [*first, *([] if alone else found)]
     cases = [found[key] for key in dict.fromkeys(keys) if key in found]
-    _measure(report, settings, cases, [t for suite in suites for t in suite.targets(settings)])
+    _measure(report, settings, cases)
 
 
-def _measure(report: Report, settings: Settings, cases: list[Case], targets: list[Target]) -> None:
+def _measure(report: Report, settings: Settings, cases: list[Case]) -> None:
     """Measures case after case; a fault of ours is a failure, a fault of a peer only a note."""
     before, document = report.document["bench"], measure([], settings)
     for case in report.in_time(cases, lambda case: f"{case.op}: {case.name}"):
         records = measure([case], settings)["records"]
         document["records"] += records
-        document["targets"] = judge(targets, document["records"])
         report.document["bench"] = joined(before, document)
         for r in records:
             name = f"{r['op']}: {r['case']}: {r['variant']}, {r['direction']}"
@@ -344,15 +342,10 @@ def _measure(report: Report, settings: Settings, cases: list[Case], targets: lis
 
 
 def joined(before: dict, later: dict) -> dict:
-    """One document of two; a case or a measured target of the later one replaces an earlier."""
+    """One document of two; a case of the later one replaces an earlier."""
     new = {(r["op"], r["case"]) for r in later["records"]}
     old = [r for r in before["records"] if (r["op"], r["case"]) not in new]
-    targets = {(t["op"], t["text"]): t for t in before["targets"]}
-    for t in later["targets"]:
-        if t["value"] is not None or (t["op"], t["text"]) not in targets:
-            targets[t["op"], t["text"]] = t
-    lists = {"records": old + later["records"], "targets": [*targets.values()]}
-    return later | before | lists
+    return later | before | {"records": old + later["records"]}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..kernels.bench.core.case import Settings
 from ..kernels.bench.core.measure import machine
-from ..kernels.bench.core.report import TARGET_WORDS, groups, oracles, table
+from ..kernels.bench.core.report import groups, oracles, table
 from ..kernels.bench.peers import versions
 from ..kernels.runtime.tables import markdown
 from ..versions import installed
@@ -55,10 +55,6 @@ def headline(document: dict) -> list[tuple[str, str]]:
     for record in document["bench"]["records"]:
         if record["op"] == "inference":
             rows.append((f"inference, {record['variant']}", _time(record)))
-    for target in document["bench"]["targets"]:
-        words = TARGET_WORDS[target["reached"]]
-        value = "" if target["value"] is None else f"{target['value']:.3g}, "
-        rows.append((f"{target['op']}: {target['text']}", f"{value}{target['wanted']}: {words}"))
     return rows
 
 

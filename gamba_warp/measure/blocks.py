@@ -9,16 +9,13 @@ from functools import partial
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from ..devices import network_products
 from ..kernels.bench.core.case import (
     BOTH,
     Case,
     Error,
-    Key,
     Settings,
-    Target,
     Variant,
     compare,
     make_cases,
@@ -35,9 +32,6 @@ LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # allowed relative rms error to float64
 _IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # those of DINOv2 ViT-B/14 at 336 pixels
 TOKENS = 128  # number of first tokens that are compared with the oracle
 _REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
-_PRODUCTS = {
-    name: getattr(torch.ops.aten, name).default for name in ("mm", "addmm", "bmm", "baddbmm")
-}
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -45,64 +39,6 @@ def cases(settings: Settings) -> list[Case]:
     blocks = [("one block", one_block, "error"), ("backbone", whole_backbone, "error")]
     models = [("one picture", pictures, None), ("batch", batches, "B")]
     return make_cases("block", settings, blocks) + make_cases("model", settings, models)
-
-
-class _Recorder(TorchDispatchMode):
-    """Records the shapes of all matrix products."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.products: list[tuple[Callable, list[tuple]]] = []
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        if function in _PRODUCTS.values():
-            operands = [x for x in args if isinstance(x, Tensor)]
-            self.products.append((function, [(x.shape, x.stride(), x.dtype) for x in operands]))
-        return function(*args, **(kwargs or {}))
-
-
-class Products:
-    """The matrix products of a run, recorded so that they can be repeated alone.
-
-    Attributes:
-        count: number of products.
-        flops: floating-point operations of all; a multiplication and an addition count as two.
-    """
-
-    def __init__(self, run: Callable[[], object], device: torch.device) -> None:
-        with _Recorder() as recorder:
-            run()
-        self.count, self.flops = len(recorder.products), 0
-        self._calls, self._device = [], device
-        self._buffers: dict[tuple, Tensor] = {}
-        for function, operands in recorder.products:
-            tensors = [self._buffer(*operand, use=i) for i, operand in enumerate(operands)]
-            a, b = tensors[-2:]
-            shape = (*a.shape[:-1], b.shape[-1])
-            self.flops += 2 * a.numel() * b.shape[-1]
-            stride = torch.empty(shape, device="meta").stride()
-            out = self._buffer(shape, stride, a.dtype, use=-1)
-            name = function.overloadpacket.__name__
-            self._calls.append(partial(getattr(torch, name), *tensors, out=out))
-
-    def _buffer(self, shape, stride, dtype, use: int) -> Tensor:
-        """Returns a tensor of this shape; operands of the same shape and position share one."""
-        key = (tuple(shape), tuple(stride), dtype, use)
-        if key not in self._buffers:
-            x = torch.empty_strided(shape, stride, dtype=dtype, device=self._device)
-            self._buffers[key] = x.normal_()
-        return self._buffers[key]
-
-    def work(self) -> dict[str, int]:
-        """Counts of the products."""
-        return {"products": self.count, "flops": self.flops}
-
-    @torch.no_grad()
-    def run(self) -> None:
-        """Repeats all products, by the library that the model takes; this is what is timed."""
-        with network_products(self._device):
-            for call in self._calls:
-                call()
 
 
 class Backbone(Problem):
@@ -237,32 +173,26 @@ def reference_block(
 
 
 def one_block(settings: Settings) -> list[Variant]:
-    """A block of the paper's size on one picture's tokens, beside its matrix products alone,
-    repeated on operands of the same shapes into given outputs. Prefix states off: condition
-    prepended and dropped, as the paper has it. For one block alone that costs the same; the states
-    of all blocks are computed at once, which pays over the depth (backbone).
+    """A block of the paper's size on one picture's tokens. Prefix states off: condition prepended
+    and dropped, as the paper has it. For one block alone that costs the same; the states of all
+    blocks are computed at once, which pays over the depth (backbone).
     """
     backbone = Backbone(settings, 1)
-    return [*_forwards(backbone, settings), backbone.variant("default", BOTH, default=True)]
+    return [*_forwards(backbone), backbone.variant("default", BOTH, default=True)]
 
 
 def whole_backbone(settings: Settings) -> list[Variant]:
-    """All blocks of the paper's size, the condition's states included, beside their matrix products
-    alone, and with the condition prepended and dropped in each block.
+    """All blocks of the paper's size, the condition's states included, and with the condition
+    prepended and dropped in each block.
     """
     rounds = 3 if settings.level == "normal" else None  # one takes seconds
-    backbone = Backbone(settings, 2 if settings.level == "quick" else 14)
-    return _forwards(backbone, settings, rounds=rounds)
+    return _forwards(Backbone(settings, 2 if settings.level == "quick" else 14), rounds=rounds)
 
 
-def _forwards(backbone: Backbone, settings: Settings, **changes) -> list[Variant]:
-    """Blocks with prefix states, with the condition prepended, and their products alone."""
-    products = Products(backbone.forward, settings.device)
-    alone = {"run": products.run, "check": None, "work": products.work, "limit": 1e-5}
+def _forwards(backbone: Backbone, **changes) -> list[Variant]:
     return [
         backbone.variant("default", default=True, **changes),
         backbone.way("prefix states off", backbone.prepended, **changes),
-        backbone.variant("matrix products alone", oracle="", **alone, **changes),
     ]
 
 
@@ -315,19 +245,4 @@ def batches(settings: Settings) -> list[Variant]:
             parameters={"B": count, "N": PRESETS["tiny"].num_gaussians},
         )
         for count in ((1, 2) if settings.level == "quick" else (1, 2, 4, 8))
-    ]
-
-
-def targets(settings: Settings) -> list[Target]:
-    """Returns the targets; there are none at a quick run's sizes."""
-    if settings.level == "quick":
-        return []
-    return [
-        Target(
-            text=f"{case}, time over that of its matrix products alone",
-            times=(Key("block", case, "default"),),
-            over=(Key("block", case, "matrix products alone"),),
-            at_most=1.3,
-        )
-        for case in ("one block", "backbone")
     ]

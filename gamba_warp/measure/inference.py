@@ -15,9 +15,7 @@ from ..gaussians import Gaussians
 from ..kernels.bench.core.case import (
     Case,
     Error,
-    Key,
     Settings,
-    Target,
     Variant,
     compare,
     make_cases,
@@ -32,7 +30,6 @@ from ..render import render
 Result = TypeVar("Result")
 OP, CASE = "inference", "one picture"
 HEADLINE = "CUDA graph, bfloat16"
-WANTED_MS = 10.0  # on an H200; the paper states 50 ms on an A100
 _GIVEN_TOKENS, _GIVEN_CHANNELS = 576, 768  # those of DINOv2 ViT-B/14 at 336 pixels
 # Allowed relative rms error of a second run. A graph runs the same kernels, but under capture torch
 # may choose other kernels for a product, and then the results differ by roundings of the dtype.
@@ -214,11 +211,3 @@ def _variants(settings: Settings) -> list[Variant]:
         oracle, parameters = "a second run", inference.parameters
         made.append(Variant(name, picture, check, 0.0, oracle, parameters=parameters))
     return made
-
-
-def targets(settings: Settings) -> list[Target]:
-    """Returns the target for an H200; there is none without CUDA or at a quick run's size."""
-    if settings.level == "quick" or settings.device.type != "cuda":
-        return []
-    text = "a picture to 16,384 Gaussians, bfloat16, ms (an H200; the paper: 50 on an A100)"
-    return [Target(text=text, times=(Key(OP, CASE, HEADLINE),), at_most=WANTED_MS)]

@@ -5,17 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from ..kernels.bench.core.report import (
-    EXPLANATION,
-    TARGET_HEADER,
-    More,
-    groups,
-    machine_line,
-    nothing_more,
-    oracles,
-    table,
-    target_rows,
-)
+from ..kernels.bench.core.report import EXPLANATION, More, nothing_more, parts
 from ..pages.charts import Axis, Point, Series, chart, pareto
 from ..pages.page import Section, page_text
 
@@ -136,20 +126,12 @@ def page(
 ) -> str:
     """Returns a self-contained HTML page with the tables and the charts."""
     sections = []
-    for document in documents:
-        interrupted = "The run was interrupted; what was measured is here."
-        text = interrupted if document["interrupted"] else ""
-        targets = target_rows(document)
-        header = TARGET_HEADER if targets else ()
-        sections.append(Section(machine_line(document), text, header=header, table=targets))
-        for op, cases in groups(document).items():
-            for case, records in cases.items():
-                said, tables = more(records)
-                text = "\n\n".join([f"{records[0]['text']} {oracles(records)}", *said])
-                header, rows = table(records)
-                drawn = [svg for svg in charts(case, records) if svg]
-                title = f"{op}: {case}"
-                sections.append(Section(title, text, charts=drawn, header=header, table=rows))
-                sections += [Section("", header=head, table=rows) for head, rows in tables]
+    for part in parts(documents, more):
+        case = part.title.partition(": ")[2]
+        drawn = [svg for svg in charts(case, part.records) if svg] if part.records else []
+        (header, rows), *others = part.tables or [((), ())]
+        text = "\n\n".join(part.texts)
+        sections.append(Section(part.title, text, charts=drawn, header=header, table=rows))
+        sections += [Section("", header=head, table=rows) for head, rows in others]
     text = f"{EXPLANATION}\n\nCircle: ours; ring: the default; square: a peer."
     return page_text("Benchmarks", text, sections)

@@ -14,9 +14,9 @@ from msgspec import Meta
 from ..batch import progress_bar
 from ..errors import UserError
 from ..files import output_folder, write_json, write_text
-from ..kernels.bench.core.case import Case, Settings, Target
+from ..kernels.bench.core.case import Case, Settings
 from ..kernels.bench.core.measure import FORMAT, TIMES, measure
-from ..kernels.bench.core.report import TARGET_WORDS, judge, markdown, ratio_table
+from ..kernels.bench.core.report import markdown, ratio_table
 from ..kernels.bench.peers import versions
 from ..kernels.bench.static.report import NoCompiler, static_markdown, static_report
 from ..untrusted import documents
@@ -73,21 +73,19 @@ def run_suites(
     """Measures the cases of suites, with a progress bar.
 
     Args:
-        suites: by operator, the module with its ``cases(settings)`` and ``targets(settings)``.
+        suites: by operator, the module with its ``cases(settings)``.
         settings: of the cases.
         only: names of the cases to measure; all of them if there is none.
 
     Returns:
-        The document of the records, targets and peers; Ctrl-C leaves what was measured in it.
+        The document of the records and peers; Ctrl-C leaves what was measured in it.
 
     Raises:
         UserError: the suites have no case of a name.
     """
     cases: list[Case] = []
-    targets: list[Target] = []
     for op, module in suites.items():
         cases += [case for case in module.cases(settings) if case.op == op]
-        targets += [t for t in module.targets(settings) if t.times[0].op == op]
     if only:
         names = list(dict.fromkeys(case.name for case in cases))
         if unknown := [name for name in only if name not in names]:
@@ -104,7 +102,6 @@ def run_suites(
 
         document = measure(cases, settings, say)
     document["machine"]["peers"] = versions() if settings.peers else {}
-    document["targets"] = judge(targets, document["records"])
     return document
 
 
@@ -161,14 +158,6 @@ _RECORD = msgspec.defstruct(
         ("parameters", dict[str, bool | _Number | _Text | None]),
     ],
 )
-_TARGET = msgspec.defstruct(
-    "Target",
-    [
-        *_fields(_Text, "op", "text", "wanted"),
-        ("value", _Number | None),
-        ("reached", bool | None),
-    ],
-)
 _MACHINE = msgspec.defstruct(
     "Machine",
     [
@@ -184,7 +173,6 @@ _DOCUMENT = msgspec.defstruct(
         ("machine", _MACHINE),
         ("interrupted", bool),
         ("records", list[_RECORD]),
-        ("targets", list[_TARGET], []),
     ],
 )
 
@@ -254,14 +242,9 @@ def failed_records(document: dict) -> list[dict]:
 
 
 def summary(document: dict, old: dict | None) -> str:
-    """Lines on targets, failures, and the ratios of the times to those of an older document."""
-    lines = []
-    for t in document["targets"]:
-        word = TARGET_WORDS[t["reached"]]
-        value = "" if t["value"] is None else f"{t['value']:.3g}"
-        lines.append(f"{word:<12} {value:>8}  ({t['wanted']})  {t['op']}: {t['text']}")
+    """Lines on failures, and the ratios of the times to those of an older document."""
     stopped = (r for r in document["records"] if r["status"].startswith("stopped"))
-    lines += [f"{r['op']}: {r['variant']}, {r['direction']}: {r['status']}" for r in stopped]
+    lines = [f"{r['op']}: {r['variant']}, {r['direction']}: {r['status']}" for r in stopped]
     if old is not None:
         lines.append(ratio_table(old, document))
     for r in failed_records(document):

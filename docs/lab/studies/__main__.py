@@ -16,9 +16,9 @@ from gamba_warp.files import output_folder
 from gamba_warp.measure import suites
 from gamba_warp.untrusted.ranges import Threads, ranged
 
-from . import drift, show
+from . import drift, show, targets
 
-# What is studied -> the module with ``cases(settings)`` and ``targets(settings)``.
+# What is studied -> the module with ``cases(settings)`` and perhaps ``targets(settings)``.
 STUDIES = {
     "scan": ".scan",
     "raster": ".raster",
@@ -82,7 +82,10 @@ def study(
         raise UserError(f"name what to study: {', '.join((*STUDIES, *GROUPS))}")
     settings = suites.make_settings(pick_device(device), quick, full, False, threads, data)
     folder = output_folder(out)
-    found = suites.run_suites({op: load_study(op) for op in chosen}, settings, only)
+    modules = {op: load_study(op) for op in chosen}
+    found = suites.run_suites(modules, settings, only)
+    wanted = [t for m in modules.values() if hasattr(m, "targets") for t in m.targets(settings)]
+    found["targets"] = targets.judge(dict.fromkeys(wanted), found["records"])
     document = show.with_crossings(found)
     suites.write_document(document, folder, show.markdown, show.page)
     print(f"{show.summary(document)}; wrote {folder / 'bench.json'}, bench.md and bench.html")

@@ -185,8 +185,3 @@ def check_near(scene: Scene, backward: bool) -> Error:
     if backward:
         return scene.changed(gaussians=few).check(BOTH)
     return scene.changed(truth=few).check("forward")
-
-
-def targets(settings: Settings) -> list:
-    """Returns no targets: what grows faster than its work is said in words."""
-    return []

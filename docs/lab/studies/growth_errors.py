@@ -293,8 +293,3 @@ def _variant(problem: Problem, length: int, device: torch.device) -> Variant:
         work=lambda: found | lines,
     )
     return made
-
-
-def targets(settings: Settings) -> list:
-    """Returns no targets: the lines are what the errors are held against."""
-    return []

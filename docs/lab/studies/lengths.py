@@ -25,7 +25,6 @@ from gamba_warp.kernels.bench.core.case import (
     Error,
     Settings,
     Stopped,
-    Target,
     Variant,
     compare,
 )
@@ -355,8 +354,3 @@ def _variant(line: Line, length: int, limit: float, oracle: str) -> Variant:
 
     made.run = run
     return made
-
-
-def targets(settings: Settings) -> list[Target]:
-    """Returns no targets: what is asked for is where the lines cross."""
-    return []

@@ -17,7 +17,6 @@ from gamba_warp.kernels.bench.core.case import (
     Error,
     NotInstalled,
     Settings,
-    Target,
     Variant,
     compare,
     make_cases,
@@ -30,6 +29,10 @@ from gamba_warp.model.posing import reference_cameras
 from gamba_warp.render import render
 
 from . import precision
+from .products import Products
+from .targets import Key, Target
+
+ALONE = "matrix products alone"
 
 
 def cases(settings: Settings) -> list[Case]:
@@ -39,14 +42,37 @@ def cases(settings: Settings) -> list[Case]:
         ("precision", precision.precisions, "error"),
     ]
     return [
-        *make_cases("block", settings, [("compiled", compiled, "error")]),
+        *make_cases("block", settings, [("compiled", compiled, "error"), (ALONE, alone, None)]),
         *make_cases("model", settings, models),
     ]
 
 
 def targets(settings: Settings) -> list[Target]:
-    """Returns those of both precisions."""
-    return precision.targets(settings)
+    """Returns those of both precisions, and of blocks beside their products."""
+    made = precision.targets(settings)
+    if settings.level != "quick":
+        for name in _DEPTHS:
+            ours, products = (Key("block", ALONE, n) for n in (name, f"{name}, products alone"))
+            text = f"{name}, time over that of its matrix products alone"
+            made.append(Target(text, (ours,), (products,), at_most=1.3))
+    return made
+
+
+_DEPTHS = {"one block": 1, "backbone": 14}
+
+
+def alone(settings: Settings) -> list[Variant]:
+    """Blocks of the paper's size beside their matrix products alone, repeated on operands of the
+    same shapes into given outputs.
+    """
+    made = []
+    for name, depth in _DEPTHS.items():
+        backbone = Backbone(settings, min(depth, 2) if settings.level == "quick" else depth)
+        made.append(backbone.variant(name, default=True))
+        products = Products(backbone.forward, settings.device)
+        rest = {"run": products.run, "check": None, "work": products.work, "oracle": ""}
+        made.append(backbone.variant(f"{name}, products alone", **rest))
+    return made
 
 
 class _Lazy:

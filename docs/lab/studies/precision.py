@@ -12,13 +12,16 @@ from torch import Tensor
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.devices import float32_products, network_products
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench.core.case import Error, Key, Settings, Target, Variant, compare
-from gamba_warp.measure.blocks import Products, without_encoder
+from gamba_warp.kernels.bench.core.case import Error, Settings, Variant, compare
+from gamba_warp.measure.blocks import without_encoder
 from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, Preset
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.posing import reference_cameras
 from gamba_warp.render import render
+
+from .products import Products
+from .targets import Key, Target
 
 PAPER, ALONE, PLAIN = "paper, float32", "products alone", "MKL's products alone"
 # Allowed relative rms errors of the Gaussians: roundings that 14 blocks carry on.

@@ -19,15 +19,14 @@ from gamba_warp.kernels.bench.cases.raster_scene import (
 from gamba_warp.kernels.bench.core.case import (
     DIRECTIONS,
     Case,
-    Key,
     Settings,
-    Target,
     Variant,
     make_cases,
 )
 from gamba_warp.kernels.rasterize import Skip
 
 from .growth import near_crop
+from .targets import Key, Target
 
 _FEW = 16384
 _CASE = "large scenes"

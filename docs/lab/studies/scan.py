@@ -16,9 +16,7 @@ from gamba_warp.kernels.bench.cases.scan_problem import (
 from gamba_warp.kernels.bench.core.case import (
     BOTH,
     Case,
-    Key,
     Settings,
-    Target,
     Variant,
     make_cases,
 )
@@ -27,6 +25,7 @@ from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
 
 from .probe import probe_rate, probe_scan
+from .targets import Key, Target
 
 on_cpu, on_cuda = partial(patch.object, cpu, "TUNING"), partial(patch.object, cuda, "FORCED")
 _TRADE_LIMIT = 1.0  # where accuracy is the knob

@@ -13,14 +13,20 @@ from gamba_warp.measure import suites
 from gamba_warp.measure.page import line_chart
 from gamba_warp.pages.charts import Axis, Point, Series, chart
 
+from . import targets
 from .crossing import FIGURES, crossings, series_of
 from .draw import bars, growth_picture
 from .parts import parts_of, parts_table
 from .slopes import ERRORS, GROWTH, error_charts, growth_charts, growth_lines, growth_table
 
 
-def more(records: Sequence[dict]) -> tuple[list[str], list[report.Table]]:
-    """Crossings and what grows too fast, in sentences; slopes and parts, in tables."""
+def more(document: dict, records: Sequence[dict]) -> tuple[list[str], list[report.Table]]:
+    """Crossings and what grows too fast, in sentences; slopes and parts, in tables.
+
+    Of a whole document (no records): its targets.
+    """
+    if not records:
+        return [], targets.rows(document)
     tables = [rows for rows in (growth_table(records), parts_table(records)) if rows]
     return [*(c.text() for c in crossings(records)), *growth_lines(records)], tables
 
@@ -60,7 +66,7 @@ def summary(document: dict) -> str:
     lines = [f"{c.op}: {c.text()}" for c in crossings(document["records"])]
     for op, cases in report.groups(document).items():
         lines += [f"{op}: {line}" for records in cases.values() for line in growth_lines(records)]
-    return "\n".join([*lines, suites.summary(document, None)])
+    return "\n".join([*targets.lines(document), *lines, suites.summary(document, None)])
 
 
 def write_pages(documents: Sequence[dict], out: Path) -> list[Path]:

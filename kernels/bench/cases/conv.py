@@ -1,4 +1,4 @@
-"""Cases of the causal convolution, and the targets on them."""
+"""Cases of the causal convolution."""
 
 from __future__ import annotations
 
@@ -13,11 +13,8 @@ from ...causal_conv1d.reference import causal_conv1d_reference
 from .. import peers
 from ..core.case import (
     BOTH,
-    DIRECTIONS,
     Case,
-    Key,
     Settings,
-    Target,
     Variant,
     dtype_name,
     make_cases,
@@ -104,18 +101,3 @@ def knobs(settings: Settings) -> list[Variant]:
         default = dtype == torch.float32
         made += problem.pair(dtype_name(dtype), {"dtype": dtype}, default=default)
     return made
-
-
-def targets(settings: Settings) -> list[Target]:
-    """What should be reached; nothing at a quick run's sizes."""
-    if settings.level == "quick":
-        return []
-    return [
-        Target(
-            f"{direction}, torch conv1d's time over ours",
-            (Key("conv", "operator", "torch conv1d", direction),),
-            (Key("conv", "operator", "default", direction),),
-            at_least=1,
-        )
-        for direction in DIRECTIONS
-    ]

@@ -11,7 +11,7 @@ from torch import Tensor
 from ...rasterize.harmonics import colors_seen_from
 from ...rasterize.harmonics.formula import colors_by_formula
 from .. import peers
-from ..core.case import DIRECTIONS, Case, Key, Settings, Target, Variant, make_cases
+from ..core.case import DIRECTIONS, Case, Settings, Variant, make_cases
 from ..core.problem import Operator
 
 LIMIT = 1e-5
@@ -92,21 +92,3 @@ def sizes(settings: Settings) -> list[Variant]:
     for count, views in _counts(settings):
         made += _variants(settings, _DEGREE, count, views, _suffix(count, views))
     return made
-
-
-def targets(settings: Settings) -> list[Target]:
-    """Faster than gsplat's torch function, where it is measured; nothing at a quick run's sizes."""
-    if settings.level == "quick" or not settings.peers:
-        return []
-    named = [("harmonics by degree", f"degree {degree}") for degree in _DEGREES]
-    named += [("harmonics", _suffix(*sizes)) for sizes in _counts(settings)]
-    return [
-        Target(
-            f"harmonics, {suffix}, {direction}, gsplat's torch function's time over ours",
-            (Key("raster", case, f"gsplat's torch, {suffix}", direction),),
-            (Key("raster", case, f"ours, {suffix}", direction),),
-            at_least=_GSPLAT,
-        )
-        for case, suffix in named
-        for direction in DIRECTIONS
-    ]

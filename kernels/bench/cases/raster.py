@@ -1,4 +1,4 @@
-"""Cases of the rasterizer, and the targets on them."""
+"""Cases of the rasterizer."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from ..core.case import (
     DIRECTIONS,
     Case,
     Error,
-    Key,
     Settings,
-    Target,
     Variant,
     compare,
     dtype_name,
@@ -248,38 +246,3 @@ def many_views(settings: Settings) -> list[Variant]:
     """32 views of 512² in one launch, beside gsplat."""
     scene = make_scene(settings, views=32)
     return scene.pair("ours", default=True) + (_peers(scene, "32 views") * settings.peers)
-
-
-def targets(settings: Settings) -> list[Target]:
-    """What should be reached; nothing at a quick run's sizes."""
-    if settings.level == "quick":
-        return []
-    made, key = [], partial(Key, "raster")
-    for scale, bound in ((1, 12), (2, 25), (4, 55)):
-        forward, both = (key("scene", f"scale {scale}", d) for d in DIRECTIONS)
-        if settings.device.type == "cpu":
-            made.append(Target(f"forward, scale {scale}, ms", (forward,), at_most=bound))
-        text = f"forward + backward over forward, scale {scale}"
-        made.append(Target(text, (both,), (forward,), at_most=3.5))
-    for direction in DIRECTIONS:
-        many, one = (key("one call", name, direction) for name in ("32 calls", "one call"))
-        text = f"8 objects x 4 views, {direction}, 32 calls over one"
-        made.append(Target(text, (many,), (one,), at_least=1.3))
-    for count in (65536, 262144) if settings.level == "full" else (65536,):
-        for direction in DIRECTIONS:
-            few, many = (
-                partial(key, "Gaussians", f"{n} Gaussians", direction) for n in (16384, count)
-            )
-            text = f"{direction}, growth of time over growth of pairs, 16384 to {count} Gaussians"
-            times, over = (many(), few("pairs")), (few(), many("pairs"))
-            made.append(Target(text, times, over, at_most=1.0))
-    made += harmonics.targets(settings)
-    if settings.device.type == "cuda":
-        ours, both = (key("32 views", "ours", d) for d in DIRECTIONS)
-        peer = key("32 views", "gsplat, 32 views")
-        made += [
-            Target("forward, µs a view of 512²", (ours,), scale=1e3 / 32, at_most=60),
-            Target("forward + backward, µs a view of 512²", (both,), scale=1e3 / 32, at_most=210),
-            Target("forward, gsplat's time over ours", (peer,), (ours,), at_least=1.5),
-        ]
-    return made

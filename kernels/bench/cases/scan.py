@@ -1,4 +1,4 @@
-"""Cases of the selective scan, and the targets on them."""
+"""Cases of the selective scan."""
 
 from __future__ import annotations
 
@@ -10,12 +10,9 @@ import torch
 
 from .. import peers
 from ..core.case import (
-    BOTH,
     DIRECTIONS,
     Case,
-    Key,
     Settings,
-    Target,
     Variant,
     dtype_name,
     make_cases,
@@ -144,36 +141,3 @@ def training_batch(settings: Settings) -> list[Variant]:
     if settings.peers:
         made += _peer(problem, peers.mamba_ssm_scan).pair("mamba-ssm", half, peer=True)
     return made
-
-
-def targets(settings: Settings) -> list[Target]:
-    """What should be reached; nothing at a quick run's sizes."""
-    if settings.level == "quick":
-        return []
-    key = partial(Key, "scan")
-    ours, both = key("operator", "default"), key("operator", "default", BOTH)
-    made = [Target("forward + backward over forward", (both,), (ours,), at_most=5)]
-    long, short = (partial(key, "length", f"L {length}") for length in (65536, 4096))
-    for name, field in (("time", "ms_p50"), ("memory", "peak_bytes")):
-        for direction in DIRECTIONS:
-            text = f"{direction}, {name} per token at L 65536 over L 4096"
-            times, over = (long(direction, field),), (short(direction, field),)
-            most = 1.2 if (name, direction) == ("time", BOTH) else 1.1
-            made.append(Target(text, times, over, scale=4096 / 65536, at_most=most))
-    saved, history = (long(BOTH, field) for field in ("saved_bytes", "state_history_bytes"))
-    text = "saved for the backward over the state history"
-    made.append(Target(text, (saved,), (history,), at_most=1 / 64))
-    if settings.device.type == "cpu":
-        for direction in DIRECTIONS:
-            one, two = (key("threads", name, direction) for name in ("1 thread", "2 threads"))
-            made.append(Target(f"{direction}, 1 thread over 2", (one,), (two,), at_least=1.8))
-        return made
-    layer = partial(key, "training batch")
-    ours, both, single = layer("default"), layer("default", BOTH), layer("one sequence")
-    return [
-        *made,
-        Target("forward of a layer, B 16, bfloat16, ms", (ours,), at_most=2.2),
-        Target("forward + backward of a layer, B 16, bfloat16, ms", (both,), at_most=6),
-        Target("forward of a layer, B 1, bfloat16, ms", (single,), at_most=0.25),
-        Target("forward, mamba-ssm's time over ours", (layer("mamba-ssm"),), (ours,), at_least=1.5),
-    ]

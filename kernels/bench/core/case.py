@@ -1,4 +1,4 @@
-"""What is measured: cases, each of a few variants that are timed in turn, and their targets."""
+"""What is measured: cases, each of a few variants that are timed in turn."""
 
 from __future__ import annotations
 
@@ -182,35 +182,3 @@ def over_threads(make: Callable[..., list[Variant]]) -> list[Variant]:
             variant.parameters = variant.parameters | {"threads": threads}
             made.append(variant)
     return made
-
-
-@dataclass(frozen=True)
-class Key:
-    """The key of a figure; ``field`` is ``ms_p50`` or a key of the record's ``work``."""
-
-    op: str
-    case: str
-    variant: str
-    direction: str = "forward"
-    field: str = "ms_p50"
-
-
-@dataclass(frozen=True)
-class Target:
-    """A figure, or a quotient of figures, that should be reached.
-
-    Attributes:
-        text: meaning of the figure, in words.
-        times: figures to multiply.
-        over: figures to divide by.
-        scale: factor of the quotient.
-        at_least: the bound, if it is a lower one.
-        at_most: the bound, if it is an upper one.
-    """
-
-    text: str
-    times: tuple[Key, ...]
-    over: tuple[Key, ...] = ()
-    scale: float = 1.0
-    at_least: float | None = None
-    at_most: float | None = None

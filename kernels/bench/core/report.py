@@ -1,13 +1,12 @@
-"""What was measured, in a form for people: targets, ratios and Markdown tables."""
+"""What was measured, in a form for people: ratios and Markdown tables."""
 
 from __future__ import annotations
 
-import math
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 from ...runtime import tables
-from .case import Key, Target
 
 _HEADER = ("variant", "direction", "dtype", "ms", "20 % to 80 %", "first call", "error")
 
@@ -30,37 +29,6 @@ _WORK = {
     "gradient_angle": "its 1 - cosine",
     "flops": "",
 }
-
-
-def judge(targets: Iterable[Target], records: Sequence[dict]) -> list[dict]:
-    """Holds records against targets.
-
-    Returns:
-        ``{op, text, wanted, value, reached}`` for each target whose cases were measured; ``value``
-        and ``reached`` are None if a figure is missing.
-    """
-    cases = {(r["op"], r["case"]) for r in records}
-    found = {(r["op"], r["case"], r["variant"], r["direction"]): r for r in reversed(records)}
-
-    def figure(key: Key) -> float:
-        r = found.get((key.op, key.case, key.variant, key.direction), {"work": {}})
-        return (r[key.field] if key.field in r else r["work"].get(key.field)) or 0.0
-
-    rows = []
-    for target in targets:
-        keys = (*target.times, *target.over)
-        if not all((k.op, k.case) in cases for k in keys):
-            continue
-        below = math.prod(map(figure, target.over))
-        value = target.scale * math.prod(map(figure, target.times)) / below if below else None
-        reached = None
-        if value:
-            low = target.at_least is None or value >= target.at_least
-            reached = low and (target.at_most is None or value <= target.at_most)
-        wanted = f"≥ {target.at_least:.3g}" if target.at_least else f"≤ {target.at_most:.3g}"
-        row = dict(op=keys[0].op, text=target.text, wanted=wanted)
-        rows.append(row | dict(value=value or None, reached=reached))
-    return rows
 
 
 def identity(record: dict) -> tuple[str, ...]:
@@ -167,16 +135,6 @@ def oracles(records: Sequence[dict]) -> str:
     return f"Error: relative rms to {' / '.join(names)}." if names else ""
 
 
-def target_rows(document: dict) -> list[list[str]]:
-    """Returns the targets' cells under ``TARGET_HEADER``."""
-    return [
-        [t["op"], t["text"], t["wanted"], number(t["value"]), TARGET_WORDS[t["reached"]]]
-        for t in document.get("targets", [])
-    ]
-
-
-TARGET_WORDS = {True: "reached", False: "missed", None: "not measured"}
-TARGET_HEADER = ("", "target", "wanted", "measured", "")
 EXPLANATION = (
     "Times are medians in milliseconds, with the 20 % and 80 % quantiles; variants of one table "
     "were timed in turn, so their ratios come from one run. The first call includes compilation or "
@@ -186,31 +144,52 @@ EXPLANATION = (
 
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # header and rows
-# What a study says of the records of one case beside the common table: sentences, and tables.
-More = Callable[[Sequence[dict]], tuple[list[str], list[Table]]]
+# What a study says beside the common table, of a document and the records of one of its cases, or
+# of the whole document where there are no records: sentences, and tables.
+More = Callable[[dict, Sequence[dict]], tuple[list[str], list[Table]]]
 
 
-def nothing_more(records: Sequence[dict]) -> tuple[list[str], list[Table]]:
+class Part(NamedTuple):
+    """What a report holds below one heading.
+
+    Attributes:
+        title: the heading: a machine, or an operator and a case.
+        texts: paragraphs.
+        tables: in their order.
+        records: of the case; none for a machine.
+    """
+
+    title: str
+    texts: list[str]
+    tables: list[Table]
+    records: Sequence[dict] = ()
+
+
+def nothing_more(document: dict, records: Sequence[dict]) -> tuple[list[str], list[Table]]:
     """What ``gamba bench`` adds to the table of a case."""
     return [], []
+
+
+def parts(documents: Sequence[dict], more: More = nothing_more) -> Iterator[Part]:
+    """Yields for each document its machine, and then its cases."""
+    for document in documents:
+        texts, tables = more(document, [])
+        if document["interrupted"]:
+            texts = ["The run was interrupted; what was measured is here.", *texts]
+        yield Part(machine_line(document), texts, tables)
+        for op, cases in groups(document).items():
+            for case, records in cases.items():
+                texts, tables = more(document, records)
+                texts = [f"{records[0]['text']} {oracles(records)}".strip(), *texts]
+                yield Part(f"{op}: {case}", texts, [table(records), *tables], records)
 
 
 def markdown(
     documents: Sequence[dict], more: More = nothing_more, by: str = "`gamba bench`, not by hand"
 ) -> str:
     """Returns a page of all tables; each document is of one machine."""
-    lines = ["# Benchmarks", "", f"Written by {by}.", "", EXPLANATION, ""]
-    for document in documents:
-        lines += [f"## {machine_line(document)}", ""]
-        if document["interrupted"]:
-            lines += ["The run was interrupted; what was measured is here.", ""]
-        if targets := target_rows(document):
-            lines += [tables.markdown(TARGET_HEADER, targets), ""]
-        for op, cases in groups(document).items():
-            for case, records in cases.items():
-                lines += [f"### {op}: {case}", "", f"{records[0]['text']} {oracles(records)}", ""]
-                said, more_tables = more(records)
-                lines += [line for text in said for line in (text, "")]
-                for rows in (table(records), *more_tables):
-                    lines += [tables.markdown(*rows), ""]
-    return "\n".join(lines)
+    lines = ["# Benchmarks", f"Written by {by}.", EXPLANATION]
+    for part in parts(documents, more):
+        lines += [f"{'###' if part.records else '##'} {part.title}", *part.texts]
+        lines += [tables.markdown(*rows) for rows in part.tables]
+    return "\n\n".join(lines) + "\n"

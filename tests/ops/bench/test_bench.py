@@ -13,6 +13,8 @@ from helpers import rel_rms
 from lab.studies import models
 from lab.studies import raster as raster_study
 from lab.studies import scan as scan_study
+from lab.studies.products import Products
+from lab.studies.targets import Key, Target, judge, of_bench
 from lab.studies.training import step
 
 from gamba_warp import cli
@@ -28,18 +30,16 @@ from gamba_warp.kernels.bench.core.case import (
     BOTH,
     Case,
     Error,
-    Key,
     NotInstalled,
     Settings,
-    Target,
     Variant,
     compare,
 )
 from gamba_warp.kernels.bench.core.measure import measure, peak_bytes, saved_bytes
-from gamba_warp.kernels.bench.core.report import judge, markdown, ratio_table, ratios
+from gamba_warp.kernels.bench.core.report import markdown, ratio_table, ratios
 from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
-from gamba_warp.measure import suites
+from gamba_warp.measure import inference, suites
 from gamba_warp.measure.blocks import without_encoder
 from gamba_warp.measure.page import charts_of, page
 from gamba_warp.model.config import PRESETS
@@ -67,9 +67,9 @@ def run(*cases):
     return measure(cases, QUICK)
 
 
-def stub(monkeypatch, *cases, targets=()):
+def stub(monkeypatch, *cases):
     """Makes ``gamba bench scan`` run these cases."""
-    module = type("M", (), {"cases": lambda _: list(cases), "targets": lambda _: list(targets)})
+    module = type("M", (), {"cases": lambda _: list(cases)})
     monkeypatch.setattr(machine, "load_suite", lambda op: module)
 
 
@@ -275,14 +275,20 @@ def test_targets_are_judged():
     assert rows[0]["wanted"] == "≤ 2.5" and rows[1]["wanted"] == "≥ 2.5"
 
 
-def test_every_target_names_what_its_suite_measures(monkeypatch):
+@pytest.mark.parametrize("gpu", [None, "H200"])
+def test_every_target_names_what_its_suite_measures(gpu):
     """Names only: nothing is run."""
-    for suite in (scan_suite, conv_suite, raster_suite, scan_study, raster_study):
-        full = Settings(torch.device("cpu"), "full", threads=2)
-        names = {c.name for c in suite.cases(full)}
-        for target in suite.targets(full):
-            assert {k.case for k in (*target.times, *target.over)} <= names, target.text
+    full = Settings(torch.device("cuda" if gpu else "cpu"), "full", threads=2)
+    suites = (scan_suite, conv_suite, raster_suite, inference, scan_study, raster_study)
+    names = {c.name for suite in suites for c in suite.cases(full)}
+    document = {"machine": {"gpu": gpu}, "settings": {"level": "full"}, "records": []}
+    wanted = of_bench(document)
+    for suite in (scan_study, raster_study):
+        wanted += suite.targets(full)
         assert suite.targets(QUICK) == []
+    for target in wanted:
+        assert {k.case for k in (*target.times, *target.over)} <= names, target.text
+    assert of_bench(document | {"settings": {"level": "quick"}}) == [] and len(wanted) > 15
 
 
 def test_pareto_front():
@@ -469,8 +475,6 @@ def test_model_cases_run(op, module):
     if op == "block":
         error = {r["variant"]: r["rel_rms_error"] for r in records}
         assert 0 < error["default"] < 1e-5
-        products = next(r for r in records if r["variant"] == "matrix products alone")
-        assert products["work"]["products"] >= 7 and products["ms_p50"] > 0
 
 
 def test_every_preset_can_be_measured_without_its_encoder():
@@ -483,13 +487,14 @@ def test_every_preset_can_be_measured_without_its_encoder():
 
 
 def test_products_are_all_of_a_runs():
-    from gamba_warp.measure.blocks import Products
-
     a, b = torch.rand(3, 4), torch.rand(5, 4)
     layer = torch.nn.Linear(4, 5)
     products = Products(lambda: (layer(a), a @ b.T, a[None] @ b.T[None]), torch.device("cpu"))
     assert products.count == 3 and products.flops == 3 * 2 * 3 * 4 * 5
     products.run()
+    (alone,) = [c for c in models.cases(QUICK) if c.name == models.ALONE]
+    for record in measure([alone], QUICK)["records"][1::2]:
+        assert record["work"]["products"] >= 7 and record["ms_p50"] > 0
 
 
 def test_unwritable_result_is_one_line(monkeypatch, tmp_path):
@@ -570,10 +575,6 @@ def first(**values):
         (lambda d: d.pop("machine"), "required field `machine`"),
         (lambda d: d["machine"].pop("warp"), r"required field `warp` - at `\$.machine`"),
         (lambda d: d.pop("interrupted"), "required field `interrupted`"),
-        (
-            lambda d: d.update(targets=[{"op": "scan"}]),
-            r"required field `text` - at `\$.targets\[0\]`",
-        ),
         (lambda d: d.update(format="gamba_warp.bench.0"), "not a result of"),
     ],
 )

@@ -153,7 +153,7 @@ def document(monkeypatch, sizes):
     monkeypatch.setattr(lengths, "time", SimpleNamespace(perf_counter=lambda: slow.now))
     build = partial(lengths.lines, QUICK, sizes, "forward", torch.float32)
     case = Case("lengths", "forward, float32", "A text.", build, "lengths")
-    module = type("Suite", (), {"cases": lambda s: [case], "targets": lambda s: []})
+    module = type("Suite", (), {"cases": lambda s: [case]})
     return with_crossings(suites.run_suites({"lengths": module}, QUICK))
 
 

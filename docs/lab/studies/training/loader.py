@@ -15,11 +15,13 @@ import torch
 from gamba_warp.cameras import orbit
 from gamba_warp.data.dataset import ViewDataset, open_dataset
 from gamba_warp.images import save_image
-from gamba_warp.kernels.bench.core.case import Case, Key, Settings, Target, Variant
+from gamba_warp.kernels.bench.core.case import Case, Settings, Variant
 from gamba_warp.train.batches import Batches, TrainingData
 from gamba_warp.train.config import DataConfig, TrainConfig
 from gamba_warp.train.ddp import World
 from gamba_warp.train.sources.pack import PackSettings, write_pack
+
+from ..targets import Key, Target
 
 OP = "loader"
 _BATCH, _NOVEL, _SIZE = 4, 3, 128  # as in the cases of a step

@@ -14,10 +14,8 @@ from torch.nn.functional import avg_pool2d, cosine_similarity
 from gamba_warp.image_metrics import SSIM_WINDOW, ssim
 from gamba_warp.kernels.bench.core.case import (
     Error,
-    Key,
     NotInstalled,
     Settings,
-    Target,
     Variant,
     compare,
 )
@@ -25,6 +23,7 @@ from gamba_warp.train.objective.losses import structure
 from gamba_warp.vision.lpips import LPIPS, load_lpips
 from gamba_warp.vision.weights import lpips_available, read_cached
 
+from ..targets import Key, Target
 from .made_up import BATCH, BOTH, NOVEL, OP, SIZE, views
 
 SSIM_TEXT = (

@@ -13,7 +13,7 @@ from torch.profiler import record_function
 from gamba_warp.cameras import Cameras
 from gamba_warp.devices import float32_products
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.kernels.bench.core.case import Case, Error, Key, Settings, Target, Variant, compare
+from gamba_warp.kernels.bench.core.case import Case, Error, Settings, Variant, compare
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.train.config import OptimConfig
 from gamba_warp.train.optim import Ema, build_optimizer
@@ -22,6 +22,7 @@ from gamba_warp.vision.lpips import load_lpips
 from gamba_warp.vision.weights import lpips_available
 
 from ..parts import measure_parts
+from ..targets import Key, Target
 from . import losses, optimizer
 from .background import background
 from .made_up import (
