@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-StepName = Literal[
-    "compile", "checks", "inference", "bench", "peers-conv", "peers-scan", "peers-raster"
-]
+StepName = Literal["checks", "inference", "bench", "peers-conv", "peers-scan", "peers-raster"]
 MINUTES = 8.0  # of the whole run
 
 
@@ -17,25 +15,22 @@ class Step(NamedTuple):
     """A part of the run.
 
     Attributes:
-        name: of ``steps.run_step``.
-        seconds: time limit in a run of ``MINUTES``.
-        cuda: whether a CPU leaves it out.
-        packages: of which at least one is needed.
+        name: of ``check.run_step``.
+        seconds: time limit in a run of ``MINUTES``, compilation included.
+        packages: of which at least one is needed, and CUDA with it.
     """
 
     name: StepName
     seconds: float
-    cuda: bool = False
     packages: tuple[str, ...] = ()
 
 
 # What matters most comes first; together they may want more than the whole time.
 STEPS = (
-    Step("compile", 100, cuda=True),
-    Step("checks", 100),
-    Step("inference", 100),
-    Step("bench", 130),
-    Step("peers-conv", 60, True, ("causal-conv1d",)),
-    Step("peers-scan", 90, True, ("mamba-ssm", "mambapy")),
-    Step("peers-raster", 480, True, ("gsplat", "gswarp")),  # gsplat compiles itself on first use
+    Step("checks", 160),
+    Step("inference", 110),
+    Step("bench", 160),
+    Step("peers-conv", 60, ("causal-conv1d",)),
+    Step("peers-scan", 90, ("mamba-ssm", "mambapy")),
+    Step("peers-raster", 480, ("gsplat", "gswarp")),  # gsplat compiles itself on first use
 )

@@ -10,38 +10,36 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-import warp as wp
 
 from ..errors import UserError, first_line
 from ..files import output_folder, write_json, write_text
 from ..kernels.bench.cases import conv, raster, scan
-from ..kernels.bench.core.case import Case, Settings
-from ..kernels.bench.core.measure import measure, synchronize
+from ..kernels.bench.core.case import Case, Settings, Variant, make_cases
+from ..kernels.bench.core.measure import measure
 from ..kernels.bench.peers import PACKAGES, versions
-from ..kernels.bench.static.report import find_kernels
 from ..measure import blocks, inference
-from ..untrusted.children import Failed, end_idle, run_each
 from . import MINUTES, STEPS, Step
 from .checks import LeftOut, checks
 from .report import headline, machine_facts, page
 
-FORMAT = "gamba_warp.gpu_check.1"
+FORMAT = "gamba_warp.gpu_check.2"
 _GRACE = 15.0  # seconds that the last item of a step may take
 _LEAST = 5.0  # seconds below which no step begins
+_LATE = "its {:.0f} s were up"
+_STEP = "import sys; from {} import run_step; run_step(*sys.argv[1:])"  # of a process of its own
 _Item = TypeVar("_Item")
 # These cases are timed first, since the time may end before the list does; all others follow.
 _FIRST = [
@@ -63,7 +61,7 @@ class Report:
 
     Attributes:
         folder: of gpu-check.json and gpu-check.md.
-        document: ``{format, verdict, machine, settings, steps, results, failures, not_done,
+        document: ``{format, verdict, machine, settings, steps, checks, failures, not_done,
             bench}``, ready for JSON; the last is one document as ``gamba bench`` writes it,
             inference included.
         until: time after which no item is begun, seconds since the epoch.
@@ -102,12 +100,10 @@ class Report:
 def begin(device: str, quick: bool, folder: Path) -> Report:
     """A report of a run of which nothing is done yet."""
     settings = {"device": device, "level": "quick" if quick else "normal"}
-    empty = {"steps": [], "results": {}, "failures": [], "not_done": []}
-    bench = {"records": []}
     document = {"format": FORMAT, "verdict": "not finished", "machine": {}, "settings": settings}
-    report = Report(folder, document | empty | {"bench": bench})
-    document = report.document
-    document["machine"] = machine_facts(report.settings)
+    document |= {name: [] for name in ("steps", "checks", "failures", "not_done")}
+    report = Report(folder, document | {"bench": {"records": []}})
+    report.document["machine"] = machine_facts(report.settings)
     for package in sorted(set(PACKAGES) - versions().keys()):
         report.leave_out(f"comparison with {package}", "not installed")
     return report
@@ -168,7 +164,7 @@ def do(report: Report, step: Step, seconds: float) -> None:
     row = {"name": step.name, "status": "not done", "reason": "", "seconds": 0.0}
     report.document["steps"].append(row)
     report.write()
-    if step.cuda and report.settings.device.type != "cuda":
+    if step.packages and report.settings.device.type != "cuda":
         row["reason"] = "needs CUDA"
     elif step.packages and not versions().keys() & set(step.packages):
         row["reason"] = f"not installed: {', '.join(step.packages)}"
@@ -176,15 +172,13 @@ def do(report: Report, step: Step, seconds: float) -> None:
         row["reason"] = "time was up"
     else:
         until = started + max(seconds - _GRACE, seconds / 2)
-        value = in_a_process(partial(run_step, report.folder, until), step.name, seconds)
+        words = "-c", _STEP.format(__name__), str(report.folder), step.name, str(until)
+        reason = in_a_process(words, seconds)
         report.read()
         row = report.document["steps"][-1]
-        row["status"] = "passed"
-        if isinstance(value, Failed) and "took more than" in value.reason:
-            row.update(status="stopped", reason=f"its {seconds:.0f} s were up")
-        elif isinstance(value, Failed):
-            row["reason"] = value.reason
-            report.document["failures"].append(f"step {step.name}: {value.reason}")
+        row.update(status="stopped" if reason == _LATE.format(seconds) else "passed", reason=reason)
+        if reason and row["status"] != "stopped":
+            report.document["failures"].append(f"step {step.name}: {reason}")
         if len(report.document["failures"]) > failures:
             row["status"] = "failed"
     row["seconds"] = time.time() - started
@@ -196,71 +190,63 @@ def do(report: Report, step: Step, seconds: float) -> None:
     print(f"{step.name:<10} {row['status']}{reason}, {row['seconds']:.0f} s", flush=True)
 
 
-def in_a_process(function: Callable[[str], object], name: str, seconds: float) -> object:
-    """``function(name)`` in a process of its own, which is ended with all that it has started.
+def in_a_process(words: Sequence[str], seconds: float) -> str:
+    """Runs Python with arguments, and ends it with all that it has started.
 
     Returns:
-        The value or ``Failed``; of a process that died, with the last line that it wrote.
+        Why it did not end well, with the last line that it wrote; else nothing.
     """
-    with tempfile.TemporaryDirectory() as place:
-        number, said = Path(place) / "number", Path(place) / "said"
+    # Kernels and compilers tell much that is no finding, so it goes to a file.
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(
+            [sys.executable, *words], stdout=said, stderr=said, start_new_session=True
+        )
         try:
-            task = partial(_leading, number, said, function)
-            [(_, value)] = run_each(task, [name], seconds=seconds)
-        finally:
-            end_idle()
-            if hasattr(os, "killpg") and number.exists():
+            code = process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return _LATE.format(seconds)
+        finally:  # also where we are interrupted
+            if hasattr(os, "killpg"):  # it leads a group, that of what it started
                 with suppress(ProcessLookupError):
-                    os.killpg(int(number.read_bytes()), signal.SIGKILL)
-        if isinstance(value, Failed) and "its process" in value.reason and said.exists():
-            lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            value = Failed(": ".join([value.reason, *lines[-1:]]))
-    return value
+                    os.killpg(process.pid, signal.SIGKILL)
+            process.kill()
+            process.wait()
+        said.seek(0)
+        lines = said.read().decode(errors="replace").strip().splitlines()
+    if code == 0:
+        return ""
+    died = f"ended with code {code}"
+    if code < 0:
+        died = f"died of signal {-code} ({signal.Signals(-code).name})"
+    return ": ".join([f"its process {died}", *lines[-1:]])
 
 
-def _leading(number: Path, said: Path, function: Callable[[str], object], name: str) -> object:
-    with said.open("wb") as file:  # kernels and compilers tell much that is no finding
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    # A daemon, as which this process began, must not start others, as torch.compile does.
-    multiprocessing.current_process()._config["daemon"] = False  # pyright: ignore[reportAttributeAccessIssue]
-    if hasattr(os, "setsid"):  # what it starts is then of this one's group
-        os.setsid()
-        number.write_text(str(os.getpid()), encoding="utf-8")
-    return function(name)
-
-
-def run_step(folder: Path, until: float, name: str) -> None:
+def run_step(folder: str | Path, name: str, until: str | float = "inf") -> None:
     """Runs the step of that name to its end, or until its time is up, into a folder's report."""
-    report = Report(folder, json.loads((folder / "gpu-check.json").read_bytes()), until)
+    document = json.loads((Path(folder) / "gpu-check.json").read_bytes())
+    report = Report(Path(folder), document, float(until))
     settings, quick = report.settings, report.settings.level == "quick"
-    if name in _BESIDE:
-        _bench(report, replace(settings, peers=True), _BESIDE[name])
-    elif name == "bench":
-        cpu = settings.device.type == "cpu"
-        _bench(report, settings, _ON_A_CPU if quick and cpu else _FIRST, alone=quick)
+    cpu = settings.device.type == "cpu"
+    if name == "checks":
+        _checks(report)
+    elif name == "inference":
+        ceilings = make_cases(inference.OP, settings, [("ceilings", _ceilings, None)])
+        _measure(report, settings, [*ceilings, *inference.cases(settings)])
+        if cpu:
+            report.leave_out("inference from a CUDA graph", "needs CUDA")
     else:
-        result = report.document["results"][name] = {}
-        {"compile": _compile, "checks": _checks, "inference": _inference}[name](report, result)
+        beside = name in _BESIDE
+        settings = replace(settings, peers=beside)
+        first = _BESIDE[name] if beside else _ON_A_CPU if quick and cpu else _FIRST
+        suites = raster, scan, conv, blocks
+        found = {(c.op, c.name): c for suite in suites for c in suite.cases(settings)}
+        keys = dict.fromkeys([*first, *([] if beside or quick else found)])
+        _measure(report, settings, [found[key] for key in keys if key in found])
     report.write()
 
 
-def _compile(report: Report, result: dict) -> None:
-    """Compiles every kernel of ``gamba bench --static`` for this device, into Warp's cache."""
-    device = wp.device_from_torch(report.settings.device)
-    entries = find_kernels()
-    result |= {"kernels": 0, "of": len(entries), "seconds": 0.0}
-    for entry in report.in_time(entries, lambda e: f"compile {e.name}, {e.case}"):
-        started = time.perf_counter()
-        if not entry.launch.kernel.module.load(device, entry.launch.block):
-            text = f"{entry.name}, {entry.case}: does not load on {device}"
-            report.document["failures"].append(text)
-        result["kernels"] += 1
-        result["seconds"] += time.perf_counter() - started
-
-
-def _checks(report: Report, result: dict) -> None:
-    found, device = result.setdefault("checks", []), report.settings.device
+def _checks(report: Report) -> None:
+    device = report.settings.device
     every = checks(report.settings.level == "quick")
     for check in report.in_time(every, lambda check: check.name):
         started = time.perf_counter()
@@ -275,53 +261,20 @@ def _checks(report: Report, result: dict) -> None:
         except Exception as error:  # a broken kernel may raise anything, and that is a finding
             row |= {"status": "failed", "found": f"{type(error).__name__}: {first_line(error)}"}
             report.document["failures"].append(f"{check.name}: {row['found']}")
-        found.append(row | {"seconds": time.perf_counter() - started})
+        report.document["checks"].append(row | {"seconds": time.perf_counter() - started})
 
 
-def _inference(report: Report, result: dict) -> None:
-    settings = report.settings
-    result["ceilings"] = _ceilings(settings)
-    _measure(report, settings, inference.cases(settings))
-    if settings.device.type != "cuda":
-        report.leave_out("inference from a CUDA graph", "needs CUDA")
-    else:
-        result["reserved_gib"] = torch.cuda.memory_reserved(settings.device) / 2**30
-
-
-def _ceilings(settings: Settings) -> dict[str, float]:
-    """Measures what the device does at best, to judge times by: a copy and a matrix product."""
-    count, side = (1 << 20, 256) if settings.level == "quick" else (1 << 30, 8192)
-    source = torch.ones(count // 4, device=settings.device)
+def _ceilings(settings: Settings) -> list[Variant]:
+    """What the device does at best, to judge times by."""
+    count, side = (1 << 18, 256) if settings.level == "quick" else (1 << 28, 8192)
+    source = torch.ones(count, device=settings.device)
     a = torch.randn(side, side, device=settings.device).bfloat16()
-    target = torch.empty_like(source)
-
-    def seconds(run: Callable[[], object]) -> float:
-        spans = []
-        for _ in range(5):
-            started = time.perf_counter()
-            run()
-            synchronize(settings.device)
-            spans.append(time.perf_counter() - started)
-        return min(spans)
-
-    return {
-        "copy_gb_per_s": 2 * count / seconds(lambda: target.copy_(source)) / 1e9,
-        "bfloat16_tflop_per_s": 2 * side**3 / seconds(lambda: a @ a) / 1e12,
+    target, product = torch.empty_like(source), torch.empty_like(a)
+    runs = {
+        "a copy": (lambda: target.copy_(source), {"traffic": 8 * count}),
+        "a product": (lambda: torch.mm(a, a, out=product), {"flops": 2 * side**3}),
     }
-
-
-def _bench(
-    report: Report, settings: Settings, first: list[tuple[str, str]], *, alone: bool = True
-) -> None:
-    """Measures the cases of ``gamba bench`` named in ``first``; unless ``alone``, then all others.
-
-    A name of ``first`` that has no case at this level is passed over.
-    """
-    suites = raster, scan, conv, blocks
-    found = {(c.op, c.name): c for suite in suites for c in suite.cases(settings)}
-    keys = [*first, *([] if alone else found)]
-    cases = [found[key] for key in dict.fromkeys(keys) if key in found]
-    _measure(report, settings, cases)
+    return [Variant(name, run, None, work=lambda n=n: n) for name, (run, n) in runs.items()]
 
 
 def _measure(report: Report, settings: Settings, cases: list[Case]) -> None:
@@ -361,7 +314,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", nargs="+", choices=names, default=(), help="only these")
     o = parser.parse_args(arguments)
     try:
-        return run_gpu_check(o.device, o.quick, o.out, o.minutes, o.steps)
+        return run_gpu_check(**vars(o))
     except UserError as error:
         print(f"gamba: {error}", file=sys.stderr)
         return 2

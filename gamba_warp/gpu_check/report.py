@@ -7,7 +7,7 @@ import warp as wp
 
 from ..kernels.bench.core.case import Settings
 from ..kernels.bench.core.measure import machine
-from ..kernels.bench.core.report import groups, oracles, table
+from ..kernels.bench.core.report import case_parts, work_text
 from ..kernels.bench.peers import versions
 from ..kernels.runtime.tables import markdown
 from ..versions import installed
@@ -39,34 +39,19 @@ def headline(document: dict) -> list[tuple[str, str]]:
     for step in document["steps"]:
         reason = f": {step['reason']}" if step["reason"] else ""
         rows.append((f"step {step['name']}", f"{step['status']}, {step['seconds']:.0f} s{reason}"))
-    results = document["results"]
-    if found := results.get("compile"):
-        text = f"{found['kernels']} of {found['of']} in {found['seconds']:.1f} s"
-        rows.append(("kernels compiled or loaded", text))
-    if words := [check["status"] for check in results.get("checks", {}).get("checks", [])]:
+    if words := [check["status"] for check in document["checks"]]:
         counts = (f"{words.count(word)} {word}" for word in dict.fromkeys(words))
         rows.append(("checks of the kernels", ", ".join(counts)))
-    inference = results.get("inference", {})
-    for name, value in inference.get("ceilings", {}).items():
-        rows.append((name.replace("_per_", "/").replace("_", " "), f"{value:.3g}"))
-    if "reserved_gib" in inference:
-        text = f"{inference['reserved_gib']:.1f} GiB, graphs and both precisions together"
-        rows.append(("inference, memory taken", text))
-    for record in document["bench"]["records"]:
-        if record["op"] == "inference":
-            rows.append((f"inference, {record['variant']}", _time(record)))
+    for r in document["bench"]["records"]:
+        if r["op"] == "inference":
+            value = r["status"]
+            if value == "ok":
+                value = f"{r['ms_p50']:.3g} ms ({r['ms_p20']:.3g} to {r['ms_p80']:.3g})"
+                value = ", ".join(filter(None, (value, work_text(r))))
+            if r["rel_rms_error"] is not None:
+                value += f", error {r['rel_rms_error']:.2g} to {r['oracle']}"
+            rows.append((f"inference, {r['variant']}", value))
     return rows
-
-
-def _time(record: dict) -> str:
-    if record["status"] != "ok":
-        return record["status"]
-    text = f"{record['ms_p50']:.3g} ms ({record['ms_p20']:.3g} to {record['ms_p80']:.3g})"
-    if "peak_bytes" in record["work"]:
-        text += f", {record['work']['peak_bytes'] / 2**20:,.0f} MiB more at the peak"
-    if record["rel_rms_error"] is not None:
-        text += f", error {record['rel_rms_error']:.2g} to {record['oracle']}"
-    return text
 
 
 def page(document: dict) -> str:
@@ -78,8 +63,7 @@ def page(document: dict) -> str:
     for name, rows in (("Failed", document["failures"]), ("Not done", not_done)):
         if rows:
             lines += ["", f"## {name}", "", *(f"- {row}" for row in rows)]
-    for op, cases in groups({"records": document["bench"]["records"]}).items():
-        for case, found in cases.items():
-            lines += ["", f"## {op}: {case}", "", f"{found[0]['text']} {oracles(found)}", ""]
-            lines.append(markdown(*table(found)))
+    for part in case_parts(document["bench"]):
+        lines += ["", f"## {part.title}", "", *part.texts, ""]
+        lines += [markdown(*rows) for rows in part.tables]
     return "\n".join([*lines, ""])

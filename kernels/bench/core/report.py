@@ -28,6 +28,7 @@ _WORK = {
     "gradient_error": "gradient off by",
     "gradient_angle": "its 1 - cosine",
     "flops": "",
+    "traffic": "",
 }
 
 
@@ -86,7 +87,8 @@ def _row(r: dict) -> list[str]:
     return [name, r["direction"], r["dtype"], *times, error]
 
 
-def _work(r: dict) -> str:
+def work_text(r: dict) -> str:
+    """Returns the counts of a record that tables show, under their names there."""
     parts = []
     for name, label in _WORK.items():
         if name not in r["work"]:
@@ -98,6 +100,8 @@ def _work(r: dict) -> str:
             text = f"{value / 2**20:,.1f} MiB"
         elif name == "flops":
             text = f"{value / 1e9:.3g} GFLOP, {value / r['ms_p50'] / 1e6:.0f} GFLOP/s"
+        elif name == "traffic":
+            text = f"{value / r['ms_p50'] / 1e6:,.0f} GB/s"
         elif name == "samples":
             text = f"{1e3 * value / r['ms_p50']:.3g} samples/s"
         else:
@@ -110,7 +114,7 @@ def table(records: Sequence[dict]) -> tuple[list[str], list[list[str]]]:
     """Returns header and rows of one case, without the columns that would be empty."""
     compared = [r["peer_ms"] and r["ms_p50"] and r["peer_ms"] / r["ms_p50"] for r in records]
     peers = [f"{number(x)} ({r['peer']})" if x else "" for x, r in zip(compared, records)]
-    work = [_work(r) for r in records]
+    work = [work_text(r) for r in records]
     header: list[str] = [*_HEADER]
     rows = [_row(r) for r in records]
     for name, cells in (("peer's time / ours", peers), ("work", work)):
@@ -127,12 +131,6 @@ def groups(document: dict) -> dict[str, dict[str, list[dict]]]:
     for r in document["records"]:
         found.setdefault(r["op"], {}).setdefault(r["case"], []).append(r)
     return found
-
-
-def oracles(records: Sequence[dict]) -> str:
-    """Says in one sentence what the errors of a case are measured against."""
-    names = list(dict.fromkeys(r["oracle"] for r in records if r["oracle"] and not r["is_peer"]))
-    return f"Error: relative rms to {' / '.join(names)}." if names else ""
 
 
 EXPLANATION = (
@@ -177,11 +175,18 @@ def parts(documents: Sequence[dict], more: More = nothing_more) -> Iterator[Part
         if document["interrupted"]:
             texts = ["The run was interrupted; what was measured is here.", *texts]
         yield Part(machine_line(document), texts, tables)
-        for op, cases in groups(document).items():
-            for case, records in cases.items():
-                texts, tables = more(document, records)
-                texts = [f"{records[0]['text']} {oracles(records)}".strip(), *texts]
-                yield Part(f"{op}: {case}", texts, [table(records), *tables], records)
+        yield from case_parts(document, more)
+
+
+def case_parts(document: dict, more: More = nothing_more) -> Iterator[Part]:
+    """Yields a part for each case of a document, with what its errors are measured against."""
+    for op, cases in groups(document).items():
+        for case, records in cases.items():
+            texts, tables = more(document, records)
+            mine = (r["oracle"] for r in records if r["oracle"] and not r["is_peer"])
+            against = " / ".join(dict.fromkeys(mine))
+            text = records[0]["text"] + f" Error: relative rms to {against}." * bool(against)
+            yield Part(f"{op}: {case}", [text, *texts], [table(records), *tables], records)
 
 
 def markdown(
