@@ -28,16 +28,11 @@ def charts_of(case: str, records: Sequence[dict]) -> list[str]:
     done = [r for r in records if r["status"] == "ok"]
     if axis is None or not done:
         return []
-    if "," in axis:
-        each = ([r | {"axis": one} for r in records] for one in axis.split(","))
-        return [svg for part in each for svg in charts_of(case, part)]
     if axis == "error":
         directions = dict.fromkeys(r["direction"] for r in done)
         return [_error_chart([r for r in done if r["direction"] == d], d) for d in directions]
-    if axis == "memory":
-        return [_memory_chart(done)]
-    if axis in ("skipped", "switched off"):
-        return [_skip_chart(done, axis == "switched off")]
+    if axis == "skipped":
+        return [_skip_chart(done)]
     return [line_chart(case, done, axis, "ms_p50", "milliseconds")]
 
 
@@ -75,7 +70,7 @@ def _error_chart(records: Sequence[dict], direction: str) -> str:
     bottom = min(errors, default=0.0) / 3  # an error of 0 is drawn here, and labelled
     points = []
     for r in records:
-        point = _marked(r, r["rel_rms_error"] or 0.0)
+        point = marked(r, r["rel_rms_error"] or 0.0)
         if r["rel_rms_error"] == 0:
             point = replace(point, y=bottom, label=f"{point.label} (error 0)")
         points.append(point)
@@ -84,38 +79,22 @@ def _error_chart(records: Sequence[dict], direction: str) -> str:
     return chart(series, Axis("milliseconds"), Axis("relative rms error"))
 
 
-def _marked(record: dict, y: float) -> Point:
+def marked(record: dict, y: float) -> Point:
+    """Returns a record's point at a height, told apart as a peer's or a default's."""
     mark = "peer" if record["is_peer"] else "default" if record["is_default"] else ""
     return Point(record["ms_p50"], y, record["variant"], mark)
 
 
-def _memory_chart(records: Sequence[dict]) -> str:
-    """Draws time against the memory that is kept for the gradient."""
-    kept = [r for r in records if "saved_bytes" in r["work"]]
-    points = [_marked(r, r["work"]["saved_bytes"] / 2**20) for r in kept]
-    front = Series("Pareto front", pareto(points), "steps")
-    series = [Series("forward+backward", points), front]
-    return chart(series, Axis("milliseconds"), Axis("kept for the gradient, MiB"))
-
-
-def _skip_chart(records: Sequence[dict], switched_off: bool) -> str:
-    """Draws work skipped against time saved, as shares of the time without the skip.
-
-    That is the time of the default of the same direction or, if the default skips and the variants
-    do not (``switched_off``), the time of the variant.
-    """
+def _skip_chart(records: Sequence[dict]) -> str:
+    """Draws work skipped against time saved, as shares of the default of the same direction."""
     series = []
     for direction in dict.fromkeys(r["direction"] for r in records):
         found = [r for r in records if r["direction"] == direction]
         base = next((r["ms_p50"] for r in found if r["is_default"]), None)
-        points = []
-        for r in found:
-            if base and "skipped" in r["work"] and not (switched_off and r["is_default"]):
-                less, all_of_it = (base, r["ms_p50"]) if switched_off else (r["ms_p50"], base)
-                saved = 100 * (1 - less / all_of_it)
-                name = r["variant"].removeprefix("without ") if switched_off else r["variant"]
-                points.append(Point(100 * r["work"]["skipped"], saved, name))
-        series.append(Series(direction, points))
+        series.append(Series(direction, [
+            Point(100 * r["work"]["skipped"], 100 * (1 - r["ms_p50"] / base), r["variant"])
+            for r in found if base and "skipped" in r["work"]
+        ]))  # fmt: skip
     return chart(series, Axis("work skipped, %", False), Axis("time saved, %", False))
 
 

@@ -8,7 +8,6 @@ from functools import partial
 
 import torch
 
-from gamba_warp.kernels.bench.cases.raster_parts import Parts
 from gamba_warp.kernels.bench.cases.raster_scene import (
     LEAVES,
     Scene,
@@ -26,6 +25,7 @@ from gamba_warp.kernels.bench.core.case import (
 from gamba_warp.kernels.rasterize import Skip
 
 from .growth import near_crop
+from .raster_parts import Parts, gsplat_parts
 from .targets import Key, Target
 
 _FEW = 16384
@@ -39,7 +39,7 @@ def cases(settings: Settings) -> list[Case]:
     """All studies of the rasterizer at the level's sizes."""
     builders = [("switches", switches, "switched off")]
     if settings.device.type == "cpu":
-        builders.append(("large scenes", large_scenes, "N"))
+        builders += [("large scenes", large_scenes, "N"), ("gsplat's parts", gsplat_parts, None)]
     return make_cases("raster", settings, builders)
 
 

@@ -11,7 +11,7 @@ from gamba_warp.kernels.bench.core import report
 from gamba_warp.measure import page as pages
 from gamba_warp.measure import suites
 from gamba_warp.measure.page import line_chart
-from gamba_warp.pages.charts import Axis, Point, Series, chart
+from gamba_warp.pages.charts import Axis, Point, Series, chart, pareto
 
 from . import targets
 from .crossing import FIGURES, crossings, series_of
@@ -34,11 +34,18 @@ def more(document: dict, records: Sequence[dict]) -> tuple[list[str], list[repor
 def charts_of(case: str, records: Sequence[dict]) -> list[str]:
     """The charts of a study's axis; of any other, those of ``gamba bench``."""
     axis: str = records[0]["axis"] or ""
+    if "," in axis:
+        each = ([r | {"axis": one} for r in records] for one in axis.split(","))
+        return [svg for part in each for svg in charts_of(case, part)]
     done = [r for r in records if r["status"] == "ok"]
     if axis == "parts":
         split = [(r["variant"], {n: sum(t) for n, t in parts_of(r).items()}) for r in done]
         few = (dict(split[i : i + 3]) for i in range(0, len(split), 3))  # a colour each
         return [bars(series, "milliseconds of a run") for series in few]
+    if axis == "memory":
+        return [_memory_chart(done)]
+    if axis == "switched off":
+        return [_switch_chart(done)]
     if axis == "share":
         return _share_charts(case, done)
     if axis == "lengths":
@@ -114,6 +121,34 @@ def join(documents: Sequence[dict]) -> dict:
 def with_crossings(document: dict) -> dict:
     """The document with where its lines cross."""
     return document | {"crossings": [c._asdict() for c in crossings(document["records"])]}
+
+
+def _memory_chart(records: Sequence[dict]) -> str:
+    """Draws time against the memory that is kept for the gradient."""
+    kept = [r for r in records if "saved_bytes" in r["work"]]
+    points = [pages.marked(r, r["work"]["saved_bytes"] / 2**20) for r in kept]
+    front = Series("Pareto front", pareto(points), "steps")
+    series = [Series("forward+backward", points), front]
+    return chart(series, Axis("milliseconds"), Axis("kept for the gradient, MiB"))
+
+
+def _switch_chart(records: Sequence[dict]) -> str:
+    """Draws what a switch of the default skips against the time that it saves.
+
+    Both are shares; the time is that of the variant without the switch.
+    """
+    series = []
+    for direction in dict.fromkeys(r["direction"] for r in records):
+        found = [r for r in records if r["direction"] == direction]
+        base = next((r["ms_p50"] for r in found if r["is_default"]), None)
+        points = []
+        for r in found:
+            if base and "skipped" in r["work"] and not r["is_default"]:
+                saved = 100 * (1 - base / r["ms_p50"])
+                name = r["variant"].removeprefix("without ")
+                points.append(Point(100 * r["work"]["skipped"], saved, name))
+        series.append(Series(direction, points))
+    return chart(series, Axis("work skipped, %", False), Axis("time saved, %", False))
 
 
 def _share_charts(case: str, records: Sequence[dict]) -> list[str]:

@@ -21,7 +21,6 @@ from ..core.case import (
     over_threads,
 )
 from . import harmonics
-from .raster_parts import gsplat_parts
 from .raster_scene import (
     LEAVES,
     TRADE_LIMIT,
@@ -51,7 +50,6 @@ def cases(settings: Settings) -> list[Case]:
         builders.append(("32 views", many_views, None))
     else:
         builders.append(("threads", by_threads, "threads"))
-        builders += [("gsplat's parts", gsplat_parts, None)] * settings.peers
     return make_cases("raster", settings, builders) + harmonics.cases(settings)
 
 
@@ -72,7 +70,7 @@ def scenes(settings: Settings) -> list[Variant]:
 
 
 def _peers(scene: Scene, name: str) -> list[Variant]:
-    """On CUDA gsplat and gswarp, the whole operator; a CPU has ``gsplat_parts``."""
+    """On CUDA gsplat and gswarp, the whole operator."""
     if scene.device.type != "cuda":
         return []
     packages = {"gsplat": peers.gsplat_rasterization, "gswarp": peers.gswarp_rasterization}

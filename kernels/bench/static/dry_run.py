@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -26,8 +26,7 @@ COUNT = 1 << 20
 MULTIPROCESSORS = 132
 
 
-@dataclass(frozen=True)
-class Launch:
+class Launch(NamedTuple):
     """A kernel and the threads of its block."""
 
     kernel: wp.Kernel
@@ -92,18 +91,15 @@ def run_backward(outputs: Sequence[Tensor]) -> None:
         gradients = pending.pop(node)
         if node.name() == "torch::autograd::AccumulateGrad":
             continue
-        for (following, index), gradient in zip(*_gradients(node, gradients)):
-            give(following, index, gradient)
-
-
-def _gradients(node, gradients: list) -> tuple[list, list]:
-    """What follows a node, and the gradient for each."""
-    following = list(node.next_functions)
-    if not hasattr(node, "needs_input_grad"):  # a node of C++
-        results = node(*gradients)
-        return following, list(results) if isinstance(results, tuple) else [results]
-    results = zip(node.apply(*gradients), node.needs_input_grad)
-    return [f for f in following if f[0] is not None], [x for x, needed in results if needed]
+        following, needed = node.next_functions, getattr(node, "needs_input_grad", None)
+        if needed is None:  # a node of C++
+            found = node(*gradients)
+            found = found if isinstance(found, tuple) else (found,)
+        else:
+            following = [f for f in following if f[0] is not None]
+            found = [x for x, asked in zip(node.apply(*gradients), needed) if asked]
+        for (after, index), gradient in zip(following, found):
+            give(after, index, gradient)
 
 
 def launches_of(run: Callable[[], Sequence[Tensor]]) -> dict[str, list[Launch]]:

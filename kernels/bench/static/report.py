@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -35,8 +35,7 @@ class NoCompiler(Exception):
     """The CUDA kernels cannot be found or compiled here."""
 
 
-@dataclass(frozen=True)
-class Machine:
+class Machine(NamedTuple):
     """A multiprocessor's limits (CUDA C++ Programming Guide, compute capabilities).
 
     Attributes:
@@ -58,8 +57,7 @@ MACHINES = {
 }
 
 
-@dataclass(frozen=True)
-class Occupancy:
+class Occupancy(NamedTuple):
     """How much of a kernel a multiprocessor holds at a time.
 
     Attributes:
@@ -89,72 +87,60 @@ def occupancy(machine: Machine, block: int, registers: int, shared: int) -> Occu
     """
     warps = -(-block // 32)
     of_warp = -(-32 * registers // 256) * 256
-    fits = {
-        "registers": machine.registers // 4 // of_warp * 4 // warps,
-        "shared memory": machine.shared // (-(-(shared + RESERVED) // 128) * 128),
-        "warps": machine.warps // warps,
-        "blocks": machine.blocks,
-    }
-    limit = min(fits, key=lambda name: fits[name])
-    blocks = fits[limit]
+    blocks, limit = min(
+        (machine.registers // 4 // of_warp * 4 // warps, "registers"),
+        (machine.shared // (-(-(shared + RESERVED) // 128) * 128), "shared memory"),
+        (machine.warps // warps, "warps"),
+        (machine.blocks, "blocks"),
+        key=lambda fit: fit[0],
+    )
     return Occupancy(blocks, blocks * warps, blocks * warps / machine.warps, limit)
 
 
 LENGTH, CHANNELS = 16961, 1024  # of the scan in the paper's model
 
 
-def _tensor(*shape: int, dtype=torch.float32, gradient: bool = True) -> Tensor:
-    return torch.empty(*shape, dtype=dtype, device="cuda", requires_grad=gradient)
+def _on_cuda(gradient: bool, *shapes: tuple[int, ...], dtype=torch.float32) -> list[Tensor]:
+    return [torch.empty(s, dtype=dtype, device="cuda", requires_grad=gradient) for s in shapes]
 
 
-def _scan(
-    batch: int, dtype, states: int = 16, mode: str = "mamba", last: bool = False
-) -> list[Tensor]:
+def _scan(batch: int, dtype, states: int = 16, mode="mamba", last: bool = False) -> list[Tensor]:
     """The paper's size, prefix and all; a single sequence is cut into segments."""
-    length, channels = LENGTH, CHANNELS
-    u, delta, z = (_tensor(batch, length, channels, dtype=dtype) for _ in range(3))
-    B, C = (_tensor(batch, length, states, dtype=dtype) for _ in range(2))
-    A, D, bias = _tensor(channels, states), _tensor(channels), _tensor(channels)
-    options: dict[str, Any] = {"delta_bias": bias, "delta_softplus": True, "discretization": mode}
+    token, state = (batch, LENGTH, CHANNELS), (batch, LENGTH, states)
+    u, delta, z, B, C = _on_cuda(True, *[token] * 3, *[state] * 2, dtype=dtype)
+    row = (CHANNELS,)
+    A, D, bias, first = _on_cuda(True, (*row, states), row, row, (batch, CHANNELS, states))
+    options: dict[str, Any] = dict(delta_bias=bias, delta_softplus=True, discretization=mode)
     if last:
         return [selective_scan_state(u, delta, A, B, **options)]
-    state = _tensor(batch, channels, states)
-    options |= {"D": D, "z": z, "initial_state": state}
-    return list(selective_scan(u, delta, A, B, C, **options, return_last_state=True))
+    options |= dict(D=D, z=z, initial_state=first, return_last_state=True)
+    return list(selective_scan(u, delta, A, B, C, **options))
 
 
 def _conv(dtype) -> list[Tensor]:
-    x, weight, bias = _tensor(1, 16384, 1024, dtype=dtype), _tensor(1024, 4), _tensor(1024)
-    return [causal_conv1d(x, weight, bias, activation="silu")]
+    x, weight, bias = ((1, 16384, 1024), (1024, 4), (1024,))
+    (x,), parameters = _on_cuda(True, x, dtype=dtype), _on_cuda(True, weight, bias)
+    return [causal_conv1d(x, *parameters, activation="silu")]
 
 
-def _raster(views: int, mode: str = "RGB", geometry: bool = True) -> list[Tensor]:
-    """16,384 Gaussians in pictures of 512 x 512; a tile's work is cut where views are few."""
+def _raster(views: int, mode="RGB", geometry: bool = True, depth: bool = False) -> list[Tensor]:
+    """16,384 Gaussians in pictures of 512 x 512; a tile's work is cut where views are few.
+
+    ``depth`` alone: that of a transmittance, of a rendering without gradients.
+    """
     num = 16384
-    tensor = partial(_tensor, gradient=geometry)
-    means, quats, scales = tensor(num, 3), tensor(num, 4), tensor(num, 3)
-    viewmats, Ks = tensor(views, 4, 4), _tensor(views, 3, 3, gradient=False)
-    renders, alphas, _ = rasterization(
-        *(means, quats, scales, tensor(num), _tensor(num, 3), viewmats, Ks, 512, 512),
-        render_mode=mode,
-    )
-    return [renders, alphas]
-
-
-def _depth() -> list[Tensor]:
-    """Of a rendering without gradients."""
-    num, views = 16384, 32
-    tensor = partial(_tensor, gradient=False)
-    splats = tensor(num, 3), tensor(num, 4), tensor(num, 3), tensor(num), tensor(num, 3)
-    *_, meta = rasterization(*splats, tensor(views, 4, 4), tensor(views, 3, 3), 512, 512)
-    return [depth_quantile(meta)]
+    shapes = (num, 3), (num, 4), (num, 3), (num,), (views, 4, 4)
+    *shape, viewmats = _on_cuda(geometry and not depth, *shapes)
+    colors, (Ks,) = _on_cuda(not depth, (num, 3)), _on_cuda(False, (views, 3, 3))
+    renders, alphas, meta = rasterization(*shape, *colors, viewmats, Ks, 512, 512, render_mode=mode)
+    return [depth_quantile(meta)] if depth else [renders, alphas]
 
 
 def _harmonics(degree: int) -> list[Tensor]:
     """Colours of 16,384 Gaussians in two views, all gradients."""
     num = 16384
-    coefficients, means = _tensor(1, num, (degree + 1) ** 2, 3), _tensor(1, num, 3)
-    return [colors_seen_from(degree, coefficients, means, _tensor(1, 2, 3))]
+    shapes = (1, num, (degree + 1) ** 2, 3), (1, num, 3), (1, 2, 3)
+    return [colors_seen_from(degree, *_on_cuda(True, *shapes))]
 
 
 _HALF = {"dtype": torch.bfloat16}
@@ -173,6 +159,7 @@ _RASTERS = {
     "32 views with depth": {"views": 32, "mode": "RGB+D"},
     "32 views, depth alone": {"views": 32, "mode": "D"},
     "32 views, gradients of colours alone": {"views": 32, "geometry": False},
+    "depth of a transmittance": {"views": 32, "depth": True},
 }
 # (op, case) -> a call of the operator; a kernel is listed with the first case that launches it
 CASES: dict[tuple[str, str], Callable[[], list[Tensor]]] = {
@@ -181,13 +168,11 @@ CASES: dict[tuple[str, str], Callable[[], list[Tensor]]] = {
     ("conv", "bfloat16"): partial(_conv, torch.bfloat16),
     ("conv", "float32"): partial(_conv, torch.float32),
     **{("raster", name): partial(_raster, **options) for name, options in _RASTERS.items()},
-    ("raster", "depth of a transmittance"): _depth,
     **{("raster", f"harmonics of degree {n}"): partial(_harmonics, n) for n in range(5)},
 }
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A kernel of the report: what launches it."""
 
     op: str
@@ -266,17 +251,17 @@ def static_report(say: Callable[[str], None] = lambda kernel: None) -> dict:
     rows = []
     for entry in find_kernels():
         say(f"{entry.op}: {entry.name}")
+        names = dict(op=entry.op, kernel=entry.name, case=entry.case, direction=entry.direction)
+        block = entry.launch.block
         for arch, (used, dynamic) in compile_kernel(entry.launch).items():
-            block = entry.launch.block
             fit = occupancy(MACHINES[arch], block, used.registers, used.shared + dynamic)
-            names = {"op": entry.op, "kernel": entry.name, "case": entry.case}
-            names |= {"direction": entry.direction, "arch": f"sm_{arch}", "block": block}
-            rows.append(names | asdict(used) | {"dynamic_shared": dynamic} | asdict(fit))
+            taken = used._asdict() | {"dynamic_shared": dynamic} | fit._asdict()
+            rows.append(names | {"arch": f"sm_{arch}", "block": block} | taken)
     nvrtc = ".".join(map(str, toolkit))
     return {
         "format": FORMAT,
         "versions": {"nvrtc": nvrtc, "warp": wp.__version__, "gamba_warp": __version__},
-        "machines": {f"sm_{arch}": asdict(machine) for arch, machine in MACHINES.items()},
+        "machines": {f"sm_{arch}": machine._asdict() for arch, machine in MACHINES.items()},
         "kernels": rows,
     }
 
@@ -294,16 +279,14 @@ nothing is spilled, more is a bound. **shared** is a block's, static and dynamic
 **limit** what is used up first.
 """
 _COLUMNS: dict[str, Callable[[dict], object]] = {
-    "block": lambda row: row["block"],
-    "registers": lambda row: row["registers"],
-    "stack, B": lambda row: row["frame"],
-    "spills": lambda row: row["reloads"],
+    "block": itemgetter("block"),
+    "registers": itemgetter("registers"),
+    "stack, B": itemgetter("frame"),
+    "spills": itemgetter("reloads"),
     "shared, B": lambda row: row["shared"] + row["dynamic_shared"],
-    "instructions": lambda row: row["instructions"],
-    "blocks": lambda row: row["blocks"],
-    "warps": lambda row: row["warps"],
+    **{name: itemgetter(name) for name in ("instructions", "blocks", "warps")},
     "of": lambda row: f"{row['share']:.0%}",
-    "limit": lambda row: row["limit"],
+    "limit": itemgetter("limit"),
 }
 
 

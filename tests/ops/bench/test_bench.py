@@ -14,6 +14,7 @@ from lab.studies import models
 from lab.studies import raster as raster_study
 from lab.studies import scan as scan_study
 from lab.studies.products import Products
+from lab.studies.show import charts_of
 from lab.studies.targets import Key, Target, judge, of_bench
 from lab.studies.training import step
 
@@ -41,7 +42,7 @@ from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import inference, suites
 from gamba_warp.measure.blocks import without_encoder
-from gamba_warp.measure.page import charts_of, page
+from gamba_warp.measure.page import page
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.pages.charts import Axis, Point, Series, chart, pareto
@@ -522,7 +523,7 @@ def test_dropped_background_is_measured_against_the_full_model():
 def test_gsplats_parts_agree_with_ours():
     pytest.importorskip("gsplat")
     settings = Settings(torch.device("cpu"), "quick", peers=True, threads=1)
-    (case,) = [c for c in raster_suite.cases(settings) if c.name == "gsplat's parts"]
+    (case,) = [c for c in raster_study.cases(settings) if c.name == "gsplat's parts"]
     records = measure([case], settings)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4, records
     assert sum(r["rel_rms_error"] is not None for r in records) == 1

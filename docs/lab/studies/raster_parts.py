@@ -9,13 +9,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ...rasterize import Skip
-from ...rasterize.constants import ALPHA_MIN, EPS2D, TILE
-from ...rasterize.ops import bin_op, project
-from ...rasterize.project import LensOptions, Projected
-from .. import peers
-from ..core.case import Error, Settings, Variant, compare
-from .raster_scene import COUNT, Scene, make_scene
+from gamba_warp.kernels.bench import peers
+from gamba_warp.kernels.bench.cases.raster_scene import COUNT, Scene, make_scene
+from gamba_warp.kernels.bench.core.case import Error, Settings, Variant, compare
+from gamba_warp.kernels.rasterize import Skip
+from gamba_warp.kernels.rasterize.constants import ALPHA_MIN, EPS2D, TILE
+from gamba_warp.kernels.rasterize.ops import bin_op, project
+from gamba_warp.kernels.rasterize.project import LensOptions, Projected
 
 
 class Parts:
