@@ -25,7 +25,7 @@ SUITES = {
     "conv": "gamba_warp.kernels.bench.cases.conv",
     "raster": "gamba_warp.kernels.bench.cases.raster",
     "block": "gamba_warp.measure.blocks",
-    "model": "gamba_warp.measure.blocks",
+    "model": "gamba_warp.measure.inference",
 }
 
 

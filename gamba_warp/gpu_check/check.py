@@ -231,14 +231,14 @@ def run_step(folder: str | Path, name: str, until: str | float = "inf") -> None:
         _checks(report)
     elif name == "inference":
         ceilings = make_cases(inference.OP, settings, [("ceilings", _ceilings, None)])
-        _measure(report, settings, [*ceilings, *inference.cases(settings)])
+        _measure(report, settings, [*ceilings, *inference.full_size(settings)])
         if cpu:
             report.leave_out("inference from a CUDA graph", "needs CUDA")
     else:
         beside = name in _BESIDE
         settings = replace(settings, peers=beside)
         first = _BESIDE[name] if beside else _ON_A_CPU if quick and cpu else _FIRST
-        suites = raster, scan, conv, blocks
+        suites = raster, scan, conv, blocks, inference
         found = {(c.op, c.name): c for suite in suites for c in suite.cases(settings)}
         keys = dict.fromkeys([*first, *([] if beside or quick else found)])
         _measure(report, settings, [found[key] for key in keys if key in found])

@@ -238,39 +238,20 @@ def same(first: tuple[Tensor, ...], second: tuple[Tensor, ...]) -> None:
             raise AssertionError(f"result {i} differs by up to {(a - b).abs().max().item():.2g}")
 
 
-class Splats:
-    """Gaussians and cameras that stay where they are in memory, rendered with all gradients."""
-
-    def __init__(self, device: torch.device, count: int = 700, views: int = 3, size: int = 75):
-        gaussians = {name: x.to(device) for name, x in shell(count, scale=3.0).items()}
-        self.leaves: dict[str, Any] = {k: x.requires_grad_() for k, x in gaussians.items()}
-        self.cameras = [x.to(device) for x in orbit_cameras(views, size)]
-        self.size = size
-
-    def run(self) -> dict[str, Tensor]:
-        """Renders, and returns picture, alphas, the number of pairs and the gradients."""
-        renders, alphas, meta = rasterization(
-            **self.leaves,
-            viewmats=self.cameras[0],
-            Ks=self.cameras[1],
-            width=self.size,
-            height=self.size,
-            render_mode="RGB+D",
-        )
-        grads = torch.autograd.grad(renders.square().sum() + alphas.sum(), [*self.leaves.values()])
-        made = {"renders": renders.detach(), "alphas": alphas.detach(), "pairs": meta.bins.count}
-        return made | dict(zip(self.leaves, grads))
-
-    @torch.no_grad()
-    def grow(self, factor: float) -> None:
-        """Multiplies the sizes of the Gaussians, and with these the number of pairs."""
-        self.leaves["scales"].mul_(factor)
+def render_all(scene: Scene) -> dict[str, Tensor]:
+    """Renders; returns picture, alphas, the number of pairs and all gradients."""
+    leaves = scene.leaves()
+    given: dict[str, Any] = {**scene.arguments(), **leaves}
+    renders, alphas, meta = rasterization(**given)
+    grads = torch.autograd.grad(renders.square().sum() + alphas.sum(), [*leaves.values()])
+    made = {"renders": renders.detach(), "alphas": alphas.detach(), "pairs": meta.bins.count}
+    return made | dict(zip(leaves, grads))
 
 
 def no_wait(device: torch.device) -> str:
     """Checks that torch waits for the device in no call but the first, neither graph nor not."""
-    splats, steps = Splats(device), TrainingStep(device)
-    for run in (splats.run, steps.run):
+    scene = _scene(700, 75, 3, {"render_mode": "RGB+D"}, device)
+    for run in (partial(render_all, scene), TrainingStep(device).run):
         run()
         before = torch.cuda.get_sync_debug_mode()
         torch.cuda.set_sync_debug_mode("error")
@@ -283,11 +264,11 @@ def no_wait(device: torch.device) -> str:
 
 def raster_graph(device: torch.device) -> str:
     """Checks bits of replays, with sizes changed meanwhile, and with more pairs than have room."""
-    splats = Splats(device)
-    graph, made, _ = captured(splats.run, device)
+    scene = _scene(700, 75, 3, {"render_mode": "RGB+D"}, device)
+    graph, made, _ = captured(partial(render_all, scene), device)
     found = []
     for factor in (1.0, 0.8, 6.0, 0.25):
-        splats.grow(factor)
+        scene.gaussians["scales"].mul_(factor)  # and with the sizes the number of pairs
         for value in made.values():
             value.fill_(-1)
         graph.replay()
@@ -298,7 +279,7 @@ def raster_graph(device: torch.device) -> str:
             raise AssertionError(
                 f"{found[-1]} pairs after {found[0]} had room, which was not meant"
             )
-        same(tuple(replayed.values()), tuple(splats.run().values()))
+        same(tuple(replayed.values()), tuple(render_all(scene).values()))
     return "equal, with " + ", ".join(map(str, found)) + " pairs"
 
 

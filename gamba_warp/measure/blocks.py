@@ -1,9 +1,8 @@
-"""Benchmark cases of blocks, and of whole models from a picture to Gaussians."""
+"""Benchmark cases of the model's blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -23,22 +22,18 @@ from ..kernels.bench.core.case import (
 from ..kernels.bench.core.problem import Problem
 from ..kernels.causal_conv1d.reference import causal_conv1d_reference
 from ..kernels.selective_scan.reference import selective_scan_reference
-from ..model.config import PRESETS, GambaConfig, Preset
-from ..model.gamba import Gamba
+from ..model.config import PRESETS, GambaConfig
 from ..model.parts.block import GambaBlock, prefix_states, run_blocks
-from ..model.posing import reference_cameras
 
 LIMIT, BACKWARD_LIMIT = 1e-5, 1e-4  # allowed relative rms error to float64
 _IMAGE_CHANNELS, _IMAGE_TOKENS = 768, 576  # those of DINOv2 ViT-B/14 at 336 pixels
 TOKENS = 128  # number of first tokens that are compared with the oracle
-_REPEATS = "a first run (0: the same bits); the blocks have the float64 oracle"
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns all cases of blocks and models at the level's sizes."""
+    """Returns all cases of blocks at the level's sizes."""
     blocks = [("one block", one_block, "error"), ("backbone", whole_backbone, "error")]
-    models = [("one picture", pictures, None), ("batch", batches, "B")]
-    return make_cases("block", settings, blocks) + make_cases("model", settings, models)
+    return make_cases("block", settings, blocks)
 
 
 class Backbone(Problem):
@@ -193,56 +188,4 @@ def _forwards(backbone: Backbone, **changes) -> list[Variant]:
     return [
         backbone.variant("default", default=True, **changes),
         backbone.way("prefix states off", backbone.prepended, **changes),
-    ]
-
-
-def without_encoder(config: GambaConfig) -> GambaConfig:
-    """The configuration without an image encoder; where only its tokens are prepended, none are."""
-    return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
-
-
-def _model_variant(settings: Settings, preset: Preset, count: int, **changes) -> Variant:
-    """A model with fresh weights and no image encoder, on ``count`` pictures."""
-    torch.manual_seed(0)
-    config = without_encoder(PRESETS[preset])
-    model = Gamba(config).to(settings.device).eval()
-    size = config.image_size
-    # Random alpha leaves no background, so that with "rays" every token is computed.
-    images = torch.rand(count, size, size, config.input_channels).to(settings.device)
-    cameras = reference_cameras(config, count).to(settings.device)
-    run = torch.no_grad()(partial(model, images, cameras))
-
-    def check() -> Error:
-        first, second = ({k: x for k, x in vars(run()).items() if x is not None} for _ in range(2))
-        return compare(second, first)
-
-    return Variant(run=run, check=check, limit=0.0, oracle=_REPEATS, **changes)
-
-
-def pictures(settings: Settings) -> list[Variant]:
-    """A posed picture to Gaussians by preset, without the image encoder. The models are whole and
-    have fresh weights; two runs must give the same bits.
-    """
-    presets = ("tiny", "rays") if settings.level == "quick" else PRESETS
-    return [
-        _model_variant(
-            *(settings, name, 1),
-            name=name,
-            default=True,
-            rounds=10,
-            parameters={"N": PRESETS[name].num_gaussians, "side": PRESETS[name].image_size},
-        )
-        for name in presets
-    ]
-
-
-def batches(settings: Settings) -> list[Variant]:
-    """Cost against the number of pictures in one call, preset tiny."""
-    return [
-        _model_variant(
-            *(settings, "tiny", count),
-            name=f"{count} picture{'s' * (count > 1)}",
-            parameters={"B": count, "N": PRESETS["tiny"].num_gaussians},
-        )
-        for count in ((1, 2) if settings.level == "quick" else (1, 2, 4, 8))
     ]

@@ -1,4 +1,4 @@
-"""Benchmark case of inference at full size: a picture to Gaussians by a CUDA graph, and a view."""
+"""Benchmark cases of whole models: pictures to Gaussians, by a CUDA graph too, and a view."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from ..kernels.bench.core.case import (
     Settings,
     Variant,
     compare,
+    dtype_name,
     make_cases,
 )
-from ..kernels.bench.core.measure import peak_bytes
-from ..model.config import PRESETS
+from ..kernels.bench.core.measure import peak_bytes, synchronize
+from ..model.config import PRESETS, GambaConfig, Preset
 from ..model.encoders import ImageEncoder
 from ..model.gamba import Gamba
 from ..model.posing import reference_cameras
@@ -52,24 +53,27 @@ class _GivenTokens(nn.Module):
         return self.tokens.expand(len(images), -1, -1)
 
 
+def without_encoder(config: GambaConfig) -> GambaConfig:
+    """The configuration without an image encoder; where only its tokens are prepended, none are."""
+    return replace(config, encoder="none", prepend=config.prepend and config.camera_token)
+
+
 def build_model(settings: Settings) -> tuple[Gamba, str]:
     """Builds the paper's model with untrained weights; the second value names its encoder in words.
 
     A quick run has a small model, of 256 Gaussians.
     """
     torch.manual_seed(0)
-    config = PRESETS["paper"]
+    config, reason = PRESETS["paper"], ""
     if settings.level == "quick":
         config = replace(config, image_size=32, patch_size=4, width=64, depth=2, dt_rank=4)
     else:
         try:
             return _on(Gamba(config, "random"), settings), f"{config.encoder}, untrained"
         except (ImportError, UserError) as error:
-            reason = str(error)
-    given = f"{_GIVEN_TOKENS} given tokens, the encoder is not in the figure"
-    if settings.level != "quick":
-        given += f" ({reason})"
+            reason = f" ({error})"
     encoder = ImageEncoder(_GivenTokens(), _GIVEN_CHANNELS, config)
+    given = f"{_GIVEN_TOKENS} given tokens, the encoder is not in the figure{reason}"
     return _on(Gamba(config, encoder=encoder), settings), given
 
 
@@ -100,27 +104,27 @@ def captured(
 
 
 class Inference:
-    """A model with one posed picture on its device, run as it is or by a CUDA graph.
+    """A model with posed pictures on its device, run as it is or by a CUDA graph.
 
     Attributes:
-        device: device of the model and of the picture.
-        parameters: Gaussians, side of the picture and name of the encoder, for tables.
+        model: the model.
+        device: device of the model and of the pictures.
+        image: ``[B, H, W, C]``. Random alpha leaves no background, so that with the decoder "rays"
+            every token is computed.
+        cameras: their cameras.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self.device = settings.device
-        self.model, encoder = build_model(settings)
-        config = self.model.config
-        size = config.image_size
-        self.parameters = {"N": config.num_gaussians, "side": size, "encoder": encoder}
+    def __init__(self, model: Gamba, device: torch.device, count: int = 1) -> None:
+        self.model, self.device, size = model, device, model.config.image_size
         g = torch.Generator().manual_seed(1)
-        self.image = torch.rand(1, size, size, 3, generator=g).to(self.device)
-        self.cameras = reference_cameras(config, 1).to(self.device)
+        shape = (count, size, size, model.config.input_channels)
+        self.image = torch.rand(shape, generator=g).to(device)
+        self.cameras = reference_cameras(model.config, count).to(device)
         self._graphs: dict[torch.dtype, tuple] = {}
         self._truths: dict[torch.dtype, Gaussians] = {}
 
     @torch.no_grad()
-    def eager(self, dtype: torch.dtype) -> Gaussians:
+    def eager(self, dtype: torch.dtype = torch.float32) -> Gaussians:
         """Runs the model's forward; bfloat16 means autocast."""
         mixed = dtype != torch.float32
         with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed, cache_enabled=False):
@@ -147,11 +151,10 @@ class Inference:
         viewmats, Ks = self.cameras.viewmats[:, None], self.cameras.Ks[:, None]
         return render(gaussians, replace(self.cameras, viewmats=viewmats, Ks=Ks)).rgb
 
-    def check(self, run: Callable[[], Gaussians], truth: torch.dtype) -> Error:
+    def check(self, run: Callable[[], Gaussians], truth: torch.dtype = torch.float32) -> Error:
         """Measures the error of the Gaussians of ``run`` to those of ``eager`` in ``truth``."""
         got = run()
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
+        synchronize(self.device)
         if truth not in self._truths:
             self._truths[truth] = self.eager(truth).to("cpu")
         got, want = (
@@ -162,13 +165,53 @@ class Inference:
 
 
 def cases(settings: Settings) -> list[Case]:
-    """Returns the one case, with the variants that the device can run."""
+    """Returns the cases of whole models without an image encoder."""
+    models = [("one picture", pictures, None), ("batch", batches, "B")]
+    return make_cases("model", settings, models)
+
+
+def _bare(settings: Settings, preset: Preset, count: int, **changes) -> Variant:
+    """A model with fresh weights and no image encoder, on ``count`` pictures."""
+    torch.manual_seed(0)
+    model = Gamba(without_encoder(PRESETS[preset])).to(settings.device).eval()
+    run = Inference(model, settings.device, count)
+    check = partial(run.check, run.eager)
+    oracle = "a first run (0: the same bits); the blocks have the float64 oracle"
+    return Variant(run=run.eager, check=check, limit=0.0, oracle=oracle, **changes)
+
+
+def pictures(settings: Settings) -> list[Variant]:
+    """A posed picture to Gaussians by preset, without the image encoder. The models are whole and
+    have fresh weights; two runs must give the same bits.
+    """
+    made = []
+    for name in ("tiny", "rays") if settings.level == "quick" else PRESETS:
+        sizes = {"N": PRESETS[name].num_gaussians, "side": PRESETS[name].image_size}
+        rest = dict(name=name, default=True, rounds=10, parameters=sizes)
+        made.append(_bare(settings, name, 1, **rest))
+    return made
+
+
+def batches(settings: Settings) -> list[Variant]:
+    """Cost against the number of pictures in one call, preset tiny."""
+    made = []
+    for count in (1, 2) if settings.level == "quick" else (1, 2, 4, 8):
+        sizes = {"B": count, "N": PRESETS["tiny"].num_gaussians}
+        name = f"{count} picture{'s' * (count > 1)}"
+        made.append(_bare(settings, "tiny", count, name=name, parameters=sizes))
+    return made
+
+
+def full_size(settings: Settings) -> list[Case]:
+    """Returns the one case of the paper's model, with the variants that the device can run."""
     return make_cases(OP, settings, [(CASE, _variants, None)])
 
 
 def _variants(settings: Settings) -> list[Variant]:
     """A posed picture to Gaussians, forward only, untrained weights; then one view of it."""
-    inference = Inference(settings)
+    model, encoder = build_model(settings)
+    inference, size = Inference(model, settings.device), model.config.image_size
+    parameters = {"N": model.config.num_gaussians, "side": size, "encoder": encoder}
     full, half = torch.float32, torch.bfloat16
     same, eager, graph = REPEAT_LIMITS, inference.eager, inference.graph
     # Name: how it runs, in which dtype; the run that it is compared with: dtype, limit and name.
@@ -184,30 +227,20 @@ def _variants(settings: Settings) -> list[Variant]:
     made = []
     for name, (function, dtype, truth, limit, oracle) in ways.items():
         run = partial(function, dtype)
-        made.append(
-            Variant(
-                name=name,
-                run=run,
-                check=partial(inference.check, run, truth),
-                limit=limit,
-                oracle=f"{oracle} (0: the same bits)",
-                dtype=str(dtype).removeprefix("torch."),
-                default=name == HEADLINE,
-                parameters=inference.parameters,
-                work=partial(inference.peak, function, dtype),
-            )
-        )
-    gaussians, size = eager(full), inference.parameters["side"]
+        check, work = partial(inference.check, run, truth), partial(inference.peak, function, dtype)
+        words = dict(oracle=f"{oracle} (0: the same bits)", dtype=dtype_name(dtype))
+        rest = dict(default=name == HEADLINE, parameters=parameters, work=work)
+        made.append(Variant(name, run, check, limit, **words, **rest))
+    gaussians = eager(full)
     best = graph if settings.device.type == "cuda" else eager
-    pictures: dict[str, Callable[[], Tensor]] = {
+    shown: dict[str, Callable[[], Tensor]] = {
         f"one view of {size} x {size}": partial(inference.view, gaussians),
         "picture to view, bfloat16": lambda: inference.view(best(half)),
     }
-    for name, picture in pictures.items():
+    for name, picture in shown.items():
 
         def check(picture=picture) -> Error:
             return compare({"picture": picture()}, {"picture": picture()})
 
-        oracle, parameters = "a second run", inference.parameters
-        made.append(Variant(name, picture, check, 0.0, oracle, parameters=parameters))
+        made.append(Variant(name, picture, check, 0.0, "a second run", parameters=parameters))
     return made

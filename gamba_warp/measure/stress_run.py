@@ -6,7 +6,7 @@ import importlib
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ SUITES = {
     "raster": ("gamba_warp.kernels.stress.cases.raster",),
     "model": ("gamba_warp.measure.stress",),
 }
+_VERSIONS = {"gamba_warp": __version__} | installed("torch", "warp-lang")  # decide a result
 _SHRUNK = 5  # failures of a run that are made small; all are written
 _HEAD = (
     *("op", "kind", "cases", "forward error", "of", "gradient error", "of", "error / limit"),
@@ -58,40 +59,27 @@ class Row:
     Attributes:
         op: name of the op.
         kind: kind of values; "all" is the sum of an op.
-        cases: number of cases that were run.
         forward: largest relative rms error of a forward result in float32, and its name.
         gradient: largest relative rms error of a gradient, and its name.
         ratio: largest error over its limit; infinite if something was not finite.
-        nonfinite: count of numbers that are not finite and should be.
-        failures: number of cases that failed in any way.
-        pixels: number of pixels compared (rasterizer).
-        undecided: number of those pixels in which rounding decides a cut or an order.
-        steep: number of cases that are judged by the widest limit of many trials.
-        seconds: time spent.
+        sums: of ``COUNTS`` by name.
     """
+
+    COUNTS = "cases", "nonfinite", "failures", "pixels", "undecided", "steep", "seconds"
 
     op: str
     kind: str
-    cases: int = 0
     forward: tuple[float, str] = (0.0, "")
     gradient: tuple[float, str] = (0.0, "")
     ratio: float = 0.0
-    nonfinite: int = 0
-    failures: int = 0
-    pixels: int = 0
-    undecided: int = 0
-    steep: int = 0
-    seconds: float = 0.0
+    sums: dict = field(default_factory=lambda: dict.fromkeys(Row.COUNTS, 0))
 
     def add(self, outcome: Outcome, seconds: float) -> None:
-        """Counts one case."""
-        self.cases += 1
-        self.seconds += seconds
-        self.nonfinite += outcome.nonfinite
-        self.failures += outcome.failure() is not None
-        self.pixels += outcome.pixels
-        self.undecided += outcome.undecided
-        self.steep += outcome.steep
+        """Counts one case, and what ``Outcome`` says of it."""
+        failed = outcome.failure() is not None
+        found = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
+        for name in self.COUNTS:
+            self.sums[name] += (found | {"seconds": seconds})[name]
         for c in outcome.comparisons:
             self.ratio = max(self.ratio, c.ratio)
             which = "gradient" if c.name.startswith("gradient") else "forward"
@@ -100,12 +88,20 @@ class Row:
 
     def to_json(self) -> dict:
         """The row as JSON values; what is not finite, which JSON cannot hold, is None."""
-        errors = {
-            name: {"error": _plain(error), "of": of}
-            for name, (error, of) in (("forward", self.forward), ("gradient", self.gradient))
-        }
-        rest = {"ratio": _plain(self.ratio), "seconds": round(self.seconds, 3)}
-        return asdict(self) | errors | rest
+        errors = {"forward": self.forward, "gradient": self.gradient}
+        named = {name: {"error": _plain(e), "of": of} for name, (e, of) in errors.items()}
+        rest = {"ratio": _plain(self.ratio), "seconds": round(self.sums["seconds"], 3)}
+        return {"op": self.op, "kind": self.kind} | self.sums | named | rest
+
+    def cells(self) -> Iterator[str]:
+        """The row under ``_HEAD``."""
+        yield from (self.op, self.kind, str(self.sums["cases"]))
+        for error, of in (self.forward, self.gradient):
+            yield from (f"{error:.1e}" if error else "0", of.removeprefix("gradient of "))
+        yield f"{self.ratio:.2f}"
+        pixels = self.sums["pixels"]
+        yield f"{self.sums['undecided'] / pixels:.2%}" if pixels else ""
+        yield from (str(self.sums[name]) for name in ("steep", "nonfinite", "failures"))
 
 
 def _plain(value: float | None) -> float | None:
@@ -114,16 +110,7 @@ def _plain(value: float | None) -> float | None:
 
 def table(rows: Sequence[Row]) -> str:
     """A Markdown table with its columns aligned for a terminal."""
-
-    def cells(r: Row) -> Iterator[str]:
-        yield from (r.op, r.kind, str(r.cases))
-        for error, of in (r.forward, r.gradient):
-            yield from (f"{error:.1e}" if error else "0", of.removeprefix("gradient of "))
-        yield f"{r.ratio:.2f}"
-        yield f"{r.undecided / r.pixels:.2%}" if r.pixels else ""
-        yield from map(str, (r.steep, r.nonfinite, r.failures))
-
-    return markdown(_HEAD, [[*cells(row)] for row in rows], aligned=True)
+    return markdown(_HEAD, [[*row.cells()] for row in rows], aligned=True)
 
 
 class StressRun:
@@ -146,7 +133,7 @@ class StressRun:
     ) -> None:
         self._ops, self._device, self._folder = ops, device, folder
         self._shrink_seconds = shrink_seconds
-        self.about = {"seed": seed, "device": str(device), **versions()}
+        self.about = {"seed": seed, "device": str(device), **_VERSIONS}
         self._rows: dict[tuple[str, str], Row] = {}
         self.failures: list[dict[str, str]] = []
 
@@ -220,7 +207,7 @@ class StressRun:
         totals, rows = self._sorted()
         lines = [table([*rows, *totals])]
         lines += [f"{self._folder / row['file']}: {row['text']}" for row in self.failures]
-        cases = sum(row.cases for row in totals)
+        cases = sum(row.sums["cases"] for row in totals)
         return "\n".join([*lines, f"{cases} cases, {len(self.failures)} failed"])
 
 
@@ -233,17 +220,12 @@ def failure_text(case: Case, outcome: Outcome) -> str:
     return f"{case.op}, {case.kind}: {failure['name']}{words.get(failure['what'], '')}"
 
 
-def versions() -> dict[str, str]:
-    """Versions by name of what decides a result."""
-    return {"gamba_warp": __version__} | installed("torch", "warp-lang")
-
-
 def reproducer(case: Case, outcome: Outcome) -> dict:
     """The content of a file from which ``replay`` runs a case again."""
     failure = outcome.failure()
     if failure is not None:
         failure |= {name: _plain(failure[name]) for name in ("error", "ratio")}
-    return {"format": FORMAT, "case": asdict(case), "failure": failure, "versions": versions()}
+    return {"format": FORMAT, "case": asdict(case), "failure": failure, "versions": _VERSIONS}
 
 
 def read_reproducer(path: Path, ops: dict[str, Op]) -> Case:

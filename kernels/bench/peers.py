@@ -179,3 +179,17 @@ def _perspective(tangent_x: float, tangent_y: float, near: float = 0.01, far: fl
     matrix[0, 0], matrix[1, 1] = 1 / tangent_x, 1 / tangent_y
     matrix[2, 2], matrix[2, 3], matrix[3, 2] = far / (far - near), -far * near / (far - near), 1
     return matrix
+
+
+def gsplat_colors(degree: int, coefficients: Tensor, means: Tensor, centers: Tensor) -> Tensor:
+    """Runs gsplat's torch function, with the half and the clamp that its rasterizer adds.
+
+    The arguments are those of ``colors_seen_from``.
+
+    Raises:
+        NotInstalled: gsplat is not installed.
+    """
+    code = load("gsplat.cuda._torch_impl", "gsplat")
+    directions = means[:, None] - centers[:, :, None]
+    wide = coefficients[:, None].expand(*directions.shape[:3], *coefficients.shape[2:])
+    return (code._spherical_harmonics(degree, directions, wide) + 0.5).clamp_min(0)

@@ -90,7 +90,7 @@ def test_the_watch_sees_what_waits(on_paper, wait):
 
 def test_inference_on_cuda_has_the_headline(monkeypatch, on_paper):
     monkeypatch.setattr(bench_inference, "_on", lambda model, settings: model.eval())
-    (case,) = bench_inference.cases(settings("cuda", "quick"))
+    (case,) = bench_inference.full_size(settings("cuda", "quick"))
     with torch.device("cuda"):
         variants = {variant.name: variant for variant in case.build()}
     assert variants[bench_inference.HEADLINE].dtype == "bfloat16"

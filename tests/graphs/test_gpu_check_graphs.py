@@ -74,7 +74,7 @@ def test_nothing_waits(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: modes[-1])
     monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", modes.append)
-    monkeypatch.setattr(graphs.Splats, "run", lambda self: run("splats"))
+    monkeypatch.setattr(graphs, "render_all", lambda scene: run("splats"))
     monkeypatch.setattr(graphs.TrainingStep, "run", lambda self: run("steps"))
     with pytest.raises(RuntimeError, match="synchronizing"):
         graphs.no_wait(CPU)

@@ -13,7 +13,7 @@ from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.devices import float32_products, network_products
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench.core.case import Error, Settings, Variant, compare
-from gamba_warp.measure.blocks import without_encoder
+from gamba_warp.measure.inference import without_encoder
 from gamba_warp.model.checkpoint import shipped_model
 from gamba_warp.model.config import PRESETS, Preset
 from gamba_warp.model.gamba import Gamba

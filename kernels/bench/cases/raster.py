@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import torch
 
+from ...rasterize.harmonics import colors_seen_from
+from ...rasterize.harmonics.formula import colors_by_formula
 from .. import peers
 from ..core.case import (
     BOTH,
@@ -20,7 +23,7 @@ from ..core.case import (
     make_cases,
     over_threads,
 )
-from . import harmonics
+from ..core.problem import Operator
 from .raster_scene import (
     LEAVES,
     TRADE_LIMIT,
@@ -50,7 +53,8 @@ def cases(settings: Settings) -> list[Case]:
         builders.append(("32 views", many_views, None))
     else:
         builders.append(("threads", by_threads, "threads"))
-    return make_cases("raster", settings, builders) + harmonics.cases(settings)
+    builders += [("harmonics by degree", degrees, "degree"), ("harmonics", harmonics, "N")]
+    return make_cases("raster", settings, builders)
 
 
 def scenes(settings: Settings) -> list[Variant]:
@@ -244,3 +248,52 @@ def many_views(settings: Settings) -> list[Variant]:
     """32 views of 512² in one launch, beside gsplat."""
     scene = make_scene(settings, views=32)
     return scene.pair("ours", default=True) + (_peers(scene, "32 views") * settings.peers)
+
+
+def degrees(settings: Settings) -> list[Variant]:
+    """Colours of 16,384 Gaussians in one view (2,048 in a quick run) from harmonics of each degree,
+    alone and with the gradients of coefficients, means and centres.
+    """
+    count = 2048 if settings.level == "quick" else 16384
+    made = []
+    for degree in range(5):
+        made += _harmonics(settings, degree, count, 1, f"degree {degree}")
+    return made
+
+
+def harmonics(settings: Settings) -> list[Variant]:
+    """Degree 3 with more Gaussians and views, alone and with gradients."""
+    quick, made = settings.level == "quick", []
+    for count in (2048,) if quick else (16384, 262144):
+        for views in (1, 2 if quick else 4):
+            name = f"{count} Gaussians, {views} view{'s' * (views > 1)}"
+            made += _harmonics(settings, 3, count, views, name)
+    return made
+
+
+def _harmonics(settings: Settings, degree: int, count: int, views: int, name: str) -> list[Variant]:
+    """N Gaussians seen from V centres: our kernels, the formula in torch and gsplat's torch."""
+    g = torch.Generator().manual_seed(0)
+    inputs = {
+        "coefficients": 0.3 * torch.randn(1, count, (degree + 1) ** 2, 3, generator=g),
+        "means": torch.randn(1, count, 3, generator=g),
+        "centers": 3 * torch.randn(1, views, 3, generator=g),
+    }
+    problem = Operator(
+        partial(colors_seen_from, degree),
+        partial(colors_by_formula, degree),
+        inputs,
+        torch.randn(1, views, count, 3, generator=g),
+        settings.device,
+        "the formula in float64",
+        {"N": count, "views": views, "degree": degree},
+        dict.fromkeys(DIRECTIONS, 1e-5),
+        fixed=() if degree else ("means", "centers"),
+    )
+    formula = replace(problem, function=problem.reference)
+    made = problem.pair(f"ours, {name}", default=True)
+    made += formula.pair(f"the formula in torch, {name}")
+    if settings.peers:
+        gsplat = replace(problem, function=partial(peers.gsplat_colors, degree))
+        made += gsplat.pair(f"gsplat's torch, {name}", peer=True)
+    return made

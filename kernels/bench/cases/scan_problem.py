@@ -6,7 +6,6 @@ import math
 from functools import partial
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ...selective_scan import selective_scan
@@ -109,15 +108,6 @@ def scan_problem(
         | dict.fromkeys("BC", first)
         | dict.fromkeys(("A", "D", "delta_bias"), chosen),
     )
-
-
-def bare(problem: Operator) -> Operator:
-    """The same with the steps given, and no gate, skip or bias."""
-    x = problem.inputs
-    step = F.softplus(x["delta"] + x["delta_bias"])
-    inputs = {"u": x["u"], "delta": step, "A": x["A"], "B": x["B"], "C": x["C"]}
-    tokens = problem.corner["u"][1].stop
-    return scan_problem(inputs, problem.device, tokens, softplus=False)
 
 
 def make_problem(settings: Settings, channels_seen: int = 32, **changes) -> Operator:

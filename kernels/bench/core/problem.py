@@ -139,9 +139,9 @@ class Operator(Problem):
     def check(self, direction: str, dtype: torch.dtype = torch.float32, **options: Any) -> Error:
         """Error of the output, and of every gradient if the direction has them."""
         gradients = direction == BOTH and self.compared
-        truth = self._truth(gradients, **options)
+        truth = self.truth(gradients, **options)
         if not gradients:
-            return compare({"out": self._cut("out", self.forward(dtype, **options))}, truth)
+            return compare({"out": self.cut("out", self.forward(dtype, **options))}, truth)
         leaves = self.leaves(dtype)
         out = self.call(leaves, **options)
         head = torch.zeros_like(self._turn("out", out.detach()), device="cpu")
@@ -150,20 +150,16 @@ class Operator(Problem):
         head = self._turn("out", head).to(out.device)
         grads = torch.autograd.grad(out, list(wanted.values()), head)
         got = {"out": out.detach()} | dict(zip(wanted, grads))
-        return compare({k: self._cut(k, x) for k, x in got.items()}, truth)
+        return compare({k: self.cut(k, x) for k, x in got.items()}, truth)
 
-    def error(self, out: Tensor, **options: Any) -> Error:
-        """Error of an output that something else gave."""
-        return compare({"out": self._cut("out", out)}, self._truth(False, **options))
-
-    def _cut(self, name: str, x: Tensor) -> Tensor:
+    def cut(self, name: str, x: Tensor) -> Tensor:
         """The corner of a result, laid out as the reference's."""
         return self._turn(name, x).cpu()[self.corner.get(name, ...)]
 
     def _drawn(self, like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=torch.Generator().manual_seed(1))
 
-    def _truth(self, gradients: bool, **options: Any) -> dict[str, Tensor]:
+    def truth(self, gradients: bool, **options: Any) -> dict[str, Tensor]:
         """Output, and if asked for the gradients, of the corner in float64; kept."""
         key = gradients, *sorted(options.items())
         if key not in self.truths:

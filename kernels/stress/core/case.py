@@ -104,8 +104,7 @@ class Outcome:
     @property
     def over(self) -> bool:
         """Whether a result is over its limit, and nothing else is wrong."""
-        failure = self.failure()
-        return failure is not None and failure["what"] == "limit"
+        return (self.failure() or {}).get("what") == "limit"
 
     def failure(self) -> dict | None:
         """Returns the failure's ``what``, ``name``, ``error`` and ``ratio``, or None.
@@ -249,13 +248,6 @@ def draw_cases(ops: Sequence[Op], seed: int) -> Iterator[tuple[Op, Case]]:
         count += 1
 
 
-def _size(op: Op, case: Case) -> float:
-    """Measures how far the options are from plain; shrinking only ever lowers it."""
-    pairs = [(case.options[name], plain) for name, plain in op.plain.items()]
-    far = (abs(a - b) if type(a) in (int, float) else float(a != b) for a, b in pairs)
-    return sum(far, float(case.kind != op.kinds[0]))
-
-
 def shrink(
     op: Op, case: Case, device: torch.device, seconds: float = 30.0
 ) -> tuple[Case, Outcome, int]:
@@ -266,27 +258,30 @@ def shrink(
     """
     outcome, tried, end = run_case(op, case, device), 0, time.monotonic() + seconds
     failure = outcome.failure() or {}
+
+    def size(case: Case) -> float:  # how far it is from plain; it only ever falls
+        pairs = [(case.options[name], plain) for name, plain in op.plain.items()]
+        far = (abs(a - b) if type(a) in (int, float) else float(a != b) for a, b in pairs)
+        return sum(far, float(case.kind != op.kinds[0]))
+
+    def simpler(case: Case, name: str) -> Iterator[Case]:  # the largest step first
+        value, plain = case.options[name], op.plain[name]
+        for step in (plain, (value + plain) // 2, value - 1) if type(value) is int else (plain,):
+            yield replace(case, options=op.valid(case.options | {name: step}))
+
     improved = bool(failure)
     while improved:
         improved = False
         for name in ("kind", *op.plain):
-            if name == "kind":
-                simpler = [replace(case, kind=op.kinds[0])]
-            else:  # the largest step towards the plain value first
-                value, plain = case.options[name], op.plain[name]
-                whole = type(value) is int
-                steps = [plain, (value + plain) // 2, value - 1] if whole else [plain]
-                options = [op.valid(case.options | {name: step}) for step in steps]
-                simpler = [replace(case, options=o) for o in options]
-            for candidate in simpler:
+            plain_kind = [replace(case, kind=op.kinds[0])]
+            for candidate in plain_kind if name == "kind" else simpler(case, name):
                 if time.monotonic() >= end:
                     return case, outcome, tried
-                if _size(op, candidate) >= _size(op, case):
+                if size(candidate) >= size(case):
                     continue
                 tried += 1
                 found = run_case(op, candidate, device)
-                other = found.failure()
-                if other is not None and other["what"] == failure["what"]:
+                if (other := found.failure()) and other["what"] == failure["what"]:
                     case, outcome, improved = candidate, found, True
                     break
     return case, outcome, tried

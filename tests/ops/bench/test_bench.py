@@ -6,6 +6,8 @@ import mmap
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 
 import pytest
 import torch
@@ -41,7 +43,7 @@ from gamba_warp.kernels.bench.core.report import markdown, ratio_table, ratios
 from gamba_warp.kernels.bench.peers import scan_loop
 from gamba_warp.kernels.selective_scan.reference import selective_scan_reference
 from gamba_warp.measure import inference, suites
-from gamba_warp.measure.blocks import without_encoder
+from gamba_warp.measure.inference import without_encoder
 from gamba_warp.measure.page import page
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
@@ -66,6 +68,11 @@ def case(*variants, name="one", axis=None, op="scan"):
 
 def run(*cases):
     return measure(cases, QUICK)
+
+
+def measured(suite, name, settings=QUICK):
+    """The records of the case of that name."""
+    return measure([c for c in suite.cases(settings) if c.name == name], settings)["records"]
 
 
 def stub(monkeypatch, *cases):
@@ -280,8 +287,8 @@ def test_targets_are_judged():
 def test_every_target_names_what_its_suite_measures(gpu):
     """Names only: nothing is run."""
     full = Settings(torch.device("cuda" if gpu else "cpu"), "full", threads=2)
-    suites = (scan_suite, conv_suite, raster_suite, inference, scan_study, raster_study)
-    names = {c.name for suite in suites for c in suite.cases(full)}
+    suites = (scan_suite, conv_suite, raster_suite, scan_study, raster_study)
+    names = {c.name for suite in suites for c in suite.cases(full)} | {inference.CASE}
     document = {"machine": {"gpu": gpu}, "settings": {"level": "full"}, "records": []}
     wanted = of_bench(document)
     for suite in (scan_study, raster_study):
@@ -431,9 +438,7 @@ def test_quick_scan_and_conv_from_the_command_line(tmp_path, capsys):
 
 
 def test_the_bare_loop_is_right():
-    settings = replace(QUICK, threads=2)
-    (case,) = [c for c in scan_study.cases(settings) if c.name == "bare loop"]
-    records = measure([case], settings)["records"]
+    records = measured(scan_study, "bare loop", replace(QUICK, threads=2))
     probe = [r for r in records if r["variant"].startswith("probe")]
     assert len(probe) == 2 and all(r["rel_rms_error"] < 1e-5 for r in probe)
 
@@ -457,8 +462,7 @@ def test_the_scene_and_its_crop():
     ],
 )
 def test_cases_run(suite, name):
-    chosen = [c for c in suite.cases(QUICK) if c.name == name]
-    records = measure(chosen, QUICK)["records"]
+    records = measured(suite, name)
     assert records and all(r["status"] == "ok" for r in records), records
     if name == "skipping":
         shares = {r["variant"]: r["work"].get("skipped") for r in records}
@@ -493,8 +497,7 @@ def test_products_are_all_of_a_runs():
     products = Products(lambda: (layer(a), a @ b.T, a[None] @ b.T[None]), torch.device("cpu"))
     assert products.count == 3 and products.flops == 3 * 2 * 3 * 4 * 5
     products.run()
-    (alone,) = [c for c in models.cases(QUICK) if c.name == models.ALONE]
-    for record in measure([alone], QUICK)["records"][1::2]:
+    for record in measured(models, models.ALONE)[1::2]:
         assert record["work"]["products"] >= 7 and record["ms_p50"] > 0
 
 
@@ -507,28 +510,24 @@ def test_unwritable_result_is_one_line(monkeypatch, tmp_path):
 
 
 def test_kept_states_are_counted_on_their_own_kernels():
-    (case,) = [c for c in scan_study.cases(QUICK) if c.name == "boundary spacing"]
-    wide, narrow = measure([case], QUICK)["records"][::-1]
+    wide, narrow = measured(scan_study, "boundary spacing")[::-1]
     assert narrow["status"] == wide["status"] == "ok" and wide["is_default"]
     assert narrow["work"]["saved_bytes"] == 2 * wide["work"]["saved_bytes"]
 
 
 def test_dropped_background_is_measured_against_the_full_model():
-    (case,) = [c for c in models.cases(QUICK) if c.name == "background tokens"]
-    full, none = measure([case], QUICK)["records"]
+    full, none = measured(models, "background tokens")
     assert full["rel_rms_error"] == 0 and full["work"]["skipped"] == 0
     assert 0 < none["rel_rms_error"] < 0.3 and 0.3 < none["work"]["skipped"] < 1
 
 
 def test_gsplats_parts_agree_with_ours():
     pytest.importorskip("gsplat")
-    settings = Settings(torch.device("cpu"), "quick", peers=True, threads=1)
-    (case,) = [c for c in raster_study.cases(settings) if c.name == "gsplat's parts"]
-    records = measure([case], settings)["records"]
+    settings = replace(QUICK, peers=True)
+    records = measured(raster_study, "gsplat's parts", settings)
     assert [r["status"] for r in records] == ["ok"] * 4, records
     assert sum(r["rel_rms_error"] is not None for r in records) == 1
-    (case,) = [c for c in raster_suite.cases(settings) if c.name == "harmonics"]
-    records = [r for r in measure([case], settings)["records"] if r["is_peer"]]
+    records = [r for r in measured(raster_suite, "harmonics", settings) if r["is_peer"]]
     assert len(records) == 4 and all(r["rel_rms_error"] < 1e-5 for r in records), records
 
 
@@ -540,58 +539,53 @@ def test_gswarp_is_reported_where_it_is_not():
         scene.changed(options={"alpha_min": 0.1}).forward(peers.gswarp_rasterization)
 
 
-def first(**values):
-    return lambda document: document["records"][0].update(values)
+GONE = object()
 
 
 @pytest.mark.parametrize(
-    "change, reason",
+    "place, value, reason",
     [
-        (first(ms_p50=math.nan), "not valid JSON"),
-        (first(ms_p50=math.inf), "not valid JSON"),
-        (
-            first(ms_p50="fast"),
-            r"got `str` - at `\$.records\[0\].ms_p50`",
-        ),
-        (first(ms_p20=None), "no times, but its status is ok"),
-        (first(ms_p50=0.0), r"> 0.0 - at `\$.records\[0\].ms_p50`"),
-        (first(max_error=1e308), r"- at `\$.records\[0\].max_error`"),
-        (
-            first(parameters={"L": []}),
-            r"`array` - at `\$.records\[0\].parameters",
-        ),
-        (
-            first(axis="a," * 10**4),
-            r"length <= 10000 - at `\$.records\[0\].axis`",
-        ),
-        (lambda d: d["machine"].update(peers=["x"]), r"got `array` - at `\$.machine.peers`"),
-        (lambda d: d["machine"].update(cores=10**18 * 10**300), r"not valid JSON|machine.cores"),
-        (
-            first(work={"pairs": "many"}),
-            r"`str` - at `\$.records\[0\].work",
-        ),
-        (lambda d: d["records"][0].pop("text"), r"required field `text` - at `\$.records\[0\]`"),
-        (lambda d: d["records"].append(7), r"got `int` - at `\$.records\[1\]`"),
-        (lambda d: d.update(records={}), r"got `object` - at `\$.records`"),
-        (lambda d: d.pop("machine"), "required field `machine`"),
-        (lambda d: d["machine"].pop("warp"), r"required field `warp` - at `\$.machine`"),
-        (lambda d: d.pop("interrupted"), "required field `interrupted`"),
-        (lambda d: d.update(format="gamba_warp.bench.0"), "not a result of"),
+        ("records.0.ms_p50", math.nan, "not valid JSON"),
+        ("records.0.ms_p50", math.inf, "not valid JSON"),
+        ("records.0.ms_p50", "fast", r"got `str` - at `\$.records\[0\].ms_p50`"),
+        ("records.0.ms_p20", None, "no times, but its status is ok"),
+        ("records.0.ms_p50", 0.0, r"> 0.0 - at `\$.records\[0\].ms_p50`"),
+        ("records.0.max_error", 1e308, r"- at `\$.records\[0\].max_error`"),
+        ("records.0.parameters.L", [], r"`array` - at `\$.records\[0\].parameters"),
+        ("records.0.axis", "a," * 10**4, r"length <= 10000 - at `\$.records\[0\].axis`"),
+        ("machine.peers", ["x"], r"got `array` - at `\$.machine.peers`"),
+        ("machine.cores", 10**18 * 10**300, r"not valid JSON|machine.cores"),
+        ("records.0.work.pairs", "many", r"`str` - at `\$.records\[0\].work"),
+        ("records.0.text", GONE, r"required field `text` - at `\$.records\[0\]`"),
+        ("records.0", 7, r"got `int` - at `\$.records\[0\]`"),
+        ("records", {}, r"got `object` - at `\$.records`"),
+        ("machine", GONE, "required field `machine`"),
+        ("machine.warp", GONE, r"required field `warp` - at `\$.machine`"),
+        ("interrupted", GONE, "required field `interrupted`"),
+        ("format", "gamba_warp.bench.0", "not a result of"),
     ],
 )
-def test_damaged_results_are_refused(tmp_path, change, reason):
+def test_damaged_results_are_refused(tmp_path, place, value, reason):
     document = run(case(variant()))
     path = tmp_path / "x.json"
     path.write_text(json.dumps(document))
     assert suites.read_document(path) == document
-    change(document)
+    *way, last = (int(name) if name.isdigit() else name for name in place.split("."))
+    part = reduce(getitem, way, document)
+    if value is GONE:
+        del part[last]
+    else:
+        part[last] = value
     path.write_text(json.dumps(document))
     with pytest.raises(UserError, match=reason):
         suites.read_document(path)
-    for data in (b"\xff\xfe", b"[" * 10**5, b"", b"null"):
-        path.write_bytes(data)
-        with pytest.raises(UserError, match="not valid JSON|nested deeper|not a result"):
-            suites.read_document(path)
+
+
+@pytest.mark.parametrize("data", [b"\xff\xfe", b"[" * 10**5, b"", b"null"])
+def test_what_is_no_result_is_refused(tmp_path, data):
+    (tmp_path / "x.json").write_bytes(data)
+    with pytest.raises(UserError, match="not valid JSON|nested deeper|not a result"):
+        suites.read_document(tmp_path / "x.json")
 
 
 def test_a_parameter_that_cannot_be_drawn_is_left_out(tmp_path):

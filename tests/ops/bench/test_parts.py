@@ -28,6 +28,11 @@ def short(monkeypatch):
     torch.set_num_threads(threads)
 
 
+def measured(op, *names):
+    """The records of a study's cases of these names."""
+    return measure([c for c in load_study(op).cases(QUICK) if c.name in names], QUICK)["records"]
+
+
 def run() -> None:
     """A product and a sine in one region, a large sine in another, and one in none."""
     x = torch.rand(200, 200, requires_grad=True)
@@ -84,8 +89,7 @@ def test_bars_of_nothing_are_no_chart():
 
 
 def test_a_step_has_its_parts():
-    (steps,) = [c for c in load_study("step").cases(QUICK) if c.name == "parts"]
-    records = measure([steps], QUICK)["records"]
+    records = measured("step", "parts")
     tiny, lower, rays, _, _ = records
     assert (tiny["variant"], lower["variant"]) == ("tiny", "tiny, bfloat16")
     for record in records:
@@ -99,8 +103,7 @@ def test_a_step_has_its_parts():
 
 @pytest.mark.parametrize(("op", "name"), [("step", "precision"), ("model", "precision")])
 def test_bfloat16_products_have_their_error_on_the_chart(op, name):
-    (case,) = [c for c in load_study(op).cases(QUICK) if c.name == name]
-    records = measure([case], QUICK)["records"]
+    records = measured(op, name)
     assert [r["status"] for r in records] == ["ok"] * 4
     for full, lower in zip(records[::2], records[1::2]):
         assert full["rel_rms_error"] < 1e-5 and lower["rel_rms_error"] > full["rel_rms_error"]
@@ -109,17 +112,14 @@ def test_bfloat16_products_have_their_error_on_the_chart(op, name):
 
 
 def test_losses_and_optimizer_are_checked_before_they_are_timed():
-    names = ("SSIM", "optimizer")
-    cases = [c for c in load_study("step").cases(QUICK) if c.name in names]
-    records = measure(cases, QUICK)["records"]
+    records = measured("step", "SSIM", "optimizer")
     assert len(records) == 13 and all(r["status"] == "ok" for r in records), records
     ours = [r for r in records if r["variant"].startswith("ours")]
     assert all(r["rel_rms_error"] < 1e-5 and r["peer"].startswith("kornia") for r in ours)
 
 
 def test_dropped_patches_are_exact_and_counted():
-    (case,) = [c for c in load_study("step").cases(QUICK) if c.name == "background"]
-    records = measure([case], QUICK)["records"]
+    records = measured("step", "background")
     assert [r["status"] for r in records] == ["ok"] * 4
     assert all(r["rel_rms_error"] < 1e-5 for r in records)
     tokens = {r["parameters"]["series"]: r["work"]["tokens"] for r in records}
