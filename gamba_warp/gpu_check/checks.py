@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.util
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -17,7 +16,6 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from ..gaussians import Gaussians
 from ..kernels.bench.cases.conv import conv_problem
 from ..kernels.bench.cases.raster_scene import Scene, orbit_cameras, shell
 from ..kernels.bench.cases.scan_problem import make_inputs, scan_problem
@@ -27,9 +25,7 @@ from ..kernels.causal_conv1d import causal_conv1d
 from ..kernels.rasterize import lists_outgrown, rasterization
 from ..kernels.selective_scan.cuda import launch as cuda_scan
 from ..kernels.selective_scan.cuda.launch import Tuning
-from ..measure.inference import build_model, captured
-from ..model.posing import reference_cameras
-from ..render import render
+from ..measure.inference import Inference, build_model, captured
 
 # Allowed relative rms errors. A GPU's exponential is off by up to 2^-22 a step, half precision
 # rounds inputs and outputs, and a few pixels may cross the cut at the faintest alpha.
@@ -291,13 +287,9 @@ class TrainingStep:
 
     def __init__(self, device: torch.device):
         torch.manual_seed(0)
-        self.model, _ = build_model(Settings(device, level="quick"))
-        self.model.train()
-        side = self.model.config.image_size
-        g = torch.Generator().manual_seed(1)
-        self.images = torch.rand(2, side, side, 3, generator=g).to(device)
-        self.cameras = reference_cameras(self.model.config, 2).to(device)
-        self.parameters = [p for p in self.model.parameters() if p.requires_grad]
+        model, _ = build_model(Settings(device, level="quick"))
+        self.inputs = Inference(model.train(), device, 2)
+        self.parameters = [p for p in model.parameters() if p.requires_grad]
         rate = torch.tensor(1e-3, device=device) if device.type == "cuda" else 1e-3
         self.optimizer = torch.optim.AdamW(
             self.parameters, lr=rate, capturable=device.type == "cuda", fused=True
@@ -306,12 +298,9 @@ class TrainingStep:
     def run(self) -> Tensor:
         """Makes a step and returns its loss."""
         self.optimizer.zero_grad(set_to_none=True)
-        gaussians: Gaussians = self.model(self.images, self.cameras)
-        views = replace(
-            self.cameras, viewmats=self.cameras.viewmats[:, None], Ks=self.cameras.Ks[:, None]
-        )
-        picture = render(gaussians, views).rgb[:, 0]
-        loss = (picture - self.images).square().mean()
+        x = self.inputs
+        picture = x.view(x.model(x.image, x.cameras))[:, 0]
+        loss = (picture - x.image).square().mean()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, 1.0)
         self.optimizer.step()

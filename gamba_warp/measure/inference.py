@@ -145,9 +145,8 @@ class Inference:
         peak = peak_bytes(partial(function, dtype), self.device)
         return {} if peak is None else {"peak_bytes": peak}
 
-    @torch.no_grad()
     def view(self, gaussians: Gaussians) -> Tensor:
-        """Renders the reference view."""
+        """Renders the reference views, ``[B, 1, H, W, 3]``."""
         viewmats, Ks = self.cameras.viewmats[:, None], self.cameras.Ks[:, None]
         return render(gaussians, replace(self.cameras, viewmats=viewmats, Ks=Ks)).rgb
 
@@ -238,6 +237,7 @@ def _variants(settings: Settings) -> list[Variant]:
         "picture to view, bfloat16": lambda: inference.view(best(half)),
     }
     for name, picture in shown.items():
+        picture = torch.no_grad()(picture)
 
         def check(picture=picture) -> Error:
             return compare({"picture": picture()}, {"picture": picture()})

@@ -26,20 +26,13 @@ Maker = Callable[[Sequence[dict]], str]  # of documents, a page
 
 
 def make_settings(
-    device: torch.device,
-    quick: bool,
-    full: bool,
-    peers: bool,
-    threads: int | None,
-    data: Path | None = None,
+    device: torch.device, quick: bool, full: bool, peers: bool, threads: int | None
 ) -> Settings:
     """The settings of the cases from the options of the command.
 
     Raises:
-        UserError: options contradict one another, or there is no such folder of data.
+        UserError: options contradict one another.
     """
-    if data is not None and not data.is_dir():
-        raise UserError(f"--data {data}: no such folder")
     if quick and full:
         raise UserError("--quick and --full: choose one")
     return Settings(
@@ -47,7 +40,6 @@ def make_settings(
         level="quick" if quick else "full" if full else "normal",
         peers=peers,
         threads=threads or torch.get_num_threads(),
-        data=data,
     )
 
 

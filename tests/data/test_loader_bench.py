@@ -3,16 +3,16 @@
 import pytest
 import torch
 from helpers import micro
+from lab.studies import StudySettings
 from lab.studies.training import loader
 
-from gamba_warp.kernels.bench.core.case import Settings
 from gamba_warp.kernels.bench.core.measure import measure
 
 
 @pytest.mark.parametrize("given", [False, True])
 def test_the_loader_is_measured(tmp_path, given):
     data = micro.write_dataset(tmp_path / "clouds") if given else None
-    settings = Settings(device=torch.device("cpu"), level="quick", data=data)
+    settings = StudySettings(device=torch.device("cpu"), level="quick", data=data)
     records = measure(loader.cases(settings), settings)["records"]
     assert [r["status"] for r in records] == ["ok"] * 4, records
     names = [r["variant"] for r in records]

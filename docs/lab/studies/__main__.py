@@ -16,7 +16,7 @@ from gamba_warp.files import output_folder
 from gamba_warp.measure import suites
 from gamba_warp.untrusted.ranges import Threads, ranged
 
-from . import drift, show, targets
+from . import StudySettings, drift, show, targets
 
 # What is studied -> the module with ``cases(settings)`` and perhaps ``targets(settings)``.
 STUDIES = {
@@ -80,7 +80,10 @@ def study(
     chosen = suites.choose(what, STUDIES, GROUPS)
     if not chosen:
         raise UserError(f"name what to study: {', '.join((*STUDIES, *GROUPS))}")
-    settings = suites.make_settings(pick_device(device), quick, full, False, threads, data)
+    if data is not None and not data.is_dir():
+        raise UserError(f"--data {data}: no such folder")
+    given = suites.make_settings(pick_device(device), quick, full, False, threads)
+    settings = StudySettings(**vars(given), data=data)
     folder = output_folder(out)
     modules = {op: load_study(op) for op in chosen}
     found = suites.run_suites(modules, settings, only)

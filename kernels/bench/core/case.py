@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -57,14 +56,12 @@ class Settings:
         level: key of ``LEVELS``; cases also choose their sizes by it.
         peers: whether other people's packages are measured too, if they are installed.
         threads: number of torch's threads on the CPU; a variant may ask for another number.
-        data: folder of posed views for the cases of training; None: made-up views.
     """
 
     device: torch.device
     level: str = "normal"
     peers: bool = False
     threads: int = 1
-    data: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -32,7 +31,8 @@ class _Covered:
     def __init__(self, settings: Settings, model: Gamba, share: float) -> None:
         torch.manual_seed(1)
         self.model, self.device = model, settings.device
-        source = step_source(model.config, replace(settings, data=None), len(SPREAD), share)
+        made_up = Settings(settings.device, settings.level, threads=settings.threads)
+        source = step_source(model.config, made_up, len(SPREAD), share)
         self.batch = source.batch(0, NOVEL).to(settings.device)
         self.optimizer = torch.optim.SGD(model.parameters(), lr=0.0)
 

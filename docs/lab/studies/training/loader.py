@@ -21,6 +21,7 @@ from gamba_warp.train.config import DataConfig, TrainConfig
 from gamba_warp.train.ddp import World
 from gamba_warp.train.sources.pack import PackSettings, write_pack
 
+from .. import data_of
 from ..targets import Key, Target
 
 OP = "loader"
@@ -93,7 +94,7 @@ class _Loader:
 def _build(settings: Settings) -> list[Variant]:
     folder = tempfile.TemporaryDirectory(prefix="gamba-bench-")
     root = Path(folder.name)
-    data = settings.data
+    data = data_of(settings)
     if data is None:
         data = root / "views"
         for number in range(4 if settings.level == "quick" else _OBJECTS):

@@ -20,6 +20,8 @@ from gamba_warp.train.batches import Batches, TrainingData
 from gamba_warp.train.config import DataConfig, TrainConfig
 from gamba_warp.train.ddp import World
 
+from .. import data_of
+
 OP, BOTH = "step", "forward+backward"
 BATCH, NOVEL, SIZE = 4, 3, 128
 SLIM = "rays, slim"  # as wide and deep as preset tiny
@@ -104,8 +106,8 @@ def step_source(
     shares = [min(1.0, covered * factor) for factor in spread]
     size = min(SIZE, config.image_size)
     data = _MadeUp(shares, size)
-    if settings.data is not None:
-        data = open_dataset(settings.data, cache=True)
+    if (folder := data_of(settings)) is not None:
+        data = open_dataset(folder, cache=True)
     views = DataConfig(size=size, mirror=0.5, recolor=0.3)
     objects = list(range(len(data.uids)))
     made = Batches(
