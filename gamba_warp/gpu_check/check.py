@@ -240,7 +240,7 @@ def run_step(folder: str | Path, name: str, until: str | float = "inf") -> None:
         first = _BESIDE[name] if beside else _ON_A_CPU if quick and cpu else _FIRST
         suites = raster, scan, conv, blocks, inference
         found = {(c.op, c.name): c for suite in suites for c in suite.cases(settings)}
-        keys = dict.fromkeys([*first, *([] if beside or quick else found)])
+        keys = dict.fromkeys(first if beside or quick else (*first, *found))
         _measure(report, settings, [found[key] for key in keys if key in found])
     report.write()
 

@@ -210,7 +210,6 @@ def _variants(settings: Settings) -> list[Variant]:
     """A posed picture to Gaussians, forward only, untrained weights; then one view of it."""
     model, encoder = build_model(settings)
     inference, size = Inference(model, settings.device), model.config.image_size
-    parameters = {"N": model.config.num_gaussians, "side": size, "encoder": encoder}
     full, half = torch.float32, torch.bfloat16
     same, eager, graph = REPEAT_LIMITS, inference.eager, inference.graph
     # Name: how it runs, in which dtype; the run that it is compared with: dtype, limit and name.
@@ -227,9 +226,8 @@ def _variants(settings: Settings) -> list[Variant]:
     for name, (function, dtype, truth, limit, oracle) in ways.items():
         run = partial(function, dtype)
         check, work = partial(inference.check, run, truth), partial(inference.peak, function, dtype)
-        words = dict(oracle=f"{oracle} (0: the same bits)", dtype=dtype_name(dtype))
-        rest = dict(default=name == HEADLINE, parameters=parameters, work=work)
-        made.append(Variant(name, run, check, limit, **words, **rest))
+        made.append(Variant(name, run, check, limit, f"{oracle} (0: the same bits)", work=work))
+        made[-1].dtype, made[-1].default = dtype_name(dtype), name == HEADLINE
     gaussians = eager(full)
     best = graph if settings.device.type == "cuda" else eager
     shown: dict[str, Callable[[], Tensor]] = {
@@ -239,8 +237,10 @@ def _variants(settings: Settings) -> list[Variant]:
     for name, picture in shown.items():
         picture = torch.no_grad()(picture)
 
-        def check(picture=picture) -> Error:
+        def repeat(picture=picture) -> Error:
             return compare({"picture": picture()}, {"picture": picture()})
 
-        made.append(Variant(name, picture, check, 0.0, "a second run", parameters=parameters))
+        made.append(Variant(name, picture, repeat, 0.0, "a second run"))
+    for variant in made:
+        variant.parameters = {"N": model.config.num_gaussians, "side": size, "encoder": encoder}
     return made

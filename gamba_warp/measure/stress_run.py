@@ -6,7 +6,7 @@ import importlib
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -52,65 +52,54 @@ def choose_ops(what: Sequence[str]) -> list[Op]:
     return [importlib.import_module(module).OP for name in wanted for module in SUITES[name]]
 
 
-@dataclass
-class Row:
-    """What the cases of one kind found so far.
+_SUMS = "cases", "nonfinite", "failures", "pixels", "undecided", "steep", "seconds"
 
-    Attributes:
-        op: name of the op.
-        kind: kind of values; "all" is the sum of an op.
-        forward: largest relative rms error of a forward result in float32, and its name.
-        gradient: largest relative rms error of a gradient, and its name.
-        ratio: largest error over its limit; infinite if something was not finite.
-        sums: of ``COUNTS`` by name.
+
+def _row(op: str, kind: str) -> dict:
+    """What the cases of a kind found, before the first of them; of the kind "all": those of an op.
+
+    The largest relative rms errors of a float32 result and of a gradient with their names; the
+    largest error over its limit, infinite if something was not finite; and ``_SUMS``, of which
+    ``Outcome`` says what they count.
     """
-
-    COUNTS = "cases", "nonfinite", "failures", "pixels", "undecided", "steep", "seconds"
-
-    op: str
-    kind: str
-    forward: tuple[float, str] = (0.0, "")
-    gradient: tuple[float, str] = (0.0, "")
-    ratio: float = 0.0
-    sums: dict = field(default_factory=lambda: dict.fromkeys(Row.COUNTS, 0))
-
-    def add(self, outcome: Outcome, seconds: float) -> None:
-        """Counts one case, and what ``Outcome`` says of it."""
-        failed = outcome.failure() is not None
-        found = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
-        for name in self.COUNTS:
-            self.sums[name] += (found | {"seconds": seconds})[name]
-        for c in outcome.comparisons:
-            self.ratio = max(self.ratio, c.ratio)
-            which = "gradient" if c.name.startswith("gradient") else "forward"
-            if c.counts:
-                setattr(self, which, max(getattr(self, which), (c.error, c.name)))
-
-    def to_json(self) -> dict:
-        """The row as JSON values; what is not finite, which JSON cannot hold, is None."""
-        errors = {"forward": self.forward, "gradient": self.gradient}
-        named = {name: {"error": _plain(e), "of": of} for name, (e, of) in errors.items()}
-        rest = {"ratio": _plain(self.ratio), "seconds": round(self.sums["seconds"], 3)}
-        return {"op": self.op, "kind": self.kind} | self.sums | named | rest
-
-    def cells(self) -> Iterator[str]:
-        """The row under ``_HEAD``."""
-        yield from (self.op, self.kind, str(self.sums["cases"]))
-        for error, of in (self.forward, self.gradient):
-            yield from (f"{error:.1e}" if error else "0", of.removeprefix("gradient of "))
-        yield f"{self.ratio:.2f}"
-        pixels = self.sums["pixels"]
-        yield f"{self.sums['undecided'] / pixels:.2%}" if pixels else ""
-        yield from (str(self.sums[name]) for name in ("steep", "nonfinite", "failures"))
+    nothing = {"error": 0.0, "of": ""}
+    sums = dict.fromkeys(_SUMS, 0)
+    return {"op": op, "kind": kind, **sums, "ratio": 0.0, "forward": nothing, "gradient": nothing}
 
 
-def _plain(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
+def _count(row: dict, outcome: Outcome, seconds: float) -> None:
+    """Counts one case."""
+    failed = outcome.failure() is not None
+    found = vars(outcome) | {"cases": 1, "nonfinite": outcome.nonfinite, "failures": failed}
+    for name in _SUMS:
+        row[name] += (found | {"seconds": seconds})[name]
+    for c in outcome.comparisons:
+        row["ratio"] = max(row["ratio"], c.ratio)
+        which = "gradient" if c.name.startswith("gradient") else "forward"
+        if c.counts and c.error > row[which]["error"]:
+            row[which] = {"error": c.error, "of": c.name}
 
 
-def table(rows: Sequence[Row]) -> str:
+def _plain(value: Any) -> Any:
+    """A value with None in place of what is not finite, which JSON cannot hold."""
+    if isinstance(value, dict):
+        return {name: _plain(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table(rows: Sequence[dict]) -> str:
     """A Markdown table with its columns aligned for a terminal."""
-    return markdown(_HEAD, [[*row.cells()] for row in rows], aligned=True)
+
+    def cells(r: dict) -> Iterator[str]:
+        yield from (r["op"], r["kind"], str(r["cases"]))
+        for found in (r["forward"], r["gradient"]):
+            yield f"{found['error']:.1e}" if found["error"] else "0"
+            yield found["of"].removeprefix("gradient of ")
+        yield f"{r['ratio']:.2f}"
+        yield f"{r['undecided'] / r['pixels']:.2%}" if r["pixels"] else ""
+        yield from (str(r[name]) for name in ("steep", "nonfinite", "failures"))
+
+    return markdown(_HEAD, [[*cells(row)] for row in rows], aligned=True)
 
 
 class StressRun:
@@ -134,7 +123,7 @@ class StressRun:
         self._ops, self._device, self._folder = ops, device, folder
         self._shrink_seconds = shrink_seconds
         self.about = {"seed": seed, "device": str(device), **_VERSIONS}
-        self._rows: dict[tuple[str, str], Row] = {}
+        self._rows: dict[tuple[str, str], dict] = {}
         self.failures: list[dict[str, str]] = []
 
     def run(self, count: int | None, seconds: float) -> None:
@@ -154,8 +143,8 @@ class StressRun:
                         break
                     outcome = run_case(op, case, self._device)
                     for key in ((case.op, "all"), (case.op, case.kind)):
-                        row = self._rows.setdefault(key, Row(*key))
-                        row.add(outcome, time.monotonic() - started)
+                        row = self._rows.setdefault(key, _row(*key))
+                        _count(row, outcome, time.monotonic() - started)
                     if outcome.failure() is not None:
                         bar.set_postfix_str(f"{op.name}: a failure, made small")
                         self._keep_failure(op, case, outcome)
@@ -182,17 +171,16 @@ class StressRun:
             if found.failure() is not None:
                 keep(small, found)
 
-    def _sorted(self) -> tuple[list[Row], list[Row]]:
+    def _sorted(self) -> tuple[list[dict], list[dict]]:
         """One row per op, and all others with those of an op together."""
-        totals = [row for row in self._rows.values() if row.kind == "all"]
-        ops = [row.op for row in totals]
-        rows = [row for row in self._rows.values() if row.kind != "all"]
-        return totals, sorted(rows, key=lambda row: ops.index(row.op))
+        totals = [row for row in self._rows.values() if row["kind"] == "all"]
+        rows = [r for t in totals for r in self._rows.values() if r["op"] == t["op"]]
+        return totals, [row for row in rows if row["kind"] != "all"]
 
     def write(self) -> None:
         """Writes stress.json and stress.md."""
         totals, rows = self._sorted()
-        lists = {"totals": [r.to_json() for r in totals], "rows": [r.to_json() for r in rows]}
+        lists = {"totals": [*map(_plain, totals)], "rows": [*map(_plain, rows)]}
         content = {"format": FORMAT, **self.about, **lists, "failures": self.failures}
         write_json(self._folder / "stress.json", content)
         about = ", ".join(f"{name} {value}" for name, value in self.about.items())
@@ -207,7 +195,7 @@ class StressRun:
         totals, rows = self._sorted()
         lines = [table([*rows, *totals])]
         lines += [f"{self._folder / row['file']}: {row['text']}" for row in self.failures]
-        cases = sum(row.sums["cases"] for row in totals)
+        cases = sum(row["cases"] for row in totals)
         return "\n".join([*lines, f"{cases} cases, {len(self.failures)} failed"])
 
 
@@ -222,9 +210,7 @@ def failure_text(case: Case, outcome: Outcome) -> str:
 
 def reproducer(case: Case, outcome: Outcome) -> dict:
     """The content of a file from which ``replay`` runs a case again."""
-    failure = outcome.failure()
-    if failure is not None:
-        failure |= {name: _plain(failure[name]) for name in ("error", "ratio")}
+    failure = _plain(outcome.failure())
     return {"format": FORMAT, "case": asdict(case), "failure": failure, "versions": _VERSIONS}
 
 

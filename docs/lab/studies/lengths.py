@@ -23,8 +23,8 @@ from gamba_warp.kernels.bench.core.case import (
     BOTH,
     Case,
     Error,
+    NotMeasured,
     Settings,
-    Stopped,
     Variant,
     compare,
 )
@@ -42,6 +42,12 @@ _SPARE = 0.8  # share of the free memory that a run may take
 _GROWTH = 2.5  # of the memory from one length to the next, at most: both blocks need O(L)
 # The kernels that never hold the L x L matrix; torch raises where it has none of them.
 _FUSED = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
+
+
+class Stopped(NotMeasured):
+    """Raised in place of a run that would go beyond a limit; ``str(error)`` says which."""
+
+    word = "stopped"
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,8 @@ def summary(document: dict) -> str:
     lines = [f"{c.op}: {c.text()}" for c in crossings(document["records"])]
     for op, cases in report.groups(document).items():
         lines += [f"{op}: {line}" for records in cases.values() for line in growth_lines(records)]
+    stopped = (r for r in document["records"] if r["status"].startswith("stopped"))
+    lines += [f"{r['op']}: {r['variant']}, {r['direction']}: {r['status']}" for r in stopped]
     return "\n".join([*targets.lines(document), *lines, suites.summary(document, None)])
 
 

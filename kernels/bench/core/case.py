@@ -21,12 +21,16 @@ def dtype_name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-class NotInstalled(Exception):
+class NotMeasured(Exception):
+    """Raised where there is nothing to measure; the status is the class's word, and why."""
+
+    word = "not measured"
+
+
+class NotInstalled(NotMeasured):
     """Raised for a peer that is not installed; ``str(error)`` names its package."""
 
-
-class Stopped(Exception):
-    """Raised in place of a run that would go beyond a limit; ``str(error)`` says which."""
+    word = "not installed"
 
 
 @dataclass(frozen=True)

@@ -130,9 +130,10 @@ def _raster(views: int, mode="RGB", geometry: bool = True, depth: bool = False) 
     """
     num = 16384
     shapes = (num, 3), (num, 4), (num, 3), (num,), (views, 4, 4)
-    *shape, viewmats = _on_cuda(geometry and not depth, *shapes)
-    colors, (Ks,) = _on_cuda(not depth, (num, 3)), _on_cuda(False, (views, 3, 3))
-    renders, alphas, meta = rasterization(*shape, *colors, viewmats, Ks, 512, 512, render_mode=mode)
+    means, quats, scales, opacities, viewmats = _on_cuda(geometry and not depth, *shapes)
+    (colors,), (Ks,) = _on_cuda(not depth, (num, 3)), _on_cuda(False, (views, 3, 3))
+    splats = means, quats, scales, opacities, colors
+    renders, alphas, meta = rasterization(*splats, viewmats, Ks, 512, 512, render_mode=mode)
     return [depth_quantile(meta)] if depth else [renders, alphas]
 
 
