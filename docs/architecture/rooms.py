@@ -98,7 +98,7 @@ ROOMS = {
         (*_LIBRARY, "photo", "trajectories", "surfaces", "viewer", "fitting"),
     ),
     "measure": Room("benchmark and stress cases that need the model", _MEASURES),
-    "train.data": Room("furniture, rendering of meshes, starter set", _LIBRARY),
+    "train.data": Room("furniture, rendering of meshes", _LIBRARY),
     "train.sources": Room("published datasets, packs; commands of data", (*_LIBRARY, "train.data")),
     "train.config": Room("the options of a run", _LIBRARY),
     "train.objective": Room("the losses", (*_LIBRARY, "train.config")),

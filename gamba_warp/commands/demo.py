@@ -11,11 +11,7 @@ from ..files import STARTER, only_process, output_folder
 from ..untrusted.ranges import Minutes, ranged
 
 # An installed package has the shipped model and two pictures, but no posed views and no meshes.
-_MAKE = (
-    "make setup unpacks it in a checkout; elsewhere make it by 'gamba data furniture --out "
-    "furniture' and 'python -m gamba_warp.train.data.starter furniture --out starter', then give "
-    "--starter starter"
-)
+_MAKE = "make setup unpacks it in a checkout; elsewhere give the folder of one by --starter"
 
 
 @ranged
@@ -30,7 +26,7 @@ def demo_command(
 
     The page is there as soon as the shipped model is through, and again when all is done. A demo
     that was interrupted goes on where it was; what is done is not done again. An
-    installed package lacks most of the starter set, and says how to make it.
+    installed package lacks most of the starter set, and says where to get it.
 
     Args:
         out: Folder for everything; OUT/index.html is the page.

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.refusals import refused
+from lab.starter import starter
 
 from gamba_warp.data.dataset import SPLITS, open_dataset
 from gamba_warp.images import load_rgba
-from gamba_warp.train.data.starter import starter
 from gamba_warp.versions import import_open3d
 
 STARTER = Path(__file__).resolve().parents[2] / "starter"

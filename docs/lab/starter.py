@@ -1,7 +1,7 @@
 """Makes the starter set in ``starter/``: forty of the furniture models, small enough to ship.
 
 ``gamba data furniture --out FURNITURE``, then
-``python -m gamba_warp.train.data.starter FURNITURE --out starter``. The same call makes the same
+``PYTHONPATH=docs python -m lab.starter FURNITURE --out starter``. The same call makes the same
 files again, but the set in the repository is older: its cameras are others. The split is that of
 the whole furniture set (by group, see ``gamba_warp.data.dataset``), so nothing that is held out
 here is trained on there. The repository keeps ``data/`` as one file, which ``make setup`` unpacks:
@@ -23,9 +23,8 @@ from gamba_warp.files import atomic_path, output_folder
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.formats.meshes import default_up, load_mesh
 from gamba_warp.images import load_rgba
-
-from .render import render_object
-from .settings import Settings
+from gamba_warp.train.data.render import render_object
+from gamba_warp.train.data.settings import Settings
 
 SETTINGS = Settings()  # the command's own
 
