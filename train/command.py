@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shlex
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import tyro
 
 from gamba_warp.errors import UserError
 
-from .config import GROUPS, TrainConfig, command_line
+from .config import TrainConfig, command_line, config_of
 from .recipes import announce, recipe_words, table_of
 
 _MAX_CONFIG = 1 << 20  # bytes of a config.json; ours have 4,000
@@ -93,24 +92,14 @@ def _options_of(path: Path) -> list[str]:
         values = read_document(path, dict[str, Any], _MAX_CONFIG)
     except UserError as error:
         raise UserError(f"{error}; this is no run's config.json, with a run's options") from error
-    if unknown := sorted(values.keys() - {"data", "preset", "set", *GROUPS}):
-        raise UserError(f"{path}: not the options of a run (unknown {', '.join(unknown)[:200]})")
-    for group, kind in GROUPS.items():
-        part = values.setdefault(group, {})
-        if not isinstance(part, dict):
-            raise UserError(f"{path}: {group} is no group of options")
-        unknown = sorted(part.keys() - {f.name for f in fields(kind)})
-        if unknown and group != "model":  # it follows from the preset and the changes of --set
-            named = ", ".join(f"{group}.{name}" for name in unknown)
-            raise UserError(f"{path}: not the options of a run (unknown {named[:200]})")
-    if "data" not in values or "preset" not in values:
-        raise UserError(f"{path}: not the options of a run (it names no data or preset)")
-    words = shlex.split(command_line(values))[2:]
-    if recipe := values["run"].get("recipe"):  # the record of it; its options are there already
-        words += ["--recipe", str(recipe)]
-    given = [values["data"], values["preset"], *(values.get("set") or [])]
-    given += [v for group in GROUPS if group != "model" for v in values[group].values()]
-    for value in given:
-        if isinstance(value, dict) or str(value).startswith("-"):
+    values.pop("model", None)  # it follows from the preset and --set
+    parts = [part for part in values.values() if not isinstance(part, dict)]
+    parts += [v for part in values.values() if isinstance(part, dict) for v in part.values()]
+    for value in (v for part in parts for v in (part if isinstance(part, list) else [part])):
+        if str(value).startswith("-"):
             raise UserError(f"{path}: {str(value)[:100]!r} is no value of an option")
+    config = config_of(values, str(path))
+    words = shlex.split(command_line(config.to_dict()))[2:]
+    if config.run.recipe:  # the record of it; its options are there already
+        words += ["--recipe", config.run.recipe]
     return words

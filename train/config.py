@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import tyro
 from msgspec import Meta
 
@@ -312,6 +315,26 @@ GROUPS = {
     "run": RunConfig,
     "model": GambaConfig,
 }
+
+
+def config_of(values: Mapping[str, Any], source: str) -> TrainConfig:
+    """The options that a ``to_dict`` value without ``model`` means; what it lacks is a default.
+
+    Args:
+        values: perhaps a stranger's.
+        source: where they come from, for the error's message.
+
+    Raises:
+        UserError: an option is unknown, or its value is wrong; names it.
+    """
+    try:
+        config = msgspec.convert(values, TrainConfig, dec_hook=lambda kind, value: kind(value))
+    except (msgspec.ValidationError, UserError) as error:
+        text = re.sub(r"^(.*) - at `\$\.(?:[a-z]+\.)?(\w+).*`$", r"\2: \1", str(error))
+        raise UserError(f"{source}: {text}") from error
+    if unknown := sorted(_flatten(dict(values)).keys() - _flatten(config.to_dict()).keys()):
+        raise UserError(f"{source}: not the options of a run (unknown {', '.join(unknown)[:200]})")
+    return config
 
 
 def config_differences(stored: dict, current: dict, free: bool = False) -> list[str]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
+import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,9 +14,8 @@ import msgspec
 
 from ..conventions import DEFAULT_DISTANCE, DeviceChoice
 from ..errors import UserError
-from ..model.config import PRESETS, GambaConfig
 from ..untrusted.ranges import option
-from .plan import Evaluation, FitOptions, Plan, Row, Value, Values
+from .plan import Evaluation, FitOptions, Plan, Row, Values
 
 if TYPE_CHECKING:
     from gamba_warp.train.config import TrainConfig
@@ -103,6 +102,8 @@ def stages(settings: Settings, row: Row, seed: int) -> list[Stage]:
     Raises:
         UserError: an option or a field of the row is wrong; names the row.
     """
+    from gamba_warp.train.config import command_line
+
     what, distance = settings.evaluation, None
     alike = ["--seed", seed, "--device", settings.device]
     if row.kind == "fit":
@@ -111,7 +112,8 @@ def stages(settings: Settings, row: Row, seed: int) -> list[Stage]:
             words += [] if value is None else [option(name), value]
         made = [Stage("fit", *words, *alike)]
     else:
-        distance = train_config(settings, row).model_config().distance
+        config = train_config(settings, row)
+        distance = config.model_config().distance
         words = ["eval-views", "--checkpoint", f"{ROW}/run/model.safetensors"]
         words += ["--data", settings.data, "--split", what.split, "--limit", what.objects]
         words += ["--views", what.views, *(["--size", what.size] if what.size else [])]
@@ -119,7 +121,7 @@ def stages(settings: Settings, row: Row, seed: int) -> list[Stage]:
         words += ["--save-gaussians"] if settings.meshes else []
         if row.background_margin is not None:
             words += ["--background-margin", row.background_margin]
-        training = [*train_words(settings, row), *alike, "--no-tensorboard"]
+        training = shlex.split(command_line(config.to_dict()))[1:] + [*alike, "--no-tensorboard"]
         made = [Stage("train", *training, makes="model.safetensors"), Stage("views", *words)]
     if settings.meshes:  # of all objects, or of some that ``run.choose`` copies
         count = what.geometry_objects
@@ -147,28 +149,6 @@ def gaussians_of(settings: Settings, row: Row) -> int:
     return train_config(settings, row).model_config().num_gaussians
 
 
-def train_words(settings: Settings, row: Row) -> list[str]:
-    """Words of a row's training: what it is trained on, with which model, how and how long."""
-    base = settings.plan.base
-    words: list[str] = ["train", str(settings.data), "--preset", base.preset]
-    if changes := _merged(base.set, row.set):
-        words += ["--set", *(f"{name}={_text(value)}" for name, value in changes.items())]
-    options = {n: v for n, v in _merged(base.options, row.options).items() if n not in BUDGET}
-    for name, value in {**options, settings.budget[0]: settings.budget[1]}.items():
-        words += _option_words(name, value)
-    return words
-
-
-def _option_words(name: str, value: Value) -> list[str]:
-    if isinstance(value, bool):
-        return [option(name if value else f"no_{name}")]
-    return [option(name), *map(_text, value if isinstance(value, list) else [value])]
-
-
-def _text(value: Value) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
-
-
 def _merged(*groups: Values) -> Values:
     """Groups joined, the later ones first; null takes away; names with underscores."""
     both = {name.replace("-", "_"): value for group in groups for name, value in group.items()}
@@ -176,57 +156,29 @@ def _merged(*groups: Values) -> Values:
 
 
 def train_config(settings: Settings, row: Row) -> TrainConfig:
-    """The options of a row's training, as ``gamba train`` parses them.
+    """The options of a row's training: on what, with which model, how and how long.
 
     Raises:
         UserError: one of them is unknown, or its value is wrong; names the row.
     """
-    base = settings.plan.base
-    try:
-        _check_names(settings.plan, row)
-        return _parsed(train_words(settings, row)[1:])
-    except UserError as error:
-        raise UserError(f"row {row.name}: {error}") from error
-    except SystemExit:
-        wrong = "its options"
-    options = _merged(base.options, row.options).items()
-    for words in (["--preset", base.preset], *(_option_words(*pair) for pair in options)):
-        try:  # each for itself, to name the one that is wrong
-            _parsed([str(settings.data), *words])
-        except SystemExit:
-            wrong = " ".join(words)
-            break
-        except UserError:
-            continue
-    raise UserError(f"row {row.name}: gamba train does not take {wrong}")
+    from gamba_warp.train.config import GROUPS, config_of
 
-
-def _parsed(words: list[str]) -> TrainConfig:
-    """What ``gamba train`` makes of its words. Raises SystemExit where it takes them not."""
-    import tyro
-
-    from gamba_warp.train.config import TrainConfig
-
-    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-        return tyro.cli(tyro.conf.OmitArgPrefixes[TrainConfig], args=words, prog="gamba train")
-
-
-def _check_names(plan: Plan, row: Row) -> None:
-    """Refuses fields and options that are not there, or that the command itself gives."""
-    from gamba_warp.train.config import GROUPS
-
-    known = {field.name for field in fields(GambaConfig)}
-    names = {f.name for group, kind in GROUPS.items() if group != "model" for f in fields(kind)}
-    if plan.base.preset not in PRESETS:
-        raise UserError(f"no preset {plan.base.preset}; there are {', '.join(PRESETS)}")
-    for name in (name.replace("-", "_") for name in [*plan.base.set, *row.set]):
-        if name not in known:
-            raise UserError(f"set: GambaConfig has no field {name}")
-    for name in (name.replace("-", "_") for name in [*plan.base.options, *row.options]):
+    base, source = settings.plan.base, f"row {row.name}"
+    of = {f.name: group for group, kind in GROUPS.items() for f in fields(kind) if group != "model"}
+    changes = _merged(base.set, row.set)
+    for name in changes.keys() - {field.name for field in fields(GROUPS["model"])}:
+        raise UserError(f"{source}: set: GambaConfig has no field {name}")
+    values: dict[str, Any] = {
+        "data": str(settings.data),
+        "preset": base.preset,
+        "set": [f"{n}={v if isinstance(v, str) else json.dumps(v)}" for n, v in changes.items()],
+    }
+    options = {n: v for n, v in _merged(base.options, row.options).items() if n not in BUDGET}
+    for name, value in {**options, settings.budget[0]: settings.budget[1]}.items():
         if name in RESERVED:
-            raise UserError(f"options: {name} is not for a plan to give")
-        if name not in names:
-            raise UserError(f"options: gamba train has no {option(name)}")
+            raise UserError(f"{source}: options: {name} is not for a plan to give")
+        values.setdefault(of.get(name, "run"), {})[name] = value
+    return config_of(values, source)
 
 
 def check(settings: Settings) -> None:
@@ -245,37 +197,17 @@ def check(settings: Settings) -> None:
 
 
 def difference(old: dict[str, list[str]], new: dict[str, list[str]]) -> str | None:
-    """Names the first difference between the commands of a row; None where there is none."""
-    for name in [*new, *old]:
-        if old.get(name) == new.get(name):
-            continue
-        if name not in old:
-            return f"the command {new[name][0]} was not part of it then"
-        if name not in new:
-            return f"the command {old[name][0]} is no part of it now"
-        there, here = (_by_option(words[name]) for words in (old, new))
-        for word in [*here, *there]:
-            if there.get(word) != here.get(word):
-                before, after = (
-                    "not given" if word not in values else values[word] or "given"
-                    for values in (there, here)
-                )
-                return f"{word}: {before} then, {after} now"
-        return "the order of its options"
-    return None
+    """The first option that is another in the commands of a row; None where there is none."""
+    if old == new:
+        return None
+    there, here = (
+        [f"{words[0]} {part}" for words in of.values() for part in _options(words[1:])]
+        for of in (old, new)
+    )
+    gone, come = [p for p in there if p not in here], [p for p in here if p not in there]
+    return f"{next(iter(gone), 'nothing')} then, {next(iter(come), 'nothing')} now"
 
 
-def _by_option(words: Sequence[str]) -> dict[str, str]:
-    """Values by option, of ``--set`` by field."""
-    found: dict[str, str] = {}
-    key = "DATA"
-    for word in words[1:]:
-        if word.startswith("--"):
-            key = word
-            found.setdefault(key, "")
-        elif key == "--set":
-            field, _, value = word.partition("=")
-            found[f"--set {field}"] = value
-        else:
-            found[key] = f"{found.get(key, '')} {word}".strip()
-    return found
+def _options(words: Sequence[str]) -> list[str]:
+    """The words of a command, each option with its values."""
+    return re.split(" (?=--)", shlex.join(words))

@@ -41,10 +41,10 @@ def told(path, tmp_path):
         ({"set": {"widht": 4}}, "row b: set: GambaConfig has no field wid"),
         ({"set": {"width": 0}}, "row b: --set: config: width is 0"),
         ({"set": {"patch_size": 5}}, "row b: --set: config: image_size"),
-        ({"options": {"clap": 4}}, "row b: options: gamba train has no --c"),
-        ({"options": {"lr": -1}}, "row b: --lr -1"),
-        ({"options": {"lr": "fast"}}, "row b: gamba train does not take --l"),
-        ({"options": {"radial_mask": 3}}, "does not take --radial-mask 3"),
+        ({"options": {"clap": 4}}, "row b: not the options of a run (unknown run.clap)"),
+        ({"options": {"lr": -1}}, "row b: lr: Expected `float` > 0"),
+        ({"options": {"lr": "fast"}}, "row b: lr: Expected `float`, got `str`"),
+        ({"options": {"radial_mask": 3}}, "row b: radial_mask: Expected `bool`, got `int`"),
         ({"options": {"seed": 3}}, "row b: options: seed is not for a plan"),
         ({"options": {"out": "x"}}, "row b: options: out is not for a plan"),
         ({"options": {"steps": 9}}, "row b: steps: the budget is the same"),
@@ -73,7 +73,7 @@ FIT = {"name": "b", "kind": "fit"}
         ([IN_SERIES, {**IN_SERIES, "name": "b"}], {}, "series n: two of its rows have the same nu"),
         ("a", {"base": {"options": {}}}, "the budget of a row: expected steps or minutes"),
         ("a", {"base": {"options": {"steps": 1, "minutes": 1}}}, "expected steps or minutes"),
-        ("a", {"base": {"preset": "huge"}}, "row a: no preset huge"),
+        ("a", {"base": {"preset": "huge"}}, "row a: preset: Invalid enum value 'huge'"),
         ([], {}, "$.rows"),
     ],
 )
@@ -164,9 +164,9 @@ def test_the_difference_of_two_commands_is_named():
     old = {"train": ["train", "D", "--set", "a=1", "b=2", "--lr", "1"], "views": ["eval-views"]}
     assert jobs.difference(old, {name: [*words] for name, words in old.items()}) is None
     other = {**old, "train": ["train", "D", "--set", "a=3", "b=2", "--lr", "1"]}
-    assert jobs.difference(old, other) == "--set a: 1 then, 3 now"
+    assert jobs.difference(old, other) == "train --set a=1 b=2 then, train --set a=3 b=2 now"
     fewer = {**old, "train": old["train"][:-2]}
-    assert jobs.difference(old, fewer) == "--lr: 1 then, not given now"
+    assert jobs.difference(old, fewer) == "train --lr 1 then, nothing now"
     more = {**old, "shapes": ["eval-geometry", "P"]}
-    assert "eval-geometry was not part" in jobs.difference(old, more)
-    assert "eval-geometry is no part" in jobs.difference(more, old)
+    assert jobs.difference(old, more) == "nothing then, eval-geometry P now"
+    assert jobs.difference(more, old) == "eval-geometry P then, nothing now"

@@ -137,7 +137,8 @@ def test_a_changed_plan_is_refused_and_restart_does_what_changed(gamba, tmp_path
     capsys.readouterr()
     assert gamba(path) == (2, [])
     said = capsys.readouterr().err
-    assert "row b, seed 0: was run with another plan: --set width: 16 then, 32 now" in said
+    then, now = (f"train --set width={width}" for width in (16, 32))
+    assert f"row b, seed 0: was run with another plan: {then} then, {now} now" in said
     assert said.count("\n") == 1 and (tmp_path / "out" / "table.json").read_bytes() == before
     assert gamba(path, "--restart", "--dry-run") == (0, [])
     assert gamba(path) == (2, []), "a dry run changes nothing"
@@ -145,7 +146,7 @@ def test_a_changed_plan_is_refused_and_restart_does_what_changed(gamba, tmp_path
     # Another evaluation trains nothing again.
     code, called = gamba(path, "--views", 3)
     assert (code, called) == (2, [])
-    assert "--views: 4 then, 3 now" in capsys.readouterr().err
+    assert "eval-views --views 4 then, eval-views --views 3 now" in capsys.readouterr().err
     code, called = gamba(path, "--views", 3, "--restart")
     assert code == 0 and called == ["eval-views a/0", "eval-views b/0"]
     other = json.loads(path.read_text()) | {"name": "other"}
