@@ -12,7 +12,6 @@ from helpers.refusals import refused
 from PIL import Image
 
 from gamba_warp.data.dataset import open_dataset, split_of
-from gamba_warp.errors import UserError
 from gamba_warp.formats.catalogue import find_meshes
 from gamba_warp.train.data import furniture
 from gamba_warp.train.data.furniture import read_properties
@@ -138,51 +137,21 @@ def test_the_name_of_a_library_removes_nothing(tmp_path, name):
     assert tree_of(tmp_path / "safe") == before
 
 
-def test_only_what_an_earlier_run_made_is_replaced(tmp_path):
-    (tmp_path / "tree").mkdir()
-    library = write_library(tmp_path / "tree" / "A.sh3f", more=["old.txt"])
-    out = tmp_path / "models"
-    (out / "A").mkdir(parents=True)
-    (out / "A" / "mine.txt").write_text("mine")
-    with pytest.raises(UserError, match="A: is not marked as made by this command"):
-        data_furniture_command(out, tree=tmp_path / "tree")
-    assert tree_of(out) == {"A", "A/mine.txt"}
-    (out / "A" / "mine.txt").unlink()
-    (out / "A").rmdir()
-    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
-    write_library(library, more=["new.txt"])
-    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
-    assert (out / "A" / "new.txt").exists() and not (out / "A" / "old.txt").exists()
-    (out / "A" / "mine.txt").write_text("mine")
-    refused("mine.txt: is not of the library", data_furniture_command, out, tree=tmp_path / "tree")
-    (out / "A" / "mine.txt").unlink()
-    (out / "A").rename(tmp_path / "elsewhere")
-    (out / "A").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(UserError, match="A: is not marked as made by this command"):
-        data_furniture_command(out, tree=tmp_path / "tree")
-    assert (tmp_path / "elsewhere" / "new.txt").exists()
-
-
-def test_a_run_that_was_interrupted_is_repeated(tmp_path, monkeypatch):
-    (tmp_path / "tree").mkdir()
+def test_what_is_there_stays(tmp_path):
+    """A folder of somebody else's, and libraries of a run that was interrupted."""
+    tree, out = tmp_path / "tree", tmp_path / "models"
+    tree.mkdir()
     for name in "AB":
-        write_library(tmp_path / "tree" / f"{name}.sh3f")
-    out, real = tmp_path / "models", furniture.unpack_library
-    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
-    before = tree_of(out)
-
-    def interrupted(path, *rest):
-        if path.stem == "B":
-            raise KeyboardInterrupt
-        return real(path, *rest)
-
-    monkeypatch.setattr(furniture, "unpack_library", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        data_furniture_command(out, tree=tmp_path / "tree")
-    assert tree_of(out) == before
-    monkeypatch.undo()
-    assert data_furniture_command(out, tree=tmp_path / "tree") == 0
-    assert tree_of(out) == before
+        write_library(tree / f"{name}.sh3f")
+    (out / "B").mkdir(parents=True)
+    (out / "B" / "mine.txt").write_text("mine")
+    refused("models/B: is not the library", data_furniture_command, out, tree=tree)
+    assert tree_of(out / "B") == {"mine.txt"} and not (out / "catalogue.json").exists()
+    (out / "B").rename(tmp_path / "elsewhere")
+    made = (out / "A" / "LICENSE.TXT").stat()
+    assert data_furniture_command(out, tree=tree) == 0
+    assert (out / "A" / "LICENSE.TXT").stat() == made and (out / "B" / "LICENSE.TXT").exists()
+    assert len(json.loads((out / "catalogue.json").read_text())["objects"]) == 4
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ rendered object.
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
@@ -17,14 +16,11 @@ import zipfile
 from collections import Counter
 from pathlib import Path, PurePosixPath
 
-import msgspec
-
 from gamba_warp.batch import progress_bar
 from gamba_warp.errors import UserError
-from gamba_warp.files import PART, output_folder, write_json
+from gamba_warp.files import PART, atomic_folder, output_folder, write_json
 from gamba_warp.formats.catalogue import CATALOGUE, check_rotation
 from gamba_warp.untrusted.archives import open_tar, open_zip, read_ar
-from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.names import parts_of, plain_name
 
 from .groups import Named, split_groups, textures_of
@@ -32,7 +28,6 @@ from .groups import Named, split_groups, textures_of
 PACKAGE = "sweethome3d-furniture"
 INSTALLED = Path("/usr/share/sweethome3d/furniture")
 _PROPERTIES = "PluginFurnitureCatalog.properties"
-_MARK = ".gamba-library.json"  # in a library's folder: what this command put there
 _MAX_TEXT = _MAX_ICON = 16 << 20  # bytes; they take a few kB
 _TEXT = {"capture_output": True, "encoding": "utf-8", "errors": "replace"}
 _BY = "https://creativecommons.org/licenses/by/3.0/"
@@ -51,12 +46,6 @@ LIBRARIES: dict[str, tuple[str, str, str]] = {
 }
 
 
-class _Mark(msgspec.Struct):
-    """What ``_MARK`` holds: the names of the library's files."""
-
-    files: list[str]
-
-
 def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) -> int:
     """Unpacks the libraries, and writes the catalogue of all models.
 
@@ -72,76 +61,29 @@ def get_furniture(out: Path, deb: Path | None = None, tree: Path | None = None) 
     Raises:
         UserError: there are no libraries, one is damaged, or two models have one name.
     """
-    out = output_folder(out)
-    with tempfile.TemporaryDirectory(dir=out, prefix=PART) as name:
-        scratch = Path(name)
-        paths = sorted(_find_libraries(deb, tree, scratch).glob("*.sh3f"))
+    out, objects = output_folder(out), []
+    with tempfile.TemporaryDirectory(dir=out, prefix=PART) as scratch:
+        paths = sorted(_find_libraries(deb, tree, Path(scratch)).glob("*.sh3f"))
         if not paths:
             raise UserError(f"{deb or tree or INSTALLED}: holds no .sh3f libraries")
-        libraries = {library_name(path): path for path in paths}
-        # Nothing in ``out`` is touched before every library is unpacked and sound.
-        for library in libraries:
-            _check_replaceable(out / library)
-        for part in ("new", "old", "icons"):
-            (scratch / part).mkdir()
-        objects = []
-        for library, path in libraries.items():
+        for path in paths:
             try:
-                objects += unpack_library(path, scratch / "new" / library, scratch / "icons")
+                objects += unpack_library(path, out)
             except UserError as error:  # a package's library lies in a folder that goes
                 reason = str(error).replace(f"{scratch}/", f"{deb or PACKAGE}: ")
                 raise UserError(reason) from error
-        counts = Counter(entry["uid"] for entry in objects)
-        if repeated := next((uid for uid, count in counts.items() if count > 1), None):
-            raise UserError(f"two models are called {repeated}")
-        named = []
-        for entry in objects:
-            textures = textures_of(scratch / "new" / entry["model"])
-            library = entry["model"].split("/")[0]
-            named.append(Named(entry["uid"], library, entry["name"], textures))
-        groups = split_groups(named)
-        for entry in objects:
-            entry["group"] = groups[entry["uid"]]
-        try:  # those of an earlier run give way
-            for library in libraries:
-                if (out / library).exists():
-                    os.replace(out / library, scratch / "old" / library)
-                os.replace(scratch / "new" / library, out / library)
-            icons = output_folder(out / "icons")
-            for icon in (scratch / "icons").iterdir():
-                os.replace(icon, icons / icon.name)
-        except OSError as error:
-            raise UserError(f"cannot write into {out}: {error.strerror or error}") from error
+    counts = Counter(entry["uid"] for entry in objects)
+    if repeated := next((uid for uid, count in counts.items() if count > 1), None):
+        raise UserError(f"two models are called {repeated}")
+    groups = split_groups(
+        [
+            Named(e["uid"], e["model"].split("/")[0], e["name"], textures_of(out / e["model"]))
+            for e in objects
+        ]
+    )
+    objects = [{**entry, "group": groups[entry["uid"]]} for entry in objects]
     write_json(out / CATALOGUE, {"objects": sorted(objects, key=lambda entry: entry["uid"])})
     return len(objects)
-
-
-def library_name(path: Path) -> str:
-    """The library's name, which becomes that of a folder.
-
-    Raises:
-        UserError: it is no plain name, or one that the command uses itself.
-    """
-    name = plain_name(path.stem, str(path))
-    if name.lower() in ("icons", CATALOGUE):
-        raise UserError(f"{path}: a library cannot be called {name}")
-    return name
-
-
-def _check_replaceable(folder: Path) -> None:
-    """Refuses a folder that is there and holds anything but what this command put there."""
-    if not folder.exists() and not folder.is_symlink():
-        return
-    reason = (
-        f"{folder}: is not marked as made by this command; move it away, or choose another --out"
-    )
-    if folder.is_symlink() or not (folder / _MARK).is_file():
-        raise UserError(reason)
-    ours = read_document(folder / _MARK, _Mark)
-    found = (path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
-    strange = sorted({path.relative_to(folder).as_posix() for path in found} - {*ours.files, _MARK})
-    if strange:
-        raise UserError(f"{folder / strange[0]}: is not of the library; move it away")
 
 
 def _find_libraries(deb: Path | None, tree: Path | None, scratch: Path) -> Path:
@@ -196,16 +138,19 @@ def read_properties(data: bytes) -> dict[str, str]:
     return {key.strip(): value.strip() for key, sign, value in pairs if sign}
 
 
-def unpack_library(path: Path, target: Path, icons: Path) -> list[dict]:
-    """Unpacks one .sh3f into ``target``, a new folder, and its icons into ``icons``.
+def unpack_library(path: Path, out: Path) -> list[dict]:
+    """Unpacks one .sh3f into a folder of its name, unless that is there, and its icons.
 
     Returns:
         The library's catalogue entries.
 
     Raises:
-        UserError: not a zip, no furniture catalogue in it, or a member that is not allowed.
+        UserError: not a zip, no furniture catalogue in it, a member that is not allowed, or the
+            folder is there and lacks a model.
     """
-    library = target.name
+    library = plain_name(path.stem, str(path))
+    if library.lower() in ("icons", CATALOGUE):
+        raise UserError(f"{path}: a library cannot be called {library}")
     if not path.is_file() or not zipfile.is_zipfile(path):  # to read a pipe would not end
         raise UserError(f"{path}: not a furniture library (no zip file)")
     with open_zip(path) as archive:
@@ -220,12 +165,15 @@ def unpack_library(path: Path, target: Path, icons: Path) -> list[dict]:
         missing = {e["model"].removeprefix(f"{library}/") for e in entries} - {*members}
         if missing:
             raise UserError(f"{path}: not a furniture library (it holds no {min(missing)!r})")
-        target.mkdir()
-        for member in progress_bar(members, desc=library, unit="file", leave=False):
-            archive.unpack(member, target)
-        for entry, picture in zip(entries, pictures):
-            (icons / f"{entry['uid']}.png").write_bytes(archive.read(picture, _MAX_ICON))
-    write_json(target / _MARK, {"files": members})
+        icons = [archive.read(picture, _MAX_ICON) for picture in pictures]
+        if not (out / library).exists():
+            with atomic_folder(out / library) as part:
+                for member in progress_bar(members, desc=library, unit="file", leave=False):
+                    archive.unpack(member, part)
+    for entry, icon in zip(entries, icons):
+        if not (out / entry["model"]).is_file():
+            raise UserError(f"{out / library}: is not the library {path}; move it away")
+        (output_folder(out / "icons") / f"{entry['uid']}.png").write_bytes(icon)
     return entries
 
 
