@@ -1,13 +1,11 @@
-"""From any picture to the model's input: one object, cut out, centred and composited.
+"""The steps from a picture to the model's input: masks, plain backgrounds, centring, compositing.
 
-The object's alpha comes from the first of these that applies: a mask file, the picture's own alpha
-channel, a plain background (flood fill from the borders), Segment Anything with a local checkpoint.
+``photo/cutout.py`` says which of them apply to a picture.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
@@ -34,49 +32,6 @@ PRESENT = 0.05  # alpha from which a pixel counts for the object's bounds
 _PLAIN_TOLERANCE = 0.07  # largest colour difference within a plain background
 _PLAIN_SHARE = 0.8  # least share of border pixels that are background; the object may touch an edge
 _MIN_OBJECT = 16  # least size of an object, pixels
-
-Segmenter = Callable[[np.ndarray], np.ndarray]
-
-
-def prepare(
-    path: str | Path, *, mask: str | Path | None = None, segmenter: Segmenter | None = None
-) -> np.ndarray:
-    """Reads a picture and cuts its object out.
-
-    Args:
-        path: any picture that ``load_rgba`` reads.
-        mask: picture of the same size, white (or opaque) on the object; it is preferred to all
-            else.
-        segmenter: function from RGB ``[H, W, 3]`` to alpha ``[H, W]``, both in [0, 1]; used last.
-
-    Returns:
-        ``[S, S, 4]`` float32 RGBA in [0, 1] with the object in the middle, its longer side
-        ``0.8 · S``; S is at most 1280.
-
-    Raises:
-        UserError: the picture or the mask cannot be read, they differ in size, no way to find the
-            object applies, or there is no object.
-    """
-    rgba = load_rgba(path, longest=WORKING_SIZE)
-    if mask is not None:
-        rgba[..., 3] = read_mask(mask, path)
-    cut = mask is not None or has_alpha(rgba)
-    rgba = shrink(rgba, WORKING_SIZE)
-    if not cut:
-        rgb = rgba[..., :3]
-        matte = plain_matte(rgb)
-        if matte is None and segmenter is None:
-            raise UserError(
-                f"{path}: cannot tell object from background; give a picture with a transparent or "
-                "plain background, --mask FILE, or --sam FILE (a Segment Anything checkpoint)"
-            )
-        if matte is None and segmenter is not None:
-            matte = np.dstack([rgb, segmenter(rgb)]).astype(np.float32)
-        rgba = cast(np.ndarray, matte)
-    try:
-        return recenter(rgba)
-    except ValueError as error:
-        raise UserError(f"{mask or path}: {error}") from error
 
 
 def has_alpha(rgba: np.ndarray) -> bool:

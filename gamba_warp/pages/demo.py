@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ..conventions import WHITE, over_background
-from ..data.preprocess import prepare
 from ..errors import UserError
 from ..formats.ply import load_ply
+from ..photo.cutout import cut_out
 from .card import OF_GROUNDS, OF_PICTURES, ModelCard, about_model, read_card
 from .curves import curves_section
 from .page import Section, demo_page
@@ -92,7 +92,7 @@ def write_demo(path: Path, results: DemoResults, text: str) -> None:
         if ply.exists():
             said = "Shipped model; a picture by another renderer."
             icons.append(_turned(f"Icon: {_name(icon)}", said, ply))
-            icons[-1].picture = prepare(icon)
+            icons[-1].picture = cut_out(icon).rgba
             if _name(icon) not in map(_name, strips):
                 others.append(icons[-1])
     mixed = [section for pair in zip_longest(held_out, others) for section in pair if section]

@@ -155,16 +155,15 @@ def cut_out(path: str | Path, ways: Ways | None = None) -> CutOut:
     """
     ways = Ways() if ways is None else ways
     rgba, why = load_rgba(path, longest=WORKING_SIZE), ""
+    method: Method | None = None
     if ways.mask is not None:
         rgba[..., 3] = read_mask(ways.mask, path)
-        method: Method = "mask"
-        rgba = shrink(rgba, WORKING_SIZE)
+        method = "mask"
     elif has_alpha(rgba):
-        method, rgba = "alpha", shrink(rgba, WORKING_SIZE)
-    else:
-        rgba = shrink(rgba, WORKING_SIZE)
+        method = "alpha"
+    rgba = shrink(rgba, WORKING_SIZE)
     source = rgba[..., :3].copy()
-    if ways.mask is None and not has_alpha(rgba):
+    if method is None:
         method, rgba, why = _found(path, source, ways)
     try:
         centred = recenter(rgba, BORDER_RATIO if ways.recenter else None)

@@ -15,7 +15,7 @@ from helpers.views import cloud_of
 from PIL import Image
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
-from gamba_warp.data.preprocess import composite, prepare
+from gamba_warp.data.preprocess import composite
 from gamba_warp.errors import UserError
 from gamba_warp.formats.meshes import load_mesh
 from gamba_warp.formats.ply import load_ply
@@ -52,7 +52,7 @@ class Recorder(torch.nn.Module):
 
 @pytest.mark.parametrize("background", ["white", "black"])
 def test_the_model_sees_the_object_from_the_reference_camera(picture, background):
-    model, rgba = Recorder(background), prepare(picture)
+    model, rgba = Recorder(background), cutout.cut_out(picture).rgba
     gaussians = reconstruct(model, rgba)
     assert gaussians.num == 9 and gaussians.means.shape == (9, 3)
     want = composite(rgba, 24, 1.0 if background == "white" else 0.0)
@@ -149,7 +149,7 @@ def test_a_picture_becomes_every_file(tmp_path, picture, checkpoint, capsys):
     assert sorted(files) == names and all(files.values())
     gaussians = load_ply(out / "thing.ply")
     with torch.inference_mode():
-        want = reconstruct(load_model(checkpoint), prepare(picture))
+        want = reconstruct(load_model(checkpoint), cutout.cut_out(picture).rgba)
     assert gaussians.num == 64 and files["thing.splat"] == 64 * 32
     # float32 through a logarithm or a logit
     torch.testing.assert_close(gaussians.means, want.means)

@@ -22,7 +22,7 @@ from gamba_warp.ablation import jobs
 from gamba_warp.ablation.plan import named, read_plan
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import open_dataset
-from gamba_warp.data.preprocess import SamSegmenter, prepare
+from gamba_warp.data.preprocess import SamSegmenter
 from gamba_warp.errors import UserError
 from gamba_warp.eval.compare import html_page, join, markdown_page, read_reports
 from gamba_warp.eval.shapes.load import load_shape
@@ -41,6 +41,7 @@ from gamba_warp.model.checkpoint import load_model
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.encoders import build_encoder, read_state
 from gamba_warp.model.released import convert_released
+from gamba_warp.photo.cutout import Ways, cut_out
 from gamba_warp.photo.matte import Matte
 from gamba_warp.train.checkpoint import find_checkpoint, load_weights
 from gamba_warp.train.config import TrainConfig
@@ -97,7 +98,7 @@ def _pictures(path: Path, out: Path) -> Any:
 
 def _prepare(path: Path, out: Path) -> Any:
     mask = next((p for p in sorted(path.parent.iterdir()) if p.stem == "mask"), None)
-    return prepare(path, mask=None if mask == path else mask)
+    return cut_out(path, Ways(None if mask == path else mask, fetch=False)).rgba
 
 
 def _view(path: Path, out: Path) -> Any:

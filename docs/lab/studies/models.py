@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit, reference_viewmat
-from gamba_warp.data.preprocess import composite, prepare
+from gamba_warp.data.preprocess import composite
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.kernels.bench.core.case import (
     Case,
@@ -26,6 +26,7 @@ from gamba_warp.measure.inference import captured
 from gamba_warp.model.checkpoint import DEFAULT_CHECKPOINT, load_model
 from gamba_warp.model.parts.block import prefix_states
 from gamba_warp.model.posing import reference_cameras
+from gamba_warp.photo.cutout import cut_out
 from gamba_warp.render import render
 
 from . import precision
@@ -142,7 +143,7 @@ class _Pictures:
         config = self.model.config
         size, self.device = config.image_size, settings.device
         chosen = icons[:: max(1, len(icons) // count)][:count]
-        images = [composite(prepare(path), size, config.background_color) for path in chosen]
+        images = [composite(cut_out(path).rgba, size, config.background_color) for path in chosen]
         self.images = [image[None].to(self.device) for image in images]
         self.camera = reference_cameras(config, 1).to(self.device)
         around = orbit(torch.tensor([90.0, 180.0]), distance=config.distance)
