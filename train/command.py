@@ -63,11 +63,7 @@ def expand(arguments: list[str]) -> list[str]:
         raise UserError("--recipe and --config: give one of them")
     at = words.index(chosen)
     if at + 1 == len(words):
-        known = {
-            "--recipe": "the name of a recipe",
-            "--config": "a run's folder or its config.json",
-        }
-        raise UserError(f"{chosen}: expected {known[chosen]}")
+        raise UserError(f"{chosen}: expected a recipe's name, or a run's folder or config.json")
     name, rest = words[at + 1], [*words[:at], *words[at + 2 :]]
     if helped:
         print(table_of(name) + "\n")

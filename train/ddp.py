@@ -138,7 +138,7 @@ class World:
         options: dict[str, Any] = {name: False, "process_group": group}
         return DistributedDataParallel(model, **options)
 
-    def agree(self, facts: Callable[[], Mapping[str, Mapping[str, object]]]) -> None:
+    def agree(self, facts: Callable[[], Mapping[str, dict[str, object]]]) -> None:
         """Refuses processes that would not do the same work.
 
         Args:
@@ -150,7 +150,7 @@ class World:
         """
         if self.size == 1:
             return
-        mine: Mapping[str, Mapping[str, object]] = {}
+        mine: Mapping[str, dict[str, object]] = {}
         with self.together():
             mine = facts()
         known = self.gather((socket.gethostname(), mine))
@@ -159,15 +159,11 @@ class World:
         if not others:
             return
         (name, there), parts = known[others[0]], []
-        for subject, a in here.items():
-            b, shown = there[subject], []
-            for key in sorted(key for key in {*a, *b} if key not in a or a[key] != b.get(key)):
-                if key not in a or key not in b:
-                    shown.append(f"{key} is {'added' if key not in a else 'missing'}")
-                elif re.fullmatch("[0-9a-f]{64}", str(a[key])):  # a hash says nothing to people
-                    shown.append(f"{key} is another")
-                else:
-                    shown.append(f"{key} is {str(b[key])[:60]}, not {str(a[key])[:60]}")
+        for subject, ours in here.items():
+            theirs = there[subject]
+            pairs = {k: (theirs.get(k, "missing"), ours.get(k, "missing")) for k in ours | theirs}
+            differing = {key: pair for key, pair in sorted(pairs.items()) if pair[0] != pair[1]}
+            shown = [f"{k} is {str(b)[:60]}, not {str(a)[:60]}" for k, (b, a) in differing.items()]
             more = [f"{len(shown) - _SHOWN} more"] if len(shown) > _SHOWN else []
             if shown:
                 parts.append(f"{subject}: {', '.join(shown[:_SHOWN] + more)}")

@@ -7,6 +7,7 @@ module imports nothing that is slow.
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -15,8 +16,6 @@ from gamba_warp.errors import UserError
 from gamba_warp.untrusted.ranges import option
 
 from .config import RecipeName
-
-_MOST = 100_000  # processes, or batches of a step, that anyone has
 
 
 class Recipe(NamedTuple):
@@ -103,19 +102,15 @@ def recipe_words(name: str, arguments: Sequence[str], environment: Mapping[str, 
     words = ["--recipe", name, *(word for text in recipe.settings for word in shlex.split(text))]
     if recipe.batch is None or option("batch_size") in given:
         return words
-    counts = []
-    for text, what in (
-        (environment.get("WORLD_SIZE", "1"), "WORLD_SIZE"),
-        (given.get("--accumulate", "1"), "--accumulate"),
-    ):
-        if not text.isascii() or not text.isdigit() or not 1 <= int(text[:9]) <= _MOST:
-            raise UserError(f"{what} {text[:40]}: expected a number from 1 to {_MOST:,}")
-        counts.append(int(text))
-    share, rest = divmod(recipe.batch, counts[0] * counts[1])
-    if rest or not share:
+    processes, accumulate = environment.get("WORLD_SIZE", "1"), given.get("--accumulate", "1")
+    for text, what in ((processes, "WORLD_SIZE"), (accumulate, "--accumulate")):
+        if not re.fullmatch("0*[1-9][0-9]{0,5}", text):
+            raise UserError(f"{what} {text[:40]}: expected a number from 1 to 999,999")
+    share, rest = divmod(recipe.batch, int(processes) * int(accumulate))
+    if rest:
         raise UserError(
-            f"--recipe {name}: its batch of {recipe.batch} does not divide by {counts[0]} "
-            f"processes times --accumulate {counts[1]}; change one of them, or give --batch-size"
+            f"--recipe {name}: its batch of {recipe.batch} does not divide by {processes} "
+            f"processes times --accumulate {accumulate}; change one of them, or give --batch-size"
         )
     return [*words, option("batch_size"), str(share)]
 

@@ -119,10 +119,10 @@ def train(config: TrainConfig, world: World) -> int:
 
 def _facts(
     config: TrainConfig, data: TrainingData, world: World, lpips: bool
-) -> Mapping[str, Mapping[str, object]]:
+) -> Mapping[str, dict[str, object]]:
     """What all processes must have in common, see ``World.agree``.
 
-    Of the data: SHA-256 by object, of its cameras and, of some objects, of the first picture.
+    Of the data: a hash by object, of its cameras and, of some objects, of the first picture.
     """
     chosen, contents = sorted(set(data.objects)), {}
     read = evenly(chosen, _PICTURES)
@@ -135,7 +135,7 @@ def _facts(
         if index in read:
             with contextlib.suppress(*EXPECTED):  # the training says so where it matters
                 digest.update(data.train.load(index, [0], depths=0).images.numpy().tobytes())
-        contents[data.train.uids[index]] = digest.hexdigest()
+        contents[data.train.uids[index]] = digest.hexdigest()[:16]
     known = {"objects": data.fingerprint, "device": world.device.type, "LPIPS": lpips}
     return {
         "options": {**options_of_all(config.to_dict()), **known},

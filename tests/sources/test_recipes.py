@@ -146,7 +146,7 @@ def test_help_shows_what_a_recipe_sets(capsys):
     [
         (["--recipe", "rats"], "--recipe rats: expected one of paper, tiny, rays"),
         (["--recipe", "rats", "--help"], "--recipe rats: expected one of"),
-        (["--recipe"], "--recipe: expected the name of a recipe"),
+        (["--recipe"], "--recipe: expected a recipe's name"),
         (["--recipe", "tiny", "--config", "run"], "--recipe and --config: give one of them"),
     ],
 )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -117,26 +118,17 @@ def join(samples: list[Batch]) -> Batch:
     return _combined(samples, torch.cat)
 
 
-def _combined(batches: list[Batch], make: Callable[[list[Tensor]], Tensor]) -> Batch:
-    """A batch each of whose tensors is made of those of some batches."""
-
-    def tensors(of: Callable[[Batch], Tensor]) -> Tensor:
-        return make([of(batch) for batch in batches])
-
-    def cameras(of: Callable[[Batch], Cameras]) -> Cameras:
-        viewmats, Ks = (tensors(lambda b, n=name: getattr(of(b), n)) for name in ("viewmats", "Ks"))
-        return replace(of(batches[0]), viewmats=viewmats, Ks=Ks)
-
-    surfaces = [batch.surfaces for batch in batches if batch.surfaces is not None]
-    return Batch(
-        uids=[uid for batch in batches for uid in batch.uids],
-        inputs=tensors(lambda b: b.inputs),
-        input_cameras=cameras(lambda b: b.input_cameras),
-        targets=tensors(lambda b: b.targets),
-        cameras=cameras(lambda b: b.cameras),
-        background=tensors(lambda b: b.background),
-        surfaces=make(surfaces) if surfaces else None,
-    )
+def _combined(parts: list[Any], make: Callable[[list[Tensor]], Tensor]) -> Any:
+    """What the parts are, each tensor in it made of those of all of them; lists are joined."""
+    first = parts[0]
+    if isinstance(first, Tensor):
+        return make(parts)
+    if isinstance(first, list):
+        return [item for part in parts for item in part]
+    if not is_dataclass(first):
+        return first
+    of = {f.name: [getattr(part, f.name) for part in parts] for f in fields(first)}
+    return type(first)(**{name: _combined(values, make) for name, values in of.items()})
 
 
 def load_sample(

@@ -16,7 +16,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -189,27 +188,15 @@ def _add_depth(files: ObjectFiles, target: Path, path: Path) -> None:
         distances = np.linalg.norm(files.camera_to_world[:, :3, 3], axis=1).tolist()
         wanted = []
         for image, distance in zip(files.images, distances):
-            assert isinstance(image, Path)  # of this layout they all are
             source = inside(raw, f"{image.stem}/{image.stem}{SUFFIX}", str(path))
-            wanted.append(DepthFile(source, target / f"{image.stem}.png", distance))
-        try:
-            convert(wanted)
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from error
-
-
-class DepthFile(NamedTuple):
-    """One view's depth.
-
-    Attributes:
-        source: the ``_nd.exr`` file.
-        target: the picture to write.
-        distance: of the camera from the object's centre, object units.
-    """
-
-    source: Path
-    target: Path
-    distance: float
+            if not source.is_file():
+                raise UserError(f"{path}: {source.name}: no such file")
+            if source.stat().st_size > MOST:
+                raise UserError(f"{path}: {source.name}: over {MOST >> 20} MB")
+            wanted.append((source, target / f"{image.stem}.png", distance))
+        for _, result in run_each(_convert, [wanted], seconds=_SECONDS, memory=_MEMORY):
+            if isinstance(result, Failed):
+                raise UserError(f"{path}: {SUFFIX.lstrip('_')} files: {result.reason}")
 
 
 def check_package() -> None:
@@ -218,24 +205,8 @@ def check_package() -> None:
         raise UserError("--depth: needs the package OpenEXR: pip install OpenEXR")
 
 
-def convert(files: Sequence[DepthFile]) -> None:
-    """Writes the depth of one object's views, in a child process.
-
-    Raises:
-        UserError: a file is missing, damaged, or has no depth.
-    """
-    for file in files:
-        if not file.source.is_file():
-            raise UserError(f"{file.source.name}: no such file")
-        if file.source.stat().st_size > MOST:
-            raise UserError(f"{file.source.name}: over {MOST >> 20} MB")
-    for _, result in run_each(_convert, [tuple(files)], seconds=_SECONDS, memory=_MEMORY):
-        if isinstance(result, Failed):
-            raise UserError(f"{SUFFIX.lstrip('_')} files: {result.reason}")
-
-
-def _convert(files: Sequence[DepthFile]) -> None:
-    """In the child."""
+def _convert(files: Sequence[tuple[Path, Path, float]]) -> None:
+    """In a child process: files of depth to pictures, each by its camera's distance."""
     import OpenEXR  # pyright: ignore[reportMissingImports]: optional
 
     for source, target, distance in files:
