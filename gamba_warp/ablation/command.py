@@ -81,6 +81,7 @@ def ablate_command(
     from ..batch import check_not_read, progress_bar
     from ..files import only_process, output_folder
     from ..kernels.runtime.system import cores
+    from ..untrusted.children import Failed, end_idle, run_each
     from .jobs import Settings, budget_of, check
     from .plan import keep_plan, named, open_plan
     from .run import row_line, run_tasks
@@ -103,7 +104,12 @@ def ablate_command(
     wanted = [chosen.row(name) for name in dict.fromkeys(rows)] or chosen.rows
     if len({*seeds}) != len(seeds):
         raise UserError("--seeds: one is there twice")
-    _check_inputs(settings, wanted)
+    # In a child: what a process held before it became a command counts as that command's memory, so
+    # the one that starts commands must not load torch.
+    for _, answer in run_each(open_inputs, [(settings, wanted)]):
+        if isinstance(answer, Failed):
+            raise UserError(answer.reason)
+    end_idle()
     if meshes is not None:
         require(*NEEDS["eval-geometry"])
     threads = threads or max(1, cores() // jobs)
@@ -153,40 +159,18 @@ def ablate_command(
         if code:
             print("stopped; the same command goes on from here")
             return code
-        from .page import write_results  # not before: see ``_check_inputs``
+        from .page import write_results  # not before: it loads torch
 
         bad = write_results(settings)
         print(f"wrote {out / 'table.md'}, table.json and index.html")
         return 1 if bad or any(task.record.status != "ok" for task in tasks) else 0
 
 
-def _check_inputs(settings: Settings, rows: list[Row]) -> None:
-    """Checks what the commands will read, in a child.
-
-    What a command's process held before it became that command counts as its memory, so the process
-    that starts commands must not load torch.
-    """
-    from ..untrusted.children import Failed, end_idle, run_each
-    from .jobs import train_config
-
-    weights = []
-    for row in rows:
-        if row.kind == "train":
-            config = train_config(settings, row)
-            model = config.model_config()
-            if config.loss.lpips == "on" or (model.encoder == "vgg16" and model.prepend):
-                weights.append(row.name)
-    for _, answer in run_each(open_inputs, [(settings, weights)]):
-        if isinstance(answer, Failed):
-            raise UserError(answer.reason)
-    end_idle()
-
-
-def open_inputs(given: tuple[Settings, list[str]]) -> None:
+def open_inputs(given: tuple[Settings, list[Row]]) -> None:
     """Opens what the commands of an ablation will read.
 
     Args:
-        given: what is the same for every row, and the names of the rows that need VGG16.
+        given: what is the same for every row, and the rows.
 
     Raises:
         UserError: something is not there.
@@ -194,13 +178,19 @@ def open_inputs(given: tuple[Settings, list[str]]) -> None:
     from ..data.dataset import open_dataset
     from ..devices import pick_device
     from ..vision.weights import FETCH, lpips_available
+    from .jobs import train_config
 
-    settings, weights = given
+    settings, rows = given
     pick_device(settings.device)
     for split in ("train", settings.evaluation.split):
         if not open_dataset(settings.data, split).uids:
             raise UserError(f"{settings.data}: its part {split} has no objects")
     if settings.meshes is not None and not settings.meshes.is_dir():
         raise UserError(f"--meshes {settings.meshes}: no such folder")
-    if weights and not lpips_available():
-        raise UserError(f"row {weights[0]}: needs the weights of VGG16; fetch them with: {FETCH}")
+    for row in (row for row in rows if row.kind == "train"):
+        config = train_config(settings, row)
+        model = config.model_config()
+        if config.loss.lpips == "on" or (model.encoder == "vgg16" and model.prepend):
+            if not lpips_available():
+                reason = f"needs the weights of VGG16; fetch them with: {FETCH}"
+                raise UserError(f"row {row.name}: {reason}")

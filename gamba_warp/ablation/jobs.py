@@ -90,8 +90,8 @@ def budget_of(plan: Plan, steps: int | None, minutes: float | None) -> tuple[str
     given = given or {n: v for n, v in _merged(plan.base.options).items() if n in BUDGET}
     if len(given) != 1 or "epochs" in given:
         raise UserError("the budget of a row: expected steps or minutes, once")
-    ((name, value),) = given.items()
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    name, value = next(iter(given.items()))
+    if type(value) not in (int, float):
         raise UserError(f"base: {name} is {str(value)[:80]}, not a number")
     return name, value
 
@@ -177,6 +177,9 @@ def train_config(settings: Settings, row: Row) -> TrainConfig:
     for name, value in {**options, settings.budget[0]: settings.budget[1]}.items():
         if name in RESERVED:
             raise UserError(f"{source}: options: {name} is not for a plan to give")
+        for item in value if isinstance(value, list) else [value]:
+            if isinstance(item, str) and (item.startswith("-") or not item.isprintable()):
+                raise UserError(f"{source}: {name}: {item!r} is no value of an option")
         values.setdefault(of.get(name, "run"), {})[name] = value
     return config_of(values, source)
 
