@@ -21,6 +21,7 @@ from ..formats.ply import save_ply
 from ..gaussians import Gaussians
 from ..image_metrics import SSIM_WINDOW, psnr, ssim
 from ..images import save_image
+from ..kernels.runtime.tables import markdown
 from ..render import render
 from ..versions import used_versions
 from .config import FitConfig
@@ -245,24 +246,21 @@ def _write_report(
     job: FitJob, records: list[dict[str, Any]], failures: list[tuple[str, str]]
 ) -> str:
     """Writes ``report.json`` and ``report.md``; returns the summary as Markdown."""
-    summary = {}
-    lines = ["| | mean | min | max |", "| --- | --- | --- | --- |"]
+    summary, rows = {}, []
     for label, key, form in _TABLE:
         values = [record[key] for record in records if record[key] is not None]
-        if not values:
-            continue
-        summary[key] = {"mean": _mean(values), "min": min(values), "max": max(values)}
-        cells = " | ".join(form.format(value) for value in summary[key].values())
-        lines.append(f"| {label} | {cells} |")
-    text = "\n".join(lines) if summary else "no object was fitted"
+        if values:
+            summary[key] = {"mean": _mean(values), "min": min(values), "max": max(values)}
+            rows.append([label, *map(form.format, summary[key].values())])
+    text = markdown(["", "mean", "min", "max"], rows) if rows else "no object was fitted"
     reasons = [{"name": name, "reason": reason} for name, reason in failures]
     report = {**_settings(job), "summary": summary, "objects": records, "failures": reasons}
     write_json(job.folder / "report.json", report)
-    table = ["| object | " + " | ".join(label for label, *_ in _TABLE) + " |"]
-    table.append("| --- " * (len(_TABLE) + 1) + "|")
-    for record in records:
-        cells = [form.format(record[k]) if record[k] is not None else "" for _, k, form in _TABLE]
-        table.append(f"| {record['name']} | " + " | ".join(cells) + " |")
-    table += ["", *(f"failed: {name}: {reason}" for name, reason in failures)]
-    write_text(job.folder / "report.md", f"{text}\n\n" + "\n".join(table).rstrip() + "\n")
+    shown = [
+        [r["name"], *("" if r[key] is None else form.format(r[key]) for _, key, form in _TABLE)]
+        for r in records
+    ]
+    table = markdown(["object", *(label for label, *_ in _TABLE)], shown)
+    failed = "".join(f"\nfailed: {name}: {reason}" for name, reason in failures)
+    write_text(job.folder / "report.md", f"{text}\n\n{table}\n{failed}".rstrip() + "\n")
     return text
