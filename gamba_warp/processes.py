@@ -141,13 +141,22 @@ class Child:
 
 
 @contextlib.contextmanager
-def stop_requests() -> Iterator[list[int]]:
-    """Collects the signals that ask this process to stop, in the yielded list."""
+def stop_requests(insist: bool = False) -> Iterator[list[int]]:
+    """Collects the signals that ask this process to stop, in the yielded list.
+
+    A SIGHUP that is ignored stays so (``end_signals``).
+
+    Args:
+        insist: whether a SIGINT after another signal interrupts at once.
+    """
     received: list[int] = []
-    old = {
-        number: signal.signal(number, lambda number, frame: received.append(number))
-        for number in (signal.SIGINT, *end_signals())
-    }
+
+    def note(number: int, frame: object) -> None:
+        if insist and received and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        received.append(number)
+
+    old = {number: signal.signal(number, note) for number in (signal.SIGINT, *end_signals())}
     try:
         yield received
     finally:

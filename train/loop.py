@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +14,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gamba_warp.errors import UserError
-from gamba_warp.kernels.runtime.system import end_signals
 from gamba_warp.model.checkpoint import save_model
 from gamba_warp.model.gamba import Gamba
+from gamba_warp.processes import stop_requests
 
 from .batches import Batches, TrainingData, fixed_batches
 from .checkpoint import STATE_VERSION, read_run, read_weights_of, save_checkpoint
@@ -28,27 +26,6 @@ from .log import RunLog, run_bar, say
 from .objective.losses import Moment, term_weights
 from .optim import Ema, Schedule, build_optimizer, checked_moments, novel_views
 from .step import Objective, collapse_reason, compute_gradients, health, validate
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """Collects SIGTERM, SIGHUP and SIGINT in the yielded list; a second SIGINT interrupts at once.
-
-    A SIGHUP that is ignored stays so (``end_signals``).
-    """
-    received: list[int] = []
-
-    def note(number: int, frame: object) -> None:
-        if received and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    old = {number: signal.signal(number, note) for number in (signal.SIGINT, *end_signals())}
-    try:
-        yield received
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
 
 
 class Trainer:
@@ -196,7 +173,7 @@ class Trainer:
         began, before, stop = time.monotonic(), self.elapsed, 0.0
         self.model.train()
         try:
-            with stop_signals() as received:
+            with stop_requests(insist=True) as received:
                 while True:
                     # Elapsed seconds and signal are the same on all processes.
                     clock = (before + time.monotonic() - began) / self.world.size

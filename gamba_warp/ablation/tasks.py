@@ -1,4 +1,4 @@
-"""What of a row is done, with one seed: ``state.json`` while it runs, ``row.json`` after it."""
+"""What of a row is done, with one seed, as its ``row.json`` keeps it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from ..versions import __version__
 from .jobs import FOLDERS, Settings, Stage, difference, stages
 from .plan import Row
 
+RECORD = "row.json"
 _MAX = 1 << 20  # bytes of a record; ours have a few kB
 
 
@@ -62,18 +63,6 @@ class Record(msgspec.Struct):
     gamba_warp: str = __version__
 
 
-def read_record(folder: Path) -> Record | None:
-    """The record of a row's folder; None where there is none.
-
-    Raises:
-        UserError: it is damaged.
-    """
-    for name in ("row.json", "state.json"):
-        if (folder / name).exists():
-            return read_document(folder / name, Record, _MAX)
-    return None
-
-
 @dataclass
 class Task:
     """A row with one seed.
@@ -112,8 +101,8 @@ class Task:
         Raises:
             UserError: something cannot be removed.
         """
-        old = self.record
-        self.record, self.changed = _begun(self.row, old.seed, self.stages), None
+        old, self.changed = self.record, None
+        self.record = Record(old.row, old.seed, {s.name: s.words for s in self.stages})
         for name, words in self.record.commands.items():
             if old.commands.get(name) != words or name not in old.ended:
                 break
@@ -131,14 +120,7 @@ class Task:
         """Writes the record, atomically, with another status if one is given."""
         if status is not None:
             self.record.status, self.record.reason = status, why
-        names = ["state.json", "row.json"]
-        now, other = names if self.record.status == "begun" else names[::-1]
-        write_json(self.folder / now, msgspec.to_builtins(self.record))
-        (self.folder / other).unlink(missing_ok=True)
-
-
-def _begun(row: Row, seed: int, stages: list[Stage]) -> Record:
-    return Record(row.name, seed, {stage.name: stage.words for stage in stages})
+        write_json(self.folder / RECORD, msgspec.to_builtins(self.record))
 
 
 def task_of(settings: Settings, row: Row, seed: int) -> Task:
@@ -149,7 +131,8 @@ def task_of(settings: Settings, row: Row, seed: int) -> Task:
     """
     made = stages(settings, row, seed)
     folder = settings.out / "rows" / row.name / f"seed-{seed}"
-    wanted = _begun(row, seed, made)
-    record = read_record(folder) or wanted
+    record = wanted = Record(row.name, seed, {stage.name: stage.words for stage in made})
+    if (folder / RECORD).exists():
+        record = read_document(folder / RECORD, Record, _MAX)
     other = difference(record.commands, wanted.commands)
     return Task(row, folder, made, record, other, settings.evaluation.geometry_objects)

@@ -225,7 +225,7 @@ def test_a_signal_lets_the_training_save_and_the_same_command_goes_on(gamba, wai
     said, _ = process.communicate(timeout=60)
     assert process.returncode == 128 + number
     assert "the same command goes on" in said and (run / "saved").exists()
-    record = json.loads((run.parent / "state.json").read_text())
+    record = json.loads((run.parent / "row.json").read_text())
     assert record["status"] == "begun" and record["parts"]["train"]["seconds"] > 0
     assert gamba(path) == (0, AFTER)
 

@@ -24,7 +24,7 @@ from gamba_warp.files import PART, STARTER, atomic_folder, only_process, sweep, 
 from gamba_warp.kernels.bench.core.measure import peak_bytes
 from gamba_warp.kernels.runtime import memory, system, team
 from gamba_warp.kernels.selective_scan import selective_scan
-from gamba_warp.train.loop import stop_signals
+from gamba_warp.processes import stop_requests
 from gamba_warp.untrusted import children
 from gamba_warp.untrusted.names import inside, parts_of
 from gamba_warp.vision.weights import cache_folder, store_weights
@@ -167,7 +167,7 @@ def test_limits_of_memory_are_left_out(monkeypatch):
 def test_training_stops_without_sighup(no_nohup, monkeypatch):
     assert system.end_signals() == [signal.SIGTERM, signal.SIGHUP]
     monkeypatch.delattr(signal, "SIGHUP")
-    with stop_signals() as received:
+    with stop_requests(insist=True) as received:
         signal.raise_signal(signal.SIGTERM)
     assert received == [signal.SIGTERM]
 

@@ -13,7 +13,6 @@ from gamba_warp import cli
 from gamba_warp.errors import UserError
 from gamba_warp.files import PART, only_process
 from gamba_warp.processes import stop_requests
-from gamba_warp.train import loop
 from gamba_warp.train.checkpoint import list_checkpoints
 from gamba_warp.train.log import Quiet, RunLog, say
 
@@ -118,18 +117,15 @@ def test_what_killed_processes_left_goes_when_training_starts(data, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_each_signal_saves_and_stops(no_nohup, number):
-    with loop.stop_signals() as received:
+    with stop_requests(insist=True) as received:
         os.kill(os.getpid(), number)
         assert received == [number]
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize(
-    "collect",
-    [loop.stop_signals, stop_requests],
-    ids=["train", "ablate"],
-)
-def test_nohup_holds(no_nohup, collect):
+def test_nohup_holds(no_nohup):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with collect():
+    with stop_requests():
         os.kill(os.getpid(), signal.SIGHUP)
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
