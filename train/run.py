@@ -80,15 +80,11 @@ def train(config: TrainConfig, world: World) -> int:
                 path = find_initial(run.init, notes.append)
                 load_weights(path, model)
                 differing = initial_differences(path, config, data.fingerprint)
-                started = f"starts from the weights of {path}, of a run with the same options"
-                if differing is None:
-                    started = (
-                        f"starts from the weights of {path}; of what run they are is not known"
-                    )
-                elif differing:
-                    started = started.replace(
-                        "the same options", f"other {', '.join(differing[:20])}"
-                    )
+                whose = "; of what run they are is not known"
+                if differing is not None:
+                    others = f"other {', '.join(differing[:20])}"
+                    whose = f", of a run with {others if differing else 'the same options'}"
+                started = f"starts from the weights of {path}{whose}"
             model.to(world.device)
             if lpips is not None:
                 lpips.to(world.device)

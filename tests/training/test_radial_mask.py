@@ -34,30 +34,34 @@ def mean_at(distance: float, angle: float, depth: float = 1.5) -> torch.Tensor:
     return torch.tensor([[reach * math.cos(angle), reach * math.sin(angle), depth - 1.5]])
 
 
-@pytest.mark.parametrize("width", [96, 131])
-def test_disc_contour(width):
-    contours = contour_distances(disc(0.6, width)[None])
-    assert contours.shape == (1, 256)
-    assert (contours - 0.6).abs().max() < CONTOUR
-
-
-def test_square_contour():
+def square() -> torch.Tensor:
     mask = torch.zeros(SIZE, SIZE)
     mask[24:72, 24:72] = 1  # half a picture wide: sides at 0.5
-    got = contour_distances(mask, rays=64)
-    angles = torch.arange(64) * (2 * math.pi / 64)
-    want = 0.5 / torch.maximum(angles.cos().abs(), angles.sin().abs())
-    assert (got - want).abs().max() < CONTOUR
+    return mask
+
+
+ANGLES = torch.arange(256) * (2 * math.pi / 256)
+
+
+@pytest.mark.parametrize(
+    "mask, want",
+    [
+        (disc(0.6)[None], 0.6),
+        (disc(0.6, 131)[None], 0.6),
+        (disc(0.8) - disc(0.4), 0.8),
+        (square(), 0.5 / torch.maximum(ANGLES.cos().abs(), ANGLES.sin().abs())),
+    ],
+    ids=["disc", "disc in a wide picture", "the outermost of a ring", "square"],
+)
+def test_contours(mask, want):
+    contours = contour_distances(mask)
+    assert contours.shape == (*mask.shape[:-2], 256)
+    assert (contours - want).abs().max() < CONTOUR
 
 
 def test_full_picture_ends_at_its_border():
     got = contour_distances(torch.ones(32, 48), rays=4)
     torch.testing.assert_close(got, torch.tensor([1.5, 1.0, 1.5, 1.0]), atol=1e-5, rtol=0)
-
-
-def test_outermost_contour_counts():
-    ring = disc(0.8) - disc(0.4)
-    assert (contour_distances(ring) - 0.8).abs().max() < CONTOUR
 
 
 def test_rays_that_meet_nothing_are_zero():
