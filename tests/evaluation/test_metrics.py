@@ -180,6 +180,24 @@ def test_summary_shows_the_interval():
     assert "2 [1, 3]" in summary_lines(report)[0]
 
 
+def test_equal_to_scikit_image_and_kornia():
+    """Their own settings, in float64, 11x11 windows without padding: the same numbers."""
+    from kornia.metrics import psnr as kornia_psnr
+    from kornia.metrics import ssim as kornia_ssim
+    from skimage.metrics import peak_signal_noise_ratio
+
+    a = torch.rand(37, 29, 3, dtype=torch.float64)
+    b = (a + 0.1 * torch.randn_like(a)).clamp(0, 1)
+    planes = [x.permute(2, 0, 1)[None] for x in (a, b)]
+    similar = kornia_ssim(*planes, window_size=11, padding="valid").mean().item()
+    assert ssim(a, b).item() == pytest.approx(similar, abs=1e-6)
+    for want in (
+        kornia_psnr(*planes, max_val=1.0).item(),
+        peak_signal_noise_ratio(a.numpy(), b.numpy(), data_range=1.0),
+    ):
+        assert psnr(a, b).item() == pytest.approx(want, abs=1e-6)
+
+
 # On black and on grey beside white: haze that white hides is seen.
 
 SIZE, VIEWS = 32, 3
