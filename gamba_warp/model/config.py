@@ -21,6 +21,7 @@ FinalNorm = Literal["same", "layer", "rms"]
 Orders = Literal["backward", "mirrored"]
 PositionWeights = Literal["softmax", "unit"]
 Resize = Literal["bicubic", "bilinear"]
+Back = Literal["learned", "opaque"]
 
 # Numbers of a ray's Gaussian: depth, offset, opacity, scales, colour.
 RAY_CHANNELS = (1, 3, 1, 3, 3)
@@ -29,7 +30,7 @@ RAY_STEM = 32  # channels after the first convolution of the decoder ``rays``
 _LATER = {
     "decoder",
     *(f"ray_{name}" for name in ("cells", "coarse", "layers", "features", "hidden")),
-    *(f"ray_{name}" for name in ("depth", "offset")),
+    *(f"ray_{name}" for name in ("depth", "offset", "back")),
     *("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor"),
     *("mixer", "attention_heads", "attention_mlp", "mixed_tokens"),
     *("triplane_size", "triplane_features", "image_tokens", "num_orders"),
@@ -110,6 +111,8 @@ class GambaConfig:
         ray_hidden: channels of a layer between these and the Gaussians; 0: no such layer.
         ray_depth: how far a Gaussian may lie before or behind the object's centre, object units.
         ray_offset: how far it may lie off its ray, on each axis, object units.
+        ray_back: opacity of the last layer: "learned" for each Gaussian, from almost nothing on, or
+            "opaque" as its cell is. It needs two layers.
         distance: distance of the reference camera from the object's centre, object units.
         fov: vertical field of view of the reference camera, degrees.
         background: colour that the input picture is composited on.
@@ -162,6 +165,7 @@ class GambaConfig:
     ray_hidden: Annotated[int, Meta(ge=0, le=1024)] = 0
     ray_depth: Annotated[float, Meta(ge=1e-3, le=100)] = 0.5
     ray_offset: Annotated[float, Meta(ge=1e-6, le=100)] = 0.3
+    ray_back: Back = "learned"
     distance: Annotated[float, Meta(ge=1e-2, le=1000)] = DEFAULT_DISTANCE
     fov: Annotated[float, Meta(ge=0.1, le=179)] = DEFAULT_FOV
     background: Background = "white"
@@ -199,6 +203,8 @@ class GambaConfig:
                     f"config: {whole} {getattr(self, whole)} is not a multiple of "
                     f"{part} {getattr(self, part)}"
                 )
+        if rays and self.ray_back == "opaque" and self.ray_layers < 2:
+            raise UserError("config: ray_back opaque needs two ray_layers, the front and the back")
         if self.prepend and self.encoder == "none" and not self.camera_token:
             raise UserError("config: prepend needs a camera token or an encoder")
         if self.image_tokens == "mixed" and not self.prepend:

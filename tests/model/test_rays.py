@@ -271,6 +271,17 @@ def test_the_hidden_layers_are_seen_by_the_rasterizer_from_the_start():
     assert opacities[..., 1:].max() > 1.05 / 255 and opacities[..., 1:].max() < 0.006
 
 
+def test_an_opaque_back_is_as_opaque_as_its_cell_whatever_the_head_says():
+    model, (rgba, cameras) = trained(rays(ray_back="opaque")), cut_outs(BOXES[2:])
+    rgba[..., 3] = rgba[..., 3].ceil()
+    front, middle, back = model(rgba, cameras).opacities[0].unflatten(0, (-1, 3)).unbind(-1)
+    full = back > 0.01
+    torch.testing.assert_close(back[full], torch.full_like(back[full], 2.0).sigmoid())
+    # The box has 12 x 8 pixels, and a cell 2 x 2.
+    assert full.sum() == 24 and front[full].std() > 0.01 and middle[full].std() > 1e-4
+    refused("ray_back opaque needs two ray_layers", rays, ray_back="opaque", ray_layers=1)
+
+
 def test_an_empty_picture_has_no_gaussians_and_may_stand_in_a_batch():
     model, (rgba, cameras) = Gamba(rays()), cut_outs()
     empty = torch.zeros_like(rgba[:1])

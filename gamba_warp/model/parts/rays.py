@@ -13,6 +13,10 @@ predicts, for a Gaussian of layer i on a ray of direction d = (x, y, 1) in the c
 
 where each · is a number of the head, near 0 at the start, and alpha is the cell's mean alpha. The
 terms with the index i are learned for each layer.
+
+With ``ray_back`` "opaque" the last layer is a surface, too: it starts opaque, and the · of its
+opacity is 0. Else the squared error of a back whose place is not known yet is least for a fog of
+faint Gaussians, and training ends in one.
 """
 
 from __future__ import annotations
@@ -28,7 +32,8 @@ from .patches import Patches
 
 FRONT_OPACITY = 3.0  # logit; neighbours overlap, so together they are opaque
 HIDDEN_OPACITY = -5.4  # logit; just over the 1/255 under which a Gaussian has no gradient
-FRONT_SIZE, HIDDEN_SIZE = 0.25, 0.6  # standard deviations, in sides of a cell
+BACK_OPACITY = 2.0  # logit of an opaque back
+FRONT_SIZE, HIDDEN_SIZE, BACK_SIZE = 0.25, 0.6, 0.4  # standard deviations, in sides of a cell
 LAST_DEPTH = 0.7  # where the last hidden layer starts, in ``ray_depth`` behind the middle
 COLOR_MARGIN = 0.01  # keeps the logit of a cell's colour finite
 EMPTY = 10.0  # how much lower the opacity's logit is in an empty cell than in a full one
@@ -66,9 +71,12 @@ class RayDecoder(nn.Module):
         hidden = layers - 1
         depths = [0.0] + [LAST_DEPTH * (i + 1) / hidden for i in range(hidden)]
         sizes = [FRONT_SIZE] + [HIDDEN_SIZE] * hidden
+        opacities = [FRONT_OPACITY] + [HIDDEN_OPACITY] * hidden
+        if config.ray_back == "opaque":
+            sizes[-1], opacities[-1] = BACK_SIZE, BACK_OPACITY
         self.depth_bias = nn.Parameter(torch.tensor(depths).atanh())
         self.scale_bias = nn.Parameter(torch.tensor(sizes).log())
-        self.opacity_bias = nn.Parameter(torch.tensor([FRONT_OPACITY] + [HIDDEN_OPACITY] * hidden))
+        self.opacity_bias = nn.Parameter(torch.tensor(opacities))
 
     def _parts(self) -> list[int]:
         """How many numbers depth, offset, opacity, scales, colour and rotation take."""
@@ -126,7 +134,10 @@ class RayDecoder(nn.Module):
         """The formulas above: ``out [B, F, cells², layers, ·]`` to Gaussians of that shape."""
         depth, offset, opacity, scale, color, *rotation = out.split(self._parts(), -1)
         alpha, base = self._cells(patches, rgba)
-        logits = self.opacity_bias + EMPTY * (alpha[..., 0] - 1) + opacity[..., 0]
+        own = opacity[..., 0]
+        if self.config.ray_back == "opaque":
+            own = F.pad(own[..., :-1], (0, 1))
+        logits = self.opacity_bias + EMPTY * (alpha[..., 0] - 1) + own
         opacities = torch.where(patches.valid[:, :, None, None], logits.sigmoid(), 0.0)
         rays, footprint = self._rays(patches, cameras)
         distance = _each(cameras.viewmats[:, :3, 3].norm(dim=-1))

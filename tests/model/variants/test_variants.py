@@ -22,7 +22,7 @@ STORED = {
     "released": "d2aa8d5e9898f27a",
 }
 NEW = ("mixer", "attention_heads", "attention_mlp", "mixed_tokens")
-NEW += ("triplane_size", "triplane_features", "image_tokens", "num_orders")
+NEW += ("triplane_size", "triplane_features", "image_tokens", "num_orders", "ray_back")
 NEW += ("final_norm", "scan_orders", "encoder_resize", "position_weights", "scale_factor")
 VARIANTS = [
     {"mixer": "attention", "attention_heads": 2},
@@ -38,6 +38,7 @@ VARIANTS = [
     {"decoder": "triplane", "triplane_size": 5, "mixed_tokens": True, "image_size": 8},
     {"num_orders": 1, "mixed_tokens": True, "image_size": 8},
     {"num_orders": 3, "decoder": "rays", "ray_cells": 2},
+    {"decoder": "rays", "ray_cells": 2, "ray_layers": 2, "ray_back": "opaque"},
 ]
 
 
