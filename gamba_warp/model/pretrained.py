@@ -19,7 +19,6 @@ from torch import Tensor
 
 from ..errors import UserError, first_line
 from ..files import atomic_path, output_folder, write_text
-from ..untrusted.documents import read_bytes
 from ..versions import __version__, advice
 from .config import GambaConfig
 from .encoders import Weights, outline_encoder
@@ -117,6 +116,8 @@ class Pretrained:
             )
         said, model = path / CONFIG_NAME, path / FILE_NAME  # the model's own file decides
         if said.is_file() and model.is_file():
+            from ..untrusted.documents import read_bytes  # not where torch and warp are all
+
             text = read_bytes(said, _MAX_CONFIG)
             if GambaConfig.from_json(text, str(said)) != read_config(model)[0]:
                 raise UserError(f"{said}: is not the configuration in {model}")
