@@ -93,28 +93,42 @@ class Packed:
     """
 
     def __init__(self, cls: Any, *values: Any) -> None:
-        made = self._values = []
-        for x, (dtype, inner, empty) in zip(values, _fields(cls), strict=True):
+        self._values, self._made = values, cls.ctype()
+        if recorder() is not None:  # the tensors may have no memory
+            return
+        of = [(x.dtype, x.shape, x.stride()) if isinstance(x, Tensor) else x for x in values]
+        key = (cls, *of)
+        known = _structs.get(key)
+        if known is None:
+            if len(_structs) >= _MOST_DESCRIPTORS:
+                _structs.clear()
+            known = _structs[key] = _filled_with(cls, values)
+        # A struct of the same shapes and numbers is copied, and only its addresses are others.
+        self._made = type(known).from_buffer_copy(known)
+        for name, x in zip(cls.vars, values):
             if isinstance(x, Tensor):
-                if x.dim() != inner + 1:
-                    x = x.view(-1, *x.shape[x.dim() - inner :]) if inner else x.view(-1)
-                x = view(x, dtype)
-            made.append(empty if x is None else x)
-        self._made = cls.ctype(*made)
+                getattr(self._made, name).data = x.data_ptr()
 
     def __ctype__(self) -> Any:
         return self._made
 
 
-@functools.cache
-def _fields(cls: Any) -> list[tuple[Any, int, Any]]:
-    """Of each field its dtype, the dimensions after the first, and what it is without an array."""
-    empty, fields = cls.ctype(), []
-    for name, var in cls.vars.items():
-        dtype = getattr(var.type, "dtype", None)
-        inner = getattr(var.type, "ndim", 1) - 1 + len(getattr(dtype, "_shape_", ()))
-        fields.append((dtype, inner, getattr(empty, name)))
-    return fields
+_structs: dict[tuple, Any] = {}  # one for each struct, and its arrays' dtypes, shapes and strides
+
+
+def _filled_with(cls: Any, values: tuple) -> Any:
+    """What a launch takes for a struct of these values."""
+    made = cls.ctype()
+    for x, (name, var) in zip(values, cls.vars.items(), strict=True):
+        if isinstance(x, Tensor):
+            dtype = var.type.dtype
+            inner = var.type.ndim - 1 + len(getattr(dtype, "_shape_", ()))
+            if x.dim() != inner + 1:
+                x = x.view(-1, *x.shape[x.dim() - inner :]) if inner else x.view(-1)
+            x = view(x, dtype)
+        if x is not None:
+            setattr(made, name, x)
+    return made
 
 
 @functools.lru_cache(1024)
