@@ -34,7 +34,8 @@ def demo(starter, out, *options):
 
 
 @pytest.mark.slow
-def test_demo(starter, tmp_path):
+def test_demo(starter, tmp_path, monkeypatch):
+    monkeypatch.setenv("GAMBA_CACHE", str(tmp_path / "cache"))  # as long with LPIPS at home
     out = tmp_path / "demo"
     assert demo(starter, out, "--minutes", "0.05") == 0
     page = (out / "index.html").read_text()
