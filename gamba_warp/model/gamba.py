@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from ..cameras import Cameras
@@ -17,7 +18,7 @@ from .parts.attention import AttentionBlock
 from .parts.block import GambaBlock, make_norm, prefix_states, run_blocks
 from .parts.decoder import GaussianDecoder
 from .parts.patches import Patches, foreground_patches
-from .parts.rays import RayDecoder, joined
+from .parts.rays import RayDecoder
 from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
 from .pretrained import Pretrained
@@ -115,12 +116,14 @@ class Gamba(Pretrained, nn.Module):
                 the object's own patches. This is faster, but the model was not trained for it:
                 ``make study WHAT=model`` states the error. None drops nothing. On CUDA it reads one
                 number back. The decoder ``rays`` is trained on the object's own patches and always
-                keeps only these, each picture its own; None is 0 there.
+                keeps only these, each picture its own; None is 0 there. A margin lets its network
+                see more, and its Gaussians stay as many.
 
         Returns:
             ``[B, N]`` Gaussians, float32, in the world of ``cameras``; N is ``num_gaussians``, or
             the number of kept tokens, in their order. With ``rays`` N is that of the picture with
-            the most patches in the batch; the others are filled up with Gaussians of opacity 0.
+            the most cells that see the object; the others are filled up with Gaussians of opacity
+            0.
 
         Raises:
             ValueError: a shape that does not fit, or a negative margin.
@@ -146,32 +149,27 @@ class Gamba(Pretrained, nn.Module):
     ) -> Gaussians:
         """What ``forward`` does for the decoder ``rays``."""
         patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
+        pixels = self.tokens.pixels(rgba, cameras)
         groups = patches.groups() if rgba.device.type == "cpu" else []
         if len(groups) < 2:
-            return self._of_patches(rgba, cameras, condition, patches)
-        parts = [
-            self._of_patches(
-                rgba[group],
-                cameras[group],
-                [state and state._make(value[group] for value in state) for state in condition],
-                patches.of(group),
-            )
-            for group in groups
-        ]
-        order = [picture for group in groups for picture in group]
-        back = sorted(range(len(order)), key=order.__getitem__)
-        return joined(parts).map(lambda value: value[back])
+            tokens = self._of_patches(pixels, condition, patches)[patches.valid]
+        else:
+            found: dict[int, Tensor] = {}
+            for group in groups:
+                part = patches.of(group)
+                states = [s and s._make(value[group] for value in s) for s in condition]
+                made = self._of_patches(pixels[group], states, part)
+                found |= {i: own[valid] for i, own, valid in zip(group, made, part.valid)}
+            tokens = torch.cat([found[i] for i in range(len(rgba))])
+        return self.decoder(tokens, pixels, patches, rgba, cameras)
 
-    def _of_patches(
-        self, rgba: Tensor, cameras: Cameras, condition: list[Any], patches: Patches
-    ) -> Gaussians:
-        pixels = self.tokens.pixels(rgba, cameras)
+    def _of_patches(self, pixels: Tensor, condition: list[Any], patches: Patches) -> Tensor:
+        """The last tokens of the patches: ``[B, F, O, width]``."""
         tokens, places = self.tokens.of_patches(pixels, patches)
-        own = self.config.num_orders * patches.valid.sum(1) if len(rgba) > 1 else None
+        own = self.config.num_orders * patches.valid.sum(1) if len(pixels) > 1 else None
         tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute, own))
         at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
-        tokens = tokens.gather(1, at).unflatten(1, places.shape[1:])
-        return self.decoder(tokens, pixels, patches, rgba, cameras)
+        return tokens.gather(1, at).unflatten(1, places.shape[1:])
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size

@@ -45,12 +45,12 @@ def inputs(batch: int, size: int = 12) -> tuple[torch.Tensor, Cameras]:
     return torch.rand(batch, size, size, 3), cameras
 
 
-def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, patches) -> Gaussians:
-    """A batch on rays gives each picture's Gaussians, whose patches are known; returns them all."""
+def assert_each_alone(model: Gamba, rgba: torch.Tensor, cameras: Cameras, cells) -> Gaussians:
+    """A batch on rays gives each picture's Gaussians, whose cells are known; returns them all."""
     together = model(rgba, cameras)
-    for index, count in enumerate(patches):
+    for index, count in enumerate(cells):
         alone = model(rgba[index : index + 1], cameras[[index]])
-        assert alone.num == count * 4 * 3
+        assert alone.num == count * 3
         for name in FIELDS:
             got = getattr(together, name)[index, : alone.num]
             # The same sums in products of other shapes: a few roundings.

@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers.model import inputs, micro
 from helpers.refusals import refused
+from torch.nn.functional import max_pool2d
 
 from gamba_warp.cameras import Cameras, intrinsics, orbit
 from gamba_warp.eval.views.baselines import billboard
@@ -15,7 +16,7 @@ from gamba_warp.image_metrics import mask_iou, psnr, ssim
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
 from gamba_warp.model.parts import patches as patch_grid
-from gamba_warp.model.parts.patches import foreground_patches
+from gamba_warp.model.parts.patches import foreground_patches, seen_cells
 from gamba_warp.model.parts.rays import RayDecoder
 from gamba_warp.model.predict import model_input, reconstruct
 from gamba_warp.render import render
@@ -58,10 +59,10 @@ def one(cameras: Cameras, index: int) -> Cameras:
 def test_a_batch_of_different_sizes_is_each_picture_alone():
     model, (rgba, cameras) = trained(rays()), cut_outs()
     together = model(rgba, cameras)
-    assert together.num == 6 * 4 * 3  # the largest has 6 of the 9 patches
+    assert together.num == 24 * 3  # the largest has 24 of the 36 cells
     for index in range(len(rgba)):
         alone = model(rgba[index : index + 1], one(cameras, index))
-        assert alone.num == (4, 1, 6)[index] * 4 * 3
+        assert alone.num == (9, 1, 24)[index] * 3
         for name in FIELDS:
             got, want = getattr(together, name)[index], getattr(alone, name)[0]
             # The same sums in products of other shapes: a few roundings.
@@ -74,7 +75,7 @@ def test_what_fills_up_a_batch_gets_and_gives_no_gradient():
     grads = []
     for pictures, views in ((rgba[:1], one(cameras, 0)), (rgba, cameras)):
         made = model(pictures, views)
-        loss = sum((value[0, : 4 * 4 * 3] ** 2).sum() for value in (made.means, made.colors))
+        loss = sum((value[0, : 9 * 3] ** 2).sum() for value in (made.means, made.colors))
         grads.append(torch.autograd.grad(loss, list(model.parameters()), allow_unused=True))
     for (name, _), alone, padded in zip(model.named_parameters(), *grads):
         if alone is not None:
@@ -137,8 +138,10 @@ def test_the_stem_sees_the_own_rows_and_columns_as_the_whole(cells):
         picture[..., 3] = alpha
     patches = foreground_patches(rgba[..., 3], 4)
     pixels = torch.rand(3, model.config.pixel_channels, 40, 40)
-    got = patches.cells(decoder._stem(pixels, patches), cells)[patches.valid]
-    want = patches.cells(decoder.stem(pixels), cells)[patches.valid]
+    seen = seen_cells(rgba, 4 // cells)
+    got = decoder._stem(pixels, patches, seen)
+    want = decoder.stem(pixels).permute(0, 2, 3, 1)[seen.picture, seen.row, seen.column]
+    assert seen.counts[1] == 0 and sum(seen.counts) == len(got)
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
     grads = [
         torch.autograd.grad(made.square().sum(), list(decoder.stem.parameters()))
@@ -187,9 +190,7 @@ def test_gaussians_follow_the_formulas(rotation):
         decoder.head.weight.zero_()
         decoder.head.bias.copy_(torch.tensor(numbers).repeat(3))
     made = model(rgba, cameras)
-    # Picture 0, patch (row 1, column 0), the first of its four; cell (row 1, column 1); layer 2.
-    patch = foreground_patches(rgba[..., 3], 4).index[0].tolist().index(3)
-    place = (patch * 4 + 3) * 3 + 2
+    place = (3 * 1 + 1) * 3 + 2  # picture 0: the middle one of 3 x 3 cells, the last layer
     square = rgba[0, 6:8, 2:4].double().numpy()
     alpha = square[..., 3].mean()
     color = (square[..., :3] * square[..., 3:]).mean((0, 1)) / alpha
@@ -226,10 +227,9 @@ def test_wild_sizes_and_almost_empty_cells_have_limits():
     footprint = 2 * cameras.viewmats[0, :3, 3].norm() / cameras.Ks[0, 1, 1]
     want = footprint * torch.tensor([3.0, -4.0]).exp()
     torch.testing.assert_close(made.scales[0, :, :2], want.expand(made.num, 2))
-    # Under an alpha of 0.001 a colour fades to black: what has none is no quotient of nothing.
-    faint = made.colors[0].view(4, 3, 3)
-    torch.testing.assert_close(faint[1], torch.full((3, 3), 0.3), rtol=1e-4, atol=0)
-    torch.testing.assert_close(faint[2], torch.full((3, 3), 0.01), rtol=1e-4, atol=0)
+    # Under an alpha of 0.001 a colour fades to black.
+    faint = made.colors[0].view(2, 3, 3)[1]
+    torch.testing.assert_close(faint, torch.full((3, 3), 0.3), rtol=1e-4, atol=0)
 
 
 def disc(size: int = 48) -> tuple[torch.Tensor, Cameras]:
@@ -313,8 +313,8 @@ def test_other_shapes_and_recompute(changes):
     config, grads = model.config, []
     for model.recompute in (False, True):
         made = model(rgba, cameras)
-        patches = foreground_patches(rgba[..., 3], config.patch_size).index.shape[1]
-        assert made.num == patches * config.ray_cells**2 * config.ray_layers
+        cells = max_pool2d(rgba[..., 3], config.patch_size // config.ray_cells) > 0
+        assert made.num == cells.sum((1, 2)).max() * config.ray_layers
         made.means.square().sum().backward()
         grads.append(model.decoder.up.weight.grad.clone())
         model.zero_grad()
@@ -322,10 +322,10 @@ def test_other_shapes_and_recompute(changes):
     assert sum(p.numel() for p in model.parameters() if p.requires_grad) <= config.num_parameters
 
 
-def test_the_margin_keeps_more_patches():
-    model, (rgba, cameras) = Gamba(rays()), cut_outs([BOXES[1]])
-    assert model(rgba, cameras).num == 12
-    assert model(rgba, cameras, background_margin=1).num == 6 * 12
+def test_the_margin_lets_the_network_see_more_patches():
+    model, (rgba, cameras) = trained(rays()), cut_outs([BOXES[1]])
+    near, wide = model(rgba, cameras), model(rgba, cameras, background_margin=1)
+    assert near.num == wide.num == 3 and (near.means - wide.means).abs().max() > 1e-3
     with pytest.raises(ValueError, match="background_margin is -1"):
         model(rgba, cameras, background_margin=-1)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 # What one more pass through the network costs on a CPU, in patches of a batch.
-PASS_COST = 16
+PASS_COST = 60
 
 
 @dataclass
@@ -45,14 +45,19 @@ class Patches:
         index = self.index[..., None].expand(-1, -1, maps.shape[-1])
         return maps.gather(1, index).unflatten(-1, (count**2, channels))
 
-    def cell_centres(self, count: int) -> Tensor:
-        """Where the cells' centres are in the picture: x, y in pixels, ``[B, F, count², 2]``."""
-        side = self.size / count
-        places = (torch.arange(count, device=self.index.device) + 0.5) * side
-        y, x = torch.meshgrid(places, places, indexing="ij")
-        row, column = self.index // self.grid, self.index % self.grid
-        corners = torch.stack([column, row], -1) * self.size
-        return corners[:, :, None] + torch.stack([x, y], -1).reshape(1, 1, -1, 2)
+    def number(self, cells: Cells, count: int) -> Tensor:
+        """Where cells are among those of all valid patches, picture by picture: ``[T]`` int64.
+
+        Args:
+            cells: cells in these patches.
+            count: cells a side of a patch; within a patch they are counted row by row.
+        """
+        order = self.valid.flatten().cumsum(0) - 1
+        found = torch.zeros(len(self.index), self.grid**2, dtype=torch.int64, device=order.device)
+        found = found.scatter(1, self.index, order.view_as(self.index))
+        patch = cells.row // count * self.grid + cells.column // count
+        inside = cells.row % count * count + cells.column % count
+        return found[cells.picture, patch] * count**2 + inside
 
     def groups(self) -> list[list[int]]:
         """Pictures of like sizes, which a CPU computes together with least filling.
@@ -119,6 +124,49 @@ class Patches:
         found = places.gather(1, tokens[:, self.index].permute(1, 2, 0).flatten(1))
         found = found.unflatten(1, (-1, orders))
         return kept, torch.where(self.valid[..., None], found, 0)
+
+
+@dataclass
+class Cells:
+    """The cells of B pictures that see something of the object, T in all.
+
+    They stand picture by picture, and row by row in a picture.
+
+    Attributes:
+        picture: ``[T]`` int64, the number of the picture.
+        row: ``[T]`` int64, from the top.
+        column: ``[T]`` int64, from the left.
+        alpha: ``[T, 1]``, the cell's mean.
+        color: ``[T, 3]``, the mean of the colours, weighted by alpha.
+        counts: how many each picture has.
+    """
+
+    picture: Tensor
+    row: Tensor
+    column: Tensor
+    alpha: Tensor
+    color: Tensor
+    counts: list[int]
+
+    def split(self, values: Tensor) -> tuple[Tensor, ...]:
+        """Cuts ``[T, ..]`` into the parts of the pictures."""
+        return values.split(self.counts)
+
+
+def seen_cells(rgba: Tensor, side: int) -> Cells:
+    """The cells in which a picture is not fully transparent.
+
+    Args:
+        rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha, H = W.
+        side: of a cell, pixels. On CUDA the numbers of cells are read back.
+    """
+    flat = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1).permute(0, 3, 1, 2)
+    means = (F.avg_pool2d(flat, side) if side > 1 else flat).permute(0, 2, 3, 1)
+    seen = means[..., 3] > 0
+    own = means[seen]
+    color = own[:, :3] / own[:, 3:].clamp_min(1e-3)
+    picture, row, column = seen.nonzero().unbind(1)
+    return Cells(picture, row, column, own[:, 3:], color, seen.sum((1, 2)).tolist())
 
 
 def foreground_patches(alpha: Tensor, size: int, margin: int = 0) -> Patches:

@@ -24,11 +24,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils.rnn import pad_sequence
 
 from ...cameras import Cameras, exact_product
 from ...gaussians import Gaussians
 from ..config import RAY_CHANNELS, RAY_STEM, GambaConfig
-from .patches import Patches
+from .patches import Cells, Patches, seen_cells
 
 FRONT_OPACITY = 3.0  # logit; neighbours overlap, so together they are opaque
 HIDDEN_OPACITY = -5.4  # logit; just over the 1/255 under which a Gaussian has no gradient
@@ -85,111 +86,96 @@ class RayDecoder(nn.Module):
     def forward(
         self, tokens: Tensor, pixels: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
     ) -> Gaussians:
-        """Decodes the patches of each picture to F · ray_cells² · ray_layers Gaussians.
+        """Decodes the cells that see something of the object, ``ray_layers`` Gaussians each.
 
         Args:
-            tokens: ``[B, F, O, width]``, the token of each patch in each of the O orders.
+            tokens: ``[P, O, width]``, the token of each patch in each of the O orders, of all valid
+                patches: those of the first picture, then those of the second, and so on.
             pixels: ``[B, pixel_channels, H, W]``, what the network sees of the pictures.
-            patches: F patches of each picture; one that is only a filling gets opacity 0.
+            patches: which patches these are.
             rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha.
             cameras: ``[B]`` of the pictures.
 
         Returns:
-            ``[B, F · ray_cells² · ray_layers]``, float32, in the world of ``cameras``.
+            ``[B, N]``, float32, in the world of ``cameras``: the cells row by row, the layers of a
+            cell side by side. N is that of the picture with the most cells; the others are filled
+            up with Gaussians of opacity 0.
         """
-        cells = self.config.ray_cells
-        hidden = self.up(tokens.flatten(2)).unflatten(2, (self.between.shape[1], -1))
-        if self.config.ray_coarse:
-            hidden = self.between.to(hidden.dtype) @ hidden
-        hidden = hidden + patches.cells(self._stem(pixels, patches), cells)
-        if self.mix is not None:
-            hidden = self.mix(F.silu(hidden))
         # bfloat16 would move a centre by up to 0.002, more than a pixel's width at 512².
         with torch.autocast(tokens.device.type, enabled=False):
+            cells = seen_cells(rgba.float(), self.config.patch_size // self.config.ray_cells)
+        hidden = self.up(tokens.flatten(1)).unflatten(1, (self.between.shape[1], -1))
+        if self.config.ray_coarse:
+            hidden = self.between.to(hidden.dtype) @ hidden
+        hidden = hidden.flatten(0, 1).index_select(0, patches.number(cells, self.config.ray_cells))
+        hidden = hidden + self._stem(pixels, patches, cells)
+        if self.mix is not None:
+            hidden = self.mix(F.silu(hidden))
+        with torch.autocast(tokens.device.type, enabled=False):
             out = self.head(F.silu(hidden.float())).unflatten(-1, (self.config.ray_layers, -1))
-            made = self._activated(out, patches, rgba.float(), cameras)
-        return made.map(lambda value: value.flatten(1, 3))
+            return _padded(self._activated(out, cells, cameras), cells.counts)
 
-    def _stem(self, pixels: Tensor, patches: Patches) -> Tensor:
-        """What ``stem`` makes of ``pixels``, as far as the patches use it: ``[B, C, n, n]``.
+    def _stem(self, pixels: Tensor, patches: Patches, cells: Cells) -> Tensor:
+        """What ``stem`` makes of ``pixels`` in the cells: ``[T, C]``.
 
         A CPU computes each picture's own rows and columns; a GPU would wait for their numbers.
         """
         if pixels.device.type != "cpu":
-            return self.stem(pixels)
-        cells, maps = self.config.ray_cells, []
-        side, step = patches.grid * cells, self.config.patch_size // cells
-        for picture, box in zip(pixels.split(1), patches.boxes()):
+            return self.stem(pixels).permute(0, 2, 3, 1)[cells.picture, cells.row, cells.column]
+        count, found = self.config.ray_cells, []
+        step, side = self.config.patch_size // count, patches.grid * count
+        parts = zip(pixels.split(1), patches.boxes(), *map(cells.split, (cells.row, cells.column)))
+        for picture, box, row, column in parts:
             (top, bottom), (left, right) = (
-                (max(0, first * cells - STEM_REACH), min(side, last * cells + STEM_REACH))
+                (max(0, first * count - STEM_REACH), min(side, last * count + STEM_REACH))
                 for first, last in box
             )
             cut = picture[..., top * step : bottom * step, left * step : right * step]
-            maps.append(F.pad(self.stem(cut), (left, side - right, top, side - bottom)))
-        return torch.cat(maps)
+            rows = self.stem(cut)[0].flatten(1).T
+            found.append(rows.index_select(0, (row - top) * (right - left) + column - left))
+        return torch.cat(found)
 
-    def _activated(
-        self, out: Tensor, patches: Patches, rgba: Tensor, cameras: Cameras
-    ) -> Gaussians:
-        """The formulas above: ``out [B, F, cells², layers, ·]`` to Gaussians of that shape."""
+    def _activated(self, out: Tensor, cells: Cells, cameras: Cameras) -> Gaussians:
+        """The formulas above: ``out [T, layers, ·]`` of the cells to Gaussians ``[T, layers]``."""
         depth, offset, opacity, scale, color, *rotation = out.split(self._parts(), -1)
-        alpha, base = self._cells(patches, rgba)
         own = opacity[..., 0]
         if self.config.ray_back == "opaque":
             own = F.pad(own[..., :-1], (0, 1))
-        logits = self.opacity_bias + EMPTY * (alpha[..., 0] - 1) + own
-        opacities = torch.where(patches.valid[:, :, None, None], logits.sigmoid(), 0.0)
-        rays, footprint = self._rays(patches, cameras)
-        distance = _each(cameras.viewmats[:, :3, 3].norm(dim=-1))
+        base = torch.logit(cells.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
+        Ks, viewmats = cameras.Ks[cells.picture], cameras.viewmats[cells.picture]
+        side = self.config.patch_size // self.config.ray_cells
+        x = (side * (cells.column + 0.5) - Ks[:, 0, 2]) / Ks[:, 0, 0]
+        y = (side * (cells.row + 0.5) - Ks[:, 1, 2]) / Ks[:, 1, 1]
+        turn, shift = viewmats[:, :3, :3], viewmats[:, None, :3, 3]
+        distance = shift.norm(dim=-1, keepdim=True)
+        footprint = side * distance / Ks[:, 1, 1, None, None]
         z = distance + self.config.ray_depth * torch.tanh(self.depth_bias[:, None] + depth)
-        points = rays * z + self.config.ray_offset * torch.tanh(offset)
-        turn, shift = cameras.viewmats[:, :3, :3], cameras.viewmats[:, :3, 3]
+        points = torch.stack([x, y, torch.ones_like(x)], -1)[:, None] * z
+        points = points + self.config.ray_offset * torch.tanh(offset)
         quats = None
         if rotation:
             quats = rotation[0] + rotation[0].new_tensor([1.0, 0.0, 0.0, 0.0])
         return Gaussians(
-            means=exact_product(points - shift[:, None, None, None], turn[:, None, None]),
+            means=exact_product(points - shift, turn),
             quats=quats,
             scales=footprint * torch.exp((self.scale_bias[:, None] + scale).clamp(*SIZE_LIMITS)),
-            opacities=opacities,
-            colors=torch.sigmoid(base + 2 * color),
+            opacities=torch.sigmoid(self.opacity_bias + EMPTY * (cells.alpha - 1) + own),
+            colors=torch.sigmoid(base[:, None] + 2 * color),
         )
 
-    def _cells(self, patches: Patches, rgba: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean alpha ``[B, F, cells², 1, 1]`` and the logit of the mean colour ``[.., 1, 3]``."""
-        cells = self.config.ray_cells
-        flat = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1).permute(0, 3, 1, 2)
-        means = patches.cells(F.avg_pool2d(flat, self.config.patch_size // cells), cells)
-        alpha = means[..., None, 3:]
-        color = means[..., None, :3] / alpha.clamp_min(1e-3)
-        return alpha, torch.logit(color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
 
-    def _rays(self, patches: Patches, cameras: Cameras) -> tuple[Tensor, Tensor]:
-        """Rays ``[B, F, cells², 1, 3]`` of depth 1, camera frame; side of a cell at the centre."""
-        x, y = patches.cell_centres(self.config.ray_cells)[..., None, :].split(1, -1)
-        K = cameras.Ks
-        x = (x - _each(K[:, 0, 2])) / _each(K[:, 0, 0])
-        y = (y - _each(K[:, 1, 2])) / _each(K[:, 1, 1])
-        side = self.config.patch_size // self.config.ray_cells
-        distance = cameras.viewmats[:, :3, 3].norm(dim=-1)
-        return torch.cat([x, y, torch.ones_like(x)], -1), _each(side * distance / K[:, 1, 1])
+def _padded(made: Gaussians, counts: list[int]) -> Gaussians:
+    """Gaussians ``[T, layers]`` of all cells, as many of each picture, as ``[B, N]``."""
 
+    def filled(values: Tensor, filling: float = 0.0) -> Tensor:
+        return pad_sequence(list(values.split(counts)), True, filling).flatten(1, 2)
 
-def joined(parts: list[Gaussians]) -> Gaussians:
-    """Batches ``[B_i, N_i]`` as one, filled up with Gaussians of opacity 0 to the largest N."""
-    most = max(part.num for part in parts)
-
-    def filled(values: list[Tensor], filling: float) -> Tensor:
-        sides = ((0, 0) * (v.ndim - 2) + (0, most - v.shape[1]) for v in values)
-        return torch.cat([F.pad(v, side, value=filling) for v, side in zip(values, sides)])
-
-    quats = [part.quats for part in parts if part.quats is not None]
     return Gaussians(
-        means=filled([part.means for part in parts], 0.0),
-        quats=filled(quats, 1.0) if quats else None,
-        scales=filled([part.scales for part in parts], 1.0),
-        opacities=filled([part.opacities for part in parts], 0.0),
-        colors=filled([part.colors for part in parts], 0.0),
+        means=filled(made.means),
+        quats=None if made.quats is None else filled(made.quats, 1.0),
+        scales=filled(made.scales, 1.0),
+        opacities=filled(made.opacities),
+        colors=filled(made.colors),
     )
 
 
@@ -198,8 +184,3 @@ def _interpolation(coarse: int, fine: int) -> Tensor:
     each = torch.eye(coarse**2).view(1, coarse**2, coarse, coarse)
     finer = F.interpolate(each, (fine, fine), mode="bilinear", align_corners=False)
     return finer.view(coarse**2, fine**2).T.contiguous()
-
-
-def _each(values: Tensor) -> Tensor:
-    """One number a picture, ``[B]``, beside ``[B, F, cells², layers, ·]``."""
-    return values.view(-1, 1, 1, 1, 1)

@@ -129,7 +129,7 @@ def test_what_fills_up_a_batch_is_not_seen():
 
 
 def cut_outs() -> tuple[torch.Tensor, Cameras]:
-    """Noise in boxes of 4, 1, 6 and no patches of transparent pictures."""
+    """Noise in boxes of 9, 1, 24 and no cells of transparent pictures."""
     images, cameras = inputs(4)
     rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
     rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
@@ -143,7 +143,7 @@ def test_a_batch_on_rays_is_each_picture_alone(gradients):
     torch.nn.init.normal_(model.decoder.head.weight, std=0.5)
     rgba, cameras = cut_outs()
     with torch.set_grad_enabled(gradients):
-        together = assert_each_alone(model, rgba, cameras, (4, 1, 6, 0))
+        together = assert_each_alone(model, rgba, cameras, (9, 1, 24, 0))
         if gradients:
             sum(getattr(together, name).sum() for name in FIELDS).backward()
             assert all(p.grad.isfinite().all() for p in model.parameters())

@@ -89,7 +89,7 @@ def test_a_batch_on_rays_is_each_picture_alone():
     images, cameras = inputs(4)
     rgba = torch.cat([images, torch.zeros_like(images[..., :1])], -1)
     rgba[0, 5:9, 1:5, 3] = rgba[1, 7, 10, 3] = rgba[2, :, 4:, 3] = 0.8
-    assert_each_alone(model, rgba, cameras, (4, 1, 6, 0))
+    assert_each_alone(model, rgba, cameras, (9, 1, 24, 0))
 
 
 def test_condition_recomputation_and_autocast():
