@@ -25,6 +25,10 @@ DeviceChoice = Literal["auto", "cpu", "cuda"]
 # it faster, else float32.
 Precision = Literal["float32", "bfloat16", "auto"]
 
+# Of the option --detail: into how many Gaussians a side each of the front may split.
+Detail = Literal[1, 2, 4]
+DETAILS: tuple[Detail, ...] = (1, 2, 4)
+
 
 def over_background(rgba, background):
     """Composites straight-alpha RGBA, an array or a tensor, over a colour.

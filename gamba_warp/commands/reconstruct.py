@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from ..batch import STAGES, check_not_read, for_each, plan_outputs, report, say
-from ..conventions import DeviceChoice, Precision
+from ..conventions import Detail, DeviceChoice, Precision
 from ..devices import pick_device
 from ..errors import UserError
 from ..files import STARTER, output_folder
@@ -45,6 +45,7 @@ def reconstruct_command(
     matte_model: Annotated[str | None, tyro.conf.arg(metavar="FILE|URL")] = None,
     sam: Path | None = None,
     recenter: bool = True,
+    detail: Detail | None = None,
     save_inputs: bool = False,
     device: DeviceChoice = "auto",
     precision: Precision = "float32",
@@ -64,12 +65,15 @@ def reconstruct_command(
         sam: Segment Anything's sam_vit_b_01ec64.pth (github.com/facebookresearch/segment-anything).
         recenter: Bring the object into the middle of the picture, at the size of training; else it
             stays where and as large as it is in a square picture.
+        detail: Into how many Gaussians a side each of the front may split, so that it is as sharp
+            as the picture; if not given, the most for which the cut-out has the pixels.
         save_inputs: Also write each cut-out as NAME-input.png, to be mended and given again.
         device: Device that computes; auto is the GPU if there is one.
         precision: That of the network's products; auto is bfloat16 where that is faster.
         times: Print what each stage took.
     """
     from ..model.checkpoint import DEFAULT_CHECKPOINT, FILE_NAME, load_model
+    from ..model.detail import checked_detail
     from ..model.predict import reconstruct
     from ..pages.card import about_model
     from ..pages.export import Outputs, write_outputs
@@ -100,6 +104,7 @@ def reconstruct_command(
         output_folder(sheet.parent)
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
+    checked_detail(detail, model.config, 0)
     ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
     output_folder(files.out)
 
@@ -109,7 +114,9 @@ def reconstruct_command(
         say(f"{path}: {cut.how}")
         STAGES.begin("network")
         started = time.perf_counter()
-        gaussians = reconstruct(model, cut.rgba, precision).to("cpu")  # waits for the device
+        gaussians = reconstruct(model, cut.rgba, precision, detail).to(
+            "cpu"
+        )  # waits for the device
         seconds = time.perf_counter() - started
         write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
 

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..conventions import Precision
+from ..conventions import Detail, Precision
 from ..data.preprocess import composite, resize_rgba
 from ..devices import network_products, pick_precision
 from ..gaussians import Gaussians
 from .config import GambaConfig
+from .detail import checked_detail, split_front
 from .posing import reference_cameras
 
 if TYPE_CHECKING:
@@ -22,7 +23,10 @@ if TYPE_CHECKING:
 
 @torch.inference_mode()
 def reconstruct(
-    model: Gamba, picture: str | Path | np.ndarray, precision: Precision = "float32"
+    model: Gamba,
+    picture: str | Path | np.ndarray,
+    precision: Precision = "float32",
+    detail: Detail | None = None,
 ) -> Gaussians:
     """One forward pass on one picture, seen by the reference camera.
 
@@ -32,12 +36,16 @@ def reconstruct(
             fetched; or the ``rgba`` of what that returns, ``[S, S, 4]`` in [0, 1] with the object
             in the middle.
         precision: of the network's products, see ``devices.pick_precision``.
+        detail: into how many Gaussians a side each of the front may split, see
+            ``detail.split_front``; 1 leaves what the network gave. None is the most for which the
+            picture has the pixels, and 1 for a decoder other than ``rays``.
 
     Returns:
         Gaussians ``[N]``, float32, on the model's device, in the reference camera's frame.
 
     Raises:
-        UserError: the file cannot be read, or its object cannot be told from the background.
+        UserError: the file cannot be read, or its object cannot be told from the background; the
+            model cannot split its front.
         ValueError: the array has another shape.
     """
     rgba = picture
@@ -48,11 +56,13 @@ def reconstruct(
     if rgba.ndim != 3 or rgba.shape[0] != rgba.shape[1] or rgba.shape[2] != 4:
         raise ValueError(f"picture has shape {rgba.shape}, expected [S, S, 4]")
     config = model.config
+    detail = checked_detail(detail, config, len(rgba))
     device = next(model.parameters()).device
     images = model_input(rgba, config).to(device)
     dtype = pick_precision(precision, device, config.width)
     with network_products(device, dtype):
-        return model(images, reference_cameras(config, 1).to(device))[0]
+        gaussians = model(images, reference_cameras(config, 1).to(device))[0]
+    return split_front(gaussians, images[0], rgba, config, detail)
 
 
 def model_input(rgba: np.ndarray, config: GambaConfig) -> Tensor:
