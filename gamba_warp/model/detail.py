@@ -37,7 +37,7 @@ from .parts.patches import foreground_patches
 from .parts.rays import COLOR_MARGIN, EMPTY
 from .posing import reference_cameras
 
-PLAIN = 3 / 255  # a cell whose colours and alpha differ by less than this is of one colour
+PLAIN = 6 / 255  # a cell that differs by less in itself, and from those beside it, is plain
 MOST_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
 ROUNDS = 2  # of correction
 SURER = 8.0  # how much the logit of an opacity rises where a whole unit of alpha is missing
@@ -134,8 +134,10 @@ def _children_a_side(picture: Tensor, means: Tensor, detail: int) -> Tensor:
     Where there would be more than ``MOST_CHILDREN`` children, the cells with the least contrast
     split in 2 x 2.
     """
-    contrast = (F.max_pool2d(picture, detail) + F.max_pool2d(-picture, detail)).amax(1)[0]
-    alpha = means[:, 3:]
+    # The cells beside a cell count, too: at its edge a parent would not be sharp enough for them.
+    both = F.max_pool2d(torch.cat([picture, -picture], 1), detail)
+    most, least = F.max_pool2d(both, 3, stride=1, padding=1).chunk(2, 1)
+    contrast, alpha = (most + least).amax(1)[0], means[:, 3:]
     splits = (contrast > PLAIN) & (alpha[0, 0] > 0)
     inner = -F.max_pool2d(-alpha, 3, stride=1, padding=1)[0, 0] > 0.99
     counts = torch.where(splits, 2, 1)

@@ -1,0 +1,255 @@
+"""The front at the picture's own resolution: which cells split, into what, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from helpers.model import micro, quick, run_reconstruct
+from helpers.refusals import refused, refused_command
+from PIL import Image
+
+from gamba_warp.cameras import Cameras, intrinsics, orbit
+from gamba_warp.conventions import over_background
+from gamba_warp.data.preprocess import resize_rgba
+from gamba_warp.formats.ply import load_ply
+from gamba_warp.gaussians import Gaussians
+from gamba_warp.image_metrics import psnr
+from gamba_warp.images import save_image
+from gamba_warp.model import detail as subject
+from gamba_warp.model.checkpoint import load_model, save_model
+from gamba_warp.model.config import GambaConfig
+from gamba_warp.model.detail import checked_detail
+from gamba_warp.model.gamba import Gamba
+from gamba_warp.model.posing import reference_cameras
+from gamba_warp.model.predict import model_input, reconstruct
+from gamba_warp.render import render
+
+FIELDS = ("means", "scales", "opacities", "colors")
+
+
+def rays(**changes) -> GambaConfig:
+    """24 x 24 cells of a pixel each, and three layers."""
+    wanted = {"decoder": "rays", "encoder": "none", "ray_cells": 8, "ray_layers": 3}
+    return micro(**(wanted | {"ray_features": 5, "image_size": 24, "patch_size": 8} | changes))
+
+
+def fresh(**changes) -> Gamba:
+    """Untrained, so its front is an opaque plane with the colours of the picture."""
+    torch.manual_seed(4)
+    return Gamba(rays(**changes)).eval()
+
+
+def board(size: int, square: int, radius: float = 0.4) -> np.ndarray:
+    """A disc ``[size, size, 4]`` of a black and orange checkerboard with sharp edges."""
+    y, x = np.mgrid[:size, :size]
+    colors = np.where((((x // square) + (y // square)) % 2 == 0)[..., None], [1, 0.6, 0.2], 0.05)
+    inside = np.hypot(x + 0.5 - size / 2, y + 0.5 - size / 2) < radius * size
+    return np.dstack([colors, inside]).astype(np.float32)
+
+
+def box(size: int, first: int, last: int, color=(0.2, 0.5, 0.9)) -> np.ndarray:
+    """A square of one colour, ``[size, size, 4]``, between two rows and the same columns."""
+    rgba = np.zeros((size, size, 4), np.float32)
+    rgba[first:last, first:last] = (*color, 1)
+    return rgba
+
+
+def input_view(gaussians: Gaussians, config: GambaConfig, rgba: np.ndarray) -> float:
+    """PSNR of the input view on white, at the size of ``rgba``."""
+    camera = reference_cameras(config, 1).resized(len(rgba), len(rgba))
+    seen = render(gaussians, camera, background=torch.ones(3)).rgb[0]
+    return float(psnr(seen.clamp(0, 1), torch.from_numpy(over_background(rgba, 1.0))))
+
+
+def same(one: Gaussians, other: Gaussians) -> bool:
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in FIELDS)
+
+
+def test_detail_1_is_what_the_network_gave_bit_for_bit():
+    model, rgba = fresh(), board(96, 8)
+    with torch.inference_mode():
+        want = model(model_input(rgba, model.config), reference_cameras(model.config, 1))[0]
+    assert same(reconstruct(model, rgba, detail=1), want)
+    assert reconstruct(model, rgba, detail=2).num > want.num
+
+
+def test_the_default_is_what_the_picture_has_the_pixels_for():
+    sides = {23: 1, 47: 1, 48: 2, 95: 2, 96: 4, 5000: 4}
+    assert {side: checked_detail(None, rays(), side) for side in sides} == sides
+    halves = rays(ray_cells=4)  # cells of 2 x 2 pixels
+    assert [checked_detail(None, halves, side) for side in (23, 24, 48)] == [1, 2, 4]
+    model = fresh()
+    assert same(reconstruct(model, board(47, 4)), reconstruct(model, board(47, 4), detail=1))
+    assert same(reconstruct(model, board(96, 4)), reconstruct(model, board(96, 4), detail=4))
+
+
+def test_what_is_plain_does_not_split():
+    model = fresh()
+    for detail in (2, 4):
+        full = box(24 * detail, 0, 24 * detail)
+        before = reconstruct(model, full, detail=1)
+        assert same(reconstruct(model, full, detail=detail), before)
+        # A mark on one cell splits this one and those beside it.
+        full[12 * detail, 12 * detail, :3] = 0
+        assert reconstruct(model, full, detail=detail).num == before.num + 9 * (detail**2 - 1)
+        # A square of 8 x 8 cells has 28 with background beside them, of which each becomes four.
+        # The 36 around it have a little of its alpha, by the filter, but their pixels have none.
+        square = box(24 * detail, 8 * detail, 16 * detail)
+        more = reconstruct(model, square, detail=detail).num
+        assert more == reconstruct(model, square, detail=1).num + 28 * 3 - 36
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"patch_size": 24, "ray_cells": 24, "ray_layers": 2}, {"ray_cells": 4, "ray_layers": 1}],
+    ids=["patch 8", "patch 24", "cells of 2 x 2 pixels"],
+)
+def test_the_input_view_becomes_sharp(changes):
+    """A fresh front has no depth to get wrong, so what is left is that of the splitting."""
+    model = fresh(**changes)
+    side = 24 // (model.config.patch_size // model.config.ray_cells)
+    rgba = board(4 * side, 3)
+    found = {k: input_view(reconstruct(model, rgba, detail=k), model.config, rgba) for k in (1, 4)}
+    assert found[1] < 17 and found[4] > found[1] + 3, found
+
+
+def test_a_checkerboard_at_512_becomes_sharp_with_the_shipped_model():
+    model, rgba = load_model(), board(512, 12)
+    found = [input_view(reconstruct(model, rgba, detail=k), model.config, rgba) for k in (1, 4)]
+    assert found[0] < 12 and found[1] > 17, found
+
+
+def test_no_crack_opens_from_the_side():
+    """The ball's shading tells the shipped model its depth; its alpha from 60° and 90° stays."""
+    size = 512
+    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2.5 - 1.25
+    height = np.sqrt(np.clip(1 - x**2 - y**2, 0, None))
+    light = (0.3 + 0.7 * height) * np.where((np.floor(x * 12) + np.floor(y * 12)) % 2, 0.7, 1.0)
+    rgba = np.dstack([light, 0.6 * light, 0.3 * light, height > 0]).astype(np.float32)
+    model = load_model()
+    viewmats = orbit(torch.tensor([60.0, 90.0, -90.0]))
+    cameras = Cameras(viewmats, intrinsics(256, 256).expand(3, 3, 3), 256, 256)
+    before, after = (
+        render(reconstruct(model, rgba, detail=k), cameras).alpha[..., 0] for k in (1, 4)
+    )
+    for one, other in zip(before, after):
+        full = one > 0.95
+        assert full.sum() > 5000
+        # One pixel in two thousand may lose a tenth of its alpha; cracks would be whole lines.
+        assert (other[full] < one[full] - 0.1).float().mean() < 5e-4
+        assert (other - one).abs().mean() < 0.02
+
+
+def test_children_lie_on_the_rays_of_their_own_pixels():
+    model, rgba = fresh(), board(48, 2)
+    found = reconstruct(model, rgba, detail=2)
+    whole = reconstruct(model, rgba, detail=1)
+    children = found.select(torch.arange(found.num) >= found.num - 200)
+    camera = reference_cameras(model.config, 1).resized(48, 48)
+    points = children.means + camera.viewmats[0, :3, 3]
+    pixels = points[:, :2] / points[:, 2:] * camera.Ks[0, 0, 0] + 24
+    torch.testing.assert_close(pixels % 1, torch.full_like(pixels, 0.5), atol=1e-3, rtol=0)
+    assert len(pixels.round(decimals=2).unique(dim=0)) == 200  # and each has a pixel of its own
+    # Half as wide across the view as their parents, and as long along it.
+    parents = whole.scales[::3].mean(0)
+    torch.testing.assert_close(
+        children.scales.mean(0) / parents, torch.tensor([0.5, 0.5, 1.0]), rtol=0.02, atol=0
+    )
+
+
+def test_children_of_turned_gaussians_keep_the_axis_along_the_view():
+    quarter = math.sqrt(0.5)
+    turns = torch.tensor([[1.0, 0, 0, 0], [quarter, quarter, 0, 0], [quarter, 0, quarter, 0]])
+    # Turned about x the axis y looks along the view, about y it is the axis x.
+    want = torch.tensor([[0, 0, 1], [0, 1, 0], [1, 0, 0]], dtype=torch.bool)
+    assert torch.equal(subject._along_the_view(3 * turns, turns), want)
+    model = fresh(predict_rotation=True)
+    found = reconstruct(model, board(48, 2), detail=2)
+    assert found.quats is not None and found.num > reconstruct(model, board(48, 2), detail=1).num
+
+
+def test_the_count_is_bounded(monkeypatch):
+    model = fresh()
+    noise = np.random.default_rng(1).random((96, 96, 4)).astype(np.float32)
+    noise[..., 3] = 1
+    noise[:, :48, :3] *= 0.3
+    before = reconstruct(model, noise, detail=1).num
+    assert reconstruct(model, noise, detail=4).num == before + 24 * 24 * 15
+    monkeypatch.setattr(subject, "MOST_CHILDREN", 4000)
+    found = reconstruct(model, noise, detail=4)
+    others = before - 24 * 24
+    assert 3900 < found.num - others <= 4000
+    # Those with the most contrast split in 4 x 4: all are in the right half,
+    # or in the column of cells (0.06 wide) beside it.
+    widths = found.scales[others:, 0]
+    assert (found.means[others:][widths < 1.5 * widths.min(), 0] > -0.07).all()
+
+
+@pytest.mark.parametrize("detail", [2, 4])
+def test_alpha_that_is_soft_everywhere(detail):
+    model, rgba = fresh(), board(96, 5)
+    y, x = np.mgrid[:96, :96] / 95
+    rgba[..., 3] = 0.2 + 0.5 * x * y
+    found = reconstruct(model, rgba, detail=detail)
+    assert all(getattr(found, name).isfinite().all() for name in FIELDS)
+    assert found.num <= model.config.num_gaussians + 3 * 24 * 24  # no cell is inner: 2 x 2 at most
+    small = resize_rgba(rgba, 48, 48)
+    before = input_view(reconstruct(model, rgba, detail=1), model.config, small)
+    assert input_view(found, model.config, small) > before
+
+
+def test_three_pixels_and_none():
+    model = fresh()
+    empty = np.zeros((96, 96, 4), np.float32)
+    assert reconstruct(model, empty, detail=4).num == 0
+    three = empty.copy()
+    three[50, 50:53] = (0.9, 0.1, 0.1, 1)
+    found = reconstruct(model, three, detail=4)
+    assert all(getattr(found, name).isfinite().all() for name in FIELDS)
+    red = found.colors[-1]
+    assert red[0] > 0.6 and red[1:].max() < 0.3
+
+
+def test_a_picture_of_8000_pixels_a_side(tmp_path, capsys):
+    """It is reduced when it is read, so the floats of a small one are all that there are."""
+    save_model(tmp_path / "model.safetensors", fresh())
+    large = Image.new("L", (8000, 8000), 255)
+    large.paste(Image.linear_gradient("L").resize((5000, 5000)), (1500, 1500))
+    large.save(tmp_path / "large.jpg", quality=50)
+    options = quick(tmp_path / "model.safetensors", tmp_path / "out")
+    assert run_reconstruct(tmp_path / "large.jpg", *options, "--detail", 4) == 0
+    assert load_ply(tmp_path / "out" / "large.ply").num > 24 * 24
+
+
+def test_the_option_reaches_the_network_and_its_default_is_the_pictures(tmp_path, capsys):
+    model = tmp_path / "model.safetensors"
+    save_model(model, fresh())
+    save_image(tmp_path / "a.png", board(120, 4))
+    counts = {}
+    for detail in ((), ("--detail", 1), ("--detail", 2), ("--detail", 4)):
+        assert run_reconstruct(tmp_path / "a.png", *quick(model, tmp_path), *detail) == 0
+        counts[detail[1:]] = load_ply(tmp_path / "a.ply").num
+    assert counts[()] == counts[(4,)] > counts[(2,)] > counts[(1,)]
+
+
+def test_other_decoders_and_other_numbers_are_refused(tmp_path, capsys):
+    torch.manual_seed(1)
+    bins = Gamba(micro(encoder="none")).eval()
+    rgba = board(96, 4)
+    refused("detail 2 needs a model with the decoder rays, and this one has bins", reconstruct,
+            bins, rgba, detail=2)  # fmt: skip
+    assert same(reconstruct(bins, rgba), reconstruct(bins, rgba, detail=1))
+    refused("detail is 3, it must be 1, 2 or 4", reconstruct, fresh(), rgba, detail=3)
+    save_model(tmp_path / "bins.safetensors", bins)
+    save_image(tmp_path / "a.png", rgba)
+    words = [tmp_path / "a.png", *quick(tmp_path / "bins.safetensors", tmp_path), "--detail", 4]
+    refused_command(capsys, "reconstruct", words, "detail 4 needs a model with the decoder rays")
+
+
+def test_no_background_gets_into_the_colours():
+    """A plain object has its colour at its rim, too: the correction does not mend it with white."""
+    model, color = fresh(), torch.tensor([0.5, 0.3, 0.1])
+    found = reconstruct(model, box(96, 29, 67, color.tolist()), detail=4)
+    front = found.colors[found.opacities > 0.05]
+    assert len(front) > 200 and (front - color).abs().max() < 0.1
