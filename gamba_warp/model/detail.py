@@ -3,9 +3,9 @@
 The network sees the picture at ``image_size``; a photograph has more pixels. So after the network
 each front cell may become k x k Gaussians, its children, each on the ray of its own small pixel:
 
-- depth, and what the network added to the opacity and the colour of the picture, are interpolated
-  between the cells. A cell counts as much as its alpha, so what is hardly there has no say.
-- opacity and colour are those of the picture at k times the cells.
+- depth, and what the network added to the opacity that alpha gives, are interpolated between the
+  cells. A cell counts as much as its alpha, so what is hardly there has no say.
+- colour and alpha are those of the picture at k times the cells.
 - the sizes are the parent's, 1/k of them across the view. Along it they stay, so that no crack
   opens for a view from the side.
 - a parent lies up to a pixel off its ray, its children do not: that costs the input view 5 dB.
@@ -34,7 +34,7 @@ from ..kernels.rasterize.constants import ALPHA_MIN
 from ..render import render
 from .config import GambaConfig
 from .parts.patches import foreground_patches
-from .parts.rays import COLOR_MARGIN, EMPTY
+from .parts.rays import EMPTY
 from .posing import reference_cameras
 
 PLAIN = 6 / 255  # a cell that differs by less in itself, and from those beside it, is plain
@@ -107,7 +107,7 @@ def split_front(
     front = gaussians.select(is_front)
     parent = cells.new_full((side * side,), -1)
     parent[cells] = torch.arange(len(cells), device=device)
-    fields = _fields(front, cells, means, config)
+    fields = _fields(front, cells, means, config.distance)
     made = [
         _children(front, parent, fields, counts == count, count, picture, camera)
         for count in sorted({2, detail})
@@ -148,28 +148,17 @@ def _children_a_side(picture: Tensor, means: Tensor, detail: int) -> Tensor:
     return counts
 
 
-def _logit(colors: Tensor) -> Tensor:
-    return torch.logit(colors.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN))
+def _fields(front: Gaussians, cells: Tensor, means: Tensor, distance: float) -> Tensor:
+    """What is interpolated, as a map of the cells, ``[1, 3, n, n]``; each is weighted by alpha.
 
-
-def _colors(premultiplied: Tensor) -> Tensor:
-    """The straight colours of ``[.., 4]`` with colours times alpha."""
-    return premultiplied[..., :3] / premultiplied[..., 3:].clamp_min(1e-3)
-
-
-def _fields(front: Gaussians, cells: Tensor, means: Tensor, config: GambaConfig) -> Tensor:
-    """What is interpolated, as a map of the cells, ``[1, 6, n, n]``; each is weighted by alpha.
-
-    Depth along the ray, what the network added to the logits of opacity and colour, the weight.
+    Depth along the ray, what the network added to the logit of the opacity, and the weight.
     """
-    of_cell = means.flatten(2)[0].T[cells]
-    alpha = of_cell[:, 3:]
-    opacity = torch.logit(front.opacities, 1e-6)[:, None] - EMPTY * (alpha - 1)
-    color = _logit(front.colors) - _logit(_colors(of_cell))
-    depth = front.means[:, 2:] + config.distance
-    fields = means.new_zeros(6, means.shape[-1] ** 2)
-    fields[:, cells] = (torch.cat([depth, opacity, color, torch.ones_like(depth)], 1) * alpha).T
-    return fields.view(1, 6, *means.shape[-2:])
+    alpha = means[0, 3].flatten()[cells]
+    opacity = torch.logit(front.opacities, 1e-6) - EMPTY * (alpha - 1)
+    depth = front.means[:, 2] + distance
+    fields = means.new_zeros(3, means.shape[-1] ** 2)
+    fields[:, cells] = torch.stack([depth, opacity, torch.ones_like(depth)]) * alpha
+    return fields.view(1, 3, *means.shape[-2:])
 
 
 def _children(
@@ -186,7 +175,7 @@ def _children(
     Args:
         front: the parents.
         parent: ``[cells²]``, which of them is that of a cell.
-        fields: ``[1, 6, cells, cells]``, see ``_fields``.
+        fields: ``[1, 3, cells, cells]``, see ``_fields``.
         mask: ``[cells²]`` bool, which cells split.
         count: children a side of a cell.
         picture: ``[1, 4, H, W]``, see ``_premultiplied``.
@@ -199,7 +188,7 @@ def _children(
     grid = mask.view(side, 1, side, 1).expand(side, count, side, count).reshape(size, size)
     row, column = grid.nonzero(as_tuple=True)
     fine = F.interpolate(fields, (size, size), mode="bilinear")[0][:, row, column].T
-    depth, opacity, color = (fine[:, :5] / fine[:, 5:]).split((1, 1, 3), -1)
+    depth, opacity = (fine[:, :2] / fine[:, 2:]).split(1, -1)
     seen = F.avg_pool2d(picture, picture.shape[-1] // size)[0][:, row, column].T
     own = parent[row // count * side + column // count]
     K = camera.resized(size, size).Ks[0]
@@ -211,7 +200,7 @@ def _children(
         quats=quats,
         scales=front.scales[own] * torch.where(_along_the_view(quats, own), 1.0, 1 / count),
         opacities=torch.sigmoid(opacity + EMPTY * (seen[:, 3:] - 1))[:, 0],
-        colors=torch.sigmoid(_logit(_colors(seen)) + color),
+        colors=(seen[:, :3] / seen[:, 3:].clamp_min(1e-3)).clamp(0, 1),
     )
     step = picture.shape[-1] // size
     pixels = torch.stack([row, column], -1) * step + step // 2
