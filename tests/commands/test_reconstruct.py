@@ -42,7 +42,13 @@ class Recorder(torch.nn.Module):
         self.weight = torch.nn.Parameter(torch.zeros(1))
         color = 1.0 if background == "white" else 0.0
         self.config = SimpleNamespace(
-            image_size=24, distance=2.0, fov=40, background_color=color, input_channels=3, width=1
+            image_size=24,
+            distance=2.0,
+            fov=40,
+            background_color=color,
+            input_channels=3,
+            width=1,
+            decoder="bins",
         )
 
     def forward(self, images, cameras):
@@ -340,7 +346,7 @@ def test_a_mask_cuts_a_busy_picture(tmp_path, checkpoint):
 def test_a_model_that_diverged_is_a_failure(tmp_path, picture, checkpoint, monkeypatch, capsys):
     gaussians = some(9)
     gaussians.means[3] = float("nan")
-    monkeypatch.setattr(predict, "reconstruct", lambda model, rgba, precision: gaussians)
+    monkeypatch.setattr(predict, "reconstruct", lambda *_: gaussians)
     assert run_reconstruct(picture, *quick(checkpoint, tmp_path / "out")) == 1
     assert "1 of 9 Gaussians are not finite" in capsys.readouterr().err
 
