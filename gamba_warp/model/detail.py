@@ -8,12 +8,12 @@ each front cell may become k x k Gaussians, its children, each on the ray of its
 - colour and alpha are those of the picture at k times the cells.
 - the sizes are the parent's, 1/k of them across the view. Along it they stay, so that no crack
   opens for a view from the side.
-- a parent lies up to a pixel off its ray, its children do not: that costs the input view 5 dB.
+- a parent lies up to a pixel off its ray, its children do not: it cost the input view several dB.
 
 What is plain does not split. Cells with background in them or beside them split in 2 x 2 at most:
 a rasterizer widens every Gaussian by a part of its own pixel, so the more of them stand along a
 silhouette, the wider it is in a picture smaller than the one they are made for. For the same reason
-two rounds of correction against the picture take colours at its full size, but opacities at half.
+two rounds of correction take colours at k times the cells, but opacities at twice the cells.
 """
 
 from __future__ import annotations
