@@ -33,7 +33,7 @@ from ..gaussians import Gaussians
 from ..kernels.rasterize.constants import ALPHA_MIN
 from ..render import render
 from .config import GambaConfig
-from .parts.patches import foreground_patches
+from .parts.patches import seen_cells
 from .parts.rays import EMPTY
 from .posing import reference_cameras
 
@@ -94,10 +94,8 @@ def split_front(
     large = torch.from_numpy(resize_rgba(rgba, side * detail, side * detail)).to(device)
     picture, means = _premultiplied(large), _premultiplied(image)
     means = F.avg_pool2d(means, config.image_size // side)
-    patches = foreground_patches(image[None, ..., 3], config.patch_size)
-    places = patches.cell_centres(config.ray_cells).view(-1, 2) * (side / config.image_size)
-    column, row = places.long().unbind(-1)
-    cells = row * side + column  # of each front Gaussian
+    seen = seen_cells(image[None], config.image_size // side)
+    cells = seen.row * side + seen.column  # of each front Gaussian
     counts = _children_a_side(picture, means, detail).flatten()
     splits = counts[cells] > 1
     if not splits.any():
