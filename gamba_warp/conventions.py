@@ -12,8 +12,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 # Grey values of the backgrounds that pictures are compared on: white, and beside it black and grey,
 # because what is right on white may be a white haze on another. Figures on white have a metric's
 # plain name, those on the others end in its name.
-WHITE = 1.0
-GROUNDS = {"black": 0.0, "grey": 0.5}
+# Turntables and sheets are drawn on grey, which shows haze whether it is dark or bright.
+WHITE, GREY = 1.0, 0.5
+GROUNDS = {"black": 0.0, "grey": GREY}
 
 # Axes of a file: x right, y down, z forward; or x right, y up, z backward.
 Axes = Literal["opencv", "opengl"]

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gamba_warp.conventions import over_background
+from gamba_warp.conventions import GREY, over_background
 from gamba_warp.files import atomic_path
 from gamba_warp.images import load_rgba, to_uint8
 
@@ -44,7 +44,7 @@ def main(data: Path) -> None:
     cells = []
     for name in OBJECTS:
         rgba = load_rgba(data / name / "000.webp")
-        seen = Image.fromarray(to_uint8(over_background(rgba, 1.0)))
+        seen = Image.fromarray(to_uint8(over_background(rgba, GREY)))
         still = np.asarray(seen.resize((SIDE, SIDE), Image.Resampling.BICUBIC))
         turn = turntable_frames(reconstruct(model, rgba), size=SIDE, frames=FRAMES, elevation=10.0)
         pair = np.stack([np.broadcast_to(still, turn.shape), turn])[:, :, CROP:-CROP, CROP:-CROP]

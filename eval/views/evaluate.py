@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gamba_warp.batch import check_not_read, progress_bar
+from gamba_warp.conventions import GREY, WHITE
 from gamba_warp.data import gso
 from gamba_warp.data.dataset import ViewDataset, open_dataset
 from gamba_warp.devices import pick_device
@@ -354,12 +355,14 @@ def sheet_rows(job: Job, records: list[dict[str, Any]], each: int) -> list[Row]:
         record = done[rank]
         try:
             truth = load_truth(job.dataset, record["name"], job.protocol, job.device)
-            rgb = pictures_of(job.predict(truth), truth).shown.on()
+            made = pictures_of(job.predict(truth), truth).shown
         except ERRORS:  # a file that went bad meanwhile; the report has what it was
             continue
-        views = choose_views(len(rgb), 0, SHEET_VIEWS + 1)[1:]
+        views = choose_views(len(truth.rgb), 0, SHEET_VIEWS + 1)[1:]
+        ground = WHITE if made.alpha is None else GREY
+        true, got = truth.shown.on(ground), made.on(ground)
         lines = label(record, f"{group}: {rank + 1} of {len(done)}")
-        rows.append(Row(lines, truth.rgb[0], truth.rgb[views], rgb[views]))
+        rows.append(Row(lines, true[0], true[views], got[views]))
     return rows
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..conventions import WHITE, over_background
+from ..conventions import GREY, over_background
 from ..errors import UserError
 from ..formats.ply import load_ply
 from ..photo.cutout import cut_out
@@ -131,7 +131,7 @@ def _around(section: Section) -> np.ndarray:
     frames = section.turntable[:: len(section.turntable) // _SHOWN][:_SHOWN] / 255.0
     flat = section.picture
     if flat.shape[-1] == 4:
-        flat = over_background(flat, WHITE)
+        flat = over_background(flat, GREY)
     side = frames.shape[1]
     nearest = ((np.arange(side) + 0.5) * len(flat) / side).astype(int)
     return np.concatenate([flat[nearest][:, nearest][None], frames])

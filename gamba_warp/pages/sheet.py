@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from ..conventions import over_background
+from ..conventions import GREY, over_background
 from ..data.preprocess import resize_rgba
 from ..errors import UserError
 from ..files import atomic_path
@@ -50,7 +50,7 @@ class Sheet:
             gaussians: ``[N]``, on the device that renders.
             view: from where the object is looked at.
         """
-        flat = over_background(resize_rgba(rgba, _TILE, _TILE), 1.0)
+        flat = over_background(resize_rgba(rgba, _TILE, _TILE), GREY)
         turn = turntable_frames(gaussians, size=_TILE, frames=VIEWS, **asdict(view))
         self._rows.append((name, np.concatenate([to_uint8(flat), *turn], axis=1)))
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV
+from ..conventions import DEFAULT_DISTANCE, DEFAULT_FOV, GREY
 from ..gaussians import Gaussians
+from ..images import to_uint8
 from ..trajectories.movies import render_path, save_movie
 from ..trajectories.paths import turntable
 
@@ -23,7 +24,7 @@ def turntable_frames(
     distance: float = DEFAULT_DISTANCE,
     fov: float = DEFAULT_FOV,
 ) -> np.ndarray:
-    """Renders one full turn on white, from the reference view on, with several views a launch.
+    """Renders one full turn on grey, from the reference view on, with several views a launch.
 
     Args:
         gaussians: one object without batch dimension, in the reference frame, on the device that
@@ -38,7 +39,7 @@ def turntable_frames(
         ``[frames, size, size, 3]`` uint8.
     """
     cameras = turntable(frames, elevation, distance, fov, size)
-    return np.stack([picture for picture, _ in render_path(gaussians, cameras)])
+    return np.stack([picture for picture, _ in render_path(gaussians, cameras, (GREY,) * 3)])
 
 
 def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECONDS) -> None:
@@ -53,4 +54,5 @@ def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECOND
     Raises:
         UserError: the suffix is another one, or the file cannot be written.
     """
-    save_movie(path, frames, len(frames) / seconds, frames[:: max(1, len(frames) // 8)])
+    sample, grey = frames[:: max(1, len(frames) // 8)], int(to_uint8(np.array(GREY)))
+    save_movie(path, frames, len(frames) / seconds, sample, (grey, grey, grey))
