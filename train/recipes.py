@@ -48,6 +48,7 @@ _RAYS = Recipe(
         "--lpips on --lpips-weight 0.25 --lpips-crop 48": "docs/lab/rays.md, the last run",
         "--lpips-after 6000": "docs/lab/rays.md, the second run, which began from nothing",
         "--lr 1.2e-3 --schedule trapezoid --decay-share 0.3": "docs/lab/rays.md, the last run",
+        "--background random": "docs/lab/rays.md, the last run: on white haze is free",
         "--precision bfloat16": "docs/lab/rays.md, the second and the last run",
     },
 )

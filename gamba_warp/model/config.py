@@ -382,6 +382,7 @@ PRESETS: dict[Preset, GambaConfig] = {
         ray_layers=3,
         ray_features=48,
         ray_hidden=64,
+        ray_back="opaque",
     ),
     # This one trains on one small GPU; it has 9,216 Gaussians.
     "small": GambaConfig(
