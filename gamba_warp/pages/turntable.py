@@ -39,7 +39,7 @@ def turntable_frames(
         ``[frames, size, size, 3]`` uint8.
     """
     cameras = turntable(frames, elevation, distance, fov, size)
-    return np.stack([picture for picture, _ in render_path(gaussians, cameras, (GREY,) * 3)])
+    return np.stack([picture for picture, _ in render_path(gaussians, cameras, (GREY, GREY, GREY))])
 
 
 def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECONDS) -> None:
