@@ -39,7 +39,7 @@ _RAYS = Recipe(
     settings={
         "--preset rays": "starter/rays.json: 128² input, Gaussians on the pixels' rays",
         "--size 128": "docs/lab/rays.md, all runs",
-        "--steps 19250": "starter/rays.json: the steps of its four runs together",
+        "--steps 19250": "docs/lab/rays.md: the steps of its first four runs together",
         "--batch-size 4 --views-per-object 3": "docs/lab/rays.md, all runs",
         "--front-share 0.5 --mirror 0.5 --recolor 0.3": "docs/lab/rays.md, all runs",
         "--no-radial-mask": "docs/lab/rays.md, all runs: Gaussians begin on the object",
