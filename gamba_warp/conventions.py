@@ -1,6 +1,6 @@
 """What every room agrees on: numbers, names, alpha; no imports of ours, and none that are slow."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 DEFAULT_FOV = 49.1  # degrees, vertical; the released data's camera
 DEFAULT_DISTANCE = 1.5  # of the reference camera from the object's centre, object units
@@ -28,7 +28,7 @@ Precision = Literal["float32", "bfloat16", "auto"]
 
 # Of the option --detail: into how many Gaussians a side each of the front may split.
 Detail = Literal[1, 2, 4]
-DETAILS: tuple[Detail, ...] = (1, 2, 4)
+DETAILS: tuple[Detail, ...] = get_args(Detail)
 
 
 def over_background(rgba, background):

@@ -104,7 +104,7 @@ def reconstruct_command(
         output_folder(sheet.parent)
     STAGES.begin("model")
     model = load_model(checkpoint, chosen, encoder_weights)
-    checked_detail(detail, model.config, 0)
+    checked_detail(detail, model.config, 0)  # before a picture is cut out
     ways = Ways(mask, matte_model, sam, recenter, chosen).checked()
     output_folder(files.out)
 
@@ -114,9 +114,8 @@ def reconstruct_command(
         say(f"{path}: {cut.how}")
         STAGES.begin("network")
         started = time.perf_counter()
-        gaussians = reconstruct(model, cut.rgba, precision, detail).to(
-            "cpu"
-        )  # waits for the device
+        made = reconstruct(model, cut.rgba, precision, detail)
+        gaussians = made.to("cpu")  # waits for the device
         seconds = time.perf_counter() - started
         write_outputs(name, cut, gaussians.to(chosen), outputs, model.config, seconds)
 

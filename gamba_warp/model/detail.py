@@ -33,7 +33,7 @@ from ..gaussians import Gaussians
 from ..kernels.rasterize.constants import ALPHA_MIN
 from ..render import render
 from .config import GambaConfig
-from .parts.patches import seen_cells
+from .parts.patches import premultiplied, seen_cells
 from .parts.rays import EMPTY
 from .posing import reference_cameras
 
@@ -92,11 +92,10 @@ def split_front(
         return gaussians
     side, device = _cells(config), gaussians.means.device
     large = torch.from_numpy(resize_rgba(rgba, side * detail, side * detail)).to(device)
-    picture, means = _premultiplied(large), _premultiplied(image)
-    means = F.avg_pool2d(means, config.image_size // side)
-    seen = seen_cells(image[None], config.image_size // side)
+    picture, seen = premultiplied(large[None]), seen_cells(image[None], config.image_size // side)
+    alpha = F.avg_pool2d(image[None, None, ..., 3], config.image_size // side)
     cells = seen.row * side + seen.column  # of each front Gaussian
-    counts = _children_a_side(picture, means, detail).flatten()
+    counts = _children_a_side(picture, alpha, detail).flatten()
     splits = counts[cells] > 1
     if not splits.any():
         return gaussians
@@ -105,7 +104,7 @@ def split_front(
     front = gaussians.select(is_front)
     parent = cells.new_full((side * side,), -1)
     parent[cells] = torch.arange(len(cells), device=device)
-    fields = _fields(front, cells, means, config.distance)
+    fields = _fields(front, cells, alpha, config.distance)
     made = [
         _children(front, parent, fields, counts == count, count, picture, camera)
         for count in sorted({2, detail})
@@ -121,13 +120,8 @@ def _cells(config: GambaConfig) -> int:
     return config.grid_size * config.ray_cells
 
 
-def _premultiplied(rgba: Tensor) -> Tensor:
-    """``[H, W, 4]`` with straight alpha as ``[1, 4, H, W]`` with colours times alpha."""
-    return torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1).permute(2, 0, 1)[None]
-
-
-def _children_a_side(picture: Tensor, means: Tensor, detail: int) -> Tensor:
-    """1, 2 or ``detail`` for each cell, ``[cells, cells]``: of the picture, and its cells' means.
+def _children_a_side(picture: Tensor, alpha: Tensor, detail: int) -> Tensor:
+    """1, 2 or ``detail`` for each cell, ``[cells, cells]``: of the picture, and its cells' alpha.
 
     Where there would be more than ``MOST_CHILDREN`` children, the cells with the least contrast
     split in 2 x 2.
@@ -135,7 +129,7 @@ def _children_a_side(picture: Tensor, means: Tensor, detail: int) -> Tensor:
     # The cells beside a cell count, too: at its edge a parent would not be sharp enough for them.
     both = F.max_pool2d(torch.cat([picture, -picture], 1), detail)
     most, least = F.max_pool2d(both, 3, stride=1, padding=1).chunk(2, 1)
-    contrast, alpha = (most + least).amax(1)[0], means[:, 3:]
+    contrast = (most + least).amax(1)[0]
     splits = (contrast > PLAIN) & (alpha[0, 0] > 0)
     inner = -F.max_pool2d(-alpha, 3, stride=1, padding=1)[0, 0] > 0.99
     counts = torch.where(splits, 2, 1)
@@ -146,17 +140,17 @@ def _children_a_side(picture: Tensor, means: Tensor, detail: int) -> Tensor:
     return counts
 
 
-def _fields(front: Gaussians, cells: Tensor, means: Tensor, distance: float) -> Tensor:
+def _fields(front: Gaussians, cells: Tensor, alpha: Tensor, distance: float) -> Tensor:
     """What is interpolated, as a map of the cells, ``[1, 3, n, n]``; each is weighted by alpha.
 
     Depth along the ray, what the network added to the logit of the opacity, and the weight.
     """
-    alpha = means[0, 3].flatten()[cells]
-    opacity = torch.logit(front.opacities, 1e-6) - EMPTY * (alpha - 1)
+    weight = alpha.flatten()[cells]
+    opacity = torch.logit(front.opacities, 1e-6) - EMPTY * (weight - 1)
     depth = front.means[:, 2] + distance
-    fields = means.new_zeros(3, means.shape[-1] ** 2)
-    fields[:, cells] = torch.stack([depth, opacity, torch.ones_like(depth)]) * alpha
-    return fields.view(1, 3, *means.shape[-2:])
+    fields = alpha.new_zeros(3, alpha.numel())
+    fields[:, cells] = torch.stack([depth, opacity, torch.ones_like(depth)]) * weight
+    return fields.view(1, 3, *alpha.shape[-2:])
 
 
 def _children(
@@ -176,7 +170,7 @@ def _children(
         fields: ``[1, 3, cells, cells]``, see ``_fields``.
         mask: ``[cells²]`` bool, which cells split.
         count: children a side of a cell.
-        picture: ``[1, 4, H, W]``, see ``_premultiplied``.
+        picture: ``[1, 4, H, W]``, see ``premultiplied``.
         camera: of the picture.
 
     Returns:
@@ -244,7 +238,7 @@ def _corrected(
         others: those that did not split.
         children: ``[M]``.
         pixels: ``[M, 2]``, row and column in the picture.
-        picture: ``[1, 4, H, W]``, see ``_premultiplied``.
+        picture: ``[1, 4, H, W]``, see ``premultiplied``.
         camera: of the picture.
     """
     size, step = picture.shape[-1], detail // 2

@@ -54,5 +54,6 @@ def save_turntable(path: str | Path, frames: np.ndarray, seconds: float = SECOND
     Raises:
         UserError: the suffix is another one, or the file cannot be written.
     """
-    sample, grey = frames[:: max(1, len(frames) // 8)], int(to_uint8(np.array(GREY)))
+    grey = int(to_uint8(np.array(GREY)))
+    sample = frames[:: max(1, len(frames) // 8)]
     save_movie(path, frames, len(frames) / seconds, sample, (grey, grey, grey))

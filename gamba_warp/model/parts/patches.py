@@ -148,9 +148,10 @@ class Cells:
     color: Tensor
     counts: list[int]
 
-    def split(self, values: Tensor) -> tuple[Tensor, ...]:
-        """Cuts ``[T, ..]`` into the parts of the pictures."""
-        return values.split(self.counts)
+
+def premultiplied(rgba: Tensor) -> Tensor:
+    """``[B, H, W, 4]`` with straight alpha as ``[B, 4, H, W]`` with colours times alpha."""
+    return torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1).permute(0, 3, 1, 2)
 
 
 def seen_cells(rgba: Tensor, side: int) -> Cells:
@@ -160,8 +161,7 @@ def seen_cells(rgba: Tensor, side: int) -> Cells:
         rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha, H = W.
         side: of a cell, pixels. On CUDA the numbers of cells are read back.
     """
-    flat = torch.cat([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1).permute(0, 3, 1, 2)
-    means = (F.avg_pool2d(flat, side) if side > 1 else flat).permute(0, 2, 3, 1)
+    means = F.avg_pool2d(premultiplied(rgba), side).permute(0, 2, 3, 1)
     seen = means[..., 3] > 0
     own = means[seen]
     color = own[:, :3] / own[:, 3:].clamp_min(1e-3)

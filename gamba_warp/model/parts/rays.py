@@ -124,8 +124,8 @@ class RayDecoder(nn.Module):
             return self.stem(pixels).permute(0, 2, 3, 1)[cells.picture, cells.row, cells.column]
         count, found = self.config.ray_cells, []
         step, side = self.config.patch_size // count, patches.grid * count
-        parts = zip(pixels.split(1), patches.boxes(), *map(cells.split, (cells.row, cells.column)))
-        for picture, box, row, column in parts:
+        places = (each.split(cells.counts) for each in (cells.row, cells.column))
+        for picture, box, row, column in zip(pixels.split(1), patches.boxes(), *places):
             (top, bottom), (left, right) = (
                 (max(0, first * count - STEM_REACH), min(side, last * count + STEM_REACH))
                 for first, last in box
