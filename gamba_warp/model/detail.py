@@ -4,7 +4,9 @@ The network sees the picture at ``image_size``; a photograph has more pixels. So
 each front cell may become k x k Gaussians, its children, each on the ray of its own small pixel:
 
 - depth, and what the network added to the opacity that alpha gives, are interpolated between the
-  cells. A cell counts as much as its alpha, so what is hardly there has no say.
+  cells. A cell counts as much as its alpha, so what is hardly there has no say. The opacity is at
+  least that of an opaque surface: a network that is not sure of the depth makes a faint front,
+  and then the colours of what lies behind it, which has no detail, show through.
 - colour and alpha are those of the picture at k times the cells.
 - the sizes are the parent's, 1/k of them across the view. Along it they stay, so that no crack
   opens for a view from the side.
@@ -39,6 +41,7 @@ from .posing import reference_cameras
 
 PLAIN = 6 / 255  # a cell that differs by less in itself, and from those beside it, is plain
 MOST_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
+SURE = 2.0  # logit of a child's opacity at least, where alpha is 1
 ROUNDS = 2  # of correction
 SURER = 8.0  # how much the logit of an opacity rises where a whole unit of alpha is missing
 FAINT = 0.05  # alpha of a rendered pixel under which its colour says little
@@ -146,7 +149,7 @@ def _fields(front: Gaussians, cells: Tensor, alpha: Tensor, distance: float) -> 
     Depth along the ray, what the network added to the logit of the opacity, and the weight.
     """
     weight = alpha.flatten()[cells]
-    opacity = torch.logit(front.opacities, 1e-6) - EMPTY * (weight - 1)
+    opacity = (torch.logit(front.opacities, 1e-6) - EMPTY * (weight - 1)).clamp_min(SURE)
     depth = front.means[:, 2] + distance
     fields = alpha.new_zeros(3, alpha.numel())
     fields[:, cells] = torch.stack([depth, opacity, torch.ones_like(depth)]) * weight

@@ -121,6 +121,17 @@ def test_a_checkerboard_at_512_becomes_sharp_with_the_shipped_model():
     assert found[1] > found[0] + 5, found  # dB, whatever the weights
 
 
+def test_what_lies_behind_a_faint_front_does_not_show_through():
+    model, rgba = fresh(ray_layers=2, ray_back="opaque"), board(96, 8)
+    with torch.inference_mode():
+        model.decoder.opacity_bias[0] = -1.0
+        image = model_input(rgba, model.config)
+        made = model(image, reference_cameras(model.config, 1))[0]
+        made.colors[1::2] = 0.0  # a black back
+        sharp = split_front(made, image[0], rgba, model.config, 4)
+    assert input_view(sharp, model.config, rgba) > 18.5  # dB; 16.2 if it did
+
+
 def test_no_crack_opens_from_the_side():
     """The ball's shading tells the shipped model its depth; its alpha from 60° and 90° stays."""
     size = 512
