@@ -16,7 +16,12 @@ from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
 from gamba_warp.train.batches import load_sample
 from gamba_warp.train.data.samples import Change
-from gamba_warp.train.objective.losses import DEPTH_BEND, depth_loss
+from gamba_warp.train.objective.losses import (
+    DEPTH_BEND,
+    SLOPE_STEPS,
+    SLOPE_WEIGHT,
+    depth_loss,
+)
 
 SIDES = (1.0, 0.4, 0.6)
 RAYS = (*micro.MODEL, "decoder=rays", "ray_cells=2", "ray_layers=3", "ray_features=8")
@@ -87,13 +92,18 @@ def some(seed, layers=3, count=40):
     return Gaussians(means, None, scales, opacities, torch.ones_like(means)), cameras, surfaces
 
 
+def bent(gap):
+    size = gap.abs()
+    return torch.where(size < DEPTH_BEND, size**2 / (2 * DEPTH_BEND), size - DEPTH_BEND / 2)
+
+
 def slow_depth_loss(gaussians, layers, cameras, surfaces):
     """The same, one Gaussian after the other."""
     totals = []
     for b in range(len(surfaces)):
         total = 0.0
         for layer, surface in zip((0, layers - 1), surfaces[b]):
-            values = []
+            values, pixels = [], {}
             for n in range(layer, gaussians.num, layers):
                 point = cameras.viewmats[b, :3, :3] @ gaussians.means[b, n]
                 point = point + cameras.viewmats[b, :3, 3]
@@ -102,10 +112,15 @@ def slow_depth_loss(gaussians, layers, cameras, surfaces):
                 if not (0 <= column < 12 and 0 <= row < 12) or gaussians.opacities[b, n] == 0:
                     continue
                 if (true := surface[row, column].item()) > 0:
-                    gap = (point[2] - true).abs()
-                    bend = DEPTH_BEND
-                    values.append(torch.where(gap < bend, gap**2 / (2 * bend), gap - bend / 2))
+                    values.append(bent(point[2] - true))
+                    pixels.setdefault((row, column), []).append(point[2] - true)
             total = total + sum(values) / max(1, len(values))
+            gaps = {place: sum(each) / len(each) for place, each in pixels.items()}
+            for down, right in [(s, 0) for s in SLOPE_STEPS] + [(0, s) for s in SLOPE_STEPS]:
+                pairs = [((r, c), (r + down, c + right)) for r, c in gaps]
+                slopes = [bent(gaps[b] - gaps[a]) for a, b in pairs if b in gaps]
+                share = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
+                total = total + share * sum(slopes) / max(1, len(slopes))
         totals.append(total)
     return torch.stack(totals)
 

@@ -26,6 +26,7 @@ from ..config import LossConfig, TrainConfig
 from .radial_mask import contour_distances, project_means, radial_mask_loss
 
 DEPTH_BEND = 0.02  # object units; see ``depth_loss``
+SLOPE_STEPS, SLOPE_WEIGHT = (1, 2, 4, 8), 1.0  # pixels; beside the distances
 
 
 def mse(got: Tensor, want: Tensor) -> Tensor:
@@ -86,7 +87,10 @@ def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Te
     """How far the first layer of ``rays`` is from the first surface, and the last from the last.
 
     A Gaussian is compared at the pixel that its centre falls on, by the distance along the optical
-    axis: quadratically up to ``DEPTH_BEND`` object units, and linearly beyond.
+    axis: quadratically up to ``DEPTH_BEND`` object units, and linearly beyond. So are the
+    differences between two pixels of a row or a column that lie ``SLOPE_STEPS`` apart: they tell
+    the form of a surface apart from its distance (after the gradient term of Ranftl et al. 2020,
+    "Towards Robust Monocular Depth Estimation").
 
     Args:
         gaussians: ``[B, N]``, as the decoder ``rays`` makes them: its layers lie side by side.
@@ -96,21 +100,41 @@ def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Te
             known; pictures of the size that the cameras have.
 
     Returns:
-        ``[B]``, the sum of the means over both layers; 0 where no depth is known.
+        ``[B]``, over both layers the mean of the distances and ``SLOPE_WEIGHT`` times that of the
+        differences; 0 where no depth is known.
     """
     height, width = surfaces.shape[-2:]
     places, depths = project_means(gaussians.means, cameras[:, None])
     column, row = places[:, 0].detach().floor().long().unbind(-1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-    means = []
-    for layer, surface in zip((0, layers - 1), surfaces.unbind(1)):
+    total = surfaces.new_zeros(len(surfaces))
+    for layer, surface in zip((0, layers - 1), surfaces.flatten(2).unbind(1)):
         of = (slice(None), slice(layer, None, layers))
-        true = surface.flatten(1).gather(1, pixel[of])
+        true = surface.gather(1, pixel[of])
         known = inside[of] & (gaussians.opacities[of] > 0) & (true > 0)
-        gaps = smooth_l1_loss(depths[:, 0][of], true, beta=DEPTH_BEND, reduction="none")
-        means.append((gaps * known).sum(1) / known.sum(1).clamp_min(1))
-    return means[0] + means[1]
+        gaps = (depths[:, 0][of] - true) * known
+        total = total + _bent_mean(gaps, known)
+        place = torch.where(known, pixel[of], height * width)  # the unknown share a place behind
+        empty = surface.new_zeros(len(surface), height * width + 1)
+        shape = (1, (height, width))
+        count = empty.scatter_add(1, place, torch.ones_like(gaps))[:, :-1].unflatten(*shape)
+        gap = empty.scatter_add(1, place, gaps)[:, :-1].unflatten(*shape) / count.clamp_min(1)
+        seen = count.clamp_max(1)
+        for step in SLOPE_STEPS:
+            for axis in (1, 2):
+                rest = gap.shape[axis] - step
+                pairs = (x.narrow(axis, at, rest) for at in (0, step) for x in (gap, seen))
+                a, a_seen, b, b_seen = pairs
+                slopes = _bent_mean(b - a, a_seen * b_seen)
+                total = total + SLOPE_WEIGHT / (2 * len(SLOPE_STEPS)) * slopes
+    return total
+
+
+def _bent_mean(gaps: Tensor, known: Tensor) -> Tensor:
+    """The mean of the known errors, quadratic up to ``DEPTH_BEND``: ``[B, ..]`` to ``[B]``."""
+    bent = smooth_l1_loss(gaps, torch.zeros_like(gaps), beta=DEPTH_BEND, reduction="none")
+    return (bent * known).flatten(1).sum(1) / known.flatten(1).sum(1).clamp_min(1)
 
 
 def random_crops(got: Tensor, want: Tensor, size: int) -> tuple[Tensor, Tensor]:
