@@ -8,6 +8,7 @@ from torch import Tensor
 from ..runtime.lanes import streams
 from ..runtime.launch import cuda_launch, parallel_launch
 from ..runtime.memory import empty
+from ..runtime.recording import kind_of
 from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, VALUES, backward_kernel, forward_kernel
@@ -34,7 +35,7 @@ def _pack(x: Tensor | None, rows: int, channels: int, like: Tensor) -> Tensor:
 
 def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None):
     """Channels padded to whole values, views of the parameters, and the state's three rows."""
-    value, width = VALUES[x.device.type]
+    value, width = VALUES[kind_of(x.device)]
     blocks = -(-x.shape[2] // width)
     shape = (width,) if width > 1 else ()
     w = _pack(weight, TAPS, blocks * width, x).view(TAPS, blocks, *shape)
@@ -46,7 +47,7 @@ def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | No
 
 
 def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list) -> None:
-    if x.device.type == "cpu":
+    if kind_of(x.device) == "cpu":
         threads = 1 if x.numel() < _FEW else None
         parallel_launch(kernel, dim, inputs, outputs, threads=threads)
     else:
@@ -63,8 +64,9 @@ def conv(
     x = lane_contiguous(x)
     blocks, w, v, rows = _operands(x, weight, bias, state)
     out = _empty(x, tuple(x.shape))
-    kernel = forward_kernel(x.device.type, x.dtype)
-    stream = int(x.device.type == "cpu" and streams([out]))
+    kind = kind_of(x.device)
+    kernel = forward_kernel(kind, x.dtype)
+    stream = int(kind == "cpu" and streams([out]))
     inputs = [int(silu), x, w, v, rows, stream]
     _launch(x, kernel, (x.shape[0] * strips, blocks), inputs, [out])
     return out
@@ -90,7 +92,8 @@ def _conv_backward(
     batch, length, channels = x.shape
     chunks = -(-length // CHUNK)
     x = lane_contiguous(x)
-    value, width = VALUES[x.device.type]
+    kind = kind_of(x.device)
+    value, width = VALUES[kind]
     blocks, w, v, rows = _operands(x, weight, bias, state)
     dx = _empty(x, (batch, length if need_x else 0, channels))
     dstate = x.new_zeros(batch, TAPS - 1 if need_state else 0, channels)
@@ -100,7 +103,7 @@ def _conv_backward(
     shaped = dweight.view(*dweight.shape[:2], blocks, width) if width > 1 else dweight
     _launch(
         x,
-        backward_kernel(x.device.type, x.dtype),
+        backward_kernel(kind, x.dtype),
         (batch * chunks, blocks),
         [int(silu), x, w, v, rows, lane_contiguous(dout)],
         [dx, dstate, view(shaped, value)],

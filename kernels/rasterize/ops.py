@@ -11,6 +11,7 @@ from typing import List
 import torch
 from torch import Tensor
 
+from ..runtime.recording import kind_of
 from ..runtime.start import without_compiler
 from .constants import BLOCKS
 from .cpu import bin as bin_cpu
@@ -35,11 +36,11 @@ MAX_PAIRS = 2**31 - 1  # pairs are numbered in int32
 
 
 def _compositor(device: torch.device):
-    return composite_cpu if device.type == "cpu" else composite_cuda
+    return composite_cpu if kind_of(device) == "cpu" else composite_cuda
 
 
 def _projector(device: torch.device) -> Callable[..., None]:
-    return project_on_lanes if device.type == "cpu" else project_on_threads
+    return project_on_lanes if kind_of(device) == "cpu" else project_on_threads
 
 
 @without_compiler
@@ -77,7 +78,7 @@ def _project_vjp(
     cotangents: List[Tensor],
     wanted: List[bool],
 ) -> List[Tensor]:
-    on_lanes = vjp_on_lanes if conics.device.type == "cpu" else None
+    on_lanes = vjp_on_lanes if kind_of(conics.device) == "cpu" else None
     kept = make_lens(LensOptions(*lens)), conics, status
     grads = project_backward(inputs, *kept, cotangents, wanted, on_lanes)
     return [g for g in grads if g is not None]
@@ -114,7 +115,8 @@ project.register_autograd(_project_backward, setup_context=_project_setup)
 
 
 def _bin_views(device: torch.device, exact: bool) -> Callable[..., Bins]:
-    return bin_cpu.bin_views if device.type == "cpu" else partial(bin_cuda.bin_views, exact=exact)
+    on_cpu = kind_of(device) == "cpu"
+    return bin_cpu.bin_views if on_cpu else partial(bin_cuda.bin_views, exact=exact)
 
 
 def _refuse_too_many(pairs: int) -> None:

@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from . import team
-from .recording import recorder
+from .recording import kind_of, recorder, stand_in
 from .views import unkept, view
 
 
@@ -99,7 +99,7 @@ def cuda_launch(
 ) -> None:
     """Launches on torch's current stream of ``device``; on a CPU device, on the CPU (for tests).
 
-    In a dry run (``recording.py``) the launch is only told to the recorder.
+    In a dry run (``recording.py``) the launch is only told to the recorder; a stand-in executes it.
 
     Args:
         kernel: a ``wp.Kernel``, not generic.
@@ -109,10 +109,14 @@ def cuda_launch(
         device: of the tensors, cpu or cuda.
         block_dim: threads of a block; on a CPU it needs ``wp.config.enable_cpu_blocks``.
     """
+    dim = (dim,) if isinstance(dim, int) else tuple(dim)
     if (dry := recorder()) is not None:
-        dry.note(kernel, (dim,) if isinstance(dim, int) else tuple(dim), block_dim)
+        dry.note(kernel, dim, block_dim)
         return
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
+    if (other := stand_in.get()) is not None:
+        other.launch(kernel, dim, arguments, block_dim)
+        return
     target: dict[str, Any] = {"device": "cpu"}
     if device.type == "cuda":
         target = {"stream": wp.stream_from_torch(torch.cuda.current_stream(device))}
@@ -126,7 +130,7 @@ def launch(kernel: Any, dim: int | Sequence[int], inputs, outputs, device: torch
     """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing."""
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
-    if device.type == "cpu":
+    if kind_of(device) == "cpu":
         parallel_launch(kernel, dim, inputs, outputs)
     else:
         cuda_launch(kernel, dim, [0, *inputs], outputs, device=device)

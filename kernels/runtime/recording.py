@@ -1,7 +1,8 @@
-"""A dry run of launches on CUDA: they are told to a function instead of made.
+"""Launches on CUDA where there is no GPU: told to a function in a dry run, or executed by another.
 
-The tensors may be fake, without memory: inside, ``views.py`` makes no views, and what is asked of
-the device is answered for one that is imagined.
+In a dry run the tensors may be fake, without memory: inside, ``views.py`` makes no views, and what
+is asked of the device is answered for one that is imagined. A stand-in executes what CUDA would,
+on tensors of the CPU: inside, the operators take their CUDA path for these.
 """
 
 from __future__ import annotations
@@ -29,6 +30,21 @@ class Recorder:
     multiprocessors: int
 
 
+@dataclass(frozen=True)
+class StandIn:
+    """Who executes the launches, on tensors of the CPU.
+
+    Attributes:
+        launch: called with the kernel, the dimensions of the launch, its arguments as Warp takes
+            them, and the threads of a block; returns when all is done.
+        multiprocessors: of the imagined device.
+    """
+
+    launch: Callable[[wp.Kernel, tuple[int, ...], list, int], None]
+    multiprocessors: int
+
+
+stand_in: ContextVar[StandIn | None] = ContextVar("stand_in", default=None)
 _recorder: ContextVar[Recorder | None] = ContextVar("recorder", default=None)
 
 
@@ -47,11 +63,15 @@ def recording(recorder: Recorder) -> Iterator[None]:
         _recorder.reset(token)
 
 
+def kind_of(device: torch.device) -> str:
+    """Which kernels work on a device's tensors, "cpu" or "cuda" (or else the device's type)."""
+    return device.type if stand_in.get() is None else "cuda"
+
+
 def multiprocessors_of(device: torch.device) -> int:
     """The number of multiprocessors of a CUDA device; of the imagined one in a dry run."""
-    recorder = _recorder.get()
-    if recorder is not None:
-        return recorder.multiprocessors
+    if (imagined := _recorder.get() or stand_in.get()) is not None:
+        return imagined.multiprocessors
     index = torch.cuda.current_device() if device.index is None else device.index
     return _properties(index).multi_processor_count
 

@@ -84,7 +84,8 @@ class Packed:
     """A Warp struct as a launch takes it, made of tensors and numbers.
 
     An instance of the struct itself would take 10 µs for each array that it is given; this takes
-    what ``view`` does, so that kernels may have structs of arrays. The tensors are kept alive.
+    what ``view`` does, so that kernels may have structs of arrays. What it is made of is kept, in
+    ``values``.
 
     Args:
         cls: from ``struct``.
@@ -93,7 +94,7 @@ class Packed:
     """
 
     def __init__(self, cls: Any, *values: Any) -> None:
-        self._values, self._made = values, cls.ctype()
+        self.values, self._made = values, cls.ctype()
         if recorder() is not None:  # the tensors may have no memory
             return
         of = [(x.dtype, x.shape, x.stride()) if isinstance(x, Tensor) else x for x in values]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..runtime.recording import kind_of
 from ..runtime.start import without_compiler
 from .cpu import launch as cpu
 from .problem import Scan
@@ -16,7 +17,7 @@ _SCAN = (
 
 
 def _implementation(x: Scan):
-    if x.u.device.type == "cpu":
+    if kind_of(x.u.device) == "cpu":
         return cpu
     from .cuda import launch as cuda
 

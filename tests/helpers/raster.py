@@ -10,8 +10,10 @@ import types
 import torch
 
 from gamba_warp.cameras import orbit
+from gamba_warp.kernels.rasterize import rasterization
 from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize.reference import rasterization_reference
+from helpers import assert_rel_rms
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 PICTURE = 1e-5  # float32 sums of some hundred terms in [0, 1]
@@ -72,6 +74,35 @@ def near_a_cut(scene, options):
         for s in (-1e-5, 1e-5)
     )
     return (low != high)[..., 0]
+
+
+def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
+    """Pictures and gradients under a random cotangent, against the oracle in float64; the meta."""
+    flip = near_a_cut(scene, {**options, "antialiased": antialiased})
+    assert flip.float().mean() < 0.05
+    got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
+    kind = "antialiased" if antialiased else "classic"
+    renders, alphas, meta = rasterization(**got, render_mode=mode, rasterize_mode=kind, **options)
+    color, depth, alpha = rasterization_reference(**want, antialiased=antialiased, **options)
+    if mode.endswith("ED"):
+        depth = depth / alpha.clamp_min(1e-10)
+    parts = {"RGB": [color], "D": [depth], "ED": [depth]}.get(mode, [color, depth])
+    expected = torch.cat(parts, -1)
+    assert alpha.mean() > 0.1 and renders.std() > 0.01, "the picture is empty"
+    keep = ~flip[..., None]
+    assert ((renders - expected) * keep).abs().max() <= PICTURE * max(1.0, expected.max().item())
+    assert ((alphas - alpha) * keep).abs().max() <= PICTURE
+    v_renders = torch.randn_like(renders) * keep
+    v_alphas = torch.randn_like(alphas) * keep
+    ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
+    ((expected * v_renders).sum() + (alpha * v_alphas).sum()).backward()
+    for name in NAMES:
+        if isinstance(got[name], torch.Tensor) and want[name].grad is not None:
+            if got[name].grad is None:  # depth alone does not see colours
+                assert name in ("colors", "backgrounds") and (want[name].grad == 0).all()
+            else:
+                assert_rel_rms(got[name].grad, want[name].grad, gradient, name)
+    return meta
 
 
 def nerfacc():

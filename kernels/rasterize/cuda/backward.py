@@ -293,7 +293,6 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                                 if L.load_stop(stops, p.place, j * WARP) == k:
                                     T[j] = -T[j]
             memory.sync()
-        memory.sync()
         complete(arena, gaussians, p.lane, waiting, rows_out.sums)
 
     return walk

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ...runtime.launch import launch
+from ...runtime.recording import kind_of
 from ...runtime.start import without_compiler
 from ...runtime.views import Packed
 from ..project import empty_on
@@ -18,7 +19,7 @@ MOST_CHANNELS = 64  # of the kernels: on a CPU the rows of coefficients lie on a
 
 
 def _kernels(device: torch.device):
-    return cpu if device.type == "cpu" else cuda
+    return cpu if kind_of(device) == "cpu" else cuda
 
 
 def _launch(kernel, chunk: int, tensors: list, outputs: list) -> None:

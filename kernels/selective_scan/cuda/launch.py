@@ -17,7 +17,7 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import cuda_launch
-from ...runtime.recording import multiprocessors_of
+from ...runtime.recording import kind_of, multiprocessors_of
 from ...runtime.scalars import LOG2E, exp2
 from ...runtime.views import lane_contiguous
 from ..problem import DISCRETIZATIONS, Scan
@@ -103,7 +103,7 @@ def scan_tuning(shape: Sequence[int], states: int, groups: int, device: torch.de
     """
     if FORCED is not None:
         return FORCED
-    if device.type != "cuda":
+    if kind_of(device) != "cuda":
         return Tuning()
     return choose(*shape, states, groups, multiprocessors_of(device))
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers import assert_rel_rms
-from helpers.raster import GRADIENT, NAMES, PICTURE, leaves, make, near_a_cut
+from helpers.raster import GRADIENT, NAMES, PICTURE, compare, leaves, make, near_a_cut
 
 from gamba_warp.kernels.rasterize import ops, rasterization
 from gamba_warp.kernels.rasterize.harmonics import colors_from_harmonics
@@ -13,35 +13,6 @@ from gamba_warp.kernels.rasterize.tiles import Limits, Size
 # Σ w z / Σ w where pixels are so faint that 1 - T has lost the digits of Σ w
 DEPTH = 1e-6  # relative: rounding of the weights, of which a mean of depths sees a part
 DEPTH_GRADIENT = 5e-6  # a depth minus the mean depth loses a digit
-
-
-def compare(scene, mode="RGB", antialiased=False, gradient=GRADIENT, **options):
-    """Pictures and gradients under a random cotangent, against the oracle in float64."""
-    flip = near_a_cut(scene, {**options, "antialiased": antialiased})
-    assert flip.float().mean() < 0.05
-    got, want = leaves(scene, torch.float32), leaves(scene, torch.float64)
-    kind = "antialiased" if antialiased else "classic"
-    renders, alphas, meta = rasterization(**got, render_mode=mode, rasterize_mode=kind, **options)
-    color, depth, alpha = rasterization_reference(**want, antialiased=antialiased, **options)
-    if mode.endswith("ED"):
-        depth = depth / alpha.clamp_min(1e-10)
-    parts = {"RGB": [color], "D": [depth], "ED": [depth]}.get(mode, [color, depth])
-    expected = torch.cat(parts, -1)
-    assert alpha.mean() > 0.1 and renders.std() > 0.01, "the picture is empty"
-    keep = ~flip[..., None]
-    assert ((renders - expected) * keep).abs().max() <= PICTURE * max(1.0, expected.max().item())
-    assert ((alphas - alpha) * keep).abs().max() <= PICTURE
-    v_renders = torch.randn_like(renders) * keep
-    v_alphas = torch.randn_like(alphas) * keep
-    ((renders * v_renders).sum() + (alphas * v_alphas).sum()).backward()
-    ((expected * v_renders).sum() + (alpha * v_alphas).sum()).backward()
-    for name in NAMES:
-        if isinstance(got[name], torch.Tensor) and want[name].grad is not None:
-            if got[name].grad is None:  # depth alone does not see colours
-                assert name in ("colors", "backgrounds") and (want[name].grad == 0).all()
-            else:
-                assert_rel_rms(got[name].grad, want[name].grad, gradient, name)
-    return meta
 
 
 @pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])

@@ -1,0 +1,192 @@
+"""What Warp does for a launch on CUDA, done by the interpreter on tensors of the CPU."""
+
+import contextlib
+import ctypes
+import functools
+import json
+import re
+import zlib
+from dataclasses import dataclass, field
+
+import torch
+import warp as wp
+from warp._src import context as warp_context
+
+from gamba_warp.kernels.runtime.recording import StandIn, stand_in
+from gamba_warp.kernels.runtime.views import Packed
+
+from .machine import FAULTS, Array, Finding, Launch, Missing, c_int64, library
+from .parse import Program, read
+
+ARCHITECTURE = 80  # the PTX of the kernels for sm_90 is the same
+MOST_STEPS = 20_000_000  # instructions of a warp; those of a test's kernels take under a million
+MOST_FINDINGS = 64
+
+
+@functools.cache
+def programs(module, block_dim: int, architecture: int = ARCHITECTURE) -> tuple[dict, dict]:
+    """A Warp module's programs by entry, and what Warp notes of the entries.
+
+    The PTX lies in Warp's folder of compiled kernels, by the module's hash.
+
+    Raises:
+        Missing: it cannot be compiled here, or kept.
+        Refused: as ``read``.
+    """
+    before = module.options["block_dim"]
+    module.options["block_dim"] = block_dim
+    try:
+        (path,) = wp.compile_aot_module(module, arch=architecture, use_ptx=True)
+        text = path.read_text(errors="replace")
+    except (OSError, RuntimeError) as error:
+        raise Missing(f"no PTX of {module.name}: {error}") from error
+    finally:
+        module.options["block_dim"] = before
+    meta = path.with_name(f"{path.name.rsplit('.', 2)[0]}.meta")
+    return read(text), json.loads(meta.read_bytes())
+
+
+@dataclass
+class Interpreter:
+    """Executes launches, and keeps what it finds.
+
+    Attributes:
+        seed: of the order of all that has none on a GPU; 0: in order.
+        approximate: how the approximate units err, within what is documented of them: 0 not at all,
+            1 to one side, else as drawn from this number.
+        findings: a line each.
+        executed: by entry its program, and by instruction how many warps executed it.
+        trace: after each launch a checksum of all the memory that it was given.
+        steps: instructions of warps.
+    """
+
+    seed: int = 0
+    approximate: int = 0
+    findings: list[str] = field(default_factory=list)
+    executed: dict[str, tuple[Program, list[int]]] = field(default_factory=dict)
+    trace: list[int] = field(default_factory=list)
+    steps: int = 0
+
+    def launch(self, kernel, dim, arguments, block_dim: int) -> None:
+        """As a ``StandIn``."""
+        of_module, notes = programs(kernel.module, block_dim)
+        pattern = re.compile(re.escape(kernel.key) + "_[0-9a-f]{8}_cuda_kernel_forward")
+        (name,) = filter(pattern.fullmatch, of_module)
+        bounds = warp_context._build_launch_bounds_from_tuple(dim, kernel.adj.kernel_dim)
+        packed = [
+            warp_context.pack_arg(kernel, wanted.type, wanted.label, value, "cpu")
+            for wanted, value in zip(kernel.adj.args, arguments, strict=True)
+        ]
+        params = [bytes(value) for value in (bounds, *packed)]
+        blocks = max(1, -(-bounds.size // block_dim))
+        if bounds.size:
+            dynamic = notes.get(f"{name}_smem_bytes", 0)
+            sizes = block_dim, (blocks, 1, 1), dynamic
+            self.execute(of_module[name], params, _tensors(arguments), sizes)
+
+    def execute(self, program: Program, params: list[bytes], tensors, sizes) -> None:
+        """Runs an entry.
+
+        Args:
+            program: from ``read``.
+            params: the bytes of each parameter.
+            tensors: what may be touched.
+            sizes: threads of a block, blocks in three directions, bytes of dynamic shared memory.
+        """
+        threads, grid, dynamic = sizes
+        assert [len(x) for x in params] == [size for _, size in program.params], program.name
+        assert not program.most_threads or threads <= program.most_threads, program.name
+        blob = bytearray(program.params_size)
+        for value, (at, size) in zip(params, program.params):
+            blob[at : at + size] = value
+        count, arrays = len(program.text), _arrays(tensors)
+        findings, executed = (Finding * MOST_FINDINGS)(), (c_int64 * count)()
+        launch = Launch(
+            code=program.code,
+            constants=program.constants,
+            params=ctypes.addressof((ctypes.c_char * len(blob)).from_buffer(blob)),
+            arrays=arrays,
+            instructions=count,
+            constant_count=len(program.constants),
+            file_size=program.file_size,
+            params_size=len(blob),
+            array_count=len(arrays),
+            shared_size=program.shared_size + dynamic,
+            local_size=program.local_size,
+            threads=threads,
+            grid=grid,
+            special=tuple(program.special),
+            seed=self.seed and self.seed + 1000 * len(self.trace),
+            approximate=self.approximate,
+            limit=MOST_STEPS,
+            findings=findings,
+            most_findings=MOST_FINDINGS,
+            executed=executed,
+        )
+        library().run(ctypes.byref(launch))
+        self.steps += launch.steps
+        contents = ((ctypes.c_char * x.size).from_address(x.base) for x in arrays)
+        self.trace.append(sum(map(zlib.crc32, contents)))  # their addresses have no order
+        _, counts = self.executed.setdefault(program.name, (program, [0] * count))
+        counts[:] = map(sum, zip(counts, executed))
+        for found in findings[: launch.found]:
+            where = f"{program.name}: {program.text[found.at]!r}"
+            thread = f"block {found.block}, thread {found.thread}"
+            self.findings.append(f"{FAULTS[found.fault]}: {where}, {thread}, {found.times} times")
+
+
+def _tensors(values) -> list[torch.Tensor]:
+    """The tensors that a launch is given, those inside of structs too."""
+    found = []
+    for value in values:
+        if isinstance(value, Packed):
+            found += _tensors(value.values)
+        elif isinstance(owner := getattr(value, "owner", value), torch.Tensor):
+            found.append(owner)
+    return found
+
+
+def _arrays(tensors):
+    """The memory of tensors, in order; what overlaps is one array."""
+    merged: list[list[int]] = []
+    for x in sorted((x for x in tensors if x.numel()), key=torch.Tensor.data_ptr):
+        size, begin = x.element_size(), x.data_ptr()
+        end = begin + size * (1 + sum((n - 1) * s for n, s in zip(x.shape, x.stride())))
+        unit = size.bit_length() - 1
+        if merged and begin < merged[-1][1]:
+            merged[-1][1:] = max(end, merged[-1][1]), min(unit, merged[-1][2])
+        else:
+            merged.append([begin, end, unit])
+    found = [(begin, end - begin, min(unit, 2)) for begin, end, unit in merged]
+    return (Array * len(found))(*found)
+
+
+@contextlib.contextmanager
+def interpreted(multiprocessors: int = 132, **options):
+    """Inside, operators on tensors of the CPU take their CUDA path; gives its ``Interpreter``.
+
+    Memory that nobody has written is full of NaN, or 77.
+    """
+    library()
+    made = Interpreter(**options)
+    before = {(owner, name): getattr(owner, name) for owner, name in _MAKERS}
+    for (owner, name), make in before.items():
+        setattr(owner, name, _poisoned(make))
+    token = stand_in.set(StandIn(made.launch, multiprocessors))
+    try:
+        yield made
+    finally:
+        stand_in.reset(token)
+        for (owner, name), make in before.items():
+            setattr(owner, name, make)
+
+
+_MAKERS = (torch, "empty"), (torch, "empty_like"), (torch.Tensor, "new_empty")
+
+
+def _poisoned(make):
+    def poisoned(*args, **options):
+        x = make(*args, **options)
+        return x.fill_(torch.nan if x.is_floating_point() else 77)
+
+    return poisoned

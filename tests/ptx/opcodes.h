@@ -1,0 +1,231 @@
+// The operations of PTX that compute, each on the 32 lanes of a warp; machine.cpp has all others.
+//
+// A register is 32 slots of 4 bytes (W) or 8 (Q), one a lane. A predicate is a W of 0 or 1; what
+// has 16 bits lies in a W with zeros above it.
+#include <cfenv>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+#include <utility>
+
+typedef uint8_t u8;
+typedef uint16_t u16;
+typedef uint32_t u32;
+typedef uint64_t u64;
+typedef int16_t s16;
+typedef int32_t s32;
+typedef int64_t s64;
+typedef float f32;
+
+const u64 SHARED = 1ull << 56, LOCAL = 2ull << 56;  // where a space begins in generic addresses
+
+struct Instruction {  // as parse.py has it
+    s32 op, guard, inverted, target, writes, reads, to[4], from[5];
+    s32 space, size, vector, is_signed, wide, wide_address;
+    s64 offset;
+};
+
+// Kinds of which machine.cpp knows more than that their lanes compute.
+enum Kind { PLAIN, SELECT, AND, OR, LOAD, STORE, ATOMIC, BRANCH, EXIT, BLOCK, WARP };
+
+struct Opcode {
+    const char *name, *operands;  // widths of the operands, first of what is written
+    s32 writes;
+    Kind kind;
+    void (*run)(u8* file, const Instruction& I, u32 lanes);
+};
+
+template<class T>
+using Slot = std::conditional_t<sizeof(T) == 8, u64, u32>;
+template<class... T>
+struct Widths {
+    static constexpr char text[] = {(sizeof(T) == 8 ? 'Q' : 'W')..., 0};
+};
+
+template<class T>
+inline T value(Slot<T> slot) {
+    if constexpr (!std::is_floating_point_v<T>) return (T)slot;
+    T x;
+    memcpy(&x, &slot, sizeof x);
+    return x;
+}
+
+template<class T>
+inline Slot<T> slot(T x) {
+    if constexpr (!std::is_floating_point_v<T>) return (std::make_unsigned_t<T>)x;
+    Slot<T> s;
+    memcpy(&s, &x, sizeof s);
+    return s;
+}
+
+template<class D, class... A, size_t... i, class F>
+inline void on_lanes(
+    u8* file, const Instruction& I, u32 lanes, F function, std::index_sequence<i...>) {
+    auto to = (Slot<D>*)(file + I.to[0]);
+    auto one = [&](int l) {
+        to[l] = slot<D>(function(value<A>(((const Slot<A>*)(file + I.from[i]))[l])...));
+    };
+    if (lanes == ~0u) {
+#pragma GCC ivdep
+        for (int l = 0; l < 32; l++) one(l);
+    } else {
+        for (int l = 0; l < 32; l++)
+            if (lanes >> l & 1) one(l);
+    }
+}
+
+// The approximate units: 0 rounds as best can be, 1 takes the smallest value that the documented
+// bound allows, any other number draws an error within it for each argument.
+static u32 approximate = 0;
+
+inline f32 flushed(f32 x) { return std::fpclassify(x) == FP_SUBNORMAL ? std::copysign(0.f, x) : x; }
+
+inline f32 approx(double exact, f32 argument, double bound) {
+    if (!approximate || !std::isfinite(exact)) return exact;
+    u32 x = slot(argument) ^ approximate * 0x9E3779B9u;
+    x = (x ^ x >> 16) * 0x7feb352du;
+    x = (x ^ x >> 15) * 0x846ca68bu;
+    double drawn = (x ^ x >> 16) / 2147483648.0 - 1.0;
+    return exact * (1 + bound * (approximate == 1 ? -1.0 : drawn));
+}
+
+template<class T>
+inline T truncated(f32 x) {  // beyond the type's range, its ends; NaN is 0
+    const double low = std::is_signed_v<T> ? -2147483648.0 : 0.0, high = low + 4294967295.0;
+    return std::isnan(x) ? 0 : x < low ? (T)low : x > high ? (T)high : (T)x;
+}
+
+// A number and NaN give the number, and -0 lies below 0.
+inline f32 least(f32 a, f32 b) {
+    if (std::isnan(a) || std::isnan(b)) return std::isnan(a) ? std::isnan(b) ? NAN : b : a;
+    return a == b ? (std::signbit(a) ? a : b) : a < b ? a : b;
+}
+inline f32 greatest(f32 a, f32 b) { return -least(-a, -b); }
+
+// Without bits: PTX leaves a division by zero open, and hardware gives these.
+template<class T>
+inline T divided(T a, T b) {
+    if (std::is_signed_v<T> && b == (T)-1) return (T)(0 - (std::make_unsigned_t<T>)a);
+    return b == 0 ? (T)-1 : (T)(a / b);
+}
+template<class T>
+inline T rest(T a, T b) {
+    return b == 0 ? a : std::is_signed_v<T> && b == (T)-1 ? 0 : (T)(a % b);
+}
+
+inline u32 reversed(u32 x) {
+    u32 y = 0;
+    for (int i = 0; i < 32; i++) y |= (x >> i & 1) << (31 - i);
+    return y;
+}
+
+inline f32 downward(f32 a, f32 b, f32 c) {  // a product and a sum, rounded down once
+    std::fesetround(FE_DOWNWARD);
+    volatile f32 x = a;
+    volatile f32 rounded = std::fma(x, b, c);
+    std::fesetround(FE_TONEAREST);
+    return rounded;
+}
+
+// To half precision, to the nearest and of two such to the even one.
+inline u16 bf16(f32 x) {
+    u32 bits = slot(x);
+    return std::isnan(x) ? 0x7fff : (bits + 0x7fff + (bits >> 16 & 1)) >> 16;
+}
+inline u16 f16(f32 x) {
+    _Float16 half = x;
+    u16 bits;
+    memcpy(&bits, &half, 2);
+    return std::isnan(x) ? 0x7fff : bits;
+}
+inline f32 of_f16(u16 bits) {
+    _Float16 half;
+    memcpy(&half, &bits, 2);
+    return half;
+}
+
+// clang-format off
+#define RUN(e, D, ...) [](u8* file, const Instruction& I, u32 lanes) { \
+    on_lanes<D, __VA_ARGS__>(file, I, lanes, e, PLACES(__VA_ARGS__)); }
+#define PLACES(...) std::make_index_sequence<sizeof(Widths<__VA_ARGS__>::text) - 1>()
+#define OP1(name, D, A, e) {name, Widths<D, A>::text, 1, PLAIN, RUN([](A a) { return (D)(e); }, D, A)},
+#define OP2K(name, kind, D, A, B, e) \
+    {name, Widths<D, A, B>::text, 1, kind, RUN(([](A a, B b) { return (D)(e); }), D, A, B)},
+#define OP2(name, D, A, B, e) OP2K(name, PLAIN, D, A, B, e)
+#define OP3K(name, kind, D, A, B, C, e) \
+    {name, Widths<D, A, B, C>::text, 1, kind, RUN(([](A a, B b, C c) { return (D)(e); }), D, A, B, C)},
+#define OP3(name, D, A, B, C, e) OP3K(name, PLAIN, D, A, B, C, e)
+
+// One operation for several types; an operation that does not depend on the sign is unsigned.
+#define MOVES(t, T) OP1("mov." t, T, T, a) OP3K("selp." t, SELECT, T, T, T, u32, c ? a : b)
+#define INTEGERS(name, e) \
+    OP2(name ".s16", u16, u16, u16, e) OP2(name ".u16", u16, u16, u16, e) OP2(name ".s32", u32, u32, u32, e) \
+    OP2(name ".u32", u32, u32, u32, e) OP2(name ".s64", u64, u64, u64, e) OP2(name ".u64", u64, u64, u64, e)
+#define SIGNED(name, e) \
+    OP2(name ".s32", s32, s32, s32, e) OP2(name ".u32", u32, u32, u32, e) \
+    OP2(name ".s64", s64, s64, s64, e) OP2(name ".u64", u64, u64, u64, e)
+#define LOGIC(name, kind, e) \
+    OP2(name ".b16", u16, u16, u16, e) OP2(name ".b32", u32, u32, u32, e) OP2(name ".b64", u64, u64, u64, e) \
+    OP2K(name ".pred", kind, u32, u32, u32, e)
+#define COMPARE(name, e) \
+    OP2(name ".s16", u32, s16, s16, e) OP2(name ".u16", u32, u16, u16, e) OP2(name ".b16", u32, u16, u16, e) \
+    OP2(name ".s32", u32, s32, s32, e) OP2(name ".u32", u32, u32, u32, e) OP2(name ".b32", u32, u32, u32, e) \
+    OP2(name ".s64", u32, s64, s64, e) OP2(name ".u64", u32, u64, u64, e) OP2(name ".b64", u32, u64, u64, e)
+
+#define COMPUTING \
+    MOVES("b16", u16) MOVES("u16", u16) MOVES("s16", u16) MOVES("b32", u32) MOVES("u32", u32) \
+    MOVES("s32", u32) MOVES("f32", u32) MOVES("b64", u64) MOVES("u64", u64) MOVES("s64", u64) \
+    OP1("mov.pred", u32, u32, a != 0) OP1("not.pred", u32, u32, !a) \
+    OP1("cvta.to.global.u64", u64, u64, a) OP1("cvta.to.shared.u64", u64, u64, a & ~SHARED) \
+    OP1("cvta.shared.u64", u64, u64, a | SHARED) OP1("cvta.local.u64", u64, u64, a) \
+    OP1("cvt.s64.s32", s64, s32, a) OP1("cvt.u64.u32", u64, u32, a) OP1("cvt.u32.u64", u32, u64, a) \
+    OP1("cvt.s64.s32 of 64", s64, u64, (s32)a) OP1("cvt.u64.u32 of 64", u64, u64, (u32)a) \
+    OP1("cvt.u32.u16", u32, u16, a) OP1("cvt.u16.u32", u16, u32, a) OP1("cvt.s32.s16", s32, s16, a) \
+    OP1("cvt.rn.f32.s32", f32, s32, a) OP1("cvt.rn.f32.u32", f32, u32, a) OP1("cvt.rn.f32.s64", f32, s64, a) \
+    OP1("cvt.rzi.s32.f32", s32, f32, truncated<s32>(a)) OP1("cvt.rzi.u32.f32", u32, f32, truncated<u32>(a)) \
+    OP1("cvt.rn.bf16.f32", u16, f32, bf16(a)) OP1("cvt.rn.f16.f32", u16, f32, f16(a)) \
+    OP1("cvt.f32.f16", f32, u16, of_f16(a)) OP1("cvt.f32.bf16", f32, u16, value<f32>((u32)a << 16)) \
+    OP1("cvt.rpi.f32.f32", f32, f32, std::ceil(a)) OP1("cvt.rmi.f32.f32", f32, f32, std::floor(a)) \
+    OP1("cvt.sat.f32.f32", f32, f32, a > 0 ? a < 1 ? a : 1 : 0) \
+    OP1("abs.f32", u32, u32, a & 0x7fffffffu) OP1("neg.f32", u32, u32, a ^ 0x80000000u) \
+    OP1("neg.s32", u32, u32, 0 - a) OP1("neg.s64", u64, u64, 0 - a) \
+    OP1("not.b16", u16, u16, ~a) OP1("not.b32", u32, u32, ~a) OP1("not.b64", u64, u64, ~a) \
+    OP1("brev.b32", u32, u32, reversed(a)) OP1("popc.b32", u32, u32, __builtin_popcount(a)) \
+    OP1("clz.b32", u32, u32, a ? __builtin_clz(a) : 32) \
+    OP1("bfind.u32", u32, u32, a ? 31 - __builtin_clz(a) : ~0u) \
+    OP1("bfind.shiftamt.u32", u32, u32, a ? __builtin_clz(a) : ~0u) \
+    INTEGERS("add", a + b) INTEGERS("sub", a - b) INTEGERS("mul.lo", a * b) \
+    SIGNED("div", divided(a, b)) SIGNED("rem", rest(a, b)) \
+    SIGNED("min", a < b ? a : b) SIGNED("max", a > b ? a : b) \
+    OP2("mul.wide.s32", s64, s32, s32, (s64)a * b) OP2("mul.wide.u32", u64, u32, u32, (u64)a * b) \
+    OP2("mul.hi.s32", s32, s32, s32, (s64)a * b >> 32) OP2("mul.hi.u32", u32, u32, u32, (u64)a * b >> 32) \
+    OP3("mad.lo.s32", u32, u32, u32, u32, a * b + c) OP3("mad.lo.u32", u32, u32, u32, u32, a * b + c) \
+    OP3("mad.lo.s64", u64, u64, u64, u64, a * b + c) \
+    OP3("mad.wide.s32", s64, s32, s32, s64, (s64)a * b + c) OP3("mad.wide.u32", u64, u32, u32, u64, (u64)a * b + c) \
+    LOGIC("and", AND, a & b) LOGIC("or", OR, a | b) LOGIC("xor", PLAIN, a ^ b) \
+    OP2("shl.b16", u16, u16, u32, b > 15 ? 0 : a << b) OP2("shl.b32", u32, u32, u32, b > 31 ? 0 : a << b) \
+    OP2("shl.b64", u64, u64, u32, b > 63 ? 0 : a << b) OP2("shr.u16", u16, u16, u32, b > 15 ? 0 : a >> b) \
+    OP2("shr.u32", u32, u32, u32, b > 31 ? 0 : a >> b) OP2("shr.b32", u32, u32, u32, b > 31 ? 0 : a >> b) \
+    OP2("shr.u64", u64, u64, u32, b > 63 ? 0 : a >> b) OP2("shr.b64", u64, u64, u32, b > 63 ? 0 : a >> b) \
+    OP2("shr.s32", s32, s32, u32, a >> (b > 31 ? 31 : b)) OP2("shr.s64", s64, s64, u32, a >> (b > 63 ? 63 : b)) \
+    COMPARE("setp.eq", a == b) COMPARE("setp.ne", a != b) COMPARE("setp.lt", a < b) \
+    COMPARE("setp.le", a <= b) COMPARE("setp.gt", a > b) COMPARE("setp.ge", a >= b) \
+    OP2("setp.eq.f32", u32, f32, f32, a == b) OP2("setp.ne.f32", u32, f32, f32, a < b || a > b) \
+    OP2("setp.lt.f32", u32, f32, f32, a < b) OP2("setp.le.f32", u32, f32, f32, a <= b) \
+    OP2("setp.gt.f32", u32, f32, f32, a > b) OP2("setp.ge.f32", u32, f32, f32, a >= b) \
+    OP2("setp.equ.f32", u32, f32, f32, !(a < b || a > b)) OP2("setp.neu.f32", u32, f32, f32, !(a == b)) \
+    OP2("setp.ltu.f32", u32, f32, f32, !(a >= b)) OP2("setp.leu.f32", u32, f32, f32, !(a > b)) \
+    OP2("setp.gtu.f32", u32, f32, f32, !(a <= b)) OP2("setp.geu.f32", u32, f32, f32, !(a < b)) \
+    OP2("setp.nan.f32", u32, f32, f32, a != a || b != b) OP2("setp.num.f32", u32, f32, f32, a == a && b == b) \
+    OP2("add.f32", f32, f32, f32, a + b) OP2("sub.f32", f32, f32, f32, a - b) OP2("mul.f32", f32, f32, f32, a * b) \
+    OP2("add.rn.f32", f32, f32, f32, a + b) OP2("sub.rn.f32", f32, f32, f32, a - b) \
+    OP2("mul.rn.f32", f32, f32, f32, a * b) OP2("div.rn.f32", f32, f32, f32, a / b) \
+    OP2("min.f32", f32, f32, f32, least(a, b)) OP2("max.f32", f32, f32, f32, greatest(a, b)) \
+    OP3("fma.rn.f32", f32, f32, f32, f32, std::fma(a, b, c)) \
+    OP3("fma.rm.f32", f32, f32, f32, f32, downward(a, b, c)) \
+    OP1("sqrt.rn.f32", f32, f32, std::sqrt(a)) OP1("rcp.rn.f32", f32, f32, 1 / a) \
+    OP1("ex2.approx.ftz.f32", f32, f32, flushed(approx(std::exp2((double)flushed(a)), a, 0x1p-22))) \
+    OP1("rcp.approx.ftz.f32", f32, f32, flushed(approx(1 / (double)flushed(a), a, 0x1p-23))) \
+    OP1("sqrt.approx.ftz.f32", f32, f32, flushed(approx(std::sqrt((double)flushed(a)), a, 0x1p-23)))
+// clang-format on
