@@ -1,0 +1,372 @@
+"""The interpreter itself: what it computes, what it finds, what it refuses."""
+
+import operator
+import re
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from . import launch as launching
+from . import machine as machines
+from .launch import Interpreter
+from .machine import Missing, Refused, opcodes
+from .parse import read
+
+HEAD = ".version 8.0\n.target sm_80\n.shared .align 16 .b8 mem[1024];\n"
+ENTRY = """.visible .entry k(.param .u64 p) {{
+.reg .pred %p<9>; .reg .b32 %r<40>; .reg .b64 %rd<40>;
+ld.param.u64 %rd1, [p]; mov.u32 %r1, %tid.x; mov.u32 %r9, %ctaid.x; mov.u32 %r3, mem;
+mul.wide.u32 %rd3, %r1, 4; add.s64 %rd4, %rd1, %rd3; shl.b32 %r2, %r1, 2; add.s32 %r4, %r3, %r2;
+{}
+ret; }}"""
+
+
+def run(body, memory, threads=64, blocks=1, dynamic=0, **options):
+    """An interpreter that has executed a kernel's body; %rd1 is the address of ``memory``."""
+    made, program = Interpreter(**options), read(HEAD + ENTRY.format(body))["k"]
+    address = memory.data_ptr().to_bytes(8, "little")
+    made.execute(program, [address], [memory], (threads, (blocks, 1, 1), dynamic))
+    return made
+
+
+# In these each thread writes what it reads of another's shared memory: of the next lane, or warp.
+PUT, TAKE = "st.shared.u32 [%r4], %r1;", "ld.shared.u32 %r7, [%r6]; st.global.u32 [%rd4], %r7;"
+NEXT = f"xor.b32 %r5, %r2, 4; add.s32 %r6, %r3, %r5; {TAKE}"
+FAR = f"xor.b32 %r5, %r2, 128; add.s32 %r6, %r3, %r5; {TAKE}"
+ODD = "and.b32 %r5, %r1, 1; setp.eq.s32 %p1, %r5, 0;"
+VOTE = "vote.sync.ballot.b32 %r8, %p1, -1; st.global.u32 [%rd4], %r8;"
+RACE, UNWRITTEN = "race in shared memory", "depends on what nobody wrote"
+FAULTS = {
+    "neighbour without a barrier": (PUT + NEXT, {RACE}),
+    "neighbour after a barrier of the warp": (PUT + "bar.warp.sync -1;" + NEXT, set()),
+    "another warp after that": (PUT + "bar.warp.sync -1;" + FAR, {RACE}),
+    "another warp after a barrier of the block": (PUT + "bar.sync 0;" + FAR, set()),
+    "a vote orders no memory": (PUT + ODD + VOTE + NEXT, {RACE}),
+    "written after it was read": (
+        PUT + "bar.sync 0;" + FAR + "st.shared.u32 [%r4], %r2;",
+        {RACE},
+    ),
+    "never written": ("bar.sync 0;" + FAR, {UNWRITTEN}),
+    "never written, never used": (
+        "ld.shared.u32 %r7, [%r4+512]; mov.u32 %r8, %r7; st.global.u32 [%rd4], %r1;",
+        set(),
+    ),
+    "a branch by what was never written": (
+        "ld.shared.u32 %r7, [%r4]; setp.eq.s32 %p1, %r7, 0; @%p1 bra $A; mov.u32 %r8, 0; $A:",
+        {UNWRITTEN},
+    ),
+    "past the end": ("st.global.u32 [%rd4+4], %r1;", {"out of bounds"}),
+    "before the beginning": (
+        "ld.global.u32 %r7, [%rd1+-4]; st.global.u32 [%rd4], %r7;",
+        {"out of bounds"},
+    ),
+    "past the end of shared memory": ("st.shared.u32 [%r4+2048], %r1;", {"out of bounds"}),
+    "misaligned": ("st.global.u32 [%rd1+2], %r1;", {"misaligned"}),
+    "half a warp at a barrier": (
+        ODD + "@%p1 bra $A; bar.sync 0; bra $B; $A: bar.sync 0; $B:",
+        {"divergent barrier"},
+    ),
+    "a guarded barrier": (ODD + "@%p1 bar.sync 0;", {"divergent barrier"}),
+    "half a warp votes": (
+        ODD + f"@%p1 bra $A; {VOTE} bra $B; $A: {VOTE} $B:",
+        {"deadlock"},
+    ),
+    "a vote without its lanes": (
+        ODD + "vote.sync.ballot.b32 %r8, %p1, 15; st.global.u32 [%rd4], %r8;",
+        {"mask of lanes that are not there"},
+    ),
+    "two blocks, one place": (
+        "add.s32 %r5, %r1, %r9; st.global.u32 [%rd4], %r5;",
+        {"race in global memory"},
+    ),
+    "two blocks, one value": ("st.global.u32 [%rd4], %r1;", set()),
+    "atomic by two blocks": ("atom.global.add.u32 %r5, [%rd4], 1;", set()),
+    "atomic and not": (
+        "atom.global.add.u32 %r5, [%rd4], 1; st.global.u32 [%rd4], %r1;",
+        {"race in global memory"},
+    ),
+    "no end": ("$A: bra $A;", {"no end"}),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults(monkeypatch, name):
+    monkeypatch.setattr(launching, "MOST_STEPS", 10_000)
+    body, want = FAULTS[name]
+    body = body if body.strip()[-1] == ";" else body + " mov.u32 %r10, 0;"
+    for seed in (0, 1, 2):
+        memory = torch.zeros(64, dtype=torch.int32)
+        made = run(body, memory, blocks=1 + ("two blocks" in name or "atomic" in name), seed=seed)
+        found = {line.split(":")[0] for line in made.findings}
+        # a race may also read what is not written yet
+        assert want <= found <= want | ({UNWRITTEN} if RACE in want else set()), made.findings
+
+
+def test_refusals(monkeypatch):
+    for text, reason in (
+        ("frob.b32 %r5, %r1;", "frob.b32 is not known"),
+        ("shfl.sync.idx.b32 %r5, %r1, 0, 31, -1;", "shfl.sync.idx.b32 is not known"),
+        ("add.s32 %r5, %rd1, 1;", "%rd1 has 64 bits"),
+        ("bar.sync 1;", "a barrier with a number"),
+    ):
+        with pytest.raises(Refused, match=re.escape(reason)):
+            read(HEAD + ENTRY.format(text))
+    with pytest.raises(Refused, match="version 10.1"):
+        read(HEAD.replace("8.0", "10.1") + ENTRY.format(""))
+
+
+def test_without_a_compiler_or_room(monkeypatch, tmp_path):
+    build = machines.library.__wrapped__
+    monkeypatch.setattr(machines.wp.config, "kernel_cache_dir", str(tmp_path / "file" / "x"))
+    (tmp_path / "file").touch()
+    with pytest.raises(Missing, match="the interpreter cannot be kept: .*file"):
+        build()
+    monkeypatch.setattr(machines.wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(machines, "_FLAGS", "-std=none")
+    with pytest.raises(Missing, match="-std=none"):
+        build()
+    monkeypatch.setattr(machines.shutil, "which", lambda name: None)
+    with pytest.raises(Missing, match="no C.. compiler"):
+        build()
+
+
+# ---- numbers
+
+WORDS = [0, 1, 2, 15, 16, 31, 32, 33, 63, 64, 0x7FFF, 0x8000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF]
+WORDS += [0x00000001, 0x007FFFFF, 0x00800000, 0x3F800000, 0x3FC00000, 0xBFC00000, 0x40200000]
+WORDS += [0x4F000000, 0xCF000000, 0x7F7FFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x3F807FFF]
+LONG = [x << 32 | 0x80000001 for x in (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)]
+
+
+def number(bits, kind):
+    """The value of a register's bits as a type of PTX reads them."""
+    if kind == "f32":
+        return np.uint32(bits).view(np.float32)
+    if kind == "pred":
+        return bits & 1
+    if kind.endswith("f16"):
+        return bits & 0xFFFF
+    size = int(kind[1:])
+    bits &= (1 << size) - 1
+    return bits - (1 << size) if kind[0] == "s" and bits >> (size - 1) else bits
+
+
+def nearest(x):
+    """The float32 that is nearest to a fraction, of two such the even one."""
+    near = np.float32(float(x))
+    around = [near, np.nextafter(near, np.float32(np.inf)), np.nextafter(near, np.float32(-np.inf))]
+    finite = [y for y in around if np.isfinite(y)]
+    return min(finite, key=lambda y: (abs(Fraction(float(y)) - x), y.view(np.uint32) & 1))
+
+
+def fused(a, b, c, down=False):
+    if not all(map(np.isfinite, (a, b, c))) or abs(float(a) * float(b) + float(c)) > 3.4e38:
+        y = np.float32(float(a) * float(b) + float(c))
+        huge = np.isinf(y) and y > 0 and not any(map(np.isinf, (a, b, c)))
+        return np.finfo(np.float32).max if down and huge else y
+    x = Fraction(float(a)) * Fraction(float(b)) + Fraction(float(c))
+    if x == 0:
+        signs = np.signbit(a) != np.signbit(b), np.signbit(c)
+        return np.float32(-0.0 if all(signs) or down and any(signs) else 0.0)
+    y = nearest(x)
+    return np.nextafter(y, np.float32(-np.inf)) if down and Fraction(float(y)) > x else y
+
+
+def quotient(a, b):
+    return -1 if b == 0 else abs(a) // abs(b) * (1 if (a < 0) == (b < 0) else -1)
+
+
+def to_integer(low, high):
+    return lambda x: 0 if np.isnan(x) else int(min(max(float(x), low), high))
+
+
+def lowest(a, b):
+    return (a if np.signbit(a) else b) if a == b else np.float32(np.fmin(float(a), float(b)))
+
+
+COMPARISONS = dict(eq=operator.eq, ne=operator.ne, lt=operator.lt, le=operator.le)
+COMPARISONS |= dict(gt=operator.gt, ge=operator.ge)
+INTEGERS = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul.lo": operator.mul,
+    "mul.wide": operator.mul,
+    "mul.hi": lambda a, b: a * b >> 32,
+    "mad.lo": lambda a, b, c: a * b + c,
+    "mad.wide": lambda a, b, c: a * b + c,
+    "and": operator.and_,
+    "or": operator.or_,
+    "xor": operator.xor,
+    "not": lambda a: ~a,
+    "neg": lambda a: -a,
+    "mov": lambda a: a,
+    "min": min,
+    "max": max,
+    "shl": lambda a, b: a << min(b, 64),
+    "shr": lambda a, b: a >> min(b, 64),
+    "div": quotient,
+    "rem": lambda a, b: a if b == 0 else a - b * quotient(a, b),
+    "selp": lambda a, b, c: a if c & 1 else b,
+    "popc": lambda a: bin(a).count("1"),
+    "brev": lambda a: int(f"{a:032b}"[::-1], 2),
+    "clz": lambda a: 32 - a.bit_length(),
+    "bfind": lambda a: a.bit_length() - 1,
+    "bfind.shiftamt": lambda a: 32 - a.bit_length() if a else -1,
+    **{f"setp.{name}": function for name, function in COMPARISONS.items()},
+}
+FLOATS = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div.rn": np.divide,
+    "rcp.rn": lambda a: np.float32(1) / a,
+    "sqrt.rn": np.sqrt,
+    "fma.rn": fused,
+    "fma.rm": lambda a, b, c: fused(a, b, c, down=True),
+    "min": lowest,
+    "max": lambda a, b: -lowest(-a, -b),
+    "abs": abs,
+    "neg": operator.neg,
+    "mov": lambda a: a,
+    "selp": INTEGERS["selp"],
+    "setp.nan": lambda a, b: np.isnan(a) or np.isnan(b),
+    "setp.num": lambda a, b: not (np.isnan(a) or np.isnan(b)),
+    "cvt.rpi": np.ceil,
+    "cvt.rmi": np.floor,
+    "cvt.sat": lambda a: np.float32(0) if np.isnan(a) else np.clip(a, 0, 1) + np.float32(0),
+    **{
+        f"setp.{k}": lambda a, b, f=f: f(a, b) and not np.isnan([a, b]).any()
+        for k, f in COMPARISONS.items()
+    },
+    **{
+        f"setp.{k}u": lambda a, b, f=f: f(a, b) or np.isnan([a, b]).any()
+        for k, f in COMPARISONS.items()
+    },
+}
+CONVERSIONS = {
+    "cvt.rn.bf16.f32": lambda x: int(torch.tensor(x).bfloat16().view(torch.int16)),
+    "cvt.rn.f16.f32": lambda x: int(np.float16(x).view(np.uint16)),
+    "cvt.f32.f16": lambda x: np.float32(np.uint16(x).view(np.float16)),
+    "cvt.f32.bf16": lambda x: np.uint32(x << 16).view(np.float32),
+    "cvt.rzi.s32.f32": to_integer(-(2**31), 2**31 - 1),
+    "cvt.rzi.u32.f32": to_integer(0, 2**32 - 1),
+    "cvt.s64.s32 of 64": lambda x: number(x, "s32"),
+    "cvt.u64.u32 of 64": lambda x: x & 0xFFFFFFFF,
+    "cvta.shared.u64": lambda x: x | 1 << 56,
+    "cvta.to.shared.u64": lambda x: x & ~(1 << 56),
+}
+APPROXIMATE = {  # the bound of the relative error, from the ISA's text or CUDA's tables
+    "ex2.approx.ftz.f32": (np.exp2, 2.0**-22),
+    "rcp.approx.ftz.f32": (np.reciprocal, 2.0**-23),
+    "sqrt.approx.ftz.f32": (np.sqrt, 2.0**-23),
+}
+COMPUTING = [name for name in opcodes() if re.match(r"[WQ]{2}", opcodes()[name][1])]
+COMPUTING = [name for name in COMPUTING if not re.match("atom|vote|redux", name)]
+
+
+def computed(name, operands, **options):
+    """The results, as bits, of an operation on rows of operands."""
+    _, widths, _ = opcodes()[name]
+    used = [f"%r{20 + k}" if width == "W" else f"%rd{20 + k}" for k, width in enumerate(widths)]
+    loads = "".join(
+        f"ld.global.u64 %rd{30 + k}, [%rd6+{8 * k}];"
+        + (f"cvt.u32.u64 {x}, %rd{30 + k};" if x[2] != "d" else f"mov.u64 {x}, %rd{30 + k};")
+        for k, x in enumerate(used[1:], 1)
+    )
+    result = "%rd39" if used[0][2] != "d" else used[0]
+    widen = f"cvt.u64.u32 {result}, {used[0]};" if result == "%rd39" else ""
+    body = f"""mad.lo.s32 %r5, %r9, 256, %r1; mul.wide.u32 %rd5, %r5, 32; add.s64 %rd6, %rd1, %rd5;
+    {loads} {name.removesuffix(" of 64")} {", ".join(used)}; {widen}
+    st.global.u64 [%rd6], {result};"""
+    memory = torch.from_numpy(operands.copy())
+    made = run(body, memory, 256, len(operands) // 256, **options)
+    assert not made.findings, made.findings
+    return memory.numpy()[:, 0].view(np.uint64)
+
+
+def operands_of(name):
+    values = WORDS + LONG if "Q" in opcodes()[name][1][1:] else WORDS
+    rows = np.zeros((1280, 4), np.int64)
+    pairs = [(a, b) for a in values for b in values]
+    rng = np.random.default_rng(0)
+    third = rng.choice(np.array(values, np.uint64), len(pairs))
+    drawn = rng.integers(0, 2**63, (1280 - len(pairs), 3), np.uint64) >> np.uint64(31)
+    filled = np.concatenate([np.column_stack([np.array(pairs, np.uint64), third]), drawn])
+    rows[:, 1:] = filled.view(np.int64)
+    # as registers hold them
+    kinds = name.removesuffix(" of 64").split(".")
+    if kinds[-1] == "pred":
+        rows &= 1
+    if kinds[-1][1:] == "16":
+        rows &= 0xFFFF
+    if kinds[0] == "selp":
+        rows[:, 3] &= 1
+    return rows
+
+
+@pytest.mark.parametrize("name", [name for name in COMPUTING if name not in APPROXIMATE])
+@np.errstate(all="ignore")
+def test_operations(name):
+    first, *words = name.split(".")
+    kind, rows = words[-1], operands_of(name)
+    got = computed(name, rows)
+    table = FLOATS if kind == "f32" else INTEGERS
+    stem = ".".join([first, *words[:-1]])
+    function = (
+        CONVERSIONS.get(name) or table.get(stem) or table.get(re.sub(r"\.(rn|f32)$", "", stem))
+    )
+    result, source = kind, kind.removesuffix(" of 64")
+    if first == "setp":
+        result = "pred"
+    elif first in ("cvt", "cvta"):
+        result, source = words[-2], source
+        if name not in CONVERSIONS and (kind != "f32" or result != "f32"):
+            function = (lambda a: nearest(Fraction(a))) if result == "f32" else lambda a: a
+        if first == "cvta" or result not in ("f32", "u16", "bf16", "f16"):
+            result = "u64" if first == "cvta" else result
+    assert function is not None, f"{name} has no oracle"
+    if stem in ("mul.wide", "mad.wide"):
+        result = kind[0] + "64"
+    widths = opcodes()[name][1]
+    for row, bits in zip(rows.view(np.uint64).tolist(), got.tolist()):
+        given = [number(x, source) for x in row[1 : len(widths)]]
+        if first in ("shl", "shr"):
+            given[1] = row[2] & 0xFFFFFFFF
+        if stem == "mad.wide":
+            given[2] = number(row[3], result)
+        if first == "selp":
+            given[2] = row[3]
+        want = function(*given)
+        if result == "f32":
+            value = number(bits, "f32")
+            same = (
+                np.isnan(value) and np.isnan(want) or value.tobytes() == np.float32(want).tobytes()
+            )
+        elif result in ("bf16", "f16") and np.isnan(given[0]):
+            same = bits == 0x7FFF
+        else:
+            size = {"pred": 1, "bf16": 16, "f16": 16}.get(result) or int(result[1:])
+            same = bits == int(want) & ((1 << size) - 1)
+        assert same, (name, given, hex(bits), want)
+
+
+@pytest.mark.parametrize("name", APPROXIMATE)
+@np.errstate(all="ignore")
+def test_approximate_units(name):
+    function, bound = APPROXIMATE[name]
+    rows = operands_of(name)
+    x = rows[:, 1].astype(np.uint32).view(np.float32).astype(np.float64)
+    x[np.abs(x) < 2.0**-126] *= 0
+    want = function(x)
+    normal = np.isfinite(want) & (np.abs(want) >= 2.0**-126) & (np.abs(want) < 2.0**127)
+    for approximate in (0, 1, 2):
+        got = computed(name, rows, approximate=approximate)
+        got = got.astype(np.uint32).view(np.float32).astype(np.float64)
+        error = ((got - want) / want)[normal]
+        slack = 2.0**-24  # the result is rounded once more
+        assert np.abs(error).max() <= (bound if approximate else 0) + slack
+        assert approximate != 1 or (error <= slack - 0.4 * bound).all()
+        assert not got[np.abs(want) < 2.0**-127].any()
+        assert (np.isnan(got) == np.isnan(want)).all()
