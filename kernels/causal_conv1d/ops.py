@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from ..runtime.lanes import streams
-from ..runtime.launch import cuda_launch, parallel_launch
+from ..runtime.launch import launch
 from ..runtime.memory import empty
-from ..runtime.recording import kind_of
+from ..runtime.stand_in import kind_of
 from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, VALUES, backward_kernel, forward_kernel
@@ -47,11 +47,8 @@ def _operands(x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | No
 
 
 def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list) -> None:
-    if kind_of(x.device) == "cpu":
-        threads = 1 if x.numel() < _FEW else None
-        parallel_launch(kernel, dim, inputs, outputs, threads=threads)
-    else:
-        cuda_launch(kernel, dim, [0, *inputs], outputs, device=x.device, block_dim=128)
+    threads = 1 if x.numel() < _FEW else None
+    launch(kernel, dim, inputs, outputs, x.device, threads, block_dim=128)
 
 
 @without_compiler

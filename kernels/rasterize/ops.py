@@ -11,7 +11,7 @@ from typing import List
 import torch
 from torch import Tensor
 
-from ..runtime.recording import kind_of
+from ..runtime.stand_in import kind_of
 from ..runtime.start import without_compiler
 from .constants import BLOCKS
 from .cpu import bin as bin_cpu

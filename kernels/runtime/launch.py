@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from . import team
-from .recording import kind_of, recorder, stand_in
+from .stand_in import kind_of, stand_in
 from .views import unkept, view
 
 
@@ -99,7 +99,7 @@ def cuda_launch(
 ) -> None:
     """Launches on torch's current stream of ``device``; on a CPU device, on the CPU (for tests).
 
-    In a dry run (``recording.py``) the launch is only told to the recorder; a stand-in executes it.
+    Where something stands in for a GPU (``stand_in.py``), that makes the launch.
 
     Args:
         kernel: a ``wp.Kernel``, not generic.
@@ -109,12 +109,9 @@ def cuda_launch(
         device: of the tensors, cpu or cuda.
         block_dim: threads of a block; on a CPU it needs ``wp.config.enable_cpu_blocks``.
     """
-    dim = (dim,) if isinstance(dim, int) else tuple(dim)
-    if (dry := recorder()) is not None:
-        dry.note(kernel, dim, block_dim)
-        return
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
-    if (other := stand_in.get()) is not None:
+    if (other := stand_in()) is not None:
+        dim = (dim,) if isinstance(dim, int) else tuple(dim)
         other.launch(kernel, dim, arguments, block_dim)
         return
     target: dict[str, Any] = {"device": "cpu"}
@@ -126,11 +123,13 @@ def cuda_launch(
         raise unkept(error) from error
 
 
-def launch(kernel: Any, dim: int | Sequence[int], inputs, outputs, device: torch.device) -> None:
+def launch(
+    kernel: Any, dim: int | Sequence[int], inputs, outputs, device, threads=None, block_dim=256
+) -> None:
     """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing."""
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
     if kind_of(device) == "cpu":
-        parallel_launch(kernel, dim, inputs, outputs)
+        parallel_launch(kernel, dim, inputs, outputs, threads)
     else:
-        cuda_launch(kernel, dim, [0, *inputs], outputs, device=device)
+        cuda_launch(kernel, dim, [0, *inputs], outputs, device=device, block_dim=block_dim)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar, cast, overload
 import warp as wp
 from torch import Tensor
 
-from .recording import recorder
+from .stand_in import is_dry, stand_in
 
 _Class = TypeVar("_Class")
 _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
@@ -17,7 +17,7 @@ _INT32_MAX = 2**31 - 1  # Warp keeps shapes and byte strides as int32
 def view(tensor: Tensor, dtype=None, name: str = "tensor"):
     """A Warp array descriptor on the memory and strides of a tensor, which it keeps alive.
 
-    In a dry run (``recording.py``) it is None: the tensor may have no memory.
+    In a dry run (``stand_in.py``) it is None: the tensor may have no memory.
 
     Args:
         tensor: float32, float64, bfloat16, float16 or integer, at most 4 dimensions.
@@ -29,7 +29,7 @@ def view(tensor: Tensor, dtype=None, name: str = "tensor"):
         ValueError: too many dimensions, a broken vector dimension, or over 2^31 bytes per stride.
         OSError: Warp's folder of compiled kernels cannot be made.
     """
-    if recorder() is not None:
+    if stand_in() is not None and is_dry():
         return None
     key = (tensor.dtype, tensor.shape, tensor.stride(), dtype)
     known = _descriptors.get(key)  # looked up once: another thread may clear them at any time
@@ -95,7 +95,7 @@ class Packed:
 
     def __init__(self, cls: Any, *values: Any) -> None:
         self.values, self._made = values, cls.ctype()
-        if recorder() is not None:  # the tensors may have no memory
+        if stand_in() is not None and is_dry():  # the tensors may have no memory
             return
         of = [(x.dtype, x.shape, x.stride()) if isinstance(x, Tensor) else x for x in values]
         key = (cls, *of)

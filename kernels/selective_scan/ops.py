@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..runtime.recording import kind_of
+from ..runtime.stand_in import kind_of
 from ..runtime.start import without_compiler
 from .cpu import launch as cpu
 from .problem import Scan

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from warp._src import context as warp_context
 
-from gamba_warp.kernels.runtime.recording import StandIn, stand_in
+from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
 from gamba_warp.kernels.runtime.views import Packed
 
 from .machine import FAULTS, Array, Finding, Launch, Missing, c_int64, library
@@ -30,7 +30,7 @@ def programs(module, block_dim: int, architecture: int = ARCHITECTURE) -> tuple[
     The PTX lies in Warp's folder of compiled kernels, by the module's hash.
 
     Raises:
-        Missing: it cannot be compiled here, or kept.
+        Missing: it cannot be kept.
         Refused: as ``read``.
     """
     before = module.options["block_dim"]
@@ -38,8 +38,8 @@ def programs(module, block_dim: int, architecture: int = ARCHITECTURE) -> tuple[
     try:
         (path,) = wp.compile_aot_module(module, arch=architecture, use_ptx=True)
         text = path.read_text(errors="replace")
-    except (OSError, RuntimeError) as error:
-        raise Missing(f"no PTX of {module.name}: {error}") from error
+    except OSError as error:
+        raise Missing(f"the PTX of {module.name} cannot be kept: {error}") from error
     finally:
         module.options["block_dim"] = before
     meta = path.with_name(f"{path.name.rsplit('.', 2)[0]}.meta")
@@ -172,11 +172,10 @@ def interpreted(multiprocessors: int = 132, **options):
     before = {(owner, name): getattr(owner, name) for owner, name in _MAKERS}
     for (owner, name), make in before.items():
         setattr(owner, name, _poisoned(make))
-    token = stand_in.set(StandIn(made.launch, multiprocessors))
     try:
-        yield made
+        with standing_in(StandIn(made.launch, multiprocessors)):
+            yield made
     finally:
-        stand_in.reset(token)
         for (owner, name), make in before.items():
             setattr(owner, name, make)
 

@@ -79,9 +79,11 @@ def library() -> ctypes.CDLL:
     """The interpreter, from Warp's folder of compiled kernels or built into it.
 
     Raises:
-        Missing: there is no compiler, it fails, or the folder cannot be written.
+        Missing: there is no NVRTC or no compiler, it fails, or the folder cannot be written.
     """
     wp.init()
+    if wp.get_cuda_toolkit_version() is None:
+        raise Missing("no NVRTC: this build of warp-lang cannot compile for CUDA")
     compiler = next(filter(None, map(shutil.which, ("g++", "clang++"))), None)
     if compiler is None:
         raise Missing("no C++ compiler (g++ or clang++)")

@@ -17,7 +17,7 @@ from .machine import opcodes
 
 def scan(states):
     """Both directions, in segments."""
-    mine = scans.leaves(scans.make(1, 140, 20, states))
+    mine = scans.leaves(scans.make(1, 140, 5, states))
     out, last = selective_scan(**mine, delta_softplus=True, return_last_state=True)
     torch.autograd.grad(out.sum() + last.sum(), [*mine.values()])
 

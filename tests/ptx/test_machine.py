@@ -3,10 +3,12 @@
 import operator
 import re
 from fractions import Fraction
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
+from helpers.kernels import plain_kernel
 
 from . import launch as launching
 from . import machine as machines
@@ -130,6 +132,13 @@ def test_without_a_compiler_or_room(monkeypatch, tmp_path):
     monkeypatch.setattr(machines.shutil, "which", lambda name: None)
     with pytest.raises(Missing, match="no C.. compiler"):
         build()
+    monkeypatch.setattr(machines.wp, "get_cuda_toolkit_version", lambda: None)
+    with pytest.raises(Missing, match="no NVRTC"):
+        build()
+    full = OSError(28, "No space left on device")
+    monkeypatch.setattr(launching.wp, "compile_aot_module", Mock(side_effect=full))
+    with pytest.raises(Missing, match="cannot be kept: .*No space left"):
+        launching.programs.__wrapped__(plain_kernel.module, 32)
 
 
 # ---- numbers

@@ -1,7 +1,7 @@
 """Which kernels an operator launches on CUDA, found without a GPU.
 
 The operators run on tensors that have a shape, a dtype and the device cuda, but no memory. Their
-launches are recorded (``runtime/recording.py``), so the code that chooses kernels is their own.
+launches are recorded (``runtime/stand_in.py``), so the code that chooses kernels is their own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch._library.custom_ops import OPDEFS
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ...runtime.recording import Recorder, recording
+from ...runtime.stand_in import StandIn, standing_in
 
 _READ_BACK = (torch.ops.aten.item.default, torch.ops.aten._local_scalar_dense.default)
 # The number of pairs, which the rasterizer reads back from the device, is taken to be this.
@@ -64,10 +64,11 @@ def dry_run() -> Iterator[list[Launch]]:
     """
     launches: list[Launch] = []
 
-    def note(kernel: wp.Kernel, dim: tuple[int, ...], block_dim: int) -> None:
+    def note(kernel: wp.Kernel, dim: tuple[int, ...], arguments: list, block_dim: int) -> None:
         launches.append(Launch(kernel, block_dim))
 
-    with recording(Recorder(note, MULTIPROCESSORS)), FakeTensorMode(), _Inside():
+    stand_in = StandIn(note, MULTIPROCESSORS, dry=True)
+    with standing_in(stand_in), FakeTensorMode(), _Inside():
         yield launches
 
 

@@ -18,7 +18,7 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.recording import recorder
+from ...runtime.stand_in import is_dry
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,7 +51,7 @@ class _Ledger:
     """
 
     def __init__(self, device: torch.device):
-        pinned = device.type == "cuda" and recorder() is None
+        pinned = device.type == "cuda" and not is_dry()
         self.highs = torch.zeros(_PLACES, dtype=torch.int64, device=device)
         self.told = torch.zeros(_PLACES, dtype=torch.int64, pin_memory=pinned)
         self.rooms: dict[Hashable, Room] = {}
@@ -88,7 +88,7 @@ def wanted(count: int) -> int:
 
 def is_capturing(device: torch.device) -> bool:
     """Whether launches on torch's current stream go into a CUDA graph now."""
-    return device.type == "cuda" and recorder() is None and torch.cuda.is_current_stream_capturing()
+    return device.type == "cuda" and not is_dry() and torch.cuda.is_current_stream_capturing()
 
 
 def find(key: Hashable, device: torch.device) -> Room | None:
@@ -113,7 +113,7 @@ def captured(room: Room, capacity: int) -> None:
 
 def remember(key: Hashable, device: torch.device, count: int) -> Room:
     """Makes room for a shape whose count was read back."""
-    if recorder() is not None:  # a dry run has no memory and leaves nothing behind
+    if is_dry():  # a dry run has no memory and leaves nothing behind
         return Room(0, wanted(count))
     with _lock:
         if device not in _ledgers:
@@ -133,7 +133,7 @@ def remember(key: Hashable, device: torch.device, count: int) -> Room:
 
 def tell(room: Room, count: Tensor) -> None:
     """Has the device note a count, ``[1]`` int64, and copy it to the host when it gets there."""
-    dry = recorder() is not None
+    dry = is_dry()
     ledger = _Ledger(count.device) if dry else _ledgers[count.device]
     launch(_note, 1, [room.place, count], [ledger.highs], count.device)
     if not dry:

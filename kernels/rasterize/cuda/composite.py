@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import cuda_launch
-from ...runtime.recording import kind_of, multiprocessors_of
+from ...runtime.stand_in import kind_of, multiprocessors_of
 from ...runtime.views import Packed
 from ..constants import BLOCKS
 from ..tiles import Bins, Drawn, Lists, Picture, Pixels, Walk, Walked

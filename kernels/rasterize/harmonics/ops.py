@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ...runtime.launch import launch
-from ...runtime.recording import kind_of
+from ...runtime.stand_in import kind_of
 from ...runtime.start import without_compiler
 from ...runtime.views import Packed
 from ..project import empty_on

@@ -17,8 +17,8 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import cuda_launch
-from ...runtime.recording import kind_of, multiprocessors_of
 from ...runtime.scalars import LOG2E, exp2
+from ...runtime.stand_in import kind_of, multiprocessors_of
 from ...runtime.views import lane_contiguous
 from ..problem import DISCRETIZATIONS, Scan
 from .backward import RUN, backward_kernel

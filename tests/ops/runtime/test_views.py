@@ -8,7 +8,7 @@ import warp as wp
 
 from gamba_warp.kernels.runtime import views
 from gamba_warp.kernels.runtime.launch import cuda_launch
-from gamba_warp.kernels.runtime.recording import Recorder, multiprocessors_of, recording
+from gamba_warp.kernels.runtime.stand_in import StandIn, multiprocessors_of, standing_in
 from gamba_warp.kernels.runtime.views import Packed, struct, view
 
 
@@ -65,19 +65,19 @@ def test_a_dry_run_tells_and_does_nothing(monkeypatch):
     """No view, no launch, no look at a device, and only in the thread that asked for it."""
     monkeypatch.setattr(views, "_descriptors", {})
     told, device, x = [], torch.device("cuda"), torch.zeros(6)
-    with recording(Recorder(lambda *launch: told.append(launch), 77)):
+    with standing_in(StandIn(lambda *launch: told.append(launch), 77, dry=True)):
         assert multiprocessors_of(device) == multiprocessors_of(torch.device("cuda:3")) == 77
         assert view(x) is None
         cuda_launch(_never, 6, [], [x], device=device, block_dim=32)
         cuda_launch(_never, (2, 3), [], [x], device=x.device)
         with ThreadPoolExecutor(1) as pool:
             assert pool.submit(view, x).result().data == x.data_ptr()
-    assert told == [(_never, (6,), 32), (_never, (2, 3), 256)]
+    assert told == [(_never, (6,), [None], 32), (_never, (2, 3), [None], 256)]
     assert not x.any() and len(views._descriptors) == 1
     assert view(x).data == x.data_ptr()
 
 
 def test_a_dry_run_ends_with_its_block():
-    with pytest.raises(RuntimeError), recording(Recorder(lambda *_: None, 1)):
+    with pytest.raises(RuntimeError), standing_in(StandIn(print, 1, dry=True)):
         raise RuntimeError
     assert view(torch.zeros(2)) is not None

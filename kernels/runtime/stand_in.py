@@ -1,0 +1,71 @@
+"""Where a tensor's work is done, and what stands in for a GPU that makes the launches on CUDA.
+
+In a dry run launches are only noted: the tensors may be fake, without memory, so ``views.py`` makes
+no views. Any other stand-in executes launches on tensors of the CPU, for which the operators then
+take their CUDA path. What is asked of the device is answered for one that is imagined.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """What is told of the launches, in place of a GPU.
+
+    Attributes:
+        launch: called with the kernel, the dimensions of the launch, its arguments as Warp takes
+            them, and the threads of a block; all is done when it returns.
+        multiprocessors: of the imagined device.
+        dry: whether it only notes launches.
+    """
+
+    launch: Callable[[wp.Kernel, tuple[int, ...], list, int], None]
+    multiprocessors: int
+    dry: bool = False
+
+
+_stand_in: ContextVar[StandIn | None] = ContextVar("stand_in", default=None)
+
+# That of this thread; None where a device makes launches. Each view of a tensor asks it, so it is
+# the variable's own method, without a call of Python's around it.
+stand_in: Callable[[], StandIn | None] = _stand_in.get
+
+
+@contextmanager
+def standing_in(new: StandIn | None) -> Iterator[None]:
+    """Inside, in this thread, launches on CUDA are made by ``new``."""
+    token = _stand_in.set(new)
+    try:
+        yield
+    finally:
+        _stand_in.reset(token)
+
+
+def is_dry() -> bool:
+    """Whether this is a dry run."""
+    return (other := stand_in()) is not None and other.dry
+
+
+def kind_of(device: torch.device) -> str:
+    """Whose kernels work on a device's tensors, "cpu" or "cuda" (or what else the device is)."""
+    return device.type if stand_in() is None or is_dry() else "cuda"
+
+
+def multiprocessors_of(device: torch.device) -> int:
+    """The number of multiprocessors of a CUDA device, or of the imagined one."""
+    if (other := stand_in()) is not None:
+        return other.multiprocessors
+    index = torch.cuda.current_device() if device.index is None else device.index
+    return _properties(index).multi_processor_count
+
+
+_properties = functools.cache(torch.cuda.get_device_properties)
