@@ -6,6 +6,7 @@ import functools
 import json
 import re
 import zlib
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import torch
@@ -15,6 +16,7 @@ from warp._src import context as warp_context
 from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
 from gamba_warp.kernels.runtime.views import Packed
 
+from .contract import contracted
 from .machine import FAULTS, Array, Finding, Launch, Missing, c_int64, library
 from .parse import Program, read
 
@@ -54,6 +56,7 @@ class Interpreter:
         seed: of the order of all that has none on a GPU; 0: in order.
         approximate: how the approximate units err, within what is documented of them: 0 not at all,
             1 to one side, else as drawn from this number.
+        contract: keys of kernels whose products are contracted with sums.
         findings: a line each.
         executed: by entry its program, and by instruction how many warps executed it.
         trace: after each launch a checksum of all the memory that it was given.
@@ -62,6 +65,7 @@ class Interpreter:
 
     seed: int = 0
     approximate: int = 0
+    contract: Collection[str] = ()
     findings: list[str] = field(default_factory=list)
     executed: dict[str, tuple[Program, list[int]]] = field(default_factory=dict)
     trace: list[int] = field(default_factory=list)
@@ -82,7 +86,10 @@ class Interpreter:
         if bounds.size:
             dynamic = notes.get(f"{name}_smem_bytes", 0)
             sizes = block_dim, (blocks, 1, 1), dynamic
-            self.execute(of_module[name], params, _tensors(arguments), sizes)
+            program = of_module[name]
+            if kernel.key in self.contract:
+                program = contracted(program)
+            self.execute(program, params, _tensors(arguments), sizes)
 
     def execute(self, program: Program, params: list[bytes], tensors, sizes) -> None:
         """Runs an entry.

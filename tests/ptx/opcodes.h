@@ -223,6 +223,8 @@ inline f32 of_f16(u16 bits) {
     OP2("mul.rn.f32", f32, f32, f32, a * b) OP2("div.rn.f32", f32, f32, f32, a / b) \
     OP2("min.f32", f32, f32, f32, least(a, b)) OP2("max.f32", f32, f32, f32, greatest(a, b)) \
     OP3("fma.rn.f32", f32, f32, f32, f32, std::fma(a, b, c)) \
+    OP3("a * b - c", f32, f32, f32, f32, std::fma(a, b, -c)) /* contract.py writes these two */ \
+    OP3("c - a * b", f32, f32, f32, f32, std::fma(-a, b, c)) \
     OP3("fma.rm.f32", f32, f32, f32, f32, downward(a, b, c)) \
     OP1("sqrt.rn.f32", f32, f32, std::sqrt(a)) OP1("rcp.rn.f32", f32, f32, 1 / a) \
     OP1("ex2.approx.ftz.f32", f32, f32, flushed(approx(std::exp2((double)flushed(a)), a, 0x1p-22))) \

@@ -11,8 +11,11 @@ from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.rasterize import depth_quantile, rasterization
 from gamba_warp.kernels.rasterize.cuda import capacity
+from gamba_warp.kernels.rasterize.cuda.bin import bin_views
 from gamba_warp.kernels.rasterize.harmonics import colors_seen_from
 from gamba_warp.kernels.rasterize.harmonics.formula import colors_by_formula
+from gamba_warp.kernels.rasterize.skip import TILE_TEST
+from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
 from gamba_warp.kernels.runtime.stand_in import standing_in
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
@@ -155,3 +158,32 @@ def test_harmonics(degree):
                 assert_rel_rms(x, y, 1e-6, name)
 
     check(run)
+
+
+def test_only_one_kernel_contracts():
+    """Counting and writing pairs round alike or not: no Gaussian's pairs fall upon another's."""
+    num, width, height = 1500, 1 << 16, 4096
+    grid = make_grid(Tiling(width, height), num=num, alpha_min=1 / 255, skip=TILE_TEST)
+    # slanting needles, of many rows of tiles: at each row's ends rounding may decide upon a tile
+    heights = 400 + 400 * torch.rand(1, num, 1)
+    splats = (
+        torch.rand(1, num, 2) * torch.tensor([width, height]),
+        torch.cat([0.1 + torch.rand(1, num, 1), 8 * torch.randn(1, num, 1), heights**-2], -1),
+        torch.rand(1, num),
+        torch.full((1, num), 0.9),
+        heights.expand(1, num, 2) * 4,
+    )
+    bins = []
+    for contract in ((), ("_count",), ("_emit",)):
+        with interpreted(contract=contract) as machine:
+            bins.append(bin_views(grid, splats, lambda count: None, exact=True))
+        assert not machine.findings, "\n".join(machine.findings)
+    plain, counted, emitted = bins
+    assert 0 < (plain.offsets.diff() != counted.offsets.diff()).sum() < 0.01 * num
+    for x in bins:
+        owners = torch.repeat_interleave(x.order, x.offsets.diff())
+        inside = x.starts[-1]
+        assert torch.equal(x.pairs[:inside], owners[x.rows[:inside]])
+        assert inside >= x.count - 0.001 * x.count
+    # what was not written belongs to no tile
+    assert emitted.starts[-1] < emitted.count or counted.starts[-1] < counted.count

@@ -64,6 +64,7 @@ def _emit(
     j = offset + wp.tid()
     i = order_in[j]
     p = offsets_in[j]
+    end = offsets_in[j + 1]
     extent = splats_in.extents[i]
     if extent[0] > 0.0 and count_in[0] <= wp.int64(tiles_out.shape[0]):
         limit = q_limit(splats_in.opacities[i], grid.alpha_min)
@@ -72,7 +73,9 @@ def _emit(
         for ty in range(rows[0], rows[1] + 1):
             columns = tile_columns(grid, ellipse, extent, ty)
             row = ((i // grid.num) * grid.tiles_y + ty) * grid.tiles_x
-            for tx in range(columns[0], columns[1] + 1):
+            # not one more than was counted: a compiler may round otherwise here than it did there
+            last = wp.min(columns[1], columns[0] + end - p - 1)
+            for tx in range(columns[0], last + 1):
                 tiles_out[p] = row + tx
                 gaussians_out[p] = i
                 p += 1
