@@ -8,7 +8,7 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test hostile endurance bench study instructions docs lint format figures \
+.PHONY: setup demo test ptx hostile endurance bench study instructions docs lint format figures \
         architecture constraints clean
 
 setup: $(STAMP)
@@ -38,6 +38,11 @@ demo: $(STAMP)
 # (docs/pace.md).
 test: $(STAMP)
 	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder
+
+# The operators' own tests on their CUDA path, executed from PTX (tests/ptx); SEED draws the order.
+ptx: $(STAMP)
+	GAMBA_PTX_SEED=$(SEED) PYTHONPATH=tests $(BIN)/python -m pytest -p ptx.plugin \
+		tests/ops/causal_conv1d tests/ops/selective_scan tests/ops/rasterize
 
 # Hostile files for every reader, or for READERS='shape or picture', as SEED draws them.
 MINUTES ?= 10

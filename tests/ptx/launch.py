@@ -102,6 +102,7 @@ class Interpreter:
         """
         threads, grid, dynamic = sizes
         assert [len(x) for x in params] == [size for _, size in program.params], program.name
+        assert grid[0] * grid[1] * grid[2] < 1 << 18, "more blocks than a shadow has bits for"
         assert not program.most_threads or threads <= program.most_threads, program.name
         blob = bytearray(program.params_size)
         for value, (at, size) in zip(params, program.params):

@@ -19,8 +19,16 @@
     X("atom.max.s32", s32, "WQW", std::max(now, given))
 #define ATOMIC_OPCODE(name, T, operands, e) {name, operands, 1, ATOMIC, nullptr},
 
+template<bool ballot>
+static void any_of(u8* file, const Instruction& I, u32 lanes) {
+    const u32* given = (const u32*)(file + I.from[0]);
+    u32 all = 0;
+    EACH(l, lanes) all |= ballot ? (u32)(given[l] != 0) << l : given[l];
+    EACH(l, lanes)((u32*)(file + I.to[0]))[l] = all;
+}
+
 static const Opcode OPCODES[] = {
-    COMPUTING ATOMICS(ATOMIC_OPCODE)  // of the others, only what the lanes compute together is here
+    COMPUTING ATOMICS(ATOMIC_OPCODE)  // what the lanes do alone
     {"ld", "", 0, LOAD, nullptr},
     {"st", "", 0, STORE, nullptr},
     {"bra", "", 0, BRANCH, nullptr},
@@ -28,37 +36,15 @@ static const Opcode OPCODES[] = {
     {"exit", "", 0, EXIT, nullptr},
     {"bar.sync", "", 0, BLOCK, nullptr},
     {"bar.warp.sync", "W", 0, WARP, nullptr},
-    {"vote.sync.ballot.b32", "WWW", 1, WARP,
-        [](u8* file, const Instruction& I, u32 lanes) {
-            u32 all = 0;
-            for (int l = 0; l < 32; l++)
-                if (lanes >> l & 1 && ((u32*)(file + I.from[0]))[l]) all |= 1u << l;
-            for (int l = 0; l < 32; l++)
-                if (lanes >> l & 1) ((u32*)(file + I.to[0]))[l] = all;
-        }},
-    {"redux.sync.or.b32", "WWW", 1, WARP,
-        [](u8* file, const Instruction& I, u32 lanes) {
-            u32 all = 0;
-            for (int l = 0; l < 32; l++)
-                if (lanes >> l & 1) all |= ((u32*)(file + I.from[0]))[l];
-            for (int l = 0; l < 32; l++)
-                if (lanes >> l & 1) ((u32*)(file + I.to[0]))[l] = all;
-        }},
+    {"vote.sync.ballot.b32", "WWW", 1, WARP, any_of<true>},
+    {"redux.sync.or.b32", "WWW", 1, WARP, any_of<false>},
 };
 const int COUNT = sizeof OPCODES / sizeof *OPCODES;
 
 enum Space { GENERIC, IN_GLOBAL, IN_SHARED, IN_LOCAL, IN_PARAM };  // and all below as launch.py
-enum Fault {
-    OUT_OF_BOUNDS,
-    MISALIGNED,
-    UNWRITTEN,
-    SHARED_RACE,
-    GLOBAL_RACE,
-    DIVERGENT,
-    DEADLOCK,
-    MASK,
-    ENDLESS
-};
+typedef s32 Fault;
+const Fault OUT_OF_BOUNDS = 0, MISALIGNED = 1, UNWRITTEN = 2, SHARED_RACE = 3, GLOBAL_RACE = 4;
+const Fault DIVERGENT = 5, DEADLOCK = 6, MASK = 7, ENDLESS = 8;
 
 struct Finding {
     s32 fault, at, block, thread;
@@ -128,15 +114,17 @@ struct Warp {
     u32 live, barriers;
     s64 steps;
     std::vector<Fragment> fragments;
+
+    template<class T>
+    T& slot(s32 r, int lane) const {
+        return ((T*)(file + r))[lane];
+    }
+    u32& lanes_known(s32 r) const { return known[r / 128]; }
 };
 
 enum Use { READ, WRITE, UPDATE };
 static u32 tags = 0;
 static std::vector<Shadow> kept;  // the shadows of all arrays, from launch to launch
-
-#define EACH(l, lanes)                                                                             \
-    for (int l = 0; l < 32; l++)                                                                   \
-        if ((lanes) >> l & 1)
 
 struct Machine {
     Launch& L;
@@ -190,8 +178,6 @@ struct Machine {
         if (L.found < L.most_findings)
             L.findings[L.found++] = {fault, (s32)at, (s32)block, (s32)thread, address, 1};
     }
-
-    // ---- memory
 
     const Region* array_of(u64 address, u64 size) {
         auto holds = [&](const Region& r) {
@@ -282,8 +268,8 @@ struct Machine {
     }
 
     u64 address_of(Warp& w, int lane, const Instruction& I) {
-        if (I.wide_address) return ((u64*)(w.file + I.from[0]))[lane] + I.offset;
-        return ((u32*)(w.file + I.from[0]))[lane] + (u32)I.offset;
+        if (I.wide_address) return w.slot<u64>(I.from[0], lane) + I.offset;
+        return w.slot<u32>(I.from[0], lane) + (u32)I.offset;
     }
 
     bool aligned(const Instruction& I, u64 address, u32 thread, u32 at) {
@@ -293,21 +279,21 @@ struct Machine {
     }
 
     void load(Warp& w, const Instruction& I, u32 lanes, u32 at) {
-        for (int k = 0; k < I.vector; k++) w.known[I.to[k] / 128] &= ~lanes;
+        for (int k = 0; k < I.vector; k++) w.lanes_known(I.to[k]) &= ~lanes;
         EACH(l, lanes) {
             u64 address = address_of(w, l, I);
             bool fits = aligned(I, address, w.index * 32 + l, at);
             for (int k = 0; k < I.vector; k++) {
                 bool known = true;
-                const u8* p =
-                    fits ? place(w, l, I, at, address + k * I.size, READ, nullptr, known) : nullptr;
+                const u8* p = nullptr;
+                if (fits) p = place(w, l, I, at, address + k * I.size, READ, nullptr, known);
                 u64 x = ~0ull;  // NaN, where nothing can be read
                 if (p) memcpy(&(x = 0), p, I.size);
-                if (I.is_signed && I.size < 8)
-                    x = (s64)(x << (64 - 8 * I.size)) >> (64 - 8 * I.size);
-                if (I.wide) ((u64*)(w.file + I.to[k]))[l] = x;
-                else ((u32*)(w.file + I.to[k]))[l] = x;
-                w.known[I.to[k] / 128] |= (u32)known << l;
+                int free = I.is_signed ? 64 - 8 * I.size : 0;
+                x = (s64)(x << free) >> free;
+                if (I.wide) w.slot<u64>(I.to[k], l) = x;
+                else w.slot<u32>(I.to[k], l) = x;
+                w.lanes_known(I.to[k]) |= (u32)known << l;
             }
         }
     }
@@ -318,10 +304,10 @@ struct Machine {
             if (!aligned(I, address, w.index * 32 + l, at)) continue;
             for (int k = 0; k < I.vector; k++) {
                 s32 r = I.from[1 + k];
-                u64 x = I.wide ? ((u64*)(w.file + r))[l] : ((u32*)(w.file + r))[l];
-                bool known = w.known[r / 128] >> l & 1,
-                     array = I.space == IN_GLOBAL || (I.space == GENERIC && address < SHARED);
-                if (!known && array) report(UNWRITTEN, at, w.index * 32 + l, address);
+                u64 x = I.wide ? w.slot<u64>(r, l) : w.slot<u32>(r, l);
+                bool known = w.lanes_known(r) >> l & 1;
+                if (I.space == IN_GLOBAL || (I.space == GENERIC && address < SHARED))
+                    demand(w, r, 1u << l, at);
                 if (u8* p = place(w, l, I, at, address + k * I.size, WRITE, (u8*)&x, known))
                     memcpy(p, &x, I.size);
             }
@@ -342,11 +328,11 @@ struct Machine {
             if (!p) continue;
             T now, next;
             memcpy(&now, p, sizeof now);
-            next = f(now, value<T>(((Slot<T>*)(w.file + I.from[1]))[l]));
+            next = f(now, value<T>(w.slot<Slot<T>>(I.from[1], l)));
             memcpy(p, &next, sizeof next);
-            ((Slot<T>*)(w.file + I.to[0]))[l] = slot<T>(now);
+            w.slot<Slot<T>>(I.to[0], l) = slot<T>(now);
         }
-        w.known[I.to[0] / 128] |= lanes;
+        w.lanes_known(I.to[0]) |= lanes;
     }
 
     void atomic(Warp& w, const Instruction& I, u32 lanes, u32 at) {
@@ -357,42 +343,32 @@ struct Machine {
         ATOMICS(UPDATES)
     }
 
-    // ---- warps
-
     u32 set_lanes(const Warp& w, s32 predicate) {
-        const u32* p = (const u32*)(w.file + predicate);
         u32 lanes = 0;
-        for (int l = 0; l < 32; l++) lanes |= (u32)(p[l] != 0) << l;
+        for (int l = 0; l < 32; l++) lanes |= (u32)(w.slot<u32>(predicate, l) != 0) << l;
         return lanes;
     }
 
     // Reports lanes that depend on a register that nobody wrote.
     void demand(Warp& w, s32 r, u32 lanes, u32 at) {
-        if (u32 unknown = lanes & ~w.known[r / 128])
+        if (u32 unknown = lanes & ~w.lanes_known(r))
             report(UNWRITTEN, at, w.index * 32 + __builtin_ctz(unknown));
     }
 
-    // The lanes in which a result is known: what is unknown is reported where it matters, no
-    // sooner.
+    // The lanes in which a result is known; what is not is reported where it matters, no sooner.
     u32 known_after(Warp& w, const Instruction& I) {
-        auto known = [&](int i) { return w.known[I.from[i] / 128]; };
-        switch (OPCODES[I.op].kind) {
-        case SELECT: {
+        auto known = [&](int i) { return w.lanes_known(I.from[i]); };
+        Kind kind = OPCODES[I.op].kind;
+        if (kind == SELECT) {
             u32 first = set_lanes(w, I.from[2]);
             return known(2) & ((first & known(0)) | (~first & known(1)));
         }
-        case AND:
-        case OR: {
-            u32 a = set_lanes(w, I.from[0]), b = set_lanes(w, I.from[1]);
-            if (OPCODES[I.op].kind == AND) a = ~a, b = ~b;  // a decides alone if it is false
-            return (known(0) & known(1)) | (known(0) & a) | (known(1) & b);
-        }
-        default: {
-            u32 lanes = ~0u;
-            for (int i = 0; i < I.reads; i++) lanes &= known(i);
-            return lanes;
-        }
-        }
+        u32 lanes = ~0u;
+        for (int i = 0; i < I.reads; i++) lanes &= known(i);
+        if (kind != AND && kind != OR) return lanes;
+        u32 a = set_lanes(w, I.from[0]), b = set_lanes(w, I.from[1]);
+        if (kind == AND) a = ~a, b = ~b;  // one that is false decides alone
+        return lanes | (known(0) & a) | (known(1) & b);
     }
 
     void add(Warp& w, Fragment f) {
@@ -416,7 +392,7 @@ struct Machine {
 
     u32 mask_of(const Warp& w, const Fragment& f) {
         const Instruction& I = L.code[f.at];
-        return ((u32*)(w.file + I.from[I.reads - 1]))[__builtin_ctz(f.lanes)];
+        return w.slot<u32>(I.from[I.reads - 1], __builtin_ctz(f.lanes));
     }
 
     bool complete(const Warp& w, const Fragment& f) { return !(mask_of(w, f) & w.live & ~f.lanes); }
@@ -424,11 +400,9 @@ struct Machine {
     // Executes what all lanes of a mask do together; false: the fragment waits for others.
     bool together(Warp& w, Fragment& f, u32 lanes) {
         const Instruction& I = L.code[f.at];
-        u32 mask = mask_of(w, f);
-        const u32* masks = (const u32*)(w.file + I.from[I.reads - 1]);
-        EACH(l, f.lanes)
-        if (masks[l] != mask || !(mask >> l & 1) || lanes != f.lanes)
-            report(MASK, f.at, w.index * 32 + l, masks[l]);
+        u32 mask = mask_of(w, f), wrong = f.lanes & ~mask;
+        EACH(l, f.lanes) wrong |= (u32)(w.slot<u32>(I.from[I.reads - 1], l) != mask) << l;
+        if (wrong || lanes != f.lanes) report(MASK, f.at, w.index * 32, mask);
         meet(w, f, AT_WARP);
         if (!complete(w, f)) {
             f.state = AT_WARP;
@@ -437,7 +411,7 @@ struct Machine {
         if (OPCODES[I.op].run) {
             demand(w, I.from[0], f.lanes, f.at);
             OPCODES[I.op].run(w.file, I, f.lanes);
-            w.known[I.to[0] / 128] |= f.lanes;
+            w.lanes_known(I.to[0]) |= f.lanes;
         } else if (f.lanes == w.live) w.barriers++;
         return true;
     }
@@ -458,17 +432,15 @@ struct Machine {
             lanes &= I.inverted ? ~set : set;
         }
         switch (OPCODES[I.op].kind) {
-        case BRANCH: {
-            u32 others = f.lanes & ~lanes;
-            if (lanes && others) {
+        case BRANCH:
+            if (lanes && lanes != f.lanes) {
                 add(w, {(u32)I.target, lanes, READY});
-                add(w, {f.at + 1, others, READY});
-                f.lanes = 0;
+                f.lanes &= ~lanes;
+                f.at++;
                 return false;
             }
             f.at = lanes ? I.target : f.at + 1;
             return true;
-        }
         case EXIT:
             w.live &= ~lanes;
             f.lanes &= ~lanes;
@@ -487,12 +459,12 @@ struct Machine {
             demand(w, I.from[0], lanes, f.at);
             if (OPCODES[I.op].kind == LOAD) load(w, I, lanes, f.at);
             else if (OPCODES[I.op].kind == STORE) store(w, I, lanes, f.at);
-            else atomic(w, I, lanes, f.at);
+            else demand(w, I.from[1], lanes, f.at), atomic(w, I, lanes, f.at);
             break;
         default: {
             u32 known = known_after(w, I);
             OPCODES[I.op].run(w.file, I, lanes);
-            u32& result = w.known[I.to[0] / 128];
+            u32& result = w.lanes_known(I.to[0]);
             result = (result & ~lanes) | (known & lanes);
         }
         }
@@ -503,25 +475,24 @@ struct Machine {
     // Runs a warp until all its fragments wait or are gone, or for some turns of a drawn length.
     void run_warp(Warp& w, s64 turns) {
         for (; !stop && turns; turns--) {
-            std::vector<int> ready;
-            for (int i = 0; i < (int)w.fragments.size(); i++)
-                if (w.fragments[i].state == READY) ready.push_back(i);
-            if (ready.empty()) return;
-            std::sort(ready.begin(), ready.end(),
-                [&](int a, int b) { return w.fragments[a].at < w.fragments[b].at; });
-            int chosen = ready[drawn ? draw() % ready.size() : 0];
-            u32 until = !drawn && ready.size() > 1 ? w.fragments[ready[1]].at : ~0u;
-            Fragment f = w.fragments[chosen];
-            w.fragments.erase(w.fragments.begin() + chosen);
+            auto behind = [](const Fragment& a, const Fragment& b) {
+                return a.state != b.state ? a.state < b.state : a.at < b.at;
+            };
+            auto& all = w.fragments;
+            std::sort(all.begin(), all.end(), behind);
+            size_t ready = 0;
+            while (ready < all.size() && all[ready].state == READY) ready++;
+            if (!ready) return;
+            size_t chosen = drawn ? draw() % ready : 0;
+            u32 until = !drawn && ready > 1 ? all[1].at : ~0u;
+            Fragment f = all[chosen];
+            all.erase(all.begin() + chosen);
             s64 slice = L.limit + 1;
             if (drawn) {
                 slice = 1 + draw() % 200;
                 if (draw() % 4) meet(w, f, READY);
-                u32 part = draw() % 24 || w.fragments.size() > 5 ? 0 : f.lanes & (u32)draw();
-                if (part != f.lanes) {
-                    add(w, {f.at, part, READY});
-                    f.lanes &= ~part;
-                }
+                u32 part = draw() % 24 || all.size() > 5 ? 0 : f.lanes & (u32)draw();
+                if (part != f.lanes) add(w, {f.at, part, READY}), f.lanes &= ~part;
             }
             bool goes_on = true;
             while (goes_on && slice-- && f.at < until) goes_on = step(w, f);
@@ -531,9 +502,7 @@ struct Machine {
         }
     }
 
-    // ---- blocks
-
-    void begin(Warp& w, const u32* place) {
+    void begin(Warp& w, const u32* of_block) {
         u32 first = w.index * 32, count = std::min<s64>(32, L.threads - first);
         std::fill(w.known, w.known + L.file_size / 128, 0);
         w.live = count == 32 ? ~0u : (1u << count) - 1;
@@ -543,17 +512,13 @@ struct Machine {
             auto& c = L.constants[i];
             if (c.wide) std::fill_n((u64*)(w.file + c.at), 32, c.value);
             else std::fill_n((u32*)(w.file + c.at), 32, (u32)c.value);
-            w.known[c.at / 128] = ~0u;
+            w.lanes_known(c.at) = ~0u;
         }
-        const u32 of_block[] = {(u32)L.threads, place[0], place[1], place[2], (u32)L.grid[0],
-            (u32)L.grid[1], (u32)L.grid[2]};
         for (int i = 0; i < 9; i++) {
             if (L.special[i] < 0) continue;
             for (u32 l = 0; l < 32; l++)
-                ((u32*)(w.file + L.special[i]))[l] = i == 0 ? first + l
-                    : i == 8                                ? l
-                                                            : of_block[i - 1];
-            w.known[L.special[i] / 128] = ~0u;
+                w.slot<u32>(L.special[i], l) = i == 0 ? first + l : i < 8 ? of_block[i - 1] : l;
+            w.lanes_known(L.special[i]) = ~0u;
         }
     }
 
@@ -580,15 +545,16 @@ struct Machine {
     }
 
     void run_block(s64 number) {
-        u32 place[] = {(u32)(number % L.grid[0]), (u32)(number / L.grid[0] % L.grid[1]),
-            (u32)(number / L.grid[0] / L.grid[1])};
+        s64 row = number / L.grid[0], *grid = L.grid;  // what follows is as `special` names it
+        const u32 of_block[] = {(u32)L.threads, (u32)(number % grid[0]), (u32)(row % grid[1]),
+            (u32)(row / grid[1]), (u32)grid[0], (u32)grid[1], (u32)grid[2]};
         block = number;
         barriers++;
         shared_tag = ++tags;
         std::fill(shared.begin(), shared.end(), 0xFF);
         std::fill(local.begin(), local.end(), 0xFF);
         std::fill(local_known.begin(), local_known.end(), 0);
-        for (auto& w : warps) begin(w, place);
+        for (auto& w : warps) begin(w, of_block);
         std::vector<int> order(warps.size());
         std::iota(order.begin(), order.end(), 0);
         while (!stop) {
@@ -618,8 +584,7 @@ const char* opcode_operands(int i) { return OPCODES[i].operands; }
 int opcode_writes(int i) { return OPCODES[i].writes; }
 
 void run(Launch* L) {
-    std::fenv_t
-        before;  // numbers below the normal ones count here, whatever the process does with them
+    std::fenv_t before;  // the process may take numbers below the normal ones for 0; PTX does not
     std::fegetenv(&before);
     std::fesetenv(FE_DFL_ENV);
     approximate = L->approximate;

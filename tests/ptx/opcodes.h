@@ -20,6 +20,10 @@ typedef float f32;
 
 const u64 SHARED = 1ull << 56, LOCAL = 2ull << 56;  // where a space begins in generic addresses
 
+#define EACH(l, lanes)                                                                             \
+    for (int l = 0; l < 32; l++)                                                                   \
+        if ((lanes) >> l & 1)
+
 struct Instruction {  // as parse.py has it
     s32 op, guard, inverted, target, writes, reads, to[4], from[5];
     s32 space, size, vector, is_signed, wide, wide_address;
@@ -70,8 +74,7 @@ inline void on_lanes(
 #pragma GCC ivdep
         for (int l = 0; l < 32; l++) one(l);
     } else {
-        for (int l = 0; l < 32; l++)
-            if (lanes >> l & 1) one(l);
+        EACH(l, lanes) one(l);
     }
 }
 

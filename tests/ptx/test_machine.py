@@ -141,7 +141,34 @@ def test_without_a_compiler_or_room(monkeypatch, tmp_path):
         launching.programs.__wrapped__(plain_kernel.module, 32)
 
 
-# ---- numbers
+def test_memory():
+    """Widths, signs and vectors; what lanes compute together; atomic operations of two blocks."""
+    memory = torch.arange(64, dtype=torch.int32) - 3
+    body = """setp.ne.s32 %p1, %r1, 0; @%p1 bra $B;
+    ld.global.u8 %r10, [%rd1]; ld.global.s8 %r11, [%rd1]; ld.global.u16 %r12, [%rd1];
+    ld.global.s16 %r13, [%rd1]; ld.global.u64 %rd10, [%rd1]; ld.global.s32 %rd11, [%rd1];
+    st.global.v4.u32 [%rd1], {%r10, %r11, %r12, %r13}; st.global.v2.u64 [%rd1+16], {%rd10, %rd11};
+    st.global.u8 [%rd1+32], %r13; st.global.u16 [%rd1+36], %r13; $B: mov.u32 %r14, 0;"""
+    assert not run(body, memory).findings
+    assert memory[:8].tolist() == [0xFD, -3, 0xFFFD, -3, -3, -2, -3, -1]
+    assert memory[8:10].tolist() == [0xFD, 0xFFFD]
+    together = """vote.sync.ballot.b32 %r10, %p1, -1; redux.sync.or.b32 %r11, %r1, -1;
+    setp.lt.s32 %p2, %r1, 32; selp.b32 %r12, %r10, %r11, %p2; st.global.u32 [%rd4], %r12;"""
+    run(ODD + together, memory)
+    assert (memory[:32] == 0x55555555).all() and (memory[32:] == 63).all()
+    for name, start, value, want in (
+        ("add.u32", 5, "%r1", 5 + 2 * sum(range(64))),
+        ("or.b32", 1 << 20, "%r1", (1 << 20) + 63),
+        ("min.s32", 7, "-5", -5),
+        ("max.s32", -7, "%r1", 63),
+    ):
+        memory[0] = start
+        assert not run(f"atom.global.{name} %r10, [%rd1], {value};", memory, blocks=2).findings
+        assert memory[0] == want
+    memory[:2] = torch.tensor([-1, 0])
+    run("mov.u64 %rd10, 1; atom.global.add.u64 %rd11, [%rd1], %rd10;", memory)
+    assert memory[:2].tolist() == [63, 1]
+
 
 WORDS = [0, 1, 2, 15, 16, 31, 32, 33, 63, 64, 0x7FFF, 0x8000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF]
 WORDS += [0x00000001, 0x007FFFFF, 0x00800000, 0x3F800000, 0x3FC00000, 0xBFC00000, 0x40200000]
@@ -272,7 +299,7 @@ APPROXIMATE = {  # the bound of the relative error, from the ISA's text or CUDA'
     "sqrt.approx.ftz.f32": (np.sqrt, 2.0**-23),
 }
 COMPUTING = [name for name in opcodes() if re.match(r"[WQ]{2}", opcodes()[name][1])]
-COMPUTING = [name for name in COMPUTING if not re.match("atom|vote|redux", name)]
+COMPUTING = [name for name in COMPUTING if not re.match(r"atom|vote|redux|.* \* ", name)]
 
 
 def computed(name, operands, **options):
