@@ -13,21 +13,21 @@ def contracted(program: Program) -> Program:
     code = made.code = type(program.code).from_buffer_copy(program.code)
     names = {number: name for name, (number, *_) in opcodes().items()}
     written = Counter(x for i in code for x in i.to[: i.writes])
-    read = Counter(x for i in code for x in i.sources[: i.reads])
+    read = Counter(x for i in code for x in i.given[: i.reads])
     targets = {i.target for i in code if names[i.op] == "bra"}
     products: dict[int, Instruction] = {}  # by where their result lies, those of this run of code
     for at, i in enumerate(code):
         if at in targets or names[i.op] == "bra":
             products.clear()
-        sides = [k for k in (0, 1) if i.sources[k] in products]
+        sides = [k for k in (0, 1) if i.given[k] in products]
         if names[i.op] in ("add.f32", "sub.f32") and i.guard < 0 and sides:
             side = sides[0]
             name = "fma.rn.f32" if names[i.op] == "add.f32" else ("a * b - c", "c - a * b")[side]
-            product, other = products.pop(i.sources[side]), i.sources[1 - side]
+            product, other = products.pop(i.given[side]), i.given[1 - side]
             i.op, i.reads = opcodes()[name][0], 3
-            i.sources[:3] = [*product.sources[:2], other]
+            i.given[:3] = [*product.given[:2], other]
         for result in i.to[: i.writes]:  # what a product is made of is no longer there
-            products = {k: x for k, x in products.items() if result not in x.sources[:2]}
+            products = {k: x for k, x in products.items() if result not in x.given[:2]}
         if names[i.op] == "mul.f32" and i.guard < 0:
             if written[i.to[0]] == read[i.to[0]] == 1:
                 products[i.to[0]] = i

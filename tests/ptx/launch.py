@@ -17,7 +17,7 @@ from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
 from gamba_warp.kernels.runtime.views import Packed
 
 from .contract import contracted
-from .machine import FAULTS, Array, Finding, Launch, Missing, c_int64, library
+from .machine import FAULTS, Array, Finding, Launch, Missing, library
 from .parse import Program, read
 
 ARCHITECTURE = 80  # the PTX of the kernels for sm_90 is the same
@@ -108,12 +108,12 @@ class Interpreter:
         for value, (at, size) in zip(params, program.params):
             blob[at : at + size] = value
         count, arrays = len(program.text), _arrays(tensors)
-        findings, executed = (Finding * MOST_FINDINGS)(), (c_int64 * count)()
+        findings, executed = (Finding * MOST_FINDINGS)(), (ctypes.c_int64 * count)()
         launch = Launch(
-            code=program.code,
-            constants=program.constants,
+            code=ctypes.addressof(program.code),
+            constants=ctypes.addressof(program.constants),
             params=ctypes.addressof((ctypes.c_char * len(blob)).from_buffer(blob)),
-            arrays=arrays,
+            arrays=ctypes.addressof(arrays),
             instructions=count,
             constant_count=len(program.constants),
             file_size=program.file_size,
@@ -127,9 +127,9 @@ class Interpreter:
             seed=self.seed and self.seed + 1000 * len(self.trace),
             approximate=self.approximate,
             limit=MOST_STEPS,
-            findings=findings,
+            findings=ctypes.addressof(findings),
             most_findings=MOST_FINDINGS,
-            executed=executed,
+            executed=ctypes.addressof(executed),
         )
         library().run(ctypes.byref(launch))
         self.steps += launch.steps

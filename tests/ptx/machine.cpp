@@ -21,7 +21,7 @@
 
 template<bool ballot>
 static void any_of(u8* file, const Instruction& I, u32 lanes) {
-    const u32* given = (const u32*)(file + I.from[0]);
+    const u32* given = (const u32*)(file + I.given[0]);
     u32 all = 0;
     EACH(l, lanes) all |= ballot ? (u32)(given[l] != 0) << l : given[l];
     EACH(l, lanes)((u32*)(file + I.to[0]))[l] = all;
@@ -268,8 +268,8 @@ struct Machine {
     }
 
     u64 address_of(Warp& w, int lane, const Instruction& I) {
-        if (I.wide_address) return w.slot<u64>(I.from[0], lane) + I.offset;
-        return w.slot<u32>(I.from[0], lane) + (u32)I.offset;
+        if (I.wide_address) return w.slot<u64>(I.given[0], lane) + I.offset;
+        return w.slot<u32>(I.given[0], lane) + (u32)I.offset;
     }
 
     bool aligned(const Instruction& I, u64 address, u32 thread, u32 at) {
@@ -303,7 +303,7 @@ struct Machine {
             u64 address = address_of(w, l, I);
             if (!aligned(I, address, w.index * 32 + l, at)) continue;
             for (int k = 0; k < I.vector; k++) {
-                s32 r = I.from[1 + k];
+                s32 r = I.given[1 + k];
                 u64 x = I.wide ? w.slot<u64>(r, l) : w.slot<u32>(r, l);
                 bool known = w.lanes_known(r) >> l & 1;
                 if (I.space == IN_GLOBAL || (I.space == GENERIC && address < SHARED))
@@ -328,7 +328,7 @@ struct Machine {
             if (!p) continue;
             T now, next;
             memcpy(&now, p, sizeof now);
-            next = f(now, value<T>(w.slot<Slot<T>>(I.from[1], l)));
+            next = f(now, value<T>(w.slot<Slot<T>>(I.given[1], l)));
             memcpy(p, &next, sizeof next);
             w.slot<Slot<T>>(I.to[0], l) = slot<T>(now);
         }
@@ -357,16 +357,16 @@ struct Machine {
 
     // The lanes in which a result is known; what is not is reported where it matters, no sooner.
     u32 known_after(Warp& w, const Instruction& I) {
-        auto known = [&](int i) { return w.lanes_known(I.from[i]); };
+        auto known = [&](int i) { return w.lanes_known(I.given[i]); };
         Kind kind = OPCODES[I.op].kind;
         if (kind == SELECT) {
-            u32 first = set_lanes(w, I.from[2]);
+            u32 first = set_lanes(w, I.given[2]);
             return known(2) & ((first & known(0)) | (~first & known(1)));
         }
         u32 lanes = ~0u;
         for (int i = 0; i < I.reads; i++) lanes &= known(i);
         if (kind != AND && kind != OR) return lanes;
-        u32 a = set_lanes(w, I.from[0]), b = set_lanes(w, I.from[1]);
+        u32 a = set_lanes(w, I.given[0]), b = set_lanes(w, I.given[1]);
         if (kind == AND) a = ~a, b = ~b;  // one that is false decides alone
         return lanes | (known(0) & a) | (known(1) & b);
     }
@@ -392,7 +392,7 @@ struct Machine {
 
     u32 mask_of(const Warp& w, const Fragment& f) {
         const Instruction& I = L.code[f.at];
-        return w.slot<u32>(I.from[I.reads - 1], __builtin_ctz(f.lanes));
+        return w.slot<u32>(I.given[I.reads - 1], __builtin_ctz(f.lanes));
     }
 
     bool complete(const Warp& w, const Fragment& f) { return !(mask_of(w, f) & w.live & ~f.lanes); }
@@ -401,7 +401,7 @@ struct Machine {
     bool together(Warp& w, Fragment& f, u32 lanes) {
         const Instruction& I = L.code[f.at];
         u32 mask = mask_of(w, f), wrong = f.lanes & ~mask;
-        EACH(l, f.lanes) wrong |= (u32)(w.slot<u32>(I.from[I.reads - 1], l) != mask) << l;
+        EACH(l, f.lanes) wrong |= (u32)(w.slot<u32>(I.given[I.reads - 1], l) != mask) << l;
         if (wrong || lanes != f.lanes) report(MASK, f.at, w.index * 32, mask);
         meet(w, f, AT_WARP);
         if (!complete(w, f)) {
@@ -409,7 +409,7 @@ struct Machine {
             return false;
         }
         if (OPCODES[I.op].run) {
-            demand(w, I.from[0], f.lanes, f.at);
+            demand(w, I.given[0], f.lanes, f.at);
             OPCODES[I.op].run(w.file, I, f.lanes);
             w.lanes_known(I.to[0]) |= f.lanes;
         } else if (f.lanes == w.live) w.barriers++;
@@ -456,10 +456,10 @@ struct Machine {
         case LOAD:
         case STORE:
         case ATOMIC:
-            demand(w, I.from[0], lanes, f.at);
+            demand(w, I.given[0], lanes, f.at);
             if (OPCODES[I.op].kind == LOAD) load(w, I, lanes, f.at);
             else if (OPCODES[I.op].kind == STORE) store(w, I, lanes, f.at);
-            else demand(w, I.from[1], lanes, f.at), atomic(w, I, lanes, f.at);
+            else demand(w, I.given[1], lanes, f.at), atomic(w, I, lanes, f.at);
             break;
         default: {
             u32 known = known_after(w, I);

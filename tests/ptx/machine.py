@@ -4,15 +4,16 @@ import ctypes
 import functools
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import tempfile
-from ctypes import POINTER, c_int32, c_int64, c_uint64
 from pathlib import Path
 
 import warp as wp
 
 _SOURCES = [Path(__file__).with_name(name) for name in ("machine.cpp", "opcodes.h")]
+_TEXT = "".join(path.read_text() for path in _SOURCES)
 # Products are contracted with sums only where an operation says so; integers overflow as in PTX.
 _FLAGS = "-O2 -march=native -ffp-contract=off -fno-math-errno -fwrapv -std=c++17 -shared -fPIC"
 
@@ -40,38 +41,21 @@ class Refused(Exception):
     """The PTX has what the interpreter does not know, by its name."""
 
 
-def _structure(**fields):
-    return type("Structure", (ctypes.Structure,), {"_fields_": [*fields.items()]})
+def _structure(name: str) -> type[ctypes.Structure]:
+    """A structure of the C++ by its name, of numbers, arrays and pointers."""
+    types = {"s32": ctypes.c_int32, "s64": ctypes.c_int64, "u64": ctypes.c_uint64}
+    (body,) = re.findall(rf"^struct {name} \{{(.*?)^\}};", _TEXT, re.S | re.M)
+    fields = []
+    for line in re.sub(r"//.*", "", body).split(";")[:-1]:
+        kind, names = re.fullmatch(r"\s*(?:const )?(\w+\*?) (.*)", line, re.S).groups()
+        for field, count in re.findall(r"(\w+)(?:\[(\d+)\])?", names):
+            made = types.get(kind, ctypes.c_void_p)
+            fields.append((field, made * int(count) if count else made))
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
-_place = dict.fromkeys(("op", "guard", "inverted", "target", "writes", "reads"), c_int32)
-_access = ("space", "size", "vector", "is_signed", "wide", "wide_address")
-Instruction = _structure(
-    **_place, to=c_int32 * 4, sources=c_int32 * 5, **dict.fromkeys(_access, c_int32), offset=c_int64
-)
-Constant = _structure(at=c_int64, value=c_uint64, wide=c_int64)
-Array = _structure(base=c_uint64, size=c_uint64, unit=c_int64)
-Finding = _structure(
-    **dict.fromkeys(("fault", "at", "block", "thread"), c_int32), address=c_uint64, times=c_int64
-)
-_sizes = ("instructions", "constant_count", "file_size", "params_size", "array_count")
-Launch = _structure(
-    code=POINTER(Instruction),
-    constants=POINTER(Constant),
-    params=ctypes.c_void_p,
-    arrays=POINTER(Array),
-    **dict.fromkeys((*_sizes, "shared_size", "local_size", "threads"), c_int64),
-    grid=c_int64 * 3,
-    special=c_int64 * len(SPECIAL),
-    seed=c_uint64,
-    approximate=c_uint64,
-    limit=c_int64,
-    findings=POINTER(Finding),
-    most_findings=c_int64,
-    found=c_int64,
-    executed=POINTER(c_int64),
-    steps=c_int64,
-)
+Instruction, Constant, Array = map(_structure, ("Instruction", "Constant", "Array"))
+Finding, Launch = map(_structure, ("Finding", "Launch"))
 
 
 @functools.cache
@@ -87,7 +71,7 @@ def library() -> ctypes.CDLL:
     compiler = next(filter(None, map(shutil.which, ("g++", "clang++"))), None)
     if compiler is None:
         raise Missing("no C++ compiler (g++ or clang++)")
-    text = b"".join(path.read_bytes() for path in _SOURCES) + f"{compiler} {_FLAGS}".encode()
+    text = f"{_TEXT} {compiler} {_FLAGS}".encode()
     folder = Path(wp.config.kernel_cache_dir)
     path = folder / f"gamba-warp-ptx-{hashlib.sha256(text).hexdigest()[:16]}.so"
     try:

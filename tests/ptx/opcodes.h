@@ -25,7 +25,7 @@ const u64 SHARED = 1ull << 56, LOCAL = 2ull << 56;  // where a space begins in g
         if ((lanes) >> l & 1)
 
 struct Instruction {  // as parse.py has it
-    s32 op, guard, inverted, target, writes, reads, to[4], from[5];
+    s32 op, guard, inverted, target, writes, reads, to[4], given[5];
     s32 space, size, vector, is_signed, wide, wide_address;
     s64 offset;
 };
@@ -68,7 +68,7 @@ inline void on_lanes(
     u8* file, const Instruction& I, u32 lanes, F function, std::index_sequence<i...>) {
     auto to = (Slot<D>*)(file + I.to[0]);
     auto one = [&](int l) {
-        to[l] = slot<D>(function(value<A>(((const Slot<A>*)(file + I.from[i]))[l])...));
+        to[l] = slot<D>(function(value<A>(((const Slot<A>*)(file + I.given[i]))[l])...));
     };
     if (lanes == ~0u) {
 #pragma GCC ivdep

@@ -211,4 +211,4 @@ class _Entry:
             if k < i.writes:
                 i.to[k] = at
             else:
-                i.sources[k - i.writes] = at
+                i.given[k - i.writes] = at
