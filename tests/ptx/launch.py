@@ -82,14 +82,11 @@ class Interpreter:
             for wanted, value in zip(kernel.adj.args, arguments, strict=True)
         ]
         params = [bytes(value) for value in (bounds, *packed)]
-        blocks = max(1, -(-bounds.size // block_dim))
-        if bounds.size:
-            dynamic = notes.get(f"{name}_smem_bytes", 0)
-            sizes = block_dim, (blocks, 1, 1), dynamic
-            program = of_module[name]
-            if kernel.key in self.contract:
-                program = contracted(program)
-            self.execute(program, params, _tensors(arguments), sizes)
+        program, blocks = of_module[name], -(-bounds.size // block_dim)
+        if kernel.key in self.contract:
+            program = contracted(program)
+        sizes = block_dim, blocks, notes.get(f"{name}_smem_bytes", 0)
+        self.execute(program, params, _tensors(arguments), sizes)
 
     def execute(self, program: Program, params: list[bytes], tensors, sizes) -> None:
         """Runs an entry.
@@ -98,11 +95,12 @@ class Interpreter:
             program: from ``read``.
             params: the bytes of each parameter.
             tensors: what may be touched.
-            sizes: threads of a block, blocks in three directions, bytes of dynamic shared memory.
+            sizes: threads of a block, blocks, and bytes of shared memory beside the text's.
         """
-        threads, grid, dynamic = sizes
+        threads, blocks, dynamic = sizes
         assert [len(x) for x in params] == [size for _, size in program.params], program.name
-        assert grid[0] * grid[1] * grid[2] < 1 << 18, "more blocks than a shadow has bits for"
+        # more blocks have more directions on a GPU, and more bits than a shadow has here
+        assert blocks < 1 << 18 and blocks * threads <= 1 << 24, f"{program.name}: {blocks} blocks"
         assert not program.most_threads or threads <= program.most_threads, program.name
         blob = bytearray(program.params_size)
         for value, (at, size) in zip(params, program.params):
@@ -114,7 +112,6 @@ class Interpreter:
             constants=ctypes.addressof(program.constants),
             params=ctypes.addressof((ctypes.c_char * len(blob)).from_buffer(blob)),
             arrays=ctypes.addressof(arrays),
-            instructions=count,
             constant_count=len(program.constants),
             file_size=program.file_size,
             params_size=len(blob),
@@ -122,7 +119,7 @@ class Interpreter:
             shared_size=program.shared_size + dynamic,
             local_size=program.local_size,
             threads=threads,
-            grid=grid,
+            blocks=blocks,
             special=tuple(program.special),
             seed=self.seed and self.seed + 1000 * len(self.trace),
             approximate=self.approximate,

@@ -68,8 +68,8 @@ struct Launch {
     const Constant* constants;
     const u8* params;
     const Array* arrays;
-    s64 instructions, constant_count, file_size, params_size, array_count, shared_size, local_size;
-    s64 threads, grid[3];
+    s64 constant_count, file_size, params_size, array_count, shared_size, local_size;
+    s64 threads, blocks;
     s64 special[9];  // registers of tid, ntid, ctaid, nctaid (x, y, z), laneid; or -1
     u64 seed, approximate;
     s64 limit;  // instructions of a warp in a block
@@ -502,7 +502,7 @@ struct Machine {
         }
     }
 
-    void begin(Warp& w, const u32* of_block) {
+    void begin(Warp& w) {
         u32 first = w.index * 32, count = std::min<s64>(32, L.threads - first);
         std::fill(w.known, w.known + L.file_size / 128, 0);
         w.live = count == 32 ? ~0u : (1u << count) - 1;
@@ -514,6 +514,7 @@ struct Machine {
             else std::fill_n((u32*)(w.file + c.at), 32, (u32)c.value);
             w.lanes_known(c.at) = ~0u;
         }
+        const u32 of_block[] = {(u32)L.threads, block, 0, 0, (u32)L.blocks, 1, 1};
         for (int i = 0; i < 9; i++) {
             if (L.special[i] < 0) continue;
             for (u32 l = 0; l < 32; l++)
@@ -545,16 +546,13 @@ struct Machine {
     }
 
     void run_block(s64 number) {
-        s64 row = number / L.grid[0], *grid = L.grid;  // what follows is as `special` names it
-        const u32 of_block[] = {(u32)L.threads, (u32)(number % grid[0]), (u32)(row % grid[1]),
-            (u32)(row / grid[1]), (u32)grid[0], (u32)grid[1], (u32)grid[2]};
         block = number;
         barriers++;
         shared_tag = ++tags;
         std::fill(shared.begin(), shared.end(), 0xFF);
         std::fill(local.begin(), local.end(), 0xFF);
         std::fill(local_known.begin(), local_known.end(), 0);
-        for (auto& w : warps) begin(w, of_block);
+        for (auto& w : warps) begin(w);
         std::vector<int> order(warps.size());
         std::iota(order.begin(), order.end(), 0);
         while (!stop) {
@@ -589,7 +587,7 @@ void run(Launch* L) {
     std::fesetenv(FE_DFL_ENV);
     approximate = L->approximate;
     Machine machine(*L);
-    std::vector<s64> order(L->grid[0] * L->grid[1] * L->grid[2]);
+    std::vector<s64> order(L->blocks);
     std::iota(order.begin(), order.end(), 0);
     if (L->seed) std::shuffle(order.begin(), order.end(), machine.draw);
     for (s64 block : order)

@@ -25,11 +25,11 @@ mul.wide.u32 %rd3, %r1, 4; add.s64 %rd4, %rd1, %rd3; shl.b32 %r2, %r1, 2; add.s3
 ret; }}"""
 
 
-def run(body, memory, threads=64, blocks=1, dynamic=0, **options):
+def run(body, memory, threads=64, blocks=1, **options):
     """An interpreter that has executed a kernel's body; %rd1 is the address of ``memory``."""
     made, program = Interpreter(**options), read(HEAD + ENTRY.format(body))["k"]
     address = memory.data_ptr().to_bytes(8, "little")
-    made.execute(program, [address], [memory], (threads, (blocks, 1, 1), dynamic))
+    made.execute(program, [address], [memory], (threads, blocks, 0))
     return made
 
 
