@@ -1,12 +1,16 @@
 """Every CUDA kernel's PTX, executed: no finding, the same bits in any order, float64's values."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import assert_rel_rms
 from helpers import raster as rasters
 from helpers import scan as scans
 from helpers.kernels import conv_inputs
+from helpers.model import SMALLEST, inputs
 
+from gamba_warp.cameras import Cameras
 from gamba_warp.kernels.causal_conv1d import causal_conv1d
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.rasterize import depth_quantile, rasterization
@@ -19,6 +23,9 @@ from gamba_warp.kernels.rasterize.tiles import Tiling, make_grid
 from gamba_warp.kernels.runtime.stand_in import standing_in
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
+from gamba_warp.model.gamba import Gamba
+from train.data.samples import Batch
+from train.step import Objective, forward
 
 from .launch import interpreted
 
@@ -187,3 +194,33 @@ def test_only_one_kernel_contracts():
         assert inside >= x.count - 0.001 * x.count
     # what was not written belongs to no tile
     assert emitted.starts[-1] < emitted.count or counted.starts[-1] < counted.count
+
+
+def test_a_training_step():
+    """Network, pictures, losses and all gradients, beside those of the CPU's kernels."""
+    size, config = 32, replace(SMALLEST, image_size=32, encoder_size=32, depth=2)
+    images, lone = inputs(2, size)
+    poses, Ks = rasters.look(2, 3, size, size)
+    views, grounds = Cameras(poses, Ks, size, size), torch.ones(2, 1, 3)
+    batch = Batch([*"ab"], images, lone, torch.rand(2, 3, size, size, 4), views, grounds)
+    model = Gamba(config, "random")
+    weights = {"rgb": 1.0, "mask": 1.0, "ssim": 0.2}
+
+    def gradients():
+        model.zero_grad()
+        loss = forward(model, batch, Objective(weights)).loss
+        loss.backward()
+        named = {k: p.grad for k, p in model.named_parameters() if p.grad is not None}
+        return {"loss": loss.detach()} | named
+
+    want = gradients()
+
+    def run():
+        got = gradients()
+        assert got.keys() == want.keys()
+        for name, value in got.items():
+            # measured 3e-6: both sum in float32, each in its own order
+            limit = rasters.PICTURE if name == "loss" else rasters.GRADIENT
+            assert_rel_rms(value, want[name], limit, name)
+
+    check(run)
