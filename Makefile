@@ -84,7 +84,7 @@ docs: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	git ls-files -z '*.h' '*.inl' | xargs -0r $(BIN)/clang-format --dry-run --Werror
+	git ls-files -z '*.h' '*.inl' '*.cpp' | xargs -0r $(BIN)/clang-format --dry-run --Werror
 	@rm -rf build
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build .
 	$(BIN)/python -m zipfile --extract build/*.whl $(WHEEL)
@@ -93,7 +93,7 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	git ls-files -z '*.h' '*.inl' | xargs -0r $(BIN)/clang-format -i
+	git ls-files -z '*.h' '*.inl' '*.cpp' | xargs -0r $(BIN)/clang-format -i
 
 # Tables and pictures of the pages from results that are kept; REPORTS="--views out/eval/report.json"
 # puts an evaluation of the shipped model into its card first.

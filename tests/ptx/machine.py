@@ -15,7 +15,7 @@ import warp as wp
 _SOURCES = [Path(__file__).with_name(name) for name in ("machine.cpp", "opcodes.h")]
 _TEXT = "".join(path.read_text() for path in _SOURCES)
 # Products are contracted with sums only where an operation says so; integers overflow as in PTX.
-_FLAGS = "-O2 -march=native -ffp-contract=off -fno-math-errno -fwrapv -std=c++17 -shared -fPIC"
+_FLAGS = "-O2 -ffp-contract=off -fno-math-errno -fwrapv -std=c++17 -shared -fPIC"
 
 SPECIAL = ("%tid.x", "%ntid.x", *(f"%ctaid.{x}" for x in "xyz"), *(f"%nctaid.{x}" for x in "xyz"))
 SPECIAL += ("%laneid",)
