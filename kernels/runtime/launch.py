@@ -124,9 +124,18 @@ def cuda_launch(
 
 
 def launch(
-    kernel: Any, dim: int | Sequence[int], inputs, outputs, device, threads=None, block_dim=256
+    kernel: Any,
+    dim: int | Sequence[int],
+    inputs: Sequence,
+    outputs: Sequence,
+    device: torch.device,
+    threads: int | None = None,
+    block_dim: int = 256,
 ) -> None:
-    """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing."""
+    """Launches a plain kernel whose first parameter is ``offset``; with ``dim`` 0, does nothing.
+
+    The threads are those of ``parallel_launch``, on a CPU; ``block_dim`` is of CUDA.
+    """
     if dim == 0 or (not isinstance(dim, int) and 0 in dim):
         return
     if kind_of(device) == "cpu":
