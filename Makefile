@@ -40,11 +40,15 @@ test: $(STAMP)
 	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder
 
 # The operators' own tests on their CUDA path, executed from PTX (tests/ptx), in the order that SEED
-# draws (0: none). APPROXIMATE=1 has ex2, rcp and sqrt err to one side, and 2, 3, … as drawn from it.
+# draws (0: none), and gamba stress for some MINUTES. APPROXIMATE=1 has ex2, rcp and sqrt err to one
+# side in these tests, 2, 3, … as drawn from it.
 APPROXIMATE ?= 0
 ptx: $(STAMP)
 	GAMBA_PTX_SEED=$(SEED) GAMBA_PTX_APPROXIMATE=$(APPROXIMATE) PYTHONPATH=tests \
-		$(BIN)/python -m pytest -p ptx.plugin tests/ops/causal_conv1d tests/ops/selective_scan tests/ops/rasterize
+		$(BIN)/python -m pytest -p ptx.plugin tests/ops/causal_conv1d \
+		tests/ops/selective_scan tests/ops/rasterize
+	PYTHONPATH=tests $(BIN)/python -m ptx stress scan --minutes $(MINUTES) --out out/ptx-scan
+	PYTHONPATH=tests $(BIN)/python -m ptx stress raster --minutes $(MINUTES) --out out/ptx-raster
 
 # Hostile files for every reader, or for READERS='shape or picture', as SEED draws them.
 MINUTES ?= 10
