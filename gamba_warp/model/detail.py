@@ -8,8 +8,9 @@ each front cell may become k x k Gaussians, its children, each on the ray of its
   least that of an opaque surface: a network that is not sure of the depth makes a faint front,
   and then the colours of what lies behind it, which has no detail, show through.
 - colour and alpha are those of the picture at k times the cells.
-- the sizes are the parent's, 1/k of them across the view. Along it they stay, so that no crack
-  opens for a view from the side.
+- the sizes are the parent's, 1/k of them across the view, but so large there that neighbours
+  overlap: at ``image_size`` a rasterizer's own widening covers the gaps between small Gaussians, at
+  k times that it does not. Along the view they stay, so that no crack opens from the side.
 - a parent lies up to a pixel off its ray, its children do not: it cost the input view several dB.
 
 What is plain does not split. Cells with background in them or beside them split in 2 x 2 at most:
@@ -41,6 +42,7 @@ from .posing import reference_cameras
 
 PLAIN = 6 / 255  # a cell that differs by less in itself, and from those beside it, is plain
 MOST_CHILDREN = 60_000  # with the other layers less than 1 MB as ``.spz``, for most objects
+COVER = 0.4  # standard deviation of a child across the view at least, in sides of its cell
 SURE = 2.0  # logit of a child's opacity at least, where alpha is 1
 ROUNDS = 2  # of correction
 SURER = 8.0  # how much the logit of an opacity rises where a whole unit of alpha is missing
@@ -190,10 +192,11 @@ def _children(
     across = (torch.stack([column, row], -1) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
     points = torch.cat([across, torch.ones_like(depth)], -1) * depth
     quats = None if front.quats is None else front.quats[own]
+    across_view = (front.scales[own] / count).clamp_min(COVER * camera.viewmats[0, 2, 3] / K[1, 1])
     children = Gaussians(
         means=points - camera.viewmats[0, :3, 3],
         quats=quats,
-        scales=front.scales[own] * torch.where(_along_the_view(quats, own), 1.0, 1 / count),
+        scales=torch.where(_along_the_view(quats, own), front.scales[own], across_view),
         opacities=torch.sigmoid(opacity + EMPTY * (seen[:, 3:] - 1))[:, 0],
         colors=(seen[:, :3] / seen[:, 3:].clamp_min(1e-3)).clamp(0, 1),
     )
