@@ -35,8 +35,7 @@ class StandIn:
 
 _stand_in: ContextVar[StandIn | None] = ContextVar("stand_in", default=None)
 
-# That of this thread; None where a device makes launches. Each view of a tensor asks it, so it is
-# the variable's own method, without a call of Python's around it.
+# That of this thread; None where a device makes launches.
 stand_in: Callable[[], StandIn | None] = _stand_in.get
 
 

@@ -11,8 +11,8 @@ from gamba_warp.kernels.bench.static import dry_run
 from gamba_warp.kernels.rasterize.cuda import capacity
 from gamba_warp.model.config import PRESETS
 from gamba_warp.model.gamba import Gamba
-from train.data.samples import Batch
-from train.step import Objective, forward
+from gamba_warp.train.data.samples import Batch
+from gamba_warp.train.step import Objective, forward
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import pytest
 
-from .machine import Missing, library
+from .machine import Missing
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -10,11 +10,3 @@ def pytest_runtest_call(item):
     outcome = yield
     if outcome.excinfo and isinstance(outcome.excinfo[1], Missing):
         outcome.force_exception(pytest.skip.Exception(str(outcome.excinfo[1])))
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _interpreter():
-    try:
-        library()
-    except Missing as reason:
-        pytest.skip(str(reason))

@@ -24,8 +24,8 @@ from gamba_warp.kernels.runtime.stand_in import standing_in
 from gamba_warp.kernels.selective_scan.cuda import launch as scan_cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 from gamba_warp.model.gamba import Gamba
-from train.data.samples import Batch
-from train.step import Objective, forward
+from gamba_warp.train.data.samples import Batch
+from gamba_warp.train.step import Objective, forward
 
 from .launch import interpreted
 

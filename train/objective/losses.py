@@ -115,19 +115,17 @@ def depth_loss(gaussians: Gaussians, layers: int, cameras: Cameras, surfaces: Te
         known = inside[of] & (gaussians.opacities[of] > 0) & (true > 0)
         gaps = (depths[:, 0][of] - true) * known
         total = total + _bent_mean(gaps, known)
-        place = torch.where(known, pixel[of], height * width)  # the unknown share a place behind
-        empty = surface.new_zeros(len(surface), height * width + 1)
-        shape = (1, (height, width))
-        count = empty.scatter_add(1, place, torch.ones_like(gaps))[:, :-1].unflatten(*shape)
-        gap = empty.scatter_add(1, place, gaps)[:, :-1].unflatten(*shape) / count.clamp_min(1)
-        seen = count.clamp_max(1)
+        empty = torch.zeros_like(surface)
+        count = empty.scatter_add(1, pixel[of], known.to(gaps.dtype)).view(-1, height, width)
+        gap = empty.scatter_add(1, pixel[of], gaps).view(-1, height, width) / count.clamp_min(1)
+        seen = count > 0
         for step in SLOPE_STEPS:
             for axis in (1, 2):
                 rest = gap.shape[axis] - step
-                pairs = (x.narrow(axis, at, rest) for at in (0, step) for x in (gap, seen))
-                a, a_seen, b, b_seen = pairs
-                slopes = _bent_mean(b - a, a_seen * b_seen)
-                total = total + SLOPE_WEIGHT / (2 * len(SLOPE_STEPS)) * slopes
+                rises = gap.narrow(axis, step, rest) - gap.narrow(axis, 0, rest)
+                both = seen.narrow(axis, step, rest) & seen.narrow(axis, 0, rest)
+                share = SLOPE_WEIGHT / (2 * len(SLOPE_STEPS))
+                total = total + share * _bent_mean(rises, both)
     return total
 
 
