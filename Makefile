@@ -40,13 +40,15 @@ test: $(STAMP)
 	GOMP_SPINCOUNT=1000 $(BIN)/python -m pytest tests -n 2 --dist loadfile --no-loadscope-reorder
 
 # The operators' own tests on their CUDA path, executed from PTX (tests/ptx), in the order that SEED
-# draws (0: none), and gamba stress for some MINUTES. APPROXIMATE=1 has ex2, rcp and sqrt err to one
-# side in these tests, 2, 3, … as drawn from it.
+# draws (0: none), large shapes, and gamba stress for some MINUTES. APPROXIMATE=1 has ex2, rcp and
+# sqrt err to one side in these tests, 2, 3, … as drawn from it; CONTRACT='.*' has products join
+# sums in kernels of these names, as ptxas may.
 APPROXIMATE ?= 0
+CONTRACT ?=
 ptx: $(STAMP)
-	GAMBA_PTX_SEED=$(SEED) GAMBA_PTX_APPROXIMATE=$(APPROXIMATE) PYTHONPATH=tests \
-		$(BIN)/python -m pytest -p ptx.plugin tests/ops/causal_conv1d \
-		tests/ops/selective_scan tests/ops/rasterize
+	GAMBA_PTX_SEED=$(SEED) GAMBA_PTX_APPROXIMATE=$(APPROXIMATE) GAMBA_PTX_CONTRACT='$(CONTRACT)' \
+		PYTHONPATH=tests $(BIN)/python -m pytest -p ptx.plugin tests/ops/causal_conv1d \
+		tests/ops/selective_scan tests/ops/rasterize tests/ptx/large.py
 	PYTHONPATH=tests $(BIN)/python -m ptx stress scan --minutes $(MINUTES) --out out/ptx-scan
 	PYTHONPATH=tests $(BIN)/python -m ptx stress raster --minutes $(MINUTES) --out out/ptx-raster
 

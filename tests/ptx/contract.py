@@ -1,12 +1,14 @@
 """Products contracted with sums, as ptxas may where PTX does not name their rounding."""
 
 import copy
+import functools
 from collections import Counter
 
 from .machine import Instruction, opcodes
 from .parse import Program
 
 
+@functools.cache
 def contracted(program: Program) -> Program:
     """A copy in which each product that only one sum reads, in the same run of code, joins it."""
     made = copy.copy(program)

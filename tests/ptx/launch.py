@@ -3,10 +3,10 @@
 import contextlib
 import ctypes
 import functools
+import itertools
 import json
 import re
 import zlib
-from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import torch
@@ -56,7 +56,7 @@ class Interpreter:
         seed: of the order of all that has none on a GPU; 0: in order.
         approximate: how the approximate units err, within what is documented of them: 0 not at all,
             1 to one side, else as drawn from this number.
-        contract: keys of kernels whose products are contracted with sums.
+        contract: kernels whose products are contracted with sums: their keys, a regular expression.
         findings: a line each.
         executed: by entry its program, and by instruction how many warps executed it.
         trace: after each launch a checksum of all the memory that it was given.
@@ -65,7 +65,7 @@ class Interpreter:
 
     seed: int = 0
     approximate: int = 0
-    contract: Collection[str] = ()
+    contract: str = ""
     findings: list[str] = field(default_factory=list)
     executed: dict[str, tuple[Program, list[int]]] = field(default_factory=dict)
     trace: list[int] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Interpreter:
         ]
         params = [bytes(value) for value in (bounds, *packed)]
         program, blocks = of_module[name], -(-bounds.size // block_dim)
-        if kernel.key in self.contract:
+        if re.fullmatch(self.contract, kernel.key):
             program = contracted(program)
         sizes = block_dim, blocks, notes.get(f"{name}_smem_bytes", 0)
         self.execute(program, params, _tensors(arguments), sizes)
@@ -152,18 +152,28 @@ def _tensors(values) -> list[torch.Tensor]:
 
 
 def _arrays(tensors):
-    """The memory of tensors, in order; what overlaps is one array."""
+    """The memory of tensors, in order: each dense piece of one; what overlaps is one array."""
     merged: list[list[int]] = []
-    for x in sorted((x for x in tensors if x.numel()), key=torch.Tensor.data_ptr):
-        size, begin = x.element_size(), x.data_ptr()
-        end = begin + size * (1 + sum((n - 1) * s for n, s in zip(x.shape, x.stride())))
-        unit = size.bit_length() - 1
+    for begin, end, unit in sorted(piece for x in tensors if x.numel() for piece in _pieces(x)):
         if merged and begin < merged[-1][1]:
             merged[-1][1:] = max(end, merged[-1][1]), min(unit, merged[-1][2])
         else:
             merged.append([begin, end, unit])
     found = [(begin, end - begin, min(unit, 2)) for begin, end, unit in merged]
     return (Array * len(found))(*found)
+
+
+def _pieces(x: torch.Tensor):
+    """Where each dense piece of a tensor's memory begins and ends, and its unit."""
+    size, dense, apart = x.element_size(), 1, []
+    for stride, length in sorted(zip(x.stride(), x.shape)):
+        if stride <= dense or length == 1:
+            dense += (length - 1) * stride if length > 1 else 0
+        else:
+            apart.append(range(0, length * stride, stride))
+    for places in itertools.product(*apart):
+        begin = x.data_ptr() + size * sum(places)
+        yield begin, begin + size * dense, size.bit_length() - 1
 
 
 @contextlib.contextmanager

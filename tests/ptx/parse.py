@@ -22,7 +22,7 @@ _PARAMETER = re.compile(r"\.param\s+(?:\.align\s+(\d+)\s+)?\.(\w+)\s+([\w$]+)(?:
 _ENTRY = re.compile(r"\.entry\s+([\w$]+)\s*\((.*?)\)([^{;]*)\{", re.S)
 
 
-@dataclass
+@dataclass(eq=False)
 class Program:
     """An entry, decoded.
 

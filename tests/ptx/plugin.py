@@ -1,6 +1,7 @@
 """For pytest, ``-p ptx.plugin``: tests take the CUDA path, their launches executed from PTX.
 
-``GAMBA_PTX_SEED`` draws the order; ``GAMBA_PTX_APPROXIMATE`` is as ``Interpreter.approximate``.
+``GAMBA_PTX_SEED`` draws the order; ``GAMBA_PTX_APPROXIMATE`` and ``GAMBA_PTX_CONTRACT`` are as
+``Interpreter`` takes them.
 """
 
 import os
@@ -10,6 +11,7 @@ import pytest
 from .launch import interpreted
 
 _OPTIONS = {x: int(os.environ.get(f"GAMBA_PTX_{x.upper()}", "0")) for x in ("seed", "approximate")}
+_OPTIONS["contract"] = os.environ.get("GAMBA_PTX_CONTRACT", "")
 # These ask for what only the CPU's kernels have: their order of lists or of sums, and its limits.
 _OF_THE_CPU = ("test_many.py", "[cpu", "_cuda.py", "test_tile_lists", "test_counts_tell")
 _OF_THE_CPU += ("scan_accuracy.py", "test_split_consistency", "test_equal_terms_of_a_sum")
