@@ -1,5 +1,6 @@
 """What holds for all tests: rewritten asserts in helpers, the marker ``gpu``, a fixed seed."""
 
+import contextlib
 import os
 import signal
 
@@ -10,6 +11,8 @@ import torch
 pytest.register_assert_rewrite("helpers")
 
 from helpers.browser import browser, browser_page  # noqa: E402, F401
+from ptx.launch import interpreted  # noqa: E402
+from ptx.machine import Missing  # noqa: E402
 
 # No test fetches a matting model, or uses one that rembg keeps on this machine.
 os.environ["GAMBA_OFFLINE"] = "1"
@@ -25,6 +28,24 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if "gpu" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_call(item):
+    """Skips what executes PTX (tests/ptx) where there is no compiler or no NVRTC."""
+    outcome = yield
+    if outcome.excinfo and isinstance(outcome.excinfo[1], Missing):
+        outcome.force_exception(pytest.skip.Exception(str(outcome.excinfo[1])))
+
+
+@pytest.fixture
+def from_ptx():
+    """Called, has tensors of the CPU take the CUDA path from there on, executed from PTX."""
+    machines = []
+    with contextlib.ExitStack() as stack:
+        yield lambda: machines.append(stack.enter_context(interpreted()))
+    findings = [line for machine in machines for line in machine.findings]
+    assert not findings, "\n".join(findings)
 
 
 @pytest.fixture

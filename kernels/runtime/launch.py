@@ -97,28 +97,24 @@ def cuda_launch(
     device: torch.device,
     block_dim: int = 256,
 ) -> None:
-    """Launches on torch's current stream of ``device``; on a CPU device, on the CPU (for tests).
-
-    Where something stands in for a GPU (``stand_in.py``), that makes the launch.
+    """Launches on torch's current stream of ``device``, or by what stands in for a GPU.
 
     Args:
         kernel: a ``wp.Kernel``, not generic.
         dim: launch dimensions; for a tile kernel the last one is ``block_dim``.
         inputs: all arguments; tensors are viewed, other values passed on.
         outputs: more arguments, by convention those that are written.
-        device: of the tensors, cpu or cuda.
-        block_dim: threads of a block; on a CPU it needs ``wp.config.enable_cpu_blocks``.
+        device: of the tensors.
+        block_dim: threads of a block.
     """
     arguments = [view(a) if isinstance(a, Tensor) else a for a in (*inputs, *outputs)]
     if (other := stand_in()) is not None:
         dim = (dim,) if isinstance(dim, int) else tuple(dim)
         other.launch(kernel, dim, arguments, block_dim)
         return
-    target: dict[str, Any] = {"device": "cpu"}
-    if device.type == "cuda":
-        target = {"stream": wp.stream_from_torch(torch.cuda.current_stream(device))}
+    stream = wp.stream_from_torch(torch.cuda.current_stream(device))
     try:
-        wp.launch(kernel, dim, arguments, block_dim=block_dim, record_tape=False, **target)
+        wp.launch(kernel, dim, arguments, block_dim=block_dim, stream=stream, record_tape=False)
     except OSError as error:
         raise unkept(error) from error
 

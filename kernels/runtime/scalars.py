@@ -1,7 +1,4 @@
-"""The leaves of ``lanes.py`` for one channel per thread, for CUDA kernels.
-
-Each is plain Warp, or a line of C++ that also compiles for a CPU, where the tests run it.
-"""
+"""The leaves of ``lanes.py`` for one channel per thread, for CUDA kernels."""
 
 import torch
 import warp as wp
@@ -31,24 +28,16 @@ BITS = {
 # 2^-22. Denormals count as 0.
 EXP2 = """
 auto exp2_ = [](float v) -> float {
-#if defined(__CUDA_ARCH__)
     float r;
     asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(v));
     return r;
-#else
-    return ::exp2f(v);
-#endif
 };
 """
 RECIPROCAL = """
 auto reciprocal_ = [](float v) -> float {
-#if defined(__CUDA_ARCH__)
     float r;
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(v));
     return r;
-#else
-    return 1.0f / v;
-#endif
 };
 """
 
@@ -56,13 +45,9 @@ auto reciprocal_ = [](float v) -> float {
 # The product of two int32 in one instruction, as addresses need it.
 WIDE = """
 auto wide_ = [](int a, int b) -> long long {
-#if defined(__CUDA_ARCH__)
     long long r;
     asm("mul.wide.s32 %0, %1, %2;" : "=l"(r) : "r"(a), "r"(b));
     return r;
-#else
-    return (long long)a * b;
-#endif
 };
 """
 
@@ -75,12 +60,7 @@ def exp2(x: float) -> float: ...
 def reciprocal(x: float) -> float: ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    asm volatile("" : "+r"(x));
-#endif
-    return x;
-""")
+@wp.func_native('asm volatile("" : "+r"(x)); return x;')
 def anew(x: int) -> int:
     """Returns x; what was computed from x before is not kept in registers for its sake."""
     ...

@@ -182,7 +182,6 @@ def interpreted(multiprocessors: int = 132, **options):
 
     Memory that nobody has written is full of NaN, or 77.
     """
-    library()
     made = Interpreter(**options)
     before = {(owner, name): getattr(owner, name) for owner, name in _MAKERS}
     for (owner, name), make in before.items():

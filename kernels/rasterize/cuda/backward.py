@@ -25,11 +25,14 @@ from .warp import (
     WIDTH,
     Gaussians,
     Place,
+    any_of,
+    ballot,
     first_block,
     kernel_options,
     placing,
     shared_memory,
     staging,
+    sync,
     touching,
 )
 
@@ -215,7 +218,7 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                     some |= wp.static(3 << first_block(j))
         if (picture.skip & ZERO_UPSTREAM) == 0:
             some = wp.static(part_blocks)
-        wanted = memory.any_of(arena, p.lane, some)
+        wanted = any_of(some)
         if wanted == 0:
             walked = 0
         if walked > 0 and p.lane == 0:
@@ -240,8 +243,8 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                         g = L.load_int(lists.order, k)
                     row = row * wp.static(parts) + p.part
                     stage(arena, picture, gaussians, p.lane, g, bits, row)
-            todo = memory.ballot(arena, p.lane, bits)
-            memory.sync()
+            todo = ballot(bits)
+            sync()
             while todo != 0:
                 i = L.lowest_bit(todo)
                 todo &= todo - 1
@@ -280,9 +283,9 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                     leave(arena, p.lane, waiting, memory.get_int(arena, i * RECORD + 7), sums)
                     waiting += 1
                     if waiting == wp.static(slots):
-                        memory.sync()
+                        sync()
                         complete(arena, gaussians, p.lane, waiting, rows_out.sums)
-                        memory.sync()
+                        sync()
                         waiting = 0
                 if (bits >> STOP) != 0:
                     # what stopped here takes part from the next pair on
@@ -292,7 +295,7 @@ def _walking(channels: int, geometry: bool, parts: int, listed: bool):
                             if T[j] < 0.0:
                                 if L.load_stop(stops, p.place, j * WARP) == k:
                                     T[j] = -T[j]
-            memory.sync()
+            sync()
         complete(arena, gaussians, p.lane, waiting, rows_out.sums)
 
     return walk
@@ -322,7 +325,7 @@ def backward_kernels(channels: int, geometry: bool, parts: int):
         rows_out: Rows,
     ):
         index, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
+        arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
         p = place(picture, index, lane)
         walk(
             picture,
@@ -349,7 +352,7 @@ def backward_kernels(channels: int, geometry: bool, parts: int):
         rows_out: Rows,
     ):
         worker, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(WARP + size),), dtype=float, storage="shared")
+        arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
         image = worker // wp.static(parts)
         tiles = picture.tiles_x * picture.tiles_y
         if lists_in.count[0] <= wp.int64(lists_in.pairs.shape[0]):

@@ -10,11 +10,10 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import cuda_launch
-from ...runtime.stand_in import kind_of, multiprocessors_of
+from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import Packed
 from ..constants import BLOCKS
 from ..tiles import Bins, Drawn, Lists, Picture, Pixels, Walk, Walked
@@ -31,8 +30,6 @@ def parts_of_tile(tiles: int, device: torch.device) -> int:
     run side by side. With more views, parts would only repeat what a Gaussian costs each warp.
     CUDA.md has the estimate behind the limits; no GPU has timed it.
     """
-    if kind_of(device) != "cuda":
-        return 1
     few = 10 * multiprocessors_of(device)
     return 4 if tiles <= few else 2 if tiles <= 2 * few else 1
 
@@ -47,8 +44,6 @@ def _launch(
 ) -> None:
     """Launches both ``kernels`` of each chunk of channels, with so many warps."""
     colors = splats.colors
-    if kind_of(colors.device) == "cpu" and not wp.config.enable_cpu_blocks:
-        raise ValueError("device is cpu: these kernels run there with enable_cpu_blocks only")
     channels = colors.shape[1]
     for first in range(0, channels if warps[0] else 0, CHUNK):
         gaussians = Packed(Gaussians, *splats, channels, first)

@@ -21,11 +21,14 @@ from .warp import (
     WIDTH,
     Gaussians,
     Place,
+    any_of,
+    ballot,
     first_block,
     kernel_options,
     placing,
     shared_memory,
     staging,
+    sync,
     touching,
     word,
 )
@@ -87,7 +90,7 @@ def _walking(channels: int, parts: int, listed: bool):
                 T[j] = 1.0
                 inside |= 1 << j
         sums = sums_type()
-        live = memory.any_of(arena, p.lane, inside)
+        live = any_of(inside)
 
         walked = end - begin
         evaluated = wp.int32(0)
@@ -116,8 +119,8 @@ def _walking(channels: int, parts: int, listed: bool):
                 if (picture.skip & BLOCK_TEST) == 0:
                     mask = live
                 stage(arena, picture, gaussians, p.lane, g, mask, 0)
-            todo = memory.ballot(arena, p.lane, mask)
-            memory.sync()
+            todo = ballot(mask)
+            sync()
             mine = wp.int32(0)
             while todo != 0 and live != 0:
                 i = L.lowest_bit(todo)
@@ -144,7 +147,7 @@ def _walking(channels: int, parts: int, listed: bool):
                                     sums[j, c] += weight * color[c]
                             else:
                                 stopped[0] += wp.static(1 << (STOP + j))
-                bits = memory.any_of(arena, p.lane, (used[0] << half) | stopped[0])
+                bits = any_of((used[0] << half) | stopped[0])
                 if p.lane == i:
                     mine = bits
                 if (bits >> STOP) != 0:
@@ -156,14 +159,14 @@ def _walking(channels: int, parts: int, listed: bool):
                             going = wp.int32(0)
                             if T[j] > 0.0:
                                 going = 1
-                            over = memory.ballot(arena, p.lane, going) == 0
+                            over = ballot(going) == 0
                             if over and (picture.skip & STOPPED) != 0:
                                 live &= wp.static(~(1 << j))
                     if live == 0:
                         walked = k0 + i - begin + 1
             if k < end:
                 leave(walked_out.blocks, k, p.part, mine)
-            memory.sync()
+            sync()
 
         if p.lane == 0:
             if wp.static(listed):
@@ -208,7 +211,7 @@ def forward_kernels(channels: int, parts: int):
         pixels_out: Pixels,
     ):
         index, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
+        arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         p = place(picture, index, lane)
         walk(picture, gaussians, lists_in, walked_out, pixels_out, arena, p)
 
@@ -222,7 +225,7 @@ def forward_kernels(channels: int, parts: int):
         pixels_out: Pixels,
     ):
         index, lane = wp.tid()
-        arena = wp.tile_empty(shape=(wp.static(WARP + _SIZE),), dtype=float, storage="shared")
+        arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         if lists_in.count[0] > wp.int64(lists_in.pairs.shape[0]):
             p = place(picture, index, lane)
             walk_unlisted(picture, gaussians, lists_in, walked_out, pixels_out, arena, p)

@@ -1,4 +1,4 @@
-"""Leaf functions of the CUDA compositor: C++ with a CPU form, for tests on CPU blocks."""
+"""Leaf functions of the CUDA compositor, in C++."""
 
 import warp as wp
 
@@ -9,15 +9,7 @@ from ...runtime.scalars import reciprocal as reciprocal
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    float y;
-    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
-    return y;
-#else
-    return sqrtf(x);
-#endif
-""")
+@wp.func_native('float y; asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x)); return y;')
 def root(x: wp.float32) -> wp.float32:
     """The square root, to 2 units in the last place."""
     ...
@@ -76,25 +68,13 @@ def exponent(
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __ffs(x) - 1;
-#else
-    return __builtin_ctz(x);
-#endif
-""")
+@wp.func_native("return __ffs(x) - 1;")
 def lowest_bit(x: wp.int32) -> wp.int32:
     """The number of the lowest bit that is set; one must be."""
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __popc(x);
-#else
-    return __builtin_popcount(x);
-#endif
-""")
+@wp.func_native("return __popc(x);")
 def count_bits(x: wp.int32) -> wp.int32:
     """The number of bits that are set."""
     ...

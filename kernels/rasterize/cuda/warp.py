@@ -39,60 +39,43 @@ def first_block(j: int) -> int:
     return j // 2 * 4 + j % 2 * 2
 
 
-_SYNC = """
-#if defined(__CUDA_ARCH__)
-    __syncwarp();
-#else
-    WP_TILE_SYNC();
-#endif
-"""
-_GATHER = """
-    unsigned* votes = (unsigned*)arena.data.ptr;
-    votes[lane] = vote;
-    WP_TILE_SYNC();
-    unsigned r = 0;
-    for (int i = 0; i < 32; ++i) r |= votes[i];
-    WP_TILE_SYNC();
-    return (int)r;
-#endif
-"""
-_ANY_OF = f"""
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
+_ANY_OF = """
+#if __CUDA_ARCH__ < 800
     for (int i = 16; i > 0; i /= 2) x |= __shfl_xor_sync(0xffffffffu, x, i);
     return x;
-#elif defined(__CUDA_ARCH__)
+#else
     int r;
     asm volatile("redux.sync.or.b32 %0, %1, 0xffffffff;" : "=r"(r) : "r"(x));
     return r;
-#else
-    const unsigned vote = x;
-{_GATHER}"""
-_BALLOT = f"""
-#if defined(__CUDA_ARCH__)
-    return (int)__ballot_sync(0xffffffffu, x != 0);
-#else
-    const unsigned vote = x != 0 ? 1u << lane : 0u;
-{_GATHER}"""
-# A tile begins at a multiple of 16 bytes on CUDA, anywhere on the CPU.
-_GET4 = f"""
-    wp::vec_t<4, float> v;
-#if defined(__CUDA_ARCH__)
-    const float4 r = *(const float4*)(arena.data.ptr + {WARP} + i);
-    v.c[0] = r.x, v.c[1] = r.y, v.c[2] = r.z, v.c[3] = r.w;
-#else
-    memcpy(&v, arena.data.ptr + {WARP} + i, 16);
 #endif
+"""
+_GET4 = """
+    wp::vec_t<4, float> v;
+    const float4 r = *(const float4*)(arena.data.ptr + i);
+    v.c[0] = r.x, v.c[1] = r.y, v.c[2] = r.z, v.c[3] = r.w;
     return v;
 """
-_PUT4 = f"""
-#if defined(__CUDA_ARCH__)
+_PUT4 = """
     float4 r;
     r.x = v.c[0], r.y = v.c[1], r.z = v.c[2], r.w = v.c[3];
-    *(float4*)(arena.data.ptr + {WARP} + i) = r;
-#else
-    memcpy(arena.data.ptr + {WARP} + i, &v, 16);
-#endif
+    *(float4*)(arena.data.ptr + i) = r;
 """
+
+
+@wp.func_native("__syncwarp();")
+def sync(): ...
+
+
+@wp.func_native(_ANY_OF)
+def any_of(x: wp.int32) -> wp.int32:
+    """The or of all lanes' integers."""
+    ...
+
+
+@wp.func_native("return (int)__ballot_sync(0xffffffffu, x != 0);")
+def ballot(x: wp.int32) -> wp.int32:
+    """Bit l: lane l's integer is not 0."""
+    ...
 
 
 def kernel_options(warps: int) -> dict[str, Any]:
@@ -105,9 +88,6 @@ class Memory(NamedTuple):
     """A warp's shared memory: ``arena`` is the tile's type, the rest are functions."""
 
     arena: object
-    sync: Callable
-    any_of: Callable  # the or of all lanes' integers
-    ballot: Callable  # bit l: lane l's integer is not 0
     put: Callable
     put_int: Callable
     get_int: Callable
@@ -117,26 +97,17 @@ class Memory(NamedTuple):
 
 @functools.cache
 def shared_memory(size: int) -> Memory:
-    """Access to ``size`` floats, which lie behind 32 words for the CPU's votes."""
+    """Access to ``size`` floats."""
     # Its stub has the function of that name only.
-    arena_type = wp.tile[float, WARP + size]  # pyright: ignore[reportIndexIssue]
+    arena_type = wp.tile[float, size]  # pyright: ignore[reportIndexIssue]
 
-    @wp.func_native(_SYNC)
-    def sync(): ...
-
-    @wp.func_native(_ANY_OF)
-    def any_of(arena: arena_type, lane: wp.int32, x: wp.int32) -> wp.int32: ...
-
-    @wp.func_native(_BALLOT)
-    def ballot(arena: arena_type, lane: wp.int32, x: wp.int32) -> wp.int32: ...
-
-    @wp.func_native(f"arena.data.ptr[{WARP} + i] = v;")
+    @wp.func_native("arena.data.ptr[i] = v;")
     def put(arena: arena_type, i: wp.int32, v: wp.float32): ...
 
-    @wp.func_native(f"memcpy(arena.data.ptr + {WARP} + i, &v, 4);")
+    @wp.func_native("memcpy(arena.data.ptr + i, &v, 4);")
     def put_int(arena: arena_type, i: wp.int32, v: wp.int32): ...
 
-    @wp.func_native(f"int v; memcpy(&v, arena.data.ptr + {WARP} + i, 4); return v;")
+    @wp.func_native("int v; memcpy(&v, arena.data.ptr + i, 4); return v;")
     def get_int(arena: arena_type, i: wp.int32) -> wp.int32: ...
 
     @wp.func_native(_PUT4)
@@ -145,7 +116,7 @@ def shared_memory(size: int) -> Memory:
     @wp.func_native(_GET4)
     def get4(arena: arena_type, i: wp.int32) -> wp.vec4: ...
 
-    return Memory(arena_type, sync, any_of, ballot, put, put_int, get_int, put4, get4)
+    return Memory(arena_type, put, put_int, get_int, put4, get4)
 
 
 @struct

@@ -3,9 +3,7 @@
 // is masked.
 #include "shape.h"
 const char* at = (const char*)origin;
-#if defined(__CUDA_ARCH__)
 __builtin_assume(__isGlobal(at));
-#endif
 wp::vec_t<COUNT, unsigned> r;
 WP_PRAGMA_UNROLL
 for (int i = 0; i < COUNT; ++i) {

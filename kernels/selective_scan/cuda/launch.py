@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...runtime.launch import cuda_launch
 from ...runtime.scalars import LOG2E, exp2
-from ...runtime.stand_in import kind_of, multiprocessors_of
+from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
 from ..problem import DISCRETIZATIONS, Scan
 from .backward import RUN, backward_kernel
@@ -93,8 +93,6 @@ def choose(
 def scan_tuning(shape: Sequence[int], states: int, groups: int, device: torch.device) -> Tuning:
     """The tuning that a scan runs on.
 
-    On a CPU, where only tests run these kernels, it is the default one, without segments.
-
     Args:
         shape: of u, ``[B, L, D]``.
         states: N.
@@ -103,8 +101,6 @@ def scan_tuning(shape: Sequence[int], states: int, groups: int, device: torch.de
     """
     if FORCED is not None:
         return FORCED
-    if kind_of(device) != "cuda":
-        return Tuning()
     return choose(*shape, states, groups, multiprocessors_of(device))
 
 

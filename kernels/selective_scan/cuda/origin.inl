@@ -1,10 +1,6 @@
 // A place in device memory as one number: the compiler would otherwise find it again at each
 // access, from the tensor's address and two strides.
 const char* at = (const char*)FROM;
-#if defined(__CUDA_ARCH__)
 unsigned long long r;
 asm("add.s64 %0, %1, %2;" : "=l"(r) : "l"(at), "l"(wide_(b, x_in.strides[0])));
 return r;
-#else
-return (wp::uint64)at + wide_(b, x_in.strides[0]);
-#endif

@@ -3,15 +3,9 @@ constexpr int WIDTH = LANES * STATES, PADDED = WIDTH * WALKS, HELD = CHANNELS * 
 constexpr int SLOTS = BLOCK / LANES, SPAN = SLOTS * CHANNELS, ROWS = BLOCK / SPAN;
 constexpr int PAD = LANES > 1 ? 32 / LANES : 0;
 
-// Vectors of shared memory are aligned; on a CPU a tile may lie anywhere.
-#if defined(__CUDA_ARCH__)
-#define ALIGNED(bytes) alignas(bytes)
-#else
-#define ALIGNED(bytes)
-#endif
 auto load_ = [](const float* from, auto& to) {
     constexpr int N = sizeof(to) / sizeof(float), V = N < 4 ? N : 4;
-    struct ALIGNED(4 * V) Vector {
+    struct alignas(4 * V) Vector {
         float v[V];
     };
     WP_PRAGMA_UNROLL
@@ -23,7 +17,7 @@ auto load_ = [](const float* from, auto& to) {
 };
 auto store_ = [](float* to, const auto& from) {
     constexpr int N = sizeof(from) / sizeof(float), V = N < 4 ? N : 4;
-    struct ALIGNED(4 * V) Vector {
+    struct alignas(4 * V) Vector {
         float v[V];
     };
     WP_PRAGMA_UNROLL

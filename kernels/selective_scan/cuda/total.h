@@ -7,7 +7,7 @@ auto total_ = [&](int walk) {
         const int t = e / (WIDTH / TAKEN) % TOKENS, n = e % (WIDTH / TAKEN) * TAKEN;
         const bool is_b = NEED_DB && NEED_DC ? e < OWN : NEED_DB;
         const float* from = arena.data.ptr + (is_b ? AT_DB : AT_DC) + t * STRIDE + n;
-        struct ALIGNED(4 * TAKEN) Sums {
+        struct alignas(4 * TAKEN) Sums {
             float v[TAKEN];
         };
         constexpr int PARTS = SLOTS < 4 ? SLOTS : 4;

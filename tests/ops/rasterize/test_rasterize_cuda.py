@@ -1,4 +1,4 @@
-"""The CUDA kernels without a GPU: small shapes on CPU blocks."""
+"""The CUDA path executed from PTX beside the CPU's, and what skips change."""
 
 from dataclasses import fields
 
@@ -13,6 +13,8 @@ from gamba_warp.kernels.rasterize.constants import ALPHA_MIN
 from gamba_warp.kernels.rasterize.cpu import composite as composite_cpu
 from gamba_warp.kernels.rasterize.cuda import composite as composite_cuda
 from gamba_warp.kernels.rasterize.cuda.warp import touching
+from gamba_warp.kernels.runtime.launch import cuda_launch
+from gamba_warp.kernels.runtime.views import view
 
 SAME = 2e-6  # the two sum in another order
 
@@ -42,11 +44,11 @@ def run(scene, v_renders, v_alphas, mode="RGB", needs=None, **options):
     return {"renders": renders, "alphas": alphas, **grads}, counts
 
 
-def test_skips_change_nothing(on_blocks):
+def test_skips_change_nothing(on_cuda):
     scene = crowded(3)
     v_renders, v_alphas = upstream()
     v_renders[:, :, :16, :16] = v_alphas[:, :, :16, :16] = 0
-    on_blocks(2)
+    on_cuda(2)
     want, counts = run(scene, v_renders, v_alphas)
     off = dict.fromkeys([field.name for field in fields(Skip)], False)
     got, all_counts = run(scene, v_renders, v_alphas, skip=Skip(**off))
@@ -60,14 +62,14 @@ def test_skips_change_nothing(on_blocks):
     "channels, mode, parts",
     [(3, "RGB", 1), (3, "RGB+ED", 2), (6, "RGB", 1), (5, "RGB", 4), (2, "RGB", 2), (1, "ED", 4)],
 )
-def test_block_kernels_equal_lane_kernels(on_blocks, channels, mode, parts):
+def test_block_kernels_equal_lane_kernels(on_cuda, channels, mode, parts):
     scene = crowded(channels)
     size = channels + ("+" in mode) if mode != "ED" else 1
     v_renders, v_alphas = upstream(size)
     v_renders[:, :, :16, :16] = v_alphas[:, :, :16, :16] = 0  # a tile without gradient
     v_renders[:, :, :4, 16:24] = v_alphas[:, :, :4, 16:24] = 0  # and a sub-tile
     lanes, lane_counts = run(scene, v_renders, v_alphas, mode)
-    on_blocks(parts)
+    on_cuda(parts)
     blocks, block_counts = run(scene, v_renders, v_alphas, mode)
     assert lanes["alphas"].mean() > 0.3
     assert_same(blocks, lanes)
@@ -80,25 +82,25 @@ def test_block_kernels_equal_lane_kernels(on_blocks, channels, mode, parts):
 
 
 @pytest.mark.parametrize("parts", [1, 2])
-def test_colours_alone(on_blocks, parts):
+def test_colours_alone(on_cuda, parts):
     """Another kernel, without moments."""
     scene = crowded(3)
     v_renders, v_alphas = upstream()
     lanes, _ = run(scene, v_renders, v_alphas, needs=["colors"])
-    on_blocks(parts)
+    on_cuda(parts)
     blocks, _ = run(scene, v_renders, v_alphas, needs=["colors"])
     assert set(blocks) == {"renders", "alphas", "colors"}
     assert_same(blocks, lanes)
 
 
-def test_a_first_gaussian_may_stop_a_pixel(on_blocks):
+def test_a_first_gaussian_may_stop_a_pixel(on_cuda):
     """Then its transmittance is still 1, as that of no pixel outside the picture may be."""
     scene = make(1, 1, num=40, width=21, height=19, channels=3, size=60.0)
     scene["opacities"][:] = 0.999999
     options = dict(alpha_max=0.999999)
     v_renders, v_alphas = torch.randn(1, 1, 19, 21, 3), torch.randn(1, 1, 19, 21, 1)
     lanes, lane_counts = run(scene, v_renders, v_alphas, **options)
-    on_blocks()
+    on_cuda()
     blocks, block_counts = run(scene, v_renders, v_alphas, **options)
     # a sub-tile is two blocks
     assert 0 < block_counts.pop("blocks_walked") <= lane_counts.pop("blocks_walked")
@@ -106,22 +108,22 @@ def test_a_first_gaussian_may_stop_a_pixel(on_blocks):
     assert_same(blocks, lanes)
 
 
-def test_a_gradient_of_nan_is_not_zero(on_blocks):
+def test_a_gradient_of_nan_is_not_zero(on_cuda):
     scene = crowded(3)
     v_renders, v_alphas = torch.zeros(1, 2, 21, 37, 3), torch.zeros(1, 2, 21, 37, 1)
     v_renders[:, :, 5, 5, 1] = torch.nan
-    on_blocks()
+    on_cuda()
     result, _ = run(scene, v_renders, v_alphas)
     assert result["colors"][..., 1].isnan().any()
 
 
-def test_two_runs_and_any_parts(on_blocks):
+def test_two_runs_and_any_parts(on_cuda):
     """The same bits twice; pictures do not depend on the parts, gradients by rounding only."""
     scene = crowded(3)
     v_renders, v_alphas = upstream()
     results = []
     for parts in (1, 1, 4):
-        on_blocks(parts)
+        on_cuda(parts)
         results.append(run(scene, v_renders, v_alphas))
     (first, counts), (second, _), (cut, cut_counts) = results
     assert counts == cut_counts
@@ -136,7 +138,6 @@ def test_many_tiles_are_not_cut(monkeypatch):
     device = torch.device("cuda", 0)
     views = [1, 2, 3, 32]
     assert [composite_cuda.parts_of_tile(1024 * n, device) for n in views] == [4, 2, 1, 1]
-    assert composite_cuda.parts_of_tile(4, torch.device("cpu")) == 1
 
 
 _touched = touching(1)
@@ -156,7 +157,7 @@ def _test_sub_tiles(
 
 
 @pytest.mark.parametrize("longest", [3.0, 2000.0])
-def test_no_sub_tile_is_missed(longest):
+def test_no_sub_tile_is_missed(from_ptx, longest):
     """Ellipses from round to needles, in and around the tile, against every pixel in float64."""
     count = 4000
     means = torch.rand(count, 2) * 48 - 16
@@ -168,12 +169,9 @@ def test_no_sub_tile_is_missed(longest):
     conics = torch.stack([cov[2] / (xx * yy), -cov[1] / cov[2], 1 / cov[2]], 1).float()
     opacities = 0.01 + 0.98 * torch.rand(count)
     bits = torch.zeros(count, dtype=torch.int32)
-    inputs = [
-        wp.from_torch(means, dtype=wp.vec2),
-        wp.from_torch(conics, dtype=wp.vec3),
-        wp.from_torch(opacities),
-    ]
-    wp.launch(_test_sub_tiles, count, [*inputs, ALPHA_MIN, wp.from_torch(bits)], device="cpu")
+    inputs = [view(means, wp.vec2), view(conics, wp.vec3), opacities, ALPHA_MIN]
+    from_ptx()
+    cuda_launch(_test_sub_tiles, count, inputs, [bits], device=bits.device)
     centre = torch.arange(16).double() + 0.5
     a, k, e = conics.double()[:, :, None, None].unbind(1)
     dy = centre[:, None] - means.double()[:, 1, None, None]
@@ -187,14 +185,6 @@ def test_no_sub_tile_is_missed(longest):
     assert 0.05 < needed.float().mean() < 0.8
     # no pixel centre need lie in an ellipse that touches a sub-tile, so some are kept in vain
     assert (got & ~needed).sum() < 0.2 * needed.sum()
-
-
-def test_a_cpu_needs_blocks(monkeypatch):
-    """Lanes one after the other would read what others have not written yet."""
-    assert not wp.config.enable_cpu_blocks
-    monkeypatch.setattr(ops, "_compositor", lambda device: composite_cuda)
-    with pytest.raises(ValueError, match="enable_cpu_blocks"):
-        rasterization(**make(1, 1, num=30, width=16, height=16))
 
 
 def test_devices_have_their_compositor():

@@ -1,4 +1,4 @@
-"""Lists with room on CUDA, on CPU blocks: no wait for counts, and the same bits without room."""
+"""Lists with room on CUDA, executed from PTX: no wait for counts, the same bits without room."""
 
 import pytest
 import torch
@@ -59,11 +59,11 @@ def render(scene, mode="RGB", **options):
         (1, "RGB", 1, False),
     ],
 )
-def test_without_room_the_bits_are_the_same(on_blocks, channels, mode, parts, skip):
+def test_without_room_the_bits_are_the_same(on_cuda, channels, mode, parts, skip):
     scene = crowded(channels)
     options = {} if skip else {"skip": Skip.from_bits(0)}
     lanes, _ = render(scene, mode, **options)
-    on_blocks(parts, lists=True)
+    on_cuda(parts)
     want, meta = render(scene, mode, **options)
     listed = meta.bins.pairs.numel()
     assert listed > meta["pairs"] > 180  # the lists had room, and had to have it
@@ -78,10 +78,10 @@ def test_without_room_the_bits_are_the_same(on_blocks, channels, mode, parts, sk
     assert without.bins.pairs.numel() == meta["pairs"]  # made once more for the counts
 
 
-def test_colours_alone_without_room(on_blocks):
+def test_colours_alone_without_room(on_cuda):
     """Another kernel, without moments."""
     scene = {k: v for k, v in crowded().items() if k != "backgrounds"}
-    on_blocks(2, lists=True)
+    on_cuda(2)
     results = []
     for _ in range(2):
         colors = scene["colors"].clone().requires_grad_()
@@ -92,10 +92,10 @@ def test_colours_alone_without_room(on_blocks):
     assert all(torch.equal(a, b) for a, b in zip(*results))
 
 
-def test_room_grows_with_what_was_told(on_blocks):
+def test_room_grows_with_what_was_told(on_cuda):
     """A scene that grows has no room once; then it has."""
     scene = crowded()
-    on_blocks(lists=True)
+    on_cuda()
     render(scene)
     first = the_room().capacity
     scene["scales"] = scene["scales"] * 4
@@ -128,9 +128,9 @@ def test_room_shrinks_slowly():
     capacity.forget()
 
 
-def test_about_as_many_gaussians_share_their_room(on_blocks):
+def test_about_as_many_gaussians_share_their_room(on_cuda):
     """A model of pictures gives another number each time; each would be read back else."""
-    on_blocks(lists=True)
+    on_cuda()
     rasterization(**crowded(num=90))
     for num, read in ((95, 0), (96, 0), (97, 1)):
         scene = crowded(num=num)
@@ -148,12 +148,12 @@ def test_old_shapes_are_forgotten(monkeypatch):
 
 
 @pytest.mark.parametrize("num, views, far", [(0, 2, False), (5, 0, False), (20, 2, True)])
-def test_nothing_to_see(on_blocks, num, views, far):
+def test_nothing_to_see(on_cuda, num, views, far):
     """No Gaussian, no view, or none that is seen, as a first and as a second call."""
     scene = make(1, views, num=num, width=21, height=19)
     if far:
         scene["means"] += 1000.0
-    on_blocks(2, lists=True)
+    on_cuda(2)
     for _ in range(2):
         result, meta = render(scene)
         assert not result["alphas"].any() and not result["means"].any()
@@ -162,10 +162,10 @@ def test_nothing_to_see(on_blocks, num, views, far):
         assert meta["tiles_empty"] == meta["tiles"] == 4 * views
 
 
-def test_a_first_scene_may_be_empty(on_blocks):
+def test_a_first_scene_may_be_empty(on_cuda):
     """Then the second has no room, and its picture is right."""
     scene = crowded()
-    on_blocks(lists=True)
+    on_cuda()
     want, _ = render(scene)
     capacity.forget()
     rasterization(**scene | {"means": scene["means"] + 1000.0})
@@ -174,10 +174,10 @@ def test_a_first_scene_may_be_empty(on_blocks):
     assert all(torch.equal(got[name], value) for name, value in want.items())
 
 
-def test_no_call_but_the_first_reads_a_number_back(on_blocks):
+def test_no_call_but_the_first_reads_a_number_back(on_cuda):
     scene = crowded(6)
     tensors = leaves(scene, torch.float32)
-    on_blocks(lists=True)
+    on_cuda()
 
     def call():
         renders, alphas, meta = rasterization(**tensors, render_mode="RGB+ED")
@@ -199,18 +199,18 @@ def test_no_call_but_the_first_reads_a_number_back(on_blocks):
     assert len(watch.found) == 1 and {*watch.found} <= READ_BACK
 
 
-def test_a_graph_needs_a_call_before_it(on_blocks, monkeypatch):
+def test_a_graph_needs_a_call_before_it(on_cuda, monkeypatch):
     scene = crowded()
-    on_blocks(lists=True)
+    on_cuda()
     monkeypatch.setattr(capacity, "is_capturing", lambda device: True)
     with pytest.raises(RuntimeError, match="never rendered"):
         rasterization(**scene)
 
 
-def test_a_graph_is_told_to_be_too_small(on_blocks, monkeypatch):
+def test_a_graph_is_told_to_be_too_small(on_cuda, monkeypatch):
     """A capture keeps its room; ``lists_outgrown`` says when replays need more."""
     scene = crowded()
-    on_blocks(lists=True)
+    on_cuda()
     rasterization(**scene)
     assert not lists_outgrown()
     with monkeypatch.context() as capture:

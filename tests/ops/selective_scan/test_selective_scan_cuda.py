@@ -1,13 +1,11 @@
-"""The scan's CUDA kernels without a GPU: small shapes on CPU blocks."""
+"""The scan's CUDA kernels, executed from PTX: what calls ask for, and every shape of a thread."""
 
 import pytest
 import torch
-import warp as wp
 from helpers import assert_rel_rms
 from helpers.scan import STATE, leaves, make, oracle
 
 from gamba_warp.kernels.selective_scan import selective_scan
-from gamba_warp.kernels.selective_scan.cpu import launch as cpu
 from gamba_warp.kernels.selective_scan.cuda import launch as cuda
 from gamba_warp.kernels.selective_scan.cuda.launch import Tuning, choose
 from gamba_warp.kernels.selective_scan.problem import Scan
@@ -16,18 +14,11 @@ NAMES = Scan._fields[:9]
 LIMIT = 2e-6  # float32 sums of a few hundred terms; measured below 6e-7
 
 
-@pytest.fixture
-def cpu_blocks(monkeypatch):
-    """CPU launches with real blocks, into memory full of NaN: what is not written shows."""
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    for name in ("empty", "empty_like"):
-        make_empty = getattr(torch, name)
-
-        def poisoned(*args, _make_empty=make_empty, **kwargs):
-            x = _make_empty(*args, **kwargs)
-            return x.fill_(torch.nan) if x.is_floating_point() else x
-
-        monkeypatch.setattr(torch, name, poisoned)
+@pytest.fixture(autouse=True)
+def on_cuda(request):
+    """But for tests on a GPU, launches are executed from PTX (tests/ptx)."""
+    if "gpu" not in request.keywords:
+        request.getfixturevalue("from_ptx")()
 
 
 @pytest.fixture
@@ -35,11 +26,11 @@ def tuned(monkeypatch):
     return lambda tuning: monkeypatch.setattr(cuda, "FORCED", tuning)
 
 
-def run(module, inputs, discretization, v_out, v_last, softplus=True, needs=None):
+def run(inputs, discretization, v_out, v_last, softplus=True, needs=None):
     """Outputs, last state and the gradients that are needed (of all inputs), by name."""
     x = Scan(*(inputs.get(k) for k in NAMES), softplus, discretization, True)
-    out, last, saved = module.forward(x)
-    grads = module.backward(v_out, v_last, x, saved, [k in (needs or inputs) for k in NAMES])
+    out, last, saved = cuda.forward(x)
+    grads = cuda.backward(v_out, v_last, x, saved, [k in (needs or inputs) for k in NAMES])
     got = {"out": out} if v_out is not None else {}
     return got | {"last": last} | {k: g for k, g in zip(NAMES, grads) if g is not None}
 
@@ -68,29 +59,7 @@ def assert_all(got, want, limit=LIMIT):
 SEGMENTS = Tuning(segments=3, back_segments=2)
 
 
-@pytest.mark.parametrize(
-    "shape, discretization, tuning",
-    [
-        ((2, 139, 37, 3, 1), "mamba", Tuning()),
-        ((1, 70, 80, 3, 2), "mamba", SEGMENTS),
-        ((1, 67, 35, 16, 1), "mamba", Tuning()),
-        ((2, 139, 37, 16, 1), "mamba", SEGMENTS),
-        ((1, 139, 20, 3, 1), "bilinear", SEGMENTS),
-        ((1, 139, 20, 3, 1), "zoh", SEGMENTS),
-    ],
-)
-def test_block_kernels_equal_lane_kernels_and_oracle(
-    cpu_blocks, tuned, shape, discretization, tuning
-):
-    tuned(tuning)
-    inputs = make(*shape)
-    v_out, v_last = cotangents(inputs)
-    blocks = run(cuda, inputs, discretization, v_out, v_last)
-    assert_all(blocks, exact(inputs, discretization, v_out, v_last))
-    assert_all(blocks, run(cpu, inputs, discretization, v_out, v_last))
-
-
-def test_equal_terms_of_a_sum_do_not_round_to_one_side(cpu_blocks):
+def test_equal_terms_of_a_sum_do_not_round_to_one_side():
     """A constant input of quick decays; added in a row, these sums are 1e-6 to 2e-5 off."""
     inputs = make(1, 2500, 5, 3)
     inputs = {k: x[:, :1].expand_as(x) if x.dim() > 2 else x for k, x in inputs.items()}
@@ -98,39 +67,39 @@ def test_equal_terms_of_a_sum_do_not_round_to_one_side(cpu_blocks):
     inputs["delta"] = inputs["delta"].abs() + 1
     v_out = torch.randn_like(inputs["u"][:, :1]).expand_as(inputs["u"])
     v_last = torch.zeros(1, *inputs["A"].shape)
-    got = run(cuda, inputs, "mamba", v_out, v_last, needs=("A", "D", "delta_bias"))
+    got = run(inputs, "mamba", v_out, v_last, needs=("A", "D", "delta_bias"))
     want = exact(inputs, "mamba", v_out, v_last)
     for name in ("A", "D", "delta_bias"):
         assert_rel_rms(got[name], want[name], 6e-7, name)
 
 
 @pytest.mark.parametrize("length", [1, 4, 5, 63, 64, 65, 128])
-def test_lengths_around_a_chunk(cpu_blocks, length):
+def test_lengths_around_a_chunk(length):
     inputs = make(1, length, 5, 3)
     v_out, v_last = cotangents(inputs)
-    assert_all(run(cuda, inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
+    assert_all(run(inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
 
 
 @pytest.mark.parametrize("states, length", [(1, 66), (17, 66), (40, 66), (256, 9)])
-def test_any_number_of_states(cpu_blocks, states, length):
+def test_any_number_of_states(states, length):
     inputs = make(1, length, 3, states)
     v_out, v_last = cotangents(inputs)
-    assert_all(run(cuda, inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
+    assert_all(run(inputs, "mamba", v_out, v_last), exact(inputs, "mamba", v_out, v_last))
 
 
 @pytest.mark.parametrize("dtype, limit", [(torch.bfloat16, 4e-3), (torch.float16, 5e-4)])
-def test_half_precision(cpu_blocks, dtype, limit):
+def test_half_precision(dtype, limit):
     """Limits: one rounding of the dtype, 2^-9 and 2^-12."""
     inputs = make(1, 20, 34, 3, dtype=dtype)
     v_out, v_last = cotangents(inputs)
     want = exact(inputs, "mamba", v_out, v_last)
-    got = run(cuda, inputs, "mamba", v_out, v_last)
+    got = run(inputs, "mamba", v_out, v_last)
     for name, value in got.items():
         assert value.dtype == (inputs[name] if name in inputs else v_last).dtype or name == "out"
         assert_rel_rms(value, want[name], LIMIT if value.dtype == torch.float32 else limit, name)
 
 
-def test_without_options_and_with_strides(cpu_blocks):
+def test_without_options_and_with_strides():
     """B and C are slices of one matrix, u and dout rows of wider ones, as projections give them."""
     inputs = {k: v for k, v in make(2, 70, 21, 3).items() if k in NAMES[:5]}
     inputs["delta"] = inputs["delta"].exp()
@@ -140,7 +109,7 @@ def test_without_options_and_with_strides(cpu_blocks):
     v_last = torch.randn(2, 21, 3)
     v_out = torch.randn(2, 70, 22)[..., :21]
     assert_all(
-        run(cuda, inputs, "mamba", v_out, v_last, softplus=False),
+        run(inputs, "mamba", v_out, v_last, softplus=False),
         exact(inputs, "mamba", v_out, v_last, softplus=False),
     )
 
@@ -154,73 +123,55 @@ TUNINGS = [
 ]
 
 
-def test_tunings_differ_by_rounding_only(cpu_blocks, tuned):
+def test_tunings_differ_by_rounding_only(tuned):
     inputs = make(1, 200, 70, 16)
     v_out, v_last = cotangents(inputs)
     results = []
     for tuning in TUNINGS:
         tuned(tuning)
-        results.append(run(cuda, inputs, "mamba", v_out, v_last))
+        results.append(run(inputs, "mamba", v_out, v_last))
     for result in results[1:]:
         assert_all(result, results[0], 1e-6)  # rounding of sums in another order
         assert any(not torch.equal(result[k], results[0][k]) for k in result)  # it was another
 
 
-def test_two_runs_same_bits(cpu_blocks):
-    inputs = make(2, 139, 37, 3)
-    v_out, v_last = cotangents(inputs)
-    first, second = (run(cuda, inputs, "mamba", v_out, v_last) for _ in range(2))
-    for name in first:
-        assert torch.equal(first[name], second[name]), name
-
-
 @pytest.mark.parametrize("name", ["C", "z", "A", "D"])
-def test_one_gradient_alone(cpu_blocks, name):
+def test_one_gradient_alone(name):
     """What is not asked for is left out of the kernel, and changes nothing."""
     inputs = make(1, 70, 20, 3)
     v_out, v_last = cotangents(inputs)
-    alone = run(cuda, inputs, "mamba", v_out, v_last, needs=[name])
+    alone = run(inputs, "mamba", v_out, v_last, needs=[name])
     assert set(alone) == {"out", "last", name}
-    every = run(cuda, inputs, "mamba", v_out, v_last)
+    every = run(inputs, "mamba", v_out, v_last)
     assert torch.equal(alone[name], every[name])
 
 
 @pytest.mark.parametrize("tuning", [Tuning(), SEGMENTS])
 @pytest.mark.parametrize("states", [3, 16])
-def test_final_state(cpu_blocks, tuned, tuning, states):
+def test_final_state(tuned, tuning, states):
     tuned(tuning)
     inputs = make(2, 139, 21, states)
     _, v_last = cotangents(inputs)
     inputs = {k: inputs[k] for k in STATE}
-    got = run(cuda, inputs, "mamba", None, v_last)
+    got = run(inputs, "mamba", None, v_last)
     assert set(got) == {"last", *STATE}
     assert_all(got, exact(inputs, "mamba", None, v_last))
     needs = ("delta", "A", "delta_bias", "initial_state")
-    assert set(run(cuda, inputs, "mamba", None, v_last, needs=needs)) == {"last", *needs}
+    assert set(run(inputs, "mamba", None, v_last, needs=needs)) == {"last", *needs}
 
 
 @pytest.mark.parametrize("batch, length", [(0, 5), (2, 0)])
 def test_empty(batch, length):
     inputs = make(batch, length, 6, 3)
     v_out, v_last = cotangents(inputs)
-    got = run(cuda, inputs, "mamba", v_out, v_last)
+    got = run(inputs, "mamba", v_out, v_last)
     assert torch.equal(got["last"], inputs["initial_state"])
     assert torch.equal(got["initial_state"], v_last)
     for name in NAMES[:8]:
         assert got[name].shape == inputs[name].shape
         assert not got[name].any(), name
-    alone = run(cuda, {k: inputs[k] for k in STATE}, "mamba", None, v_last)
+    alone = run({k: inputs[k] for k in STATE}, "mamba", None, v_last)
     assert torch.equal(alone["last"], inputs["initial_state"])
-
-
-def test_sums_need_blocks():
-    """Without CPU blocks dB is wrong, so the tests above do see the reduction."""
-    inputs = make(1, 5, 20, 3)
-    v_out, v_last = cotangents(inputs)
-    assert not wp.config.enable_cpu_blocks
-    blocks = run(cuda, inputs, "mamba", v_out, v_last)
-    by_lanes = run(cpu, inputs, "mamba", v_out, v_last)
-    assert not torch.allclose(blocks["B"], by_lanes["B"], rtol=0.1)
 
 
 def test_choice_follows_the_shape():
