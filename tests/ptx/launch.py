@@ -9,6 +9,7 @@ import re
 import zlib
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 import warp as wp
 from warp._src import context as warp_context
@@ -17,7 +18,7 @@ from gamba_warp.kernels.runtime.stand_in import StandIn, standing_in
 from gamba_warp.kernels.runtime.views import Packed
 
 from .contract import contracted
-from .machine import FAULTS, Array, Finding, Launch, Missing, library
+from .machine import FAULTS, Array, Count, Finding, Launch, Missing, library
 from .parse import Program, read
 
 ARCHITECTURE = 80  # the PTX of the kernels for sm_90 is the same
@@ -57,8 +58,10 @@ class Interpreter:
         approximate: how the approximate units err, within what is documented of them: 0 not at all,
             1 to one side, else as drawn from this number.
         contract: kernels whose products are contracted with sums: their keys, a regular expression.
+        counting: whether it counts what instructions ask for, at some cost.
         findings: a line each.
         executed: by entry its program, and by instruction how many warps executed it.
+        counts: where it is counting, by entry and instruction the fields of ``Count``.
         trace: after each launch a checksum of all the memory that it was given.
         steps: instructions of warps.
     """
@@ -66,8 +69,10 @@ class Interpreter:
     seed: int = 0
     approximate: int = 0
     contract: str = ""
+    counting: bool = False
     findings: list[str] = field(default_factory=list)
     executed: dict[str, tuple[Program, list[int]]] = field(default_factory=dict)
+    counts: dict[str, np.ndarray] = field(default_factory=dict)
     trace: list[int] = field(default_factory=list)
     steps: int = 0
 
@@ -107,6 +112,7 @@ class Interpreter:
             blob[at : at + size] = value
         count, arrays = len(program.text), _arrays(tensors)
         findings, executed = (Finding * MOST_FINDINGS)(), (ctypes.c_int64 * count)()
+        asked = np.zeros((count, len(Count._fields_)), np.int64)
         launch = Launch(
             code=ctypes.addressof(program.code),
             constants=ctypes.addressof(program.constants),
@@ -127,6 +133,7 @@ class Interpreter:
             findings=ctypes.addressof(findings),
             most_findings=MOST_FINDINGS,
             executed=ctypes.addressof(executed),
+            counts=asked.ctypes.data if self.counting else None,
         )
         library().run(ctypes.byref(launch))
         self.steps += launch.steps
@@ -134,6 +141,8 @@ class Interpreter:
         self.trace.append(sum(map(zlib.crc32, contents)))  # their addresses have no order
         _, counts = self.executed.setdefault(program.name, (program, [0] * count))
         counts[:] = map(sum, zip(counts, executed))
+        if self.counting:
+            self.counts[program.name] = self.counts.get(program.name, 0) + asked
         for found in findings[: launch.found]:
             where = f"{program.name}: {program.text[found.at]!r}"
             thread = f"block {found.block}, thread {found.thread}"

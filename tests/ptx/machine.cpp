@@ -9,6 +9,8 @@
 #include <algorithm>
 #include <numeric>
 #include <random>
+#include <set>
+#include <unordered_set>
 #include <vector>
 
 #define ATOMICS(X)                                                                                 \
@@ -17,7 +19,7 @@
     X("atom.or.b32", u32, "WQW", now | given)                                                      \
     X("atom.min.s32", s32, "WQW", std::min(now, given))                                            \
     X("atom.max.s32", s32, "WQW", std::max(now, given))
-#define ATOMIC_OPCODE(name, T, operands, e) {name, operands, 1, ATOMIC, nullptr},
+#define ATOMIC_OPCODE(name, T, operands, e) {name, "atomic", operands, 1, ATOMIC, nullptr},
 
 template<bool ballot>
 static void any_of(u8* file, const Instruction& I, u32 lanes) {
@@ -29,15 +31,15 @@ static void any_of(u8* file, const Instruction& I, u32 lanes) {
 
 static const Opcode OPCODES[] = {
     COMPUTING ATOMICS(ATOMIC_OPCODE)  // what the lanes do alone
-    {"ld", "", 0, LOAD, nullptr},
-    {"st", "", 0, STORE, nullptr},
-    {"bra", "", 0, BRANCH, nullptr},
-    {"ret", "", 0, EXIT, nullptr},
-    {"exit", "", 0, EXIT, nullptr},
-    {"bar.sync", "", 0, BLOCK, nullptr},
-    {"bar.warp.sync", "W", 0, WARP, nullptr},
-    {"vote.sync.ballot.b32", "WWW", 1, WARP, any_of<true>},
-    {"redux.sync.or.b32", "WWW", 1, WARP, any_of<false>},
+    {"ld", "load", "", 0, LOAD, nullptr},
+    {"st", "store", "", 0, STORE, nullptr},
+    {"bra", "branch", "", 0, BRANCH, nullptr},
+    {"ret", "branch", "", 0, EXIT, nullptr},
+    {"exit", "branch", "", 0, EXIT, nullptr},
+    {"bar.sync", "barrier", "", 0, BLOCK, nullptr},
+    {"bar.warp.sync", "barrier", "W", 0, WARP, nullptr},
+    {"vote.sync.ballot.b32", "vote", "WWW", 1, WARP, any_of<true>},
+    {"redux.sync.or.b32", "vote", "WWW", 1, WARP, any_of<false>},
 };
 const int COUNT = sizeof OPCODES / sizeof *OPCODES;
 
@@ -63,6 +65,13 @@ struct Array {  // memory that a launch may touch, in units of 1 << unit bytes
     s64 unit;
 };
 
+// What an instruction asked for: lanes that came to it, and branches that parted them; of memory
+// bytes, sectors of 32 bytes, those of global memory that the launch had not touched before, passes
+// of shared memory (32 banks of 4 bytes), and those that conflicts of banks add to them.
+struct Count {
+    s64 lanes, splits, bytes, sectors, first, passes, conflicts;
+};
+
 struct Launch {
     const Instruction* code;
     const Constant* constants;
@@ -76,6 +85,7 @@ struct Launch {
     Finding* findings;
     s64 most_findings, found;
     s64* executed;  // by instruction, how many warps' fragments
+    Count* counts;  // by instruction, or none
     s64 steps;
 };
 
@@ -135,6 +145,7 @@ struct Machine {
     std::vector<u32> knowns;
     std::vector<Shadow> shared_shadows;
     std::vector<Region> arrays;
+    std::unordered_set<u64> touched;  // sectors of global memory, where they are counted
     Region shared_region;
     const Region* last = nullptr;
     u32 block = 0, barriers = 0, tag = 0, shared_tag = 0;
@@ -234,14 +245,17 @@ struct Machine {
         if (race) report(r.race, at, thread, address);
     }
 
+    s32 space_of(const Instruction& I, u64 address) const {
+        if (I.space != GENERIC) return I.space;
+        return address >> 56 == 1 ? IN_SHARED : address >> 56 == 2 ? IN_LOCAL : IN_GLOBAL;
+    }
+
     // The memory of an access, or nullptr. `known` tells or, if it is read, is told whether what is
     // there was written.
     u8* place(Warp& w, int lane, const Instruction& I, u32 at, u64 address, Use use,
         const u8* given, bool& known) {
         u32 thread = w.index * 32 + lane, size = I.size;
-        s32 space = I.space;
-        if (space == GENERIC)
-            space = address >> 56 == 1 ? IN_SHARED : address >> 56 == 2 ? IN_LOCAL : IN_GLOBAL;
+        s32 space = space_of(I, address);
         if (space == IN_GLOBAL || space == IN_SHARED) {
             if (space == IN_SHARED) address |= SHARED;
             const Region* r = space == IN_GLOBAL ? array_of(address, size) : &shared_region;
@@ -312,6 +326,37 @@ struct Machine {
                     memcpy(p, &x, I.size);
             }
         }
+    }
+
+    // As the CUDA C++ Programming Guide has it: shared memory serves a warp's lanes together, or
+    // half of them where each asks for 8 bytes, or a quarter for 16; lanes that ask for the same
+    // word share it. Threads' words of local memory lie side by side.
+    void count(Warp& w, const Instruction& I, u32 there, u32 lanes, Count& c) {
+        Kind kind = OPCODES[I.op].kind;
+        c.lanes += __builtin_popcount(there);
+        c.splits += kind == BRANCH && lanes && lanes != there;
+        if (kind != LOAD && kind != STORE && kind != ATOMIC) return;
+        int size = I.size * I.vector, group = size > 8 ? 8 : size > 4 ? 16 : 32;
+        c.bytes += size * __builtin_popcount(lanes);
+        std::set<u64> sectors;
+        for (int begin = 0; begin < 32; begin += group) {
+            std::set<u64> words;
+            int banks[32] = {};
+            EACH(l, lanes >> begin << begin & ~0u >> (32 - group - begin)) {
+                u64 address = address_of(w, l, I);
+                s32 space = space_of(I, address);
+                for (u64 word = address / 4; word <= (address + size - 1) / 4; word++) {
+                    if (space == IN_GLOBAL) c.first += touched.insert(word / 8).second;
+                    if (space == IN_GLOBAL) sectors.insert(word / 8);
+                    else if (space == IN_LOCAL) sectors.insert((word * 32 + l) / 8);
+                    else if (space == IN_SHARED && words.insert(word).second) banks[word % 32]++;
+                }
+            }
+            int passes = *std::max_element(banks, banks + 32);
+            c.passes += passes;
+            c.conflicts += std::max(passes - 1, 0);
+        }
+        c.sectors += sectors.size();
     }
 
     template<class T, class F>
@@ -431,6 +476,7 @@ struct Machine {
             u32 set = set_lanes(w, I.guard);
             lanes &= I.inverted ? ~set : set;
         }
+        if (L.counts) count(w, I, f.lanes, lanes, L.counts[f.at]);
         switch (OPCODES[I.op].kind) {
         case BRANCH:
             if (lanes && lanes != f.lanes) {
@@ -578,6 +624,7 @@ struct Machine {
 
 extern "C" {
 const char* opcode_name(int i) { return i < COUNT ? OPCODES[i].name : nullptr; }
+const char* opcode_unit(int i) { return OPCODES[i].unit; }
 const char* opcode_operands(int i) { return OPCODES[i].operands; }
 int opcode_writes(int i) { return OPCODES[i].writes; }
 

@@ -55,7 +55,7 @@ def _structure(name: str) -> type[ctypes.Structure]:
 
 
 Instruction, Constant, Array = map(_structure, ("Instruction", "Constant", "Array"))
-Finding, Launch = map(_structure, ("Finding", "Launch"))
+Finding, Count, Launch = map(_structure, ("Finding", "Count", "Launch"))
 
 
 @functools.cache
@@ -87,7 +87,8 @@ def library() -> ctypes.CDLL:
     except OSError as error:
         raise Missing(f"the interpreter cannot be kept: {error}") from error
     made = ctypes.CDLL(str(path))
-    made.opcode_name.restype = made.opcode_operands.restype = ctypes.c_char_p
+    for text in (made.opcode_name, made.opcode_unit, made.opcode_operands):
+        text.restype = ctypes.c_char_p
     return made
 
 
@@ -101,3 +102,9 @@ def opcodes() -> dict[str, tuple[int, str, int]]:
         operands = library().opcode_operands(number).decode()
         found[name.decode()] = number, operands, library().opcode_writes(number)
     return found
+
+
+@functools.cache
+def units() -> list[str]:
+    """By an operation's number, what works on it."""
+    return [library().opcode_unit(number).decode() for number, *_ in opcodes().values()]

@@ -34,7 +34,9 @@ struct Instruction {  // as parse.py has it
 enum Kind { PLAIN, SELECT, AND, OR, LOAD, STORE, ATOMIC, BRANCH, EXIT, BLOCK, WARP };
 
 struct Opcode {
-    const char *name, *operands;  // widths of the operands, first of what is written
+    // The unit is what works on it; a move is mostly none of the machine's instructions, and a
+    // routine many. Operands are told by their widths, first of what is written.
+    const char *name, *unit, *operands;
     s32 writes;
     Kind kind;
     void (*run)(u8* file, const Instruction& I, u32 lanes);
@@ -152,85 +154,86 @@ inline f32 of_f16(u16 bits) {
 #define RUN(e, D, ...) [](u8* file, const Instruction& I, u32 lanes) { \
     on_lanes<D, __VA_ARGS__>(file, I, lanes, e, PLACES(__VA_ARGS__)); }
 #define PLACES(...) std::make_index_sequence<sizeof(Widths<__VA_ARGS__>::text) - 1>()
-#define OP1(name, D, A, e) {name, Widths<D, A>::text, 1, PLAIN, RUN([](A a) { return (D)(e); }, D, A)},
-#define OP2K(name, kind, D, A, B, e) \
-    {name, Widths<D, A, B>::text, 1, kind, RUN(([](A a, B b) { return (D)(e); }), D, A, B)},
-#define OP2(name, D, A, B, e) OP2K(name, PLAIN, D, A, B, e)
-#define OP3K(name, kind, D, A, B, C, e) \
-    {name, Widths<D, A, B, C>::text, 1, kind, RUN(([](A a, B b, C c) { return (D)(e); }), D, A, B, C)},
-#define OP3(name, D, A, B, C, e) OP3K(name, PLAIN, D, A, B, C, e)
+#define OP1(unit, name, D, A, e) \
+    {name, #unit, Widths<D, A>::text, 1, PLAIN, RUN([](A a) { return (D)(e); }, D, A)},
+#define OP2K(unit, name, kind, D, A, B, e) \
+    {name, #unit, Widths<D, A, B>::text, 1, kind, RUN(([](A a, B b) { return (D)(e); }), D, A, B)},
+#define OP2(unit, name, D, A, B, e) OP2K(unit, name, PLAIN, D, A, B, e)
+#define OP3K(unit, name, kind, D, A, B, C, e) \
+    {name, #unit, Widths<D, A, B, C>::text, 1, kind, RUN(([](A a, B b, C c) { return (D)(e); }), D, A, B, C)},
+#define OP3(unit, name, D, A, B, C, e) OP3K(unit, name, PLAIN, D, A, B, C, e)
 
 // One operation for several types; an operation that does not depend on the sign is unsigned.
-#define MOVES(t, T) OP1("mov." t, T, T, a) OP3K("selp." t, SELECT, T, T, T, u32, c ? a : b)
-#define INTEGERS(name, e) \
-    OP2(name ".s16", u16, u16, u16, e) OP2(name ".u16", u16, u16, u16, e) OP2(name ".s32", u32, u32, u32, e) \
-    OP2(name ".u32", u32, u32, u32, e) OP2(name ".s64", u64, u64, u64, e) OP2(name ".u64", u64, u64, u64, e)
-#define SIGNED(name, e) \
-    OP2(name ".s32", s32, s32, s32, e) OP2(name ".u32", u32, u32, u32, e) \
-    OP2(name ".s64", s64, s64, s64, e) OP2(name ".u64", u64, u64, u64, e)
+#define MOVES(t, T) OP1(move, "mov." t, T, T, a) OP3K(integer, "selp." t, SELECT, T, T, T, u32, c ? a : b)
+#define INTEGERS(unit, name, e) \
+    OP2(unit, name ".s16", u16, u16, u16, e) OP2(unit, name ".u16", u16, u16, u16, e) OP2(unit, name ".s32", u32, u32, u32, e) \
+    OP2(unit, name ".u32", u32, u32, u32, e) OP2(unit, name ".s64", u64, u64, u64, e) OP2(unit, name ".u64", u64, u64, u64, e)
+#define SIGNED(unit, name, e) \
+    OP2(unit, name ".s32", s32, s32, s32, e) OP2(unit, name ".u32", u32, u32, u32, e) \
+    OP2(unit, name ".s64", s64, s64, s64, e) OP2(unit, name ".u64", u64, u64, u64, e)
 #define LOGIC(name, kind, e) \
-    OP2(name ".b16", u16, u16, u16, e) OP2(name ".b32", u32, u32, u32, e) OP2(name ".b64", u64, u64, u64, e) \
-    OP2K(name ".pred", kind, u32, u32, u32, e)
+    OP2(integer, name ".b16", u16, u16, u16, e) OP2(integer, name ".b32", u32, u32, u32, e) OP2(integer, name ".b64", u64, u64, u64, e) \
+    OP2K(integer, name ".pred", kind, u32, u32, u32, e)
 #define COMPARE(name, e) \
-    OP2(name ".s16", u32, s16, s16, e) OP2(name ".u16", u32, u16, u16, e) OP2(name ".b16", u32, u16, u16, e) \
-    OP2(name ".s32", u32, s32, s32, e) OP2(name ".u32", u32, u32, u32, e) OP2(name ".b32", u32, u32, u32, e) \
-    OP2(name ".s64", u32, s64, s64, e) OP2(name ".u64", u32, u64, u64, e) OP2(name ".b64", u32, u64, u64, e)
+    OP2(integer, name ".s16", u32, s16, s16, e) OP2(integer, name ".u16", u32, u16, u16, e) OP2(integer, name ".b16", u32, u16, u16, e) \
+    OP2(integer, name ".s32", u32, s32, s32, e) OP2(integer, name ".u32", u32, u32, u32, e) OP2(integer, name ".b32", u32, u32, u32, e) \
+    OP2(integer, name ".s64", u32, s64, s64, e) OP2(integer, name ".u64", u32, u64, u64, e) OP2(integer, name ".b64", u32, u64, u64, e)
 
 #define COMPUTING \
     MOVES("b16", u16) MOVES("u16", u16) MOVES("s16", u16) MOVES("b32", u32) MOVES("u32", u32) \
     MOVES("s32", u32) MOVES("f32", u32) MOVES("b64", u64) MOVES("u64", u64) MOVES("s64", u64) \
-    OP1("mov.pred", u32, u32, a != 0) OP1("not.pred", u32, u32, !a) \
-    OP1("cvta.to.global.u64", u64, u64, a) OP1("cvta.to.shared.u64", u64, u64, a & ~SHARED) \
-    OP1("cvta.shared.u64", u64, u64, a | SHARED) OP1("cvta.local.u64", u64, u64, a) \
-    OP1("cvt.s64.s32", s64, s32, a) OP1("cvt.u64.u32", u64, u32, a) OP1("cvt.u32.u64", u32, u64, a) \
-    OP1("cvt.s64.s32 of 64", s64, u64, (s32)a) OP1("cvt.u64.u32 of 64", u64, u64, (u32)a) \
-    OP1("cvt.u32.u16", u32, u16, a) OP1("cvt.u16.u32", u16, u32, a) OP1("cvt.s32.s16", s32, s16, a) \
-    OP1("cvt.rn.f32.s32", f32, s32, a) OP1("cvt.rn.f32.u32", f32, u32, a) OP1("cvt.rn.f32.s64", f32, s64, a) \
-    OP1("cvt.rzi.s32.f32", s32, f32, truncated<s32>(a)) OP1("cvt.rzi.u32.f32", u32, f32, truncated<u32>(a)) \
-    OP1("cvt.rn.bf16.f32", u16, f32, bf16(a)) OP1("cvt.rn.f16.f32", u16, f32, f16(a)) \
-    OP1("cvt.f32.f16", f32, u16, of_f16(a)) OP1("cvt.f32.bf16", f32, u16, value<f32>((u32)a << 16)) \
-    OP1("cvt.rpi.f32.f32", f32, f32, std::ceil(a)) OP1("cvt.rmi.f32.f32", f32, f32, std::floor(a)) \
-    OP1("cvt.sat.f32.f32", f32, f32, a > 0 ? a < 1 ? a : 1 : 0) \
-    OP1("abs.f32", u32, u32, a & 0x7fffffffu) OP1("neg.f32", u32, u32, a ^ 0x80000000u) \
-    OP1("neg.s32", u32, u32, 0 - a) OP1("neg.s64", u64, u64, 0 - a) \
-    OP1("not.b16", u16, u16, ~a) OP1("not.b32", u32, u32, ~a) OP1("not.b64", u64, u64, ~a) \
-    OP1("brev.b32", u32, u32, reversed(a)) OP1("popc.b32", u32, u32, __builtin_popcount(a)) \
-    OP1("clz.b32", u32, u32, a ? __builtin_clz(a) : 32) \
-    OP1("bfind.u32", u32, u32, a ? 31 - __builtin_clz(a) : ~0u) \
-    OP1("bfind.shiftamt.u32", u32, u32, a ? __builtin_clz(a) : ~0u) \
-    INTEGERS("add", a + b) INTEGERS("sub", a - b) INTEGERS("mul.lo", a * b) \
-    SIGNED("div", divided(a, b)) SIGNED("rem", rest(a, b)) \
-    SIGNED("min", a < b ? a : b) SIGNED("max", a > b ? a : b) \
-    OP2("mul.wide.s32", s64, s32, s32, (s64)a * b) OP2("mul.wide.u32", u64, u32, u32, (u64)a * b) \
-    OP2("mul.hi.s32", s32, s32, s32, (s64)a * b >> 32) OP2("mul.hi.u32", u32, u32, u32, (u64)a * b >> 32) \
-    OP3("mad.lo.s32", u32, u32, u32, u32, a * b + c) OP3("mad.lo.u32", u32, u32, u32, u32, a * b + c) \
-    OP3("mad.lo.s64", u64, u64, u64, u64, a * b + c) \
-    OP3("mad.wide.s32", s64, s32, s32, s64, (s64)a * b + c) OP3("mad.wide.u32", u64, u32, u32, u64, (u64)a * b + c) \
+    OP1(move, "mov.pred", u32, u32, a != 0) OP1(integer, "not.pred", u32, u32, !a) \
+    OP1(move, "cvta.to.global.u64", u64, u64, a) OP1(move, "cvta.to.shared.u64", u64, u64, a & ~SHARED) \
+    OP1(move, "cvta.shared.u64", u64, u64, a | SHARED) OP1(move, "cvta.local.u64", u64, u64, a) \
+    OP1(integer, "cvt.s64.s32", s64, s32, a) OP1(move, "cvt.u64.u32", u64, u32, a) OP1(move, "cvt.u32.u64", u32, u64, a) \
+    OP1(move, "cvt.s64.s32 of 64", s64, u64, (s32)a) OP1(move, "cvt.u64.u32 of 64", u64, u64, (u32)a) \
+    OP1(move, "cvt.u32.u16", u32, u16, a) OP1(move, "cvt.u16.u32", u16, u32, a) OP1(integer, "cvt.s32.s16", s32, s16, a) \
+    OP1(convert, "cvt.rn.f32.s32", f32, s32, a) OP1(convert, "cvt.rn.f32.u32", f32, u32, a) OP1(convert, "cvt.rn.f32.s64", f32, s64, a) \
+    OP1(convert, "cvt.rzi.s32.f32", s32, f32, truncated<s32>(a)) OP1(convert, "cvt.rzi.u32.f32", u32, f32, truncated<u32>(a)) \
+    OP1(convert, "cvt.rn.bf16.f32", u16, f32, bf16(a)) OP1(convert, "cvt.rn.f16.f32", u16, f32, f16(a)) \
+    OP1(convert, "cvt.f32.f16", f32, u16, of_f16(a)) OP1(integer, "cvt.f32.bf16", f32, u16, value<f32>((u32)a << 16)) \
+    OP1(convert, "cvt.rpi.f32.f32", f32, f32, std::ceil(a)) OP1(convert, "cvt.rmi.f32.f32", f32, f32, std::floor(a)) \
+    OP1(float32, "cvt.sat.f32.f32", f32, f32, a > 0 ? a < 1 ? a : 1 : 0) \
+    OP1(move, "abs.f32", u32, u32, a & 0x7fffffffu) OP1(move, "neg.f32", u32, u32, a ^ 0x80000000u) \
+    OP1(integer, "neg.s32", u32, u32, 0 - a) OP1(integer, "neg.s64", u64, u64, 0 - a) \
+    OP1(integer, "not.b16", u16, u16, ~a) OP1(integer, "not.b32", u32, u32, ~a) OP1(integer, "not.b64", u64, u64, ~a) \
+    OP1(special, "brev.b32", u32, u32, reversed(a)) OP1(special, "popc.b32", u32, u32, __builtin_popcount(a)) \
+    OP1(special, "clz.b32", u32, u32, a ? __builtin_clz(a) : 32) \
+    OP1(special, "bfind.u32", u32, u32, a ? 31 - __builtin_clz(a) : ~0u) \
+    OP1(special, "bfind.shiftamt.u32", u32, u32, a ? __builtin_clz(a) : ~0u) \
+    INTEGERS(integer, "add", a + b) INTEGERS(integer, "sub", a - b) INTEGERS(multiply, "mul.lo", a * b) \
+    SIGNED(routine, "div", divided(a, b)) SIGNED(routine, "rem", rest(a, b)) \
+    SIGNED(integer, "min", a < b ? a : b) SIGNED(integer, "max", a > b ? a : b) \
+    OP2(multiply, "mul.wide.s32", s64, s32, s32, (s64)a * b) OP2(multiply, "mul.wide.u32", u64, u32, u32, (u64)a * b) \
+    OP2(multiply, "mul.hi.s32", s32, s32, s32, (s64)a * b >> 32) OP2(multiply, "mul.hi.u32", u32, u32, u32, (u64)a * b >> 32) \
+    OP3(multiply, "mad.lo.s32", u32, u32, u32, u32, a * b + c) OP3(multiply, "mad.lo.u32", u32, u32, u32, u32, a * b + c) \
+    OP3(multiply, "mad.lo.s64", u64, u64, u64, u64, a * b + c) \
+    OP3(multiply, "mad.wide.s32", s64, s32, s32, s64, (s64)a * b + c) OP3(multiply, "mad.wide.u32", u64, u32, u32, u64, (u64)a * b + c) \
     LOGIC("and", AND, a & b) LOGIC("or", OR, a | b) LOGIC("xor", PLAIN, a ^ b) \
-    OP2("shl.b16", u16, u16, u32, b > 15 ? 0 : a << b) OP2("shl.b32", u32, u32, u32, b > 31 ? 0 : a << b) \
-    OP2("shl.b64", u64, u64, u32, b > 63 ? 0 : a << b) OP2("shr.u16", u16, u16, u32, b > 15 ? 0 : a >> b) \
-    OP2("shr.u32", u32, u32, u32, b > 31 ? 0 : a >> b) OP2("shr.b32", u32, u32, u32, b > 31 ? 0 : a >> b) \
-    OP2("shr.u64", u64, u64, u32, b > 63 ? 0 : a >> b) OP2("shr.b64", u64, u64, u32, b > 63 ? 0 : a >> b) \
-    OP2("shr.s32", s32, s32, u32, a >> (b > 31 ? 31 : b)) OP2("shr.s64", s64, s64, u32, a >> (b > 63 ? 63 : b)) \
+    OP2(integer, "shl.b16", u16, u16, u32, b > 15 ? 0 : a << b) OP2(integer, "shl.b32", u32, u32, u32, b > 31 ? 0 : a << b) \
+    OP2(integer, "shl.b64", u64, u64, u32, b > 63 ? 0 : a << b) OP2(integer, "shr.u16", u16, u16, u32, b > 15 ? 0 : a >> b) \
+    OP2(integer, "shr.u32", u32, u32, u32, b > 31 ? 0 : a >> b) OP2(integer, "shr.b32", u32, u32, u32, b > 31 ? 0 : a >> b) \
+    OP2(integer, "shr.u64", u64, u64, u32, b > 63 ? 0 : a >> b) OP2(integer, "shr.b64", u64, u64, u32, b > 63 ? 0 : a >> b) \
+    OP2(integer, "shr.s32", s32, s32, u32, a >> (b > 31 ? 31 : b)) OP2(integer, "shr.s64", s64, s64, u32, a >> (b > 63 ? 63 : b)) \
     COMPARE("setp.eq", a == b) COMPARE("setp.ne", a != b) COMPARE("setp.lt", a < b) \
     COMPARE("setp.le", a <= b) COMPARE("setp.gt", a > b) COMPARE("setp.ge", a >= b) \
-    OP2("setp.eq.f32", u32, f32, f32, a == b) OP2("setp.ne.f32", u32, f32, f32, a < b || a > b) \
-    OP2("setp.lt.f32", u32, f32, f32, a < b) OP2("setp.le.f32", u32, f32, f32, a <= b) \
-    OP2("setp.gt.f32", u32, f32, f32, a > b) OP2("setp.ge.f32", u32, f32, f32, a >= b) \
-    OP2("setp.equ.f32", u32, f32, f32, !(a < b || a > b)) OP2("setp.neu.f32", u32, f32, f32, !(a == b)) \
-    OP2("setp.ltu.f32", u32, f32, f32, !(a >= b)) OP2("setp.leu.f32", u32, f32, f32, !(a > b)) \
-    OP2("setp.gtu.f32", u32, f32, f32, !(a <= b)) OP2("setp.geu.f32", u32, f32, f32, !(a < b)) \
-    OP2("setp.nan.f32", u32, f32, f32, a != a || b != b) OP2("setp.num.f32", u32, f32, f32, a == a && b == b) \
-    OP2("add.f32", f32, f32, f32, a + b) OP2("sub.f32", f32, f32, f32, a - b) OP2("mul.f32", f32, f32, f32, a * b) \
-    OP2("add.rn.f32", f32, f32, f32, a + b) OP2("sub.rn.f32", f32, f32, f32, a - b) \
-    OP2("mul.rn.f32", f32, f32, f32, a * b) OP2("div.rn.f32", f32, f32, f32, a / b) \
-    OP2("min.f32", f32, f32, f32, least(a, b)) OP2("max.f32", f32, f32, f32, greatest(a, b)) \
-    OP3("fma.rn.f32", f32, f32, f32, f32, std::fma(a, b, c)) \
-    OP3("a * b - c", f32, f32, f32, f32, std::fma(a, b, -c)) /* contract.py writes these two */ \
-    OP3("c - a * b", f32, f32, f32, f32, std::fma(-a, b, c)) \
-    OP3("fma.rm.f32", f32, f32, f32, f32, downward(a, b, c)) \
-    OP1("sqrt.rn.f32", f32, f32, std::sqrt(a)) OP1("rcp.rn.f32", f32, f32, 1 / a) \
-    OP1("ex2.approx.ftz.f32", f32, f32, flushed(approx(std::exp2((double)flushed(a)), a, 0x1p-22))) \
-    OP1("rcp.approx.ftz.f32", f32, f32, flushed(approx(1 / (double)flushed(a), a, 0x1p-23))) \
-    OP1("sqrt.approx.ftz.f32", f32, f32, flushed(approx(std::sqrt((double)flushed(a)), a, 0x1p-23)))
+    OP2(integer, "setp.eq.f32", u32, f32, f32, a == b) OP2(integer, "setp.ne.f32", u32, f32, f32, a < b || a > b) \
+    OP2(integer, "setp.lt.f32", u32, f32, f32, a < b) OP2(integer, "setp.le.f32", u32, f32, f32, a <= b) \
+    OP2(integer, "setp.gt.f32", u32, f32, f32, a > b) OP2(integer, "setp.ge.f32", u32, f32, f32, a >= b) \
+    OP2(integer, "setp.equ.f32", u32, f32, f32, !(a < b || a > b)) OP2(integer, "setp.neu.f32", u32, f32, f32, !(a == b)) \
+    OP2(integer, "setp.ltu.f32", u32, f32, f32, !(a >= b)) OP2(integer, "setp.leu.f32", u32, f32, f32, !(a > b)) \
+    OP2(integer, "setp.gtu.f32", u32, f32, f32, !(a <= b)) OP2(integer, "setp.geu.f32", u32, f32, f32, !(a < b)) \
+    OP2(integer, "setp.nan.f32", u32, f32, f32, a != a || b != b) OP2(integer, "setp.num.f32", u32, f32, f32, a == a && b == b) \
+    OP2(float32, "add.f32", f32, f32, f32, a + b) OP2(float32, "sub.f32", f32, f32, f32, a - b) OP2(float32, "mul.f32", f32, f32, f32, a * b) \
+    OP2(float32, "add.rn.f32", f32, f32, f32, a + b) OP2(float32, "sub.rn.f32", f32, f32, f32, a - b) \
+    OP2(float32, "mul.rn.f32", f32, f32, f32, a * b) OP2(routine, "div.rn.f32", f32, f32, f32, a / b) \
+    OP2(integer, "min.f32", f32, f32, f32, least(a, b)) OP2(integer, "max.f32", f32, f32, f32, greatest(a, b)) \
+    OP3(float32, "fma.rn.f32", f32, f32, f32, f32, std::fma(a, b, c)) \
+    OP3(float32, "a * b - c", f32, f32, f32, f32, std::fma(a, b, -c)) /* contract.py writes these two */ \
+    OP3(float32, "c - a * b", f32, f32, f32, f32, std::fma(-a, b, c)) \
+    OP3(float32, "fma.rm.f32", f32, f32, f32, f32, downward(a, b, c)) \
+    OP1(routine, "sqrt.rn.f32", f32, f32, std::sqrt(a)) OP1(routine, "rcp.rn.f32", f32, f32, 1 / a) \
+    OP1(special, "ex2.approx.ftz.f32", f32, f32, flushed(approx(std::exp2((double)flushed(a)), a, 0x1p-22))) \
+    OP1(special, "rcp.approx.ftz.f32", f32, f32, flushed(approx(1 / (double)flushed(a), a, 0x1p-23))) \
+    OP1(special, "sqrt.approx.ftz.f32", f32, f32, flushed(approx(std::sqrt((double)flushed(a)), a, 0x1p-23)))
 // clang-format on

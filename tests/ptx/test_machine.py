@@ -13,8 +13,8 @@ from helpers.kernels import plain_kernel
 from . import launch as launching
 from . import machine as machines
 from .launch import Interpreter
-from .machine import Missing, Refused, opcodes
-from .parse import read
+from .machine import Count, Missing, Refused, opcodes, units
+from .parse import SPACES, read
 
 HEAD = ".version 8.0\n.target sm_80\n.shared .align 16 .b8 mem[1024];\n"
 ENTRY = """.visible .entry k(.param .u64 p) {{
@@ -412,3 +412,51 @@ def test_approximate_units(name):
         assert approximate != 1 or (error <= slack - 0.4 * bound).all()
         assert not got[np.abs(want) < 2.0**-127].any()
         assert (np.isnan(got) == np.isnan(want)).all()
+
+
+# What the 32 lanes of a warp ask for: bytes, sectors, those touched first, passes, conflicts.
+ASKED = {
+    "ld.global.u32 %r7, [%rd4];": (128, 4, 4, 0, 0),
+    "ld.global.u32 %r7, [%rd4]; ld.global.u32 %r8, [%rd4];": (256, 8, 4, 0, 0),
+    "ld.global.u32 %r7, [%rd1];": (128, 1, 1, 0, 0),
+    "shl.b32 %r5, %r1, 5; cvt.u64.u32 %rd5, %r5; add.s64 %rd5, %rd1, %rd5;"
+    "ld.global.v4.u32 {%r5, %r6, %r7, %r8}, [%rd5];": (512, 32, 32, 0, 0),
+    "st.shared.u32 [%r4], %r1;": (128, 0, 0, 1, 0),
+    "st.shared.u32 [%r3], 5;": (128, 0, 0, 1, 0),
+    "add.s32 %r5, %r4, %r2; st.shared.u32 [%r5], %r1;": (128, 0, 0, 2, 1),
+    "shl.b32 %r5, %r1, 7; and.b32 %r5, %r5, 1023; add.s32 %r5, %r5, %r3;"
+    "ld.shared.u32 %r7, [%r5];": (128, 0, 0, 8, 7),
+    "add.s32 %r5, %r4, %r2; st.shared.v2.u32 [%r5], {%r1, %r1};": (256, 0, 0, 2, 0),
+    "mad.lo.s32 %r5, %r1, 16, %r3; st.shared.v4.b32 [%r5], {0, 1, 2, 3};": (512, 0, 0, 4, 0),
+    "mad.lo.s32 %r5, %r1, 16, %r3; st.shared.v2.u32 [%r5], {%r1, %r1};": (256, 0, 0, 4, 2),
+    "setp.lt.u32 %p1, %r1, 9; @%p1 st.shared.u32 [%r4], %r1;": (36, 0, 0, 1, 0),
+    "mov.u64 %rd9, own; st.local.u32 [%rd9], %r1;": (128, 4, 0, 0, 0),
+    "mov.u64 %rd9, own; cvta.local.u64 %rd9, %rd9; st.u64 [%rd9], %rd1;": (256, 8, 0, 0, 0),
+    "atom.global.add.u32 %r5, [%rd1], 1;": (128, 1, 1, 0, 0),
+}
+
+
+@pytest.mark.parametrize("body", ASKED)
+def test_what_is_asked_of_memory(body):
+    memory = torch.zeros(32 * 8, dtype=torch.int32)
+    made = run(".local .align 8 .b8 own[8];" + body, memory, threads=32, counting=True)
+    program, _ = made.executed["k"]
+    asked = [
+        dict(zip([name for name, _ in Count._fields_], row))
+        for i, row in zip(program.code, made.counts["k"])
+        if units()[i.op] in ("load", "store", "atomic") and SPACES[i.space] != "param"
+    ]
+    names = ("bytes", "sectors", "first", "passes", "conflicts")
+    assert tuple(sum(row[name] for row in asked) for name in names) == ASKED[body]
+
+
+def test_lanes_that_part():
+    memory = torch.zeros(64, dtype=torch.int32)
+    body = ODD + "@%p1 bra $A; mov.u32 %r8, 0; mov.u32 %r8, 1; $A: st.global.u32 [%rd4], %r1;"
+    made = run(body, memory, counting=True)
+    program, executed = made.executed["k"]
+    lanes, splits = (made.counts["k"][:, k] for k in (0, 1))
+    (branch,) = (at for at, text in enumerate(program.text) if "bra" in text)
+    assert splits.sum() == splits[branch] == 2, "of two warps"
+    assert [*lanes[branch : branch + 4]] == [64, 32, 32, 64] and executed[branch + 3] == 2
+    assert not run(body, memory).counts
