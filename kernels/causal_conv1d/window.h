@@ -11,7 +11,8 @@ auto rows_ = [](auto& array, int b, int t0, int d, int) {
         size_t step;  // bytes
         Row row(int t) const { return (Row)((char*)first + t * step); }
     };
-    char* const at = (char*)array.data + (size_t)b * array.strides[0] + t0 * array.strides[1];
+    char* const at =
+        (char*)array.data + (size_t)b * array.strides[0] + (size_t)t0 * array.strides[1];
     return Rows{(Row)at + d, (size_t)array.strides[1]};
 };
 auto read_ = [](const auto& rows, int t) -> F { return (F)*rows.row(t); };

@@ -13,10 +13,6 @@ SOURCES = [
 ]
 
 
-def _is_kernel(node) -> bool:
-    return any("wp.kernel" in ast.unparse(d) for d in node.decorator_list)
-
-
 def _is_device(node) -> bool:
     return any("wp." in ast.unparse(d) for d in node.decorator_list)
 
@@ -38,16 +34,6 @@ def test_public_functions_have_docstrings(path):
             if isinstance(node, ast.FunctionDef) and (_is_device(node) or _is_overload(node)):
                 continue
             assert ast.get_docstring(node), f"{node.name} has no docstring"
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_kernel_arrays_say_their_direction(path):
-    """Arrays end in _in or _out, inputs before outputs."""
-    for node in filter(_is_kernel, _functions(path)):
-        names = [a.arg for a in node.args.args if "array" in ast.unparse(a.annotation)]
-        assert all(n.endswith(("_in", "_out")) for n in names), f"{node.name}: {names}"
-        directions = [name.endswith("_out") for name in names]
-        assert directions == sorted(directions), f"{node.name}: outputs come last"
 
 
 def test_every_progress_bar_is_the_one_that_logs_do_without():

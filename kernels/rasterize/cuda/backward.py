@@ -314,11 +314,11 @@ def backward_kernels(channels: int, geometry: bool, parts: int):
     walk = _walking(channels, geometry, parts, True)
     walk_unlisted = _walking(channels, geometry, parts, False)
 
-    @wp.kernel(**options)
+    @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite_vjp(
         picture: Picture,
-        gaussians: Gaussians,
+        gaussians_in: Gaussians,
         lists_in: Lists,
         walked_in: Walked,
         v_pixels_in: Pixels,
@@ -329,7 +329,7 @@ def backward_kernels(channels: int, geometry: bool, parts: int):
         p = place(picture, index, lane)
         walk(
             picture,
-            gaussians,
+            gaussians_in,
             lists_in,
             walked_in.transmittances,
             walked_in.stops,
@@ -341,11 +341,11 @@ def backward_kernels(channels: int, geometry: bool, parts: int):
             p,
         )
 
-    @wp.kernel(**options)
+    @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite_vjp_unlisted(
         picture: Picture,
-        gaussians: Gaussians,
+        gaussians_in: Gaussians,
         lists_in: Lists,
         walked_in: Walked,
         v_pixels_in: Pixels,
@@ -362,7 +362,7 @@ def backward_kernels(channels: int, geometry: bool, parts: int):
             p = place(picture, tile * wp.static(parts) + worker % wp.static(parts), lane)
             walk_unlisted(
                 picture,
-                gaussians,
+                gaussians_in,
                 lists_in,
                 walked_in.transmittances,
                 walked_in.stops,

@@ -201,11 +201,11 @@ def forward_kernels(channels: int, parts: int):
     place = placing(parts)
     walk, walk_unlisted = _walking(channels, parts, True), _walking(channels, parts, False)
 
-    @wp.kernel(**options)
+    @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite(
         picture: Picture,
-        gaussians: Gaussians,
+        gaussians_in: Gaussians,
         lists_in: Lists,
         walked_out: Walked,
         pixels_out: Pixels,
@@ -213,13 +213,13 @@ def forward_kernels(channels: int, parts: int):
         index, lane = wp.tid()
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         p = place(picture, index, lane)
-        walk(picture, gaussians, lists_in, walked_out, pixels_out, arena, p)
+        walk(picture, gaussians_in, lists_in, walked_out, pixels_out, arena, p)
 
-    @wp.kernel(**options)
+    @wp.kernel(enable_backward=False, **options)
     @no_type_check
     def composite_unlisted(
         picture: Picture,
-        gaussians: Gaussians,
+        gaussians_in: Gaussians,
         lists_in: Lists,
         walked_out: Walked,
         pixels_out: Pixels,
@@ -228,6 +228,6 @@ def forward_kernels(channels: int, parts: int):
         arena = wp.tile_empty(shape=(wp.static(_SIZE),), dtype=float, storage="shared")
         if lists_in.count[0] > wp.int64(lists_in.pairs.shape[0]):
             p = place(picture, index, lane)
-            walk_unlisted(picture, gaussians, lists_in, walked_out, pixels_out, arena, p)
+            walk_unlisted(picture, gaussians_in, lists_in, walked_out, pixels_out, arena, p)
 
     return composite, composite_unlisted

@@ -80,8 +80,7 @@ def ballot(x: wp.int32) -> wp.int32:
 
 def kernel_options(warps: int) -> dict[str, Any]:
     """Options of a kernel whose blocks are warps, so many of which share a multiprocessor."""
-    bounds = {"launch_bounds": (WARP, warps), "grid_stride": False}
-    return {"enable_backward": False, "module": "unique", **bounds}
+    return {"module": "unique", "launch_bounds": (WARP, warps), "grid_stride": False}
 
 
 class Memory(NamedTuple):
@@ -155,9 +154,8 @@ def placing(parts: int):
         y = p.tile // picture.tiles_x % picture.tiles_y * TILE + p.part * wp.static(TILE // parts)
         p.px = x + lane % WIDTH
         p.py = y + lane // WIDTH
-        p.pixel = wp.int64(p.image * picture.height + p.py) * wp.int64(picture.width) + wp.int64(
-            p.px
-        )
+        line = p.image * picture.height + p.py  # among those of all pictures
+        p.pixel = wp.int64(line) * wp.int64(picture.width) + wp.int64(p.px)
         p.place = wp.int64(index) * wp.int64(wp.static(pixels * WARP)) + wp.int64(lane)
         for i in range(2):
             p.x[i] = float(p.px + i * WIDTH) + 0.5

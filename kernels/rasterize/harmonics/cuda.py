@@ -18,7 +18,7 @@ from .shared import SHORTEST, Seen, Size
 CHUNK = 1  # Gaussians of a task
 _HERE = Path(__file__).parent
 # Loops over a column of coefficients are written out, so that it stays in registers.
-_OPTIONS = {"enable_backward": False, "max_unroll": 25}
+_OPTIONS = {"max_unroll": 25}
 
 
 @wp.func
@@ -76,34 +76,34 @@ def forward_kernel(degree: int, channels: int, clamped: bool):
     count, leaves = (degree + 1) ** 2, _leaves(degree)
     basis, used_are_finite = leaves.basis, leaves.used_are_finite
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
     @no_type_check
-    def harmonics(offset: wp.int32, size: Size, seen: Seen):
+    def harmonics(offset: wp.int32, size: Size, seen_out: Seen):
         i = offset + wp.tid()
         num, views = size.num, size.views
-        mean = seen.means[i]
+        mean = seen_out.means[i]
         for view in range(views):
             image = i // num * views + view
             at = image * num + i % num
             row = wp.where(size.per_view != 0, at, i)
-            t = _direction(mean, seen.centers[image])
+            t = _direction(mean, seen_out.centers[image])
             Y = basis(t[0], t[1], t[2])
             bad = not (wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2]))
-            for d in range(seen.colors.shape[1]):
+            for d in range(seen_out.colors.shape[1]):
                 value = wp.float32(0.0)
                 for k in range(count):
-                    value += Y[k] * seen.coefficients[row, k, d]
+                    value += Y[k] * seen_out.coefficients[row, k, d]
                 # a coefficient that is not finite leaves such a sum; the reverse need not hold
                 bad = bad or not wp.isfinite(value)
                 if wp.static(clamped):
                     value += 0.5
                     value = wp.where(value < 0.0, 0.0, value)
-                seen.colors[at, d] = value
+                seen_out.colors[at, d] = value
             if bad:
                 finite = wp.isfinite(mean[0]) and wp.isfinite(mean[1]) and wp.isfinite(mean[2])
-                if not (finite and used_are_finite(seen.coefficients, row)):
-                    for d in range(seen.colors.shape[1]):
-                        seen.colors[at, d] = wp.nan
+                if not (finite and used_are_finite(seen_out.coefficients, row)):
+                    for d in range(seen_out.colors.shape[1]):
+                        seen_out.colors[at, d] = wp.nan
 
     return harmonics
 
@@ -115,33 +115,33 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
     above = _ABOVE[clamped]
     column, basis, slopes = leaves.column, leaves.basis, leaves.slopes
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.kernel(enable_backward=False, module="unique", module_options=_OPTIONS)
     @no_type_check
-    def harmonics_vjp(offset: wp.int32, size: Size, seen: Seen, v_seen: Seen):
+    def harmonics_vjp(offset: wp.int32, size: Size, seen_in: Seen, v_seen_out: Seen):
         i = offset + wp.tid()
         num, views = size.num, size.views
-        mean = seen.means[i]
+        mean = seen_in.means[i]
         b = i // num
-        channels = v_seen.colors.shape[1]
-        if v_seen.coefficients:
+        channels = v_seen_out.colors.shape[1]
+        if v_seen_out.coefficients:
             for d in range(channels):
                 v_column = column()
                 for view in range(views):
                     image = b * views + view
                     at = image * num + i % num
                     # what passes no gradient on may hold NaN, which must not meet a zero
-                    if seen.colors[at, d] > wp.static(above):
-                        t = _direction(mean, seen.centers[image])
-                        v_column += v_seen.colors[at, d] * basis(t[0], t[1], t[2])
+                    if seen_in.colors[at, d] > wp.static(above):
+                        t = _direction(mean, seen_in.centers[image])
+                        v_column += v_seen_out.colors[at, d] * basis(t[0], t[1], t[2])
                     last = size.per_view != 0 or view == views - 1
                     if last:
                         row = wp.where(size.per_view != 0, at, i)
                         for k in range(count):
-                            v_seen.coefficients[row, k, d] = v_column[k]
-                        for k in range(count, v_seen.coefficients.shape[1]):
-                            v_seen.coefficients[row, k, d] = 0.0
+                            v_seen_out.coefficients[row, k, d] = v_column[k]
+                        for k in range(count, v_seen_out.coefficients.shape[1]):
+                            v_seen_out.coefficients[row, k, d] = 0.0
                         v_column = column()
-        if wp.static(degree > 0) and (v_seen.means or v_seen.centers):
+        if wp.static(degree > 0) and (v_seen_out.means or v_seen_out.centers):
             v_mean = wp.vec3(0.0, 0.0, 0.0)
             for view in range(views):
                 image = b * views + view
@@ -150,13 +150,13 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
                 s = column()
                 alive = wp.bool(False)
                 for d in range(channels):
-                    if seen.colors[at, d] > wp.static(above):
+                    if seen_in.colors[at, d] > wp.static(above):
                         alive = True
-                        v = v_seen.colors[at, d]
+                        v = v_seen_out.colors[at, d]
                         for k in range(count):
-                            s[k] = s[k] + v * seen.coefficients[row, k, d]
+                            s[k] = s[k] + v * seen_in.coefficients[row, k, d]
                 if alive:
-                    t = _direction(mean, seen.centers[image])
+                    t = _direction(mean, seen_in.centers[image])
                     u = wp.vec3(t[0], t[1], t[2])
                     v_t = slopes(u[0], u[1], u[2], s)
                     # through the division by the length, a constant where it is too short
@@ -164,9 +164,9 @@ def backward_kernel(degree: int, channels: int, clamped: bool):
                         v_t = v_t - wp.dot(u, v_t) * u
                     v_t = v_t / wp.max(t[3], SHORTEST)
                     v_mean += v_t
-                    if v_seen.centers:
-                        v_seen.centers[at] = -v_t
-            if v_seen.means:
-                v_seen.means[i] = v_mean
+                    if v_seen_out.centers:
+                        v_seen_out.centers[at] = -v_t
+            if v_seen_out.means:
+                v_seen_out.means[i] = v_mean
 
     return harmonics_vjp

@@ -55,10 +55,9 @@ struct Column {
     const float* row(int t) const { return (const float*)(at + t * step); }
 };
 auto column_ = [&](auto& array, int n) -> Column {
-    const auto* s = array.strides;
-    return {(const char*)array.data + (size_t)p.b * s[0] + (size_t)p.t0 * s[1]
-            + (size_t)p.group * s[2] + (size_t)n * 4,
-        (size_t)s[1]};
+    return {(const char*)array.data + (size_t)p.b * array.strides[0]
+            + (size_t)p.t0 * array.strides[1] + (size_t)p.group * array.strides[2] + (size_t)n * 4,
+        (size_t)array.strides[1]};
 };
 
 // Several states from n on, or one: their A, and the lanes in which they are slow.

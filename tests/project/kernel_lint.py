@@ -1,0 +1,189 @@
+"""The rules of kernels that can be checked without running them; ``make lint`` does so.
+
+- ``arguments``: inputs come first, then outputs. An array, or a struct of arrays, is ``…_in``, or
+  ``…_out`` if it is written; that may be read, too. Numbers have plain names.
+- ``types``: each argument says its type, itself: an array, a struct or a number.
+- ``inputs``: nothing is written to what is named ``…_in``, in kernels and in functions of Warp's.
+  What a function knows by a plain name is not followed.
+- ``32 bits``: the number of a row fits in 32 bits, because views.py refuses longer arrays, and
+  Warp's own indexing multiplies it by the stride in 64. What is counted in elements or bytes does
+  not fit: so a stride or a length is widened before it is multiplied, and so is, in C++, a factor
+  of what is added to an array's ``data``. A product that is widened too late is refused; if it is
+  the number of a row, it gets a name. Lengths that a struct holds, and pointers that were made
+  from ``data``, are not looked at.
+- ``backward``: ``enable_backward=False``, for the kernel or the module.
+
+A kernel from ``native_kernel`` is C++ and two mappings, of inputs and of outputs: so these need no
+endings, and their order, types and options are right by themselves. What its file writes is checked
+where the inputs are written out in the call.
+"""
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+_NUMBER = re.compile(r"int|float|bool|wp\.(u?int|float)\d+|wp\.bool")
+_WRITING = re.compile(r"(tile_)?(atomic|store|write|put)")
+_WIDENED = ("wp.int64", "wp.uint64", "wp.static", "float", "wp.float32")
+_WIDE = r"\(size_t\)|\(long long\)|\bwide_\("
+
+Found = Iterator[tuple[int, str, str]]  # line, rule, what
+
+
+def findings(sources: dict[str, str]) -> list[str]:
+    """What breaks a rule in files, Python or C++, given as texts by their names."""
+    trees = {name: ast.parse(text) for name, text in sources.items() if name.endswith(".py")}
+    structs: dict[str, bool] = {}  # whether what has that name has arrays
+    for node in (node for tree in trees.values() for node in ast.walk(tree)):
+        if isinstance(node, ast.ClassDef):
+            fields = [ast.unparse(x.annotation) for x in node.body if isinstance(x, ast.AnnAssign)]
+            structs[node.name] = structs.get(node.name, False) or "array" in " ".join(fields)
+    inputs: dict[str, set[str]] = {}  # of native kernels, by their files
+    for name, tree in trees.items():
+        for file, names in _native(tree):
+            inputs.setdefault(str(Path(name).parent / file), set()).update(names)
+    found = []
+    for name, text in sources.items():
+        if name in trees:
+            of_file = [*_python(trees[name], structs)]
+        else:
+            of_file = [*_cpp(text, inputs.get(name, set()))]
+        found += [f"{name}:{line}: {rule}: {what}" for line, rule, what in sorted(of_file)]
+    return found
+
+
+def _python(tree: ast.Module, structs: dict[str, bool]) -> Found:
+    options = [ast.unparse(node) for node in tree.body]
+    off = any("set_module_options({'enable_backward': False" in text for text in options)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "wp.kernel":
+            said = {k.arg: ast.unparse(k.value) for k in node.keywords}
+            if said.get("enable_backward", str(not off or "module" in said)) != "False":
+                yield node.lineno, "backward", "the kernel has no enable_backward=False"
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            for line, rule, what in _cpp(node.value, set()):
+                yield node.lineno + line - 1, rule, what
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        decorators = [ast.unparse(x) for x in node.decorator_list]
+        if "wp.kernel" in decorators and not off:
+            at = node.decorator_list[decorators.index("wp.kernel")].lineno
+            yield at, "backward", f"neither {node.name} nor its module turns it off"
+        if any(x.startswith("wp.kernel") for x in decorators):
+            yield from _arguments(node, structs)
+        if any(x.startswith(("wp.kernel", "wp.func")) for x in decorators):
+            yield from _body(node)
+
+
+def _arguments(kernel: ast.FunctionDef, structs: dict[str, bool]) -> Found:
+    outputs = False
+    for arg in kernel.args.args:
+        name, kind = arg.arg, ast.unparse(arg.annotation) if arg.annotation else ""
+        arrays = "array" in kind or structs.get(kind, False)
+        if not (arrays or kind in structs or _NUMBER.fullmatch(kind)):
+            yield arg.lineno, "types", f"{name} of {kernel.name} does not say its type"
+        if arrays and not name.endswith(("_in", "_out")):
+            yield arg.lineno, "arguments", f"{name} of {kernel.name} is neither …_in nor …_out"
+        if outputs and not name.endswith("_out"):
+            yield arg.lineno, "arguments", f"{name} of {kernel.name} comes after an output"
+        outputs |= name.endswith("_out")
+
+
+def _body(function: ast.FunctionDef) -> Found:
+    for node in ast.walk(function):
+        written: list[ast.expr] = []
+        if isinstance(node, (ast.Assign, ast.AugAssign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            written = [y for x in targets for y in (x.elts if isinstance(x, ast.Tuple) else [x])]
+        elif isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if _WRITING.match(called.rpartition(".")[2]):
+                written = [*node.args[:1]]
+            if called in ("wp.int64", "wp.uint64"):
+                inside = [y for x in node.args for y in _narrow(x)]
+                if any(isinstance(getattr(x, "op", None), ast.Mult) for x in inside):
+                    yield node.lineno, "32 bits", f"widened too late: {ast.unparse(node)}"
+        if isinstance(node, (ast.BinOp, ast.AugAssign)) and isinstance(node.op, ast.Mult):
+            of = (node.left, node.right) if isinstance(node, ast.BinOp) else (node.value,)
+            names = {getattr(y, "attr", "") for x in of for y in _narrow(x)}
+            if names & {"shape", "strides"}:
+                yield node.lineno, "32 bits", f"a length is multiplied: {ast.unparse(node)}"
+        for x in written:
+            while isinstance(x, (ast.Subscript, ast.Attribute)):
+                x = x.value
+            if isinstance(x, ast.Name) and x.id.endswith("_in"):
+                yield x.lineno, "inputs", f"{function.name} writes to {x.id}"
+
+
+def _narrow(node: ast.AST) -> Iterator[ast.AST]:
+    """A node and what is in it, without what is widened or known when the kernel is compiled."""
+    if not (isinstance(node, ast.Call) and ast.unparse(node.func) in _WIDENED):
+        yield node
+        for child in ast.iter_child_nodes(node):
+            yield from _narrow(child)
+
+
+def _native(tree: ast.Module) -> Iterator[tuple[str, set[str]]]:
+    """The file of each native kernel whose inputs are written out, and their names."""
+    known = {ast.unparse(x.targets[0]): x.value for x in tree.body if isinstance(x, ast.Assign)}
+
+    def keys(node: ast.AST) -> set[str]:
+        node = known.get(ast.unparse(node), node)
+        pairs = zip(node.keys, node.values) if isinstance(node, ast.Dict) else ()
+        return {y for k, v in pairs for y in (keys(v) if k is None else {ast.literal_eval(k)})}
+
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "native_kernel":
+            names = {y for k in node.keywords if k.arg == "inputs" for y in keys(k.value)}
+            for file in re.findall(r"'([\w/]+\.inl)'", ast.unparse(node)):
+                yield file, names
+
+
+def _cpp(text: str, inputs: set[str]) -> Found:
+    text = re.sub(r"//.*", "", text)
+
+    def line(at: int) -> int:
+        return text.count("\n", 0, at) + 1
+
+    name = "|".join([r"\w+_in", *sorted(inputs)])
+    target = rf"\b({name})(?:\.\w+)*\.data"
+    for m in re.finditer(rf"{target}\[[^;=]*\]\s*[-+*/|&^]?=(?!=)|__atomic_\w+\(&?{target}", text):
+        yield line(m.start()), "inputs", f"writes to {m[1] or m[2]}"
+    for m in re.finditer(r"\((?:size_t|long long)\)\([^()]* \* [^()]*\)", text):
+        yield line(m.start()), "32 bits", f"widened too late: {m[0]}"
+    array = r"[\w.]+\.strides\[\d\]"
+    allowed = rf"wide_\([^;]*?{array}\)|\(size_t\)(?:[\w.]+\s*\* \(?)?{array}"
+    rest = re.sub(allowed, lambda m: re.sub(r"\S", " ", m[0]), text)
+    for m in re.finditer(r"\S+\bstrides\b\S*", rest):
+        yield line(m.start()), "32 bits", f"not widened: {m[0]}"
+    declared = re.findall(r"\b(?:size_t|long long|int64_t) ([^;()]*)", text)
+    names = [n for x in declared for n in re.findall(r"^\w+|\w+(?= =)", x)]
+    wide = re.compile("|".join([_WIDE, *(rf"\b{n}\b" for n in names)]))
+    for m in re.finditer(r"\.data\)?(?:\[|\s+\+ )", text):
+        for term in _terms(text[m.end() :]):
+            factors = re.split(r"\s\* ", term)
+            if len(factors) > 1 and not wide.search(" * ".join(factors[:2])):
+                yield line(m.start()), "32 bits", f"not widened: {term}"
+
+
+def _terms(text: str) -> list[str]:
+    """The terms of the sum that a text begins with."""
+    terms, depth = [""], 0
+    for token in re.findall(r"\s[-+] |\s+|\w+|\S", text):
+        depth += (token in "([{") - (token in ")]}")
+        if depth < 0 or depth == 0 and token in ",;?:=":
+            break
+        if depth == 0 and token[1:] in ("+ ", "- "):
+            terms.append("")
+        else:
+            terms[-1] += token
+    return terms
+
+
+if __name__ == "__main__":
+    files = [x for x in sorted((ROOT / "kernels").rglob("*")) if x.suffix in (".py", ".h", ".inl")]
+    faults = findings({str(x.relative_to(ROOT)): x.read_text() for x in files})
+    sys.exit("\n".join(faults) or None)

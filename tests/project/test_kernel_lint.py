@@ -1,0 +1,110 @@
+"""The rules of kernel_lint.py: the tree keeps them, and each is seen to be broken."""
+
+import subprocess
+import sys
+
+import pytest
+from project import kernel_lint
+from project.kernel_lint import findings
+
+STRUCTS = """
+class Sizes:
+    rows: int
+class Lists:
+    order: wp.array[wp.int32]
+"""
+KERNEL = """
+@wp.kernel(enable_backward=False, module="unique")
+def k(sizes: Sizes, lists_in: Lists, x_in: wp.array2d[float], y_out: wp.array[wp.float32]):
+    i = wp.tid()
+    n = x_in.shape[1]
+    at = wp.int64(i) * wp.int64(x_in.shape[1]) + wp.int64(wp.static(2 * SIZE))
+    y_out[i] = x_in[i, n - 1] * float(x_in.shape[1])
+    store(y_out, at, x_in[i, 0])
+"""
+NATIVE = """
+SHARED = {"sizes": int}
+native_kernel(
+    "n", native(HERE / "n.inl"), inputs={**SHARED, "lists": Lists}, outputs={"work": Lists}
+)
+"""
+CPP = """
+const size_t row = task, at = row * 3;
+work.order.data[row * count + i] = lists.order.data[i];
+const float* p = (const float*)((char*)x_in.data + (size_t)i * x_in.strides[0]) + i * 4;
+const float* q = p + wide_(i, x_in.strides[1]) * 2 + (x_in.data[i] == 0);
+float* out = y_out.data + ((size_t)b * rows + i) * count;
+"""
+
+
+def _found(python="", cpp=CPP):
+    return findings({"k/a.py": STRUCTS + KERNEL + NATIVE + python, "k/n.inl": cpp})
+
+
+def test_what_keeps_the_rules_is_not_found():
+    assert _found() == []
+
+
+def test_the_kernels_keep_the_rules():
+    done = subprocess.run([sys.executable, kernel_lint.__file__], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "rule"),
+    [
+        ("lists_in: Lists, x_in", "lists: Lists, x_in", "arguments"),
+        ("x_in: wp.array2d[float]", "x: wp.array2d[float]", "arguments"),
+        ("x_in: wp.array2d[float], y_out: w", "y_out: wp.array[float], x_in: w", "arguments"),
+        ("y_out: wp.array[wp.float32]", "y_out: wp.array[wp.float32], n: int", "arguments"),
+        ("sizes: Sizes", "sizes", "types"),
+        ("x_in: wp.array2d[float]", "x_in: rows", "types"),
+        ("y_out[i] =", "x_in[i, 0] =", "inputs"),
+        ("y_out[i] =", "y_out[i], x_in[i, 0] = 0.0,", "inputs"),
+        ("y_out[i] =", "lists_in.order[i] +=", "inputs"),
+        ("store(y_out, at", "L.store_int(x_in, at", "inputs"),
+        ("i = wp.tid()", "i = wp.atomic_add(lists_in.order, 0, 1)", "inputs"),
+        ("i = wp.tid()", "i = wp.tid() * x_in.shape[1]", "32 bits"),
+        ("i = wp.tid()", "i = wp.tid()\n    i *= x_in.strides[0]", "32 bits"),
+        ("wp.int64(i) * wp.int64(x_in.shape[1])", "wp.int64(i * sizes.rows)", "32 bits"),
+        ("enable_backward=False, ", "", "backward"),
+        ("enable_backward=False, ", "enable_backward=True, ", "backward"),
+        ("enable_backward=False, ", "**options, ", "backward"),
+        ('(enable_backward=False, module="unique")', "", "backward"),
+    ],
+)
+def test_each_rule_of_python(old, new, rule):
+    before, found_old, after = KERNEL.partition(old)
+    assert found_old
+    (found,) = findings({"k/a.py": (head := STRUCTS + before + new) + after})
+    assert found.startswith(f"k/a.py:{head.count(chr(10)) + 1}: {rule}: "), found
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("x_in.data[i] = 0;", "inputs"),
+        ("lists.order.data[i + n] |= 1;", "inputs"),
+        ("__atomic_fetch_add(lists.order.data + i, 1, 0);", "inputs"),
+        ("float v = x_in.data[i * count + n];", "32 bits"),
+        ("float* p = (float*)x_in.data + i * count;", "32 bits"),
+        ("float* p = y_out.data + (size_t)i + n * count;", "32 bits"),
+        ("at += i * x_in.strides[0];", "32 bits"),
+        ("const auto* s = x_in.strides;", "32 bits"),
+        ("at += (size_t)(i * count);", "32 bits"),
+    ],
+)
+def test_each_rule_of_cpp(text, rule):
+    (found,) = _found(cpp=f"// {text}\n{text}\n")
+    assert found.startswith(f"k/n.inl:2: {rule}: "), found
+    inside = f'\n@wp.func_native("""\n{text}\n""")\ndef f(): ...\n'
+    assert len(_found(python=inside)) == (1 if "lists." not in text else 0)
+
+
+def test_a_module_may_turn_backward_off():
+    off = 'wp.set_module_options({"enable_backward": False})\n'
+    kernel = "@wp.kernel\ndef k(i: int): ...\n"
+    assert findings({"k/a.py": off + kernel}) == []
+    assert len(findings({"k/a.py": kernel})) == 1
+    own = '@wp.kernel(module="unique")\ndef k(i: int): ...\n'  # a module of its own
+    assert len(findings({"k/a.py": off + own})) == 1
