@@ -81,13 +81,14 @@ inline void on_lanes(
 }
 
 // The approximate units: 0 rounds as best can be, 1 takes the smallest value that the documented
-// bound allows, any other number draws an error within it for each argument.
+// bound allows, any other number draws an error within it for each argument. What the ISA's tables
+// of special arguments state is exact: 0 has the power 1, which masks tokens past the end.
 static u32 approximate = 0;
 
 inline f32 flushed(f32 x) { return std::fpclassify(x) == FP_SUBNORMAL ? std::copysign(0.f, x) : x; }
 
 inline f32 approx(double exact, f32 argument, double bound) {
-    if (!approximate || !std::isfinite(exact)) return exact;
+    if (!approximate || !std::isfinite(exact) || flushed(argument) == 0) return exact;
     u32 x = slot(argument) ^ approximate * 0x9E3779B9u;
     x = (x ^ x >> 16) * 0x7feb352du;
     x = (x ^ x >> 15) * 0x846ca68bu;

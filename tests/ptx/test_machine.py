@@ -409,7 +409,8 @@ def test_approximate_units(name):
         error = ((got - want) / want)[normal]
         slack = 2.0**-24  # the result is rounded once more
         assert np.abs(error).max() <= (bound if approximate else 0) + slack
-        assert approximate != 1 or (error <= slack - 0.4 * bound).all()
+        assert approximate != 1 or (error <= slack - 0.4 * bound)[x[normal] != 0].all()
+        assert (got == want)[x == 0].all()  # by the ISA's tables; tokens past the end rely on it
         assert not got[np.abs(want) < 2.0**-127].any()
         assert (np.isnan(got) == np.isnan(want)).all()
 

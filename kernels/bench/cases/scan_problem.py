@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from ...selective_scan import selective_scan
-from ...selective_scan.reference import selective_scan_reference
-from ..core.case import BOTH, Settings
+from ...selective_scan.reference import EXACT, Off, selective_scan_reference
+from ..core.case import BOTH, Settings, compare
 from ..core.measure import peak_bytes, saved_bytes
 from ..core.problem import Operator
 
@@ -21,6 +22,30 @@ CUDA_LIMIT = 1e-5  # of both directions: ex2.approx is off by 2^-22 at every tok
 HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
 # Tokens, channels, and tokens that the oracle looks at.
 SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (16961, 1024, 16961)}
+
+
+EX2 = 2.0**-22  # the largest relative error of ex2.approx, CUDA's own figure for exp2f
+
+
+def allowances(
+    results: Callable[[Off], Mapping[str, Tensor]], exponential: float = EX2
+) -> dict[str, float]:
+    """How far an inexact exponential may take results from float64's (CUDA.md, Exponential).
+
+    Args:
+        results: the formulas in float64, their results by name.
+        exponential: its largest relative error.
+
+    Returns:
+        By name the relative rms difference that errors always to one side make: of the decays, and
+        of the steps, where a reciprocal adds half as much.
+    """
+    exact = results(EXACT)
+    found = dict.fromkeys(exact, 0.0)
+    for off in (Off(decay=exponential), Off(step=1.5 * exponential)):
+        for name, value in results(off).items():
+            found[name] += compare({name: value}, {name: exact[name]}).rel_rms
+    return found
 
 
 def make_inputs(

@@ -139,18 +139,25 @@ class Operator(Problem):
     def check(self, direction: str, dtype: torch.dtype = torch.float32, **options: Any) -> Error:
         """Error of the output, and of every gradient if the direction has them."""
         gradients = direction == BOTH and self.compared
-        truth = self.truth(gradients, **options)
+        got = self.results(gradients, dtype, **options)
+        return compare(got, self.truth(gradients, **options))
+
+    def results(
+        self, gradients: bool, dtype: torch.dtype = torch.float32, **options: Any
+    ) -> dict[str, Tensor]:
+        """What ``truth`` has, of the operator itself."""
         if not gradients:
-            return compare({"out": self.cut("out", self.forward(dtype, **options))}, truth)
+            return {"out": self.cut("out", self.forward(dtype, **options))}
         leaves = self.leaves(dtype)
         out = self.call(leaves, **options)
         head = torch.zeros_like(self._turn("out", out.detach()), device="cpu")
+        truth = self.truth(gradients, **options)
         head[self.corner.get("out", ...)] = self._drawn(truth["out"]).to(head.dtype)
         wanted = {k: x for k, x in leaves.items() if x.requires_grad}
         head = self._turn("out", head).to(out.device)
         grads = torch.autograd.grad(out, list(wanted.values()), head)
         got = {"out": out.detach()} | dict(zip(wanted, grads))
-        return compare({k: self.cut(k, x) for k, x in got.items()}, truth)
+        return {k: self.cut(k, x) for k, x in got.items()}
 
     def cut(self, name: str, x: Tensor) -> Tensor:
         """The corner of a result, laid out as the reference's."""

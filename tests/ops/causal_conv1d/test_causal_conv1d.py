@@ -9,6 +9,7 @@ from helpers.scan import assert_gradient_alone, assert_gradients, leaves
 from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
 from gamba_warp.kernels.causal_conv1d.reference import causal_conv1d_reference
 from gamba_warp.kernels.runtime.lanes import streams
+from gamba_warp.kernels.runtime.stand_in import kind_of
 
 FORWARD = 2e-7  # float32 rounding of four products and a SiLU
 GRADIENT = 2e-6  # float32 sums over up to 2 * 577 tokens
@@ -44,14 +45,19 @@ def test_without_bias_and_state():
 
 
 def test_equal_terms_of_a_sum():
-    """Equal additions round to the same side, so not all tokens of a task are added in a row."""
+    """Equal additions round to the same side, so not all tokens are added in a row.
+
+    n of them are off by 3/8 n 2^-24 at most. A CPU adds runs of 16 (64 in a row
+    were 5e-7 off), CUDA 64 in a row, as runs would take more registers.
+    """
     inputs = make(1, 640, 37, 4)
     inputs["x"] = (0.1 + torch.rand(37)).expand_as(inputs["x"]).contiguous()
     inputs["initial_state"] = inputs["x"][:, :3].clone()
     mine = leaves(inputs)
     (got,) = torch.autograd.grad(causal_conv1d(**mine).sum(), [mine["weight"]])
     want = 640 * inputs["x"][0, 0].double()[:, None].expand_as(got)
-    assert_rel_rms(got, want, 3e-7, "gradient of weight")  # in a row: 5e-7
+    limit = {"cpu": 3e-7, "cuda": 3 / 8 * 64 * 2**-24}[kind_of(got.device)]
+    assert_rel_rms(got, want, limit, "gradient of weight")
 
 
 @pytest.mark.parametrize("cut", [1, 2, 300])

@@ -7,6 +7,7 @@ from helpers.scan import (
     FORWARD,
     assert_gradient_alone,
     compare,
+    device_errors,
     every_discretization,
     leaves,
     make,
@@ -120,9 +121,11 @@ def test_split_consistency(cut):
         part["initial_state"] = state
         out, state = selective_scan(**part, delta_softplus=True, return_last_state=True)
         parts.append(out)
-    # equal to rounding only: cuts move tokens to other chunks, not to other operations
-    assert rel_rms(torch.cat(parts, 1), whole) < 1e-7
-    assert rel_rms(state, last) < 1e-7
+    # equal to rounding only: cuts move tokens to other chunks, not to other operations; on CUDA to
+    # other segments, over which a product of decays is one exponential
+    more = device_errors(oracle, inputs, decays=2.0**-24, delta_softplus=True)
+    assert rel_rms(torch.cat(parts, 1), whole) < 1e-7 + more["out"]
+    assert rel_rms(state, last) < 1e-7 + more["last"]
 
 
 def test_repeatable_and_independent_of_threads():
@@ -290,8 +293,9 @@ def test_mamba_ssm_signature(constant):
     if constant:
         exact[constant] = exact[constant].expand(2, 33, 20, 5)
     want, want_last = oracle(**exact, delta_softplus=True)
-    assert_rel_rms(out, want.transpose(1, 2), FORWARD, "out")
-    assert_rel_rms(last, want_last, 2 * FORWARD, "last state")
+    more = device_errors(oracle, exact, delta_softplus=True)
+    assert_rel_rms(out, want.transpose(1, 2), FORWARD + more["out"], "out")
+    assert_rel_rms(last, want_last, 2 * FORWARD + more["last"], "last state")
 
 
 def test_mamba_ssm_three_dimensional_matrices():

@@ -7,6 +7,7 @@ from helpers.scan import (
     STATE,
     assert_gradients,
     compare,
+    device_errors,
     every_discretization,
     leaves,
     make,
@@ -35,10 +36,18 @@ def test_state_matches_oracle(shape, discretization):
     inputs = state_of(*shape)
     options = {"delta_softplus": True, "discretization": discretization}
     mine, theirs = leaves(inputs), leaves(inputs, torch.float64)
-    last = selective_scan_state(**mine, **options)
-    _, want = oracle(**theirs, C=torch.zeros_like(theirs["B"]), **options)
-    assert_rel_rms(last, want, 1e-6, "last state")
-    assert_gradients((mine, [last]), (theirs, [want]), 1e-5)
+    last, heads = (
+        selective_scan_state(**mine, **options),
+        [torch.randn(shape[0], *inputs["A"].shape)],
+    )
+
+    def exact(**tensors):
+        return oracle(C=torch.zeros_like(tensors["B"]), **tensors)[1:]
+
+    wants = exact(**theirs, **options)
+    more = device_errors(exact, inputs, heads, names=["last"], **options)
+    assert_rel_rms(last, wants[0], 1e-6 + more["last"], "last state")
+    assert_gradients((mine, [last]), (theirs, wants), 1e-5, heads=heads, more=more)
 
 
 def test_state_is_that_of_the_scan():
