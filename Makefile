@@ -75,10 +75,11 @@ bench: $(STAMP)
 study: $(STAMP)
 	PYTHONPATH=docs $(BIN)/python -m lab.studies $(WHAT)
 
-# docs/lab/benchmarks/static.md: what the CUDA kernels take, and with nvdisasm (on PATH, in CUDA_HOME
-# or inside Triton) their instructions, and the scan's least times.
+# docs/lab/benchmarks: counts.md, what the CUDA kernels execute, counted while their PTX is executed
+# here; static.md, what they take, and with nvdisasm (on PATH, in CUDA_HOME or inside Triton) their
+# instructions and the scan's least times.
 instructions: $(STAMP)
-	PYTHONPATH=docs $(BIN)/python -m lab.instructions
+	PYTHONPATH=docs:tests $(BIN)/python -m lab.instructions
 
 # The site, in site/: a broken link, anchor or docstring is an error.
 docs: $(STAMP)

@@ -33,13 +33,13 @@ static const Opcode OPCODES[] = {
     COMPUTING ATOMICS(ATOMIC_OPCODE)  // what the lanes do alone
     {"ld", "load", "", 0, LOAD, nullptr},
     {"st", "store", "", 0, STORE, nullptr},
-    {"bra", "branch", "", 0, BRANCH, nullptr},
-    {"ret", "branch", "", 0, EXIT, nullptr},
-    {"exit", "branch", "", 0, EXIT, nullptr},
+    {"bra", "jump", "", 0, BRANCH, nullptr},
+    {"ret", "jump", "", 0, EXIT, nullptr},
+    {"exit", "jump", "", 0, EXIT, nullptr},
     {"bar.sync", "barrier", "", 0, BLOCK, nullptr},
     {"bar.warp.sync", "barrier", "W", 0, WARP, nullptr},
-    {"vote.sync.ballot.b32", "vote", "WWW", 1, WARP, any_of<true>},
-    {"redux.sync.or.b32", "vote", "WWW", 1, WARP, any_of<false>},
+    {"vote.sync.ballot.b32", "shuffle", "WWW", 1, WARP, any_of<true>},
+    {"redux.sync.or.b32", "shuffle", "WWW", 1, WARP, any_of<false>},
 };
 const int COUNT = sizeof OPCODES / sizeof *OPCODES;
 
@@ -65,11 +65,12 @@ struct Array {  // memory that a launch may touch, in units of 1 << unit bytes
     s64 unit;
 };
 
-// What an instruction asked for: lanes that came to it, and branches that parted them; of memory
-// bytes, sectors of 32 bytes, those of global memory that the launch had not touched before, passes
-// of shared memory (32 banks of 4 bytes), and those that conflicts of banks add to them.
+// What an instruction asked for: lanes that came to it, and branches that parted them; bytes of
+// global memory, sectors of 32 bytes of global or local memory, those of global memory that the
+// launch had not touched before; passes of shared memory (32 banks of 4 bytes), those that
+// conflicts of banks add to them, and passes if all lanes could be served together.
 struct Count {
-    s64 lanes, splits, bytes, sectors, first, passes, conflicts;
+    s64 lanes, splits, bytes, sectors, first, passes, conflicts, together;
 };
 
 struct Launch {
@@ -337,19 +338,22 @@ struct Machine {
         c.splits += kind == BRANCH && lanes && lanes != there;
         if (kind != LOAD && kind != STORE && kind != ATOMIC) return;
         int size = I.size * I.vector, group = size > 8 ? 8 : size > 4 ? 16 : 32;
-        c.bytes += size * __builtin_popcount(lanes);
-        std::set<u64> sectors;
+        std::set<u64> sectors, all;
+        int together[32] = {};
         for (int begin = 0; begin < 32; begin += group) {
             std::set<u64> words;
             int banks[32] = {};
             EACH(l, lanes >> begin << begin & ~0u >> (32 - group - begin)) {
                 u64 address = address_of(w, l, I);
                 s32 space = space_of(I, address);
+                c.bytes += space == IN_GLOBAL ? size : 0;
                 for (u64 word = address / 4; word <= (address + size - 1) / 4; word++) {
                     if (space == IN_GLOBAL) c.first += touched.insert(word / 8).second;
                     if (space == IN_GLOBAL) sectors.insert(word / 8);
                     else if (space == IN_LOCAL) sectors.insert((word * 32 + l) / 8);
-                    else if (space == IN_SHARED && words.insert(word).second) banks[word % 32]++;
+                    if (space != IN_SHARED) continue;
+                    banks[word % 32] += words.insert(word).second;
+                    together[word % 32] += all.insert(word).second;
                 }
             }
             int passes = *std::max_element(banks, banks + 32);
@@ -357,6 +361,7 @@ struct Machine {
             c.conflicts += std::max(passes - 1, 0);
         }
         c.sectors += sectors.size();
+        c.together += *std::max_element(together, together + 32);
     }
 
     template<class T, class F>

@@ -194,7 +194,7 @@ inline f32 of_f16(u16 bits) {
     OP1(convert, "cvt.rn.bf16.f32", u16, f32, bf16(a)) OP1(convert, "cvt.rn.f16.f32", u16, f32, f16(a)) \
     OP1(convert, "cvt.f32.f16", f32, u16, of_f16(a)) OP1(integer, "cvt.f32.bf16", f32, u16, value<f32>((u32)a << 16)) \
     OP1(convert, "cvt.rpi.f32.f32", f32, f32, std::ceil(a)) OP1(convert, "cvt.rmi.f32.f32", f32, f32, std::floor(a)) \
-    OP1(float32, "cvt.sat.f32.f32", f32, f32, a > 0 ? a < 1 ? a : 1 : 0) \
+    OP1(float, "cvt.sat.f32.f32", f32, f32, a > 0 ? a < 1 ? a : 1 : 0) \
     OP1(move, "abs.f32", u32, u32, a & 0x7fffffffu) OP1(move, "neg.f32", u32, u32, a ^ 0x80000000u) \
     OP1(integer, "neg.s32", u32, u32, 0 - a) OP1(integer, "neg.s64", u64, u64, 0 - a) \
     OP1(integer, "not.b16", u16, u16, ~a) OP1(integer, "not.b32", u32, u32, ~a) OP1(integer, "not.b64", u64, u64, ~a) \
@@ -225,14 +225,14 @@ inline f32 of_f16(u16 bits) {
     OP2(integer, "setp.ltu.f32", u32, f32, f32, !(a >= b)) OP2(integer, "setp.leu.f32", u32, f32, f32, !(a > b)) \
     OP2(integer, "setp.gtu.f32", u32, f32, f32, !(a <= b)) OP2(integer, "setp.geu.f32", u32, f32, f32, !(a < b)) \
     OP2(integer, "setp.nan.f32", u32, f32, f32, a != a || b != b) OP2(integer, "setp.num.f32", u32, f32, f32, a == a && b == b) \
-    OP2(float32, "add.f32", f32, f32, f32, a + b) OP2(float32, "sub.f32", f32, f32, f32, a - b) OP2(float32, "mul.f32", f32, f32, f32, a * b) \
-    OP2(float32, "add.rn.f32", f32, f32, f32, a + b) OP2(float32, "sub.rn.f32", f32, f32, f32, a - b) \
-    OP2(float32, "mul.rn.f32", f32, f32, f32, a * b) OP2(routine, "div.rn.f32", f32, f32, f32, a / b) \
+    OP2(float, "add.f32", f32, f32, f32, a + b) OP2(float, "sub.f32", f32, f32, f32, a - b) OP2(float, "mul.f32", f32, f32, f32, a * b) \
+    OP2(float, "add.rn.f32", f32, f32, f32, a + b) OP2(float, "sub.rn.f32", f32, f32, f32, a - b) \
+    OP2(float, "mul.rn.f32", f32, f32, f32, a * b) OP2(routine, "div.rn.f32", f32, f32, f32, a / b) \
     OP2(integer, "min.f32", f32, f32, f32, least(a, b)) OP2(integer, "max.f32", f32, f32, f32, greatest(a, b)) \
-    OP3(float32, "fma.rn.f32", f32, f32, f32, f32, std::fma(a, b, c)) \
-    OP3(float32, "a * b - c", f32, f32, f32, f32, std::fma(a, b, -c)) /* contract.py writes these two */ \
-    OP3(float32, "c - a * b", f32, f32, f32, f32, std::fma(-a, b, c)) \
-    OP3(float32, "fma.rm.f32", f32, f32, f32, f32, downward(a, b, c)) \
+    OP3(float, "fma.rn.f32", f32, f32, f32, f32, std::fma(a, b, c)) \
+    OP3(float, "a * b - c", f32, f32, f32, f32, std::fma(a, b, -c)) /* contract.py writes these two */ \
+    OP3(float, "c - a * b", f32, f32, f32, f32, std::fma(-a, b, c)) \
+    OP3(float, "fma.rm.f32", f32, f32, f32, f32, downward(a, b, c)) \
     OP1(routine, "sqrt.rn.f32", f32, f32, std::sqrt(a)) OP1(routine, "rcp.rn.f32", f32, f32, 1 / a) \
     OP1(special, "ex2.approx.ftz.f32", f32, f32, flushed(approx(std::exp2((double)flushed(a)), a, 0x1p-22))) \
     OP1(special, "rcp.approx.ftz.f32", f32, f32, flushed(approx(1 / (double)flushed(a), a, 0x1p-23))) \

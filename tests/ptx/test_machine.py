@@ -415,25 +415,27 @@ def test_approximate_units(name):
         assert (np.isnan(got) == np.isnan(want)).all()
 
 
-# What the 32 lanes of a warp ask for: bytes, sectors, those touched first, passes, conflicts.
+# What the 32 lanes of a warp ask for: bytes of global memory, sectors, those touched first, passes,
+# conflicts, and passes if all lanes were served together.
 ASKED = {
-    "ld.global.u32 %r7, [%rd4];": (128, 4, 4, 0, 0),
-    "ld.global.u32 %r7, [%rd4]; ld.global.u32 %r8, [%rd4];": (256, 8, 4, 0, 0),
-    "ld.global.u32 %r7, [%rd1];": (128, 1, 1, 0, 0),
+    "ld.global.u32 %r7, [%rd4];": (128, 4, 4, 0, 0, 0),
+    "ld.global.u32 %r7, [%rd4]; ld.global.u32 %r8, [%rd4];": (256, 8, 4, 0, 0, 0),
+    "ld.global.u32 %r7, [%rd1];": (128, 1, 1, 0, 0, 0),
     "shl.b32 %r5, %r1, 5; cvt.u64.u32 %rd5, %r5; add.s64 %rd5, %rd1, %rd5;"
-    "ld.global.v4.u32 {%r5, %r6, %r7, %r8}, [%rd5];": (512, 32, 32, 0, 0),
-    "st.shared.u32 [%r4], %r1;": (128, 0, 0, 1, 0),
-    "st.shared.u32 [%r3], 5;": (128, 0, 0, 1, 0),
-    "add.s32 %r5, %r4, %r2; st.shared.u32 [%r5], %r1;": (128, 0, 0, 2, 1),
+    "ld.global.v4.u32 {%r5, %r6, %r7, %r8}, [%rd5];": (512, 32, 32, 0, 0, 0),
+    "st.shared.u32 [%r4], %r1;": (0, 0, 0, 1, 0, 1),
+    "st.shared.u32 [%r3], 5;": (0, 0, 0, 1, 0, 1),
+    "add.s32 %r5, %r4, %r2; st.shared.u32 [%r5], %r1;": (0, 0, 0, 2, 1, 2),
     "shl.b32 %r5, %r1, 7; and.b32 %r5, %r5, 1023; add.s32 %r5, %r5, %r3;"
-    "ld.shared.u32 %r7, [%r5];": (128, 0, 0, 8, 7),
-    "add.s32 %r5, %r4, %r2; st.shared.v2.u32 [%r5], {%r1, %r1};": (256, 0, 0, 2, 0),
-    "mad.lo.s32 %r5, %r1, 16, %r3; st.shared.v4.b32 [%r5], {0, 1, 2, 3};": (512, 0, 0, 4, 0),
-    "mad.lo.s32 %r5, %r1, 16, %r3; st.shared.v2.u32 [%r5], {%r1, %r1};": (256, 0, 0, 4, 2),
-    "setp.lt.u32 %p1, %r1, 9; @%p1 st.shared.u32 [%r4], %r1;": (36, 0, 0, 1, 0),
-    "mov.u64 %rd9, own; st.local.u32 [%rd9], %r1;": (128, 4, 0, 0, 0),
-    "mov.u64 %rd9, own; cvta.local.u64 %rd9, %rd9; st.u64 [%rd9], %rd1;": (256, 8, 0, 0, 0),
-    "atom.global.add.u32 %r5, [%rd1], 1;": (128, 1, 1, 0, 0),
+    "ld.shared.u32 %r7, [%r5];": (0, 0, 0, 8, 7, 8),
+    "add.s32 %r5, %r4, %r2; st.shared.v2.u32 [%r5], {%r1, %r1};": (0, 0, 0, 2, 0, 2),
+    "mad.lo.s32 %r5, %r1, 16, %r3; st.shared.v4.b32 [%r5], {0, 1, 2, 3};": (0, 0, 0, 4, 0, 4),
+    "mad.lo.s32 %r5, %r1, 16, %r3; st.shared.v2.u32 [%r5], {%r1, %r1};": (0, 0, 0, 4, 2, 4),
+    "setp.lt.u32 %p1, %r1, 9; @%p1 st.shared.u32 [%r4], %r1;": (0, 0, 0, 1, 0, 1),
+    "mov.u64 %rd9, own; st.local.u32 [%rd9], %r1;": (0, 4, 0, 0, 0, 0),
+    "mov.u64 %rd9, own; cvta.local.u64 %rd9, %rd9; st.u64 [%rd9], %rd1;": (0, 8, 0, 0, 0, 0),
+    "atom.global.add.u32 %r5, [%rd1], 1;": (128, 1, 1, 0, 0, 0),
+    "ld.shared.v4.u32 {%r5, %r6, %r7, %r8}, [%r3];": (0, 0, 0, 4, 0, 1),
 }
 
 
@@ -447,7 +449,7 @@ def test_what_is_asked_of_memory(body):
         for i, row in zip(program.code, made.counts["k"])
         if units()[i.op] in ("load", "store", "atomic") and SPACES[i.space] != "param"
     ]
-    names = ("bytes", "sectors", "first", "passes", "conflicts")
+    names = ("bytes", "sectors", "first", "passes", "conflicts", "together")
     assert tuple(sum(row[name] for row in asked) for name in names) == ASKED[body]
 
 

@@ -1,8 +1,8 @@
-"""What the scan's kernels would take at the least on a GPU, from counts of their instructions.
+"""What kernels would take at the least on a GPU, from counts of what they execute.
 
 An estimate, never a measurement: each unit of a multiprocessor is taken to work in every cycle, and
-the busiest one sets the time. Stalls, barriers, branches that not all warps take, bank conflicts
-and misses of the caches are not in it, so a real time is longer.
+the busiest one sets the time. Stalls, barriers and misses of the caches are not in it, so a real
+time is longer.
 """
 
 from __future__ import annotations
@@ -11,11 +11,8 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gamba_warp.kernels.selective_scan.cuda import backward, forward
-from gamba_warp.kernels.selective_scan.cuda.blocks import MARK, SUB, UNROLL, BlockShape, block_shape
-from gamba_warp.kernels.selective_scan.cuda.launch import choose
-
-from .sass import Turns
+from gamba_warp.kernels.selective_scan.cuda.blocks import MARK, block_shape
+from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 
 
 @dataclass(frozen=True)
@@ -41,8 +38,48 @@ DEVICES = {
     80: Device("A100 SXM 80 GB", 108, 1.41e9, 2.039e12, 64),
     90: Device("H200 SXM", 132, 1.98e9, 4.8e12, 128),
 }
-LANES, SPECIAL, INTEGER, MEMORY = 32, 16, 64, 32  # of a warp; of a multiprocessor's units
-SCHEDULERS = 4
+LANES, SPECIAL, INTEGER = 32, 16, 64  # of a warp; of a multiprocessor's units
+SCHEDULERS, SECTOR = 4, 32
+LINE = 128  # bytes of the L1 cache or of shared memory, which is a part of it, per cycle
+# What the counts hold beside instructions: what these ask of memory.
+ASKED = ("bytes", "sectors", "first", "own", "passes", "conflicts", "together")
+
+
+def every(counts: Mapping[str, float]) -> float:
+    """All instructions of the counts."""
+    return sum(number for kind, number in counts.items() if kind not in ASKED)
+
+
+def cycles(device: Device, counts: Mapping[str, float]) -> dict[str, float]:
+    """Cycles of one multiprocessor that each of its units needs at the least.
+
+    Args:
+        device: whose.
+        counts: instructions of warps by kind ("float", "special", …) and ``ASKED``, as
+            ``counting.Executed`` has them. A "routine" counts as one instruction.
+
+    Returns:
+        ``issue``: 4 instructions start per cycle. ``special``: exponentials, roots and reciprocals.
+        ``float32``: additions, products and moves by the float unit, and products of integers.
+        ``integer``: the other arithmetic, comparisons and conversions. ``L1``: passes of shared
+        memory, and sectors of the cache of which it is a part. ``dram``: each sector once.
+    """
+    found = defaultdict(float, counts)
+    of_memory = device.bandwidth / device.clock / device.multiprocessors
+    moves = found["multiply"] * LANES / INTEGER
+    return {
+        "issue": every(counts) / SCHEDULERS,
+        "special": found["special"] * LANES / SPECIAL,
+        "float32": found["float"] * LANES / device.float_lanes + moves,
+        "integer": (found["integer"] + found["convert"]) * LANES / INTEGER,
+        "L1": found["together"] + (found["sectors"] + found["own"]) * SECTOR / LINE,
+        "dram": found["first"] * SECTOR / of_memory,
+    }
+
+
+def limit(found: Mapping[str, float]) -> str:
+    """The name of the largest."""
+    return max(found, key=lambda name: found[name])
 
 
 @dataclass(frozen=True)
@@ -51,15 +88,11 @@ class Work:
 
     Attributes:
         blocks: of threads.
-        warps: of a block.
-        turns: of the loops, for ``sass.executed``.
         elements: (batch, token, channel, state) of a block.
         traffic: bytes of device memory of the launch, each counted once.
     """
 
     blocks: int
-    warps: int
-    turns: tuple[Turns, ...]
     elements: int
     traffic: float
 
@@ -76,9 +109,14 @@ class Shape:
     outputs: bool = True  # else the last state alone
 
 
-def scan_work(kernel: str, shape: Shape, multiprocessors: int) -> Work | None:
-    """The work of one of the scan's kernels; None for one whose time does not matter."""
-    tuning = choose(shape.batch, shape.length, shape.channels, shape.states, 1, multiprocessors)
+def scan_work(kernel: str, shape: Shape, tuning: Tuning) -> Work | None:
+    """The work of one of the scan's kernels; None for one whose time does not matter.
+
+    In segments ``scan_forward`` is the walk that gives a segment's last state, as
+    ``summarise_backward`` is of the gradient; the last segment needs none.
+    """
+    if kernel not in ("scan_forward", "summarise_backward", "scan_backward"):
+        return None
     back = kernel != "scan_forward"
     per_thread = (tuning.back_channels, tuning.back_states)
     segments = tuning.back_segments
@@ -87,18 +125,9 @@ def scan_work(kernel: str, shape: Shape, multiprocessors: int) -> Work | None:
     f = block_shape(tuning.block, *per_thread, shape.states)
     tokens = -(-shape.length // MARK // segments) * MARK
     parts = -(-shape.channels // f.span)
-    turns = {
-        "scan_forward": _forward_turns,
-        "summarise_backward": _summary_turns,
-        "scan_backward": _backward_turns,
-    }.get(kernel)
-    if turns is None:
-        return None
-    summary = kernel == "summarise_backward"
+    summary = kernel != "scan_backward" and segments > 1
     return Work(
-        blocks=shape.batch * parts * -(-shape.length // tokens),
-        warps=tuning.block // LANES,
-        turns=turns(f, tokens),
+        blocks=shape.batch * parts * (-(-shape.length // tokens) - summary),
         elements=tokens * f.span * shape.states,
         traffic=_traffic(shape, back, summary, parts),
     )
@@ -108,7 +137,7 @@ def _traffic(shape: Shape, back: bool, summary: bool, parts: int) -> float:
     """u, delta, z, out or dout, and the gradients; B and C; saved states; sums for dB and dC."""
     tensors = 2 if not shape.outputs else 4
     if summary:
-        tensors = 3 if shape.outputs else 1
+        tensors = (3 if shape.outputs else 1) if back else 2
     elif back:
         tensors = 7 if shape.outputs else 4
     of_channel = tensors * shape.bytes + (0 if summary else 4 * shape.states / MARK)
@@ -117,81 +146,25 @@ def _traffic(shape: Shape, back: bool, summary: bool, parts: int) -> float:
     return shape.batch * shape.length * (shape.channels * of_channel + of_token)
 
 
-def _walked(f: BlockShape, turns: tuple[Turns, ...]) -> tuple[Turns, ...]:
-    return ((f.walks, turns),) if f.walks > 1 else turns
+def per_element(counts: Mapping[str, float], work: Work) -> dict[str, float]:
+    """Counts of a launch, of warps, as those of a thread for one (batch, token, channel, state)."""
+    scale = LANES / (work.blocks * work.elements)
+    found = {kind: number * scale for kind, number in sorted(counts.items())}
+    return {"all": every(found)} | found
 
 
-def _forward_turns(f: BlockShape, tokens: int) -> tuple[Turns, ...]:
-    tile = forward.tile_tokens(f)
-    return ((tokens // tile, _walked(f, ((tile // UNROLL, ()),))),)
+def estimate(device: Device, work: Work, each: Mapping[str, float]) -> dict[str, float | str]:
+    """The least time of a launch, milliseconds, by what sets it; "ms" and "limit" are the largest.
 
+    The multiprocessor with the most blocks sets it, but for "dram", which is the whole device's.
 
-def _summary_turns(f: BlockShape, tokens: int) -> tuple[Turns, ...]:
-    return ((tokens // 16, _walked(f, ((16 // UNROLL, ()),))),)
-
-
-def _backward_turns(f: BlockShape, tokens: int) -> tuple[Turns, ...]:
-    mark, tile = backward.MARK_TILE, backward.TILE
-    walked = (MARK - SUB) / MARK * (mark / SUB)  # the last few tokens need no mark after them
-    marks = (MARK // mark, _walked(f, ((walked, ()),)))
-    back = (MARK // tile, _walked(f, ((tile // SUB, ()),)))
-    return ((tokens // MARK, (marks, back)),)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """The least time of a launch, milliseconds, and what sets it.
-
-    Attributes:
-        issue: 4 instructions of a warp start per cycle.
-        special: exponentials and reciprocals, 16 per cycle.
-        float32: additions, products and moves by the float unit.
-        integer: the other arithmetic, 64 per cycle.
-        memory: words through the load and store unit, 32 per cycle; those that several threads
-            read together are counted for each, so this is more than it takes.
-        dram: device memory.
+    Args:
+        device: that it runs on.
+        work: of the launch.
+        each: of ``per_element``.
     """
-
-    issue: float
-    special: float
-    float32: float
-    integer: float
-    memory: float
-    dram: float
-
-    @property
-    def ms(self) -> float:
-        """The largest, ``memory`` left out, as it is a bound from above."""
-        return max(self.issue, self.special, self.float32, self.integer, self.dram)
-
-    @property
-    def limit(self) -> str:
-        """The name of the largest."""
-        return next(name for name, value in vars(self).items() if value == self.ms)
-
-
-def estimate(device: Device, work: Work, executed: Mapping[str, float]) -> Estimate:
-    """The least time of a launch from what each warp of it executes.
-
-    The multiprocessor with the most blocks sets it.
-    """
-    counts = defaultdict(float, executed)
-    warps = -(-work.blocks // device.multiprocessors) * work.warps
-    milliseconds = 1e3 * warps / device.clock
-    every = sum(executed.values()) - counts["passes"]
-    moves = counts["multiply"] * LANES / INTEGER
-    return Estimate(
-        issue=every / SCHEDULERS * milliseconds,
-        special=counts["special"] * LANES / SPECIAL * milliseconds,
-        float32=(counts["float"] * LANES / device.float_lanes + moves) * milliseconds,
-        integer=(counts["integer"] + counts["convert"]) * LANES / INTEGER * milliseconds,
-        memory=counts["passes"] * LANES / MEMORY * milliseconds,
-        dram=1e3 * work.traffic / device.bandwidth,
-    )
-
-
-def per_element(work: Work, executed: Mapping[str, float]) -> dict[str, float]:
-    """Instructions of a thread, by kind and "all", for one (batch, token, channel, state)."""
-    scale = work.warps * LANES / work.elements
-    found = {kind: number * scale for kind, number in executed.items() if kind != "passes"}
-    return {"all": sum(found.values())} | dict(sorted(found.items()))
+    warps = -(-work.blocks // device.multiprocessors) * work.elements / LANES
+    counts = {kind: number * warps for kind, number in each.items() if kind != "all"}
+    found = {k: 1e3 * x / device.clock for k, x in cycles(device, counts).items()}
+    found["dram"] = 1e3 * work.traffic / device.bandwidth
+    return found | {"ms": max(found.values()), "limit": limit(found)}

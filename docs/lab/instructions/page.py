@@ -40,17 +40,20 @@ def loops(document: dict) -> list[str]:
 
 
 _ESTIMATES = """
-**Estimates from counts, not measurements.** Each loop turns as often as the shape says, conditions
-are all taken to hold, and every unit works in every cycle; the busiest sets the time, on the
-multiprocessor with the most blocks. Stalls, barriers, bank conflicts and misses are not in it: a
-real time is longer. The shape has {length} tokens and {channels} channels, and 16 sequences, or
-one where it says "in segments". Milliseconds; **memory** is a bound from above, as words that
-threads share count for each of them, and does not set the time. **per element** are instructions of
-a thread for one (batch, token, channel, state).
+**Estimates from counts, not measurements.** The instructions of each loop in the disassembly, times
+how often that loop turned when the kernel's PTX was executed ({tokens} tokens, {width} channels;
+two segments where the case says "in segments"): ptxas keeps PTX's loops, so its numbers of
+instructions and exact turns go together (what a branch skips counts in part, as in PTX on average).
+Every unit works in every cycle; the busiest sets the time, on the multiprocessor with the most
+blocks. Stalls, barriers and misses are not in it: a real time is longer. The shape has {length}
+tokens and {channels} channels, and 16 sequences, or one where it says "in segments"; there
+`scan_forward` is the walk that gives each segment's last state. Milliseconds. **L1** is the cache
+and shared memory together, 128 bytes per cycle; lanes that read the same word share it. **per
+element** are instructions of a thread for one (batch, token, channel, state).
 
 {devices}
 """
-_LIMITS = ("issue", "special", "float32", "integer", "dram", "memory")
+_LIMITS = ("issue", "special", "float32", "integer", "L1", "dram")
 
 
 def estimates(document: dict) -> list[str]:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
+import torch
+from ptx.launch import programs
+
+from gamba_warp.kernels.bench.cases.scan_problem import make_inputs
 from gamba_warp.kernels.bench.static.cubin import read_cubin
 from gamba_warp.kernels.bench.static.dry_run import MULTIPROCESSORS
 from gamba_warp.kernels.bench.static.report import (
@@ -18,8 +23,12 @@ from gamba_warp.kernels.bench.static.report import (
     static_report,
     symbol_of,
 )
+from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
+from gamba_warp.kernels.selective_scan.cuda import launch
+from gamba_warp.kernels.selective_scan.cuda.launch import Tuning, choose
 
-from .estimate import DEVICES, Shape, estimate, per_element, scan_work
+from .counting import Executed, count
+from .estimate import ASKED, DEVICES, Shape, estimate, per_element, scan_work
 from .sass import counts, disassemble, executed, find_nvdisasm, innermost, parse
 
 # The shapes of the scan's cases, for the estimates.
@@ -30,9 +39,46 @@ SHAPES = {
     for name, o in SCANS.items()
     for batch, text in ((16, ""), (1, ", in segments"))
 }
+# What is executed of them: whole chunks, two blocks of channels; one segment, or two for several.
+TOKENS, WIDTH, SEGMENTS = 1024, 128, 2
 
 
-def count_instructions(entry: Entry, tool: Path) -> dict[int, dict]:
+def tuning_of(shape: Shape) -> Tuning:
+    """The kernels that a shape runs on."""
+    return choose(shape.batch, shape.length, shape.channels, shape.states, 1, MULTIPROCESSORS)
+
+
+def count_scan(case: str) -> tuple[dict[str, dict[str, Executed]], Shape, Tuning]:
+    """What a scan of ``SHAPES`` executes, cut to ``TOKENS`` and ``WIDTH``, and on which kernels."""
+    options = SCANS[case.removesuffix(", in segments")]
+    shape = replace(SHAPES[case], batch=1, length=TOKENS, channels=WIDTH)
+    tuning = tuning_of(SHAPES[case])
+    tuning = tuning._replace(
+        segments=min(tuning.segments, SEGMENTS), back_segments=min(tuning.back_segments, SEGMENTS)
+    )
+    inputs = make_inputs(1, TOKENS, WIDTH, shape.states)
+    inputs["initial_state"] = torch.zeros(1, WIDTH, shape.states)
+    for name in ("u", "delta", "z", "B", "C"):
+        inputs[name] = inputs[name].to(options["dtype"])
+    call = partial(selective_scan, return_last_state=True)
+    if not shape.outputs:
+        inputs = {k: x for k, x in inputs.items() if k not in ("C", "D", "z")}
+        call = selective_scan_state
+    inputs = {k: x.requires_grad_() for k, x in inputs.items()}
+    mode = {"delta_softplus": True, "discretization": options.get("mode", "mamba")}
+
+    def run():
+        found = call(**inputs, **mode)
+        return found if isinstance(found, tuple) else (found,)
+
+    before, launch.FORCED = launch.FORCED, tuning
+    try:
+        return count(run, inputs.values(), MULTIPROCESSORS), shape, tuning
+    finally:
+        launch.FORCED = before
+
+
+def count_instructions(entry: Entry, tool: Path, scans: dict) -> dict[int, dict]:
     """By architecture ``loop``, what the largest innermost loop holds, and the scan's estimate."""
     found = {}
     for arch, path in binaries(entry.launch).items():
@@ -41,14 +87,17 @@ def count_instructions(entry: Entry, tool: Path) -> dict[int, dict]:
         found[arch] = {"loop": dict(counts(code, innermost(code)))}
         if entry.op != "scan":
             continue
-        device, shape = DEVICES[arch], SHAPES[entry.case]
-        work = scan_work(entry.name, shape, MULTIPROCESSORS)
-        total = executed(code, work.turns) if work else None
-        if work is None or total is None:
+        counted, small, tuning = scans[entry.case]
+        work = scan_work(entry.name, small, tuning)
+        whole = scan_work(entry.name, SHAPES[entry.case], tuning_of(SHAPES[entry.case]))
+        if work is None or whole is None:
             continue
-        least = estimate(device, work, total)
-        found[arch]["per_element"] = per_element(work, total)
-        found[arch]["estimate"] = asdict(least) | {"ms": least.ms, "limit": least.limit}
+        of_module, _ = programs(entry.launch.kernel.module, entry.launch.block)
+        (ran,) = (x for name, x in counted[entry.direction].items() if name in of_module)
+        total = executed(code, ran.code, ran.times)
+        total.pop("passes")
+        each = per_element(total | {name: ran.counts[name] for name in ASKED}, work)
+        found[arch] |= {"per_element": each, "estimate": estimate(DEVICES[arch], whole, each)}
     return found
 
 
@@ -61,12 +110,16 @@ def report(say: Callable[[str], None] = lambda kernel: None) -> dict:
     """
     document = static_report(say)
     document["devices"] = {f"sm_{arch}": asdict(device) for arch, device in DEVICES.items()}
-    document["scan"] = {"length": LENGTH, "channels": CHANNELS}
+    document["scan"] = dict(length=LENGTH, channels=CHANNELS, tokens=TOKENS, width=WIDTH)
     tool = find_nvdisasm()
     if tool is None:
         return document
+    scans = {}
+    for case in SHAPES:
+        say(f"executed: scan, {case}")
+        scans[case] = count_scan(case)
     rows = iter(document["kernels"])
     for entry in find_kernels():
-        for found in count_instructions(entry, tool).values():
+        for found in count_instructions(entry, tool, scans).values():
             next(rows).update(found)
     return document

@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -208,38 +208,38 @@ def innermost(code: Sequence[Instruction]) -> frozenset[int]:
     return max(leaves(find_loops(code)), key=len, default=frozenset(range(len(code))))
 
 
-# How often a loop turns, and the same of the loops inside it.
-Turns = tuple[float, tuple["Turns", ...]]
+def executed(
+    code: Sequence[Instruction], ptx: Sequence[Instruction], times: Sequence[int]
+) -> dict[str, float]:
+    """How many instructions of each kind the warps execute.
 
-
-def executed(code: Sequence[Instruction], turns: Sequence[Turns]) -> dict[str, float] | None:
-    """How many instructions of each kind a warp executes, conditions all taken to hold.
+    ptxas keeps the loops of PTX. Each instruction of a loop is taken to be executed as often as
+    those of the same loop in PTX are on average, so branches that some warps skip count in part.
 
     Args:
         code: of the kernel.
-        turns: of its largest loops, in the order of their places; others count as one turn.
-
-    Returns:
-        None where the code has fewer loops than ``turns``.
+        ptx: its PTX. At each level the largest loops of both, in the order of their places, are
+            the same; the code of a loop that one of the two has more is that of what is around it.
+        times: by instruction of the PTX, how many warps executed it.
     """
-    total: dict[str, float] = dict(counts(code))
-    return total if _add(total, code, find_loops(code), turns, 1) else None
+    total: dict[str, float] = defaultdict(float)
+
+    def add(mine: Loop, theirs: Loop) -> None:
+        same = min(len(mine.inside), len(theirs.inside))
+        pairs = [*zip(_largest(mine.inside, same), _largest(theirs.inside, same))]
+        body = mine.body.difference(*(loop.body for loop, _ in pairs))
+        like = theirs.body.difference(*(loop.body for _, loop in pairs))
+        turns = sum(times[i] for i in like) / len(like)
+        for kind, number in counts(code, body).items():
+            total[kind] += number * turns
+        for pair in pairs:
+            add(*pair)
+
+    wholes = (Loop(0, frozenset(range(len(x))), find_loops(x)) for x in (code, ptx))
+    add(*wholes)
+    return dict(total)
 
 
-def _add(
-    total: dict[str, float],
-    code: Sequence[Instruction],
-    loops: Sequence[Loop],
-    turns: Sequence[Turns],
-    times: float,
-) -> bool:
-    """Adds what the loops' turns add to counting every instruction ``times``; False: too few."""
-    if len(loops) < len(turns):
-        return False
-    largest = sorted(loops, key=lambda loop: len(loop.body), reverse=True)[: len(turns)]
-    for loop, (count, inside) in zip(sorted(largest, key=lambda loop: loop.first), turns):
-        for kind, number in counts(code, loop.body).items():
-            total[kind] += number * times * (count - 1)
-        if not _add(total, code, loop.inside, inside, times * count):
-            return False
-    return True
+def _largest(loops: Sequence[Loop], count: int) -> list[Loop]:
+    chosen = sorted(loops, key=lambda loop: len(loop.body), reverse=True)[:count]
+    return sorted(chosen, key=lambda loop: loop.first)

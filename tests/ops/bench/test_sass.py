@@ -1,7 +1,6 @@
 """Counts from a disassembly, the loops in it, and the times estimated from them."""
 
 import json
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -11,11 +10,14 @@ from lab.instructions.estimate import (
     Device,
     Shape,
     Work,
+    cycles,
     estimate,
     per_element,
     scan_work,
 )
 from lab.instructions.page import markdown
+
+from gamba_warp.kernels.selective_scan.cuda.launch import Tuning
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "lab" / "benchmarks"
 
@@ -82,16 +84,29 @@ def test_loops_are_found(code):
     assert sass.innermost(code) == inner.body
 
 
-def test_turns_multiply(code):
+def test_turns_are_those_of_ptx(code):
+    """The same loops in PTX, of other instructions: what its loops turn, ours do."""
+
+    def ptx(*jumps):
+        found = [sass.Instruction("add", True, None) for _ in range(12)]
+        for at, target in jumps:
+            found[at] = sass.Instruction("BRA", False, target)
+        return found
+
     once = sass.counts(code)
-    total = sass.executed(code, [(10, ((4, ()),))])
+    nest = ptx((7, 3), (9, 1))
+    times = [1, 10, 10, 40, 40, 40, 40, 40, 10, 10, 1, 1]
+    total = sass.executed(code, nest, times)
     assert total["special"] == 40 and total["float"] == 80
     assert total["global"] == 10 and total["convert"] == 10
     assert total["uniform"] == once["uniform"] == 1
     assert total["passes"] == 10 * (1 + 4) + 40 * 2 + 1
-    assert sass.executed(code, [(1, ((1, ()),))]) == once
-    assert sass.executed(code, [(2, ()), (3, ())]) is None  # there is one outer loop
-    assert sass.executed(code, [(2, ((3, ((4, ()),)),))]) is None
+    assert sass.executed(code, nest, [1] * 12) == once
+    half = [1, 10, 10, 40, 40, 20, 20, 40, 10, 10, 1, 1]  # a branch that half of the warps skip
+    assert sass.executed(code, nest, half)["special"] == 32
+    # a loop that only PTX has, before the others: its turns are of what is around the loops
+    more = sass.executed(code, ptx((0, 0), (7, 3), (9, 1)), [7, *times[1:]])
+    assert more["special"] == 40 and more["uniform"] == 3
 
 
 def test_a_self_jump_is_no_turn(code):
@@ -101,37 +116,44 @@ def test_a_self_jump_is_no_turn(code):
 
 def test_the_busiest_unit_sets_the_time():
     device = Device("a toy", 10, 1e9, 1e12, 128)
-    work = Work(blocks=11, warps=4, turns=(), elements=4 * 32 * 50, traffic=2e6)
-    counted = Counter({"float": 400, "special": 40, "integer": 100, "multiply": 20, "passes": 70})
-    found = estimate(device, work, counted)
+    work = Work(blocks=11, elements=4 * 32 * 50, traffic=2e6)
+    counted = {"float": 400, "special": 40, "integer": 100, "multiply": 20, "together": 70}
+    counted |= {"sectors": 80, "own": 40, "first": 16, "passes": 90, "bytes": 1000}
+    each = per_element({kind: 11 * 4 * number for kind, number in counted.items()}, work)
+    assert each["all"] == pytest.approx(560 / 50) and each["passes"] == pytest.approx(90 / 50)
+    found = estimate(device, work, each)
     warps = 2 * 4  # the eleventh block is a second one for somebody
-    assert found.issue == pytest.approx(1e3 * warps * 560 / 4 / 1e9)
-    assert found.special == pytest.approx(1e3 * warps * 40 * 2 / 1e9)
-    assert found.float32 == pytest.approx(1e3 * warps * (400 / 4 + 20 / 2) / 1e9)
-    assert found.integer == pytest.approx(1e3 * warps * 100 / 2 / 1e9)
-    assert found.memory == pytest.approx(1e3 * warps * 70 / 1e9)
-    assert found.dram == pytest.approx(2e-3)
-    assert (found.ms, found.limit) == (found.dram, "dram")
-    found = estimate(device, work, counted + Counter(float=100_000))
-    assert found.limit == "issue"
-    found = estimate(DEVICES[80], work, Counter(float=100_000))
-    assert found.limit == "float32"  # two cycles for a warp
-    assert per_element(work, counted)["all"] == pytest.approx(560 / 50)
+    assert found["issue"] == pytest.approx(1e3 * warps * 560 / 4 / 1e9)
+    assert found["special"] == pytest.approx(1e3 * warps * 40 * 2 / 1e9)
+    assert found["float32"] == pytest.approx(1e3 * warps * (400 / 4 + 20 / 2) / 1e9)
+    assert found["integer"] == pytest.approx(1e3 * warps * 100 / 2 / 1e9)
+    assert found["L1"] == pytest.approx(1e3 * warps * (70 + 120 / 4) / 1e9)
+    assert found["dram"] == pytest.approx(2e-3)
+    assert (found["ms"], found["limit"]) == (found["dram"], "dram")
+    many = each | {"float": 1e5, "all": 1e5}
+    assert estimate(device, work, many)["limit"] == "issue"
+    assert estimate(DEVICES[80], work, many)["limit"] == "float32"  # two cycles for a warp
+    # of a multiprocessor's share of the memory, 100 bytes per cycle
+    assert cycles(device, {"first": 50})["dram"] == pytest.approx(50 * 32 / 100)
 
 
 def test_the_work_of_the_scan():
     shape = Shape(16, 16961, 1024, 16, 2)
-    forward, back = (scan_work(k, shape, 132) for k in ("scan_forward", "scan_backward"))
+    forward, back = (scan_work(k, shape, Tuning()) for k in ("scan_forward", "scan_backward"))
     tokens = 266 * 64  # whole chunks
     for work in (forward, back):
-        assert (work.blocks, work.warps, work.elements) == (256, 4, tokens * 64 * 16)
+        assert (work.blocks, work.elements) == (256, tokens * 64 * 16)
     each = 16 * 16961 * 1024
     matrices = 16 * 16961 * 2 * 16
     assert forward.traffic == each * (4 * 2 + 1) + matrices * 2
     assert back.traffic == each * (7 * 2 + 1) + matrices * (2 + 4 * 16)
-    one = scan_work("summarise_backward", Shape(1, 16961, 1024, 16, 2), 132)
-    assert one.blocks > 256 and one.elements < back.elements
-    assert scan_work("carry", shape, 132) is None
+    cut = Tuning(segments=7, back_segments=5)
+    one = scan_work("summarise_backward", Shape(1, 16961, 1024, 16, 2), cut)
+    assert (one.blocks, one.elements) == (16 * 4, 54 * 64 * 64 * 16), "the last needs no summary"
+    first = scan_work("scan_forward", Shape(1, 16961, 1024, 16, 2), cut)
+    assert (first.blocks, first.elements) == (16 * 6, 38 * 64 * 64 * 16)
+    assert first.traffic == 16961 * (1024 * 2 * 2 + 16 * 2)
+    assert scan_work("carry", shape, cut) is None
 
 
 def rows(kernel, case):

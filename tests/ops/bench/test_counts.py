@@ -1,0 +1,79 @@
+"""Counts of what the kernels execute: those that are kept are those of the kernels."""
+
+import json
+from pathlib import Path
+
+import pytest
+from lab.instructions import headline
+from lab.instructions.counting import count
+from ptx.machine import Missing, library
+
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "lab" / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def document():
+    return json.loads((DOCS / "counts.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def kernels(document):
+    return {(row["kernel"], row["case"], row["per"][:4]): row for row in document["kernels"]}
+
+
+def test_the_page_is_of_the_counts(document):
+    assert (DOCS / "counts.md").read_text() == headline.markdown(document)
+
+
+@pytest.mark.parametrize("case", [("conv", "bfloat16"), ("raster", "harmonics of degree 3")])
+def test_the_counts_are_of_these_kernels(document, case):
+    """Made again by ``make instructions``."""
+    try:
+        library()
+    except Missing as reason:
+        pytest.skip(str(reason))
+    if document["versions"] != headline.versions():
+        pytest.skip("another compiler made what was counted")
+    kept = [row for row in document["kernels"] if (row["op"], row["case"]) == case]
+    assert [*headline.rows_of(*case, set())] == kept
+
+
+def test_known_counts(kernels):
+    """What the sources say of exponentials, products and bytes."""
+    forward, back = (
+        kernels[k, "bfloat16", "(b, "]["each"] for k in ("scan_forward", "scan_backward")
+    )
+    # a state's decay; softplus and gate are of 16 states
+    assert forward["special"] == 1 + 4 / 16
+    # marks but before the last of 16 groups of tokens, and the walk; likewise
+    assert back["special"] == 1 + 15 / 16 + 8 / 16
+    # u, delta, z, out and 1/64 of the states, in sectors: a warp has 32 channels of 2 bytes
+    tensors = 4 * 2 / 32 + 16 * 4 / 64 / 32
+    assert tensors / 16 * 32 < forward["first"] < 1.25 * tensors / 16 * 32
+    conv = kernels["conv_forward", "float32", "(b, "]["each"]
+    # four taps and a bias, and SiLU's two
+    assert conv["float"] == 7 and conv["special"] == 2 and conv["first"] == pytest.approx(8, 0.01)
+    for row in kernels.values():
+        each = row["each"]
+        assert each["together"] <= each["passes"] and each["conflicts"] < each["passes"]
+        assert 0 < each["first"] <= each["sectors"] and 8 < row["lanes"] <= 32
+
+
+def test_bounds(kernels):
+    """A tenth above the counts when this was written."""
+    for kernel, case, per, kind, most in (
+        ("scan_forward", "bfloat16", "(b, ", "all", 12.1),
+        ("scan_backward", "bfloat16", "(b, ", "all", 36.0),
+        ("scan_backward", "bfloat16", "(b, ", "passes", 8.7),
+        ("conv_forward", "bfloat16", "(b, ", "all", 33.4),
+        ("conv_backward", "bfloat16", "(b, ", "all", 64.5),
+        ("composite", "whole tiles", "pair", "all", 164.0),
+        ("composite_vjp", "whole tiles", "pair", "all", 215.0),
+    ):
+        found = kernels[kernel, case, per]["each"][kind]
+        assert 0.5 * most < found <= most, (kernel, kind)
+
+
+def test_what_is_not_executed_is_not_counted():
+    found = count(lambda: [], (), 1)
+    assert found == {"forward": {}}
