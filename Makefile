@@ -8,7 +8,7 @@ LOCK := $(if $(LOCKED),constraints.txt)
 STAMP := $(VENV)/.ready$(if $(LOCKED),-locked)
 WHEEL := build/wheel-check
 
-.PHONY: setup demo test ptx hostile endurance bench study instructions docs lint format figures \
+.PHONY: setup demo test ptx debug hostile endurance bench study instructions docs lint format figures \
         architecture constraints clean
 
 setup: $(STAMP)
@@ -51,6 +51,14 @@ ptx: $(STAMP)
 		tests/ops/selective_scan tests/ops/rasterize tests/ptx/large.py
 	PYTHONPATH=tests $(BIN)/python -m ptx stress scan --minutes $(MINUTES) --out out/ptx-scan
 	PYTHONPATH=tests $(BIN)/python -m ptx stress raster --minutes $(MINUTES) --out out/ptx-raster
+
+# The operators' own tests in Warp's debug mode on the CPU: indices into Warp arrays are checked,
+# pointers in C++ are not (tests/ops/debug_mode.py). What an assertion says comes from C, past what
+# Python prints, and must not be lost with the process.
+debug: $(STAMP)
+	PYTHONPATH=tests $(BIN)/python -m pytest --capture=sys -p ops.debug_mode \
+		tests/ops/causal_conv1d tests/ops/rasterize tests/ops/runtime tests/ops/selective_scan \
+		tests/ops/ssim
 
 # Hostile files for every reader, or for READERS='shape or picture', as SEED draws them.
 MINUTES ?= 10

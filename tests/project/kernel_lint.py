@@ -10,7 +10,7 @@
   not fit: so a stride or a length is widened before it is multiplied, and so is, in C++, a factor
   of what is added to an array's ``data``. A product that is widened too late is refused; if it is
   the number of a row, it gets a name. Lengths that a struct holds, and pointers that were made
-  from ``data``, are not looked at.
+  from ``data``, are not looked at; ``make ptx`` runs the scan with strides near 2^31.
 - ``backward``: ``enable_backward=False``, for the kernel or the module.
 
 A kernel from ``native_kernel`` is C++ and two mappings, of inputs and of outputs: so these need no

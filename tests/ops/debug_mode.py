@@ -1,0 +1,15 @@
+"""For pytest, ``-p ops.debug_mode``: kernels are compiled in Warp's debug mode, on the CPU.
+
+It checks each index into a Warp array, vector or matrix; the first that is wrong ends the process,
+with the assertion, and with the launch in Python's stack. Pointers in C++ (``array.data``) have no
+bounds that it could check: so the CPU's own kernels are hardly watched, but those written in Warp
+are, of which a CPU runs many of CUDA's.
+"""
+
+import warp as wp
+
+wp.config.mode = "debug"
+# What a kernel checks at its end is found through a pointer that all threads share, if it lies on
+# their stacks; optimization removes that, which this mode has none of. None: only on AArch64, where
+# the pointer is in a register.
+wp.config.enable_tiles_in_stack_memory = None

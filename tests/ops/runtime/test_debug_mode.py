@@ -1,0 +1,29 @@
+"""Warp's debug mode, in which ``make debug`` runs the operators' tests."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+PROGRAM = """
+import ops.debug_mode, torch
+from gamba_warp.kernels.runtime.launch import cuda_launch
+from helpers.kernels import plain_kernel
+x, y = torch.zeros(2, 8)
+for room in (7, 6):
+    cuda_launch(plain_kernel, 7, [x[:7]], [y[:room]], device=x.device)
+    print("room for", room, flush=True)
+"""
+
+
+def test_a_write_past_the_end_of_an_array_ends_the_process():
+    tests = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env={**os.environ, "PYTHONPATH": str(tests)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.stdout.endswith("room for 7\n"), done.stdout + done.stderr
+    assert done.returncode < 0 and "i < arr.shape[0]" in done.stderr
