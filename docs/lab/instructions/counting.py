@@ -27,13 +27,6 @@ _NAME = re.compile(r"(?:\w+__locals__)?_?(\w+?)(?:_[0-9a-f]{8})+_cuda_kernel_for
 _DROPPED = ("move", "parameter")
 
 
-class _Every:
-    """The keys of all kernels."""
-
-    def __contains__(self, key: object) -> bool:
-        return True
-
-
 @dataclass(frozen=True)
 class Executed:
     """What all launches of a kernel executed.
@@ -110,7 +103,7 @@ def count(
     run: Callable[[], Sequence[Tensor]], wanted: Iterable[Tensor], multiprocessors: int
 ) -> dict[str, dict[str, Executed]]:
     """What a call executes on an imagined device: "forward", and "gradient" of what it returns."""
-    options = {"counting": True, "contract": _Every()}
+    options = {"counting": True, "contract": ".*"}
     with interpreted(multiprocessors, **options) as machine:
         outputs = [x for x in run() if x.requires_grad]
     found = {"forward": executed(machine)}
