@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -78,6 +81,7 @@ class Check(NamedTuple):
 def checks(quick: bool) -> Iterator[Check]:
     """Yields all checks, or a few of each kind if ``quick``."""
     few = 2 if quick else None
+    yield Check("operations of PTX, as the interpreter of the tests", _operations, cuda=True)
     for shape in SCANS[:few]:
         yield Check(f"scan {shape}", partial(_scan, shape, torch.float32))
     for shape in SCANS[: few and 1]:
@@ -99,6 +103,21 @@ def checks(quick: bool) -> Iterator[Check]:
     yield Check("rasterizer and a training step: no wait for the device", no_wait, cuda=True)
     yield Check("rasterizer and its gradients in a CUDA graph", raster_graph, cuda=True)
     yield Check("a whole training step in a CUDA graph", step_graph, cuda=True)
+
+
+def _operations(device: torch.device) -> str:
+    """Runs the comparison of tests/ptx, which the package does not have, in a checkout."""
+    tests = Path(__file__).parents[2] / "tests" / "ptx"
+    if not tests.is_dir() or importlib.util.find_spec("pytest") is None:
+        raise LeftOut("needs a checkout and pytest")
+    command = [sys.executable, "-m", "pytest", "-m", "gpu", str(tests)]
+    done = subprocess.run(command, cwd=tests.parents[1], capture_output=True, text=True)
+    last = "".join([*filter(None, done.stdout.splitlines())][-1:])
+    if done.returncode:
+        raise AssertionError(last)
+    if "passed" not in last:  # without a compiler it is skipped
+        raise LeftOut(last)
+    return "equal bit for bit, the approximate units within their bounds"
 
 
 def _problem(shape: tuple, device: torch.device) -> Operator:

@@ -176,9 +176,10 @@ inline f32 of_f16(u16 bits) {
     OP2(integer, name ".b16", u16, u16, u16, e) OP2(integer, name ".b32", u32, u32, u32, e) OP2(integer, name ".b64", u64, u64, u64, e) \
     OP2K(integer, name ".pred", kind, u32, u32, u32, e)
 #define COMPARE(name, e) \
-    OP2(integer, name ".s16", u32, s16, s16, e) OP2(integer, name ".u16", u32, u16, u16, e) OP2(integer, name ".b16", u32, u16, u16, e) \
-    OP2(integer, name ".s32", u32, s32, s32, e) OP2(integer, name ".u32", u32, u32, u32, e) OP2(integer, name ".b32", u32, u32, u32, e) \
-    OP2(integer, name ".s64", u32, s64, s64, e) OP2(integer, name ".u64", u32, u64, u64, e) OP2(integer, name ".b64", u32, u64, u64, e)
+    OP2(integer, name ".s16", u32, s16, s16, e) OP2(integer, name ".u16", u32, u16, u16, e) OP2(integer, name ".s32", u32, s32, s32, e) \
+    OP2(integer, name ".u32", u32, u32, u32, e) OP2(integer, name ".s64", u32, s64, s64, e) OP2(integer, name ".u64", u32, u64, u64, e)
+#define SAME(name, e) COMPARE(name, e) \
+    OP2(integer, name ".b16", u32, u16, u16, e) OP2(integer, name ".b32", u32, u32, u32, e) OP2(integer, name ".b64", u32, u64, u64, e)
 
 #define COMPUTING \
     MOVES("b16", u16) MOVES("u16", u16) MOVES("s16", u16) MOVES("b32", u32) MOVES("u32", u32) \
@@ -216,7 +217,7 @@ inline f32 of_f16(u16 bits) {
     OP2(integer, "shr.u32", u32, u32, u32, b > 31 ? 0 : a >> b) OP2(integer, "shr.b32", u32, u32, u32, b > 31 ? 0 : a >> b) \
     OP2(integer, "shr.u64", u64, u64, u32, b > 63 ? 0 : a >> b) OP2(integer, "shr.b64", u64, u64, u32, b > 63 ? 0 : a >> b) \
     OP2(integer, "shr.s32", s32, s32, u32, a >> (b > 31 ? 31 : b)) OP2(integer, "shr.s64", s64, s64, u32, a >> (b > 63 ? 63 : b)) \
-    COMPARE("setp.eq", a == b) COMPARE("setp.ne", a != b) COMPARE("setp.lt", a < b) \
+    SAME("setp.eq", a == b) SAME("setp.ne", a != b) COMPARE("setp.lt", a < b) \
     COMPARE("setp.le", a <= b) COMPARE("setp.gt", a > b) COMPARE("setp.ge", a >= b) \
     OP2(integer, "setp.eq.f32", u32, f32, f32, a == b) OP2(integer, "setp.ne.f32", u32, f32, f32, a < b || a > b) \
     OP2(integer, "setp.lt.f32", u32, f32, f32, a < b) OP2(integer, "setp.le.f32", u32, f32, f32, a <= b) \

@@ -1,7 +1,9 @@
 """The interpreter itself: what it computes, what it finds, what it refuses."""
 
+import ctypes
 import operator
 import re
+import subprocess
 from fractions import Fraction
 from unittest.mock import Mock
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.kernels import plain_kernel
+from lab.instructions.sass import find_nvdisasm
 
 from . import launch as launching
 from . import machine as machines
@@ -16,9 +19,9 @@ from .launch import Interpreter
 from .machine import Count, Missing, Refused, opcodes, units
 from .parse import SPACES, read
 
-HEAD = ".version 8.0\n.target sm_80\n.shared .align 16 .b8 mem[1024];\n"
+HEAD = ".version 8.0\n.target sm_80\n.address_size 64\n.shared .align 16 .b8 mem[1024];\n"
 ENTRY = """.visible .entry k(.param .u64 p) {{
-.reg .pred %p<9>; .reg .b32 %r<40>; .reg .b64 %rd<40>;
+.reg .pred %p<20>; .reg .b16 %h<20>; .reg .b32 %r<40>; .reg .b64 %rd<40>;
 ld.param.u64 %rd1, [p]; mov.u32 %r1, %tid.x; mov.u32 %r9, %ctaid.x; mov.u32 %r3, mem;
 mul.wide.u32 %rd3, %r1, 4; add.s64 %rd4, %rd1, %rd3; shl.b32 %r2, %r1, 2; add.s32 %r4, %r3, %r2;
 {}
@@ -300,22 +303,55 @@ APPROXIMATE = {  # the bound of the relative error, from the ISA's text or CUDA'
 }
 
 
+LOADED = {  # a register of each kind from the 64 bits of an operand, and 64 bits from it
+    "p": ("cvt.u32.u64 %r2{k}, %rd3{k}; setp.ne.u32 {x}, %r2{k}, 0;", "selp.u32 %r20, 1, 0, {x};"),
+    "h": ("cvt.u32.u64 %r2{k}, %rd3{k}; cvt.u16.u32 {x}, %r2{k};", "cvt.u32.u16 %r20, {x};"),
+    "r": ("cvt.u32.u64 {x}, %rd3{k};", "mov.u32 %r20, {x};"),
+    "rd": ("mov.u64 {x}, %rd3{k};", ""),
+}
+
+
+def registers_of(name):
+    """The kinds of registers that an operation takes, first that of its result."""
+
+    def kind(word):
+        return "p" if word == "pred" else {"16": "h", "64": "rd"}.get(word[-2:], "r")
+
+    first, *words = name.removesuffix(" of 64").split(".")
+    kinds = [kind(words[-1])] * len(opcodes()[name][1])
+    if first in ("setp", "cvt"):
+        kinds[0] = "p" if first == "setp" else kind(words[-2])
+    if name.endswith(" of 64"):
+        kinds[1] = "rd"
+    if first == "selp":
+        kinds[3] = "p"
+    if first in ("shl", "shr"):
+        kinds[2] = "r"
+    if words[0] == "wide":
+        kinds[::3] = ["rd"] * len(kinds[::3])
+    return kinds
+
+
+def body_of(name):
+    """A kernel's body, in which each thread computes an operation on its row of operands."""
+    kinds = registers_of(name)
+    used = [f"%{kind}1{k}" for k, kind in enumerate(kinds)]
+    loads = "".join(
+        f"ld.global.u64 %rd3{k}, [%rd6+{8 * k}]; {LOADED[kind][0].format(k=k, x=x)}\n"
+        for k, (kind, x) in enumerate(zip(kinds, used))
+        if k
+    )
+    result = used[0] if kinds[0] == "rd" else "%rd39"
+    widen = LOADED[kinds[0]][1].format(x=used[0]) + "cvt.u64.u32 %rd39, %r20;"
+    return f"""mad.lo.s32 %r5, %r9, 256, %r1; mul.wide.u32 %rd5, %r5, 32; add.s64 %rd6, %rd1, %rd5;
+    {loads} {name.removesuffix(" of 64")} {", ".join(used)}; {widen if result == "%rd39" else ""}
+    st.global.u64 [%rd6], {result};"""
+
+
 def computed(name, operands, **options):
     """The results, as bits, of an operation on rows of operands."""
-    _, widths, _ = opcodes()[name]
-    used = [f"%r{20 + k}" if width == "W" else f"%rd{20 + k}" for k, width in enumerate(widths)]
-    loads = "".join(
-        f"ld.global.u64 %rd{30 + k}, [%rd6+{8 * k}];"
-        + (f"cvt.u32.u64 {x}, %rd{30 + k};" if x[2] != "d" else f"mov.u64 {x}, %rd{30 + k};")
-        for k, x in enumerate(used[1:], 1)
-    )
-    result = "%rd39" if used[0][2] != "d" else used[0]
-    widen = f"cvt.u64.u32 {result}, {used[0]};" if result == "%rd39" else ""
-    body = f"""mad.lo.s32 %r5, %r9, 256, %r1; mul.wide.u32 %rd5, %r5, 32; add.s64 %rd6, %rd1, %rd5;
-    {loads} {name.removesuffix(" of 64")} {", ".join(used)}; {widen}
-    st.global.u64 [%rd6], {result};"""
     memory = torch.from_numpy(operands.copy())
-    made = run(body, memory, 256, len(operands) // 256, **options)
+    made = run(body_of(name), memory, 256, len(operands) // 256, **options)
     assert not made.findings, made.findings
     return memory.numpy()[:, 0].view(np.uint64)
 
@@ -343,11 +379,70 @@ def operands_of(name):
 @np.errstate(all="ignore")
 def test_operations():
     """Each that computes; what only contract.py writes has no name in PTX."""
-    others = re.compile(r"atom|vote|redux|.* \* ")
-    names = [name for name, (_, operands, _) in opcodes().items() if len(operands) > 1]
-    for name in names:
-        if name not in APPROXIMATE and not others.match(name):
+    for name in operations():
+        if name not in APPROXIMATE:
             check_operation(name)
+
+
+def operations():
+    others = re.compile(r"atom|vote|redux|.* \* ")
+    named = (name for name, (_, operands, _) in opcodes().items() if len(operands) > 1)
+    return [name for name in named if not others.match(name)]
+
+
+def test_operations_are_ptx(tmp_path):
+    """Assembled, as a GPU's driver does it: what is compared there is the ISA's, not only ours."""
+    found = find_nvdisasm()  # ptxas lies beside it
+    if not found or not found.with_name("ptxas").exists():
+        pytest.skip("no ptxas")
+    entries = (
+        ENTRY.replace(" k(", f" k{i}(").format(body_of(x)) for i, x in enumerate(operations())
+    )
+    path = tmp_path / "k.ptx"
+    path.write_text("\n".join([HEAD, *entries]))
+    command = [
+        found.with_name("ptxas"),
+        "--gpu-name=sm_90",
+        "-O0",
+        path,
+        "-o",
+        tmp_path / "k.cubin",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.gpu
+def test_operations_on_a_gpu():
+    """Bit for bit as the interpreter, but the approximate units, which stay within their bounds."""
+    driver = ctypes.CDLL("libcuda.so.1")
+
+    def do(name, *arguments):
+        code = getattr(driver, name)(*arguments)
+        assert code == 0, f"{name}: {code}"
+
+    differing = []
+    for name in operations():
+        rows = operands_of(name)
+        memory = torch.from_numpy(rows.copy()).cuda()
+        module, function = ctypes.c_void_p(), ctypes.c_void_p()
+        do("cuModuleLoadData", ctypes.byref(module), (HEAD + ENTRY.format(body_of(name))).encode())
+        do("cuModuleGetFunction", ctypes.byref(function), module, b"k")
+        address = ctypes.c_uint64(memory.data_ptr())
+        params = (ctypes.c_void_p * 1)(ctypes.addressof(address))
+        torch.cuda.synchronize()
+        do("cuLaunchKernel", function, len(rows) // 256, 1, 1, 256, 1, 1, 0, None, params, None)
+        torch.cuda.synchronize()
+        got, want = memory.cpu().numpy()[:, 0].view(np.uint64), computed(name, rows)
+        same = got == want
+        first, *words = name.split(".")
+        if words[-2 if first == "cvt" else -1] == "f32" and first != "setp":
+            x, y = (v.astype(np.uint32).view(np.float32) for v in (got, want))
+            same |= np.isnan(x) & np.isnan(y)
+            if name in APPROXIMATE:
+                same |= np.abs(x - y) <= (APPROXIMATE[name][1] + 2.0**-24) * np.abs(y)
+        differing += [(name, rows[i, 1:], hex(got[i]), hex(want[i])) for i in (~same).nonzero()[0]]
+    assert not differing, differing[:20]
 
 
 def check_operation(name):
