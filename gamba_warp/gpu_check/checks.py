@@ -111,7 +111,7 @@ def _operations(device: torch.device) -> str:
     if not tests.is_dir() or importlib.util.find_spec("pytest") is None:
         raise LeftOut("needs a checkout and pytest")
     command = [sys.executable, "-m", "pytest", "-m", "gpu", str(tests)]
-    done = subprocess.run(command, cwd=tests.parents[1], capture_output=True, text=True)
+    done = subprocess.run(command, cwd=tests.parents[1], capture_output=True, encoding="utf-8")
     last = "".join([*filter(None, done.stdout.splitlines())][-1:])
     if done.returncode:
         raise AssertionError(last)
