@@ -18,6 +18,7 @@ from ..project import Splats
 from ..skip import TILE_TEST
 from ..tiles import Bins, Grid, box_pairs, make_ellipse, q_limit, tile_columns, tile_rows
 from . import capacity
+from . import leaves as L
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,8 +77,8 @@ def _emit(
             # not one more than was counted: a compiler may round otherwise here than it did there
             last = wp.min(columns[1], columns[0] + end - p - 1)
             for tx in range(columns[0], last + 1):
-                tiles_out[p] = row + tx
-                gaussians_out[p] = i
+                L.store_int(tiles_out, p, row + tx)
+                L.store_int(gaussians_out, p, i)
                 p += 1
 
 

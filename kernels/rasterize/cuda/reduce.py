@@ -13,6 +13,7 @@ from ...runtime.launch import launch
 from ...runtime.views import Packed
 from ..project import Splats
 from ..tiles import Bins, Drawn
+from . import leaves as L
 from .backward import columns_of_moments, row_length
 
 wp.set_module_options({"enable_backward": False})
@@ -37,9 +38,12 @@ def _add_rows(
         end = j + wp.where(end != begin, 1, 0)
         begin = j
     total = wp.float32(0.0)
-    for p in range(begin, end):
-        total += v_pairs_in[p, column]
-    sums_out[j, column] = total
+    columns = wp.int64(v_pairs_in.shape[1])
+    row = wp.int64(begin) * columns
+    for _ in range(begin, end):
+        total += L.load(v_pairs_in, row, column)
+        row += columns
+    L.store(sums_out, wp.int64(j) * columns, column, total)
 
 
 @wp.func
