@@ -144,6 +144,8 @@ def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
 
     An expected depth needs the sum of the weights too, which is a channel of ones. ``alphas`` is
     that sum but for rounding: it is made as 1 - T, and where a pixel is faint, it has lost digits.
+    Depth and ones come first, so that CUDA has both in one chunk of channels: where depths are
+    equal their gradients cancel, and two rounded sums would leave a rest.
     """
     if render_mode == "RGB":
         return colors
@@ -153,7 +155,7 @@ def _channels(render_mode: str, colors: Tensor, depths: Tensor) -> Tensor:
     if "RGB" in render_mode:
         if colors.dim() == 3:
             colors = colors[:, None].expand(-1, depths.shape[1], -1, -1)
-        parts.insert(0, colors)
+        parts.append(colors)
     return torch.cat(parts, -1)
 
 
@@ -161,10 +163,10 @@ def _finish(render_mode: str, renders: Tensor, alphas: Tensor, backgrounds: Tens
     """Expected depth, and the background behind the colour channels."""
     depth = None
     if render_mode.endswith("ED"):
-        renders, depth, weight = renders.split([renders.shape[-1] - 2, 1, 1], -1)
+        depth, weight, renders = renders.split([1, 1, renders.shape[-1] - 2], -1)
         depth = depth / weight.clamp_min(_WEIGHT_EPS)
     elif render_mode != "RGB":
-        renders, depth = renders.split([renders.shape[-1] - 1, 1], -1)
+        depth, renders = renders.split([1, renders.shape[-1] - 1], -1)
     if backgrounds is not None and renders.shape[-1]:
         renders = renders + (1.0 - alphas) * backgrounds.flatten(0, 1)[:, None, None]
     return renders if depth is None else torch.cat([renders, depth], -1)

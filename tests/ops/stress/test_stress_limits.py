@@ -28,6 +28,14 @@ def test_cases_that_failed_once_pass(path):
     assert outcome.comparisons and outcome.failure() is None, outcome.failure()
 
 
+@pytest.mark.parametrize(
+    "path", [x for x in CORPUS if x.stem.startswith("raster")], ids=lambda path: path.stem
+)
+def test_cases_of_the_rasterizer_pass_on_cuda(from_ptx, path):
+    from_ptx()
+    test_cases_that_failed_once_pass(path)
+
+
 def spread_of(samples):
     """The rms of each sample's difference from the first."""
     return (samples[1:] - samples[0]).square().flatten(1).mean(1).sqrt()
