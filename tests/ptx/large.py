@@ -37,15 +37,29 @@ def on_both(function, inputs, cotangents):
         yield dict(enumerate(outs)) | dict(zip(mine, grads))
 
 
+def few(name, x):
+    """The first channels of a tensor of the scan; B and C have none."""
+    dim = {"B": None, "C": None, "A": 0, "initial_state": 1}.get(name, -1)
+    return x if dim is None else x.narrow(dim, 0, 8)
+
+
 def test_the_papers_scan():
     def scan(**x):
         return [selective_scan(**x, delta_softplus=True)]
 
+    def exact(**x):
+        return scans.oracle(**x, delta_softplus=True)[:1]
+
     inputs = scans.make(1, 16_961, 1024, 16, dtype=torch.bfloat16)
-    got, want = on_both(scan, inputs, [torch.randn_like(inputs["u"])])
+    cotangents = [torch.randn_like(inputs["u"])]
+    # what approximate units may add takes float64 long, and is asked of a few channels
+    of_few = {k: few(k, x) for k, x in inputs.items()}
+    more = scans.device_errors(exact, of_few, [few("u", cotangents[0]).double()], names=(0,))
+    got, want = on_both(scan, inputs, cotangents)
     for name, x in got.items():
         limit = scans.GRADIENT if x.dtype == torch.float32 else HALF
-        assert_rel_rms(x, want[name], limit, str(name))
+        pair = [few(name, y) if more[name] else y for y in (x, want[name])]
+        assert_rel_rms(*pair, limit + more[name], str(name))
 
 
 def test_the_papers_picture():
