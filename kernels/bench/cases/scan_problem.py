@@ -18,7 +18,8 @@ from ..core.problem import Operator
 # The relative rms errors to float64 that are allowed. Those of half precision are explained by the
 # rounding of inputs and output.
 LIMITS = {"forward": 1e-6, BOTH: 1e-5}
-CUDA_LIMIT = 1e-5  # of both directions: ex2.approx is off by 2^-22 at every token
+# With what ex2.approx may add at 16,961 tokens (CUDA.md): 1.9e-6 of the output, 3.3e-5 of dA.
+CUDA_LIMITS = {"forward": 3e-6, BOTH: 4.5e-5}
 HALF_LIMITS = {torch.bfloat16: 3e-2, torch.float16: 5e-3}
 # Tokens, channels, and tokens that the oracle looks at.
 SIZES = {"quick": (1024, 256, 128), "normal": (16961, 1024, 2048), "full": (16961, 1024, 16961)}
@@ -115,7 +116,7 @@ def scan_problem(
     function = partial(selective_scan, delta_softplus=softplus)
     if initial_state is not None:
         function = partial(function, initial_state=initial_state.to(device))
-    limit = dict.fromkeys(LIMITS, CUDA_LIMIT) if device.type == "cuda" else LIMITS
+    limits = CUDA_LIMITS if device.type == "cuda" else LIMITS
     part = f", first {tokens} of {length} tokens" if tokens < length else ""
     per_channel = dict.fromkeys(("u", "delta", "z", "out"), (*first, chosen))
     return Operator(
@@ -126,7 +127,7 @@ def scan_problem(
         device,
         f"float64 loop, {len(chosen)} of {width} channels{part}",
         {"B": batch, "L": length, "D": width, "N": inputs["A"].shape[1]},
-        limit,
+        limits,
         HALF_LIMITS,
         cast=("u", "delta", "z", "B", "C", "out"),
         corner=per_channel
