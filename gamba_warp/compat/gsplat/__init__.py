@@ -5,6 +5,7 @@ The strategies and the writers of files are gsplat's own and load it when they a
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 from ..absent import complete
@@ -27,7 +28,7 @@ __all__ = [
 ]
 
 _OF_STRATEGY = ("DefaultStrategy", "MCMCStrategy", "Strategy")
-_OF_GSPLAT = ("PngCompression", "export_splats")
+_OF_GSPLAT = {"PngCompression": "gsplat.compression", "export_splats": "gsplat.exporter"}
 # Names of gsplat 1.5.3, in the first place those of later versions behind them.
 ABSENT = complete(
     __name__,
@@ -87,7 +88,5 @@ def __getattr__(name: str) -> Any:
 
         return getattr(strategy, name)
     if name in _OF_GSPLAT:
-        import gsplat
-
-        return getattr(gsplat, name)
+        return getattr(importlib.import_module(_OF_GSPLAT[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,28 @@
+"""``python -m gamba_warp.compat SCRIPT …`` or ``-m MODULE …``: a program over our kernels."""
+
+import runpy
+import sys
+from pathlib import Path
+
+from . import take_names
+
+
+def main(arguments: list[str]) -> None:
+    """Runs a program after the names are taken, as ``python`` itself would."""
+    if arguments[:1] == ["-m"] and len(arguments) > 1:
+        sys.argv = arguments[1:]
+        take_names()
+        sys.path[0] = ""
+        runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+    elif arguments and Path(arguments[0]).is_file():
+        sys.argv = arguments
+        take_names()
+        sys.path[0] = str(Path(arguments[0]).resolve().parent)
+        runpy.run_path(arguments[0], run_name="__main__")
+    else:
+        named = f": there is no file {arguments[0]!r}" if arguments else ""
+        sys.exit(f"python -m gamba_warp.compat SCRIPT … or -m MODULE …{named}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

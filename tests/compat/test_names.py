@@ -1,0 +1,88 @@
+"""Programs that import mamba_ssm, causal_conv1d and gsplat by their own names get ours."""
+
+import importlib.util
+import subprocess
+import sys
+
+from gamba_warp.compat import take_names
+
+PROGRAM = """
+import importlib.metadata, importlib.util, sys
+import causal_conv1d, gsplat, mamba_ssm
+import gsplat.cuda._wrapper as wrapper
+from causal_conv1d.causal_conv1d_interface import causal_conv1d_fn
+from gsplat.rendering import rasterization
+from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
+from mamba_ssm.ops.triton.selective_state_update import selective_state_update
+
+print(*sys.argv, __name__)
+assert importlib.util.find_spec("mamba_ssm") and importlib.util.find_spec("gsplat.rendering")
+print(*map(importlib.metadata.version, ("mamba-ssm", "causal_conv1d", "gsplat")))
+assert selective_scan_fn is mamba_ssm.selective_scan_fn
+assert causal_conv1d_fn is causal_conv1d.causal_conv1d_fn
+assert rasterization is gsplat.rasterization
+assert wrapper.isect_tiles is gsplat.isect_tiles
+ours = selective_scan_fn, selective_state_update, causal_conv1d_fn, rasterization
+assert all(x.__module__.startswith("gamba_warp.") for x in ours)
+try:
+    mamba_ssm.Mamba2()
+except NotImplementedError as error:
+    print(error)
+"""
+# gsplat's own, where it is installed, over what takes its place.
+OF_GSPLAT = """
+import gsplat.strategy.ops as ops
+from gsplat import MCMCStrategy, export_splats
+from gsplat.compression import PngCompression
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+
+assert MCMCStrategy.__mro__[1].__module__ == "gsplat.strategy.mcmc"
+assert PngCompression is gsplat.PngCompression
+ours = ops.compute_relocation, ops.quat_scale_to_covar_preci
+assert all(x.__module__ == "gamba_warp.compat.gsplat.relocation" for x in ours)
+"""
+
+
+def run(*arguments, cwd=None):
+    """A new process: names are taken once in each."""
+    command = [sys.executable, "-m", "gamba_warp.compat", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd)
+
+
+def test_a_program_gets_our_interfaces_under_their_names(tmp_path):
+    path = tmp_path / "client.py"
+    path.write_text(PROGRAM + (OF_GSPLAT if importlib.util.find_spec("gsplat") else ""))
+    done = run(path, "--steps", 3)
+    assert not done.returncode, done.stderr
+    assert done.stdout.splitlines() == [
+        f"{path} --steps 3 __main__",
+        "2.3.2 1.7.0 1.5.3",
+        "mamba-ssm's Mamba2 is not here: only its Mamba-1 is",
+    ]
+    done = run("-m", "client", cwd=tmp_path)
+    assert not done.returncode and done.stdout.startswith(f"{path} __main__"), done.stderr
+
+
+def test_what_cannot_be_run_is_one_line(tmp_path):
+    done = run(tmp_path / "none.py")
+    assert done.returncode == 1 and not done.stdout
+    assert done.stderr.startswith("python -m gamba_warp.compat SCRIPT …")
+    assert done.stderr.count("\n") == 1 and "none.py" in done.stderr
+
+
+def test_names_are_refused(monkeypatch):
+    """An imported package is not replaced, and nothing is taken; nor is a name that is not here."""
+    monkeypatch.setitem(sys.modules, "causal_conv1d", object())
+    before = dict(sys.modules)
+    for names, kind, text in (
+        ((), ImportError, "causal_conv1d is imported already"),
+        (("mamba_ssm", "causal_conv1d"), ImportError, "causal_conv1d is imported already"),
+        (("flash_attn",), ValueError, "allowed: mamba_ssm, causal_conv1d, gsplat"),
+    ):
+        try:
+            take_names(*names)
+        except kind as error:
+            assert text in str(error)
+        else:
+            raise AssertionError(names)
+    assert sys.modules == before
