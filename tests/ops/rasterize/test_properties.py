@@ -176,7 +176,8 @@ def test_background_shows_through():
     got, _, _ = rasterization(**scene, backgrounds=backgrounds, render_mode="RGB+D")
     want = black + (1 - alphas) * backgrounds[:, :, None, None]
     assert (got[..., :3] - want).abs().max() < 1e-6
-    assert (got[..., 3:] - rasterization(**scene, render_mode="D")[0]).abs().max() == 0
+    # Depth in 4 channels is another kernel's, which may contract products with sums elsewhere.
+    assert (got[..., 3:] - rasterization(**scene, render_mode="D")[0]).abs().max() < 1e-6
 
 
 def test_repeatable_with_any_number_of_threads():
