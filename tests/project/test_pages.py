@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shlex
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -111,7 +112,8 @@ def test_commands_are_understood(block, parsed, capsys):
             for target in targets:
                 assert re.search(rf"^{target}:", MAKEFILE, re.MULTILINE), f"{block}: make {target}"
         elif words[0] == "python":
-            assert (ROOT / words[1]).is_file(), f"{block}: {words[1]}"
+            found = find_spec(words[2]) if words[1] == "-m" else (ROOT / words[1]).is_file()
+            assert found, f"{block}: {words}"
         else:
             assert words[0] in OTHERS, f"{block}: {words}"
 
