@@ -2,7 +2,7 @@
 // runs three tokens behind.
 #include "window.h"
 const auto douts = rows_(dout_in, b, 0, d, width), dxs = rows_(dx_out, b, 0, d, width);
-const auto dstates = rows_(dstate_out, b, 0, d, width);
+const auto dstates = rows_(dstate_out, own, 0, d, width);
 const F one = F{} + 1.0f;
 F g0 = F{}, g1 = F{}, g2 = F{}, sums[5] = {}, run[5] = {};
 auto complete = [&] {
@@ -10,7 +10,7 @@ auto complete = [&] {
 };
 for (int t = t0; t < end + 3; ++t) {
     F x3 = x2, g3 = F{};
-    if (t < length) {
+    if (t < stop) {
         x3 = read_(xs, t), g3 = read_(douts, t);
         if (use_silu) {
             const F y = fma_(w0, x0, fma_(w1, x1, fma_(w2, x2, fma_(w3, x3, bias))));
@@ -26,7 +26,7 @@ for (int t = t0; t < end + 3; ++t) {
     const F dx = fma_(w3, g0, fma_(w2, g1, fma_(w1, g2, w0 * g3)));
     if (t - 3 >= t0) {
         if (dx_out.shape[1] > 0) write_(dxs, t - 3, dx);
-    } else if (t < 3 && dstate_out.shape[1] > 0) write_(dstates, t, dx);
+    } else if (t - begin < 3 && dstate_out.shape[1] > 0) write_(dstates, t - begin, dx);
     x0 = x1, x1 = x2, x2 = x3;
     g0 = g1, g1 = g2, g2 = g3;
     if (RUN > 0 && (t - t0) % RUN == RUN - 1) complete();

@@ -5,6 +5,7 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
+from ..runtime.packed import sequences
 from ..runtime.views import tokens_first
 from .kernels import TAPS
 from .ops import conv
@@ -22,6 +23,8 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: Literal[False] = False,
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> Tensor: ...
 @overload
 def causal_conv1d(
@@ -32,6 +35,8 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: Literal[True],
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]: ...
 @overload
 def causal_conv1d(
@@ -42,6 +47,8 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: bool,
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]: ...
 def causal_conv1d(
     x: Tensor,
@@ -51,6 +58,8 @@ def causal_conv1d(
     activation: str | None = None,
     initial_state: Tensor | None = None,
     return_final_state: bool = False,
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Depthwise causal convolution along tokens, channels last (README, equation 1).
 
@@ -59,15 +68,20 @@ def causal_conv1d(
         weight: ``[D, W]`` float dtype, W from 2 to 4; the last tap meets the present token.
         bias: ``[D]`` float dtype, or None for 0.
         activation: None, "silu" or "swish" (the same).
-        initial_state: ``[B, W-1, D]`` in x's dtype, the tokens before the first; None for 0.
-        return_final_state: also return the last W-1 tokens, ``[B, W-1, D]``.
+        initial_state: ``[B, W-1, D]`` in x's dtype, the tokens before the first; None for 0. Of
+            packed rows ``[S, W-1, D]``, one for each sequence.
+        return_final_state: also return the last W-1 tokens, ``[B, W-1, D]`` or ``[S, W-1, D]``.
+        cu_seqlens: ``[S + 1]`` int32 or int64, where the S sequences of one packed row begin and
+            end; no token sees another sequence. None: each row is a sequence.
+        seq_idx: ``[B, L]`` likewise, in its place: a sequence is a run of equal numbers in a row.
 
     Returns:
         ``[B, L, D]`` in x's dtype, and the final state if asked for.
 
     Raises:
         TypeError: an argument is not a tensor or has another dtype.
-        ValueError: a shape, a device or ``activation`` is not one of the above.
+        ValueError: a shape, a device or ``activation`` is not one of the above, or
+            ``cu_seqlens`` or ``seq_idx`` is none (``runtime.packed.sequences``).
     """
     tensors = {"x": x, "weight": weight, "bias": bias, "initial_state": initial_state}
     for name, value in tensors.items():
@@ -81,7 +95,8 @@ def causal_conv1d(
             raise ValueError(f"{name} is on {value.device}, x is on {x.device}; cpu or cuda")
     if x.dim() != 3 or x.shape[2] == 0:
         raise ValueError(f"x has shape {tuple(x.shape)}, must be [B, L, D] with D >= 1")
-    batch, _, channels = x.shape
+    packed = sequences(x, cu_seqlens, seq_idx)
+    batch, channels = len(x if packed is None else packed), x.shape[2]
     if weight.dim() != 2 or weight.shape[0] != channels or not 2 <= weight.shape[1] <= TAPS:
         raise ValueError(f"weight has shape {tuple(weight.shape)}, must be ({channels}, 2 to 4)")
     if bias is not None and tuple(bias.shape) != (channels,):
@@ -93,21 +108,35 @@ def causal_conv1d(
         raise TypeError(f"initial_state has dtype {initial_state.dtype}, x has {x.dtype}")
     if activation not in ACTIVATIONS:
         raise ValueError(f"activation is {activation!r}, allowed: {ACTIVATIONS}")
-    out = conv(x, weight, bias, initial_state, activation is not None)
+    out = conv(x, weight, bias, initial_state, packed, activation is not None)
     if not return_final_state:
         return out
     history = weight.shape[1] - 1
     if initial_state is None:
-        initial_state = x.new_zeros(x.shape[0], history, x.shape[2])
+        initial_state = x.new_zeros(batch, history, channels)
+    if packed is not None:
+        return out, _last_tokens(x, initial_state, packed)
     recent = torch.cat([initial_state, x[:, max(0, x.shape[1] - history) :]], 1)
     return out, recent[:, recent.shape[1] - history :]
+
+
+def _last_tokens(x: Tensor, initial_state: Tensor, packed: Tensor) -> Tensor:
+    """The last tokens of each sequence, in front those before its first: ``[S, W-1, D]``."""
+    row, begin, end = packed.long().unbind(1)
+    history = initial_state.shape[1]
+    t = end[:, None] + torch.arange(-history, 0, device=x.device)
+    before = t - begin[:, None] + history  # of those that are tokens before the first
+    old = initial_state.gather(1, before.clamp(0, history - 1)[..., None].expand_as(initial_state))
+    if not x.shape[1]:
+        return old
+    return torch.where((t < begin[:, None])[..., None], old, x[row[:, None], t.clamp(min=0)])
 
 
 def causal_conv1d_fn(
     x: Tensor,
     weight: Tensor,
     bias: Tensor | None = None,
-    seq_idx: None = None,
+    seq_idx: Tensor | None = None,
     initial_states: Tensor | None = None,
     return_final_states: bool = False,
     final_states_out: Tensor | None = None,
@@ -119,8 +148,8 @@ def causal_conv1d_fn(
         x: ``[B, D, L]`` float32, bfloat16 or float16.
         weight: ``[D, W]``, W from 2 to 4.
         bias: ``[D]``, or None.
-        seq_idx: must be None.
-        initial_states: ``[B, D, W-1]``, or None.
+        seq_idx: ``[B, L]`` int32, the sequence of each token, or None; below 0 the output is 0.
+        initial_states: ``[B, D, W-1]``, or None; must be None beside ``seq_idx``.
         return_final_states: also return ``[B, D, W-1]``.
         final_states_out: where to write the final states, or None.
         activation: None, "silu" or "swish".
@@ -130,10 +159,10 @@ def causal_conv1d_fn(
 
     Raises:
         TypeError: as ``causal_conv1d``.
-        ValueError: as ``causal_conv1d``; also for a ``seq_idx``.
+        ValueError: as ``causal_conv1d``; also for states beside a ``seq_idx``.
     """
-    if seq_idx is not None:
-        raise ValueError("seq_idx is given; packed sequences are not supported")
+    if seq_idx is not None and (initial_states is not None or return_final_states):
+        raise ValueError("seq_idx is given beside states, which causal_conv1d with cu_seqlens has")
     out, final = causal_conv1d(
         tokens_first(x, "x"),
         weight,
@@ -141,8 +170,11 @@ def causal_conv1d_fn(
         activation=activation,
         initial_state=tokens_first(initial_states, "initial_states"),
         return_final_state=True,
+        seq_idx=seq_idx,
     )
     out, final = out.transpose(1, 2), final.transpose(1, 2)
+    if seq_idx is not None:
+        out = out.masked_fill((seq_idx < 0)[:, None], 0)
     if final_states_out is not None:
         with torch.no_grad():
             final_states_out.copy_(final)

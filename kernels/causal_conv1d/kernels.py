@@ -40,7 +40,13 @@ def _window(device_type: str, io: torch.dtype) -> dict[str, Any]:
     """What both kernels begin with."""
     value, rows = VALUES[device_type][0], wp.array3d(dtype=WARP_DTYPES[io])
     parameters = {"weight_in": wp.array2d(dtype=value), "bias_in": wp.array(dtype=value)}
-    return {"use_silu": int, "x_in": rows, **parameters, "state_in": rows}
+    return {
+        "use_silu": int,
+        "pieces_in": wp.array2d(dtype=wp.int32),  # ``runtime.packed.pieces``, or none
+        "x_in": rows,
+        **parameters,
+        "state_in": rows,
+    }
 
 
 @functools.cache

@@ -8,6 +8,7 @@ from torch import Tensor
 from ..runtime.lanes import streams
 from ..runtime.launch import launch
 from ..runtime.memory import empty
+from ..runtime.packed import count_slots, pieces
 from ..runtime.stand_in import kind_of
 from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
@@ -51,26 +52,42 @@ def _launch(x: Tensor, kernel, dim: tuple[int, int], inputs: list, outputs: list
     launch(kernel, dim, inputs, outputs, x.device, threads, block_dim=128)
 
 
+def _pieces(x: Tensor, rows: Tensor | None, tokens: int) -> tuple[int, Tensor]:
+    """How many pieces of so many tokens there are, and those of packed rows."""
+    batch, length, _ = x.shape
+    if rows is None:
+        return batch * -(-length // tokens), torch.empty(0, 5, dtype=torch.int32, device=x.device)
+    return count_slots(rows, batch, length, tokens), pieces(rows, batch, length, tokens)
+
+
 @without_compiler
 @torch.library.custom_op("gamba_warp::causal_conv1d", mutates_args=())
 def conv(
-    x: Tensor, weight: Tensor, bias: Tensor | None, state: Tensor | None, silu: bool
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    state: Tensor | None,
+    packed: Tensor | None,
+    silu: bool,
 ) -> Tensor:
-    """``causal_conv1d`` after its checks: ``x [B, L, D]`` to ``[B, L, D]``."""
-    strips = -(-x.shape[1] // STRIP)
+    """``causal_conv1d`` after its checks: ``x [B, L, D]`` to ``[B, L, D]``.
+
+    ``packed`` are the sequences (``runtime.packed``), or None.
+    """
+    strips, where = _pieces(x, packed, STRIP)
     x = lane_contiguous(x)
     blocks, w, v, rows = _operands(x, weight, bias, state)
     out = _empty(x, tuple(x.shape))
     kind = kind_of(x.device)
     kernel = forward_kernel(kind, x.dtype)
     stream = int(kind == "cpu" and streams([out]))
-    inputs = [int(silu), x, w, v, rows, stream]
-    _launch(x, kernel, (x.shape[0] * strips, blocks), inputs, [out])
+    inputs = [int(silu), where, x, w, v, rows, stream]
+    _launch(x, kernel, (strips, blocks), inputs, [out])
     return out
 
 
 @conv.register_fake
-def _(x, weight, bias, state, silu):
+def _(x, weight, bias, state, packed, silu):
     return torch.empty_like(x, memory_format=torch.contiguous_format)
 
 
@@ -82,27 +99,27 @@ def _conv_backward(
     weight: Tensor,
     bias: Tensor | None,
     state: Tensor | None,
+    packed: Tensor | None,
     silu: bool,
     needs: List[bool],
 ) -> List[Tensor]:
     need_x, need_weight, need_bias, need_state = needs
     batch, length, channels = x.shape
-    chunks = -(-length // CHUNK)
+    chunks, where = _pieces(x, packed, CHUNK)
     x = lane_contiguous(x)
     kind = kind_of(x.device)
     value, width = VALUES[kind]
     blocks, w, v, rows = _operands(x, weight, bias, state)
     dx = _empty(x, (batch, length if need_x else 0, channels))
-    dstate = x.new_zeros(batch, TAPS - 1 if need_state else 0, channels)
-    dweight = torch.empty(
-        batch * chunks, 5 if need_weight or need_bias else 0, blocks * width, device=x.device
-    )
+    dstate = x.new_zeros(len(rows), TAPS - 1 if need_state else 0, channels)
+    make = torch.empty if packed is None else torch.zeros  # a piece may have no token
+    dweight = make(chunks, 5 if need_weight or need_bias else 0, blocks * width, device=x.device)
     shaped = dweight.view(*dweight.shape[:2], blocks, width) if width > 1 else dweight
     _launch(
         x,
         backward_kernel(kind, x.dtype),
-        (batch * chunks, blocks),
-        [int(silu), x, w, v, rows, lane_contiguous(dout)],
+        (chunks, blocks),
+        [int(silu), where, x, w, v, rows, lane_contiguous(dout)],
         [dx, dstate, view(shaped, value)],
     )
     grads = [dx] if need_x else []
@@ -117,7 +134,7 @@ def _conv_backward(
 
 
 @_conv_backward.register_fake
-def _(dout, x, weight, bias, state, silu, needs):
+def _(dout, x, weight, bias, state, packed, silu, needs):
     return [
         torch.empty_like(a, memory_format=torch.contiguous_format)
         for a, needed in zip((x, weight, bias, state), needs)
@@ -126,14 +143,14 @@ def _(dout, x, weight, bias, state, silu, needs):
 
 
 def _setup_context(ctx, inputs, output):
-    x, weight, bias, state, ctx.silu = inputs
-    ctx.save_for_backward(x, weight, bias, state)
+    *tensors, ctx.silu = inputs
+    ctx.save_for_backward(*tensors)
 
 
 def _gradient(ctx, dout):
     needs = list(ctx.needs_input_grad[:4])
     grads = iter(_conv_backward(dout, *ctx.saved_tensors, ctx.silu, needs))
-    return (*(next(grads) if needed else None for needed in needs), None)
+    return (*(next(grads) if needed else None for needed in needs), None, None)
 
 
 def _no_second_gradient(ctx, *grads):

@@ -19,11 +19,16 @@ auto read_ = [](const auto& rows, int t) -> F { return (F)*rows.row(t); };
 auto write_ = [](const auto& rows, int t, F v) { *rows.row(t) = (ELEMENT)v; };
 auto put_ = [&](const auto& rows, int t, F v, bool) { write_(rows, t, v); };
 #endif
-const int pieces = (x_in.shape[1] + PIECE - 1) / PIECE, b = task / pieces;
-const int t0 = task % pieces * PIECE, length = x_in.shape[1];
-const int end = t0 + PIECE < length ? t0 + PIECE : length;
+const int pieces = (x_in.shape[1] + PIECE - 1) / PIECE;
+int b = 0, begin = 0, stop = x_in.shape[1], t0 = 0, own = 0;  // ``own``: the sequence
+if (pieces_in.shape[0] > 0) {
+    const int* const piece = (const int*)pieces_in.data + (size_t)task * 5;
+    b = piece[0], begin = piece[1], stop = piece[2], t0 = piece[3], own = piece[4];
+    if (own < 0) return;
+} else b = own = task / pieces, t0 = task % pieces * PIECE;
+const int end = t0 + PIECE < stop ? t0 + PIECE : stop;
 const int d = k * WIDTH, width = x_in.shape[2] - d < WIDTH ? x_in.shape[2] - d : WIDTH;
-const auto xs = rows_(x_in, b, 0, d, width), before = rows_(state_in, b, 0, d, width);
+const auto xs = rows_(x_in, b, 0, d, width), before = rows_(state_in, own, 0, d, width);
 const F* const w = (const F*)weight_in.data + k;
 const size_t taps = weight_in.shape[1];
 const F w0 = w[0], w1 = w[taps], w2 = w[2 * taps], w3 = w[3 * taps];
@@ -31,6 +36,6 @@ const F bias = ((const F*)bias_in.data)[k];
 F x0 = F{}, x1 = F{}, x2 = F{};  // the three tokens before
 for (int t = t0 - 3; t < t0; ++t) {
     x0 = x1, x1 = x2;
-    if (t >= 0) x2 = read_(xs, t);
-    else if (state_in.shape[1] > 0) x2 = read_(before, t + 3);
+    if (t >= begin) x2 = read_(xs, t);
+    else if (state_in.shape[1] > 0) x2 = read_(before, t - begin + 3);
 }

@@ -7,6 +7,7 @@ from typing import Literal, overload
 import torch
 from torch import Tensor
 
+from ..runtime.packed import sequences
 from ..runtime.views import tokens_first
 from . import ops
 from .problem import DISCRETIZATIONS, Scan
@@ -44,8 +45,10 @@ def _check_groups(name: str, x: Tensor, u: Tensor, states: int) -> Tensor:
     return x
 
 
-def _check_common(u, delta, A, delta_bias, initial_state, discretization) -> int:
-    """Checks what both functions take, except B and C; returns N."""
+def _check_common(
+    u, delta, A, delta_bias, initial_state, discretization, cu_seqlens, seq_idx
+) -> tuple[int, Tensor | None]:
+    """Checks what both functions take, except B and C; returns N and the packed sequences."""
     if not isinstance(u, Tensor):
         raise TypeError(f"u is {type(u).__name__}, must be a tensor")
     if u.dim() != 3 or u.shape[2] == 0:
@@ -63,10 +66,11 @@ def _check_common(u, delta, A, delta_bias, initial_state, discretization) -> int
     _check("delta", delta, tuple(u.shape), DTYPES, u.device)
     if delta_bias is not None:
         _check("delta_bias", delta_bias, (channels,), DTYPES, u.device)
+    packed = sequences(u, cu_seqlens, seq_idx)
     if initial_state is not None:
-        shape = (batch, channels, states)
+        shape = (batch if packed is None else len(packed), channels, states)
         _check("initial_state", initial_state, shape, (torch.float32,), u.device)
-    return states
+    return states, packed
 
 
 def _run(x: Scan) -> tuple[Tensor, Tensor]:
@@ -92,6 +96,8 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: Literal[False] = False,
     discretization: str = "mamba",
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> Tensor: ...
 @overload
 def selective_scan(
@@ -108,6 +114,8 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: Literal[True],
     discretization: str = "mamba",
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]: ...
 @overload
 def selective_scan(
@@ -124,6 +132,8 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: bool,
     discretization: str = "mamba",
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]: ...
 def selective_scan(
     u: Tensor,
@@ -139,6 +149,8 @@ def selective_scan(
     initial_state: Tensor | None = None,
     return_last_state: bool = False,
     discretization: str = "mamba",
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> Tensor | tuple[Tensor, Tensor]:
     """Mamba's selective scan, channels last (Gu and Dao 2023, algorithm 2; README for the maths).
 
@@ -156,19 +168,28 @@ def selective_scan(
         z: ``[B, L, D]`` in u's dtype, or None for no gate.
         delta_bias: ``[D]`` float dtype, or None for 0.
         delta_softplus: whether δ is a softplus.
-        initial_state: ``[B, D, N]`` float32, h before the first token; None for 0.
-        return_last_state: also return h after the last token.
+        initial_state: ``[B, D, N]`` float32, h before the first token; None for 0. Of packed
+            rows ``[S, D, N]``, one for each sequence.
+        return_last_state: also return h after the last token, of each sequence.
         discretization: "mamba" (f = e^x, g = 1), "zoh" (f = e^x, g = (e^x - 1) / x) or "bilinear"
             (f = (1 + x/2) / (1 - x/2), g = 1 / (1 - x/2)), with x = δA.
+        cu_seqlens: ``[S + 1]`` int32 or int64, where the S sequences of one packed row begin and
+            end: each starts from its own state, and no token sees another's. None: each row of the
+            batch is a sequence.
+        seq_idx: ``[B, L]`` likewise, in its place: a sequence is a run of equal numbers in a row.
 
     Returns:
-        ``out [B, L, D]`` in u's dtype; with ``return_last_state`` also ``[B, D, N]`` float32.
+        ``out [B, L, D]`` in u's dtype; with ``return_last_state`` also ``[B, D, N]`` float32, of
+        packed rows ``[S, D, N]``.
 
     Raises:
         TypeError: an argument is not a tensor or has another dtype.
-        ValueError: a shape, a device or ``discretization`` is not one of the above.
+        ValueError: a shape, a device or ``discretization`` is not one of the above, or
+            ``cu_seqlens`` or ``seq_idx`` is none (``runtime.packed.sequences``).
     """
-    states = _check_common(u, delta, A, delta_bias, initial_state, discretization)
+    states, packed = _check_common(
+        u, delta, A, delta_bias, initial_state, discretization, cu_seqlens, seq_idx
+    )
     B, C = _check_groups("B", B, u, states), _check_groups("C", C, u, states)
     if B.shape != C.shape:
         raise ValueError(f"C has {C.shape[2]} groups, B has {B.shape[2]}; they must be equal")
@@ -176,7 +197,7 @@ def selective_scan(
         _check("D", D, (u.shape[2],), DTYPES, u.device)
     if z is not None:
         _check("z", z, tuple(u.shape), (u.dtype,), u.device)
-    tensors = (u, delta, A, B, C, D, z, delta_bias, initial_state)
+    tensors = (u, delta, A, B, C, D, z, delta_bias, initial_state, packed)
     out, last = _run(Scan(*tensors, delta_softplus, discretization, False))
     return (out, last) if return_last_state else out
 
@@ -191,6 +212,8 @@ def selective_scan_state(
     *,
     initial_state: Tensor | None = None,
     discretization: str = "mamba",
+    cu_seqlens: Tensor | None = None,
+    seq_idx: Tensor | None = None,
 ) -> Tensor:
     """The state after the last token, where no output is needed: no C, D or gate is computed.
 
@@ -203,17 +226,21 @@ def selective_scan_state(
         delta_softplus: whether δ is a softplus.
         initial_state: h before the first token.
         discretization: as ``selective_scan``.
+        cu_seqlens: as ``selective_scan``.
+        seq_idx: as ``selective_scan``.
 
     Returns:
-        ``[B, D, N]`` float32, with gradients to every tensor.
+        ``[B, D, N]`` float32, of packed rows ``[S, D, N]``, with gradients to every tensor.
 
     Raises:
         TypeError: as ``selective_scan``.
         ValueError: as ``selective_scan``.
     """
-    states = _check_common(u, delta, A, delta_bias, initial_state, discretization)
+    states, packed = _check_common(
+        u, delta, A, delta_bias, initial_state, discretization, cu_seqlens, seq_idx
+    )
     B = _check_groups("B", B, u, states)
-    tensors = (u, delta, A, B, None, None, None, delta_bias, initial_state)  # no C, D and z
+    tensors = (u, delta, A, B, None, None, None, delta_bias, initial_state, packed)  # no C, D, z
     return _run(Scan(*tensors, delta_softplus, discretization, False))[1]
 
 

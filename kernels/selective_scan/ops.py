@@ -12,7 +12,8 @@ from .problem import Scan
 
 _SCAN = (
     "Tensor u, Tensor delta, Tensor A, Tensor B, Tensor? C, Tensor? D, Tensor? z, "
-    "Tensor? delta_bias, Tensor? initial_state, bool softplus, str discretization, bool save"
+    "Tensor? delta_bias, Tensor? initial_state, Tensor? packed, bool softplus, "
+    "str discretization, bool save"
 )
 
 
@@ -40,7 +41,7 @@ def scan(*args) -> tuple[Tensor, Tensor, Tensor]:
 def _(*args):
     x = Scan(*args)
     out = torch.empty_like(x.u, memory_format=torch.contiguous_format)
-    last = x.A.new_empty(x.u.shape[0], *x.A.shape)
+    last = x.A.new_empty(x.sequences, *x.A.shape)
     saved = x.A.new_empty(_implementation(x).saved_shape(x))
     return out if x.C is not None else out.new_empty(x.u.shape[0], 0, x.u.shape[2]), last, saved
 
@@ -60,7 +61,7 @@ def _scan_backward(dout, dlast, saved, needs, *args) -> list[Tensor]:
 @_scan_backward.register_fake
 def _(dout, dlast, saved, needs, *args):
     x = Scan(*args)
-    state = x.A.new_empty(x.u.shape[0], *x.A.shape)
+    state = x.A.new_empty(x.sequences, *x.A.shape)
     return [
         torch.empty_like(tensor, memory_format=torch.contiguous_format)
         for tensor, needed in zip((*x[:8], state), needs)
@@ -73,13 +74,13 @@ def _setup_context(ctx, inputs, output):
     _, _, saved = output
     ctx.mark_non_differentiable(saved)
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*x[:8], saved)
-    ctx.options = x[9:]
+    ctx.save_for_backward(*x[:8], x.packed, saved)
+    ctx.options = x[10:]
 
 
 def _gradient(ctx, dout, dlast, _):
-    *tensors, saved = ctx.saved_tensors
-    x = Scan._make((*tensors, None, *ctx.options))
+    *tensors, packed, saved = ctx.saved_tensors
+    x = Scan._make((*tensors, None, packed, *ctx.options))
     if not x.save:
         raise RuntimeError("selective_scan: this call kept nothing for a gradient")
     needs = list(ctx.needs_input_grad[:9])
@@ -88,7 +89,7 @@ def _gradient(ctx, dout, dlast, _):
     elif dout is None:
         dout = x.u.new_zeros(1, 1, x.u.shape[2]).expand_as(x.u)
     grads = iter(_scan_backward(dout, dlast, saved, needs, *x))
-    return (*(next(grads) if needed else None for needed in needs), None, None, None)
+    return (*(next(grads) if needed else None for needed in needs), *[None] * 4)
 
 
 def _no_second_gradient(ctx, *grads):

@@ -25,7 +25,8 @@ class Scan(NamedTuple):
         D: ``[D]``, or None.
         z: as u, or None.
         delta_bias: ``[D]``, or None.
-        initial_state: ``[B, D, N]``, or None.
+        initial_state: ``[B, D, N]``, or None; of packed rows ``[S, D, N]``.
+        packed: the sequences of packed rows (``runtime.packed``), or None.
         softplus: whether δ is a softplus.
         discretization: one of ``DISCRETIZATIONS``.
         save: whether the states are kept that a gradient starts from.
@@ -40,9 +41,15 @@ class Scan(NamedTuple):
     z: Tensor | None
     delta_bias: Tensor | None
     initial_state: Tensor | None
+    packed: Tensor | None
     softplus: bool
     discretization: str
     save: bool
+
+    @property
+    def sequences(self) -> int:
+        """How many there are: B, or S of packed rows."""
+        return len(self.u if self.packed is None else self.packed)
 
 
 class Discretization(NamedTuple):

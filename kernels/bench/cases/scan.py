@@ -31,6 +31,7 @@ def cases(settings: Settings) -> list[Case]:
         ("knobs", knobs, "error"),
         ("length", lengths, "L"),
         ("batch", batches, "B"),
+        ("packed", packed, None),
         ("states", states, "N"),
         ("threads", by_threads, "threads") if cpu else ("training batch", training_batch, None),
     ]
@@ -112,6 +113,24 @@ def batches(settings: Settings) -> list[Variant]:
     for batch in (1, 4) if quick else (1, 2, 4, 8):
         problem = make_problem(settings, batch=batch, length=length, channels=256)
         made += problem.pair(f"B {batch}")
+    return made
+
+
+def packed(settings: Settings) -> list[Variant]:
+    """Sequences of many lengths in one packed row beside one sequence as long. The oracle sees the
+    first of them.
+    """
+    length, width, _ = SIZES[settings.level]
+    first = length // 8
+    problem = scan_problem(make_inputs(1, length, width), settings.device, first)
+    made = problem.pair("one sequence", default=True)
+    for count in (8, 64):
+        g = torch.Generator().manual_seed(count)
+        cuts = first + torch.randperm(length - first, generator=g)[: count - 1].sort().values
+        cuts[0] = first
+        cuts = torch.tensor([0, *cuts.tolist(), length], dtype=torch.int32, device=settings.device)
+        cut = replace(problem, function=partial(problem.function, cu_seqlens=cuts))
+        made += cut.pair(f"{count} sequences")
     return made
 
 

@@ -6,8 +6,8 @@ each_(true, [&](const Place p) __attribute__((always_inline)) {
 #include "prepare.h"
 #include "states.h"
     F *const dh_of = row_(dh_out, p.state, p.k), *const da_of = row_(da_out, p.state, p.k);
-    const int chunk = p.t0 / TOKENS;
-    const F* const start = row_(starts_in, p.b, chunk, p.k);
+    const int chunk = p.chunk + (p.t0 - p.begin) / TOKENS;
+    const F* const start = row_(starts_in, chunk, p.k);
     write_soon_(du_out), write_soon_(ddelta_out), write_soon_(dz_out);
     F* const sums = row_(sums_out, task);  // [2, states, TOKENS]
     const bool first = p.j % BLOCKS == 0;
@@ -123,8 +123,8 @@ each_(true, [&](const Place p) __attribute__((always_inline)) {
         if (need_delta) put_(ddelta, t, d, stream);
         if (need_z) put_(dz, t, own.y * late[t].gate, stream);
     }
-    *row_(dchannel_out, p.b, chunk, 0, p.k) = dskip;
-    *row_(dchannel_out, p.b, chunk, 1, p.k) = dbias;
+    *row_(dchannel_out, chunk, 0, p.k) = dskip;
+    *row_(dchannel_out, chunk, 1, p.k) = dbias;
 #include "sum_lanes.h"
     if (p.j % BLOCKS == BLOCKS - 1 || p.j == p.blocks - 1) {
         const size_t part = p.part + p.j / BLOCKS, size = (size_t)states * sizes.length;

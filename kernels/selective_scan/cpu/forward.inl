@@ -6,8 +6,8 @@ each_(false, [&](const Place p) __attribute__((always_inline)) {
 #include "states.h"
     F* const h_of = row_(h_out, p.state, p.k);
     F* const product_of = OUTPUT ? nullptr : row_(product_out, p.state, p.k);
-    if (starts_out.shape[1] > 0 && p.t0 % CHUNK == 0) {
-        F* const start = row_(starts_out, p.b, p.t0 / CHUNK, p.k);
+    if (starts_out.shape[0] > 0 && (p.t0 - p.begin) % CHUNK == 0) {
+        F* const start = row_(starts_out, p.chunk + (p.t0 - p.begin) / CHUNK, p.k);
         for (int n = 0; n < states; ++n) start[n] = h_of[n];
     }
 

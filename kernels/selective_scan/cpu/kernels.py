@@ -88,7 +88,7 @@ class Sizes:
     length: int
     segment: int  # tokens of a segment, a multiple of the chunk
     segments: int
-    batch: int
+    batch: int  # sequences
     states: int
     groups: int
     group_width: int
@@ -112,7 +112,7 @@ def forward_kernel(kind: Kind, output: bool) -> Any:
     outputs = {
         "h_out": wp.array3d(dtype=lanes),
         "product_out": wp.array3d(dtype=lanes),
-        "starts_out": wp.array4d(dtype=lanes),
+        "starts_out": wp.array3d(dtype=lanes),
         "y_out": wp.array3d(dtype=WARP_DTYPES[kind.io]),
     }
     return native_kernel("scan_forward", kind.text("forward.inl", False, output), inputs, outputs)
@@ -138,7 +138,7 @@ def backward_kernel(kind: Kind) -> Any:
         **_channels(kind),
         "b_in": _MATRIX,
         "c_in": _MATRIX,
-        "starts_in": wp.array4d(dtype=lanes),
+        "starts_in": wp.array3d(dtype=lanes),
         "dout_in": rows,
     }
     outputs = {
@@ -150,7 +150,7 @@ def backward_kernel(kind: Kind) -> Any:
         "da_out": wp.array3d(dtype=lanes),
         "db_out": wp.array2d(dtype=wp.float32),
         "dc_out": wp.array2d(dtype=wp.float32),
-        "dchannel_out": wp.array4d(dtype=lanes),
+        "dchannel_out": wp.array3d(dtype=lanes),
     }
     return native_kernel("scan_backward", kind.text("backward.inl", True), inputs, outputs)
 
@@ -160,4 +160,11 @@ def _channels(kind: Kind) -> dict[str, Any]:
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     deltas = wp.array3d(dtype=WARP_DTYPES[kind.delta_io])
     channels = wp.array2d(dtype=lanes)
-    return {"sizes": Sizes, "u_in": rows, "delta_in": deltas, "z_in": rows, "channel_in": channels}
+    return {
+        "sizes": Sizes,
+        "rows_in": wp.array2d(dtype=wp.int32),  # of packed rows: b, begin, end, chunk; or none
+        "u_in": rows,
+        "delta_in": deltas,
+        "z_in": rows,
+        "channel_in": channels,
+    }

@@ -12,6 +12,7 @@ from torch import Tensor
 from ...runtime.lanes import W, lanes, streams
 from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
+from ...runtime.packed import count_slots, slots
 from ...runtime.views import filled, lane_contiguous, view
 from ..problem import DISCRETIZATIONS, Scan
 from . import kernels
@@ -24,37 +25,64 @@ SEGMENT = 4  # chunks of a segment at least
 class Layout:
     """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded.
 
-    A task is a segment of one batch element's tokens and a span of blocks of one group. The blocks
+    A task is a segment of one sequence's tokens and a span of blocks of one group. The blocks
     of a span are walked side by side, so that rows are read in long parts. Segments are for inputs
     with too few channels for torch's threads; finding their first states costs a second walk.
+    Packed sequences are each cut as they are alone, so that their bits are the same; those with
+    fewer segments than others have empty ones behind.
     """
 
-    def __init__(self, u: Tensor, A: Tensor, B: Tensor, most: int, chunk: int, split: bool = True):
+    def __init__(self, x: Scan, chunk: int, split: bool = True):
         """
         Args:
-            u: ``[B, L, D]``.
-            A: ``[D, N]``.
-            B: ``[B, L, G, N]``.
-            most: blocks of a span at most, a multiple of BLOCKS.
+            x: what is scanned.
             chunk: tokens; a state is saved at the start of each chunk.
             split: whether there may be several segments.
         """
-        self.batch, self.length, self.channels = u.shape
-        self.states, self.groups = A.shape[1], B.shape[2]
+        self.batch, self.length, self.channels = x.u.shape
+        self.states, self.groups = x.A.shape[1], x.B.shape[2]
+        self.sequences = x.sequences
         self.group_width = self.channels // self.groups
         self.group_blocks = -(-self.group_width // W)
         self.blocks = self.groups * self.group_blocks
-        self.chunks = -(-self.length // chunk)
         threads = torch.get_num_threads()
-        per_thread = max(1, min(self.group_blocks, -(-self.batch * self.blocks // threads)))
-        self.span = min(most, -(-per_thread // BLOCKS) * BLOCKS)
-        spans = self.batch * self.groups * -(-self.group_blocks // self.span)
-        self.segments = 1
-        if split and 0 < spans < threads:
-            self.segments = max(1, min(-(-threads // spans), self.length // (SEGMENT * chunk)))
-        self.segment = max(1, -(-self.chunks // self.segments)) * chunk
-        self.segments = max(1, -(-self.length // self.segment))
-        self.tasks = self.segments * spans
+
+        def spans(sequences: int) -> int:  # of all of them together; sets the blocks of a span
+            per_thread = max(1, min(self.group_blocks, -(-sequences * self.blocks // threads)))
+            self.span = min(SPAN, -(-per_thread // BLOCKS) * BLOCKS)
+            return sequences * self.groups * -(-self.group_blocks // self.span)
+
+        alone = spans(self.batch if x.packed is None else 1)
+        most = -(-threads // alone) if split and 0 < alone < threads else 1
+
+        def segment(length: Any) -> Any:  # its tokens, of a number or a tensor
+            count = -(-length // chunk)
+            if isinstance(length, Tensor):
+                cuts = (length // (SEGMENT * chunk)).clamp(1, most)
+                return (-(-count // cuts)).clamp(min=1) * chunk
+            return max(1, -(-count // max(1, min(most, length // (SEGMENT * chunk))))) * chunk
+
+        if x.packed is None:
+            self.segment = segment(self.length)
+            self.segments = max(1, -(-self.length // self.segment))
+            self.chunks = self.batch * -(-self.length // chunk)
+            self.rows, self.last = torch.empty(0, 4, dtype=torch.int32), -1
+        else:
+            self.chunks = count_slots(x.packed, self.batch, self.length, chunk)
+            self.segment = self.length
+            b, begin, end = x.packed.unbind(1)
+            own = segment(end - begin)
+            counts = (-(-(end - begin) // own)).clamp(min=1)
+            self.segments = int(counts.max()) if len(counts) else 1
+            step = torch.arange(self.segments, dtype=torch.int32)[:, None]
+            first = torch.minimum(begin + step * own, end)
+            place = slots(x.packed, self.length, chunk) + step * (own // chunk)
+            rows = b.expand_as(first), first, torch.minimum(first + own, end), place
+            self.rows = torch.stack(rows, 2).flatten(0, 1)
+            self.last = -1
+            if self.segments > 1:
+                self.last = counts.long() - 1, torch.arange(len(counts))
+        self.tasks = self.segments * spans(self.sequences)
         self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
 
     def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
@@ -82,10 +110,10 @@ class Layout:
         return x.reshape(*lead, self.channels, *tail).contiguous()
 
     def states_of(self, x: Tensor | None) -> Tensor:
-        """Packs states ``[B, D, N]``, or None for 0, to ``[B, blocks, N, W]``."""
+        """Packs states ``[S, D, N]``, or None for 0, to ``[S, blocks, N, W]``."""
         if x is None:
-            return torch.zeros(self.batch, self.blocks, self.states, W)
-        return self.pack(x, (self.batch,))
+            return torch.zeros(self.sequences, self.blocks, self.states, W)
+        return self.pack(x, (self.sequences,))
 
     def total(self, parts: Tensor) -> Tensor:
         """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
@@ -129,7 +157,7 @@ class _Operands:
     def __init__(self, x: Scan, split: bool = True):
         states = x.A.shape[1]
         tuning = TUNING._replace(walked=TUNING.walked or (2 if states <= FEW else 4))
-        self.layout = y = Layout(x.u, x.A, x.B, SPAN, tuning.chunk, split)
+        self.layout = y = Layout(x, tuning.chunk, split)
         self.kind = Kind(x.u.dtype, x.delta.dtype, x.discretization, tuning)
         self.options = int(x.softplus), int(x.z is not None)
         u, delta = lane_contiguous(x.u), lane_contiguous(x.delta)
@@ -137,7 +165,7 @@ class _Operands:
         skip, bias = (zero if v is None else v.float()[:, None] for v in (x.D, x.delta_bias))
         channel = torch.cat([x.A, x.A.abs().amax(1, keepdim=True), skip, bias], 1)
         z = u if x.z is None else lane_contiguous(x.z)
-        self.inputs = [u, delta, z, view(y.pack(channel), lanes)]
+        self.inputs = [y.rows, u, delta, z, view(y.pack(channel), lanes)]
         self.b = _entries(x.B)
         self.c = self.b if x.C is None else _entries(x.C)
 
@@ -147,20 +175,20 @@ class _Operands:
         stream = int(y.group_width % W == 0 and streams(results))
         sizes = filled(
             Sizes,
-            *(y.length, y.segment, y.segments, y.batch, y.states, y.groups, y.group_width),
+            *(y.length, y.segment, y.segments, y.sequences, y.states, y.groups, y.group_width),
             *(y.group_blocks, y.span, *self.options, needs, stream),
         )
         parallel_launch(kernel, y.tasks, [sizes, *self.inputs, *inputs], outputs)
 
     def states(self, fill: float = 0.0) -> Tensor:
         y = self.layout
-        return torch.full((y.segments, y.batch, y.blocks, y.states, W), fill)
+        return torch.full((y.segments, y.sequences, y.blocks, y.states, W), fill)
 
     def accumulate(self, h: Tensor, starts: Tensor) -> Tensor:
         """Brings the pairs ``h`` from before each segment to after it: the decays' products."""
         product = _pairs(self.states(1.0))
         kernel = kernels.forward_kernel(self.kind, output=False)
-        u = self.inputs[0]
+        u = self.inputs[1]
         outputs = [_flat(h), _flat(product), view(starts, lanes), u]
         self.run(kernel, [self.b, self.b], outputs)
         return _values(product)
@@ -168,8 +196,13 @@ class _Operands:
 
 def saved_shape(x: Scan) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    y = Layout(x.u, x.A, x.B, SPAN, TUNING.chunk)
-    return (y.batch, y.chunks if x.save else 0, y.blocks, y.states, W)
+    batch, length, channels = x.u.shape
+    groups, chunk = x.B.shape[2], TUNING.chunk
+    chunks = batch * -(-length // chunk)
+    if x.packed is not None:
+        chunks = count_slots(x.packed, batch, length, chunk)
+    blocks = groups * -(-(channels // groups) // W)
+    return (chunks if x.save else 0, blocks, x.A.shape[1], W)
 
 
 def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
@@ -186,12 +219,12 @@ def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
     h = y.states_of(x.initial_state)[None]
     if y.segments > 1:
         local = _pairs(s.states())
-        product = s.accumulate(local, starts[:, :0])
+        product = s.accumulate(local, starts[:0])
         local = _values(local)
         h = _carry(h[0], local, product)
         if not read:
-            last = torch.addcmul(local[-1:], product[-1:], h[-1:])
-            return out, y.unpack(last[-1], (y.batch,)), starts
+            last = torch.addcmul(local[y.last], product[y.last], h[y.last])
+            return out, y.unpack(last, (y.sequences,)), starts
     h = _pairs(h)
     if read:
         kernel = kernels.forward_kernel(s.kind, output=True)
@@ -199,7 +232,7 @@ def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
         s.run(kernel, [s.b, s.c], outputs, results=[out])
     else:
         s.accumulate(h, starts)
-    return out, y.unpack(_values(h)[-1], (y.batch,)), starts
+    return out, y.unpack(_values(h)[y.last], (y.sequences,)), starts
 
 
 def backward(
@@ -246,7 +279,8 @@ def backward(
     dh, da = _pairs(dh), s.states()
     du, ddelta, dz = like(x.u, need_u), like(x.delta, need_delta), like(x.u, need_z)
     db, dc = parts(need_B), parts(need_C)
-    dchannel = torch.empty(y.batch, y.chunks, 2, y.blocks, W)
+    make = torch.empty if x.packed is None else torch.zeros  # some have no chunk
+    dchannel = make(y.chunks, 2, y.blocks, W)
     sums = torch.empty(y.tasks, 2 * y.states * chunk if need_B or need_C else 0, W)
     s.run(
         kernels.backward_kernel(s.kind),
@@ -264,10 +298,10 @@ def backward(
         lambda: y.unpack(da.sum((0, 1))) / scale,
         lambda: y.total(db),
         lambda: y.total(dc),
-        lambda: y.unpack(dchannel[:, :, 0].sum((0, 1))),
+        lambda: y.unpack(dchannel[:, 0].sum(0)),
         lambda: dz,
-        lambda: y.unpack(dchannel[:, :, 1].sum((0, 1))),
-        lambda: y.unpack(_values(dh)[0], (y.batch,)),
+        lambda: y.unpack(dchannel[:, 1].sum(0)),
+        lambda: y.unpack(_values(dh)[0], (y.sequences,)),
     )
     tensors: tuple[Any, ...] = (*x[:8], x.A)
     dense = torch.contiguous_format

@@ -1,9 +1,10 @@
-// A task: a segment of the tokens of one batch element, and lane groups of one channel group.
+// A task: a segment of the tokens of one sequence, and lane groups of one channel group.
 // States, gradients of states and products of decays are pairs: N values, then for each what it has
-// rounded away (states.h). They are ordered by segment, then batch element.
+// rounded away (states.h). They are ordered by segment, then sequence.
 struct Place {
     int b, state, group;  // ``state``: row of the state arrays
     int begin, end;       // tokens
+    int chunk;            // row of what is kept of chunks, of the segment's first
     int first, blocks;    // first lane group, and how many
     int part;             // row of the partial sums of dB and dC
     // then of a lane group and TOKENS tokens, or fewer at the end
@@ -17,10 +18,16 @@ auto place_of = [&](int task) -> Place {
     const int row = task / spans / sizes.groups;
     Place p = {};
     p.first = task % spans * sizes.span, p.group = task / spans % sizes.groups;
-    p.b = row % sizes.batch, p.state = row;
+    p.state = row;
+    if (rows_in.shape[0] > 0) {
+        const int* const own = (const int*)rows_in.data + (size_t)row * 4;
+        p.b = own[0], p.begin = own[1], p.end = own[2], p.chunk = own[3];
+    } else {
+        p.b = row % sizes.batch, p.begin = row / sizes.batch * sizes.segment;
+        p.end = p.begin + sizes.segment < sizes.length ? p.begin + sizes.segment : sizes.length;
+        p.chunk = p.b * ((sizes.length + CHUNK - 1) / CHUNK) + p.begin / CHUNK;
+    }
     p.part = (p.b * sizes.groups + p.group) * parts + p.first / BLOCKS;
-    p.begin = row / sizes.batch * sizes.segment;
-    p.end = p.begin + sizes.segment < sizes.length ? p.begin + sizes.segment : sizes.length;
     const int left = sizes.group_blocks - p.first;
     p.blocks = sizes.span < left ? sizes.span : left;
     return p;

@@ -18,6 +18,7 @@ from ...runtime.views import struct
 from ..problem import DISCRETIZATIONS, macros
 from .blocks import (
     MARK,
+    RUN,
     SUB,
     BlockShape,
     Place,
@@ -36,8 +37,6 @@ from .groups import Groups, group_io, group_shared, row_io
 
 MARK_TILE = 16  # tokens of a tile of the walk that marks
 TILE = 8  # and of the walk back
-# Chunks whose sums are added in a row: equal terms in a row round to the same side.
-RUN = 16
 
 
 @struct
@@ -189,6 +188,7 @@ def backward_kernel(
     def scan_backward(
         # in
         sizes: Sizes,
+        packed_in: wp.array2d(dtype=int),
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
         z_in: wp.array3d(dtype=scalar),
@@ -212,7 +212,7 @@ def backward_kernel(
         dbias_out: wp.array3d(dtype=float),
     ):
         index, lane = wp.tid()
-        p = place(sizes, index, lane)
+        p = place(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(size),), dtype=float, storage="shared")
         marks = wp.zeros(shape=(wp.static(marks_size),), dtype=float)
         a = read_states(a_in, 0, p) * wp.static(scale)
@@ -223,7 +223,6 @@ def backward_kernel(
         row = (p.b * sizes.groups + p.group) * sizes.parts + p.part
         product = wp.int64(row) * wp.int64(sizes.length) * wp.int64(sizes.states)
         chunks = (p.end - p.begin + wp.static(MARK - 1)) / wp.static(MARK)
-        starts = p.b * ((sizes.length + wp.static(MARK - 1)) / wp.static(MARK))
         u_at = origin(u_in, p.b, p.d)
         delta_at = origin_delta(delta_in, p.b, p.d)
         z_at = origin(z_in, p.b, p.d)
@@ -236,7 +235,7 @@ def backward_kernel(
         for back in range(chunks):
             chunk = p.begin + (chunks - 1 - back) * wp.static(MARK)
             end = wp.min(chunk + wp.static(MARK), p.end)
-            h = read_states(starts_in, starts + chunk / wp.static(MARK), p)
+            h = read_states(starts_in, p.mark + (chunk - p.begin) / wp.static(MARK), p)
             # the walk that marks
             subs = (end - chunk + wp.static(SUB - 1)) / wp.static(SUB)
             t = chunk + p.row * wp.static(m.adjacent)
@@ -342,8 +341,8 @@ def backward_kernel(
                 sums += wp.vec2(dskip, dbias)
             sync()
             # the chunk's sums join those of its run, which begin at 0 in memory
-            e = place(sizes, anew(index), anew(lane))
-            run = e.at * ((sizes.segment / MARK + RUN - 1) / RUN) + back / RUN
+            e = place(sizes, packed_in, anew(index), anew(lane))
+            run = e.run + back / RUN
             write_states(da_out, run, e, second_half(state) + read_states(da_out, run, e))
             state = join(first_half(state), vec())
             if e.active != 0:
@@ -352,6 +351,6 @@ def backward_kernel(
                 dbias_out[run, e.row, e.d] = sums[1]
             sums = wp.vec2()
         if p.segment == 0:
-            write_states(first_out, p.b, p, first_half(state))
+            write_states(first_out, p.own, p, first_half(state))
 
     return scan_backward

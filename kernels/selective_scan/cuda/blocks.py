@@ -23,6 +23,8 @@ from ..problem import macros
 
 STATES = 16  # of a state block, the most that a channel holds in registers
 MARK = 64  # tokens between the states that the forward saves for the gradient
+# Chunks whose sums are added in a row: equal terms in a row round to the same side.
+RUN = 16
 SUB = 4  # tokens whose states and decays the gradient holds in registers
 UNROLL = 4  # tokens whose sums wait in registers, so that their loads need not wait for stores
 
@@ -135,7 +137,10 @@ class Place:
     group: int
     part: int
     segment: int
+    own: int  # the sequence
     at: int  # row of arrays [B * segments, ...]
+    mark: int  # row of the saved states, of the first token
+    run: int  # row of the gradient's sums, of the first token
     begin: int  # tokens
     end: int
     lane: int  # of the block
@@ -185,17 +190,28 @@ def placing(f: BlockShape):
 
     @wp.func
     @no_type_check
-    def place(sizes: Sizes, index: int, lane: int) -> Place:
+    def place(sizes: Sizes, packed_in: wp.array2d(dtype=int), index: int, lane: int) -> Place:
         p = Place()
         p.part = index % sizes.parts
         rest = index / sizes.parts
         p.group = rest % sizes.groups
         rest = rest / sizes.groups
         p.segment = rest % sizes.segments
-        p.b = rest / sizes.segments
+        p.own = rest / sizes.segments
         p.at = rest
-        p.begin = p.segment * sizes.segment
-        p.end = wp.min(p.begin + sizes.segment, sizes.length)
+        if packed_in.shape[0] > 0:  # one segment each; rows as ``packed.slots`` has them
+            p.b = packed_in[p.own, 0]
+            p.begin = packed_in[p.own, 1]
+            p.end = packed_in[p.own, 2]
+            t = p.b * sizes.length + p.begin
+            p.mark = t / MARK + p.own
+            p.run = t / wp.static(RUN * MARK) + p.own
+        else:
+            p.b = p.own
+            p.begin = p.segment * sizes.segment
+            p.end = wp.min(p.begin + sizes.segment, sizes.length)
+            p.mark = p.b * ((sizes.length + MARK - 1) / MARK) + p.begin / MARK
+            p.run = p.at * ((sizes.segment / MARK + RUN - 1) / RUN)
         p.lane = lane
         p.d0 = p.group * sizes.group_width + p.part * wp.static(f.span)
         p.count = wp.min(wp.static(f.span), sizes.group_width - p.part * wp.static(f.span))

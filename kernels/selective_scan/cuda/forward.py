@@ -97,6 +97,7 @@ def forward_kernel(
     def scan_forward(
         # in
         sizes: Sizes,
+        packed_in: wp.array2d(dtype=int),
         u_in: wp.array3d(dtype=scalar),
         delta_in: wp.array3d(dtype=delta_scalar),
         z_in: wp.array3d(dtype=scalar),
@@ -113,7 +114,7 @@ def forward_kernel(
         y_out: wp.array3d(dtype=scalar),
     ):
         index, lane = wp.tid()
-        p = place(sizes, index, lane)
+        p = place(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(2 * size),), dtype=float, storage="shared")
         a = read_states(a_in, 0, p) * wp.static(scale)
         h = vec()
@@ -123,7 +124,6 @@ def forward_kernel(
         bias = bias_in[p.d]
         skip = skip_in[p.d]
         total = wp.float32(0.0)
-        row = p.b * ((sizes.length + MARK - 1) / MARK) + p.begin / MARK
         u = fetch(u_in, p, p.begin, p.end)
         delta = fetch_delta(delta_in, p, p.begin, p.end)
         b = fetch_matrix(b_in, p, p.begin, p.end)
@@ -160,8 +160,8 @@ def forward_kernel(
             delta = fetch_delta(delta_in, p, t0 + wp.static(tokens), p.end)
             b = fetch_matrix(b_in, p, t0 + wp.static(tokens), p.end)
             if wp.static(not summary):
-                if sizes.save != 0 and t0 % MARK == 0:
-                    write_states(saved_out, row + (t0 - p.begin) / MARK, p, h)
+                if sizes.save != 0 and (t0 - p.begin) % MARK == 0:
+                    write_states(saved_out, p.mark + (t0 - p.begin) / MARK, p, h)
             if wp.static(multiply):
                 product = decay(arena, base, p, a, product)
             h = advance(arena, base, p, a, h)
@@ -169,7 +169,8 @@ def forward_kernel(
             sync()
             t0 = p.begin + (tiles - 1) * wp.static(tokens)
             base = ((tiles - 1) % 2) * wp.static(size)
-            finish(p, arena, base, t0, u_before, z_before, skip, y_out)
+            if tiles > 0:  # a packed sequence may have no token
+                finish(p, arena, base, t0, u_before, z_before, skip, y_out)
         if wp.static(summary):
             write_states(last_out, p.at, p, h)
             if wp.static(multiply):
@@ -177,6 +178,6 @@ def forward_kernel(
             elif p.active != 0:
                 decay_out[p.at, p.row, p.d] = total
         elif p.segment == sizes.segments - 1:
-            write_states(last_out, p.b, p, h)
+            write_states(last_out, p.own, p, h)
 
     return scan_forward

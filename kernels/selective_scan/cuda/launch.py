@@ -17,12 +17,13 @@ import warp as wp
 from torch import Tensor
 
 from ...runtime.launch import cuda_launch
+from ...runtime.packed import count_slots
 from ...runtime.scalars import LOG2E, exp2
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
 from ..problem import DISCRETIZATIONS, Scan
-from .backward import RUN, backward_kernel
-from .blocks import MARK, Sizes, block_shape
+from .backward import backward_kernel
+from .blocks import MARK, RUN, Sizes, block_shape
 from .forward import forward_kernel
 from .summary import summary_kernel
 
@@ -145,8 +146,10 @@ def _carry_kernel(exponential: bool, reverse: bool):
 class _Operands:
     """The tensors of one scan as the kernels take them, and how it is cut.
 
-    ``state`` is a new, dense ``[B, D, N]``: the first state, or the gradient of the last. ``shape``
-    is the block shape; ``back`` says that the gradient runs.
+    ``state`` is new and dense, ``[B, D, N]`` or of packed rows ``[S, D, N]``: the first state, or
+    the gradient of the last. ``shape`` is the block shape; ``back`` says that the gradient runs.
+    Packed sequences are not cut: into how many parts, only their lengths could say, and nobody
+    waits for these.
     """
 
     def __init__(self, x: Scan, state: Tensor | None, back: bool):
@@ -157,11 +160,17 @@ class _Operands:
         if back:
             per_thread = (tuning.back_channels, tuning.back_states)
             segments = tuning.back_segments
+        if x.packed is not None:
+            segments = 1
         self.shape = block_shape(tuning.block, *per_thread, self.states)
         self.marks = -(-self.length // MARK)
         self.segment = -(-max(self.marks, 1) // segments) * MARK
         self.segments = -(-self.length // self.segment)
         self.parts = -(-(self.channels // self.groups) // self.shape.span)
+        self.sequences = x.sequences
+        self.packed = x.packed
+        if x.packed is None:
+            self.packed = torch.empty(0, 3, dtype=torch.int32, device=self.device)
 
         C = x.B if x.C is None else x.C
         matrix = x.B.dtype if x.B.dtype == C.dtype else torch.float32
@@ -177,7 +186,8 @@ class _Operands:
             zero if v is None else v.float().contiguous() for v in (x.D, x.delta_bias)
         )
         if state is None:
-            self.state = torch.zeros(self.batch, self.channels, self.states, device=self.device)
+            shape = self.sequences, self.channels, self.states
+            self.state = torch.zeros(shape, device=self.device)
         else:
             self.state = state.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
 
@@ -192,10 +202,10 @@ class _Operands:
         sizes.parts, sizes.segments, sizes.segment = self.parts, self.segments, self.segment
         sizes.save = int(save)
         tensors = self.u, self.delta, self.z, self.A[None], self.B, self.C, self.skip, self.bias
-        return [sizes, *tensors]
+        return [sizes, self.packed, *tensors]
 
     def launch(self, kernel: Any, inputs: list, outputs: list) -> None:
-        blocks = self.batch * self.segments * self.groups * self.parts
+        blocks = self.sequences * self.segments * self.groups * self.parts
         threads = self.shape.block
         dim = (blocks, threads)
         cuda_launch(kernel, dim, inputs, outputs, device=self.device, block_dim=threads)
@@ -221,7 +231,11 @@ class _Operands:
 
 def saved_shape(x: Scan) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns, whatever the tuning."""
-    return (x.u.shape[0], -(-x.u.shape[1] // MARK) if x.save else 0, *x.A.shape)
+    batch, length, _ = x.u.shape
+    rows = batch * -(-length // MARK)
+    if x.packed is not None:
+        rows = count_slots(x.packed, batch, length, MARK)
+    return (rows if x.save else 0, *x.A.shape)
 
 
 def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
@@ -234,13 +248,12 @@ def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
     if not o.u.numel():
         return out, o.state, saved
     first, none = o.state, o.empty(0, 0, 0)
-    flat = saved.view(-1, o.channels, o.states)
     kernel = functools.partial(forward_kernel, o.dtypes, o.mode, o.shape)
     if o.segments > 1:
         inputs = [*o.inputs(), o.state]
-        first = o.carried(kernel(False, True, o.softplus, False), inputs, [flat, out], False)
+        first = o.carried(kernel(False, True, o.softplus, False), inputs, [saved, out], False)
     last = torch.empty_like(o.state)
-    outputs = [last, none, flat, out]
+    outputs = [last, none, saved, out]
     chosen = kernel(read, False, o.softplus, o.use_z and read)
     o.launch(chosen, [*o.inputs(x.save), first], outputs)
     return out, last, saved
@@ -279,6 +292,8 @@ def backward(
     du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
     db, dc = sums("dB"), sums("dC")
     runs = o.batch * o.segments * -(-o.segment // (RUN * MARK))
+    if x.packed is not None:
+        runs = count_slots(x.packed, o.batch, o.length, RUN * MARK)
     dfirst = torch.empty_like(o.state)
     da = torch.zeros(runs, o.channels, o.states, device=o.device)
     dskip, dbias = torch.zeros(2, runs, o.shape.rows, o.channels, device=o.device)
@@ -286,13 +301,13 @@ def backward(
         dout = o.u if dout is None else lane_contiguous(dout)
         last = o.state
         if o.segments > 1:  # the gradient of the state after each segment
-            sizes, _, delta, z, A, _, C, _, bias = o.inputs()
+            sizes, packed, _, delta, z, A, _, C, _, bias = o.inputs()
             kernel = summary_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, read)
-            last = o.carried(kernel, [sizes, delta, z, A, C, bias, dout], [], True)
+            last = o.carried(kernel, [sizes, packed, delta, z, A, C, bias, dout], [], True)
         kernel = backward_kernel(o.dtypes, o.mode, o.shape, o.softplus, o.use_z, flags)
         o.launch(
             kernel,
-            [*o.inputs(), dout, saved.view(-1, o.channels, o.states), last],
+            [*o.inputs(), dout, saved, last],
             [dfirst, du, ddelta, dz, da, db, dc, dskip, dbias],
         )
     else:

@@ -57,6 +57,7 @@ def summary_kernel(
     def summarise_backward(
         # in
         sizes: Sizes,
+        packed_in: wp.array2d(dtype=int),
         delta_in: wp.array3d(dtype=delta_scalar),
         z_in: wp.array3d(dtype=scalar),
         a_in: wp.array3d(dtype=float),
@@ -68,7 +69,7 @@ def summary_kernel(
         decay_out: wp.array3d(dtype=float),
     ):
         index, lane = wp.tid()
-        p = place(sizes, index, lane)
+        p = place(sizes, packed_in, index, lane)
         arena = wp.tile_empty(shape=(wp.static(2 * size),), dtype=float, storage="shared")
         a = read_states(a_in, 0, p) * wp.static(scale)
         dh = vec()

@@ -164,11 +164,16 @@ def test_bad_options():
     inputs = make(2, 5, 6, 4)
     with pytest.raises(ValueError, match="activation is 'relu'"):
         causal_conv1d(**inputs, activation="relu")
-    with pytest.raises(ValueError, match="seq_idx"):
-        causal_conv1d_fn(inputs["x"].transpose(1, 2), inputs["weight"], seq_idx=torch.zeros(2, 5))
+    with pytest.raises(ValueError, match="seq_idx is given beside states"):
+        causal_conv1d_fn(
+            inputs["x"].transpose(1, 2),
+            inputs["weight"],
+            seq_idx=torch.zeros(2, 5).int(),
+            return_final_states=True,
+        )
 
 
 def test_operator_contract():
     """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
-    arguments = (*leaves(make(2, 7, 5, 3)).values(), True)
+    arguments = (*leaves(make(2, 7, 5, 3)).values(), None, True)
     torch.library.opcheck(torch.ops.gamba_warp.causal_conv1d.default, arguments)

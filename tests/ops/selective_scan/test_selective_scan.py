@@ -79,7 +79,7 @@ def test_one_gradient_alone(name):
 
 
 def test_unneeded_gradients_are_not_computed():
-    x = Scan(*make(1, 10, 5, 2).values(), True, "mamba", True)
+    x = Scan(*make(1, 10, 5, 2).values(), None, True, "mamba", True)
     out, _, saved = cpu.forward(x)
     needs = [name == "C" for name in x._fields[:9]]
     grads = cpu.backward(torch.ones_like(out), None, x, saved, needs)
@@ -239,7 +239,7 @@ def test_no_second_derivative():
 @pytest.mark.parametrize("read", [True, False])
 def test_operator_contract(read):
     """Schema, fake tensors, autograd registration and AOT tracing, by torch's own checker."""
-    x = Scan(*leaves(make(2, 7, 5, 2)).values(), True, "mamba", True)
+    x = Scan(*leaves(make(2, 7, 5, 2)).values(), None, True, "mamba", True)
     x = x if read else x._replace(C=None, D=None, z=None)
     torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, tuple(x))
 

@@ -28,7 +28,7 @@ def tuned(monkeypatch):
 
 def run(inputs, discretization, v_out, v_last, softplus=True, needs=None):
     """Outputs, last state and the gradients that are needed (of all inputs), by name."""
-    x = Scan(*(inputs.get(k) for k in NAMES), softplus, discretization, True)
+    x = Scan(*(inputs.get(k) for k in NAMES), None, softplus, discretization, True)
     out, last, saved = cuda.forward(x)
     grads = cuda.backward(v_out, v_last, x, saved, [k in (needs or inputs) for k in NAMES])
     got = {"out": out} if v_out is not None else {}

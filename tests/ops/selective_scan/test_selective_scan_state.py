@@ -17,6 +17,7 @@ from helpers.scan import (
 
 from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
 from gamba_warp.kernels.selective_scan.cpu.launch import Layout
+from gamba_warp.kernels.selective_scan.problem import Scan
 
 
 def state_of(*shape):
@@ -75,7 +76,7 @@ def test_state_refuses_bad_input():
 def test_segments_match_oracle(threads, discretization):
     """Too few channels for the threads: the tokens are cut, and states carried over the cuts."""
     inputs = make(1, 1111, 21, 3)
-    layout = Layout(inputs["u"], inputs["A"], inputs["B"], 4, 64)
+    layout = Layout(Scan(*inputs.values(), None, True, discretization, True), 64)
     assert layout.segments == {2: 2, 5: 4}[threads]
     compare(inputs, alone=True, discretization=discretization)
 

@@ -1,0 +1,110 @@
+"""Packed rows: several sequences one after the other in a row of tokens, as the kernels know them.
+
+A list of sequences is an int32 tensor ``[S, 3]`` on the tokens' device: for each its row of the
+batch, its first token, and the token behind its last. They follow one another and leave no token
+out.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_DTYPES = (torch.int32, torch.int64)
+
+
+def sequences(x: Tensor, cu_seqlens: Tensor | None, seq_idx: Tensor | None) -> Tensor | None:
+    """The list of sequences of a call, or None where each row is one.
+
+    Args:
+        x: ``[B, L, D]``, the tokens.
+        cu_seqlens: ``[S + 1]`` int32 or int64, ascending from 0 to L, where B is 1: sequence s has
+            the tokens from ``cu_seqlens[s]`` to before ``cu_seqlens[s + 1]``, perhaps none. On CUDA
+            the values are not looked at, which would wait for the device, but bounded.
+        seq_idx: ``[B, L]`` int32 or int64: a sequence is a run of equal numbers in a row. To find
+            the runs waits for a CUDA device.
+
+    Raises:
+        TypeError: an argument is not a tensor, or of another dtype.
+        ValueError: both are given, a shape or device differs, ``cu_seqlens`` falls, does not begin
+            at 0 or end at L, or ``seq_idx`` comes back to an earlier number of its row.
+    """
+    if cu_seqlens is None and seq_idx is None:
+        return None
+    if cu_seqlens is not None and seq_idx is not None:
+        raise ValueError("cu_seqlens and seq_idx are given, allowed is one of them")
+    batch, length = x.shape[:2]
+    name, given = ("seq_idx", seq_idx) if cu_seqlens is None else ("cu_seqlens", cu_seqlens)
+    if not isinstance(given, Tensor):
+        raise TypeError(f"{name} is {type(given).__name__}, must be a tensor")
+    if given.dtype not in _DTYPES:
+        raise TypeError(f"{name} has dtype {given.dtype}, allowed: {', '.join(map(str, _DTYPES))}")
+    if given.device != x.device:
+        raise ValueError(f"{name} is on {given.device}, the tokens are on {x.device}")
+    if cu_seqlens is None:
+        if tuple(given.shape) != (batch, length):
+            raise ValueError(f"seq_idx has shape {tuple(given.shape)}, must be {(batch, length)}")
+        return _runs(given)
+    if given.dim() != 1 or len(given) == 0 or batch != 1:
+        raise ValueError(
+            f"cu_seqlens has shape {tuple(given.shape)}, must be [S + 1] beside one row of tokens; "
+            f"there are {batch}"
+        )
+    if given.device.type == "cpu" and not torch.compiler.is_compiling():
+        first, last, fall = int(given[0]), int(given[-1]), (given.diff() < 0).nonzero()
+        if first or last != length:
+            raise ValueError(f"cu_seqlens goes from {first} to {last}, must go from 0 to {length}")
+        if len(fall):
+            s = int(fall[0])
+            raise ValueError(f"cu_seqlens falls from {given[s]} to {given[s + 1]} at entry {s + 1}")
+    ends = given.clamp(0, length).int()
+    begins = ends[:-1]
+    return torch.stack([torch.zeros_like(begins), begins, torch.maximum(begins, ends[1:])], 1)
+
+
+def _runs(seq_idx: Tensor) -> Tensor:
+    length = seq_idx.shape[1]
+    new = torch.ones_like(seq_idx, dtype=torch.bool)
+    new[:, 1:] = seq_idx[:, 1:] != seq_idx[:, :-1]
+    row, begin = new.nonzero().unbind(1)
+    of_row = torch.stack([row, seq_idx[row, begin].long()], 1)
+    if len(of_row.unique(dim=0)) < len(of_row):
+        values, counts = of_row.unique(dim=0, return_counts=True)
+        b, number = values[counts > 1][0].tolist()
+        raise ValueError(f"seq_idx of row {b} comes back to {number}; equal numbers must be a run")
+    last = torch.cat([row[1:] != row[:-1], torch.ones_like(row[:1], dtype=torch.bool)])
+    end = torch.where(last, length, torch.cat([begin[1:], begin[:1]]))
+    return torch.stack([row, begin, end], 1).int()
+
+
+def slots(rows: Tensor, length: int, tokens: int) -> Tensor:
+    """Before each sequence, how many slots of so many tokens those before it take at most: ``[S]``.
+
+    Sequence s needs a slot for each ``tokens`` of its own, from its first token on. There are
+    ``count_slots`` in all, whatever the values, so that nobody waits for these.
+
+    Args:
+        rows: the sequences.
+        length: L, tokens of a row.
+        tokens: of a slot.
+    """
+    at = rows[:, 0] * length + rows[:, 1]
+    return (at // tokens + torch.arange(len(rows), device=rows.device)).int()
+
+
+def count_slots(rows: Tensor, batch: int, length: int, tokens: int) -> int:
+    """The number of all slots, of which the last of a sequence may stay empty."""
+    return batch * length // tokens + len(rows)
+
+
+def pieces(rows: Tensor, batch: int, length: int, tokens: int) -> Tensor:
+    """The slots: ``[P, 5]`` int32, each its sequence's row, begin and end, its own first token, and
+    the sequence, which is -1 where it has no token.
+    """
+    first = slots(rows, length, tokens)
+    p = torch.arange(count_slots(rows, batch, length, tokens), device=rows.device)
+    s = torch.searchsorted(first.long(), p, right=True) - 1
+    own = rows[s].long()
+    t0 = own[:, 1] + (p - first[s]) * tokens
+    s = torch.where(t0 < own[:, 2], s, -1)
+    return torch.cat([own, t0[:, None], s[:, None]], 1).int()

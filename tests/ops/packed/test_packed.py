@@ -1,0 +1,250 @@
+"""Packed rows: each sequence has the bits that it has alone, whatever stands beside it."""
+
+from unittest.mock import patch
+
+import pytest
+import torch
+from helpers.kernels import conv_inputs
+from helpers.scan import gradients, leaves, make
+
+from gamba_warp.kernels.causal_conv1d import causal_conv1d, causal_conv1d_fn
+from gamba_warp.kernels.runtime.packed import count_slots, pieces, sequences
+from gamba_warp.kernels.selective_scan import selective_scan, selective_scan_state
+from gamba_warp.kernels.selective_scan.cuda import launch as cuda
+
+LENGTHS = [0, 1, 2, 3, 17, 64, 65, 0, 130, 1, 0]
+SHARED = ("A", "D", "delta_bias", "weight", "bias")
+STATES = ("initial_state",)
+
+
+def borders(lengths):
+    return torch.tensor([0, *lengths]).cumsum(0).int()
+
+
+def scan_inputs(lengths, channels, states, groups=1, dtype=torch.float32):
+    inputs = make(1, sum(lengths), channels, states, groups, dtype)
+    return inputs | {"initial_state": torch.randn(len(lengths), channels, states)}
+
+
+def assert_as_alone(function, inputs, lengths, limit):
+    """Compares results and gradients of a packed row with those of each sequence by itself.
+
+    Gradients of what the sequences share are sums over them, in another order: ``limit``.
+    """
+    cuts = borders(lengths)
+    packed = leaves(inputs)
+    outs = function(**packed, cu_seqlens=cuts)
+    heads = [torch.randn_like(x) for x in outs]
+    got = gradients(packed, outs, heads)
+    shared = {name: 0 for name in SHARED if name in inputs}
+    for s, (i, j) in enumerate(zip(cuts[:-1], cuts[1:])):
+        tokens, state = (slice(None), slice(i, j)), slice(s, s + 1)
+        place = {k: state if k in STATES else tokens for k in inputs if k not in SHARED}
+        alone = leaves({k: v[place[k]] if k in place else v for k, v in inputs.items()})
+        own = function(**alone)
+        assert torch.equal(outs[0][tokens], own[0]), f"output of sequence {s}"
+        assert torch.equal(outs[1][state], own[1]), f"last state of sequence {s}"
+        wanted = gradients(alone, own, [heads[0][tokens], heads[1][state]])
+        for name, gradient in wanted.items():
+            if name in shared:
+                shared[name] = shared[name] + gradient
+            else:
+                assert torch.equal(got[name][place[name]], gradient), f"d{name} of sequence {s}"
+    for name, total in shared.items():
+        assert (got[name] - total).abs().max() <= limit * total.abs().max(), name
+
+
+def scan(**x):
+    return selective_scan(**x, delta_softplus=True, return_last_state=True)
+
+
+def conv(**x):
+    return causal_conv1d(**x, activation="silu", return_final_state=True)
+
+
+@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.parametrize(
+    "lengths, channels, states, groups, rule, dtype",
+    [
+        (LENGTHS, 5, 3, 1, "mamba", torch.float32),
+        ([5, 63, 64, 1, 129], 37, 16, 1, "mamba", torch.float32),
+        ([1, 70, 0, 2], 32, 16, 2, "zoh", torch.float32),
+        ([100, 20], 20, 5, 1, "bilinear", torch.float32),
+        ([64, 31], 130, 16, 1, "mamba", torch.bfloat16),
+        ([40, 3], 16, 20, 1, "mamba", torch.float16),
+    ],
+)
+def test_scan(lengths, channels, states, groups, rule, dtype, device, from_ptx):
+    inputs = scan_inputs(lengths, channels, states, groups, dtype)
+
+    def function(**x):
+        return selective_scan(**x, delta_softplus=True, return_last_state=True, discretization=rule)
+
+    # On CUDA packed sequences are not cut into segments, so those alone must not be either.
+    with patch.object(cuda, "FORCED", cuda.Tuning()):
+        if device == "ptx":
+            from_ptx()
+        assert_as_alone(function, inputs, lengths, 1e-5)
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+@pytest.mark.parametrize("channels, states", [(5, 4), (64, 16)])
+def test_scan_in_segments(channels, states, threads):
+    """Where a sequence alone is cut for the threads, it is cut in the same places here."""
+    lengths = [700, 3, 0, 300, 512, 256, 1, 1030]
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        assert_as_alone(scan, scan_inputs(lengths, channels, states), lengths, 1e-5)
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("device", ["cpu", "ptx"])
+@pytest.mark.parametrize("channels, width", [(5, 2), (37, 3), (16, 4)])
+def test_convolution(channels, width, device, from_ptx):
+    inputs = conv_inputs(1, sum(LENGTHS), channels, width)
+    inputs["initial_state"] = torch.randn(len(LENGTHS), width - 1, channels)
+    if device == "ptx":
+        from_ptx()
+    assert_as_alone(conv, inputs, LENGTHS, 1e-5)
+
+
+def test_state_alone_and_no_state():
+    inputs = scan_inputs([3, 0, 70], 7, 4)
+    cuts = borders([3, 0, 70])
+    _, last = scan(**inputs, cu_seqlens=cuts)
+    rest = {k: v for k, v in inputs.items() if k not in ("C", "D", "z")}
+    assert torch.equal(selective_scan_state(**rest, delta_softplus=True, cu_seqlens=cuts), last)
+    rest = {k: v for k, v in inputs.items() if k != "initial_state"}
+    zero = torch.zeros_like(inputs["initial_state"])
+    with_zeros = scan(**rest, initial_state=zero, cu_seqlens=cuts)
+    assert all(map(torch.equal, scan(**rest, cu_seqlens=cuts), with_zeros))
+
+
+@pytest.mark.parametrize("cuts", [[0], [0, 0], [0, 0, 0]])
+def test_no_tokens(cuts):
+    count = len(cuts) - 1
+    cuts = torch.tensor(cuts, dtype=torch.int64)
+    inputs = make(1, 0, 5, 3) | {"initial_state": torch.randn(count, 5, 3)}
+    out, last = scan(**inputs, cu_seqlens=cuts)
+    assert out.shape == (1, 0, 5) and torch.equal(last, inputs["initial_state"])
+    inputs = conv_inputs(1, 0, 5, 4) | {"initial_state": torch.randn(count, 3, 5)}
+    out, final = conv(**inputs, cu_seqlens=cuts)
+    assert out.shape == (1, 0, 5) and torch.equal(final, inputs["initial_state"])
+
+
+def test_numbers_of_sequences():
+    """``seq_idx`` of two rows says what ``cu_seqlens`` says of one; numbers may have gaps."""
+    rows = [[4, 1, 70], [60, 15]]
+    seq_idx = torch.stack(
+        [torch.arange(len(r)).mul(3).repeat_interleave(torch.tensor(r)) for r in rows]
+    ).int()
+    x = make(2, 75, 6, 4) | {"initial_state": torch.randn(5, 6, 4)}
+    flat = {
+        k: v.reshape(1, 150, *v.shape[2:]) if v.shape[:2] == (2, 75) else v for k, v in x.items()
+    }
+    out, last = scan(**x, seq_idx=seq_idx)
+    want, want_last = scan(**flat, cu_seqlens=borders([*rows[0], *rows[1]]))
+    assert torch.equal(out.flatten(0, 1), want[0]) and torch.equal(last, want_last)
+    x = conv_inputs(2, 75, 6, 4)
+    x = {k: x[k] for k in ("x", "weight", "bias")}
+    out = causal_conv1d(**x, seq_idx=seq_idx)
+    flat = x | {"x": x["x"].reshape(1, 150, 6)}
+    want = causal_conv1d(**flat, cu_seqlens=borders([*rows[0], *rows[1]]))
+    assert torch.equal(out.flatten(0, 1), want[0])
+
+
+def test_padding_of_causal_conv1d():
+    """Numbers below 0 are no sequence for causal-conv1d: output 0, and no gradient flows."""
+    x = conv_inputs(1, 9, 3, 4)
+    t = x["x"].transpose(1, 2).detach().requires_grad_()
+    seq_idx = torch.tensor([[0, 0, 0, 1, 1, 1, -1, -1, -1]])
+    out = causal_conv1d_fn(t, x["weight"], x["bias"], seq_idx=seq_idx)
+    out.sum().backward()
+    assert (out[..., 6:] == 0).all() and (t.grad[..., 6:] == 0).all()
+    want = causal_conv1d_fn(t[..., 3:6], x["weight"], x["bias"])
+    assert torch.equal(out[..., 3:6], want)
+
+
+def test_pieces_cover_each_token_once():
+    torch.manual_seed(1)
+    for tokens in (1, 4, 16):
+        for _ in range(20):
+            lengths = (torch.randint(0, 40, (9,)) * torch.randint(0, 2, (9,))).tolist()
+            length = sum(lengths)
+            rows = sequences(torch.empty(1, length, 1), borders(lengths), None)
+            found = pieces(rows, 1, length, tokens)
+            assert len(found) == count_slots(rows, 1, length, tokens)
+            seen = [
+                (s, t)
+                for _, _, end, t0, s in found.tolist()
+                if s >= 0
+                for t in range(t0, min(t0 + tokens, end))
+            ]
+            assert seen == [
+                (s, t) for s, (_, i, j) in enumerate(rows.tolist()) for t in range(i, j)
+            ]
+
+
+@pytest.mark.parametrize(
+    "given, error, text",
+    [
+        ({"cu_seqlens": [0, 4, 3, 7]}, ValueError, "falls from 4 to 3 at entry 2"),
+        ({"cu_seqlens": [1, 7]}, ValueError, "goes from 1 to 7, must go from 0 to 7"),
+        ({"cu_seqlens": [0, 6]}, ValueError, "goes from 0 to 6"),
+        ({"cu_seqlens": []}, ValueError, r"shape \(0,\), must be \[S \+ 1\]"),
+        ({"cu_seqlens": [0.0, 7.0]}, TypeError, "dtype torch.float32, allowed: torch.int32"),
+        ({"cu_seqlens": "all"}, TypeError, "cu_seqlens is str"),
+        ({"seq_idx": [[0, 0, 1, 1, 0, 2, 2]]}, ValueError, "row 0 comes back to 0"),
+        ({"seq_idx": [[0, 1]]}, ValueError, r"shape \(1, 2\), must be \(1, 7\)"),
+        ({"seq_idx": [[0] * 7], "cu_seqlens": [0, 7]}, ValueError, "allowed is one of them"),
+    ],
+)
+def test_bad_sequences(given, error, text):
+    given = {k: torch.tensor(v) if isinstance(v, list) else v for k, v in given.items()}
+    if "falls" in text or "goes" in text:
+        given["cu_seqlens"] = given["cu_seqlens"].int()
+    if text.startswith("shape"):
+        given = {k: v.int() for k, v in given.items()}
+    with pytest.raises(error, match=text):
+        selective_scan(**make(1, 7, 5, 3), **given)
+    with pytest.raises(error, match=text):
+        causal_conv1d(**conv_inputs(1, 7, 5, 4), **given)
+
+
+def test_bad_states_and_devices():
+    cuts = torch.tensor([0, 3, 7])
+    with pytest.raises(
+        ValueError, match=r"initial_state has shape \(1, 5, 3\), must be \(2, 5, 3\)"
+    ):
+        selective_scan(
+            **make(1, 7, 5, 3) | {"initial_state": torch.zeros(1, 5, 3)}, cu_seqlens=cuts
+        )
+    with pytest.raises(
+        ValueError, match=r"initial_state has shape \(1, 3, 5\), must be \(2, 3, 5\)"
+    ):
+        causal_conv1d(**conv_inputs(1, 7, 5, 4), cu_seqlens=cuts)
+    with pytest.raises(ValueError, match="cu_seqlens is on meta, the tokens are on cpu"):
+        selective_scan(**make(1, 7, 5, 3), cu_seqlens=cuts.to("meta"))
+    with pytest.raises(ValueError, match="there are 2"):
+        selective_scan(**make(2, 7, 5, 3), cu_seqlens=cuts)
+
+
+def test_operator_contracts_and_whole_graph():
+    """Schema, fake tensors, autograd registration; one graph of both operators under compile."""
+    rows = sequences(torch.empty(1, 7, 1), torch.tensor([0, 3, 7]), None)
+    x = leaves(scan_inputs([3, 4], 5, 3))
+    arguments = (*x.values(), rows, True, "mamba", True)
+    torch.library.opcheck(torch.ops.gamba_warp.selective_scan.default, arguments)
+    y = leaves(conv_inputs(1, 7, 5, 4) | {"initial_state": torch.randn(2, 3, 5)})
+    arguments = (*y.values(), rows, True)
+    torch.library.opcheck(torch.ops.gamba_warp.causal_conv1d.default, arguments)
+
+    def both(cuts):
+        out, _ = conv(**y, cu_seqlens=cuts)
+        return scan(**x | {"u": out}, cu_seqlens=cuts)
+
+    compiled = torch.compile(both, fullgraph=True, backend="aot_eager")
+    cuts = torch.tensor([0, 3, 7])
+    assert all(map(torch.equal, compiled(cuts), both(cuts)))
