@@ -9,7 +9,7 @@ import tyro
 
 from gamba_warp.errors import UserError
 
-from . import growth, model_card, step
+from . import growth, model_card, step, times
 
 
 def figures(
@@ -25,6 +25,7 @@ def figures(
     model_card.main(views, geometry, retrieval)
     growth.main()
     step.main()
+    times.main()
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from . import StudySettings, drift, show, targets
 # What is studied -> the module with ``cases(settings)`` and perhaps ``targets(settings)``.
 STUDIES = {
     "scan": ".scan",
+    "times": ".times",
     "raster": ".raster",
     "lengths": ".lengths",
     "step": ".training.step",
@@ -57,8 +58,9 @@ def study(
     Writes bench.json, bench.md and bench.html. Ctrl-C keeps what was measured.
 
     Args:
-        what: scan and raster (choices inside the kernels), block and model (compiled, in both
-            precisions, without background), lengths (a Mamba block against a transformer block
+        what: scan and raster (choices inside the kernels), times (of a layer's scan, by length,
+            width and dtype), block and model (compiled, in both precisions, without background),
+            lengths (a Mamba block against a transformer block
             over the number of tokens), step (of training, by parts), growth (time, memory and
             errors over every size, with slopes; growth-scan, growth-raster and growth-errors are
             its parts), loader; drift, alone, prints how rules of occupancy drift on damaged shapes.

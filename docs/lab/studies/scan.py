@@ -90,10 +90,11 @@ def bare_loop(settings: Settings) -> list[Variant]:
     given = bare(problem)
     made = [problem.variant("default", default=True)]
     made.append(given.variant("given steps, no gate or skip"))
-    return [*made, *(_probe(given, threads) for threads in sorted({1, settings.threads}))]
+    return [*made, *(probe(given, threads) for threads in sorted({1, settings.threads}))]
 
 
-def _probe(bare: Operator, threads: int) -> Variant:
+def probe(bare: Operator, threads: int) -> Variant:
+    """The bare loop of ``probe.py`` on the inputs of ``bare``."""
     x = bare.inputs
     out = torch.empty_like(x["u"][0])
     run = partial(

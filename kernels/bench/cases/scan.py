@@ -51,17 +51,17 @@ def reference_loop(settings: Settings) -> list[Variant]:
     if settings.level == "normal":
         length = 2048  # at 16961 tokens the loop takes seconds and its factors gigabytes
     problem = scan_problem(make_inputs(1, length, width), settings.device, tokens)
-    loop = _peer(problem, peers.scan_loop).variant("torch loop", peer=True, rounds=2)
+    loop = peer(problem, peers.scan_loop).variant("torch loop", peer=True, rounds=2)
     made = [problem.variant("default", default=True), loop]
     if settings.peers:
-        mambapy = _peer(problem, peers.mambapy_scan, channels_first=False)
+        mambapy = peer(problem, peers.mambapy_scan, channels_first=False)
         made.append(mambapy.variant("mambapy", peer=True, rounds=3))
         if settings.device.type == "cuda":
-            made.append(_peer(problem, peers.mamba_ssm_scan).variant("mamba-ssm", peer=True))
+            made.append(peer(problem, peers.mamba_ssm_scan).variant("mamba-ssm", peer=True))
     return made
 
 
-def _peer(problem: Operator, function: Callable, channels_first: bool = True) -> Operator:
+def peer(problem: Operator, function: Callable, channels_first: bool = True) -> Operator:
     """Another package's scan on the same inputs, laid out for it; its output is checked."""
     return replace(
         problem,
@@ -158,5 +158,5 @@ def training_batch(settings: Settings) -> list[Variant]:
     made = problem.pair("default", half, default=True)
     made.append(make_problem(settings).variant("one sequence", options=half))
     if settings.peers:
-        made += _peer(problem, peers.mamba_ssm_scan).pair("mamba-ssm", half, peer=True)
+        made += peer(problem, peers.mamba_ssm_scan).pair("mamba-ssm", half, peer=True)
     return made
