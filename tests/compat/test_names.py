@@ -4,6 +4,7 @@ import importlib.util
 import subprocess
 import sys
 
+from gamba_warp.compat import __main__ as program
 from gamba_warp.compat import take_names
 
 PROGRAM = """
@@ -43,10 +44,10 @@ assert all(x.__module__ == "gamba_warp.compat.gsplat.relocation" for x in ours)
 """
 
 
-def run(*arguments, cwd=None):
+def run(*arguments):
     """A new process: names are taken once in each."""
     command = [sys.executable, "-m", "gamba_warp.compat", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd)
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 def test_a_program_gets_our_interfaces_under_their_names(tmp_path):
@@ -59,8 +60,19 @@ def test_a_program_gets_our_interfaces_under_their_names(tmp_path):
         "2.3.2 1.7.0 1.5.3",
         "mamba-ssm's Mamba2 is not here: only its Mamba-1 is",
     ]
-    done = run("-m", "client", cwd=tmp_path)
-    assert not done.returncode and done.stdout.startswith(f"{path} __main__"), done.stderr
+
+
+def test_a_module_runs_as_with_python(monkeypatch):
+    """Its own arguments, and the present folder before all others."""
+    calls = []
+    monkeypatch.setattr(program, "take_names", lambda: calls.append("names"))
+    monkeypatch.setattr(program.runpy, "run_module", lambda *x, **y: calls.append((sys.argv, x, y)))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "argv", [])
+    program.main(["-m", "client", "--steps", "3"])
+    options = {"run_name": "__main__", "alter_sys": True}
+    assert calls == ["names", (["client", "--steps", "3"], ("client",), options)]
+    assert sys.path[0] == ""
 
 
 def test_what_cannot_be_run_is_one_line(tmp_path):
