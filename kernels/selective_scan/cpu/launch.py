@@ -47,20 +47,21 @@ class Layout:
         self.blocks = self.groups * self.group_blocks
         threads = torch.get_num_threads()
 
-        def spans(sequences: int) -> int:  # of all of them together; sets the blocks of a span
+        def spans(sequences: int) -> tuple[int, int]:  # blocks of one, and how many there are
             per_thread = max(1, min(self.group_blocks, -(-sequences * self.blocks // threads)))
-            self.span = min(SPAN, -(-per_thread // BLOCKS) * BLOCKS)
-            return sequences * self.groups * -(-self.group_blocks // self.span)
+            span = min(SPAN, -(-per_thread // BLOCKS) * BLOCKS)
+            return span, sequences * self.groups * -(-self.group_blocks // span)
 
-        alone = spans(self.batch if x.packed is None else 1)
+        _, alone = spans(self.batch if x.packed is None else 1)
+        self.span, count = spans(self.sequences)
         most = -(-threads // alone) if split and 0 < alone < threads else 1
 
         def segment(length: Any) -> Any:  # its tokens, of a number or a tensor
-            count = -(-length // chunk)
+            chunks = -(-length // chunk)
             if isinstance(length, Tensor):
                 cuts = (length // (SEGMENT * chunk)).clamp(1, most)
-                return (-(-count // cuts)).clamp(min=1) * chunk
-            return max(1, -(-count // max(1, min(most, length // (SEGMENT * chunk))))) * chunk
+                return (-(-chunks // cuts)).clamp(min=1) * chunk
+            return max(1, -(-chunks // max(1, min(most, length // (SEGMENT * chunk))))) * chunk
 
         if x.packed is None:
             self.segment = segment(self.length)
@@ -82,7 +83,7 @@ class Layout:
             self.last = -1
             if self.segments > 1:
                 self.last = counts.long() - 1, torch.arange(len(counts))
-        self.tasks = self.segments * spans(self.sequences)
+        self.tasks = self.segments * count
         self.parts = self.batch * self.groups * -(-self.group_blocks // BLOCKS)
 
     def pack(self, x: Tensor | None, lead: tuple[int, ...] = ()) -> Tensor:
