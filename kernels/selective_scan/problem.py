@@ -76,6 +76,18 @@ DISCRETIZATIONS = {
 }
 
 
+def sum_parts(parts: Tensor) -> Tensor:
+    """Sums ``[B, G, parts, ..]`` over the parts, in the memory of the first.
+
+    One is added after the other. The order of torch's own sum depends on the shape, and so would
+    the bits of a sequence on the others beside it.
+    """
+    first, *rest = parts.unbind(2)
+    for part in rest:
+        first += part
+    return first
+
+
 def macros(name: str, on_cpu: bool) -> dict[str, object]:
     """For the kernels' C++: MODE is that of the numbers MAMBA, BILINEAR, ZOH."""
     numbers: dict[str, object] = {key.upper(): i for i, key in enumerate(DISCRETIZATIONS)}

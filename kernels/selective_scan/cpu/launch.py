@@ -14,7 +14,7 @@ from ...runtime.launch import parallel_launch
 from ...runtime.memory import empty
 from ...runtime.packed import count_slots, slots
 from ...runtime.views import filled, lane_contiguous, view
-from ..problem import DISCRETIZATIONS, Scan
+from ..problem import DISCRETIZATIONS, Scan, sum_parts
 from . import kernels
 from .kernels import BLOCKS, FEW, NEEDS, SPAN, Kind, Sizes, Tuning
 
@@ -119,8 +119,8 @@ class Layout:
     def total(self, parts: Tensor) -> Tensor:
         """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
         of_group = -(-self.group_blocks // BLOCKS)
-        x = parts.view(self.batch, self.groups, of_group, self.states, self.length).sum(2)
-        return x.permute(0, 3, 1, 2)
+        x = parts.view(self.batch, self.groups, of_group, self.states, self.length)
+        return sum_parts(x).permute(0, 3, 1, 2)
 
 
 def _pairs(states: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from ...runtime.packed import count_slots
 from ...runtime.scalars import LOG2E, exp2
 from ...runtime.stand_in import multiprocessors_of
 from ...runtime.views import lane_contiguous
-from ..problem import DISCRETIZATIONS, Scan
+from ..problem import DISCRETIZATIONS, Scan, sum_parts
 from .backward import backward_kernel
 from .blocks import MARK, RUN, Sizes, block_shape
 from .forward import forward_kernel
@@ -287,7 +287,7 @@ def backward(
 
     def total(parts: Tensor) -> Tensor:
         shape = (o.batch, o.groups, o.parts, o.length, o.states)
-        return parts.view(shape).sum(2).transpose(1, 2).contiguous()
+        return sum_parts(parts.view(shape)).transpose(1, 2).contiguous()
 
     du, ddelta, dz = like(o.u, "du"), like(o.delta, "ddelta"), like(o.u, "y")
     db, dc = sums("dB"), sums("dC")

@@ -71,6 +71,7 @@ def conv(**x):
         ([1, 70, 0, 2], 32, 16, 2, "zoh", torch.float32),
         ([100, 20], 20, 5, 1, "bilinear", torch.float32),
         ([64, 31], 130, 16, 1, "mamba", torch.bfloat16),
+        ([3, 40, 1], 700, 3, 1, "mamba", torch.float32),  # dB and dC are sums of many parts
         ([40, 3], 16, 9, 1, "mamba", torch.float16),
     ],
 )
