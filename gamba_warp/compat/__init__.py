@@ -1,5 +1,97 @@
-"""Other packages' interfaces over our kernels: change the import, or take their names."""
+"""Other packages' interfaces over our kernels: change the import, or take the packages' names."""
 
-from .names import take_names
+from __future__ import annotations
 
+import importlib
+import importlib.metadata
+import importlib.util
+import pkgutil
+import sys
+from collections.abc import Iterator
+from email.message import Message
+from types import ModuleType
+from typing import Any
+
+# The versions whose interfaces these are.
+VERSIONS = {"mamba_ssm": "2.3.2", "causal_conv1d": "1.7.0", "gsplat": "1.5.3"}
+# What takes the place of gsplat's own where gsplat is installed: the rest of it is torch alone.
+_OF_GSPLAT = ("gsplat", "gsplat.cuda._wrapper", "gsplat.relocation", "gsplat.rendering")
+_HERE = __name__
 __all__ = ["take_names"]
+
+
+def take_names(*packages: str) -> None:
+    """Lets ``import mamba_ssm``, ``causal_conv1d`` and ``gsplat`` give what is in this folder.
+
+    It is called once, before the first of these imports, and holds for the whole process. Their
+    versions are there too for who asks ``importlib.metadata``. Where gsplat is installed, all of
+    it that needs no CUDA (its strategies, writers of files, helpers) stays its own, over our
+    functions.
+
+    Args:
+        packages: some of ``VERSIONS``; none are all of them.
+
+    Raises:
+        ImportError: a package of that name has been imported already.
+        ValueError: another name.
+    """
+    for name in packages or VERSIONS:
+        if name not in VERSIONS:
+            raise ValueError(f"the package {name!r} is not here, allowed: {', '.join(VERSIONS)}")
+        if name in sys.modules:
+            raise ImportError(f"{name} is imported already: its names are taken before that")
+    for name in packages or VERSIONS:
+        own = importlib.import_module(f"{_HERE}.{name}")
+        theirs = importlib.util.find_spec(name) if name == "gsplat" else None
+        for _, path, _ in pkgutil.walk_packages(own.__path__, f"{own.__name__}."):
+            if not path.endswith("gsplat.strategy"):  # it is gsplat's own and loads gsplat
+                importlib.import_module(path)
+        for path, module in list(sys.modules.items()):
+            under = path.removeprefix(f"{_HERE}.")
+            if under.partition(".")[0] == name and (theirs is None or under in _OF_GSPLAT):
+                sys.modules[under] = module
+        if theirs is not None:
+            sys.modules[name] = _over(own, name, theirs.submodule_search_locations)
+    if not any(isinstance(finder, _Versions) for finder in sys.meta_path):
+        sys.meta_path.append(_Versions())
+
+
+def _over(own: ModuleType, name: str, folders: Any) -> ModuleType:
+    """A package with the names of ours and, for what is not among its modules, other folders."""
+    made = ModuleType(name, own.__doc__)
+    kept = {"__name__", "__package__", "__loader__", "__spec__"}
+    vars(made).update({key: value for key, value in vars(own).items() if key not in kept})
+    made.__path__ = list(folders)
+    made.__spec__ = importlib.util.spec_from_loader(name, None, is_package=True)
+    return made
+
+
+class _Versions(importlib.metadata.DistributionFinder):
+    """Finds the versions of the packages whose names are taken, behind those that are installed."""
+
+    def find_spec(self, *_: Any) -> None:
+        """No module: all are imported already."""
+
+    def find_distributions(
+        self, context: importlib.metadata.DistributionFinder.Context | None = None
+    ) -> Iterator[importlib.metadata.Distribution]:
+        asked = getattr(context, "name", None)
+        for name, version in VERSIONS.items():
+            if asked and asked.lower().replace("-", "_") == name and name in sys.modules:
+                yield _Said(name, version)
+
+
+class _Said(importlib.metadata.Distribution):
+    def __init__(self, name: str, version: str):
+        self._known = Message()
+        self._known["Name"], self._known["Version"] = name, version
+
+    @property
+    def metadata(self) -> Any:
+        return self._known
+
+    def read_text(self, filename: str) -> None:
+        """There are no files."""
+
+    def locate_file(self, path: Any) -> Any:
+        return path
