@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,7 +24,7 @@ from ..core.case import (
 )
 from ..core.rounding import Rounding, samples_of
 from ..oracles import scan as scan_oracle
-from .scan import LAYOUTS, laid
+from .scan import LAYOUTS, SEQUENCES, borders, laid
 
 OPTIONS = {
     "api": Option("conv", ("conv", "causal-conv1d")),
@@ -39,6 +40,7 @@ OPTIONS = {
     "final": Option(False, 0.5),
     "weight": Option("normal", RANGES, 0.3),
     "cotangent": Option("normal", COTANGENTS, others=RANGES),
+    "sequences": SEQUENCES,
 }
 
 
@@ -47,7 +49,8 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     o, dtype = case.options, DTYPES[case.options["dtype"]]
     batch, length, channels, width = (o[k] for k in ("batch", "length", "channels", "width"))
     g = {name: generator(case, name) for name in ("x", "weight", "rest")}
-    state = fill((batch, width - 1, channels), case.kind, g["rest"]) if o["use_state"] else None
+    before = max(batch, o["sequences"]), width - 1, channels
+    state = fill(before, case.kind, g["rest"]) if o["use_state"] else None
     made = {
         "x": laid(fill((batch, length, channels), case.kind, g["x"]).to(dtype), o["layout"]),
         "weight": fill((channels, width), o["weight"], g["weight"]),
@@ -59,13 +62,13 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     }
 
 
-def _run(o: dict, x: dict) -> dict[str, Tensor]:
+def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
     """The results by name, channels last."""
     values = x["weight"], x["bias"]
     rest: dict[str, Any] = {"activation": "silu" if o["silu"] else None}
     state = x["initial_state"]
     if o["api"] == "conv":
-        rest |= dict(initial_state=state, return_final_state=o["final"])
+        rest |= dict(initial_state=state, return_final_state=o["final"], cu_seqlens=cu_seqlens)
         result = causal_conv1d(x["x"], *values, **rest)
     else:
         state = None if state is None else state.mT
@@ -80,15 +83,21 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     o, x = case.options, build(case, device)
     samples: dict[str, Any] = {k: samples_of(t) for k, t in x.items()}
     r = Rounding(case.seed, trial)
-    out, final = scan_oracle.conv(samples, o["silu"], DTYPES[o["dtype"]], r)
+    exact = partial(scan_oracle.conv, silu=o["silu"], dtype=DTYPES[o["dtype"]], r=r)
+    cuts = borders(case)
+    out, final = exact(samples) if cuts is None else scan_oracle.of_sequences(exact, samples, cuts)
     leaves = {k: t for k, t in x.items() if t is not None}
     truths, true_leaves = {"out": out, "final": final}, {k: samples[k] for k in leaves}
-    runs = Runs(case, lambda: _run(o, x), leaves, truths, true_leaves)
+    cu_seqlens = None if cuts is None else torch.tensor(cuts, device=device)
+    runs = Runs(case, lambda: _run(o, x, cu_seqlens), leaves, truths, true_leaves)
     return runs.outcome({"out": (1,), "x": (1,)})
 
 
 def _fit(options: dict) -> dict:
-    return fitted(options, ("batch", "length", "channels"), 60_000)  # more than draw can give
+    o = fitted(options, ("batch", "length", "channels"), 60_000)  # more than draw can give
+    if o["api"] != "conv":
+        o["sequences"] = 1
+    return o | {"batch": 1} if o["sequences"] > 1 else o
 
 
 OP = Op("conv", dict.fromkeys(RANGES, {}), OPTIONS, _fit, evaluate)

@@ -29,6 +29,7 @@ from ..oracles import scan as scan_oracle
 DISCRETIZATIONS = ("mamba", "bilinear", "zoh")
 APIS = ("scan", "state", "prefix", "mamba-ssm")
 LAYOUTS = ("dense", "expanded", "channels first", "part")
+SEQUENCES = Option(1, (1, 1, 1, 2, 3, 7, 20), span=(1, 20))  # packed in one row
 _LARGEST = 60_000  # B L D N: the oracle holds some dozen of these eight times
 
 # kind -> options that it fixes or draws; the ranges of delta and A: see _steps, _rates
@@ -85,12 +86,17 @@ OPTIONS = {
     "B": Option("normal", others=RANGES),
     "C": Option("normal", RANGES, 0.2),
     "cotangent": Option("normal", COTANGENTS, others=RANGES),
+    "sequences": SEQUENCES,
 }
 
 
 def _fit(options: dict) -> dict:
     """Sizes that fit each other and the oracle; options that the API takes."""
     o = dict(options)
+    if o["api"] in ("prefix", "mamba-ssm"):
+        o["sequences"] = 1
+    if o["sequences"] > 1:
+        o["batch"] = 1
     while math.prod(o[k] for k in ("batch", "length", "channels", "states")) > _LARGEST:
         if o["states"] > 1 and (o["length"] < 1000 or o["channels"] == 1):
             o["states"] = (o["states"] + 1) // 2
@@ -154,6 +160,15 @@ def laid(x: Tensor, layout: str) -> Tensor:
     return x
 
 
+def borders(case: Case) -> list[int] | None:
+    """Where the packed sequences begin and end, some without tokens; None of a single one."""
+    length, count = case.options["length"], case.options["sequences"]
+    if count == 1:
+        return None
+    cuts = torch.randint(length + 1, (count - 1,), generator=generator(case, "cuts"))
+    return [0, *cuts.sort().values.tolist(), length]
+
+
 def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     """The leaves by argument, channels last; a constant B is ``[D, N]``."""
     o = case.options
@@ -172,7 +187,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
         "D": rest(channels) if o["use_D"] else None,
         "z": 3 * torch.randn(token, generator=g["z"]) if o["use_z"] else None,
         "delta_bias": rest(channels) if o["use_bias"] and o["softplus"] else None,
-        "initial_state": rest(batch, channels, n) if o["use_state"] else None,
+        "initial_state": rest(max(batch, o["sequences"]), channels, n) if o["use_state"] else None,
     }
     if o["use_bias"] and not o["softplus"]:
         made["delta_bias"] = 0.01 * rest(channels).abs()
@@ -188,7 +203,7 @@ def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
     }
 
 
-def _run(o: dict, x: dict) -> dict[str, Tensor]:
+def _run(o: dict, x: dict, cu_seqlens: Tensor | None) -> dict[str, Tensor]:
     """The results by name, channels last."""
     common: dict[str, Any] = dict(delta_softplus=o["softplus"])
     if o["api"] == "mamba-ssm":
@@ -199,7 +214,7 @@ def _run(o: dict, x: dict) -> dict[str, Tensor]:
         result = selective_scan_fn(u, delta, x["A"], B, C, x["D"], z, x["delta_bias"], **more)
         out, *last = result if isinstance(result, tuple) else (result,)
         return {"out": out.mT} | dict(zip(["last"], last))
-    common["discretization"] = o["discretization"]
+    common |= dict(discretization=o["discretization"], cu_seqlens=cu_seqlens)
     state = x["initial_state"]
     k = o["length"] if o["api"] == "state" else o["split"]
     if o["api"] in ("state", "prefix"):
@@ -222,10 +237,17 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     used = dict(samples)
     if o["constant_B"]:  # every channel is a group of its own
         used["B"] = scan_oracle.over_tokens(r(samples["B"]), samples["u"], r)
-    out, last = scan_oracle.scan(used, o["softplus"], o["discretization"], r)
+    exact = partial(
+        scan_oracle.scan, softplus=o["softplus"], discretization=o["discretization"], r=r
+    )
+    cuts = borders(case)
+    out, last = exact(used) if cuts is None else scan_oracle.of_sequences(exact, used, cuts)
     leaves = {k: t for k, t in x.items() if t is not None}
     truths = {"out": out[:, :, o["split"] :], "last": last}
-    runs = Runs(case, lambda: _run(o, x), leaves, truths, {k: samples[k] for k in leaves})
+    cu_seqlens = None if cuts is None else torch.tensor(cuts, device=device)
+    runs = Runs(
+        case, lambda: _run(o, x, cu_seqlens), leaves, truths, {k: samples[k] for k in leaves}
+    )
     # the tokens of a channel are taken together
     parts: dict[str, tuple[int, ...]] = dict.fromkeys(("out", "u", "delta", "z", "C"), (1,))
     return runs.outcome(parts if o["constant_B"] else parts | {"B": (1,)})

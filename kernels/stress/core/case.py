@@ -206,7 +206,9 @@ def run_case(op: Op, case: Case, device: torch.device) -> Outcome:
 
     A case that is over its limit is run ``TRIALS`` times, and the middle one of these counts. If it
     is steep, up to ``STEEP_TRIALS`` count, each result by its widest limit. README.md says why.
+    An option that the case does not name is plain.
     """
+    case = replace(case, options=op.plain | case.options)
     try:
         found = [op.evaluate(case, device, 0)]
         if not found[0].over:

@@ -137,7 +137,7 @@ class Rounding:
         if not dims:
             return x.clone()
         x = x.movedim(dims, tuple(range(-len(dims), 0))).flatten(-len(dims))
-        squares, rounded = torch.zeros_like(x[..., 0]), x[-1].float()
+        squares, rounded = torch.zeros_like(x.sum(-1)), x[-1].float()
         small = torch.where(x[1:-1].abs() < UNDERFLOW, x[1:-1], 0.0)
         small[2:4].clamp_(min=0.0)  # all terms, or those of one sign, which may be the smaller ones
         small[4:].clamp_(max=0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from ..core.rounding import UNDERFLOW, Rounding
 
+TOKENS = ("u", "delta", "B", "C", "z", "x")  # leaves that have a value for each token
 EXP_ULPS = 5.0  # the kernels' exponential: 3e-7 relative to its argument's fraction
 
 
@@ -131,6 +133,26 @@ def scan(x: dict, softplus: bool, discretization: str, r: Rounding) -> tuple[Ten
     if x["z"] is not None:
         y = r(y * r(x["z"] * r.sigmoid(x["z"], EXP_ULPS)))
     return y, h[:, :, -1]
+
+
+def of_sequences(
+    function: Callable[[dict], tuple[Tensor, Tensor]], x: dict, cuts: list[int]
+) -> tuple[Tensor, Tensor]:
+    """Output and last states of sequences packed in one row, each computed alone.
+
+    Args:
+        function: gives output ``[S, 1, L, D]`` and last state ``[S, 1, ..]`` of such leaves.
+        x: the leaves ``[S, ..]`` by name, with a state for each sequence.
+        cuts: where sequences begin, and where the last ends.
+    """
+    found = []
+    for s, (i, j) in enumerate(zip(cuts, cuts[1:])):
+        place = {k: (slice(None), slice(None), slice(i, j)) for k in TOKENS}
+        place |= {"initial_state": (slice(None), slice(s, s + 1))}
+        own = {k: t if t is None or k not in place else t[place[k]] for k, t in x.items()}
+        found.append(function(own))
+    outs, lasts = zip(*found)
+    return torch.cat(outs, 2), torch.cat(lasts, 1)
 
 
 def conv(x: dict, silu: bool, dtype: torch.dtype, r: Rounding) -> tuple[Tensor, Tensor]:
