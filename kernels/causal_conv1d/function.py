@@ -115,13 +115,22 @@ def causal_conv1d(
     if initial_state is None:
         initial_state = x.new_zeros(batch, history, channels)
     if packed is not None:
-        return out, _last_tokens(x, initial_state, packed)
+        return out, last_tokens(x, initial_state, packed)
     recent = torch.cat([initial_state, x[:, max(0, x.shape[1] - history) :]], 1)
     return out, recent[:, recent.shape[1] - history :]
 
 
-def _last_tokens(x: Tensor, initial_state: Tensor, packed: Tensor) -> Tensor:
-    """The last tokens of each sequence, in front those before its first: ``[S, W-1, D]``."""
+def last_tokens(x: Tensor, initial_state: Tensor, packed: Tensor) -> Tensor:
+    """The last tokens of each sequence, in front those before its first.
+
+    Args:
+        x: ``[B, L, D]``.
+        initial_state: ``[S, H, D]``, the tokens before the first of each sequence, H > 0.
+        packed: the sequences (``runtime.packed``).
+
+    Returns:
+        ``[S, H, D]``.
+    """
     row, begin, end = packed.long().unbind(1)
     history = initial_state.shape[1]
     t = end[:, None] + torch.arange(-history, 0, device=x.device)

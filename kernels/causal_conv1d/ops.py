@@ -1,7 +1,5 @@
 """The convolution as torch operators: launches, fake results and gradients."""
 
-from typing import List
-
 import torch
 from torch import Tensor
 
@@ -14,6 +12,7 @@ from ..runtime.start import without_compiler
 from ..runtime.views import lane_contiguous, view
 from .kernels import CHUNK, STRIP, TAPS, VALUES, backward_kernel, forward_kernel
 
+_ARGUMENTS = "Tensor x, Tensor weight, Tensor? bias, Tensor? state, Tensor? packed, bool silu"
 _FEW = 1 << 15  # elements that one thread has done before it could wake another
 
 
@@ -61,15 +60,10 @@ def _pieces(x: Tensor, rows: Tensor | None, tokens: int) -> tuple[int, Tensor]:
 
 
 @without_compiler
-@torch.library.custom_op("gamba_warp::causal_conv1d", mutates_args=())
-def conv(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None,
-    state: Tensor | None,
-    packed: Tensor | None,
-    silu: bool,
-) -> Tensor:
+@torch.library.custom_op(
+    "gamba_warp::causal_conv1d", mutates_args=(), schema=f"({_ARGUMENTS}) -> Tensor"
+)
+def conv(x, weight, bias, state, packed, silu):
     """``causal_conv1d`` after its checks: ``x [B, L, D]`` to ``[B, L, D]``.
 
     ``packed`` are the sequences (``runtime.packed``), or None.
@@ -92,17 +86,12 @@ def _(x, weight, bias, state, packed, silu):
 
 
 @without_compiler
-@torch.library.custom_op("gamba_warp::causal_conv1d_backward", mutates_args=())
-def _conv_backward(
-    dout: Tensor,
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor | None,
-    state: Tensor | None,
-    packed: Tensor | None,
-    silu: bool,
-    needs: List[bool],
-) -> List[Tensor]:
+@torch.library.custom_op(
+    "gamba_warp::causal_conv1d_backward",
+    mutates_args=(),
+    schema=f"(Tensor dout, {_ARGUMENTS}, bool[] needs) -> Tensor[]",
+)
+def _conv_backward(dout, x, weight, bias, state, packed, silu, needs):
     need_x, need_weight, need_bias, need_state = needs
     batch, length, channels = x.shape
     chunks, where = _pieces(x, packed, CHUNK)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ...kernels.causal_conv1d.function import last_tokens
+from ...kernels.runtime.packed import sequences
+
 __all__ = ["causal_conv1d_varlen_states", "causal_conv1d_varlen_states_ref"]
 
 
@@ -21,17 +24,14 @@ def causal_conv1d_varlen_states(x: Tensor, cu_seqlens: Tensor, state_len: int) -
         ``[S, D, state_len]`` in x's dtype, 0 where a sequence is shorter. Channels are adjacent.
 
     Raises:
-        ValueError: a shape is not one of the above.
+        TypeError: ``cu_seqlens`` has another dtype than int32 and int64.
+        ValueError: ``x`` has another shape, or ``cu_seqlens`` is not as above.
     """
-    if x.dim() != 2 or cu_seqlens.dim() != 1 or len(cu_seqlens) == 0:
-        raise ValueError(
-            f"x has shape {tuple(x.shape)}, must be [tokens, D]; "
-            f"cu_seqlens {tuple(cu_seqlens.shape)}, must be [S + 1]"
-        )
-    places = cu_seqlens[1:, None] + torch.arange(-state_len, 0, device=x.device)
-    outside = places < cu_seqlens[:-1, None]
-    padded = torch.cat([x, x.new_zeros(1, x.shape[1])])
-    return padded[places.masked_fill(outside, len(x)).long()].mT
+    if x.dim() != 2:
+        raise ValueError(f"x has shape {tuple(x.shape)}, must be [tokens, D] as of cu_seqlens")
+    packed = sequences(x[None], cu_seqlens, None)
+    assert packed is not None
+    return last_tokens(x[None], x.new_zeros(len(packed), state_len, x.shape[1]), packed).mT
 
 
 causal_conv1d_varlen_states_ref = causal_conv1d_varlen_states

@@ -22,6 +22,14 @@ TUNING = Tuning()
 SEGMENT = 4  # chunks of a segment at least
 
 
+def _chunks(x: Scan, chunk: int) -> int:
+    """How many chunks of so many tokens all sequences have, at most where they are packed."""
+    batch, length, _ = x.u.shape
+    if x.packed is None:
+        return batch * -(-length // chunk)
+    return count_slots(x.packed, batch, length, chunk)
+
+
 class Layout:
     """How channels map to lanes: D = groups × group_width, each group in blocks of W, padded.
 
@@ -56,23 +64,19 @@ class Layout:
         self.span, count = spans(self.sequences)
         most = -(-threads // alone) if split and 0 < alone < threads else 1
 
-        def segment(length: Any) -> Any:  # its tokens, of a number or a tensor
-            chunks = -(-length // chunk)
-            if isinstance(length, Tensor):
-                cuts = (length // (SEGMENT * chunk)).clamp(1, most)
-                return (-(-chunks // cuts)).clamp(min=1) * chunk
-            return max(1, -(-chunks // max(1, min(most, length // (SEGMENT * chunk))))) * chunk
+        def segment(length: int) -> int:  # its tokens
+            cuts = max(1, min(most, length // (SEGMENT * chunk)))
+            return max(1, -(-length // (cuts * chunk))) * chunk
 
+        self.chunks = _chunks(x, chunk)
         if x.packed is None:
             self.segment = segment(self.length)
             self.segments = max(1, -(-self.length // self.segment))
-            self.chunks = self.batch * -(-self.length // chunk)
             self.rows, self.last = torch.empty(0, 4, dtype=torch.int32), -1
         else:
-            self.chunks = count_slots(x.packed, self.batch, self.length, chunk)
             self.segment = self.length
             b, begin, end = x.packed.unbind(1)
-            own = segment(end - begin)
+            own = torch.tensor([*map(segment, (end - begin).tolist())], dtype=torch.int32)
             counts = (-(-(end - begin) // own)).clamp(min=1)
             self.segments = int(counts.max()) if len(counts) else 1
             step = torch.arange(self.segments, dtype=torch.int32)[:, None]
@@ -197,13 +201,9 @@ class _Operands:
 
 def saved_shape(x: Scan) -> tuple[int, ...]:
     """The shape of the saved states that ``forward`` returns."""
-    batch, length, channels = x.u.shape
-    groups, chunk = x.B.shape[2], TUNING.chunk
-    chunks = batch * -(-length // chunk)
-    if x.packed is not None:
-        chunks = count_slots(x.packed, batch, length, chunk)
-    blocks = groups * -(-(channels // groups) // W)
-    return (chunks if x.save else 0, blocks, x.A.shape[1], W)
+    groups = x.B.shape[2]
+    blocks = groups * -(-(x.u.shape[2] // groups) // W)
+    return (_chunks(x, TUNING.chunk) if x.save else 0, blocks, x.A.shape[1], W)
 
 
 def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
