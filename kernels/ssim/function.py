@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .constants import WINDOW
 from .lanes import dissimilarity_on_lanes
 from .products import dissimilarity_by_products
+from .reference import WINDOW
 
 
 def dissimilarity(got: Tensor, want: Tensor, slope: bool) -> tuple[Tensor, Tensor | None]:

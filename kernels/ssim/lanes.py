@@ -16,8 +16,8 @@ from torch import Tensor
 from ..runtime.launch import parallel_launch
 from ..runtime.native import native, native_kernel
 from ..runtime.views import Packed, struct
-from .constants import C1, C2, EDGE, SIGMA, WINDOW
 from .products import box_of_windows, groups
+from .reference import C1, C2, EDGE, SIGMA, WINDOW
 
 _LANES = 16
 _STRIP = 8  # rows of windows of a task, whose values are summed before they are stored

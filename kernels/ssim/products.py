@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from .constants import C1, C2, EDGE, SIGMA, WINDOW
+from .reference import C1, C2, EDGE, SIGMA, WINDOW
 
 _TILE = 32  # columns of a banded product
 _TOGETHER = 1 << 17  # numbers of the pictures that a CPU takes together, two of 128²
