@@ -249,3 +249,23 @@ def test_operator_contracts_and_whole_graph():
     compiled = torch.compile(both, fullgraph=True, backend="aot_eager")
     cuts = torch.tensor([0, 3, 7])
     assert all(map(torch.equal, compiled(cuts), both(cuts)))
+
+
+def test_export_and_autocast_keep_the_bits(tmp_path):
+    """A program of both operators, written to a file and read, with borders it was not made for."""
+    x = scan_inputs([3, 4], 5, 3)
+    y = conv_inputs(1, 7, 5, 4) | {"initial_state": torch.randn(2, 3, 5)}
+
+    class Both(torch.nn.Module):
+        def forward(self, cu_seqlens):
+            u, state = conv(**y, cu_seqlens=cu_seqlens)
+            return *scan(**x | {"u": u}, cu_seqlens=cu_seqlens), state
+
+    made = torch.export.export(Both(), (torch.tensor([0, 3, 7]),))
+    torch.export.save(made, tmp_path / "both.pt2")
+    read = torch.export.load(tmp_path / "both.pt2").module()
+    for cuts in ([0, 3, 7], [0, 0, 7]):
+        wanted = Both()(torch.tensor(cuts))
+        assert all(map(torch.equal, read(torch.tensor(cuts)), wanted))
+        with torch.autocast("cpu", torch.bfloat16):  # products round; these operators have none
+            assert all(map(torch.equal, Both()(torch.tensor(cuts)), wanted))
