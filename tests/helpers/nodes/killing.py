@@ -84,7 +84,7 @@ class _Reaper:
         """Chooses the moment: so many more logged steps, 0 for at once, and then some seconds."""
         wanted = self.rng.choice((0, *range(1, _STEPS_PER_KILL)))
         self._steps = len(_lines(self.log, "train")) + wanted
-        self._wait = self.rng.uniform(0, 3.0 if wanted == 0 else 0.1)
+        self._wait = self.rng.uniform(0, 1.5 if wanted == 0 else 0.1)
 
     def __call__(self, agents: list[subprocess.Popen]) -> None:
         """Looks whether the moment has come; ``agents`` are the two torchruns."""
