@@ -17,7 +17,7 @@ from .encoders import ImageEncoder, Weights, build_encoder
 from .parts.attention import AttentionBlock
 from .parts.block import GambaBlock, make_norm, prefix_states, run_blocks
 from .parts.decoder import GaussianDecoder
-from .parts.patches import Patches, foreground_patches
+from .parts.patches import foreground_patches
 from .parts.rays import RayDecoder
 from .parts.tokens import CameraToken, SplatTokens
 from .parts.triplane import PlaneBranch, TriplaneDecoder
@@ -150,26 +150,13 @@ class Gamba(Pretrained, nn.Module):
         """What ``forward`` does for the decoder ``rays``."""
         patches = foreground_patches(rgba[..., 3], self.config.patch_size, margin)
         pixels = self.tokens.pixels(rgba, cameras)
-        groups = patches.groups() if rgba.device.type == "cpu" else []
-        if len(groups) < 2:
-            tokens = self._of_patches(pixels, condition, patches)[patches.valid]
-        else:
-            found: dict[int, Tensor] = {}
-            for group in groups:
-                part = patches.of(group)
-                states = [s and s._make(value[group] for value in s) for s in condition]
-                made = self._of_patches(pixels[group], states, part)
-                found |= {i: own[valid] for i, own, valid in zip(group, made, part.valid)}
-            tokens = torch.cat([found[i] for i in range(len(rgba))])
-        return self.decoder(tokens, pixels, patches, rgba, cameras)
-
-    def _of_patches(self, pixels: Tensor, condition: list[Any], patches: Patches) -> Tensor:
-        """The last tokens of the patches: ``[B, F, O, width]``."""
         tokens, places = self.tokens.of_patches(pixels, patches)
-        own = self.config.num_orders * patches.valid.sum(1) if len(pixels) > 1 else None
-        tokens = self.norm(run_blocks(self.blocks, tokens, condition, self.recompute, own))
-        at = places.flatten(1)[..., None].expand(-1, -1, tokens.shape[-1])
-        return tokens.gather(1, at).unflatten(1, places.shape[1:])
+        cu_seqlens = None
+        if len(rgba) != 1:
+            counts = torch.tensor([0, *patches.counts], device=tokens.device)
+            cu_seqlens = self.config.num_orders * counts.cumsum(0)
+        tokens = run_blocks(self.blocks, tokens[None], condition, self.recompute, cu_seqlens)
+        return self.decoder(self.norm(tokens)[0, places], pixels, patches, rgba, cameras)
 
     def _check(self, images: Tensor, cameras: Cameras) -> None:
         size = self.config.image_size

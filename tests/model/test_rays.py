@@ -15,7 +15,6 @@ from gamba_warp.eval.views.compare import Truth
 from gamba_warp.image_metrics import mask_iou, psnr, ssim
 from gamba_warp.model.config import GambaConfig
 from gamba_warp.model.gamba import Gamba
-from gamba_warp.model.parts import patches as patch_grid
 from gamba_warp.model.parts.patches import foreground_patches, seen_cells
 from gamba_warp.model.parts.rays import RayDecoder
 from gamba_warp.model.predict import model_input, reconstruct
@@ -56,9 +55,13 @@ def one(cameras: Cameras, index: int) -> Cameras:
     )
 
 
-def test_a_batch_of_different_sizes_is_each_picture_alone():
+@pytest.mark.parametrize("segment", [4096, 7])
+def test_a_batch_of_different_sizes_is_each_picture_alone(monkeypatch, segment):
+    """Also where the batch's row of tokens is cut in the midst of pictures."""
+    monkeypatch.setattr("gamba_warp.model.parts.block.SEGMENT", segment)
     model, (rgba, cameras) = trained(rays()), cut_outs()
-    together = model(rgba, cameras)
+    with torch.set_grad_enabled(segment > 7):
+        together = model(rgba, cameras)
     assert together.num == 24 * 3  # the largest has 24 of the 36 cells
     for index in range(len(rgba)):
         alone = model(rgba[index : index + 1], one(cameras, index))
@@ -83,40 +86,24 @@ def test_what_fills_up_a_batch_gets_and_gives_no_gradient():
 
 
 @pytest.mark.parametrize("encoder", ["none", "gamba_test_vit"])
-def test_pictures_taken_by_size_are_those_taken_together(monkeypatch, encoder):
-    """Four groups, of which one is an empty picture; the order of the batch stays."""
-    monkeypatch.setattr(patch_grid, "PASS_COST", 0)
-    model, (rgba, cameras) = (
-        trained(rays(encoder=encoder)),
-        cut_outs([*BOXES, (slice(0, 0), slice(0, 0))]),
-    )
-    patches = foreground_patches(rgba[..., 3], 4)
+def test_gradients_of_a_batch_are_those_of_its_pictures(encoder):
+    """Of four pictures in one row of tokens, one of them empty."""
+    model = trained(rays(encoder=encoder))
+    rgba, cameras = cut_outs([*BOXES, (slice(0, 0), slice(0, 0))])
     weights = {name: p for name, p in model.named_parameters() if p.requires_grad}
-    assert patches.groups() == [[3], [1], [0], [2]]
-    results = []
-    for cost in (0, 100):
-        monkeypatch.setattr(patch_grid, "PASS_COST", cost)
+
+    def gradients(rgba, cameras):
         made = model(rgba, cameras)
         seen = (made.opacities > 0)[..., None]
         others = (made.means, made.scales, made.colors)
         values = [made.opacities, *(value * seen for value in others)]
         loss = sum(value.square().sum() for value in values)
-        grads = torch.autograd.grad(loss, list(weights.values()), allow_unused=True)
-        results.append((values, grads))
-    assert patches.groups() == [[3, 1, 0, 2]] and made.opacities[3].eq(0).all()
-    for got, want in zip(results[0][0], results[1][0]):
-        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
-    for name, got, want in zip(weights, results[0][1], results[1][1]):
-        if want is not None:
-            torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5, msg=name)
+        found = torch.autograd.grad(loss, list(weights.values()), allow_unused=True)
+        return [torch.zeros(()) if g is None else g for g in found]
 
-
-def test_groups_leave_out_the_most_filling():
-    valid = torch.arange(100) < torch.tensor([90, 20, 100, 22])[:, None]
-    patches = patch_grid.Patches(torch.arange(100).expand(4, -1), valid, 10, 8)
-    assert patches.groups() == [[1, 3], [0, 2]]
-    assert patches.of([1, 3]).index.shape == (2, 22)
-    assert patches.of([1, 3]).valid.sum(1).tolist() == [20, 22]
+    alone = [gradients(rgba[i : i + 1], one(cameras, i)) for i in range(4)]
+    for name, got, *wanted in zip(weights, gradients(rgba, cameras), *alone):
+        torch.testing.assert_close(got, sum(wanted), rtol=1e-4, atol=1e-5, msg=name)
 
 
 @pytest.mark.parametrize("cells", [1, 2, 4])
@@ -159,22 +146,23 @@ def test_tokens_of_patches_are_those_of_the_whole_in_their_order(additive, order
     whole = tokens(rgba, cameras)
     patches = foreground_patches(rgba[..., 3], 4)
     got, places = tokens.of_patches(tokens.pixels(rgba, cameras), patches)
-    for index in range(len(rgba)):
-        inside = torch.zeros(9, dtype=torch.bool)
-        inside[patches.index[index][patches.valid[index]]] = True
-        want = whole[index, inside[tokens.orders]]
-        torch.testing.assert_close(got[index, : len(want)], want)
-        for place, patch in zip(places[index], patches.index[index][patches.valid[index]]):
-            for order in range(orders):
-                number = 9 * order + tokens.orders.view(orders, 9)[order].tolist().index(patch)
-                torch.testing.assert_close(got[index, place[order]], whole[index, number])
+    own = [patches.place[patches.picture == index].tolist() for index in range(len(rgba))]
+    inside = torch.zeros(len(rgba), 9, dtype=torch.bool)
+    for index, places_of in enumerate(own):
+        inside[index, places_of] = True
+    assert patches.counts == [len(places_of) for places_of in own]
+    torch.testing.assert_close(got, whole[inside[:, tokens.orders]])
+    for place, picture, patch in zip(places, patches.picture, patches.place):
+        for order in range(orders):
+            number = 9 * order + tokens.orders.view(orders, 9)[order].tolist().index(patch)
+            torch.testing.assert_close(got[place[order]], whole[picture, number])
 
 
 def test_a_picture_without_background_keeps_every_token():
     patches = foreground_patches(torch.ones(2, 12, 12), 4)
     orders = Gamba(rays()).tokens.orders
     kept, _ = patches.orders(orders)
-    assert kept.tolist() == [list(range(36))] * 2 and patches.valid.all()
+    assert kept.tolist() == [*range(36)] * 2 and patches.counts == [9, 9]
 
 
 @pytest.mark.parametrize("rotation", [False, True])

@@ -54,29 +54,21 @@ class AttentionBlock(Block):
                 layer.weight.div_(math.sqrt(2 * config.depth))
 
     def forward(
-        self, tokens: Tensor, state: Memory | None, layout: Tensor | None = None
+        self, tokens: Tensor, state: Memory | None, cu_seqlens: Tensor | None = None
     ) -> tuple[Tensor, Memory | None]:
         """Refines the 3DGS tokens, all of them: ``Block.forward``."""
         parts = self.kvq_proj(self.norm(tokens)).chunk(3, dim=-1)
-        keys, values, queries = (_by_head(part, self.heads) for part in parts)
-        if state is not None:
-            keys = torch.cat([state.keys.to(keys.dtype), keys], dim=2)
-            values = torch.cat([state.values.to(values.dtype), values], dim=2)
-        hidden = F.scaled_dot_product_attention(queries, keys, values, attn_mask=layout)
+        parts = [_by_head(part, self.heads) for part in parts]
+        if cu_seqlens is None:
+            hidden = _attention(*parts, state)
+        else:  # a picture after the other, each over its own tokens
+            pictures = zip(*(part.split(cu_seqlens.diff().tolist(), 2) for part in parts))
+            hidden = torch.cat([
+                _attention(*own, state and Memory(*(x[i : i + 1] for x in state)))
+                for i, own in enumerate(pictures)
+            ], 2)  # fmt: skip
         tokens = tokens + self.out_proj(hidden.transpose(1, 2).flatten(2))
         return tokens + self.mlp(self.mlp_norm(tokens)), state
-
-    def layout(self, tokens: Tensor, state: Memory | None, lengths: Tensor | None) -> Tensor | None:
-        """Which keys are seen, ``[B, 1, 1, K + L]`` bool: the prefix, and a picture's own tokens.
-
-        A picture without tokens keeps one of its filling, since an attention to nothing may be NaN.
-        """
-        if lengths is None:
-            return None
-        steps = torch.arange(tokens.shape[1], device=tokens.device)
-        own = steps < lengths.clamp_min(1)[:, None]
-        prefix = 0 if state is None else state.keys.shape[2]
-        return F.pad(own, (prefix, 0), value=True)[:, None, None]
 
     @staticmethod
     def after(blocks: Blocks, prefix: Tensor) -> list[Memory]:
@@ -95,3 +87,11 @@ class AttentionBlock(Block):
 def _by_head(tokens: Tensor, heads: int) -> Tensor:
     """``[B, L, width]`` to ``[B, heads, L, width / heads]``."""
     return tokens.unflatten(2, (heads, -1)).transpose(1, 2)
+
+
+def _attention(keys: Tensor, values: Tensor, queries: Tensor, memory: Memory | None) -> Tensor:
+    """Each token looks at the prefix and at all tokens of its picture."""
+    if memory is not None:
+        keys = torch.cat([memory.keys.to(keys.dtype), keys], dim=2)
+        values = torch.cat([memory.values.to(values.dtype), values], dim=2)
+    return F.scaled_dot_product_attention(queries, keys, values)

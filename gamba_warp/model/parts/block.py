@@ -97,11 +97,14 @@ class Mamba(nn.Module):
         for parameter in (self.A_log, self.D, self.conv_bias, self.dt_proj.bias):
             vars(parameter)["_no_weight_decay"] = True
 
-    def forward(self, tokens: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+    def forward(
+        self, tokens: Tensor, state: State | None = None, cu_seqlens: Tensor | None = None
+    ) -> tuple[Tensor, State]:
         """Maps ``[B, L, width]`` to ``[B, L, width]``; a token sees itself and those before it.
 
         ``state`` is what earlier tokens left, or None if there are none. The state after the last
-        token is returned beside the tokens.
+        token is returned beside the tokens. ``cu_seqlens [S + 1]`` are the borders of S sequences
+        packed in one row; B of the states is S then.
         """
         conv_state, scan_state = state or (None, None)
         x, z = self.in_proj(tokens).chunk(2, dim=-1)
@@ -114,6 +117,7 @@ class Mamba(nn.Module):
             activation="silu",
             initial_state=conv_state,
             return_final_state=True,
+            cu_seqlens=cu_seqlens,
         )
         low_rank, B, C = self.x_proj(x).split(self.split, dim=-1)
         # The bias is added inside the scan, in float32: δ of 1e-3 does not survive bfloat16.
@@ -131,6 +135,7 @@ class Mamba(nn.Module):
             initial_state=scan_state,
             return_last_state=True,
             discretization=self.discretization,
+            cu_seqlens=cu_seqlens,
         )
         return self.out_proj(y), State(conv_state, scan_state)
 
@@ -153,23 +158,19 @@ class Block(nn.Module):
         self.norm = make_norm(config)
 
     def forward(
-        self, tokens: Tensor, state: Any, layout: Tensor | None = None
+        self, tokens: Tensor, state: Any, cu_seqlens: Tensor | None = None
     ) -> tuple[Tensor, Any]:
         """Refines the 3DGS tokens, all of them or the next segment.
 
         Args:
-            tokens: ``[B, L, width]``.
+            tokens: ``[B, L, width]``, or the tokens of all pictures in one row.
             state: this block's entry of ``prefix_states``, or its state after the segment before.
-            layout: the result of ``layout``, the same for all blocks.
+            cu_seqlens: ``[B + 1]``, where each picture's tokens begin and end in such a row.
 
         Returns:
             ``[B, L, width]``, and the state after the last token.
         """
         raise NotImplementedError
-
-    def layout(self, tokens: Tensor, state: Any, lengths: Tensor | None) -> Tensor | None:
-        """What all blocks know of the places of the tokens, or None; see ``run_blocks``."""
-        return None
 
     @staticmethod
     def after(blocks: Blocks, prefix: Tensor) -> list[Any]:
@@ -194,27 +195,29 @@ class GambaBlock(Block):
         """Builds the block; zero channels mean that there is no such condition."""
         super().__init__(config, camera_channels, image_channels)
         self.mixed = config.image_tokens == "mixed"
+        self.in_segments = not self.mixed
         self.mamba = Mamba(config)
 
     def forward(
-        self, tokens: Tensor, state: State | Mixed | None, layout: Tensor | None = None
+        self, tokens: Tensor, state: State | Mixed | None, cu_seqlens: Tensor | None = None
     ) -> tuple[Tensor, State | Mixed]:
         """Refines the 3DGS tokens: ``Block.forward``."""
         if isinstance(state, Mixed):
-            assert layout is not None
-            hidden, _ = self.mamba(merged(state, self.norm(tokens), layout))
-            return tokens + dropped(hidden, layout, tokens.shape[1]), state
-        hidden, after = self.mamba(self.norm(tokens), state)
+            return tokens + self._mixing(self.norm(tokens), state.tokens, cu_seqlens), state
+        hidden, after = self.mamba(self.norm(tokens), state, cu_seqlens)
         return tokens + hidden, after
 
-    def layout(self, tokens: Tensor, state: Any, lengths: Tensor | None) -> Tensor | None:
-        """The places of mixed tokens; None of a prefix, behind which the tokens keep theirs."""
-        if not isinstance(state, Mixed):
-            return None
-        batch, length = tokens.shape[:2]
-        if lengths is None:
-            lengths = torch.full((batch,), length, device=tokens.device)
-        return mixed_places(state.tokens.shape[1], length, lengths)
+    def _mixing(self, tokens: Tensor, mixed: Tensor, cu_seqlens: Tensor | None) -> Tensor:
+        """The Mamba block over ``mixed [B, K, width]`` and 3DGS tokens, whose outputs remain."""
+        count, length = mixed.shape[1], tokens.shape[1]
+        if cu_seqlens is None:
+            cu_seqlens = length * torch.arange(len(tokens) + 1, device=tokens.device)
+        places = mixed_places(count, cu_seqlens)
+        both = torch.cat([mixed.to(tokens.dtype).flatten(0, 1), tokens.flatten(0, 1)])
+        row = torch.empty_like(both).index_copy(0, places, both)[None]
+        borders = cu_seqlens + count * torch.arange(len(cu_seqlens), device=tokens.device)
+        hidden, _ = self.mamba(row, cu_seqlens=borders)
+        return hidden[0, places[mixed.shape[:2].numel() :]].view_as(tokens)
 
     @staticmethod
     def after(blocks: Blocks, prefix: Tensor) -> list[State] | list[Mixed]:
@@ -258,7 +261,7 @@ def run_blocks(
     tokens: Tensor,
     states: Sequence[Any],
     recompute: bool = False,
-    lengths: Tensor | None = None,
+    cu_seqlens: Tensor | None = None,
 ) -> Tensor:
     """Runs all blocks over the 3DGS tokens.
 
@@ -268,28 +271,29 @@ def run_blocks(
 
     Args:
         blocks: the network's blocks, all of one kind, in their order.
-        tokens: ``[B, L, width]``.
+        tokens: ``[B, L, width]``; with ``cu_seqlens`` ``[1, T, width]``, those of all pictures.
         states: the result of ``prefix_states``, one entry per block.
         recompute: with gradients, keep only each block's input and run the block again in the
             backward pass.
-        lengths: ``[B]`` int64, how many tokens of each picture are its own; the others only fill
-            up the batch, and these see nothing of them. None means all.
+        cu_seqlens: ``[B + 1]`` int64, where each picture's tokens begin and end in one row.
 
     Returns:
-        ``[B, L, width]``; what fills up has no meaning.
+        The shape of ``tokens``.
     """
     blocks, states, gradients = list(blocks), list(states), torch.is_grad_enabled()
     first: Any = blocks[0]
-    layout = first.layout(tokens, states[0], lengths)
-    segments = [tokens]
-    if tokens.device.type == "cpu" and not gradients and first.in_segments and layout is None:
+    segments, start = [tokens], 0
+    if tokens.device.type == "cpu" and not gradients and first.in_segments:
         segments = list(tokens.split(SEGMENT, dim=1))
     for s, segment in enumerate(segments):
+        # Of a picture with no token in this segment the state passes as it is.
+        own = None if cu_seqlens is None else (cu_seqlens - start).clamp(0, segment.shape[1])
+        start += segment.shape[1]
         for i, block in enumerate(blocks):
             run = block
             if recompute and gradients:
                 run = partial(checkpoint, _Repeated(block), use_reentrant=False)
-            segment, states[i] = run(segment, states[i], layout)
+            segment, states[i] = run(segment, states[i], own)
         segments[s] = segment
     return torch.cat(segments, dim=1) if len(segments) > 1 else segments[0]
 
@@ -368,38 +372,25 @@ class Mixed(NamedTuple):
     tokens: Tensor
 
 
-def mixed_places(count: int, length: int, lengths: Tensor) -> Tensor:
-    """Where each token stands in the common sequence, when tokens are no prefix but mixed in.
+def mixed_places(count: int, cu_seqlens: Tensor) -> Tensor:
+    """Where each token stands in the common row, when tokens are no prefix but mixed in.
 
-    Of K such tokens and L 3DGS tokens, token k = 0 .. K-1 stands before the 3DGS token of the
-    number floor((k + 1) L / (K + 1)), so that they cut the 3DGS tokens into K + 1 pieces of nearly
-    one length. A Mamba block then runs over all K + L tokens, and the outputs of the K are dropped.
+    Of K such tokens and a picture's L 3DGS tokens, token k = 0 .. K-1 stands before the 3DGS token
+    of the number floor((k + 1) L / (K + 1)), so that they cut the 3DGS tokens into K + 1 pieces of
+    nearly one length. A Mamba block then runs over all K + L tokens, and the outputs of the K are
+    dropped.
 
     Args:
         count: K.
-        length: L, what fills up the batch included; that stays behind all others.
-        lengths: ``[B]`` int64, how many of the L tokens are a picture's own.
+        cu_seqlens: ``[B + 1]`` int64, where each picture's 3DGS tokens begin and end.
 
     Returns:
-        ``[B, K + L]`` int64, each row a permutation: first the places of the K tokens.
+        ``[B K + T]`` int64, a permutation: the places of each picture's K tokens, then those of
+        all 3DGS tokens.
     """
-    steps = torch.arange(count, device=lengths.device)
-    before = (steps + 1) * lengths[:, None] // (count + 1)
-    own = torch.arange(length, device=lengths.device).expand(len(lengths), -1).contiguous()
-    passed = torch.searchsorted(before.contiguous(), own, right=True)
-    return torch.cat([before + steps, own + passed], 1)
-
-
-def merged(mixed: Mixed, tokens: Tensor, places: Tensor) -> Tensor:
-    """Puts both kinds of tokens, ``[B, L, width]`` the second, into one ``[B, K + L, width]``."""
-    both = torch.cat([mixed.tokens.to(tokens.dtype), tokens], 1)
-    return torch.zeros_like(both).scatter(1, _index(places, both), both)
-
-
-def dropped(sequence: Tensor, places: Tensor, length: int) -> Tensor:
-    """The 3DGS tokens of ``sequence [B, K + L, width]`` in their order: ``[B, L, width]``."""
-    return sequence.gather(1, _index(places[:, places.shape[1] - length :], sequence))
-
-
-def _index(places: Tensor, tokens: Tensor) -> Tensor:
-    return places[..., None].expand(-1, -1, tokens.shape[-1])
+    steps = torch.arange(1, count + 1, device=cu_seqlens.device)
+    before = cu_seqlens[:-1, None] + steps * cu_seqlens.diff()[:, None] // (count + 1)
+    before = before.flatten()
+    own = torch.arange(int(cu_seqlens[-1]), device=cu_seqlens.device)
+    passed = torch.searchsorted(before, own, right=True)
+    return torch.cat([before + torch.arange(len(before), device=own.device), own + passed])

@@ -24,7 +24,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.nn.utils.rnn import pad_sequence
 
 from ...cameras import Cameras, exact_product
 from ...gaussians import Gaussians
@@ -89,8 +88,7 @@ class RayDecoder(nn.Module):
         """Decodes the cells that see something of the object, ``ray_layers`` Gaussians each.
 
         Args:
-            tokens: ``[P, O, width]``, the token of each patch in each of the O orders, of all valid
-                patches: those of the first picture, then those of the second, and so on.
+            tokens: ``[P, O, width]``, the token of each patch in each of the O orders.
             pixels: ``[B, pixel_channels, H, W]``, what the network sees of the pictures.
             patches: which patches these are.
             rgba: ``[B, H, W, 4]`` in [0, 1], straight alpha.
@@ -113,7 +111,7 @@ class RayDecoder(nn.Module):
             hidden = self.mix(F.silu(hidden))
         with torch.autocast(tokens.device.type, enabled=False):
             out = self.head(F.silu(hidden.float())).unflatten(-1, (self.config.ray_layers, -1))
-            return _padded(self._activated(out, cells, cameras), cells.counts)
+            return _padded(self._activated(out, cells, cameras), cells)
 
     def _stem(self, pixels: Tensor, patches: Patches, cells: Cells) -> Tensor:
         """What ``stem`` makes of ``pixels`` in the cells: ``[T, C]``.
@@ -164,11 +162,16 @@ class RayDecoder(nn.Module):
         )
 
 
-def _padded(made: Gaussians, counts: list[int]) -> Gaussians:
-    """Gaussians ``[T, layers]`` of all cells, as many of each picture, as ``[B, N]``."""
+def _padded(made: Gaussians, cells: Cells) -> Gaussians:
+    """Gaussians ``[T, layers]`` of all cells as ``[B, N]``, those of each picture first."""
+    counts = torch.tensor(cells.counts, device=cells.picture.device)
+    shape = len(counts), max(cells.counts, default=0)
+    first = shape[1] * torch.arange(len(counts), device=counts.device) - counts.cumsum(0) + counts
+    places = torch.arange(len(cells.picture), device=counts.device) + first[cells.picture]
 
     def filled(values: Tensor, filling: float = 0.0) -> Tensor:
-        return pad_sequence(list(values.split(counts)), True, filling).flatten(1, 2)
+        rows = values.new_full((shape[0] * shape[1], *values.shape[1:]), filling)
+        return rows.index_copy_(0, places, values).unflatten(0, shape).flatten(1, 2)
 
     return Gaussians(
         means=filled(made.means),

@@ -130,24 +130,22 @@ class SplatTokens(nn.Module):
 
         Args:
             pixels: result of ``pixels``.
-            patches: F patches of each picture.
+            patches: P patches of the pictures.
 
         Returns:
-            Tokens ``[B, OF, width]`` in their order, and where among them each patch has those of
-            its O orders: ``[B, F, O]`` int64; see ``Patches.orders``.
+            Tokens ``[P O, width]`` in their order, picture by picture, and where among them each
+            patch has those of its O orders: ``[P, O]`` int64; see ``Patches.orders``.
         """
         kept, places = patches.orders(self.orders)
         tokens = self.embedding[kept]
         if self.patchify is None:
             return tokens, places
-        cut = patches.cells(pixels, self.patch_size).flatten(2)
+        cut = patches.cells(pixels, self.patch_size).flatten(1)
         weight = self.patchify.weight.permute(0, 2, 3, 1).flatten(1)
-        found = F.linear(cut, weight, self.patchify.bias)  # [B, F, width]
-        number = torch.zeros(len(pixels), patches.grid**2, dtype=torch.int64, device=pixels.device)
-        steps = torch.arange(patches.index.shape[1], device=pixels.device)
-        number = number.scatter(1, patches.index, steps.expand_as(patches.index))
-        at = number.gather(1, self.orders[kept])[..., None]
-        return tokens + found.gather(1, at.expand(-1, -1, found.shape[-1])), places
+        found = F.linear(cut, weight, self.patchify.bias)  # [P, width]
+        of_token = torch.empty_like(kept)
+        of_token[places] = torch.arange(len(places), device=kept.device)[:, None]
+        return tokens + found.index_select(0, of_token), places
 
     def foreground(self, images: Tensor, background: float, margin: int) -> Tensor:
         """Finds the tokens whose patch is not plain background, or is near such a patch.

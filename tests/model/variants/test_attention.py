@@ -111,20 +111,16 @@ def test_every_token_sees_every_other_and_is_not_cut_into_segments(monkeypatch):
     assert (moved > 1e-5).all()
 
 
-def test_what_fills_up_a_batch_is_not_seen():
-    blocks, lengths = make_blocks(2, 7, 0), torch.tensor([5, 9, 0])
-    tokens, camera = torch.randn(3, 9, 24), torch.randn(3, 1, 7)
-    states = prefix_states(blocks, camera, None)
-    got = run_blocks(blocks, tokens, states, lengths=lengths)
-    assert got.isfinite().all()
-    for picture, length in enumerate(lengths):
+def test_pictures_of_a_row_do_not_see_each_other():
+    blocks, tokens = make_blocks(2, 7, 0), torch.randn(1, 14, 24)
+    cuts = torch.tensor([0, 5, 14, 14])
+    states = prefix_states(blocks, torch.randn(3, 1, 7), None)
+    got = run_blocks(blocks, tokens, states, cu_seqlens=cuts)
+    for picture, (i, j) in enumerate(zip(cuts, cuts[1:])):
         own = slice(picture, picture + 1)
-        alone = run_blocks(
-            blocks, tokens[own, :length], [state._make(x[own] for x in state) for state in states]
-        )
-        # Sums over another number of keys, of which some weigh 0.
-        torch.testing.assert_close(got[own, :length], alone, rtol=1e-5, atol=1e-6)
-    nothing = run_blocks(make_blocks(2, 0, 0), tokens, [None, None], lengths=lengths)
+        given = [state._make(x[own] for x in state) for state in states]
+        torch.testing.assert_close(got[:, i:j], run_blocks(blocks, tokens[:, i:j], given))
+    nothing = run_blocks(make_blocks(2, 0, 0), tokens, [None, None], cu_seqlens=cuts)
     assert nothing.isfinite().all()
 
 

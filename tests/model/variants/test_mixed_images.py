@@ -63,13 +63,12 @@ def test_equals_the_plain_form(camera, count, length):
 
 
 def test_places_known_answer():
-    # Of 10 own tokens and 2 others, these stand before tokens 3 and 6; the filling stays behind.
-    got = mixed_places(2, 12, torch.tensor([10, 12, 0]))
-    assert got[0].tolist() == [3, 7, 0, 1, 2, 4, 5, 6, 8, 9, 10, 11, 12, 13]
-    assert got[1, :2].tolist() == [4, 9]
-    assert got[2].tolist() == [*range(14)]
-    for row in mixed_places(5, 3, torch.tensor([3, 1])):
-        assert sorted(row.tolist()) == list(range(8))
+    # Of 10 own tokens and 2 others, these stand before tokens 3 and 6; then 12 tokens, then none.
+    got = mixed_places(2, torch.tensor([0, 10, 22, 22])).tolist()
+    assert got[:6] == [3, 7, 12 + 4, 12 + 9, 26, 27]
+    assert got[6:16] == [0, 1, 2, 4, 5, 6, 8, 9, 10, 11] and sorted(got) == [*range(28)]
+    assert got[16:] == [12 + t for t in (0, 1, 2, 3, 5, 6, 7, 8, 10, 11, 12, 13)]
+    assert sorted(mixed_places(5, torch.tensor([0, 3, 4])).tolist()) == [*range(14)]
 
 
 def test_a_token_is_seen_by_those_behind_it_alone(monkeypatch):
