@@ -26,6 +26,8 @@ SLACK = 2  # bytes after the end: a line end
 MAX_ZEROS = 1 << 24  # bytes of all accessors that no bytes of the file stand behind
 MAX_LINE = 1 << 16  # letters: a point with a few hundred numbers
 MAX_VALUES = 60_000_000  # numbers of one file; 480 MB as float64
+# Extensions that pack triangles; a reader without them sees zeros.
+_PACKED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
 _BOM = b"\xef\xbb\xbf"
 # str takes four control signs for blanks, which are none in a file: they become no ASCII.
 _STRICT = bytes(0xFF if 0x1C <= number <= 0x1F else number for number in range(256))
@@ -71,6 +73,7 @@ class Gltf(msgspec.Struct):
     buffers: list[_Buffer] = []
     bufferViews: list[View] = []
     accessors: list[Accessor] = []
+    extensionsRequired: list[str] = []
 
 
 Tree = TypeVar("Tree", bound=Gltf)
@@ -228,6 +231,8 @@ def _check_accessors(path: Path, tree: Gltf) -> None:
 
     trimesh compares the buffers' stated lengths with their real ones where a view is taken.
     """
+    if packed := _PACKED & {*tree.extensionsRequired}:
+        raise UserError(f"{path}: packed by {min(packed)}, which is not read; unpack it first")
     for number, view in enumerate(tree.bufferViews):
         there = tree.buffers[view.buffer].byteLength - view.byteOffset
         compare_sizes(path, f"the bytes of view {number}", view.byteLength, there, exact=False)

@@ -183,6 +183,7 @@ LIES = {
         },
         "accessor 4",
     ),
+    "draco": ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "packed by KHR_draco"),
     "lists": ({"accessors": {}}, "array"),
     "deep": (DEEP, "nested"),
     "outside": ({"buffers": [{"byteLength": 36, "uri": "../secret.bin"}]}, "not found"),

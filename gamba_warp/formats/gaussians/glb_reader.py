@@ -54,7 +54,6 @@ class _Document(Gltf):
     nodes: list[_Node] = []
     scenes: list[_Scene] = []
     scene: _Index | None = None
-    extensionsRequired: list[str] = []
 
 
 def holds_gaussians(path: Path, file: BinaryIO, size: int) -> bool:
