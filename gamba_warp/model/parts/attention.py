@@ -58,14 +58,15 @@ class AttentionBlock(Block):
     ) -> tuple[Tensor, Memory | None]:
         """Refines the 3DGS tokens, all of them: ``Block.forward``."""
         parts = self.kvq_proj(self.norm(tokens)).chunk(3, dim=-1)
-        parts = [_by_head(part, self.heads) for part in parts]
+        keys, values, queries = (_by_head(part, self.heads) for part in parts)
         if cu_seqlens is None:
-            hidden = _attention(*parts, state)
+            hidden = _attention(keys, values, queries, state)
         else:  # a picture after the other, each over its own tokens
-            pictures = zip(*(part.split(cu_seqlens.diff().tolist(), 2) for part in parts))
+            counts = cu_seqlens.diff().tolist()
+            pictures = zip(*(part.split(counts, 2) for part in (keys, values, queries)))
             hidden = torch.cat([
-                _attention(*own, state and Memory(*(x[i : i + 1] for x in state)))
-                for i, own in enumerate(pictures)
+                _attention(k, v, q, state and Memory(*(x[i : i + 1] for x in state)))
+                for i, (k, v, q) in enumerate(pictures)
             ], 2)  # fmt: skip
         tokens = tokens + self.out_proj(hidden.transpose(1, 2).flatten(2))
         return tokens + self.mlp(self.mlp_norm(tokens)), state
