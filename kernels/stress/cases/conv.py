@@ -84,12 +84,11 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     samples: dict[str, Any] = {k: samples_of(t) for k, t in x.items()}
     r = Rounding(case.seed, trial)
     exact = partial(scan_oracle.conv, silu=o["silu"], dtype=DTYPES[o["dtype"]], r=r)
-    cuts = borders(case)
-    out, final = exact(samples) if cuts is None else scan_oracle.of_sequences(exact, samples, cuts)
+    cuts = borders(case, device)
+    out, final = scan_oracle.of_sequences(exact, samples, cuts)
     leaves = {k: t for k, t in x.items() if t is not None}
     truths, true_leaves = {"out": out, "final": final}, {k: samples[k] for k in leaves}
-    cu_seqlens = None if cuts is None else torch.tensor(cuts, device=device)
-    runs = Runs(case, lambda: _run(o, x, cu_seqlens), leaves, truths, true_leaves)
+    runs = Runs(case, lambda: _run(o, x, cuts), leaves, truths, true_leaves)
     return runs.outcome({"out": (1,), "x": (1,)})
 
 

@@ -160,13 +160,13 @@ def laid(x: Tensor, layout: str) -> Tensor:
     return x
 
 
-def borders(case: Case) -> list[int] | None:
-    """Where the packed sequences begin and end, some without tokens; None of a single one."""
+def borders(case: Case, device: torch.device) -> Tensor | None:
+    """``cu_seqlens`` of the packed sequences, some without tokens; None of a single one."""
     length, count = case.options["length"], case.options["sequences"]
     if count == 1:
         return None
     cuts = torch.randint(length + 1, (count - 1,), generator=generator(case, "cuts"))
-    return [0, *cuts.sort().values.tolist(), length]
+    return torch.tensor([0, *cuts.sort().values.tolist(), length], device=device)
 
 
 def build(case: Case, device: torch.device) -> dict[str, Tensor | None]:
@@ -240,14 +240,11 @@ def evaluate(case: Case, device: torch.device, trial: int = 0) -> Outcome:
     exact = partial(
         scan_oracle.scan, softplus=o["softplus"], discretization=o["discretization"], r=r
     )
-    cuts = borders(case)
-    out, last = exact(used) if cuts is None else scan_oracle.of_sequences(exact, used, cuts)
+    cuts = borders(case, device)
+    out, last = scan_oracle.of_sequences(exact, used, cuts)
     leaves = {k: t for k, t in x.items() if t is not None}
     truths = {"out": out[:, :, o["split"] :], "last": last}
-    cu_seqlens = None if cuts is None else torch.tensor(cuts, device=device)
-    runs = Runs(
-        case, lambda: _run(o, x, cu_seqlens), leaves, truths, {k: samples[k] for k in leaves}
-    )
+    runs = Runs(case, lambda: _run(o, x, cuts), leaves, truths, {k: samples[k] for k in leaves})
     # the tokens of a channel are taken together
     parts: dict[str, tuple[int, ...]] = dict.fromkeys(("out", "u", "delta", "z", "C"), (1,))
     return runs.outcome(parts if o["constant_B"] else parts | {"B": (1,)})

@@ -136,17 +136,19 @@ def scan(x: dict, softplus: bool, discretization: str, r: Rounding) -> tuple[Ten
 
 
 def of_sequences(
-    function: Callable[[dict], tuple[Tensor, Tensor]], x: dict, cuts: list[int]
+    function: Callable[[dict], tuple[Tensor, Tensor]], x: dict, cuts: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Output and last states of sequences packed in one row, each computed alone.
 
     Args:
         function: gives output ``[S, 1, L, D]`` and last state ``[S, 1, ..]`` of such leaves.
         x: the leaves ``[S, ..]`` by name, with a state for each sequence.
-        cuts: where sequences begin, and where the last ends.
+        cuts: where sequences begin, and where the last ends; None: nothing is packed.
     """
+    if cuts is None:
+        return function(x)
     found = []
-    for s, (i, j) in enumerate(zip(cuts, cuts[1:])):
+    for s, (i, j) in enumerate(cuts.unfold(0, 2, 1).tolist()):
         place = {k: (slice(None), slice(None), slice(i, j)) for k in TOKENS}
         place |= {"initial_state": (slice(None), slice(s, s + 1))}
         own = {k: t if t is None or k not in place else t[place[k]] for k, t in x.items()}
