@@ -40,7 +40,7 @@ _FREE = {
     VIEWS: (
         *("source", "data", "split", "split_version", "uids", "uids_sha256"),
         *("baselines", "contact_sheet", "distance", "rendering", "pictures", "resize_pictures"),
-        *("lpips", "lpips_reason", "grounds"),
+        *("lpips", "lpips_reason", "grounds", "name", "changed"),
     ),
     SHAPES: ("name", "definitions", "frame", "pred_axes", "reference", "distance"),
 }

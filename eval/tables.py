@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -64,3 +65,12 @@ def figures(
 def markdown(lines: Lines) -> str:
     """A Markdown table of lines, aligned in plain text too."""
     return table(lines[0], lines[1:], aligned=True)
+
+
+def latex(lines: Lines) -> str:
+    """A LaTeX ``tabular`` of lines, with the rules of booktabs."""
+    escaped = [[re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line] for line in lines]
+    head, *rows = (" & ".join(line) + r" \\" for line in escaped)
+    columns = "l" + "r" * (len(lines[0]) - 1)
+    parts = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", head, r"\midrule", *rows]
+    return "\n".join([*parts, r"\bottomrule", r"\end{tabular}"]) + "\n"

@@ -17,13 +17,14 @@ from gamba_warp.errors import UserError
 from gamba_warp.surfaces.options import Method, Pixels, Views, Voxels
 from gamba_warp.untrusted.ranges import Seed, ranged
 
-Align = Literal["none", "scale", "icp"]
+Step = Literal["box", "scale", "yaw", "turn", "rigid", "icp"]
 Frame = Literal["gt", "unit", "reference"]
 Up = Literal["auto", "y", "z"]
 PredAxes = Literal["auto", "opencv", "opengl", "z-up", "frame"]
 PointRule = Literal["area", "views"]
 GridRule = Literal["around", "lattice"]
-OccupancyRule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity"]
+OccupancyRule = Literal["solid", "joint", "enclosed", "majority", "winding", "parity", "none"]
+ChamferForm = Literal["mean", "sum", "squared", "squared-sum"]
 
 Reference = Annotated[int, Meta(ge=0, le=100_000)]
 Distance = Annotated[float, Meta(ge=0.01, le=1000)]
@@ -36,15 +37,21 @@ class ShapesOptions:
     Attributes:
         pred: Gaussians (.ply), a mesh or a point cloud; or a folder of them.
         gt: A mesh or a point cloud; or a folder, paired with PRED by name.
-        out: Folder for report.json, objects.csv and, with --baseline, table.md.
+        out: Folder for report.json, objects.csv, table.md and table.tex. An evaluation that was
+            interrupted goes on there with the objects that it lacks.
         baseline: Folders of other predictions of the same objects: PRED is compared with each,
             object by object. A folder's name names its row.
-        protocol: default, syncdreamer (points that 16 cameras see, parity on a 64^3 lattice),
-            gso (the objects of "gamba data gso", in the input camera's frame), or a JSON file: a
+        protocol: default, gso (the objects of "gamba data gso", in the input camera's frame), a
+            protocol of the field (triposr, sf3d, spar3d, syncdreamer, gamba), or a JSON file: a
             protocol, or the report.json of an evaluation to repeat.
+        explain: Print the protocol: what its source states, what it leaves open, and what was
+            chosen; nothing is evaluated.
+        set: Fields of the protocol, FIELD=JSON each: --set num_points=10000 surface.voxels=64
+            thresholds=[0.1,0.2]. "--explain" lists them.
         surface: How Gaussians become a surface; centers is a diagnostic.
-        align: How predictions are aligned with the truth before comparing; scale also moves, icp
-            also turns.
+        align: Steps that align predictions with the truth before comparing, in their order: box
+            (bounding boxes), scale (centroids and spread of points), yaw and turn (search about
+            the upward axis or about all), rigid and icp (ICP without and with scale); or none.
         frame: Frame of the predictions: that of the GT file, its unit frame (z-up, longest side 1,
             centred), or the reference camera's (needs --data).
         up: Upward axis of GT files; auto goes by the format: y of .obj, .glb and .gltf; of others
@@ -61,17 +68,24 @@ class ShapesOptions:
         views: Number of views of the TSDF.
         pixels: Side of the TSDF's depth maps.
         seed: Seed of the random points.
+        sensitivity: Evaluate under every protocol, and under each change of one field of this one,
+            in place of once: a table and a chart of what the choices alone change, in OUT.
+        paint: Paint the distance on so many objects' surfaces, from the best to the worst, in
+            OUT/painted.html.
+        workers: Pairs evaluated at the same time, each in a process of its own.
         strict: Meshes with a flag other than "open" (not manifold, self-intersecting, inverted, …)
             are failures; else they are evaluated and flagged.
     """
 
-    pred: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PRED")]
-    gt: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GT")]
+    pred: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PRED")] = None
+    gt: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="GT")] = None
     out: Path | None = None
     baseline: tuple[Path, ...] = ()
     protocol: str = "default"
+    explain: bool = False
+    set: tuple[str, ...] = ()
     surface: Method | None = None
-    align: Align | None = None
+    align: tuple[Step | Literal["none"], ...] | None = None
     frame: Frame | None = None
     up: Up | None = None
     pred_axes: PredAxes | None = None
@@ -83,6 +97,9 @@ class ShapesOptions:
     views: Views | None = None
     pixels: Pixels | None = None
     seed: Seed | None = None
+    sensitivity: bool = False
+    paint: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    workers: Annotated[int, Meta(ge=1, le=256)] = 1
     strict: bool = False
 
 
@@ -104,12 +121,21 @@ def eval_geometry_command(
     """
     if json and csv:
         raise UserError("--json and --csv: give one of them")
+    if options.explain:
+        return _explained(options)
+    if options.pred is None or options.gt is None:
+        raise UserError("give PRED and GT: two files or two folders")
     from ..report import count_line, csv_of, json_of, summary_lines
     from .pairs import evaluate_shapes
     from .protocol import chosen_protocol
     from .table import page
 
     protocol = chosen_protocol(options)
+    if options.sensitivity:
+        from .sensitivity import evaluate_variants
+
+        print(evaluate_variants(options, protocol), end="")
+        return 0
     report = evaluate_shapes(options, protocol)
     parts = {"": report} | report["baselines"]
     for name, part in parts.items():
@@ -135,3 +161,20 @@ def eval_geometry_command(
             for item in part["failures"]:
                 print(f"failed: {item['name']} ({name}): {item['reason']}")
     return code
+
+
+def _explained(options: ShapesOptions) -> int:
+    """Prints the protocol that the options name, with its source."""
+    from .. import presets
+    from ..report import flat
+    from .protocol import PRESETS, chosen_protocol
+
+    preset = presets.PRESETS.get(options.protocol)
+    if preset is not None and preset.views is not None:
+        print(presets.explain(options.protocol, preset.views), "", sep="\n")
+    if preset is None or options.protocol in PRESETS:
+        protocol = chosen_protocol(options)
+        print(presets.explain(protocol.name, flat(protocol.fields(), lists=True)))
+        if protocol.changes():
+            print(f"changed: {', '.join(protocol.changes())}")
+    return 0

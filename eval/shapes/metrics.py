@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
 from gamba_warp.cameras import intrinsics, orbit
-from gamba_warp.errors import UserError
 from gamba_warp.gaussians import Gaussians
-from gamba_warp.versions import import_open3d
 
+from .align import aligned, match_moments, symmetry
 from .load import Evaluated, centers
 from .occupancy import RULES, grid_around, syncdreamer_grid
 from .protocol import GeometryProtocol
-from .shape import Mesh, Points, Similarity, halves, sample, visible_points
-
-# How far correspondences reach in each round of ICP; the truth's longest side is 1.
-ICP_DISTANCES = (0.2, 0.1, 0.05)
+from .shape import Mesh, Points, halves, nearest, sample, visible_points
 
 # Turns that files are mistaken by: half ones, and quarter ones about x between y-up and z-up.
 TURNS = {
@@ -31,12 +26,12 @@ TURNS = {
     "90 degrees about x": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
     "-90 degrees about x": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
-_FEW = 20_000  # points that are enough to tell
+_FEW = 5_000  # points that are enough to tell
 
 
 def compare(
     predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
-) -> dict[str, Any]:
+) -> tuple[Mesh | Points, dict[str, Any]]:
     """Computes all metrics of one pair, after the protocol's alignment.
 
     Args:
@@ -45,29 +40,48 @@ def compare(
         protocol: says how points and voxels are taken, and how the prediction is aligned.
 
     Returns:
-        What ``surface_metrics`` and ``shape_iou`` return, ``noise_floor``, and, where the protocol
-        aligns, ``alignment``.
+        The aligned prediction; and what the three functions below return.
 
     Raises:
         UserError: a shape cannot be sampled or aligned.
     """
-    seed = 2 * protocol.seed
-    true_points = take_points(truth, protocol, seed)
-    points = take_points(predicted, protocol, seed + 1)
-    result: dict[str, Any] = {}
-    if protocol.align != "none":
-        motion, residual = match_moments(points, true_points), {}
-        if protocol.align == "icp":
-            motion, residual = icp(points, true_points)
-        predicted = motion.apply(predicted)
-        points = take_points(predicted, protocol, seed + 1)
-        result["alignment"] = motion.record() | residual
-    return {
-        **surface_metrics(points, true_points, protocol.thresholds),
+    predicted, alignment = align_shape(predicted, truth, protocol)
+    return predicted, {
+        **point_metrics(predicted, truth, protocol),
         **shape_iou(predicted, truth, protocol),
-        "noise_floor": noise_floor(truth, protocol, true_points),
-        **result,
+        **alignment,
     }
+
+
+def align_shape(
+    predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
+) -> tuple[Mesh | Points, dict[str, Any]]:
+    """Moves a prediction as the protocol says; arguments as for ``compare``.
+
+    Returns:
+        The prediction; and, where the protocol aligns, ``alignment`` (the motion) and, where it
+        searches for a turn, ``gt_symmetry`` (see ``align.symmetry``).
+
+    Raises:
+        UserError: it cannot be sampled or aligned.
+    """
+    if not protocol.align:
+        return predicted, {}
+    points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, truth))
+    motion, residual = aligned(points, true_points, protocol.align)
+    found: dict[str, Any] = {"alignment": motion.record() | residual}
+    if {"yaw", "turn"} & set(protocol.align):
+        found["gt_symmetry"] = symmetry(true_points)
+    return motion.apply(predicted), found
+
+
+def point_metrics(
+    predicted: Mesh | Points, truth: Mesh | Points, protocol: GeometryProtocol
+) -> dict[str, Any]:
+    """What ``surface_metrics`` says of points of two shapes, and ``noise_floor``."""
+    points, true_points = (take_points(s, protocol, protocol.seed) for s in (predicted, truth))
+    found = surface_metrics(points, true_points, protocol)
+    return found | {"noise_floor": noise_floor(truth, protocol, true_points)}
 
 
 def take_points(shape: Mesh | Points, protocol: GeometryProtocol, seed: int) -> Points:
@@ -93,15 +107,15 @@ def noise_floor(truth: Mesh | Points, protocol: GeometryProtocol, points: Points
     Args:
         truth: the shape.
         protocol: says how it is sampled.
-        points: its sample with the seed ``2 * protocol.seed``.
+        points: its sample with the seed of the protocol.
     """
     if isinstance(truth, Points):
         if len(truth.positions) < 2:
             return None
-        one, two = halves(truth, protocol.num_points, 2 * protocol.seed)
+        one, two = halves(truth, protocol.num_points, protocol.seed)
     else:
-        one, two = points, take_points(truth, protocol, 2 * protocol.seed + 1)
-    return surface_metrics(two, one, ())["chamfer"]
+        one, two = points, take_points(truth, protocol, protocol.seed + 1)
+    return surface_metrics(two, one, protocol)["chamfer"]
 
 
 def shape_iou(
@@ -113,6 +127,8 @@ def shape_iou(
         ``iou`` (None without volume), ``iou_voxel`` (the side of a voxel) and, where ``iou`` is
         None, ``iou_reason``.
     """
+    if protocol.occupancy == "none":
+        return {"iou": None, "iou_reason": "the protocol takes none"}
     if isinstance(predicted, Points):
         return {"iou": None, "iou_reason": "the prediction is a point cloud"}
     if isinstance(truth, Points):
@@ -128,62 +144,6 @@ def shape_iou(
     if iou is None:
         return {"iou": None, "iou_reason": "neither shape fills a voxel", "iou_voxel": grid.step}
     return {"iou": iou, "iou_voxel": grid.step}
-
-
-def match_moments(predicted: Points, truth: Points) -> Similarity:
-    """Finds the translation and scale after which centroids and mean square radii are equal.
-
-    Args:
-        predicted: points to be moved.
-        truth: points to be met.
-
-    Raises:
-        UserError: the prediction is a single point.
-    """
-    centers = [points.positions.mean(0) for points in (predicted, truth)]
-    radii = [
-        np.sqrt(((points.positions - center) ** 2).sum(1).mean())
-        for points, center in zip((predicted, truth), centers, strict=True)
-    ]
-    if radii[0] <= 0:
-        raise UserError("cannot be aligned: all points are one")
-    scale = float(radii[1] / radii[0])
-    return Similarity(np.eye(3), centers[1] - scale * centers[0], scale)
-
-
-def icp(predicted: Points, truth: Points) -> tuple[Similarity, dict[str, float]]:
-    """Finds rotation, translation and scale by Open3D's point-to-point ICP.
-
-    It starts from ``match_moments`` and finds small rotations only.
-
-    Args:
-        predicted: points to be moved.
-        truth: points to be met.
-
-    Returns:
-        The motion, and Open3D's ``fitness`` (share of points with a partner) and ``inlier_rmse``.
-
-    Raises:
-        UserError: the prediction is a single point.
-    """
-    o3d = import_open3d()
-    clouds = [
-        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.positions))
-        for points in (predicted, truth)
-    ]
-    start = match_moments(predicted, truth)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = start.scale * start.rotation, start.translation
-    method = o3d.pipelines.registration.TransformationEstimationPointToPoint(with_scaling=True)
-    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(max_iteration=100)
-    for distance in ICP_DISTANCES:
-        result = o3d.pipelines.registration.registration_icp(
-            *clouds, distance, matrix, method, criteria
-        )
-        matrix = result.transformation
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    motion = Similarity(matrix[:3, :3] / scale, np.array(matrix[:3, 3]), scale)
-    return motion, {"fitness": result.fitness, "inlier_rmse": result.inlier_rmse}
 
 
 def chamfer_by_turn(
@@ -209,47 +169,32 @@ def chamfer_by_turn(
     points = of.positions
     for name, turn in TURNS.items():
         turned = Points(predicted.motion.after(turn).points(points))
-        if protocol.align != "none":
+        if protocol.align:
             turned = match_moments(turned, true).apply(turned)
-        found[name] = surface_metrics(turned, true, ())["chamfer"]
+        found[name] = float(np.mean([nearest(*way)[0].mean() for way in _ways(turned, true)]))
     return found
 
 
-def nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the nearest of ``points [M, 3]`` to each of ``queries [N, 3]``, in float32.
-
-    Returns:
-        Distances ``[N]`` float32 and indices ``[N]``.
-    """
-    o3d = import_open3d()
-    search = o3d.core.nns.NearestNeighborSearch(np.ascontiguousarray(points, np.float32))
-    search.knn_index()
-    indices, squared = search.knn_search(np.ascontiguousarray(queries, np.float32), 1)
-    return np.sqrt(squared.numpy()[:, 0]), indices.numpy()[:, 0]
-
-
-def surface_metrics(
-    predicted: Points, truth: Points, thresholds: Sequence[float] = (0.01, 0.02, 0.05)
-) -> dict:
+def surface_metrics(predicted: Points, truth: Points, protocol: GeometryProtocol) -> dict:
     """Measures how far two surfaces are apart, by points on them.
 
     Args:
         predicted: at least one point.
-        truth: at least one point, in the same frame and unit.
-        thresholds: distances for the F-score, in the same unit.
+        truth: at least one point, in the same frame; the truth's longest side is 1.
+        protocol: says the unit, the form of the Chamfer distance and the thresholds.
 
     Returns:
         ``accuracy`` (mean distance from predicted to true points), ``completeness`` (from true to
-        predicted), ``chamfer`` (mean of the two, distances not squared), ``chamfer_squared`` (mean
-        of the two mean squared distances), ``fscore`` ``{str(threshold): 0..1}`` (harmonic mean of
+        predicted), ``chamfer`` (of both, in the protocol's form), ``chamfer_squared`` (mean of the
+        two mean squared distances), ``fscore`` ``{str(threshold): 0..1}`` (harmonic mean of
         precision and recall), ``hausdorff`` (the largest distance of either way) and
         ``normal_consistency`` (mean absolute cosine of nearest points' normals, both ways,
         averaged; None without normals).
     """
-    there, there_at = nearest(predicted.positions, truth.positions)
-    back, back_at = nearest(truth.positions, predicted.positions)
+    (there, there_at), (back, back_at) = (nearest(*way) for way in _ways(predicted, truth))
+    there, back = (protocol.unit * found.astype(np.float64) for found in (there, back))
     fscore = {}
-    for threshold in thresholds:
+    for threshold in protocol.thresholds:
         precision, recall = np.mean(there <= threshold), np.mean(back <= threshold)
         total = precision + recall
         fscore[f"{threshold:g}"] = float(2 * precision * recall / total) if total else 0.0
@@ -258,16 +203,22 @@ def surface_metrics(
         one = np.abs((predicted.normals * truth.normals[there_at]).sum(1)).mean()
         two = np.abs((truth.normals * predicted.normals[back_at]).sum(1)).mean()
         consistency = float(one + two) / 2
-    there, back = there.astype(np.float64), back.astype(np.float64)
+    plain, squared = (float(a.mean() + b.mean()) for a, b in ((there, back), (there**2, back**2)))
+    forms = {"mean": plain / 2, "sum": plain, "squared": squared / 2, "squared-sum": squared}
     return {
-        "chamfer": float(there.mean() + back.mean()) / 2,
-        "chamfer_squared": float((there**2).mean() + (back**2).mean()) / 2,
+        "chamfer": forms[protocol.chamfer],
+        "chamfer_squared": squared / 2,
         "accuracy": float(there.mean()),
         "completeness": float(back.mean()),
         "hausdorff": float(max(there.max(), back.max())),
         "fscore": fscore,
         "normal_consistency": consistency,
     }
+
+
+def _ways(predicted: Points, truth: Points) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Queries and points of both ways, from the predicted ones to the true ones first."""
+    return (predicted.positions, truth.positions), (truth.positions, predicted.positions)
 
 
 def volume_iou(a: np.ndarray, b: np.ndarray) -> float | None:

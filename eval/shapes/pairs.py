@@ -6,8 +6,11 @@ imported by the functions that run there.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -34,10 +37,11 @@ from ..report import (
     save_report,
     stdout_to_stderr,
 )
+from ..tables import latex
 from .command import ShapesOptions
 from .protocol import GeometryProtocol
 from .shape import SUFFIXES, Similarity
-from .table import PREDICTED, differences_of, page, summaries
+from .table import PREDICTED, differences_of, lines_of, page, summaries
 
 if TYPE_CHECKING:
     from gamba_warp.data.dataset import ViewDataset
@@ -47,6 +51,7 @@ PACKAGES = ("open3d-cpu", "open3d", "pymeshlab", "scikit-image", "trimesh", "num
 # entries of the records that have no meaningful mean
 _NO_MEAN = (
     *("alignment", "gt_normalization", "iou_voxel", "pred_closed", "gt_closed", "chamfer_turned"),
+    "gt_symmetry",
 )
 
 
@@ -85,17 +90,30 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
     if (protocol.frame == "reference") != (options.data is not None):
         raise UserError("--frame reference and --data: give both or neither")
     listed = gso.NAMES if protocol.name == "gso" else ()
+    assert options.pred is not None and options.gt is not None  # the command asks for them
     found = find_all(options.pred, options.baseline, options.gt, listed)
     dataset = None
     if options.data is not None:
         from gamba_warp.data.dataset import open_dataset
 
         dataset = open_dataset(options.data)
+    if options.paint and options.out is None:
+        raise UserError("--paint: needs --out")
     folder = output_folder(options.out) if options.out is not None else None
+    journal = Journal(folder, protocol, options.data)
+    ways: dict[str, dict[str, Any]] = {name: {} for name in found}
+    if options.paint:
+        ways[PREDICTED]["evaluate"] = partial(evaluate_pair, painted=folder)
+    run = partial(
+        evaluate_pairs,
+        protocol=protocol,
+        dataset=dataset,
+        journal=journal,
+        workers=options.workers,
+    )
     with stdout_to_stderr():
         objects = {
-            name: failures + evaluate_pairs(pairs, protocol, dataset)
-            for name, (pairs, failures) in found.items()
+            name: failures + run(pairs, **ways[name]) for name, (pairs, failures) in found.items()
         }
     named = {"pred": options.pred, "gt": options.gt, "data": options.data}
     predicted = objects.pop(PREDICTED)
@@ -118,9 +136,54 @@ def evaluate_shapes(options: ShapesOptions, protocol: GeometryProtocol) -> dict[
         report["evaluation"] = gso.protocol_of(done)
     if folder is not None:
         save_report(report, folder)
-        if objects:
-            write_text(folder / "table.md", page(report))
+        write_text(folder / "table.md", page(report))
+        write_text(folder / "table.tex", latex(lines_of(report, "mean")))
+        if options.paint:
+            from .painted import painted_page
+
+            painted_page(report, folder, options.paint)
+        journal.end()
     return report
+
+
+class Journal:
+    """The records of an evaluation that is under way, so that an interrupted one goes on.
+
+    A line of the file is a pair's record with a key of all that decides it: the protocol, this
+    program's version and both files.
+    """
+
+    def __init__(self, folder: Path | None, protocol: GeometryProtocol, data: Path | None) -> None:
+        self._file = None if folder is None else folder / "objects.jsonl"
+        self._decides = [protocol.to_json(), __version__, str(data and data.resolve())]
+        self._known: dict[str, dict[str, Any]] = {}
+        if self._file is not None and self._file.is_file():
+            for line in self._file.read_text(encoding="utf-8", errors="replace").splitlines():
+                with suppress(ValueError, KeyError, TypeError):  # a line that was cut off
+                    entry = json.loads(line)
+                    self._known[entry["key"]] = entry["record"]
+
+    def key(self, pair: Pair) -> str:
+        """What decides the pair's record."""
+        with suppress(UserError):
+            files = [sha256(pair.pred), sha256(pair.gt), pair.name, pair.rotation]
+            return hashlib.sha256(json.dumps([*self._decides, *files]).encode()).hexdigest()
+        return ""  # which no entry has: the pair will fail by name
+
+    def get(self, key: str) -> dict[str, Any] | None:
+        """The record that is known, or None."""
+        return self._known.get(key)
+
+    def add(self, key: str, record: dict[str, Any]) -> None:
+        """Notes a record; failures are tried again the next time, so they are not noted."""
+        if self._file is not None and record["status"] == OK:
+            with open(self._file, "a", encoding="utf-8") as file:
+                file.write(json.dumps(finite_or_none({"key": key, "record": record})) + "\n")
+
+    def end(self) -> None:
+        """Removes the file: the report holds it all."""
+        if self._file is not None:
+            self._file.unlink(missing_ok=True)
 
 
 Found = tuple[list[Pair], list[dict[str, str]]]  # what find_pairs returns
@@ -234,7 +297,10 @@ def out_of_reference(dataset: ViewDataset, uid: str, reference: int, distance: f
 
 
 def evaluate_pair(
-    pair: Pair, protocol: GeometryProtocol, motion: Similarity | None
+    pair: Pair,
+    protocol: GeometryProtocol,
+    motion: Similarity | None,
+    painted: Path | None = None,
 ) -> dict[str, Any]:
     """Loads and compares one pair.
 
@@ -242,6 +308,7 @@ def evaluate_pair(
         pair: the files.
         protocol: what to do.
         motion: of the prediction into the truth's unit frame; None: the same as the truth's.
+        painted: the folder in which the surfaces are painted, or None.
 
     Returns:
         The object's record.
@@ -258,8 +325,14 @@ def evaluate_pair(
         into, frame_axes = motion or truth.motion, FRAME_AXES.get(protocol.frame, truth.axes)
         predicted = load_prediction(pair.pred, into, frame_axes, protocol)
     with stages("compare"):
-        metrics = check_finite(compare(predicted.shape, truth.shape, protocol))
+        shape, metrics = compare(predicted.shape, truth.shape, protocol)
+        check_finite(metrics)
         turned = check_finite(chamfer_by_turn(predicted, truth, protocol))
+    if painted is not None:
+        from .painted import paint
+
+        with stages("paint"):
+            paint(pair.name, shape, truth.shape, painted)
     return {
         "name": pair.name,
         "status": OK,
@@ -284,6 +357,8 @@ def evaluate_pairs(
     protocol: GeometryProtocol,
     dataset: ViewDataset | None,
     evaluate: Callable[..., dict[str, Any]] = evaluate_pair,
+    journal: Journal | None = None,
+    workers: int = 1,
 ) -> list[dict[str, Any]]:
     """Evaluates every pair; what goes wrong with one is its failure and stops no other.
 
@@ -294,6 +369,8 @@ def evaluate_pairs(
         protocol: what to do.
         dataset: whose objects have the names of the pairs, for the frame "reference".
         evaluate: makes the record of one pair, as ``evaluate_pair`` does; a function of a module.
+        journal: of what is done already, and for what is done here; or None.
+        workers: pairs evaluated at the same time.
 
     Returns:
         One record for each pair.
@@ -303,11 +380,16 @@ def evaluate_pairs(
     attempt = partial(
         _attempt, protocol=protocol, dataset=dataset, evaluate=evaluate, threads=threads
     )
-    found = run_each(attempt, pairs, seconds=PAIR_SECONDS)
-    objects = []
-    for index, result in progress_bar(found, total=len(pairs), unit="object"):
+    journal = journal or Journal(None, protocol, None)
+    keys = [journal.key(pair) for pair in pairs]
+    objects = [record for key in keys if (record := journal.get(key))]
+    left = [at for at, key in enumerate(keys) if journal.get(key) is None]
+    waiting = [pairs[at] for at in left]
+    found = run_each(attempt, waiting, workers=workers, seconds=PAIR_SECONDS)
+    for index, result in progress_bar(found, total=len(waiting), unit="object"):
         if isinstance(result, Failed):
-            result = failure(pairs[index].name, result.reason)
+            result = failure(waiting[index].name, result.reason)
+        journal.add(keys[left[index]], result)
         objects.append(result)
     return objects
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,8 +16,10 @@ from gamba_warp.surfaces.options import SurfaceOptions
 from gamba_warp.untrusted.documents import read_document
 from gamba_warp.untrusted.ranges import Seed, check_options
 
+from .. import presets
+from .align import STEPS
 from .command import (
-    Align,
+    ChamferForm,
     Distance,
     Frame,
     GridRule,
@@ -25,6 +28,7 @@ from .command import (
     PredAxes,
     Reference,
     ShapesOptions,
+    Step,
     Up,
 )
 from .occupancy import RULES
@@ -32,7 +36,7 @@ from .occupancy import RULES
 Thresholds = Annotated[
     tuple[Annotated[float, Meta(gt=0, le=100)], ...], Meta(min_length=1, max_length=100)
 ]
-VERSION = 3  # goes up whenever the same protocol would give other numbers
+VERSION = 4  # goes up whenever the same protocol would give other numbers
 
 POINTS: dict[PointRule, str] = {
     "area": "area-uniform on the whole surface, inner faces included; faces given twice and faces "
@@ -47,12 +51,18 @@ GRIDS: dict[GridRule, str] = {
     "larger where the longest side of both together would have more than twice as many",
     "lattice": "64 points a side from -1 in steps of 1/32",
 }
+FORMS: dict[ChamferForm, str] = {
+    "mean": "mean of the two mean nearest distances between points, not squared",
+    "sum": "sum of the two mean nearest distances between points, not squared",
+    "squared": "mean of the two mean squared nearest distances",
+    "squared-sum": "sum of the two mean squared nearest distances",
+}
 DEFINITIONS = {
     "normalization": "truth centred on its bounding box, longest side 1, turned to z-up",
     "axes": "of a file: asked for, else those of its format (Gaussians: opencv; .obj, .glb, .gltf: "
     "opengl), else unknown; a prediction is turned into those of its frame where both are known",
-    "chamfer": "mean of the two mean nearest distances between points, not squared",
-    "chamfer_squared": "mean of the two mean squared nearest distances",
+    "samples": "both shapes are drawn from with one seed: a shape and itself have distance 0",
+    "chamfer_squared": FORMS["squared"],
     "accuracy": "mean nearest distance from predicted to true points",
     "completeness": "mean nearest distance from true to predicted points",
     "hausdorff": "largest nearest distance, of either way, between the points",
@@ -65,19 +75,23 @@ DEFINITIONS = {
 
 @dataclass(frozen=True)
 class GeometryProtocol:
-    """All that decides a number of ``eval-geometry``. Lengths: the truth's longest side is 1.
+    """All that decides a number of ``eval-geometry``.
+
+    Lengths that are fields: the truth's longest side is 1. Those that a report states, and the
+    thresholds, are in units in which it is ``unit`` long.
 
     Attributes:
         name: name of the preset, or whatever a file says.
         points: how points are put on surfaces, one of ``POINTS``.
         num_points: number of points of a shape (for "area", and for point clouds).
-        seed: seed of the random points; predicted and true points have different seeds.
+        seed: seed of the random points, of both shapes.
+        unit: length of the truth's longest side: 2 where a source fills the cube [-1, 1]^3.
+        chamfer: the form of the Chamfer distance, one of ``FORMS``.
         thresholds: distances of the F-score.
-        occupancy: rule of the Volume IoU, one of ``occupancy.RULES``.
+        occupancy: rule of the Volume IoU, one of ``occupancy.RULES``; "none": it is not taken.
         grid: grid of the Volume IoU, one of ``GRIDS``.
         iou_voxels: number of the grid's voxels in a unit of length, for "around".
-        align: how predictions are aligned with the truth; with anything but "none" the numbers
-            are those of another protocol.
+        align: steps by which predictions are aligned with the truth, of ``align.STEPS``.
         frame: the frame that predictions are in (see the command).
         up: the upward axis of the truth's files.
         pred_axes: the axes of the predictions' files (see the command).
@@ -92,11 +106,13 @@ class GeometryProtocol:
     points: PointRule = "area"
     num_points: Annotated[int, Meta(ge=1, le=10_000_000)] = 100_000
     seed: Seed = 0
+    unit: Annotated[float, Meta(ge=1e-3, le=1e3)] = 1.0
+    chamfer: ChamferForm = "mean"
     thresholds: Thresholds = (0.01, 0.02, 0.05)
     occupancy: OccupancyRule = "solid"
     grid: GridRule = "around"
     iou_voxels: Annotated[int, Meta(ge=8, le=512)] = 64
-    align: Align = "none"
+    align: Annotated[tuple[Step, ...], Meta(max_length=10)] = ()
     frame: Frame = "gt"
     up: Up = "auto"
     pred_axes: PredAxes = "auto"
@@ -109,15 +125,22 @@ class GeometryProtocol:
         """Says what the names mean: the rules chosen, and each metric."""
         return {
             "points": POINTS[self.points],
-            "occupancy": RULES[self.occupancy].meaning,
+            "chamfer": FORMS[self.chamfer],
+            "align": "; then ".join(STEPS[step] for step in self.align) or "nothing is moved",
+            "occupancy": "it is not taken"
+            if self.occupancy == "none"
+            else RULES[self.occupancy].meaning,
             "grid": GRIDS[self.grid],
             **DEFINITIONS,
         }
 
     def to_json(self) -> dict[str, Any]:
         """Returns the protocol for a report; ``read_protocol`` reads it back."""
-        values = asdict(self) | {"thresholds": list(self.thresholds)}
-        return {"version": VERSION, **values, "definitions": self.definitions()}
+        return {"version": VERSION, **self.fields(), "definitions": self.definitions()}
+
+    def fields(self) -> dict[str, Any]:
+        """All values by field, as JSON has them."""
+        return asdict(self) | {"thresholds": list(self.thresholds), "align": list(self.align)}
 
     def changes(self) -> list[str]:
         """Names the fields that differ from the preset of this name, else from the default."""
@@ -128,13 +151,10 @@ class GeometryProtocol:
         return changed + [f"surface.{k}" for k in nested]
 
 
-PRESETS = {
-    "default": GeometryProtocol(),
-    "syncdreamer": GeometryProtocol(
-        name="syncdreamer", points="views", occupancy="parity", grid="lattice", iou_voxels=32
-    ),
-    # Predictions of "gamba eval-views --protocol gso --save-gaussians" against the set's meshes.
-    "gso": GeometryProtocol(name="gso", frame="reference", up="z"),
+PRESETS = {"default": GeometryProtocol()} | {
+    name: msgspec.convert({"name": name, **preset.shapes}, GeometryProtocol)
+    for name, preset in presets.PRESETS.items()
+    if preset.shapes is not None
 }
 
 
@@ -146,13 +166,46 @@ def chosen_protocol(options: ShapesOptions) -> GeometryProtocol:
     """
     base = read_protocol(options.protocol)
     check_options(options)
-    names = ("seed", "align", "frame", "up", "pred_axes", "reference", "distance")
+    names = ("seed", "frame", "up", "pred_axes", "reference", "distance")
     given = {name: getattr(options, name) for name in names}
     given |= {"num_points": options.points, "strict": options.strict or None}
+    if options.align is not None:
+        given["align"] = tuple(step for step in options.align if step != "none")
     surface = {name: getattr(options, name) for name in ("voxels", "views", "pixels")}
     surface["method"] = options.surface
     given, surface = ({k: v for k, v in part.items() if v is not None} for part in (given, surface))
-    return replace(base, surface=replace(base.surface, **surface), **given)
+    chosen = replace(base, surface=replace(base.surface, **surface), **given)
+    return with_fields(chosen, options.set) if options.set else chosen
+
+
+def with_fields(protocol: GeometryProtocol, texts: Sequence[str]) -> GeometryProtocol:
+    """The protocol with fields that are given as ``FIELD=JSON``, of the surface ``surface.FIELD``.
+
+    A value that is no JSON is taken for a text.
+
+    Raises:
+        UserError: not of this form, an unknown field, or a value out of its range.
+    """
+    value = protocol.fields()
+    for text in texts:
+        field, sign, given = text.partition("=")
+        inner, _, name = field.rpartition(".")
+        place = value["surface"] if inner == "surface" else value
+        if not sign or inner not in ("", "surface") or name not in place or field == "surface":
+            known = ", ".join([*(k for k in value if k != "surface"), "surface.…"])
+            raise UserError(f"--set {text}: not FIELD=JSON, FIELD one of {known}")
+        try:
+            place[name] = msgspec.json.decode(given)
+        except msgspec.DecodeError:
+            place[name] = given
+    return _checked(value, f"--set {' '.join(texts)}")
+
+
+def _checked(value: dict[str, Any], whose: str | Path) -> GeometryProtocol:
+    try:
+        return msgspec.convert(value, GeometryProtocol)
+    except msgspec.ValidationError as error:
+        raise UserError(f"{whose}: {error}") from error
 
 
 def read_protocol(choice: str) -> GeometryProtocol:
@@ -167,6 +220,8 @@ def read_protocol(choice: str) -> GeometryProtocol:
     if choice in PRESETS:
         return PRESETS[choice]
     path = Path(choice)
+    if choice in presets.PRESETS:
+        raise UserError(f"--protocol {choice}: is of views (gamba eval-views), not of shapes")
     if not path.is_file():
         raise UserError(f"--protocol {choice}: neither {', '.join(PRESETS)} nor a file")
     value = read_document(path, dict[str, Any])
@@ -183,10 +238,7 @@ def read_protocol(choice: str) -> GeometryProtocol:
             if unknown := part.keys() - known.keys():
                 names = ", ".join(sorted(known))
                 raise UserError(f"{path}: {at}{min(unknown)} is unknown; known: {names}")
-    try:
-        protocol = msgspec.convert(base | value, GeometryProtocol)
-    except msgspec.ValidationError as error:
-        raise UserError(f"{path}: {error}") from error
+    protocol = _checked(base | value, path)
     if words is not None and words != protocol.definitions():
         raise UserError(f"{path}: its definitions are not those of this program's version")
     return protocol

@@ -133,6 +133,11 @@ class Similarity:
         """This motion after a rotation ``[3, 3]`` about the origin."""
         return Similarity(self.rotation @ turn, self.translation, self.scale)
 
+    def of(self, first: Similarity) -> Similarity:
+        """This motion after another one."""
+        moved = self.points(first.translation[None])[0]
+        return Similarity(self.rotation @ first.rotation, moved, self.scale * first.scale)
+
     def record(self) -> dict:
         """Returns the motion for a report: ``scale, rotation, translation`` as plain numbers."""
         return {
@@ -170,6 +175,19 @@ def sample(shape: Mesh | Points, count: int, seed: int) -> Points:
     o3d.utility.random.seed(seed)
     cloud = mesh.sample_points_uniformly(count, use_triangle_normal=True)
     return Points(np.asarray(cloud.points), np.asarray(cloud.normals))
+
+
+def nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the nearest of ``points [M, 3]`` to each of ``queries [N, 3]``, in float32.
+
+    Returns:
+        Distances ``[N]`` float32 and indices ``[N]``.
+    """
+    o3d = import_open3d()
+    search = o3d.core.nns.NearestNeighborSearch(np.ascontiguousarray(points, np.float32))
+    search.knn_index()
+    indices, squared = search.knn_search(np.ascontiguousarray(queries, np.float32), 1)
+    return np.sqrt(squared.numpy()[:, 0]), indices.numpy()[:, 0]
 
 
 def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..averages import LEVEL, intervals_of, mean_of, median, median_of, minus
 from ..report import OK, flat
-from ..tables import Column, Row, figures, markdown
+from ..tables import Column, Lines, Row, figures, markdown
 
 PREDICTED = "predicted"  # name of the row of what is under test
 METRICS = (
@@ -52,28 +52,31 @@ def differences_of(objects: list[dict[str, Any]], others: list[dict[str, Any]]) 
 
 
 def page(report: dict[str, Any]) -> str:
-    """The text of ``table.md``, from a report of ``eval-geometry`` with baselines."""
+    """The text of ``table.md``, from a report of ``eval-geometry``."""
+    note = (
+        f"Means over objects with {100 * LEVEL:g} % bootstrap intervals over objects; differences "
+        "object by object, over the objects that both have. Lengths: the truth's longest side is "
+        f"{report['protocol']['unit']:g}. Chamfer: less is better."
+    )
+    means, medians = (markdown(lines_of(report, of)) for of in ("mean", "median"))
+    return "\n\n".join([means, note, "Medians over objects:", medians]) + "\n"
+
+
+def lines_of(report: dict[str, Any], of: str) -> Lines:
+    """The lines of a table of a report's "mean" or "median", as ``page`` has them."""
     thresholds = sorted(report["protocol"]["thresholds"])
     middle = thresholds[len(thresholds) // 2]
-    columns = _SHOWN | {f"fscore.{middle}": Column(f"F-score at {middle:g}", 4)}
+    columns = _SHOWN | {f"fscore.{middle:g}": Column(f"F-score at {middle:g}", 4)}
     parts = {PREDICTED: report, **report["baselines"]}
     named = [(name, part["num_ok"], part) for name, part in parts.items()]
     gains = report["differences"].items()
     named += [(f"{PREDICTED} - {name}", part["objects"], part) for name, part in gains]
     rows = []
     for name, count, part in named:
-        of = {key: flat(part[key], lists=True) for key in ("mean", "interval", "median")}
-        shown = {key: {kind: values.get(key) for kind, values in of.items()} for key in columns}
+        found = {key: flat(part[key], lists=True) for key in ("mean", "interval", "median")}
+        shown = {key: {kind: values.get(key) for kind, values in found.items()} for key in columns}
         rows.append(Row([name, str(count)], shown, " - " in name))
-    means, medians = (
-        markdown(figures(["", "objects"], columns, rows, of)) for of in ("mean", "median")
-    )
-    note = (
-        f"Means over objects with {100 * LEVEL:g} % bootstrap intervals over objects; differences "
-        "object by object, over the objects that both have. Lengths: the truth's longest side is "
-        "1. Chamfer: less is better."
-    )
-    return "\n\n".join([means, note, "Medians over objects:", medians]) + "\n"
+    return figures(["", "objects"], columns, rows, of)
 
 
 def summaries(objects: list[dict[str, Any]]) -> dict[str, Any]:

@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from msgspec import Meta
@@ -18,6 +18,8 @@ from gamba_warp.errors import UserError
 from gamba_warp.fitting.config import FitConfig, Steps
 from gamba_warp.untrusted.ranges import check_options, option, ranged
 from gamba_warp.versions import require
+
+from ..presets import PRESETS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +35,11 @@ class ViewsOptions:
             prediction | truth); without it the table is printed and that is all.
         protocol: gso: the 60 Google Scanned Objects of "gamba data gso" at 512 pixels, the first
             view being the input, with what is missing of them in the report;
-            then --size, --reference, --views, --split and --limit are its own.
+            then --size, --reference, --views, --split and --limit are its own. splatter-image,
+            gamba: those of these papers, as far as they say them (gamba eval-geometry --protocol
+            NAME --explain); such options change them, and the report says so.
         split: Split of the dataset.
-        reference: Index of the input view.
+        reference: Index of the input view; 0 by default.
         views: Number of views of an object, input included, evenly spaced; all by default.
         size: Height of the pictures compared; the files' own by default.
         limit: Only so many objects, evenly spaced in the order of names.
@@ -69,9 +73,9 @@ class ViewsOptions:
     checkpoint: Annotated[Path, tyro.conf.arg(aliases=["--predictions"])]
     data: Path
     out: Path | None = None
-    protocol: Literal["default", "gso"] = "default"
+    protocol: Literal["default", "gso", "splatter-image", "gamba"] = "default"
     split: Literal["all", "train", "val", "test"] = "test"
-    reference: Annotated[int, Meta(ge=0, le=100_000)] = 0
+    reference: Annotated[int, Meta(ge=0, le=100_000)] | None = None
     views: Annotated[int, Meta(ge=1, le=100_000)] | None = None
     size: Annotated[int, Meta(ge=16, le=4096)] | None = None
     limit: Annotated[int, Meta(ge=1)] | None = None
@@ -99,10 +103,10 @@ class ViewsOptions:
             ModuleNotFoundError: an option needs a library that is not installed.
         """
         check_options(self)
-        if self.protocol != "default":
+        if self.protocol == "gso":
             for name in ("split", "reference", "views", "size", "limit"):
                 if getattr(self, name) != getattr(ViewsOptions, name):
-                    raise UserError(f"--protocol {self.protocol}: has its own {option(name)}")
+                    raise UserError(f"--protocol gso: has its own {option(name)}")
         for name in ("save_gaussians", "save_pictures"):
             if getattr(self, name) and self.out is None:
                 raise UserError(f"{option(name)}: needs --out")
@@ -110,6 +114,23 @@ class ViewsOptions:
             raise UserError("--save-retrieval: needs --out, and the baselines")
         if self.save_retrieval:
             require("trimesh")
+
+    def filled(self) -> ViewsOptions:
+        """These options, with the protocol's own where none are given.
+
+        Raises:
+            UserError, ModuleNotFoundError: as for ``check``.
+        """
+        self.check()
+        own = {"reference": 0} | self._own()
+        return replace(self, **{k: v for k, v in own.items() if getattr(self, k) is None})
+
+    def changed(self) -> list[str]:
+        """Those of the protocol's own options that are others here."""
+        return [name for name, value in self._own().items() if getattr(self, name) != value]
+
+    def _own(self) -> dict[str, Any]:
+        return PRESETS[self.protocol].views or {} if self.protocol in PRESETS else {}
 
 
 @ranged
@@ -125,7 +146,7 @@ def eval_views_command(
         json: Print the report, as report.json holds it, in place of the table.
         csv: Print the objects, as objects.csv holds them, in place of the table.
     """
-    options.check()
+    options = options.filled()
     if json and csv:
         raise UserError("--json and --csv: give one of them")
     from ..report import count_line, csv_of, json_of

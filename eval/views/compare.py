@@ -80,6 +80,8 @@ class ViewsProtocol:
         evaluation: of a named evaluation, what it is and which of its objects are missing; or None.
         pictures: how pictures under test are read and matched; None: Gaussians are rendered.
         resize_pictures: whether those of another size are resized.
+        name: of the protocol.
+        changed: the options of its own that were given others.
     """
 
     split: str
@@ -104,6 +106,8 @@ class ViewsProtocol:
     evaluation: dict[str, Any] | None = None
     pictures: str | None = None
     resize_pictures: bool = False
+    name: str = "default"
+    changed: list[str] = field(default_factory=list)
 
 
 @dataclass

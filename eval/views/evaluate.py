@@ -151,9 +151,11 @@ def open_job(options: ViewsOptions) -> Job:
         reason = None if lpips_available() else f"no weights; fetch them with: {FETCH}"
         network = None if reason else load_lpips().to(device)
     protocol = ViewsProtocol(
+        name=options.protocol,
+        changed=options.changed(),
         split=options.split,
         split_version=dataset.split_version,
-        reference=options.reference,
+        reference=options.reference or 0,
         views=options.views,
         size=gso.SIZE if evaluation else options.size,
         lpips="VGG16, version 0.1" if network else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -154,6 +155,46 @@ def chart(
         ticks=[(to_y(value), number(value)) for value in y.values or to_y.ticks()],
         labels=_labels(named, size[0], bottom),
         slots=[(a, max(1.0, b - a), text) for a, b, (_, text) in zip(edges, edges[1:], tooltips)],
+    )
+
+
+_COLUMNS, _GAP, _TITLE = 2, 28, 30
+_STYLE = """
+svg { --text: #22252a; --soft: #686d76; --line: #dfe0dc; --card: #ffffff;
+  --s0: #1f6feb; --s1: #d1582b; --s2: #2c8a57; --s3: #8250c4; --s4: #b8860b; --s5: #c2397b; }
+.name { font-weight: 600; }
+text { fill: var(--text); font: 12px system-ui, sans-serif; }
+.title { font-size: 15px; font-weight: 600; }
+.axis { fill: var(--soft); font-weight: 600; }
+.grid { stroke: var(--line); }
+.line { fill: none; stroke-width: 2; stroke-linejoin: round; }
+.guide { stroke-dasharray: 3 4; }
+"""
+
+
+def picture(drawn: Sequence[tuple[str, str]], size: tuple[int, int] = (WIDTH, HEIGHT)) -> str:
+    """Charts with their titles as one SVG file with colours of its own, for pages that load it.
+
+    Args:
+        drawn: a title, and what ``chart`` returns, each.
+        size: that of the charts.
+
+    Returns:
+        The text of the file; empty if there is no chart.
+    """
+    if not drawn:
+        return ""
+    step_x, step_y, columns = size[0] + _GAP, size[1] + _GAP + _TITLE, min(_COLUMNS, len(drawn))
+    width, height = columns * step_x + _GAP, -(-len(drawn) // columns) * step_y + _GAP
+    parts = [f'<rect width="{width}" height="{height}" fill="#ffffff"/>']
+    for i, (name, svg) in enumerate(drawn):
+        x, y = _GAP + i % columns * step_x, _GAP + i // columns * step_y
+        parts.append(f'<text class="title" x="{x + 6}" y="{y + 16}">{html.escape(name)}</text>')
+        place = f'<svg x="{x}" y="{y + _TITLE}" width="{size[0]}" height="{size[1]}" '
+        parts.append(str(svg).replace("<svg ", place, 1))
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}">'
+        f"<style>{_STYLE}</style>{''.join(parts)}</svg>\n"
     )
 
 

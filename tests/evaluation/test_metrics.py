@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from gamba_warp.eval.report import (
     summary_lines,
 )
 from gamba_warp.eval.shapes.metrics import surface_metrics, volume_iou
+from gamba_warp.eval.shapes.protocol import PRESETS
 from gamba_warp.eval.shapes.shape import Points
 from gamba_warp.eval.views.compare import Shown, Truth, compare, render_views
 from gamba_warp.formats.ply import save_ply
@@ -27,6 +29,8 @@ from gamba_warp.render import render
 from gamba_warp.versions import import_open3d
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+DEFAULT = PRESETS["default"]
 
 
 @pytest.mark.parametrize("shift", [0.5, 0.1, 0.001])
@@ -85,7 +89,7 @@ def test_small_pictures_have_no_ssim():
 def test_surface_metrics_by_hand():
     one = Points(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 0, 1], [0, 0, 1]]))
     two = Points(np.array([[0.0, 0, 0.03]]), np.array([[0.0, 0.6, -0.8]]))
-    got = surface_metrics(one, two, (0.02, 0.05))
+    got = surface_metrics(one, two, replace(DEFAULT, thresholds=(0.02, 0.05)))
     far = math.sqrt(1 + 0.03**2)
     want = {"accuracy": (0.03 + far) / 2, "completeness": 0.03}
     want["chamfer"] = (want["accuracy"] + want["completeness"]) / 2
@@ -98,7 +102,7 @@ def test_surface_metrics_by_hand():
 
 def test_equal_points_are_at_no_distance():
     points = Points(np.random.default_rng(0).random((500, 3)))
-    got = surface_metrics(points, points)
+    got = surface_metrics(points, points, DEFAULT)
     assert got["chamfer"] == got["chamfer_squared"] == 0
     assert set(got["fscore"].values()) == {1.0} and got["normal_consistency"] is None
 
@@ -114,7 +118,7 @@ def test_surface_metrics_equal_open3d():
     kinds = [metric.ChamferDistance, metric.HausdorffDistance, metric.FScore]
     values = clouds[0].compute_metrics(clouds[1], kinds, params).numpy().tolist()
     chamfer, hausdorff, *fscores = values
-    got = surface_metrics(Points(one), Points(two), radii)
+    got = surface_metrics(Points(one), Points(two), replace(DEFAULT, thresholds=radii))
     assert abs(got["chamfer"] - chamfer / 2) < 1e-6  # its Chamfer is the sum, ours the mean
     assert abs(got["hausdorff"] - hausdorff) < 1e-6
     assert np.allclose(list(got["fscore"].values()), np.array(fscores) / 100, atol=1e-5)

@@ -9,8 +9,9 @@ import pytest
 
 from gamba_warp.cli import run
 from gamba_warp.errors import UserError
+from gamba_warp.eval import presets
 from gamba_warp.eval import report as reports
-from gamba_warp.eval.report import check_finite, csv_of, make_report, save_report
+from gamba_warp.eval.report import check_finite, csv_of, flat, make_report, save_report
 from gamba_warp.eval.shapes.protocol import PRESETS, read_protocol
 
 
@@ -60,7 +61,10 @@ def test_bad_protocols_are_one_line(tmp_path, text, reason, capsys):
 
 def test_protocol_files(tmp_path, capsys):
     assert run("eval-geometry", ["a", "b", "--protocol", "absent.json"]) == 2
-    assert "neither default, syncdreamer, gso nor a file" in capsys.readouterr().err
+    assert (
+        "neither default, gamba, gso, sf3d, spar3d, syncdreamer, triposr nor"
+        in capsys.readouterr().err
+    )
     path = tmp_path / "p.json"
     for preset in PRESETS.values():
         path.write_text(json.dumps(preset.to_json()))
@@ -68,6 +72,56 @@ def test_protocol_files(tmp_path, capsys):
     path.write_text('{"name": "syncdreamer", "num_points": 5, "surface": {"voxels": 32}}')
     read = read_protocol(str(path))
     assert read.points == "views" and read.num_points == 5 and read.surface.voxels == 32
+
+
+def test_a_protocol_of_views_has_no_shapes(capsys):
+    assert run("eval-geometry", ["a", "b", "--protocol", "splatter-image"]) == 2
+    assert "is of views (gamba eval-views), not of shapes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["default", *presets.PRESETS])
+def test_explained_protocols_say_what_is_stated_and_what_is_open(name, capsys):
+    assert run("eval-geometry", ["--protocol", name, "--explain"]) == 0
+    text, preset = capsys.readouterr().out, presets.PRESETS.get(name)
+    assert text.startswith(f"{name}: ")
+    if preset is not None:
+        words = " ".join(text.split())
+        for kind, subjects in (("stated", preset.stated), ("open", preset.open)):
+            for subject, said in subjects.items():
+                assert subject in text and f"{kind}: {said}" in words
+    if name in PRESETS:
+        for field in flat(PRESETS[name].fields()):
+            assert f"\n{field} " in text
+
+
+def test_any_field_can_be_changed_and_the_change_is_named(capsys):
+    words = ["--protocol", "triposr", "--explain", "--align", "box", "none", "--set"]
+    given = ["unit=1", "thresholds=[0.05]", "surface.voxels=64", "chamfer=sum", "occupancy=solid"]
+    assert run("eval-geometry", [*words, *given]) == 0
+    text = capsys.readouterr().out
+    for shown in ("unit 1.0", "thresholds [0.05]", "surface.voxels 64", 'chamfer "sum"'):
+        assert shown in " ".join(text.split())
+    names = "unit, chamfer, thresholds, occupancy, align, surface.voxels"
+    assert text.endswith(f"changed: {names}\n")
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        ("unit", "not FIELD=JSON"),
+        ("speed=1", "not FIELD=JSON, FIELD one of name, points,"),
+        ("surface={}", "not FIELD=JSON"),
+        ("surface.speed=1", "not FIELD=JSON"),
+        ("unit=0", "Expected `float` >= 0.001 - at `$.unit`"),
+        ("chamfer=half", "Invalid enum value 'half' - at `$.chamfer`"),
+        ('align=["fly"]', "Invalid enum value 'fly' - at `$.align[0]`"),
+        ("surface.voxels=many", "Expected `int`, got `str` - at `$.surface.voxels`"),
+    ],
+)
+def test_bad_fields_are_one_line(text, reason, capsys):
+    assert run("eval-geometry", ["--explain", "--set", text]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("gamba: --set ") and reason in error and error.count("\n") == 1
 
 
 def test_changes_name_what_is_nested_too():

@@ -1,0 +1,291 @@
+"""Alignment of a prediction with the truth: the steps that a protocol names, one after the other.
+
+The search for a turn needs no start: it looks at thousands of turns, by distances that are read
+from a lattice of nearest points in place of a tree, and follows the best of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gamba_warp.errors import UserError
+from gamba_warp.versions import import_open3d
+
+from .command import Step
+from .shape import Points, Similarity, nearest
+
+STEPS: dict[Step, str] = {
+    "box": "the bounding boxes get one centre and one longest side",
+    "scale": "the points get one centroid and one root mean square distance from it",
+    "yaw": "of 360 turns about the truth's upward axis, a degree apart, through the centroids, "
+    "which are brought together, the one with the lowest Chamfer distance of 1,024 points",
+    "turn": "of 4,096 turns about any axis through the centroids, which are brought together, the "
+    "32 with the lowest Chamfer distance of 256 points and 20 degrees or more apart, each followed "
+    "by 20 rounds of ICP; of these the lowest Chamfer distance of 4,096 points",
+    "rigid": "ICP of Open3D, point to point, of rotation and translation; correspondences within "
+    "0.2, 0.1 and 0.05 of the truth's longest side in turn",
+    "icp": "the same with scale",
+}
+
+# How far correspondences reach in each round of ICP; the truth's longest side is 1.
+ICP_DISTANCES = (0.2, 0.1, 0.05)
+
+TURNS, CANDIDATES, ROUNDS, APART = 4096, 32, 20, 20.0  # of the search, as STEPS has them
+SCORED, FOLLOWED, JUDGED = 256, 1024, 4096  # points
+LATTICE = 64  # places a side
+ALIKE = 1.2  # times the least Chamfer distance, under which a turned shape is the same shape
+
+
+def aligned(
+    predicted: Points, truth: Points, steps: Sequence[Step]
+) -> tuple[Similarity, dict[str, float]]:
+    """Finds the motion of the prediction that the steps make together.
+
+    Args:
+        predicted: points on the prediction.
+        truth: points on the truth; its longest side is 1.
+        steps: of ``STEPS``.
+
+    Returns:
+        The motion; and of the last ICP Open3D's ``fitness`` (share of points with a partner) and
+        ``inlier_rmse``.
+
+    Raises:
+        UserError: the prediction is a single point.
+    """
+    if steps and not np.ptp(predicted.positions, axis=0).any():
+        raise UserError("cannot be aligned: all points of the prediction are one")
+    motion, residual = Similarity(np.eye(3), np.zeros(3)), {}
+    for step in steps:
+        moved = motion.apply(predicted)
+        if step in ("rigid", "icp"):
+            found, residual = icp(moved, truth, with_scale=step == "icp")
+        else:
+            found = _SEARCHES[step](moved, truth)
+        motion = found.of(motion)
+    return motion, residual
+
+
+def match_boxes(predicted: Points, truth: Points) -> Similarity:
+    """Finds the translation and scale after which the bounding boxes agree in centre and side."""
+    boxes = [(p.positions.min(0), p.positions.max(0)) for p in (predicted, truth)]
+    centers, sides = zip(*(((low + high) / 2, (high - low).max()) for low, high in boxes))
+    return _of_size(centers, sides)
+
+
+def match_moments(predicted: Points, truth: Points) -> Similarity:
+    """Finds the translation and scale after which centroids and mean square radii are equal."""
+    centers = [points.positions.mean(0) for points in (predicted, truth)]
+    radii = [
+        np.sqrt(((points.positions - center) ** 2).sum(1).mean())
+        for points, center in zip((predicted, truth), centers, strict=True)
+    ]
+    return _of_size(centers, radii)
+
+
+def _of_size(centers: Sequence[np.ndarray], sizes: Sequence[float]) -> Similarity:
+    scale = float(sizes[1] / sizes[0])
+    return Similarity(np.eye(3), centers[1] - scale * centers[0], scale)
+
+
+def icp(predicted: Points, truth: Points, with_scale: bool) -> tuple[Similarity, dict[str, float]]:
+    """Finds a small rotation, a translation and, if asked for, a scale by Open3D's ICP.
+
+    Args:
+        predicted: points to be moved.
+        truth: points to be met.
+        with_scale: whether the scale is free.
+
+    Returns:
+        The motion, and Open3D's ``fitness`` (share of points with a partner) and ``inlier_rmse``.
+    """
+    o3d = import_open3d()
+    clouds = [
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.positions))
+        for points in (predicted, truth)
+    ]
+    matrix = np.eye(4)
+    method = o3d.pipelines.registration.TransformationEstimationPointToPoint(with_scale)
+    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(max_iteration=100)
+    for distance in ICP_DISTANCES:
+        result = o3d.pipelines.registration.registration_icp(
+            *clouds, distance, matrix, method, criteria
+        )
+        matrix = result.transformation
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    motion = Similarity(matrix[:3, :3] / scale, np.array(matrix[:3, 3]), scale)
+    return motion, {"fitness": result.fitness, "inlier_rmse": result.inlier_rmse}
+
+
+def search_yaw(predicted: Points, truth: Points) -> Similarity:
+    """Finds the turn about z with the lowest Chamfer distance; see ``STEPS``."""
+    angles = np.radians(np.arange(360.0))
+    turns = np.zeros((360, 3, 3))
+    turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)
+    turns[:, 1, 0] = np.sin(angles)
+    turns[:, 0, 1] = -turns[:, 1, 0]
+    turns[:, 2, 2] = 1
+    one, two = _Cloud.of(predicted), _Cloud.of(truth)
+    best = turns[_chamfer(one, two, turns, FOLLOWED).argmin()]
+    return Similarity(best, two.center - best @ one.center)
+
+
+def search_turns(predicted: Points, truth: Points) -> Similarity:
+    """Finds the turn about any axis with the lowest Chamfer distance; see ``STEPS``."""
+    turns, moves, chamfer = _candidates(_Cloud.of(predicted), _Cloud.of(truth))
+    best = chamfer.argmin()
+    return Similarity(turns[best], moves[best])
+
+
+_SEARCHES = {
+    "box": match_boxes,
+    "scale": match_moments,
+    "yaw": search_yaw,
+    "turn": search_turns,
+}
+
+
+def symmetry(truth: Points) -> list[list[float]]:
+    """Turns after which a shape is itself, within the noise of a few thousand points.
+
+    Args:
+        truth: points on the shape.
+
+    Returns:
+        ``[x, y, z, degrees]`` each: a unit axis and an angle of 20 to 180 degrees; at most 31, each
+        20 degrees or more from the others, and least Chamfer distance first. Of a shape that may
+        be turned by any angle these are some of many.
+    """
+    from scipy.spatial.transform import Rotation
+
+    order = np.random.default_rng(1).permutation(len(truth.positions))
+    halves = [_Cloud.of(Points(truth.positions[part])) for part in (order[::2], order[1::2])]
+    turns, _, chamfer = _candidates(*halves, also=np.eye(3)[None])
+    found: list[list[float]] = []
+    kept = np.eye(3)[None]
+    for at in chamfer.argsort():
+        # The least one is that of no turn, or it has one less only by the points' noise.
+        if chamfer[at] <= ALIKE * chamfer.min() and (_degrees(turns[at], kept) >= APART).all():
+            kept = np.concatenate([kept, turns[at][None]])
+            vector = Rotation.from_matrix(turns[at]).as_rotvec(degrees=True)
+            angle = float(np.linalg.norm(vector))
+            found.append([round(float(x), 3) for x in (*vector / angle, angle)])
+    return found
+
+
+class _Cloud(NamedTuple):
+    """Points about their centroid, with the nearest of them for each place of a lattice.
+
+    Attributes:
+        center: ``[3]``.
+        points: ``[N, 3]`` in random order, less the centre.
+        reach: half of the lattice's side.
+        index: ``[LATTICE, LATTICE, LATTICE]``, which of the points is near each place.
+    """
+
+    center: np.ndarray
+    points: np.ndarray
+    reach: float
+    index: np.ndarray
+
+    @classmethod
+    def of(cls, cloud: Points) -> _Cloud:
+        from scipy.ndimage import distance_transform_edt
+
+        center = cloud.positions.mean(0)
+        order = np.random.default_rng(0).permutation(len(cloud.positions))
+        points = cloud.positions[order] - center
+        reach = max(1.25 * float(np.abs(points).max()), 1e-12)
+        place = _places(points, reach)
+        there = np.full((LATTICE,) * 3, -1)
+        there[tuple(place.T)] = np.arange(len(points))
+        nearest_place = distance_transform_edt(
+            there < 0, return_distances=False, return_indices=True
+        )
+        return cls(center, points, reach, there[tuple(np.asarray(nearest_place))])
+
+    def near(self, queries: np.ndarray) -> np.ndarray:
+        """A near one of the points, ``[.., 3]``, for each query ``[.., 3]``."""
+        place = _places(queries, self.reach)
+        return self.points[self.index[place[..., 0], place[..., 1], place[..., 2]]]
+
+
+def _places(points: np.ndarray, reach: float) -> np.ndarray:
+    place = ((points / reach + 1) * (LATTICE / 2)).astype(np.int64)
+    return place.clip(0, LATTICE - 1)
+
+
+def _chamfer(one: _Cloud, two: _Cloud, turns: np.ndarray, count: int) -> np.ndarray:
+    """``[M]`` Chamfer distances after each of ``[M, 3, 3]`` turns of the first cloud."""
+    found = np.empty(len(turns))
+    for at in range(0, len(turns), 256):  # which bounds the memory
+        part = turns[at : at + 256]
+        there = one.points[:count] @ part.transpose(0, 2, 1)
+        back = two.points[:count] @ part
+        found[at : at + 256] = _lengths(there - two.near(there)) + _lengths(back - one.near(back))
+    return found / 2
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Mean lengths ``[M]`` of vectors ``[M, n, 3]``."""
+    return np.sqrt(np.einsum("mni,mni->mn", vectors, vectors)).mean(1)
+
+
+def _candidates(
+    one: _Cloud, two: _Cloud, also: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The best turns ``[C, 3, 3]``, moves ``[C, 3]`` and their Chamfer distances ``[C]``.
+
+    Args:
+        one: what is turned.
+        two: what it is turned to.
+        also: turns ``[.., 3, 3]`` that are followed beside the best of all.
+    """
+    every = spread_turns(TURNS)
+    kept = np.empty((0, 3, 3)) if also is None else also
+    for turn in every[_chamfer(one, two, every, SCORED).argsort()]:
+        if len(kept) == CANDIDATES:
+            break
+        if (_degrees(turn, kept) >= APART).all():
+            kept = np.concatenate([kept, turn[None]])
+    turns, moves = kept, np.zeros((len(kept), 3))
+    points = one.points[:FOLLOWED]
+    for _ in range(ROUNDS):
+        moved = points @ turns.transpose(0, 2, 1) + moves[:, None]
+        turns, moves = _fitted(points, two.near(moved))
+    few, chamfer = two.points[:JUDGED], []
+    for turn, move in zip(turns, moves):
+        moved = one.points[:JUDGED] @ turn.T + move
+        chamfer.append((nearest(moved, few)[0].mean() + nearest(few, moved)[0].mean()) / 2)
+    return turns, moves + two.center - turns @ one.center, np.array(chamfer)
+
+
+def _fitted(points: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Turns ``[M, 3, 3]`` and moves ``[M, 3]`` that bring points ``[n, 3]`` to ``[M, n, 3]`` best.
+
+    By singular values (Kabsch 1976), mirror images excluded.
+    """
+    middle, middles = points.mean(0), targets.mean(1)
+    u, _, v = np.linalg.svd((targets - middles[:, None]).transpose(0, 2, 1) @ (points - middle))
+    v[:, 2] *= np.sign(np.linalg.det(u @ v))[:, None]
+    turns = u @ v
+    return turns, middles - turns @ middle
+
+
+def spread_turns(count: int) -> np.ndarray:
+    """Rotations ``[count, 3, 3]``, evenly spread: super-Fibonacci spirals (Alexa 2022)."""
+    from scipy.spatial.transform import Rotation
+
+    place = np.arange(count) + 0.5
+    inner, outer = np.sqrt(place / count), np.sqrt(1 - place / count)
+    a, b = (2 * np.pi * place / step for step in (np.sqrt(2), 1.533751168755204288118041))
+    quats = [inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)]
+    return Rotation.from_quat(np.stack(quats, 1)).as_matrix()
+
+
+def _degrees(turn: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Angles ``[..]`` between a rotation and each of ``[.., 3, 3]``."""
+    return np.degrees(np.arccos(((np.einsum("ij,mij->m", turn, others) - 1) / 2).clip(-1, 1)))

@@ -1,0 +1,148 @@
+"""Alignment from any start, symmetries, and the figures of a protocol that searches."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from gamba_warp.errors import UserError
+from gamba_warp.eval.shapes.align import STEPS, aligned, spread_turns, symmetry
+from gamba_warp.eval.shapes.metrics import compare
+from gamba_warp.eval.shapes.protocol import PRESETS
+from gamba_warp.eval.shapes.shape import Mesh, Points, Similarity, sample
+
+
+def united(*parts):
+    """One mesh of parts, centred, with a longest side of 1."""
+    mesh = trimesh.util.concatenate(parts)
+    low, high = mesh.bounds
+    return Mesh((mesh.vertices - (low + high) / 2) / (high - low).max(), np.array(mesh.faces))
+
+
+def box(size, at=(0.0, 0, 0)):
+    return trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+
+
+CHAIR = united(
+    box((0.5, 0.5, 0.05)),
+    box((0.5, 0.05, 0.6), (0, 0.22, 0.3)),
+    box((0.05, 0.05, 0.5), (0.2, -0.2, -0.25)),
+    box((0.3, 0.05, 0.05), (-0.2, -0.2, 0.2)),
+)
+SHAPES = {
+    "chair": CHAIR,
+    "box": united(box((1, 0.6, 0.3))),
+    "cube": united(box((1, 1, 1))),
+    "ball": united(trimesh.creation.icosphere(3)),
+}
+
+
+def motions(count):
+    """Turns of any size, moves of several lengths of the object, and scales from 1/5 to 5."""
+    random = np.random.default_rng(7)
+    turns = Rotation.random(count, rng=8).as_matrix()
+    scales = np.exp(random.uniform(-1.6, 1.6, count))
+    return [Similarity(t, random.normal(size=3) * 3, float(s)) for t, s in zip(turns, scales)]
+
+
+@pytest.mark.parametrize("name", ["chair", "box", "cube"])
+def test_a_copy_comes_back_from_any_start(name):
+    protocol = replace(PRESETS["triposr"], align=("scale", "turn", "icp"))
+    for motion in motions(3):
+        moved, got = compare(motion.apply(SHAPES[name]), SHAPES[name], protocol)
+        assert got["chamfer"] <= 1e-3 and set(got["fscore"].values()) == {1.0}
+        found = got["alignment"]
+        assert abs(found["scale"] * motion.scale - 1) < 1e-3
+        again = Similarity(*(np.array(found[k]) for k in ("rotation", "translation", "scale")))
+        back = again.apply(motion.apply(SHAPES[name]))
+        assert np.abs(back.vertices - moved.vertices).max() < 1e-9
+
+
+def test_a_turn_about_the_upward_axis_is_found_by_its_own_search():
+    turn = Rotation.from_euler("z", 143.4, degrees=True).as_matrix()
+    points, truth = (sample(CHAIR, 10_000, seed) for seed in (0, 1))
+    tilted = Similarity(turn, np.array([0.3, 0.1, -0.2]))
+    found, residual = aligned(tilted.apply(points), truth, ("yaw",))
+    assert not residual and np.allclose(found.rotation[2], [0, 0, 1])
+    assert np.degrees(Rotation.from_matrix(found.rotation @ turn).magnitude()) <= 0.6 + 0.5
+    assert np.abs(found.of(tilted).translation).max() < 0.02  # the noise of two centroids
+
+
+@pytest.mark.parametrize("steps", [(step,) for step in STEPS])
+def test_steps_are_repeatable_and_a_single_point_is_refused(steps):
+    points, truth = (sample(CHAIR, 2000, seed) for seed in (0, 1))
+    one, two = (aligned(points, truth, steps) for _ in range(2))
+    assert (one[0].rotation == two[0].rotation).all() and one[0].scale == two[0].scale
+    assert (one[0].translation == two[0].translation).all() and one[1] == two[1]
+    with pytest.raises(UserError, match="all points of the prediction are one"):
+        aligned(Points(np.zeros((5, 3))), truth, steps)
+
+
+def test_boxes_and_moments_are_matched():
+    random = np.random.default_rng(3)
+    one, two = Points(random.random((50, 3))), Points(3 * random.random((70, 3)) - 8)
+    box_of = aligned(one, two, ("box",))[0].apply(one).positions
+    low, high = two.positions.min(0), two.positions.max(0)
+    assert np.allclose((box_of.min(0) + box_of.max(0)) / 2, (low + high) / 2)
+    assert np.ptp(box_of, axis=0).max() == pytest.approx((high - low).max())
+    spread = aligned(one, two, ("scale",))[0].apply(one).positions
+    assert np.allclose(spread.mean(0), two.positions.mean(0))
+    assert spread.var(0).sum() == pytest.approx(two.positions.var(0).sum())
+
+
+def test_rigid_icp_keeps_the_size():
+    points = sample(CHAIR, 4000, 0)
+    larger = Similarity(np.eye(3), np.array([0.02, 0, 0]), 1.1).apply(points)
+    rigid, free = (aligned(larger, points, (step,))[0] for step in ("rigid", "icp"))
+    assert rigid.scale == pytest.approx(1, abs=1e-9) and free.scale == pytest.approx(
+        1 / 1.1, abs=0.01
+    )
+
+
+@pytest.mark.parametrize("name, turns", [("chair", 0), ("box", 3), ("cube", 23)])
+def test_symmetries_are_said(name, turns):
+    found = symmetry(sample(SHAPES[name], 10_000, 0))
+    assert len(found) == turns
+    for *axis, degrees in found:
+        assert np.linalg.norm(axis) == pytest.approx(1, abs=2e-3) and 85 < degrees < 181
+
+
+def test_a_ball_may_be_turned_by_any_angle():
+    assert len(symmetry(sample(SHAPES["ball"], 10_000, 0))) > 20
+
+
+def test_turns_are_spread_evenly():
+    turns = spread_turns(512)
+    assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3))
+    assert np.allclose(np.linalg.det(turns), 1)
+    some = Rotation.random(200, rng=0).as_matrix()
+    cosines = (np.einsum("aij,bij->ab", some, turns).max(1) - 1) / 2
+    assert np.degrees(np.arccos(cosines)).max() < 38  # an even grid of so many is 24 to 33 apart
+
+
+def test_the_figures_of_triposr_are_those_of_another_implementation():
+    """Chamfer and F-scores of the points that were compared, by scipy's tree in float64."""
+    protocol = replace(PRESETS["triposr"], align=())
+    other = Mesh(CHAIR.vertices * [1.1, 0.9, 1] + [0.03, 0, 0], CHAIR.faces)
+    _, got = compare(other, CHAIR, protocol)
+    one, two = (2 * sample(shape, 10_000, protocol.seed).positions for shape in (other, CHAIR))
+    there, back = cKDTree(two).query(one)[0], cKDTree(one).query(two)[0]
+    assert got["chamfer"] == pytest.approx((there.mean() + back.mean()) / 2, abs=1e-6)
+    for threshold in (0.1, 0.2, 0.5):
+        a, b = (there <= threshold).mean(), (back <= threshold).mean()
+        assert got["fscore"][f"{threshold:g}"] == pytest.approx(2 * a * b / (a + b), abs=1e-4)
+
+
+@pytest.mark.parametrize("form, want", [("sum", 0.2), ("squared", 0.01), ("squared-sum", 0.02)])
+def test_forms_of_the_chamfer_distance(form, want):
+    """Two spheres of radii 0.4 and 0.5: each is 0.1 from the other, squared 0.01."""
+    ball = trimesh.creation.icosphere(5)
+    small, large = (Mesh(r * ball.vertices, np.array(ball.faces)) for r in (0.4, 0.5))
+    protocol = replace(PRESETS["default"], num_points=50_000, chamfer=form, occupancy="none")
+    for unit in (1.0, 2.0):
+        _, got = compare(small, large, replace(protocol, unit=unit))
+        scaled = want * (unit if form == "sum" else unit**2)
+        assert got["chamfer"] == pytest.approx(scaled, rel=0.01)  # nearest samples lie aslant
