@@ -89,8 +89,33 @@ def majority(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 
 def parity(mesh: Mesh, grid: Grid) -> np.ndarray:
-    """Occupancy ``[X, Y, Z]`` bool, as mesh2sdf has it without its repair. See ``RULES``."""
-    return _crossings(mesh.scene(), grid.points(), np.array([-1.0, 0, 0])) % 2 == 1
+    """Occupancy ``[X, Y, Z]`` bool, as mesh2sdf has it without its repair. See ``RULES``.
+
+    Rays run along the grid's lines. One that meets an edge is decided as if it were moved by very
+    little along y and by less along z, so that it meets exactly one of the faces there. Places on
+    the surface are outside; in mesh2sdf the rounding of their distance decides.
+    """
+    corners = (mesh.vertices.astype(np.float32).astype(np.float64) - grid.origin) / grid.step
+    corners = corners[mesh.faces]
+    first = np.ceil(corners[..., 1:].min(1)).clip(0).astype(int)
+    last = np.floor(corners[..., 1:].max(1)).astype(int)
+    count = (np.minimum(last, np.array(grid.shape[1:]) - 1) - first + 1).clip(0)
+    face = np.repeat(np.arange(len(corners)), count.prod(1))  # once for each line in its box
+    within = np.arange(len(face)) - np.repeat(count.prod(1).cumsum() - count.prod(1), count.prod(1))
+    line = first[face] + np.stack(np.divmod(within, count[face, 1]), -1)
+    (y, z), x = (corners[face, :, 1:] - line[:, None]).transpose(2, 0, 1), corners[face, :, 0]
+    after, later = [1, 2, 0], [2, 0, 1]
+    areas = z[:, after] * y[:, later] - y[:, after] * z[:, later]
+    ties = np.sign(z[:, later] - z[:, after]) * 2 + np.sign(y[:, after] - y[:, later])
+    sides = np.sign(np.where(areas != 0, areas, ties))
+    hit = (np.abs(sides.sum(1)) == 3) & (areas.sum(1) != 0)
+    at = np.ceil((areas[hit] * x[hit]).sum(1) / areas[hit].sum(1)).clip(0).astype(int)
+    line, known = line[hit], at < grid.shape[0]
+    crossings = np.zeros(grid.shape, np.int32)
+    np.add.at(crossings, (at[known], *line[known].T), 1)
+    inside = crossings.cumsum(0) % 2 == 1
+    inside[inside] = mesh.scene().compute_distance(grid.points()[inside]).numpy() > 2e-7
+    return inside
 
 
 def winding(mesh: Mesh, grid: Grid) -> np.ndarray:
@@ -227,7 +252,8 @@ RULES: dict[OccupancyRule, Rule] = {
         winding,
     ),
     "parity": Rule(
-        "a point is inside if a ray along -x crosses the surface an odd number of times",
+        "a point is inside if a ray along -x crosses the surface an odd number of times, and it is "
+        "not on the surface",
         parity,
     ),
 }

@@ -209,7 +209,11 @@ def halves(points: Points, count: int, seed: int) -> tuple[Points, Points]:
 def visible_points(
     mesh: Mesh, viewmats: np.ndarray, K: np.ndarray, size: int, voxel: float
 ) -> Points:
-    """Back-projects depth maps of a mesh and thins the points to one mean point in each voxel.
+    """Points of depth maps as SyncDreamer's script takes them, one mean point in each voxel.
+
+    Depth is interpolated between the corners as they lie in the picture, not in space, and what
+    is seen at a pixel's centre is put on the ray through its upper left corner. Neither is exact;
+    with large faces it moves points by hundredths, and without it the figures are others.
 
     Args:
         mesh: what the cameras see.
@@ -225,14 +229,19 @@ def visible_points(
         UserError: no camera sees the mesh.
     """
     o3d = import_open3d()
-    scene = mesh.scene()
+    corners = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2)
+    rays = np.zeros((size * size, 6), np.float32)
+    rays[:, :2], rays[:, 5] = corners + 0.5, 1  # along the depth, in pixels
     seen = []
     for viewmat in viewmats.astype(np.float64):
-        rays = scene.create_rays_pinhole(K.astype(np.float64), viewmat, size, size)
-        depth = scene.cast_rays(rays)["t_hit"].numpy()
-        rays, hit = rays.numpy(), np.isfinite(depth)
-        seen.append(rays[hit][:, :3] + depth[hit][:, None] * rays[hit][:, 3:])
-    points = np.concatenate(seen)
+        there = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = there @ K.T
+        flat = Mesh(np.column_stack([pixels[:, :2] / pixels[:, 2:], there[:, 2]]), mesh.faces)
+        depth = flat.scene().cast_rays(rays)["t_hit"].numpy().astype(np.float64)
+        hit = np.isfinite(depth)
+        places = np.column_stack([corners[hit], np.ones(hit.sum())]) * depth[hit][:, None]
+        seen.append((places @ np.linalg.inv(K).T - viewmat[:3, 3]) @ viewmat[:3, :3])
+    points = np.concatenate(seen).astype(np.float32)
     if len(points) == 0:
         raise UserError("no camera sees the mesh")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
