@@ -12,6 +12,7 @@ from gamba_warp.cameras import intrinsics, orbit
 from gamba_warp.gaussians import Gaussians
 
 from .align import aligned, match_moments, symmetry
+from .command import ChamferForm
 from .load import Evaluated, centers
 from .occupancy import RULES, grid_around, syncdreamer_grid
 from .protocol import GeometryProtocol
@@ -104,6 +105,8 @@ def syncdreamer_points(mesh: Mesh) -> Points:
 def noise_floor(truth: Mesh | Points, protocol: GeometryProtocol, points: Points) -> float | None:
     """Chamfer distance between two samples of the truth; None for a cloud of a single point.
 
+    The distances of one way stand for both, since either sample is as good as the other.
+
     Args:
         truth: the shape.
         protocol: says how it is sampled.
@@ -115,7 +118,8 @@ def noise_floor(truth: Mesh | Points, protocol: GeometryProtocol, points: Points
         one, two = halves(truth, protocol.num_points, protocol.seed)
     else:
         one, two = points, take_points(truth, protocol, protocol.seed + 1)
-    return surface_metrics(two, one, protocol)["chamfer"]
+    found = protocol.unit * nearest(two.positions, one.positions)[0].astype(np.float64)
+    return _chamfer(found, found, protocol.chamfer)
 
 
 def shape_iou(
@@ -203,17 +207,22 @@ def surface_metrics(predicted: Points, truth: Points, protocol: GeometryProtocol
         one = np.abs((predicted.normals * truth.normals[there_at]).sum(1)).mean()
         two = np.abs((truth.normals * predicted.normals[back_at]).sum(1)).mean()
         consistency = float(one + two) / 2
-    plain, squared = (float(a.mean() + b.mean()) for a, b in ((there, back), (there**2, back**2)))
-    forms = {"mean": plain / 2, "sum": plain, "squared": squared / 2, "squared-sum": squared}
     return {
-        "chamfer": forms[protocol.chamfer],
-        "chamfer_squared": squared / 2,
+        "chamfer": _chamfer(there, back, protocol.chamfer),
+        "chamfer_squared": _chamfer(there, back, "squared"),
         "accuracy": float(there.mean()),
         "completeness": float(back.mean()),
         "hausdorff": float(max(there.max(), back.max())),
         "fscore": fscore,
         "normal_consistency": consistency,
     }
+
+
+def _chamfer(there: np.ndarray, back: np.ndarray, form: ChamferForm) -> float:
+    if form in ("squared", "squared-sum"):
+        there, back = there**2, back**2
+    total = float(there.mean() + back.mean())
+    return total if form in ("sum", "squared-sum") else total / 2
 
 
 def _ways(predicted: Points, truth: Points) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
