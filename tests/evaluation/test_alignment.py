@@ -75,8 +75,12 @@ def test_a_turn_about_the_upward_axis_is_found_by_its_own_search():
 def test_steps_are_repeatable_and_a_single_point_is_refused(steps):
     points, truth = (sample(CHAIR, 2000, seed) for seed in (0, 1))
     one, two = (aligned(points, truth, steps) for _ in range(2))
-    assert (one[0].rotation == two[0].rotation).all() and one[0].scale == two[0].scale
-    assert (one[0].translation == two[0].translation).all() and one[1] == two[1]
+    # Open3D's ICP adds in the order in which its threads end; all else has the same bits.
+    slack = 1e-12 if steps[0] in ("rigid", "icp") else 0
+    for name in ("rotation", "translation", "scale"):
+        apart = np.abs(np.array(getattr(one[0], name)) - getattr(two[0], name)).max()
+        assert apart <= slack, name
+    assert one[1] == pytest.approx(two[1], rel=slack)
     with pytest.raises(UserError, match="all points of the prediction are one"):
         aligned(Points(np.zeros((5, 3))), truth, steps)
 
