@@ -44,6 +44,7 @@ def parallel_launch(
         outputs: more arguments, by convention those that are written.
         threads: number of threads; None means ``torch.get_num_threads()``.
         pieces: number of pieces; None means one per thread. More pieces even out uneven work.
+            Piece i begins at ``dim[0] * i // pieces``, by which a kernel finds memory of its own.
 
     Raises:
         Exception: the first one that a piece raised.

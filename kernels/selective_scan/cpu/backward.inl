@@ -2,14 +2,18 @@
 // backwards equations 6, 7 and 9 to 12. Σ rate q is left in da. Sums begin anew in the first of the
 // BLOCKS lane groups that share them. What is not in ``needs`` is not computed.
 #include "task.h"
-each_(true, [&](const Place p) __attribute__((always_inline)) {
+F *const work = row_(work_out, piece_(work_out)), *const sums = row_(sums_out, piece_(sums_out));
+auto work_of = [&](const Place& p) { return work + p.j * 3 * sizes.states; };
+auto enter = [&](const Place& p) {
+    load_(dlast_in, p, work_of(p)), fill_(work_of(p) + 2 * sizes.states, 0.0f);
+};
+auto walk = [&](const Place p) __attribute__((always_inline)) {
 #include "prepare.h"
 #include "states.h"
-    F *const dh_of = row_(dh_out, p.state, p.k), *const da_of = row_(da_out, p.state, p.k);
+    F *const dh_of = work_of(p), *const da_of = dh_of + 2 * states;
     const int chunk = p.chunk + (p.t0 - p.begin) / TOKENS;
     const F* const start = row_(starts_in, chunk, p.k);
     write_soon_(du_out), write_soon_(ddelta_out), write_soon_(dz_out);
-    F* const sums = row_(sums_out, task);  // [2, states, TOKENS]
     const bool first = p.j % BLOCKS == 0;
     auto reverse = [&](auto kind, auto range, const auto& at,
                        int needs) __attribute__((always_inline)) {
@@ -71,7 +75,7 @@ each_(true, [&](const Place p) __attribute__((always_inline)) {
 #if WEIGHTED
                 const F g = own.g, gv = g * v;
 #else
-            const F gv = v;
+                const F gv = v;
 #endif
                 if (needs & NEED_DB) db[k * TOKENS + t] = fma_(gv, du, db[k * TOKENS + t]);
                 s = fma_(gv, splat(b_t), s);
@@ -81,8 +85,8 @@ each_(true, [&](const Place p) __attribute__((always_inline)) {
                 const F q = v * (own.h * df + du * b_t * dg);
                 dh.decay(own.m);
 #else
-            dh.decay(own.m);
-            const F q = dh.value() * own.h;
+                dh.decay(own.m);
+                const F q = dh.value() * own.h;
 #endif
                 p = fma_(q, at.a[k], p);
                 das[k] = fma_(q, rate, das[k]);
@@ -132,4 +136,7 @@ each_(true, [&](const Place p) __attribute__((always_inline)) {
         if (sizes.needs & NEED_DC)
             sum_lanes_((const E*)(sums + states * TOKENS), dc_out.data + part * size);
     }
+};
+each_(true, enter, walk, [&](const Place& p) {
+    store_(dfirst_out, p, work_of(p)), store_(da_out, p, work_of(p) + 2 * sizes.states);
 });

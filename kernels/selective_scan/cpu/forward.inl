@@ -1,11 +1,16 @@
 // A strip of a lane group: equation 1 over its tokens, with equation 5 and the gate, or without
 // OUTPUT with the product of the decays.
 #include "task.h"
-each_(false, [&](const Place p) __attribute__((always_inline)) {
+F* const work = row_(work_out, piece_(work_out));
+auto work_of = [&](const Place& p) { return work + p.j * (OUTPUT ? 2 : 4) * sizes.states; };
+auto enter = [&](const Place& p) {
+    load_(first_in, p, work_of(p));
+    if (!OUTPUT) pairs_(work_of(p) + 2 * sizes.states, 1.0f);
+};
+auto walk = [&](const Place p) __attribute__((always_inline)) {
 #include "tokens.h"
 #include "states.h"
-    F* const h_of = row_(h_out, p.state, p.k);
-    F* const product_of = OUTPUT ? nullptr : row_(product_out, p.state, p.k);
+    F *const h_of = work_of(p), *const product_of = h_of + 2 * states;
     if (starts_out.shape[0] > 0 && (p.t0 - p.begin) % CHUNK == 0) {
         F* const start = row_(starts_out, p.chunk + (p.t0 - p.begin) / CHUNK, p.k);
         for (int n = 0; n < states; ++n) start[n] = h_of[n];
@@ -75,4 +80,8 @@ each_(false, [&](const Place p) __attribute__((always_inline)) {
         const auto y = here_(y_out, p.width);
         for (int t = 0; t < count; ++t) put_(y, t, token[t].y * token[t].gate, stream);
     }
+};
+each_(false, enter, walk, [&](const Place& p) {
+    store_(last_out, p, work_of(p));
+    if (!OUTPUT) store_(product_out, p, work_of(p) + 2 * sizes.states);
 });

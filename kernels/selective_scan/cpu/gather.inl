@@ -1,10 +1,14 @@
 // What the outputs send back to the state before the first token, and the product of the decays.
 #include "task.h"
-each_(false, [&](const Place p) __attribute__((always_inline)) {
+F* const work = row_(work_out, piece_(work_out));
+auto work_of = [&](const Place& p) { return work + p.j * 4 * sizes.states; };
+auto enter = [&](const Place& p) {
+    pairs_(work_of(p), 0.0f), pairs_(work_of(p) + 2 * sizes.states, 1.0f);
+};
+auto walk = [&](const Place p) __attribute__((always_inline)) {
 #include "prepare.h"
 #include "states.h"
-    F *const dh_of = row_(dh_out, p.state, p.k),
-             *const product_of = row_(product_out, p.state, p.k);
+    F *const dh_of = work_of(p), *const product_of = dh_of + 2 * states;
     visit_(true, [&](auto kind, auto range, const auto& at) __attribute__((always_inline)) {
         using State = decltype(kind);
         constexpr int K = sizeof(at.a) / sizeof(F);
@@ -34,4 +38,7 @@ each_(false, [&](const Place p) __attribute__((always_inline)) {
             products[k].keep(product_of[n + k], product_of[states + n + k]);
         }
     });
+};
+each_(false, enter, walk, [&](const Place& p) {
+    store_(dh_out, p, work_of(p)), store_(product_out, p, work_of(p) + 2 * sizes.states);
 });

@@ -32,6 +32,8 @@ NEEDS = {"NEED_DZ": 1, "NEED_DC": 2, "NEED_DB": 4, "NEED_DH": 8}
 
 _HERE = Path(__file__).parent
 _MATRIX = wp.array4d(dtype=wp.float32)
+_STATES = wp.array3d(dtype=wp.float32)  # [rows, D, N], or without rows
+_WORK = wp.array2d(dtype=lanes)  # a row for each piece of the launch
 
 
 class Tuning(NamedTuple):
@@ -102,16 +104,17 @@ class Sizes:
 
 @functools.cache
 def forward_kernel(kind: Kind, output: bool) -> Any:
-    """Brings the states in ``h_out`` from before each segment to after it.
+    """Brings the states from before each segment, ``first_in``, to after it, ``last_out``.
 
     ``channel_in`` has for each lane group the N rates of A, then the greatest |A|, D and the bias;
-    ``task.h`` tells of states. With ``output`` it computes y; else it multiplies the decays into
-    ``product_out``, and z, C and D are not used.
+    ``task.h`` tells of states. With ``output`` it computes y; else the products of the decays, and
+    z, C and D are not used.
     """
-    inputs = {**_channels(kind), "b_in": _MATRIX, "c_in": _MATRIX}
+    inputs = {**_channels(kind), "b_in": _MATRIX, "c_in": _MATRIX, "first_in": _STATES}
     outputs = {
-        "h_out": wp.array3d(dtype=lanes),
-        "product_out": wp.array3d(dtype=lanes),
+        "work_out": _WORK,
+        "last_out": _STATES,
+        "product_out": _STATES,
         "starts_out": wp.array3d(dtype=lanes),
         "y_out": wp.array3d(dtype=WARP_DTYPES[kind.io]),
     }
@@ -123,16 +126,13 @@ def gradient_states_kernel(kind: Kind) -> Any:
     """What a segment's outputs send back to the state before it, and the products of the decays."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     inputs = {**_channels(kind), "c_in": _MATRIX, "dout_in": rows}
-    outputs = {"dh_out": wp.array3d(dtype=lanes), "product_out": wp.array3d(dtype=lanes)}
+    outputs = {"work_out": _WORK, "dh_out": _STATES, "product_out": _STATES}
     return native_kernel("scan_gradient_states", kind.text("gather.inl", True), inputs, outputs)
 
 
 @functools.cache
 def backward_kernel(kind: Kind) -> Any:
-    """Computes all gradients from those of the states after each segment, in ``dh_out``.
-
-    ``sums_out`` is a task's workspace.
-    """
+    """Computes all gradients from those of the states after each segment, ``dlast_in``."""
     rows = wp.array3d(dtype=WARP_DTYPES[kind.io])
     inputs = {
         **_channels(kind),
@@ -140,14 +140,16 @@ def backward_kernel(kind: Kind) -> Any:
         "c_in": _MATRIX,
         "starts_in": wp.array3d(dtype=lanes),
         "dout_in": rows,
+        "dlast_in": _STATES,
     }
     outputs = {
-        "sums_out": wp.array2d(dtype=lanes),
-        "dh_out": wp.array3d(dtype=lanes),
+        "work_out": _WORK,
+        "sums_out": _WORK,
+        "dfirst_out": _STATES,
         "du_out": rows,
         "ddelta_out": wp.array3d(dtype=WARP_DTYPES[kind.delta_io]),
         "dz_out": rows,
-        "da_out": wp.array3d(dtype=lanes),
+        "da_out": _STATES,
         "db_out": wp.array2d(dtype=wp.float32),
         "dc_out": wp.array2d(dtype=wp.float32),
         "dchannel_out": wp.array3d(dtype=lanes),

@@ -114,12 +114,6 @@ class Layout:
             x = x.narrow(n + 1, 0, self.group_width)
         return x.reshape(*lead, self.channels, *tail).contiguous()
 
-    def states_of(self, x: Tensor | None) -> Tensor:
-        """Packs states ``[S, D, N]``, or None for 0, to ``[S, blocks, N, W]``."""
-        if x is None:
-            return torch.zeros(self.sequences, self.blocks, self.states, W)
-        return self.pack(x, (self.sequences,))
-
     def total(self, parts: Tensor) -> Tensor:
         """Sums ``[B·G·parts, N·L]`` over the parts of a group: ``[B, L, G, N]``."""
         of_group = -(-self.group_blocks // BLOCKS)
@@ -127,22 +121,12 @@ class Layout:
         return sum_parts(x).permute(0, 3, 1, 2)
 
 
-def _pairs(states: Tensor) -> Tensor:
-    """States as the kernels hold them, each with what it has rounded away, which is 0 at first."""
-    return torch.constant_pad_nd(states, (0, 0, 0, states.shape[-2]))
-
-
-def _values(pairs: Tensor) -> Tensor:
-    """The states of ``_pairs``."""
-    return pairs.narrow(-2, 0, pairs.shape[-2] // 2)
-
-
-def _carry(first: Tensor, local: Tensor, product: Tensor) -> Tensor:
+def _carry(first: Tensor | None, local: Tensor, product: Tensor) -> Tensor:
     """States before each segment (dimension 0): a segment turns h to local + product · h."""
     states = torch.empty_like(local)
-    for s in range(len(local)):
-        states[s] = first
-        first = torch.addcmul(local[s], product[s], first)
+    states[0] = 0 if first is None else first
+    for s in range(len(local) - 1):
+        torch.addcmul(local[s], product[s], states[s], out=states[s + 1])
     return states
 
 
@@ -152,8 +136,11 @@ def _entries(x: Tensor) -> Tensor:
     return x if x.stride(-1) == 1 or x.shape[-1] == 1 else x.contiguous()
 
 
-def _flat(states: Tensor):
-    return view(states.flatten(0, 1), lanes)
+def _rows(states: Tensor | None):
+    """States ``[.., D, N]`` as the kernels take them; None has no rows."""
+    if states is None:
+        return torch.empty(0, 1, 1)
+    return states.contiguous().view(-1, *states.shape[-2:])
 
 
 class _Operands:
@@ -185,18 +172,22 @@ class _Operands:
         )
         parallel_launch(kernel, y.tasks, [sizes, *self.inputs, *inputs], outputs)
 
-    def states(self, fill: float = 0.0) -> Tensor:
+    def work(self, rows: int):
+        """Memory of lanes for each piece of a launch, ``rows`` for each state."""
         y = self.layout
-        return torch.full((y.segments, y.sequences, y.blocks, y.states, W), fill)
+        pieces = max(1, min(torch.get_num_threads(), y.tasks))
+        return view(torch.empty(pieces, rows * y.states, W), lanes)
 
-    def accumulate(self, h: Tensor, starts: Tensor) -> Tensor:
-        """Brings the pairs ``h`` from before each segment to after it: the decays' products."""
-        product = _pairs(self.states(1.0))
+    def states(self) -> Tensor:
+        y = self.layout
+        return torch.empty(y.segments, y.sequences, y.channels, y.states)
+
+    def advance(self, first: Tensor | None, last: Tensor, product: Tensor | None, starts: Tensor):
+        """Walks without outputs: states after each segment, and the products of the decays."""
         kernel = kernels.forward_kernel(self.kind, output=False)
-        u = self.inputs[1]
-        outputs = [_flat(h), _flat(product), view(starts, lanes), u]
-        self.run(kernel, [self.b, self.b], outputs)
-        return _values(product)
+        outputs = [_rows(last), _rows(product), view(starts, lanes), self.inputs[1]]
+        work = self.work(4 * self.layout.span)
+        self.run(kernel, [self.b, self.b, _rows(first)], [work, *outputs])
 
 
 def saved_shape(x: Scan) -> tuple[int, ...]:
@@ -217,23 +208,20 @@ def forward(x: Scan) -> tuple[Tensor, Tensor, Tensor]:
     s = _Operands(x, split=read or not x.save)
     y, starts = s.layout, empty(saved_shape(x), torch.float32)
     out = empty(x.u.shape if read else (y.batch, 0, y.channels), x.u.dtype)
-    h = y.states_of(x.initial_state)[None]
+    first, last = x.initial_state, s.states()
     if y.segments > 1:
-        local = _pairs(s.states())
-        product = s.accumulate(local, starts[:0])
-        local = _values(local)
-        h = _carry(h[0], local, product)
+        product = s.states()
+        s.advance(None, last, product, starts[:0])
+        first = _carry(first, last, product)
         if not read:
-            last = torch.addcmul(local[y.last], product[y.last], h[y.last])
-            return out, y.unpack(last, (y.sequences,)), starts
-    h = _pairs(h)
+            return out, torch.addcmul(last[y.last], product[y.last], first[y.last]), starts
     if read:
         kernel = kernels.forward_kernel(s.kind, output=True)
-        outputs = [_flat(h), _flat(h), view(starts, lanes), out]
-        s.run(kernel, [s.b, s.c], outputs, results=[out])
+        outputs = [s.work(2 * y.span), _rows(last), _rows(None), view(starts, lanes), out]
+        s.run(kernel, [s.b, s.c, _rows(first)], outputs, results=[out])
     else:
-        s.accumulate(h, starts)
-    return out, y.unpack(_values(h)[y.last], (y.sequences,)), starts
+        s.advance(first, last, None, starts)
+    return out, last[y.last] if y.segments > 1 else last.squeeze(0), starts
 
 
 def backward(
@@ -268,26 +256,22 @@ def backward(
     def parts(needed: bool) -> Tensor:
         return empty((y.parts, y.states * y.length if needed else 0), torch.float32)
 
-    dh = y.states_of(dlast)[None]
     if y.segments > 1 and through:  # the gradient of the state after each segment
-        local, product = _pairs(s.states()), _pairs(s.states(1.0))
+        local, product = s.states(), s.states()
         kernel = kernels.gradient_states_kernel(s.kind)
-        s.run(kernel, [s.c, dout], [_flat(local), _flat(product)])
-        local, product = _values(local).flip(0), _values(product).flip(0)
-        dh = _carry(dh[0], local, product).flip(0).contiguous()
-    elif y.segments > 1:
-        dh = s.states()
-    dh, da = _pairs(dh), s.states()
+        s.run(kernel, [s.c, dout], [s.work(4 * y.span), _rows(local), _rows(product)])
+        dlast = _carry(dlast, local.flip(0), product.flip(0)).flip(0)
+    dh, da = s.states() if need_h else None, s.states() if need_A else None
     du, ddelta, dz = like(x.u, need_u), like(x.delta, need_delta), like(x.u, need_z)
     db, dc = parts(need_B), parts(need_C)
     make = torch.empty if x.packed is None else torch.zeros  # some have no chunk
     dchannel = make(y.chunks, 2, y.blocks, W)
-    sums = torch.empty(y.tasks, 2 * y.states * chunk if need_B or need_C else 0, W)
     s.run(
         kernels.backward_kernel(s.kind),
-        [s.b, s.c, view(starts, lanes), dout],
+        [s.b, s.c, view(starts, lanes), dout, _rows(dlast if through else None)],
         [
-            view(sums, lanes), _flat(dh), du, ddelta, dz, _flat(da), db, dc, view(dchannel, lanes),
+            s.work(3 * y.span), s.work(2 * chunk), _rows(dh), du, ddelta, dz, _rows(da), db, dc,
+            view(dchannel, lanes),
         ],
         flags,
         [du, ddelta, dz],
@@ -296,13 +280,13 @@ def backward(
     values = (
         lambda: du,
         lambda: ddelta,
-        lambda: y.unpack(da.sum((0, 1))) / scale,
+        lambda: da.sum((0, 1)) / scale,
         lambda: y.total(db),
         lambda: y.total(dc),
         lambda: y.unpack(dchannel[:, 0].sum(0)),
         lambda: dz,
         lambda: y.unpack(dchannel[:, 1].sum(0)),
-        lambda: y.unpack(_values(dh)[0], (y.sequences,)),
+        lambda: dh[0],
     )
     tensors: tuple[Any, ...] = (*x[:8], x.A)
     dense = torch.contiguous_format

@@ -1,24 +1,25 @@
-// A task: a segment of the tokens of one sequence, and lane groups of one channel group.
-// States, gradients of states and products of decays are pairs: N values, then for each what it has
-// rounded away (states.h). They are ordered by segment, then sequence.
+// A task: a segment of the tokens of one sequence, and lane groups of one channel group. Tasks that
+// follow one another have the same lane groups and adjacent tokens, also in the backward order: so
+// the rows that one fetches beyond its own tokens are those of the next.
 struct Place {
-    int b, state, group;  // ``state``: row of the state arrays
-    int begin, end;       // tokens
-    int chunk;            // row of what is kept of chunks, of the segment's first
-    int first, blocks;    // first lane group, and how many
-    int part;             // row of the partial sums of dB and dC
+    int b, row, group;  // ``row``: of the segment, which are ordered by number, then sequence
+    int begin, end;     // tokens
+    int chunk;          // row of what is kept of chunks, of the segment's first
+    int first, blocks;  // first lane group, and how many
+    int part;           // row of the partial sums of dB and dC
     // then of a lane group and TOKENS tokens, or fewer at the end
     int t0, count;
     int j, k;      // lane group of the task, and of all
     int d, width;  // channels
 };
-auto place_of = [&](int task) -> Place {
+auto place_of = [&](bool backwards) -> Place {
     const int spans = (sizes.group_blocks + sizes.span - 1) / sizes.span;
     const int parts = (sizes.group_blocks + BLOCKS - 1) / BLOCKS;
-    const int row = task / spans / sizes.groups;
+    const int rows = sizes.segments * sizes.batch, share = task / rows;
+    const int row = backwards ? rows - 1 - task % rows : task % rows;
     Place p = {};
-    p.first = task % spans * sizes.span, p.group = task / spans % sizes.groups;
-    p.state = row;
+    p.first = share % spans * sizes.span, p.group = share / spans;
+    p.row = row;
     if (rows_in.shape[0] > 0) {
         const int* const own = (const int*)rows_in.data + (size_t)row * 4;
         p.b = own[0], p.begin = own[1], p.end = own[2], p.chunk = own[3];
@@ -40,21 +41,61 @@ auto row_ = [](auto& array, auto... indices) -> F* {
     for (; dim < array.ndim; ++dim) at *= array.shape[dim];
     return (F*)array.data + at;
 };
-// Calls ``walk`` with the lane groups of every TOKENS tokens, in the tokens' order or backwards.
-auto each_ = [&](bool backwards, auto walk) __attribute__((always_inline)) {
+// States, gradients of states and products of decays lie in the caller's order, [rows, D, N]; one
+// without rows is not there: zeros, or not asked for. While a task walks its tokens they are lanes,
+// in the workspace of the launch's piece: pairs, N values, then for each what it has rounded away
+// (states.h).
+auto states_ = [&](const auto& array, const Place& p) -> float* {
+    const size_t channels = (size_t)sizes.groups * sizes.group_width;
+    return (float*)array.data + (p.row * channels + p.d) * sizes.states;
+};
+auto fill_ = [&](F* values, float value) {
+    for (int n = 0; n < sizes.states; ++n) values[n] = splat(value);
+};
+auto pairs_ = [&](F* pairs, float value) {
+    fill_(pairs, value), fill_(pairs + sizes.states, 0.0f);
+};
+auto load_ = [&](const auto& array, const Place& p, F* pairs) {
+    pairs_(pairs, 0.0f);
+    if (array.shape[0] == 0) return;
+    const float* const from = states_(array, p);
+    for (int n = 0; n < sizes.states; ++n)
+        for (int i = 0; i < p.width; ++i) ((float*)(pairs + n))[i] = from[i * sizes.states + n];
+};
+auto store_ = [&](auto& array, const Place& p, const F* values) {
+    if (array.shape[0] == 0) return;
+    float* const to = states_(array, p);
+    for (int i = 0; i < p.width; ++i)
+        for (int n = 0; n < sizes.states; ++n)
+            to[i * sizes.states + n] = ((const float*)(values + n))[i];
+};
+// The row of a workspace that has one for each piece of the launch.
+auto piece_ = [&](const auto& array) -> int {
+    const long long tasks = (long long)sizes.segments * sizes.batch * sizes.groups
+        * ((sizes.group_blocks + sizes.span - 1) / sizes.span);
+    return (int)(((task + 1ll) * array.shape[0] - 1) / tasks);
+};
+// Calls ``walk`` with the lane groups of every TOKENS tokens, in the tokens' order or backwards;
+// before it ``enter``, and after it ``leave`` with each lane group.
+auto each_ = [&](bool backwards, auto enter, auto walk, auto leave) __attribute__((always_inline)) {
 #include "../../runtime/denormals.h"
-    Place p = place_of(task);
-    const int strips = (p.end - p.begin + TOKENS - 1) / TOKENS;
-    for (int strip = 0; strip < strips; ++strip) {
-        p.t0 = p.begin + (backwards ? strips - 1 - strip : strip) * TOKENS;
-        p.count = p.end - p.t0 < TOKENS ? p.end - p.t0 : TOKENS;
+    Place p = place_of(backwards);
+    auto groups = [&](auto act) __attribute__((always_inline)) {
         for (p.j = 0; p.j < p.blocks; ++p.j) {
             const int own = p.first + p.j, left = sizes.group_width - own * 16;
             p.k = p.group * sizes.group_blocks + own;
             p.d = p.group * sizes.group_width + own * 16, p.width = left < 16 ? left : 16;
-            walk(p);
+            act(p);
         }
+    };
+    groups(enter);
+    const int strips = (p.end - p.begin + TOKENS - 1) / TOKENS;
+    for (int strip = 0; strip < strips; ++strip) {
+        p.t0 = p.begin + (backwards ? strips - 1 - strip : strip) * TOKENS;
+        p.count = p.end - p.t0 < TOKENS ? p.end - p.t0 : TOKENS;
+        groups(walk);
     }
+    groups(leave);
 #if defined(__x86_64__)
     __builtin_ia32_sfence();  // what was written past the caches is seen by other threads
 #endif

@@ -51,7 +51,7 @@ struct Fetch {
 Fetch fetches[8];
 int asked = 0, fetched = 0;
 const int next = GRADIENT ? -TOKENS : TOKENS;
-const bool more = p.t0 + next >= 0 && p.t0 + next < p.end;
+const bool more = p.t0 + next >= 0 && p.t0 + next < sizes.length;
 auto read_soon_ = [&](auto& array) {
     const auto rows = here_(array, 16);
     const int row = p.j * count / p.blocks, line = p.j * count % p.blocks;
