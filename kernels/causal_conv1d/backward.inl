@@ -12,6 +12,7 @@ for (int t = t0; t < end + 3; ++t) {
     F x3 = x2, g3 = F{};
     if (t < stop) {
         x3 = read_(xs, t), g3 = read_(douts, t);
+        next_(xs, t), next_(douts, t);
         if (use_silu) {
             const F y = fma_(w0, x0, fma_(w1, x1, fma_(w2, x2, fma_(w3, x3, bias))));
             const F s = sigmoid_(y);

@@ -3,6 +3,7 @@
 const auto ys = rows_(y_out, b, 0, d, width);
 for (int t = t0; t < end; ++t) {
     const F x3 = read_(xs, t);
+    next_(xs, t);
     F y = fma_(w0, x0, fma_(w1, x1, fma_(w2, x2, fma_(w3, x3, bias))));
     if (use_silu) y = y * sigmoid_(y);
     put_(ys, t, y, stream);

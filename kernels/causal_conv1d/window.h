@@ -18,6 +18,10 @@ auto rows_ = [](auto& array, int b, int t0, int d, int) {
 auto read_ = [](const auto& rows, int t) -> F { return (F)*rows.row(t); };
 auto write_ = [](const auto& rows, int t, F v) { *rows.row(t) = (ELEMENT)v; };
 auto put_ = [&](const auto& rows, int t, F v, bool) { write_(rows, t, v); };
+auto next_ = [](const auto&, int) {};
+#else
+// Each row lies in another page, so no processor foresees that the next task wants its next lanes.
+auto next_ = [](const auto& rows, int t) { __builtin_prefetch(rows.row(t) + WIDTH); };
 #endif
 const int pieces = (x_in.shape[1] + PIECE - 1) / PIECE;
 int b = 0, begin = 0, stop = x_in.shape[1], t0 = 0, own = 0;  // ``own``: the sequence
