@@ -77,7 +77,7 @@ def distances(shape: Mesh | Points, other: Mesh | Points) -> np.ndarray:
     places = shape.vertices if isinstance(shape, Mesh) else shape.positions
     if isinstance(other, Mesh):
         return other.scene().compute_distance(places.astype(np.float32)).numpy()
-    return nearest(places, other.positions)[0]
+    return nearest(Points(places), other)[0]
 
 
 def colors_of(distance: np.ndarray) -> np.ndarray:
